@@ -1,0 +1,496 @@
+//! The TOML schema of the networks: sizes, heads and modes, with the published size as the default.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+
+/// Everything that decides what the networks compute.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Config {
+    /// The point predictor (SNAPSNAP §1, 2, 4).
+    pub network: NetworkConfig,
+    /// The Gaussian regressor (SNAPSNAP §8).
+    pub regressor: RegressorConfig,
+    /// Which quirks of the published code are reproduced (SNAPSNAP §13).
+    pub mode: ModeConfig,
+}
+
+/// Size and modes of the point predictor. The default is DUSt3R's `ViTLarge_BaseDecoder_512_dpt` with four heads.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct NetworkConfig {
+    /// Channels of an encoder token.
+    pub enc_dim: usize,
+    /// Encoder blocks.
+    pub enc_depth: usize,
+    /// Attention heads of an encoder block.
+    pub enc_heads: usize,
+    /// Channels of a decoder token.
+    pub dec_dim: usize,
+    /// Blocks of each of the two decoders.
+    pub dec_depth: usize,
+    /// Attention heads of a decoder block.
+    pub dec_heads: usize,
+    /// Hidden channels of a block's MLP, as a multiple of its token channels.
+    pub mlp_ratio: usize,
+    /// Side of a square patch in pixels.
+    pub patch: usize,
+    /// Base of the rotary position embedding.
+    pub rope_base: f64,
+    /// Channels of the four DPT branches.
+    pub layer_dims: [usize; 4],
+    /// Channels inside the DPT fusion blocks.
+    pub feature_dim: usize,
+    /// Channels before the last DPT convolution.
+    pub last_dim: usize,
+    /// Which token maps feed the DPT branches: 0 is the encoder's output, l the l-th decoder layer's.
+    pub hooks: [usize; 4],
+    /// Kind of head.
+    pub head: HeadKind,
+    /// Whether the right and left heads exist; without them only the two photographed sides are predicted.
+    pub side_heads: bool,
+    /// How the tokens of the two photographs become those of the unseen sides.
+    pub fusion: Fusion,
+    /// Activation of the confidence channel.
+    pub conf_mode: ConfMode,
+    /// Side of the square canvas in pixels, on which points and Gaussians live.
+    pub resolution: usize,
+    /// Side of the square image that the point predictor sees, in pixels.
+    pub net_resolution: usize,
+    /// A side pixel becomes a Gaussian where its confidence exceeds this.
+    pub conf_threshold: f32,
+    /// How points and confidences get from `net_resolution` to `resolution`; unset: as `mode.compat` says.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub upsample: Option<Upsample>,
+    /// Initial value of δ, the learned global scale of the points (metres per network unit).
+    pub delta: f64,
+}
+
+impl Default for NetworkConfig {
+    fn default() -> Self {
+        Self {
+            enc_dim: 1024,
+            enc_depth: 24,
+            enc_heads: 16,
+            dec_dim: 768,
+            dec_depth: 12,
+            dec_heads: 12,
+            mlp_ratio: 4,
+            patch: 16,
+            rope_base: 100.0,
+            layer_dims: [96, 192, 384, 768],
+            feature_dim: 256,
+            last_dim: 128,
+            hooks: [0, 6, 9, 12],
+            head: HeadKind::Dpt,
+            side_heads: true,
+            fusion: Fusion::Mean,
+            conf_mode: ConfMode::Sigmoid,
+            resolution: 1024,
+            net_resolution: 512,
+            conf_threshold: 0.9,
+            upsample: None,
+            delta: 5.0,
+        }
+    }
+}
+
+impl NetworkConfig {
+    /// Channels of the four token maps that feed the DPT branches.
+    pub fn hook_widths(&self) -> [usize; 4] {
+        self.hooks.map(|hook| if hook == 0 { self.enc_dim } else { self.dec_dim })
+    }
+}
+
+/// Size of the Gaussian regressor.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct RegressorConfig {
+    /// 1: one network for all views; 2: one for front and back, one for the sides (the paper's ablation).
+    pub networks: usize,
+    /// Channels of every UNet stage.
+    pub channels: usize,
+    /// Groups of every group normalisation.
+    pub groups: usize,
+}
+
+impl Default for RegressorConfig {
+    fn default() -> Self {
+        Self { networks: 1, channels: 16, groups: 16 }
+    }
+}
+
+/// Quirk or fix, one key each. An unset key follows `compat`; a key that contradicts `compat = true` is refused.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ModeConfig {
+    /// Reproduces every quirk of the published code, which the published weights were trained with.
+    pub compat: bool,
+    /// Axes that predicted quaternions refer to.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub rotation_frame: Option<RotationFrame>,
+    /// How the canvas gets from `resolution` to `net_resolution`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub downsample: Option<Downsample>,
+    /// World frame of the PLY.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub world_frame: Option<WorldFrame>,
+    /// Whether the regressor sees only the person's box (with the margin its receptive field needs).
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub crop: Option<bool>,
+}
+
+macro_rules! names {
+    ($(#[$doc:meta])* $name:ident { $($(#[$vdoc:meta])* $variant:ident = $text:literal),+ $(,)? }) => {
+        $(#[$doc])*
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+        pub enum $name { $($(#[$vdoc])* #[serde(rename = $text)] $variant),+ }
+    };
+}
+
+names! {
+    /// Kind of head.
+    HeadKind {
+        /// Convolutional head over four token maps.
+        Dpt = "dpt",
+        /// One linear layer and a pixel shuffle.
+        Linear = "linear",
+    }
+}
+names! {
+    /// How the tokens of the two photographs become those of the unseen sides (SNAPSNAP §4, §13.3 fix 4).
+    Fusion {
+        /// Arithmetic mean at equal token positions.
+        Mean = "mean",
+        /// Mean of the front tokens and the horizontally flipped back tokens.
+        MirrorMean = "mirror-mean",
+        /// Both token maps stacked along the channels.
+        Concat = "concat",
+    }
+}
+names! {
+    /// Activation of the confidence channel (SNAPSNAP §2.2).
+    ConfMode {
+        /// 1 / (1 + e^−x), Snap-Snap.
+        Sigmoid = "sigmoid",
+        /// 1 + e^x, DUSt3R.
+        Exp = "exp",
+    }
+}
+names! {
+    /// Interpolation of points and confidences from the network's grid to the canvas.
+    Upsample {
+        /// Bilinear, blending body and background points across the silhouette.
+        Bilinear = "bilinear",
+        /// Bilinear, normalised by the mask: only body points are blended (SNAPSNAP §13.3 fix 6).
+        MaskAware = "mask-aware",
+    }
+}
+names! {
+    /// Axes that predicted quaternions refer to.
+    RotationFrame {
+        /// The front camera's; rotated into the world with the means (SNAPSNAP §13.3 fix 1).
+        Camera = "camera",
+        /// Passed on unchanged, as if they were in world axes.
+        World = "world",
+    }
+}
+names! {
+    /// Reduction of the canvas to the network's input.
+    Downsample {
+        /// Mean over the pixels that fall into one.
+        Area = "area",
+        /// The first pixel of each cell.
+        Nearest = "nearest",
+    }
+}
+names! {
+    /// World frame of the PLY.
+    WorldFrame {
+        /// y up, metres, feet near y = 0, subject upright and facing +z: the training cameras' world.
+        Upright = "upright",
+        /// The published demo's diag(−1, −1, −1) about (0, 0, 2): a mirror image.
+        Mirrored = "mirrored",
+    }
+}
+
+/// A config that cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum ConfigError {
+    /// The file could not be read.
+    #[error("{path}: cannot read the config: {source}")]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// Not TOML, an unknown key, a wrong type or an unknown name.
+    #[error("{origin}: {message}")]
+    Syntax {
+        /// File or other origin of the text.
+        origin: String,
+        /// The parser's message, with line and key.
+        message: String,
+    },
+    /// A value that makes no sense, alone or beside another.
+    #[error("{origin}: `{key}`: {message}")]
+    Value {
+        /// File or other origin of the text.
+        origin: String,
+        /// Dotted key.
+        key: &'static str,
+        /// What is wrong and what is allowed.
+        message: String,
+    },
+}
+
+impl Config {
+    /// Reads and checks a TOML file; `overrides` are `a.b=c` assignments applied on top.
+    ///
+    /// # Errors
+    /// [`ConfigError`], naming file, key and allowed values.
+    pub fn from_file(path: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
+        let text = std::fs::read_to_string(path)
+            .map_err(|source| ConfigError::Read { path: path.to_owned(), source })?;
+        Self::from_toml(&text, &path.display().to_string(), overrides)
+    }
+
+    /// Parses and checks TOML text; `origin` names it in errors, `overrides` are `a.b=c` assignments applied on top.
+    ///
+    /// # Errors
+    /// [`ConfigError`], naming origin, key and allowed values.
+    pub fn from_toml(text: &str, origin: &str, overrides: &[String]) -> Result<Self, ConfigError> {
+        let syntax = |origin: &str, message: String| ConfigError::Syntax { origin: origin.to_owned(), message };
+        // Straight from the text first: only this way do messages carry line numbers.
+        let config: Self = toml::from_str(text).map_err(|e| syntax(origin, e.to_string()))?;
+        if overrides.is_empty() {
+            return config.checked(origin);
+        }
+        let mut table: toml::Table = toml::from_str(text).map_err(|e| syntax(origin, e.to_string()))?;
+        for assignment in overrides {
+            assign(&mut table, assignment).map_err(|message| syntax(&format!("--set {assignment}"), message))?;
+        }
+        let origin = format!("{origin} with --set {}", overrides.join(" --set "));
+        let config: Self =
+            toml::Value::Table(table).try_into().map_err(|e: toml::de::Error| syntax(&origin, e.to_string()))?;
+        config.checked(&origin)
+    }
+
+    /// The config as TOML, every set key written out.
+    ///
+    /// # Panics
+    /// Never: every field is representable in TOML.
+    pub fn to_toml(&self) -> String {
+        toml::to_string_pretty(self).expect("the config has only TOML types")
+    }
+
+    /// The size the network wants: canvas pixels per network pixel.
+    pub fn upsample_factor(&self) -> usize {
+        self.network.resolution / self.network.net_resolution
+    }
+
+    /// Interpolation of points and confidences.
+    pub fn upsample(&self) -> Upsample {
+        self.network.upsample.unwrap_or(if self.mode.compat { Upsample::Bilinear } else { Upsample::MaskAware })
+    }
+
+    /// Frame of the predicted quaternions.
+    pub fn rotation_frame(&self) -> RotationFrame {
+        self.mode.rotation_frame.unwrap_or(if self.mode.compat { RotationFrame::World } else { RotationFrame::Camera })
+    }
+
+    /// Reduction of the canvas to the network's input.
+    pub fn downsample(&self) -> Downsample {
+        self.mode.downsample.unwrap_or(if self.mode.compat { Downsample::Nearest } else { Downsample::Area })
+    }
+
+    /// World frame of the PLY.
+    pub fn world_frame(&self) -> WorldFrame {
+        self.mode.world_frame.unwrap_or(if self.mode.compat { WorldFrame::Mirrored } else { WorldFrame::Upright })
+    }
+
+    /// Whether the regressor sees only the person's box.
+    pub fn crop(&self) -> bool {
+        self.mode.crop.unwrap_or(!self.mode.compat)
+    }
+
+    fn checked(self, origin: &str) -> Result<Self, ConfigError> {
+        match self.problem() {
+            Some((key, message)) => Err(ConfigError::Value { origin: origin.to_owned(), key, message }),
+            None => Ok(self),
+        }
+    }
+
+    /// The first value that makes no sense: its key, and what is wrong.
+    fn problem(&self) -> Option<(&'static str, String)> {
+        let n = &self.network;
+        let sizes = [
+            ("network.enc_dim", n.enc_dim, 65_536),
+            ("network.enc_depth", n.enc_depth, 1_024),
+            ("network.enc_heads", n.enc_heads, 1_024),
+            ("network.dec_dim", n.dec_dim, 65_536),
+            ("network.dec_depth", n.dec_depth, 1_024),
+            ("network.dec_heads", n.dec_heads, 1_024),
+            ("network.mlp_ratio", n.mlp_ratio, 64),
+            ("network.patch", n.patch, 1_024),
+            ("network.layer_dims", n.layer_dims.into_iter().min().unwrap_or(0), usize::MAX),
+            ("network.layer_dims", n.layer_dims.into_iter().max().unwrap_or(0), 65_536),
+            ("network.feature_dim", n.feature_dim, 65_536),
+            ("network.last_dim", n.last_dim, 65_536),
+            ("network.resolution", n.resolution, 16_384),
+            ("network.net_resolution", n.net_resolution, 16_384),
+            ("regressor.channels", self.regressor.channels, 4_096),
+            ("regressor.groups", self.regressor.groups, 4_096),
+        ];
+        for (key, value, most) in sizes {
+            if value == 0 || value > most {
+                return Some((key, format!("is {value}, must be between 1 and {most}")));
+            }
+        }
+        for (key, dim, heads) in
+            [("network.enc_heads", n.enc_dim, n.enc_heads), ("network.dec_heads", n.dec_dim, n.dec_heads)]
+        {
+            if dim % heads != 0 || (dim / heads) % 4 != 0 {
+                let message = format!(
+                    "{dim} channels over {heads} heads: the channels of one head must be a multiple of 4 (rotary \
+                     position embedding)"
+                );
+                return Some((key, message));
+            }
+        }
+        if !n.rope_base.is_finite() || n.rope_base <= 0.0 {
+            return Some(("network.rope_base", format!("is {}, must be positive", n.rope_base)));
+        }
+        if n.feature_dim % 2 != 0 {
+            return Some(("network.feature_dim", format!("is {}, must be even", n.feature_dim)));
+        }
+        if let Some(hook) = n.hooks.into_iter().find(|&h| h > n.dec_depth) {
+            return Some(("network.hooks", format!("{hook} is beyond the last layer {}", n.dec_depth)));
+        }
+        if n.head == HeadKind::Dpt && n.patch != 16 {
+            return Some(("network.patch", format!("is {}; the DPT head is built for patches of 16 pixels", n.patch)));
+        }
+        if n.net_resolution % n.patch != 0 {
+            let message = format!("{} is no multiple of the patch {}", n.net_resolution, n.patch);
+            return Some(("network.net_resolution", message));
+        }
+        if n.resolution % n.net_resolution != 0 || n.resolution % 4 != 0 {
+            let message = format!(
+                "is {}, must be a multiple of `network.net_resolution` ({}) and of 4",
+                n.resolution, n.net_resolution
+            );
+            return Some(("network.resolution", message));
+        }
+        if n.conf_threshold.is_nan() {
+            return Some(("network.conf_threshold", "is not a number".into()));
+        }
+        if !n.delta.is_finite() || n.delta == 0.0 {
+            return Some(("network.delta", format!("is {}, must be finite and not 0", n.delta)));
+        }
+        let r = &self.regressor;
+        if !(1..=2).contains(&r.networks) {
+            return Some(("regressor.networks", format!("is {}, allowed: 1, 2", r.networks)));
+        }
+        if r.networks == 2 && !n.side_heads {
+            return Some(("regressor.networks", "is 2, but `network.side_heads = false` leaves the second unused".into()));
+        }
+        if r.channels % r.groups != 0 {
+            return Some(("regressor.channels", format!("{} is no multiple of {} groups", r.channels, r.groups)));
+        }
+        self.contradiction()
+    }
+
+    fn contradiction(&self) -> Option<(&'static str, String)> {
+        if !self.mode.compat {
+            return (self.rotation_frame() == RotationFrame::Camera && self.world_frame() == WorldFrame::Mirrored).then(
+                || {
+                    let message = "\"mirrored\" is a reflection, which no quaternion can follow: set \
+                                   `mode.rotation_frame = \"world\"` or `mode.world_frame = \"upright\"`";
+                    ("mode.world_frame", message.into())
+                },
+            );
+        }
+        let quirks = [
+            ("network.upsample", self.upsample() == Upsample::Bilinear, "\"bilinear\""),
+            ("mode.rotation_frame", self.rotation_frame() == RotationFrame::World, "\"world\""),
+            ("mode.downsample", self.downsample() == Downsample::Nearest, "\"nearest\""),
+            ("mode.world_frame", self.world_frame() == WorldFrame::Mirrored, "\"mirrored\""),
+            ("mode.crop", !self.crop(), "false"),
+        ];
+        let (key, _, allowed) = quirks.into_iter().find(|(_, holds, _)| !holds)?;
+        Some((key, format!("contradicts `mode.compat = true`, which means {allowed}; leave one of the two out")))
+    }
+}
+
+/// Applies `a.b=c`: `c` is a TOML value, or a bare word for a string.
+fn assign(table: &mut toml::Table, assignment: &str) -> Result<(), String> {
+    let Some((key, value)) = assignment.split_once('=') else {
+        return Err("expected SECTION.KEY=VALUE".into());
+    };
+    let parsed = toml::from_str::<toml::Table>(&format!("v = {value}")).ok().and_then(|mut t| t.remove("v"));
+    let value = parsed.unwrap_or_else(|| toml::Value::String(value.trim().to_owned()));
+    let mut path: Vec<&str> = key.split('.').map(str::trim).collect();
+    let last = path.pop().filter(|k| !k.is_empty()).ok_or("the key is empty")?;
+    let mut at = table;
+    for section in path {
+        let entry = at.entry(section).or_insert_with(|| toml::Value::Table(toml::Table::new()));
+        at = entry.as_table_mut().ok_or_else(|| format!("`{section}` is a value, not a section"))?;
+    }
+    at.insert(last.to_owned(), value);
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn refusal(text: &str, overrides: &[&str]) -> String {
+        let overrides: Vec<String> = overrides.iter().map(|s| (*s).to_owned()).collect();
+        Config::from_toml(text, "x.toml", &overrides).expect_err("refused").to_string()
+    }
+
+    #[test]
+    fn the_default_survives_a_round_trip_through_toml() {
+        let config = Config::default();
+        assert_eq!(Config::from_toml(&config.to_toml(), "x", &[]).expect("valid"), config);
+    }
+
+    #[test]
+    fn an_unknown_key_is_named_with_its_line() {
+        let message = refusal("[network]\nenc_dim = 64\nenc_dims = 3\n", &[]);
+        assert!(message.contains("x.toml") && message.contains("line 3") && message.contains("enc_dims"), "{message}");
+    }
+
+    #[test]
+    fn an_unknown_name_lists_the_allowed_ones() {
+        let message = refusal("[network]\nfusion = \"sum\"\n", &[]);
+        assert!(message.contains("mirror-mean") && message.contains("concat"), "{message}");
+    }
+
+    #[test]
+    fn impossible_sizes_name_the_key() {
+        assert!(refusal("[network]\nenc_heads = 7\n", &[]).contains("network.enc_heads"));
+        assert!(refusal("[network]\nnet_resolution = 500\n", &[]).contains("network.net_resolution"));
+        assert!(refusal("[network]\nhooks = [0, 6, 9, 13]\n", &[]).contains("network.hooks"));
+        assert!(refusal("[regressor]\nnetworks = 3\n", &[]).contains("regressor.networks"));
+        assert!(refusal("[regressor]\nchannels = 24\n", &[]).contains("regressor.channels"));
+    }
+
+    #[test]
+    fn a_fix_beside_compat_is_a_contradiction() {
+        let message = refusal("[mode]\ncompat = true\ndownsample = \"area\"\n", &[]);
+        assert!(message.contains("mode.downsample") && message.contains("nearest"), "{message}");
+    }
+
+    #[test]
+    fn set_overrides_one_key_and_is_named_when_wrong() {
+        let set = |s: &str| Config::from_toml("", "x", &[s.to_owned()]);
+        assert!(set("mode.compat=true").expect("valid").mode.compat);
+        assert_eq!(set("network.fusion=concat").expect("valid").network.fusion, Fusion::Concat);
+        assert_eq!(set("network.hooks=[0,1,2,3]").expect("valid").network.hooks, [0, 1, 2, 3]);
+        assert!(refusal("", &["network.nothing=1"]).contains("nothing"));
+        assert!(refusal("", &["network"]).contains("SECTION.KEY=VALUE"));
+    }
+}

@@ -1,0 +1,82 @@
+//! Multi-head attention with rotary positions: self-attention with one fused projection, cross-attention with three
+//! (SNAPSNAP §1.4). The scale is head_dim^(−½), there is no mask.
+
+use burn::module::Module;
+use burn::nn::{Linear, LinearConfig};
+use burn::tensor::module::attention;
+use burn::tensor::{Device, Tensor};
+
+use super::rope::Rope;
+use crate::cpu;
+
+/// Self-attention; `qkv`'s output rows are all queries, all keys, all values.
+#[derive(Module, Debug)]
+pub struct SelfAttention {
+    qkv: Linear,
+    proj: Linear,
+    heads: usize,
+}
+
+impl SelfAttention {
+    pub(crate) fn new(dim: usize, heads: usize, device: &Device) -> Self {
+        Self {
+            qkv: LinearConfig::new(dim, 3 * dim).init(device),
+            proj: LinearConfig::new(dim, dim).init(device),
+            heads,
+        }
+    }
+
+    /// `[B, N, dim]` → `[B, N, dim]`.
+    pub(crate) fn forward(&self, x: Tensor<3>, rope: &Rope) -> Tensor<3> {
+        let dim = x.dims()[2];
+        let qkv = self.qkv.forward(x);
+        let part = |i: usize| qkv.clone().narrow(2, i * dim, dim);
+        self.proj.forward(rotary_attention(part(0), part(1), part(2), rope, rope, self.heads))
+    }
+}
+
+/// Cross-attention: queries from one side's tokens, keys and values from the other's.
+#[derive(Module, Debug)]
+pub struct CrossAttention {
+    projq: Linear,
+    projk: Linear,
+    projv: Linear,
+    proj: Linear,
+    heads: usize,
+}
+
+impl CrossAttention {
+    pub(crate) fn new(dim: usize, heads: usize, device: &Device) -> Self {
+        let square = || LinearConfig::new(dim, dim).init(device);
+        Self { projq: square(), projk: square(), projv: square(), proj: square(), heads }
+    }
+
+    /// Queries `x` `[B, N, dim]`, memory `y` `[B, M, dim]` → `[B, N, dim]`.
+    pub(crate) fn forward(&self, x: Tensor<3>, y: Tensor<3>, rope: &Rope) -> Tensor<3> {
+        let (q, k, v) = (self.projq.forward(x), self.projk.forward(y.clone()), self.projv.forward(y));
+        self.proj.forward(rotary_attention(q, k, v, rope, rope, self.heads))
+    }
+}
+
+/// softmax(rope(q) · rope(k)ᵀ / √head_dim) · v, heads side by side in the channels: `[B, N, dim]`, `[B, M, dim]`
+/// twice → `[B, N, dim]`.
+fn rotary_attention(
+    q: Tensor<3>,
+    k: Tensor<3>,
+    v: Tensor<3>,
+    rope_q: &Rope,
+    rope_k: &Rope,
+    heads: usize,
+) -> Tensor<3> {
+    if cpu::is_fast(&q) {
+        return cpu::rotary_attention(q, k, v, rope_q, rope_k, heads);
+    }
+    let [b, n, dim] = q.dims();
+    let split = |x: Tensor<3>| {
+        let m = x.dims()[1];
+        x.reshape([b, m, heads, dim / heads]).swap_dims(1, 2)
+    };
+    let (q, k) = (rope_q.apply(split(q)), rope_k.apply(split(k)));
+    let out = attention(q, k, split(v), None, None, Default::default());
+    out.swap_dims(1, 2).reshape([b, n, dim])
+}

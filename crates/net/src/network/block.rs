@@ -1,0 +1,97 @@
+//! Pre-norm transformer blocks of the encoder and the decoders (SNAPSNAP §1.4).
+
+use burn::module::Module;
+use burn::nn::{LayerNorm, LayerNormConfig, Linear, LinearConfig};
+use burn::tensor::activation::gelu;
+use burn::tensor::{Device, Tensor};
+
+use super::attention::{CrossAttention, SelfAttention};
+use super::rope::Rope;
+use crate::cpu;
+
+/// Epsilon of every layer normalisation (SNAPSNAP §1.1).
+const NORM_EPSILON: f64 = 1e-6;
+
+pub(crate) fn layer_norm(dim: usize, device: &Device) -> LayerNorm {
+    LayerNormConfig::new(dim).with_epsilon(NORM_EPSILON).init(device)
+}
+
+/// Linear → GELU (erf form) → Linear.
+#[derive(Module, Debug)]
+pub struct Mlp {
+    fc1: Linear,
+    fc2: Linear,
+}
+
+impl Mlp {
+    fn new(dim: usize, ratio: usize, device: &Device) -> Self {
+        Self {
+            fc1: LinearConfig::new(dim, ratio * dim).init(device),
+            fc2: LinearConfig::new(ratio * dim, dim).init(device),
+        }
+    }
+
+    fn forward(&self, x: Tensor<3>) -> Tensor<3> {
+        let hidden = if cpu::is_fast(&x) { cpu::linear_gelu(&self.fc1, x) } else { gelu(self.fc1.forward(x)) };
+        self.fc2.forward(hidden)
+    }
+}
+
+/// x + SA(LN₁ x), then x + MLP(LN₂ x).
+#[derive(Module, Debug)]
+pub struct EncoderBlock {
+    norm1: LayerNorm,
+    attn: SelfAttention,
+    norm2: LayerNorm,
+    mlp: Mlp,
+}
+
+impl EncoderBlock {
+    pub(crate) fn new(dim: usize, heads: usize, mlp_ratio: usize, device: &Device) -> Self {
+        Self {
+            norm1: layer_norm(dim, device),
+            attn: SelfAttention::new(dim, heads, device),
+            norm2: layer_norm(dim, device),
+            mlp: Mlp::new(dim, mlp_ratio, device),
+        }
+    }
+
+    /// `[B, N, dim]` → `[B, N, dim]`.
+    pub(crate) fn forward(&self, x: Tensor<3>, rope: &Rope) -> Tensor<3> {
+        let x = x.clone() + self.attn.forward(self.norm1.forward(x), rope);
+        x.clone() + self.mlp.forward(self.norm2.forward(x))
+    }
+}
+
+/// x + SA(LN₁ x), then x + CA(LN₂ x, LN_y y), then x + MLP(LN₃ x); `y` are the other side's tokens.
+#[derive(Module, Debug)]
+pub struct DecoderBlock {
+    norm1: LayerNorm,
+    attn: SelfAttention,
+    norm2: LayerNorm,
+    norm_y: LayerNorm,
+    cross_attn: CrossAttention,
+    norm3: LayerNorm,
+    mlp: Mlp,
+}
+
+impl DecoderBlock {
+    pub(crate) fn new(dim: usize, heads: usize, mlp_ratio: usize, device: &Device) -> Self {
+        Self {
+            norm1: layer_norm(dim, device),
+            attn: SelfAttention::new(dim, heads, device),
+            norm2: layer_norm(dim, device),
+            norm_y: layer_norm(dim, device),
+            cross_attn: CrossAttention::new(dim, heads, device),
+            norm3: layer_norm(dim, device),
+            mlp: Mlp::new(dim, mlp_ratio, device),
+        }
+    }
+
+    /// `x`, `y` `[B, N, dim]` → `[B, N, dim]`.
+    pub(crate) fn forward(&self, x: Tensor<3>, y: Tensor<3>, rope: &Rope) -> Tensor<3> {
+        let x = x.clone() + self.attn.forward(self.norm1.forward(x), rope);
+        let x = x.clone() + self.cross_attn.forward(self.norm2.forward(x), self.norm_y.forward(y), rope);
+        x.clone() + self.mlp.forward(self.norm3.forward(x))
+    }
+}

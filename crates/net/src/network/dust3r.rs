@@ -1,0 +1,194 @@
+//! The two-view transformer: shared encoder, twin cross-attention decoders, two or four heads (SNAPSNAP §1.5, §4).
+//!
+//! Field names are the checkpoint's.
+
+use burn::module::Module;
+use burn::nn::conv::{Conv2d, Conv2dConfig};
+use burn::nn::{LayerNorm, Linear, LinearConfig, PaddingConfig2d};
+use burn::tensor::{Device, Tensor};
+
+use super::block::{DecoderBlock, EncoderBlock, layer_norm};
+use super::dpt::DptHead;
+use super::linear::LinearHead;
+use super::rope::Rope;
+use crate::config::{Fusion, HeadKind, NetworkConfig};
+
+/// One side of the person. The sides are named as seen in the front picture.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum View {
+    /// Photographed; its camera's frame is everybody's frame.
+    Front,
+    /// Photographed.
+    Back,
+    /// Unseen; camera yaw +90° from the front.
+    Right,
+    /// Unseen; camera yaw +270° from the front.
+    Left,
+}
+
+impl View {
+    /// All views in the order of the heads, of the fixtures and of the concatenated Gaussians.
+    pub const ALL: [Self; 4] = [Self::Front, Self::Back, Self::Right, Self::Left];
+
+    /// Lower-case name.
+    pub fn name(self) -> &'static str {
+        ["front", "back", "right", "left"][self as usize]
+    }
+}
+
+#[derive(Module, Debug)]
+struct PatchEmbed {
+    proj: Conv2d,
+}
+
+#[derive(Module, Debug)]
+#[allow(clippy::large_enum_variant, reason = "at most four of them exist")]
+enum Head {
+    Dpt(DptHead),
+    Linear(LinearHead),
+}
+
+/// Token maps of one photograph: entry 0 is the encoder's output, entry l the l-th decoder layer's, all `[B, N, C]`.
+pub type TokenMaps = Vec<Tensor<3>>;
+
+/// The network of DUSt3R with two or four heads.
+#[derive(Module, Debug)]
+pub struct Dust3r {
+    patch_embed: PatchEmbed,
+    enc_blocks: Vec<EncoderBlock>,
+    enc_norm: LayerNorm,
+    decoder_embed: Linear,
+    dec_blocks: Vec<DecoderBlock>,
+    dec_blocks2: Vec<DecoderBlock>,
+    dec_norm: LayerNorm,
+    downstream_head1: Head,
+    downstream_head2: Head,
+    downstream_head3: Option<Head>,
+    downstream_head4: Option<Head>,
+    #[module(skip)]
+    config: NetworkConfig,
+}
+
+impl Dust3r {
+    pub(crate) fn new(config: &NetworkConfig, device: &Device) -> Self {
+        let c = config;
+        let patch = [c.patch, c.patch];
+        let encoder = |_| EncoderBlock::new(c.enc_dim, c.enc_heads, c.mlp_ratio, device);
+        let decoder = |_| DecoderBlock::new(c.dec_dim, c.dec_heads, c.mlp_ratio, device);
+        let head = |fused: bool| {
+            let double = if fused && c.fusion == Fusion::Concat { 2 } else { 1 };
+            match c.head {
+                HeadKind::Dpt => Head::Dpt(DptHead::new(c, c.hook_widths().map(|w| double * w), device)),
+                HeadKind::Linear => Head::Linear(LinearHead::new(double * c.dec_dim, c.patch, device)),
+            }
+        };
+        Self {
+            patch_embed: PatchEmbed {
+                proj: Conv2dConfig::new([3, c.enc_dim], patch)
+                    .with_stride(patch)
+                    .with_padding(PaddingConfig2d::Valid)
+                    .init(device),
+            },
+            enc_blocks: (0..c.enc_depth).map(encoder).collect(),
+            enc_norm: layer_norm(c.enc_dim, device),
+            decoder_embed: LinearConfig::new(c.enc_dim, c.dec_dim).init(device),
+            dec_blocks: (0..c.dec_depth).map(decoder).collect(),
+            dec_blocks2: (0..c.dec_depth).map(decoder).collect(),
+            dec_norm: layer_norm(c.dec_dim, device),
+            downstream_head1: head(false),
+            downstream_head2: head(false),
+            downstream_head3: c.side_heads.then(|| head(true)),
+            downstream_head4: c.side_heads.then(|| head(true)),
+            config: c.clone(),
+        }
+    }
+
+    /// Views that have a head.
+    pub fn views(&self) -> &'static [View] {
+        if self.downstream_head3.is_some() { &View::ALL } else { &View::ALL[..2] }
+    }
+
+    /// Rows and columns of the token grid of an image of `height` × `width` pixels.
+    ///
+    /// # Panics
+    /// If a side is no multiple of the patch.
+    pub fn grid(&self, [height, width]: [usize; 2]) -> [usize; 2] {
+        let patch = self.config.patch;
+        assert!(
+            height % patch == 0 && width % patch == 0 && height * width > 0,
+            "image {height}×{width}: both sides must be positive multiples of the patch {patch}"
+        );
+        [height / patch, width / patch]
+    }
+
+    /// Images `[B, 3, H, W]` in [−1, 1] → normalised encoder tokens `[B, N, enc_dim]`.
+    pub fn encode(&self, images: Tensor<4>) -> Tensor<3> {
+        let c = &self.config;
+        let [_, _, h, w] = images.dims();
+        let [rows, columns] = self.grid([h, w]);
+        let rope = Rope::new(rows, columns, c.enc_dim / c.enc_heads, c.rope_base, &images.device());
+        let tokens = self.patch_embed.proj.forward(images).flatten::<3>(2, 3).swap_dims(1, 2);
+        let tokens = self.enc_blocks.iter().fold(tokens, |x, block| block.forward(x, &rope));
+        self.enc_norm.forward(tokens)
+    }
+
+    /// Encoder tokens of the two photographs `[B, N, enc_dim]` → all token maps of each.
+    ///
+    /// Both decoders read the other's tokens of the *previous* layer.
+    pub fn decode(&self, front: Tensor<3>, back: Tensor<3>, [rows, columns]: [usize; 2]) -> [TokenMaps; 2] {
+        let c = &self.config;
+        let rope = Rope::new(rows, columns, c.dec_dim / c.dec_heads, c.rope_base, &front.device());
+        let mut x = self.decoder_embed.forward(front.clone());
+        let mut y = self.decoder_embed.forward(back.clone());
+        let (mut front, mut back) = (vec![front], vec![back]);
+        for (block, block2) in self.dec_blocks.iter().zip(&self.dec_blocks2) {
+            (x, y) = (block.forward(x.clone(), y.clone(), &rope), block2.forward(y, x, &rope));
+            front.push(x.clone());
+            back.push(y.clone());
+        }
+        for maps in [&mut front, &mut back] {
+            let last = maps.pop().expect("never empty");
+            maps.push(self.dec_norm.forward(last));
+        }
+        [front, back]
+    }
+
+    /// Raw x, y, z, confidence `[B, 4, H, W]` of one view, from both photographs' token maps.
+    ///
+    /// # Panics
+    /// If the network has no head for `view`.
+    pub fn raw_points(&self, view: View, [front, back]: &[TokenMaps; 2], grid: [usize; 2]) -> Tensor<4> {
+        let head = match view {
+            View::Front => &self.downstream_head1,
+            View::Back => &self.downstream_head2,
+            View::Right => self.downstream_head3.as_ref().expect("a network with side heads"),
+            View::Left => self.downstream_head4.as_ref().expect("a network with side heads"),
+        };
+        let tokens = |i: usize| match view {
+            View::Front => front[i].clone(),
+            View::Back => back[i].clone(),
+            View::Right | View::Left => self.fuse(front[i].clone(), back[i].clone(), grid),
+        };
+        match head {
+            Head::Linear(head) => head.forward(tokens(self.config.dec_depth), grid),
+            Head::Dpt(head) => head.forward(self.config.hooks.map(|i| {
+                let x = tokens(i);
+                let [b, _, c] = x.dims();
+                x.swap_dims(1, 2).reshape([b, c, grid[0], grid[1]])
+            })),
+        }
+    }
+
+    /// Tokens of an unseen side.
+    fn fuse(&self, front: Tensor<3>, back: Tensor<3>, [rows, columns]: [usize; 2]) -> Tensor<3> {
+        match self.config.fusion {
+            Fusion::Mean => (front + back) * 0.5,
+            Fusion::MirrorMean => {
+                let [b, n, c] = back.dims();
+                let mirrored = back.reshape([b, rows, columns, c]).flip([2]).reshape([b, n, c]);
+                (front + mirrored) * 0.5
+            }
+            Fusion::Concat => Tensor::cat(vec![front, back], 2),
+        }
+    }
+}

@@ -1,0 +1,13 @@
+//! The point predictor: two photographs → one point map per side of the person (SNAPSNAP §1, 2, 4).
+
+mod attention;
+mod block;
+mod dpt;
+mod dust3r;
+mod linear;
+mod predictor;
+mod rope;
+
+pub use dust3r::{Dust3r, TokenMaps, View};
+pub use predictor::{PointMap, PointPredictor, activate};
+pub use rope::Rope;

@@ -1,0 +1,102 @@
+//! The point predictor as Snap-Snap uses it: the two-view network, the activations of its raw points, and δ.
+
+use burn::module::{Module, Param};
+use burn::tensor::activation::sigmoid;
+use burn::tensor::{Device, Tensor};
+
+use super::dust3r::{Dust3r, View};
+use crate::config::{ConfMode, NetworkConfig, Upsample};
+use crate::resample::bilinear;
+
+/// Points and confidences on one view's pixel grid.
+#[derive(Debug, Clone)]
+pub struct PointMap {
+    /// `[B, H, W, 3]` in the front camera's frame: network units, metres once multiplied by δ.
+    pub points: Tensor<4>,
+    /// `[B, H, W]`: in (0, 1) with `sigmoid`, in (1, ∞) with `exp`.
+    pub conf: Tensor<3>,
+}
+
+/// Raw x, y, z, confidence `[B, 4, H, W]` → point map (SNAPSNAP §2.2): p = r / ‖r‖ · (e^‖r‖ − 1).
+pub fn activate(raw: Tensor<4>, conf_mode: ConfMode) -> PointMap {
+    /// Below this ‖r‖ the direction is numerically meaningless.
+    const MIN_NORM: f64 = 1e-8;
+    let [b, _, h, w] = raw.dims();
+    let xyz = raw.clone().narrow(1, 0, 3).permute([0, 2, 3, 1]);
+    let norm = xyz.clone().square().sum_dim(3).sqrt();
+    let points = xyz / norm.clone().clamp_min(MIN_NORM) * expm1(norm);
+    let conf = raw.narrow(1, 3, 1).reshape([b, h, w]);
+    let conf = match conf_mode {
+        ConfMode::Sigmoid => sigmoid(conf),
+        ConfMode::Exp => conf.exp() + 1.0,
+    };
+    PointMap { points, conf }
+}
+
+/// e^x − 1 for x ≥ 0, without the cancellation of `exp(x) − 1` near 0: a series for small x.
+fn expm1(x: Tensor<4>) -> Tensor<4> {
+    /// Where the series hands over: the first term left out, x⁷/5040, is 2e-7 of the sum here.
+    const SMALL: f64 = 0.3;
+    let terms = [1.0 / 720.0, 1.0 / 120.0, 1.0 / 24.0, 1.0 / 6.0, 0.5, 1.0];
+    let series = terms.iter().fold(x.zeros_like(), |sum, &term| (sum + term) * x.clone());
+    let direct = x.clone().exp() - 1.0;
+    direct.mask_where(x.lower_elem(SMALL), series)
+}
+
+/// Two-view network and global scale δ.
+#[derive(Module, Debug)]
+pub struct PointPredictor {
+    /// δ `[1]`: metres per network unit.
+    scale: Param<Tensor<1>>,
+    /// The network.
+    pub dust3r: Dust3r,
+}
+
+impl PointPredictor {
+    /// A predictor whose parameters wait to be loaded.
+    pub fn new(config: &NetworkConfig, device: &Device) -> Self {
+        let scale = Param::from_tensor(Tensor::full([1], config.delta, device));
+        Self { scale, dust3r: Dust3r::new(config, device) }
+    }
+
+    /// δ `[1]`.
+    pub fn delta(&self) -> Tensor<1> {
+        self.scale.val()
+    }
+
+    /// Point map of one view on the canvas: enlarged `factor` times and multiplied by δ (in this order, SNAPSNAP §4).
+    ///
+    /// `weights` `[B, 1, H, W]` ≥ 0 are the body's share of each network pixel, for `mask-aware` interpolation.
+    pub fn to_canvas(&self, map: PointMap, factor: usize, method: Upsample, weights: Option<Tensor<4>>) -> PointMap {
+        let [b, h, w, _] = map.points.dims();
+        let size = [h * factor, w * factor];
+        let up = |x: Tensor<4>| if factor == 1 { x } else { bilinear(x, size, false) };
+        let points = map.points.permute([0, 3, 1, 2]);
+        let plain = up(points.clone());
+        let points = match (method, weights) {
+            (Upsample::MaskAware, Some(weights)) if factor > 1 => {
+                /// A canvas pixel with less body than this around it keeps the plain interpolation.
+                const MIN_WEIGHT: f64 = 1e-4;
+                let total = up(weights.clone());
+                let inside = up(points * weights) / total.clone().clamp_min(MIN_WEIGHT);
+                let outside = total.lower_elem(MIN_WEIGHT).expand(plain.dims());
+                inside.mask_where(outside, plain)
+            }
+            _ => plain,
+        };
+        let points = points.permute([0, 2, 3, 1]) * self.delta().reshape([1, 1, 1, 1]);
+        let conf = up(map.conf.reshape([b, 1, h, w])).reshape([b, size[0], size[1]]);
+        PointMap { points, conf }
+    }
+
+    /// Point maps of all views in one call, at network resolution and without δ: photographs `[B, 3, H, W]` in
+    /// [−1, 1], both sides multiples of the patch.
+    pub fn forward(&self, front: Tensor<4>, back: Tensor<4>, conf_mode: ConfMode) -> Vec<(View, PointMap)> {
+        let [b, _, h, w] = front.dims();
+        let grid = self.dust3r.grid([h, w]);
+        let tokens = self.dust3r.encode(Tensor::cat(vec![front, back], 0));
+        let maps = self.dust3r.decode(tokens.clone().narrow(0, 0, b), tokens.narrow(0, b, b), grid);
+        let activated = |&view| (view, activate(self.dust3r.raw_points(view, &maps, grid), conf_mode));
+        self.dust3r.views().iter().map(activated).collect()
+    }
+}

@@ -1,0 +1,54 @@
+//! The Gaussian regressor: colours and points of one view → one Gaussian per pixel (SNAPSNAP §8).
+
+mod attributes;
+mod statistics;
+mod unet;
+
+use burn::module::Module;
+use burn::nn::PaddingConfig2d;
+use burn::nn::conv::{Conv2d, Conv2dConfig};
+use burn::tensor::{Device, Tensor};
+
+pub use attributes::Attributes;
+pub use statistics::Statistics;
+pub use unet::{RECEPTIVE_RADIUS, UNet};
+
+use crate::config::RegressorConfig;
+use crate::cpu;
+
+/// Channels in: red, green, blue in [−1, 1], then x, y, z in metres (front camera's frame).
+pub const INPUT_CHANNELS: usize = 6;
+/// Channels out: opacity 1, scale 3, rotation 4, colour 3, offset 3 (SNAPSNAP §8.3).
+pub const FEATURES: usize = 14;
+
+/// UNet and final 1×1 convolution. Field names are the checkpoint's.
+#[derive(Module, Debug)]
+pub struct Regressor {
+    pub(crate) pred_unet: UNet,
+    pub(crate) gs_conv: Conv2d,
+}
+
+impl Regressor {
+    /// A regressor whose parameters wait to be loaded.
+    pub fn new(config: &RegressorConfig, device: &Device) -> Self {
+        Self {
+            pred_unet: UNet::new(config, device),
+            gs_conv: Conv2dConfig::new([FEATURES, FEATURES], [1, 1])
+                .with_padding(PaddingConfig2d::Valid)
+                .init(device),
+        }
+    }
+
+    /// Input `[B, 6, H, W]` with H and W multiples of 4 → features `[B, H, W, 14]`, before activation.
+    ///
+    /// Group-norm statistics are taken from `statistics` if frozen, else measured and added to it.
+    pub fn forward(&self, input: Tensor<4>, statistics: &mut Statistics) -> Tensor<4> {
+        let [_, channels, h, w] = input.dims();
+        assert_eq!(channels, INPUT_CHANNELS, "regressor input must be [B, {INPUT_CHANNELS}, H, W]");
+        assert!(h % 4 == 0 && w % 4 == 0, "regressor input {h}×{w}: both sides must be multiples of 4");
+        if cpu::is_fast(&input) && self.pred_unet.suits_cpu_kernel() {
+            return cpu::regress(self, input, statistics);
+        }
+        self.gs_conv.forward(self.pred_unet.forward(input, statistics)).permute([0, 2, 3, 1])
+    }
+}

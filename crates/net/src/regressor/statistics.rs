@@ -1,0 +1,58 @@
+//! Group-norm statistics that can be measured on one input and reused on another.
+
+use burn::nn::GroupNorm;
+use burn::tensor::Tensor;
+
+/// Means and reciprocal standard deviations of every group normalisation of one forward pass, in order of execution.
+///
+/// Statistics depend on how much background an image holds; freezing them separates that effect from all others.
+#[derive(Debug, Clone, Default)]
+pub struct Statistics {
+    layers: Vec<[Tensor<2>; 2]>,
+    next: Option<usize>,
+}
+
+impl Statistics {
+    /// Measured during the pass, and recorded.
+    pub fn measured() -> Self {
+        Self::default()
+    }
+
+    /// These statistics, to be used instead of new ones by one pass over the same number of images.
+    pub fn frozen(&self) -> Self {
+        Self { layers: self.layers.clone(), next: Some(0) }
+    }
+
+    /// Mean and reciprocal standard deviation `[B, groups]` of the next layer: frozen, or from `measure`.
+    pub(crate) fn layer(&mut self, measure: impl FnOnce() -> [Tensor<2>; 2]) -> [Tensor<2>; 2] {
+        match &mut self.next {
+            Some(next) => {
+                *next += 1;
+                self.layers[*next - 1].clone()
+            }
+            None => {
+                self.layers.push(measure());
+                self.layers[self.layers.len() - 1].clone()
+            }
+        }
+    }
+}
+
+/// Group normalisation of `[B, C, H, W]` with controllable statistics.
+pub(crate) fn normalise(norm: &GroupNorm, x: Tensor<4>, statistics: &mut Statistics) -> Tensor<4> {
+    let [b, c, h, w] = x.dims();
+    let groups = norm.num_groups;
+    let [mean, rstd] = statistics.layer(|| {
+        let flat = x.clone().reshape([b, groups, c / groups * h * w]);
+        let mean = flat.clone().mean_dim(2);
+        let variance = (flat - mean.clone()).square().mean_dim(2);
+        [mean.squeeze_dim(2), (variance + norm.epsilon).sqrt().recip().squeeze_dim(2)]
+    });
+    let per_channel = |x: Tensor<2>| x.reshape([b, groups, 1]).repeat_dim(2, c / groups).reshape([b, c]);
+    let affine = |p: &Option<burn::module::Param<Tensor<1>>>| {
+        p.as_ref().expect("the published group norms are affine").val().reshape([1, c])
+    };
+    let scale = per_channel(rstd) * affine(&norm.gamma);
+    let shift = affine(&norm.beta) - per_channel(mean) * scale.clone();
+    x * scale.reshape([b, c, 1, 1]) + shift.reshape([b, c, 1, 1])
+}

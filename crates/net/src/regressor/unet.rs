@@ -1,0 +1,164 @@
+//! The UNet of the regressor (SNAPSNAP §8.2): two halvings, residual blocks with group normalisation, no attention.
+//!
+//! Field names are the checkpoint's.
+
+use burn::module::Module;
+use burn::nn::conv::{Conv2d, Conv2dConfig};
+use burn::nn::{GroupNorm, GroupNormConfig, PaddingConfig2d};
+use burn::tensor::activation::silu;
+use burn::tensor::{Device, Tensor};
+
+use super::statistics::{Statistics, normalise};
+use super::{FEATURES, INPUT_CHANNELS};
+use crate::config::RegressorConfig;
+use crate::cpu;
+
+/// Every sum of two branches is scaled by this, so that its variance stays put.
+pub(crate) const BRANCH_SCALE: f64 = std::f64::consts::FRAC_1_SQRT_2;
+
+/// How far from an output pixel an input pixel can matter, statistics aside: the reach of the 3×3 convolutions on the
+/// longest path, in pixels of the input: 14 at full size, 12 at half size (·2), 14 at a quarter (·4), and up to 3 more
+/// because an enlarged pixel lies beside, not on, the one it came from. Rounded up to a multiple of 4.
+pub const RECEPTIVE_RADIUS: usize = 100;
+
+fn conv3x3(from: usize, to: usize, stride: usize, device: &Device) -> Conv2d {
+    Conv2dConfig::new([from, to], [3, 3])
+        .with_stride([stride, stride])
+        .with_padding(PaddingConfig2d::Explicit(1, 1, 1, 1))
+        .init(device)
+}
+
+/// (conv₂(silu(norm₂(conv₁(silu(norm₁ x))))) + shortcut x) / √2.
+#[derive(Module, Debug)]
+pub(crate) struct ResBlock {
+    pub norm1: GroupNorm,
+    pub conv1: Conv2d,
+    pub norm2: GroupNorm,
+    pub conv2: Conv2d,
+    pub shortcut: Option<Conv2d>,
+}
+
+impl ResBlock {
+    fn new(from: usize, config: &RegressorConfig, device: &Device) -> Self {
+        let to = config.channels;
+        let shortcut = Conv2dConfig::new([from, to], [1, 1]).with_padding(PaddingConfig2d::Valid);
+        Self {
+            norm1: GroupNormConfig::new(config.groups, from).init(device),
+            conv1: conv3x3(from, to, 1, device),
+            norm2: GroupNormConfig::new(config.groups, to).init(device),
+            conv2: conv3x3(to, to, 1, device),
+            shortcut: (from != to).then(|| shortcut.init(device)),
+        }
+    }
+
+    fn forward(&self, x: Tensor<4>, statistics: &mut Statistics) -> Tensor<4> {
+        let h = self.conv1.forward(silu(normalise(&self.norm1, x.clone(), statistics)));
+        let h = self.conv2.forward(silu(normalise(&self.norm2, h, statistics)));
+        let x = match &self.shortcut {
+            Some(shortcut) => shortcut.forward(x),
+            None => x,
+        };
+        (h + x) * BRANCH_SCALE
+    }
+}
+
+#[derive(Module, Debug)]
+pub(crate) struct DownBlock {
+    pub nets: Vec<ResBlock>,
+    pub downsample: Option<Conv2d>,
+}
+
+#[derive(Module, Debug)]
+pub(crate) struct MidBlock {
+    pub nets: Vec<ResBlock>,
+}
+
+#[derive(Module, Debug)]
+pub(crate) struct UpBlock {
+    pub nets: Vec<ResBlock>,
+    pub upsample: Option<Conv2d>,
+}
+
+/// Three levels, two of which halve the size.
+#[derive(Module, Debug)]
+pub struct UNet {
+    pub(crate) conv_in: Conv2d,
+    pub(crate) down_blocks: Vec<DownBlock>,
+    pub(crate) mid_block: MidBlock,
+    pub(crate) up_blocks: Vec<UpBlock>,
+    pub(crate) norm_out: GroupNorm,
+    pub(crate) conv_out: Conv2d,
+}
+
+/// Levels of the UNet.
+const LEVELS: usize = 3;
+
+impl UNet {
+    pub(crate) fn new(config: &RegressorConfig, device: &Device) -> Self {
+        let c = config.channels;
+        let blocks = |n: usize, from: usize| (0..n).map(|_| ResBlock::new(from, config, device)).collect();
+        Self {
+            conv_in: conv3x3(INPUT_CHANNELS, c, 1, device),
+            down_blocks: (0..LEVELS)
+                .map(|level| DownBlock {
+                    nets: blocks(2, c),
+                    downsample: (level + 1 < LEVELS).then(|| conv3x3(c, c, 2, device)),
+                })
+                .collect(),
+            mid_block: MidBlock { nets: blocks(2, c) },
+            up_blocks: (0..LEVELS)
+                .map(|level| UpBlock {
+                    nets: blocks(3, 2 * c),
+                    upsample: (level + 1 < LEVELS).then(|| conv3x3(c, c, 1, device)),
+                })
+                .collect(),
+            norm_out: GroupNormConfig::new(config.groups, c).init(device),
+            conv_out: conv3x3(c, FEATURES, 1, device),
+        }
+    }
+
+    /// Whether the fused CPU kernel has this width.
+    pub(crate) fn suits_cpu_kernel(&self) -> bool {
+        self.norm_out.num_channels == cpu::UNET_CHANNELS
+    }
+
+    /// `[B, 6, H, W]`, H and W multiples of 4 → `[B, 14, H, W]`.
+    pub fn forward(&self, x: Tensor<4>, statistics: &mut Statistics) -> Tensor<4> {
+        let mut x = self.conv_in.forward(x);
+        let mut skips = vec![x.clone()];
+        for block in &self.down_blocks {
+            for net in &block.nets {
+                x = net.forward(x, statistics);
+                skips.push(x.clone());
+            }
+            if let Some(downsample) = &block.downsample {
+                x = downsample.forward(x);
+                skips.push(x.clone());
+            }
+        }
+        for net in &self.mid_block.nets {
+            x = net.forward(x, statistics);
+        }
+        for block in &self.up_blocks {
+            for net in &block.nets {
+                let skip = skips.pop().expect("as many skips as up blocks consume");
+                x = net.forward(Tensor::cat(vec![x, skip], 1), statistics);
+            }
+            if let Some(upsample) = &block.upsample {
+                x = upsample.forward(repeat_twice(x));
+            }
+        }
+        self.conv_out.forward(silu(normalise(&self.norm_out, x, statistics)))
+    }
+}
+
+/// Nearest-neighbour ×2 enlargement of `[B, C, H, W]`.
+fn repeat_twice(x: Tensor<4>) -> Tensor<4> {
+    let [b, c, h, w] = x.dims();
+    x.reshape([b * c, h, 1, w]).repeat_dim(2, 2).reshape([b * c, 2 * h, w, 1]).repeat_dim(3, 2).reshape([
+        b,
+        c,
+        2 * h,
+        2 * w,
+    ])
+}

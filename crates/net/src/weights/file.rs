@@ -1,0 +1,189 @@
+//! Our weight file: writing it tensor by tensor, opening it, and turning it back into the authors' layout.
+
+use std::collections::{BTreeSet, HashMap};
+use std::io::{self, Write};
+use std::path::Path;
+
+use safetensors::Dtype;
+use safetensors::tensor::{Metadata, TensorInfo};
+use snapsnap_splat::file::write_whole;
+
+use super::schema::{self, Part, TensorSpec};
+use super::source::Source;
+use super::{WeightsError, import};
+use crate::config::Config;
+
+/// Metadata key under which the config (TOML) is stored.
+pub const CONFIG_KEY: &str = "snapsnap.config";
+
+/// Bytes of an f32.
+const F32: usize = 4;
+
+/// Writes `tensors` in order, asking `values` for one at a time, so that never more than one is in memory.
+pub(super) fn write<'a, T: std::borrow::Borrow<TensorSpec> + 'a>(
+    path: &Path,
+    config: &Config,
+    tensors: &'a [T],
+    mut values: impl FnMut(&'a TensorSpec) -> Result<Vec<f32>, WeightsError>,
+) -> Result<(), WeightsError> {
+    let infos = tensors.iter().map(|t| (t.borrow().name.clone(), t.borrow().shape.clone()));
+    let metadata = HashMap::from([("format".into(), "pt".into()), (CONFIG_KEY.into(), config.to_toml())]);
+    write_tensors(path, metadata, infos.collect(), |i| values(tensors[i].borrow()))
+}
+
+fn write_tensors(
+    path: &Path,
+    metadata: HashMap<String, String>,
+    tensors: Vec<(String, Vec<usize>)>,
+    mut values: impl FnMut(usize) -> Result<Vec<f32>, WeightsError>,
+) -> Result<(), WeightsError> {
+    let count = tensors.len();
+    let mut at = 0;
+    let infos = tensors.into_iter().map(|(name, shape)| {
+        let from = at;
+        at += shape.iter().product::<usize>() * F32;
+        (name, TensorInfo { dtype: Dtype::F32, shape, data_offsets: (from, at) })
+    });
+    let header = Metadata::new(Some(metadata), infos.collect()).expect("consecutive, exactly sized tensors");
+    let mut header = serde_json::to_vec(&header).expect("the header has only JSON types");
+    // The format asks for data aligned to 8 bytes and allows spaces for it.
+    header.resize(header.len().next_multiple_of(8), b' ');
+
+    // Errors of both kinds pass through `write_whole`.
+    enum Failure {
+        Io(io::Error),
+        Weights(WeightsError),
+    }
+    impl From<io::Error> for Failure {
+        fn from(e: io::Error) -> Self {
+            Self::Io(e)
+        }
+    }
+    write_whole(path, |out| {
+        out.write_all(&(header.len() as u64).to_le_bytes())?;
+        out.write_all(&header)?;
+        for i in 0..count {
+            let values = values(i).map_err(Failure::Weights)?;
+            let bytes: Vec<u8> = values.iter().flat_map(|v| v.to_le_bytes()).collect();
+            out.write_all(&bytes)?;
+        }
+        Ok(())
+    })
+    .map_err(|e| match e {
+        Failure::Io(source) => WeightsError::Write { path: path.to_owned(), source },
+        Failure::Weights(e) => e,
+    })
+}
+
+/// An opened weight file whose tensors fit its config.
+pub struct WeightFile {
+    pub(super) source: Source,
+    /// The config the tensors were checked against.
+    pub config: Config,
+}
+
+impl WeightFile {
+    /// Opens `path` and checks every tensor's presence, shape and type against `config`, or, without one, against the
+    /// config in the file's metadata. Values are checked when they are read.
+    ///
+    /// # Errors
+    /// [`WeightsError`], naming every tensor that is missing, unused, mis-shaped or of the wrong type.
+    pub fn open(path: &Path, config: Option<Config>) -> Result<Self, WeightsError> {
+        let source = Source::open(path)?;
+        let config = match config {
+            Some(config) => config,
+            None => stored_config(&source)?,
+        };
+        let mut problems = Vec::new();
+        let parts = parts_of(source.tensors().keys());
+        let expected: Vec<_> = schema::tensors(&config).into_iter().filter(|t| parts.contains(t.part)).collect();
+        for spec in &expected {
+            match source.tensors().get(&spec.name) {
+                None => problems.push(format!("missing: {} {:?}", spec.name, spec.shape)),
+                Some(entry) => problems.extend(import::mismatch(spec, entry, path)),
+            }
+        }
+        let names: BTreeSet<_> = expected.iter().map(|t| t.name.as_str()).collect();
+        let unused = source.tensors().keys().filter(|k| !names.contains(k.as_str()));
+        problems.extend(unused.map(|k| format!("not part of the configured networks: {k}")));
+        if problems.is_empty() {
+            return Ok(Self { source, config });
+        }
+        Err(WeightsError::Tensors { origin: path.display().to_string(), problems })
+    }
+
+    /// The file.
+    pub fn path(&self) -> &Path {
+        self.source.path()
+    }
+
+    /// Refuses a file that lacks one of the parts.
+    ///
+    /// # Errors
+    /// [`WeightsError::Format`], saying which checkpoint to import as well.
+    pub fn require(&self, part: Part) -> Result<(), WeightsError> {
+        let parts = parts_of(self.source.tensors().keys());
+        if parts.contains(part) {
+            return Ok(());
+        }
+        let message = match part {
+            Part::PointPredictor => "has no point predictor (`dust3r.*`): import a stage-1 checkpoint as well",
+            Part::Regressor => {
+                "has no Gaussian regressor (`pred_unet.*`, `gs_conv.*`): import a stage-2 checkpoint as well"
+            }
+        };
+        Err(WeightsError::format(self.path(), message))
+    }
+}
+
+/// The config in a file's metadata.
+fn stored_config(source: &Source) -> Result<Config, WeightsError> {
+    let text = source.metadata.get(CONFIG_KEY).ok_or_else(|| {
+        WeightsError::format(source.path(), "has no config in its metadata; give one with --config, or import it first")
+    })?;
+    Ok(Config::from_toml(text, &format!("{} (metadata {CONFIG_KEY})", source.path().display()), &[])?)
+}
+
+/// Which parts a set of keys touches.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Parts {
+    point_predictor: bool,
+    regressor: bool,
+}
+
+impl Parts {
+    pub(super) fn contains(self, part: Part) -> bool {
+        match part {
+            Part::PointPredictor => self.point_predictor,
+            Part::Regressor => self.regressor,
+        }
+    }
+}
+
+pub(super) fn parts_of<'a>(keys: impl Iterator<Item = &'a String>) -> Parts {
+    let mut parts = Parts { point_predictor: false, regressor: false };
+    for key in keys {
+        let regressor = ["pred_unet.", "gs_conv."].iter().any(|p| key.trim_start_matches(schema::SIDE).starts_with(p));
+        parts.regressor |= regressor;
+        parts.point_predictor |= !regressor;
+    }
+    parts
+}
+
+/// Writes `from` (our file) to `to` with every name the authors' state dicts have, aliases included, and without our
+/// metadata, so that a strict `load_state_dict` accepts each part. Returns the number of tensors written.
+///
+/// # Errors
+/// [`WeightsError`].
+pub fn export(from: &Path, to: &Path) -> Result<usize, WeightsError> {
+    let file = WeightFile::open(from, None)?;
+    let mut entries: Vec<(String, &str)> = Vec::new();
+    for name in file.source.tensors().keys() {
+        entries.push((name.clone(), name));
+        entries.extend(import::alias_of(name).map(|alias| (alias, name.as_str())));
+    }
+    let shapes = entries.iter().map(|(alias, name)| (alias.clone(), file.source.tensors()[*name].shape.clone()));
+    let metadata = HashMap::from([("format".to_owned(), "pt".to_owned())]);
+    write_tensors(to, metadata, shapes.collect(), |i| file.source.read_f32(entries[i].1))?;
+    Ok(entries.len())
+}

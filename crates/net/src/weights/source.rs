@@ -1,0 +1,186 @@
+//! Reading tensors, one at a time, from `.safetensors` files and PyTorch checkpoints. No code of a pickle is executed.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{self, Read};
+use std::path::{Path, PathBuf};
+
+use pytorch_reader::PytorchReader;
+use safetensors::tensor::Metadata;
+
+use super::WeightsError;
+
+/// A checkpoint whose tensors can be read by name.
+pub struct Source {
+    path: PathBuf,
+    tensors: BTreeMap<String, Entry>,
+    reader: Reader,
+    /// Text metadata of a `.safetensors` file.
+    pub metadata: BTreeMap<String, String>,
+}
+
+/// What the file says about one tensor.
+#[derive(Debug, Clone)]
+pub struct Entry {
+    /// Element type, PyTorch's name in lower case (`f32`, `bf16`, `i64` …).
+    pub dtype: String,
+    /// Extents, outermost first.
+    pub shape: Vec<usize>,
+    /// First byte in a `.safetensors` file.
+    start: u64,
+    /// Bytes in a `.safetensors` file.
+    len: usize,
+}
+
+enum Reader {
+    Safetensors(File),
+    Pytorch(BTreeMap<String, pytorch_reader::Tensor>),
+}
+
+/// Largest `.safetensors` header accepted; the format's own limit.
+const MAX_HEADER: u64 = 100_000_000;
+
+impl Source {
+    /// Opens a checkpoint; the kind is recognised by content, not by file name.
+    ///
+    /// # Errors
+    /// [`WeightsError`] for a file that is missing, truncated, or neither of the two formats.
+    pub fn open(path: &Path) -> Result<Self, WeightsError> {
+        let read = |source| WeightsError::Read { path: path.to_owned(), source };
+        let mut file = File::open(path).map_err(read)?;
+        let mut start = [0_u8; 9];
+        let filled = read_up_to(&mut file, &mut start).map_err(read)?;
+        // A safetensors file starts with a little-endian header length and then JSON; every PyTorch container starts
+        // with bytes that would make that length absurd.
+        let header = u64::from_le_bytes([start[0], start[1], start[2], start[3], start[4], start[5], start[6], start[7]]);
+        if filled == 9 && start[8] == b'{' && header <= MAX_HEADER {
+            return Self::safetensors(path, file, header);
+        }
+        if path.extension().is_some_and(|e| e == "safetensors") {
+            return Err(WeightsError::format(path, "not a safetensors file (no header)"));
+        }
+        Self::pytorch(path)
+    }
+
+    fn safetensors(path: &Path, mut file: File, header: u64) -> Result<Self, WeightsError> {
+        let read = |source| WeightsError::Read { path: path.to_owned(), source };
+        let size = file.metadata().map_err(read)?.len();
+        let mut text = vec![b'{'; 1];
+        (&mut file).take(header - 1).read_to_end(&mut text).map_err(read)?;
+        let metadata: Metadata = serde_json::from_slice(&text)
+            .map_err(|e| WeightsError::format(path, &format!("damaged or truncated safetensors header: {e}")))?;
+        let data = 8 + header;
+        let expected = data + metadata.data_len() as u64;
+        if size != expected {
+            let message = format!("truncated or damaged: {size} bytes, the header promises {expected}");
+            return Err(WeightsError::format(path, &message));
+        }
+        let tensors = metadata.tensors().into_iter().map(|(name, info)| {
+            let (from, to) = info.data_offsets;
+            let dtype = format!("{:?}", info.dtype).to_lowercase();
+            (name, Entry { dtype, shape: info.shape.clone(), start: data + from as u64, len: to - from })
+        });
+        Ok(Self {
+            path: path.to_owned(),
+            tensors: tensors.collect(),
+            reader: Reader::Safetensors(file),
+            metadata: metadata.metadata().iter().flatten().map(|(k, v)| (k.clone(), v.clone())).collect(),
+        })
+    }
+
+    fn pytorch(path: &Path) -> Result<Self, WeightsError> {
+        let all = PytorchReader::new(path)
+            .map_err(|e| WeightsError::format(path, &format!("neither safetensors nor a PyTorch checkpoint: {e}")))?
+            .into_tensors();
+        // Snap-Snap keeps its weights under `network`, DUSt3R and CroCo under `model`; beside them lie optimiser states.
+        let wrapper = ["network.", "model."].into_iter().find(|w| all.keys().any(|k| k.starts_with(w))).unwrap_or("");
+        let reader: BTreeMap<_, _> =
+            all.into_iter().filter_map(|(k, t)| Some((k.strip_prefix(wrapper)?.to_owned(), t))).collect();
+        let entry = |t: &pytorch_reader::Tensor| Entry {
+            dtype: format!("{:?}", t.dtype()).to_lowercase(),
+            shape: t.shape().to_vec(),
+            start: 0,
+            len: t.byte_len(),
+        };
+        let tensors = reader.iter().map(|(k, t)| (k.clone(), entry(t))).collect();
+        Ok(Self { path: path.to_owned(), tensors, reader: Reader::Pytorch(reader), metadata: BTreeMap::new() })
+    }
+
+    /// The file.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// All tensors by name.
+    pub fn tensors(&self) -> &BTreeMap<String, Entry> {
+        &self.tensors
+    }
+
+    /// Reads one float tensor as f32 in row-major order; f16 and bf16 are widened.
+    ///
+    /// # Errors
+    /// [`WeightsError`] if the file cannot be read or `name` is absent or of another type.
+    pub fn read_f32(&self, name: &str) -> Result<Vec<f32>, WeightsError> {
+        let entry = self
+            .tensors
+            .get(name)
+            .ok_or_else(|| WeightsError::format(&self.path, &format!("has no tensor `{name}`")))?;
+        let bytes = match &self.reader {
+            Reader::Safetensors(file) => {
+                let mut bytes = vec![0; entry.len];
+                read_at(file, &mut bytes, entry.start).map(|()| bytes)
+            }
+            Reader::Pytorch(tensors) => tensors[name].read(),
+        };
+        let bytes = bytes.map_err(|source| WeightsError::Read { path: self.path.clone(), source })?;
+        widen(bytes, &entry.dtype).ok_or_else(|| {
+            WeightsError::format(&self.path, &format!("`{name}` is {}, not f32, f16 or bf16", entry.dtype))
+        })
+    }
+}
+
+/// Whether tensors of this type can become f32 without loss.
+pub fn is_readable(dtype: &str) -> bool {
+    matches!(dtype, "f32" | "f16" | "bf16")
+}
+
+fn widen(bytes: Vec<u8>, dtype: &str) -> Option<Vec<f32>> {
+    let two = |widen: fn([u8; 2]) -> f32| bytes.chunks_exact(2).map(|b| widen([b[0], b[1]])).collect();
+    match dtype {
+        "f32" => Some(bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect()),
+        "f16" => Some(two(|b| burn::tensor::f16::from_le_bytes(b).to_f32())),
+        "bf16" => Some(two(|b| burn::tensor::bf16::from_le_bytes(b).to_f32())),
+        _ => None,
+    }
+}
+
+#[cfg(unix)]
+fn read_at(file: &File, buffer: &mut [u8], offset: u64) -> io::Result<()> {
+    std::os::unix::fs::FileExt::read_exact_at(file, buffer, offset)
+}
+
+#[cfg(windows)]
+fn read_at(file: &File, mut buffer: &mut [u8], mut offset: u64) -> io::Result<()> {
+    while !buffer.is_empty() {
+        match std::os::windows::fs::FileExt::seek_read(file, buffer, offset)? {
+            0 => return Err(io::ErrorKind::UnexpectedEof.into()),
+            n => {
+                buffer = &mut buffer[n..];
+                offset += n as u64;
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Fills as much of `buffer` as the reader has.
+fn read_up_to(reader: &mut impl Read, buffer: &mut [u8]) -> io::Result<usize> {
+    let mut filled = 0;
+    while filled < buffer.len() {
+        match reader.read(&mut buffer[filled..])? {
+            0 => break,
+            n => filled += n,
+        }
+    }
+    Ok(filled)
+}

@@ -1,0 +1,120 @@
+//! Pinhole cameras: OpenCV axes (x right, y down, z forward), metres, pixels, pixel centres at +½.
+
+use glam::{DMat3, DVec2, DVec3};
+
+/// `x ↦ rotation · x + translation`; `rotation` is orthonormal but may be a reflection (the published demo's is).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RigidTransform {
+    /// Orthonormal 3×3 matrix.
+    pub rotation: DMat3,
+    /// Metres.
+    pub translation: DVec3,
+}
+
+impl RigidTransform {
+    /// The transform that changes nothing.
+    pub const IDENTITY: Self = Self { rotation: DMat3::IDENTITY, translation: DVec3::ZERO };
+
+    /// Applies the transform to a point (metres).
+    pub fn apply(&self, point: DVec3) -> DVec3 {
+        self.rotation * point + self.translation
+    }
+
+    /// The transform that undoes this one.
+    pub fn inverse(&self) -> Self {
+        let rotation = self.rotation.transpose();
+        Self { rotation, translation: -(rotation * self.translation) }
+    }
+}
+
+/// A pinhole camera.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Camera {
+    /// Image width in pixels.
+    pub width: u32,
+    /// Image height in pixels.
+    pub height: u32,
+    /// Focal lengths along x and y in pixels.
+    pub focal: DVec2,
+    /// Principal point in pixels, in coordinates where the first pixel's centre is (½, ½).
+    pub principal_point: DVec2,
+    /// World → camera.
+    pub world_to_camera: RigidTransform,
+}
+
+/// Radius of the training orbit in metres (SNAPSNAP §5.3).
+const ORBIT_RADIUS: f64 = 2.0;
+/// Point that the training cameras look at, in metres (SNAPSNAP §5.3).
+const ORBIT_CENTRE: DVec3 = DVec3::new(0.0, 0.85, 0.0);
+/// Downward pitch of the training cameras in degrees (SNAPSNAP §5.3).
+const ORBIT_PITCH_DEGREES: f64 = 8.0;
+
+impl Camera {
+    /// The training orbit's camera at `yaw_degrees` with a square image of `size` pixels (SNAPSNAP §5.3): 2 m from
+    /// (0, 0.85, 0), 8° downward pitch, focal length 0.8·size, principal point moved down by 25/1024 of the size.
+    /// World: y up, floor at y = 0; yaw 0 stands on +z and sees the front of a subject that faces +z.
+    pub fn orbit_at_yaw_degrees(yaw_degrees: f64, size: u32) -> Self {
+        let (sin, cos) = yaw_degrees.to_radians().sin_cos();
+        let (pitch_sin, pitch_cos) = ORBIT_PITCH_DEGREES.to_radians().sin_cos();
+        let backward = DVec3::new(pitch_cos * sin, pitch_sin, pitch_cos * cos);
+        let forward = -backward;
+        let right = DVec3::new(cos, 0.0, -sin);
+        let down = forward.cross(right);
+        let rotation = DMat3::from_cols(right, down, forward).transpose();
+        let eye = ORBIT_CENTRE + ORBIT_RADIUS * backward;
+        let side = f64::from(size);
+        Self {
+            width: size,
+            height: size,
+            focal: DVec2::splat(0.8 * side),
+            principal_point: DVec2::new(0.5 * side, 537.0 / 1024.0 * side),
+            world_to_camera: RigidTransform { rotation, translation: -(rotation * eye) },
+        }
+    }
+
+    /// Projects a world point (metres): pixel coordinates (pixel centres at +½) and depth along the optical axis
+    /// (metres). `None` for a point on or behind the camera's plane.
+    pub fn project(&self, world: DVec3) -> Option<(DVec2, f64)> {
+        let p = self.world_to_camera.apply(world);
+        (p.z > 0.0).then(|| (self.focal * DVec2::new(p.x, p.y) / p.z + self.principal_point, p.z))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Check values of SNAPSNAP §5.3 and §13.4.
+    #[test]
+    fn orbit_camera_matches_the_published_check_values() {
+        let camera = Camera::orbit_at_yaw_degrees(0.0, 1024);
+        let RigidTransform { rotation, translation } = camera.world_to_camera;
+        let expected = DMat3::from_cols_array(&[
+            1.0, 0.0, 0.0, 0.0, -0.990268, -0.139173, 0.0, 0.139173, -0.990268,
+        ]);
+        assert!((rotation - expected).to_cols_array().iter().all(|d| d.abs() < 1e-6), "{rotation}");
+        assert!((translation - DVec3::new(0.0, 0.841728, 2.118297)).length() < 2e-6, "{translation}");
+
+        let (pixel, depth) = camera.project(DVec3::new(0.3, 0.85, 0.0)).expect("in front");
+        assert!((pixel - DVec2::new(634.88, 537.0)).length() < 1e-9, "{pixel}");
+        assert!((depth - 2.0).abs() < 1e-12, "{depth}");
+        let row = |y: f64| camera.project(DVec3::new(0.0, y, 0.0)).expect("in front").0.y;
+        assert!((row(0.0) - 862.518).abs() < 5e-4, "{}", row(0.0));
+        assert!((row(1.8) - 124.390).abs() < 5e-4, "{}", row(1.8));
+    }
+
+    #[test]
+    fn orbit_cameras_are_proper_rotations_at_every_yaw() {
+        for yaw in [0.0, 37.0, 90.0, 180.0, 270.0] {
+            let rotation = Camera::orbit_at_yaw_degrees(yaw, 512).world_to_camera.rotation;
+            assert!((rotation.determinant() - 1.0).abs() < 1e-12, "yaw {yaw}");
+        }
+    }
+
+    #[test]
+    fn inverse_undoes_the_transform() {
+        let t = Camera::orbit_at_yaw_degrees(33.0, 64).world_to_camera;
+        let p = DVec3::new(0.1, -2.0, 3.5);
+        assert!((t.inverse().apply(t.apply(p)) - p).length() < 1e-12);
+    }
+}

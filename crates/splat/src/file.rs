@@ -1,0 +1,87 @@
+//! Files that appear whole or not at all.
+
+use std::fs::{self, File};
+use std::io::{self, BufWriter, Write};
+use std::path::Path;
+
+/// Writes `path` through `fill`: into a temporary file beside it, which is renamed when `fill` has succeeded, so that
+/// a failure leaves whatever was there before. A path that exists and is no regular file (a pipe, `/dev/stdout`) is
+/// written in place: renaming would replace the device itself.
+///
+/// # Errors
+/// What `fill` returns, or the operating system's refusal to create, write or rename the file.
+pub fn write_whole<E: From<io::Error>>(
+    path: &Path,
+    fill: impl FnOnce(&mut BufWriter<&mut File>) -> Result<(), E>,
+) -> Result<(), E> {
+    if fs::metadata(path).is_ok_and(|m| !m.is_file() && !m.is_dir()) {
+        let mut file = File::options().write(true).open(path)?;
+        let mut out = BufWriter::new(&mut file);
+        fill(&mut out)?;
+        return Ok(out.flush()?);
+    }
+    let mut builder = tempfile::Builder::new();
+    builder.prefix(".snapsnap-");
+    #[cfg(unix)]
+    {
+        // What an ordinary new file gets (the umask still applies), not the private mode of temporary files.
+        use std::os::unix::fs::PermissionsExt;
+        builder.permissions(fs::Permissions::from_mode(0o666));
+    }
+    let mut file = builder.tempfile_in(folder_of(path))?;
+    let mut out = BufWriter::with_capacity(1 << 20, file.as_file_mut());
+    fill(&mut out)?;
+    out.flush()?;
+    drop(out);
+    if path.is_dir() {
+        return Err(io::Error::new(io::ErrorKind::IsADirectory, "is a directory").into());
+    }
+    file.persist(path).map_err(|e| e.error)?;
+    Ok(())
+}
+
+/// Checks, before any work, that `path` can be written: its folder exists and lets us create a file.
+///
+/// # Errors
+/// The operating system's reason.
+pub fn check_writable(path: &Path) -> io::Result<()> {
+    if path.is_dir() {
+        return Err(io::Error::new(io::ErrorKind::IsADirectory, "is a directory"));
+    }
+    if fs::metadata(path).is_ok_and(|m| !m.is_file()) {
+        return File::options().write(true).open(path).map(drop);
+    }
+    tempfile::tempfile_in(folder_of(path)).map(drop)
+}
+
+fn folder_of(path: &Path) -> &Path {
+    path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_failed_write_leaves_the_old_file_and_nothing_else() {
+        let folder = tempfile::tempdir().expect("temporary folder");
+        let path = folder.path().join("a.txt");
+        fs::write(&path, "old").expect("write");
+        let failed: io::Result<()> = write_whole(&path, |out| {
+            out.write_all(b"half")?;
+            Err(io::Error::other("stop"))
+        });
+        assert_eq!(failed.expect_err("fails").to_string(), "stop");
+        assert_eq!(fs::read_to_string(&path).expect("read"), "old");
+        assert_eq!(fs::read_dir(folder.path()).expect("list").count(), 1);
+    }
+
+    #[test]
+    fn a_missing_folder_and_a_directory_are_refused_before_any_work() {
+        let folder = tempfile::tempdir().expect("temporary folder");
+        assert!(check_writable(&folder.path().join("no/such/file")).is_err());
+        assert!(check_writable(folder.path()).is_err());
+        assert!(check_writable(&folder.path().join("new")).is_ok());
+        assert_eq!(fs::read_dir(folder.path()).expect("list").count(), 0);
+    }
+}

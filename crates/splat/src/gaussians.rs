@@ -1,0 +1,134 @@
+//! A set of 3D Gaussians as tensors on one device.
+
+use burn::tensor::{Device, Tensor, TensorData};
+use glam::DQuat;
+
+use crate::{RigidTransform, SplatError};
+
+/// N anisotropic 3D Gaussians with one colour each (SH degree 0), after activation.
+#[derive(Debug, Clone)]
+pub struct Gaussians {
+    /// Centres `[N,3]`, metres.
+    pub means: Tensor<2>,
+    /// Unit quaternions `[N,4]` (w, x, y, z).
+    pub rotations: Tensor<2>,
+    /// Standard deviations along the rotated axes `[N,3]`, metres, > 0.
+    pub scales: Tensor<2>,
+    /// Opacities `[N]` in [0, 1].
+    pub opacities: Tensor<1>,
+    /// Colours `[N,3]` (red, green, blue) in [0, 1].
+    pub colors: Tensor<2>,
+}
+
+impl Gaussians {
+    /// Puts the tensors together.
+    ///
+    /// # Errors
+    /// [`SplatError::Shape`] where a tensor's rows or columns do not fit.
+    pub fn new(
+        means: Tensor<2>,
+        rotations: Tensor<2>,
+        scales: Tensor<2>,
+        opacities: Tensor<1>,
+        colors: Tensor<2>,
+    ) -> Result<Self, SplatError> {
+        let n = means.dims()[0];
+        let check = |field, found: &[usize], expected: &[usize]| {
+            if found == expected {
+                return Ok(());
+            }
+            Err(SplatError::Shape { field, found: found.to_vec(), expected: expected.to_vec() })
+        };
+        check("means", &means.dims(), &[n, 3])?;
+        check("rotations", &rotations.dims(), &[n, 4])?;
+        check("scales", &scales.dims(), &[n, 3])?;
+        check("opacities", &opacities.dims(), &[n])?;
+        check("colors", &colors.dims(), &[n, 3])?;
+        Ok(Self { means, rotations, scales, opacities, colors })
+    }
+
+    /// Number of Gaussians.
+    pub fn len(&self) -> usize {
+        self.means.dims()[0]
+    }
+
+    /// Whether there is no Gaussian at all.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Device that holds the tensors.
+    pub fn device(&self) -> Device {
+        self.means.device()
+    }
+
+    /// Moves the centres by `transform`; leaves the quaternions alone.
+    pub fn with_means_transformed(mut self, transform: &RigidTransform) -> Self {
+        let device = self.device();
+        // Row vectors: (R·p)ᵀ = pᵀ·Rᵀ, and glam's column-major array read row by row is Rᵀ.
+        let rotation = transform.rotation.to_cols_array().map(|v| v as f32);
+        let rotation = Tensor::<2>::from_data(TensorData::new(rotation.to_vec(), [3, 3]), &device);
+        let translation = transform.translation.to_array().map(|v| v as f32);
+        let translation = Tensor::<2>::from_data(TensorData::new(translation.to_vec(), [1, 3]), &device);
+        self.means = self.means.matmul(rotation) + translation;
+        self
+    }
+
+    /// Moves the whole set rigidly: the centres, and the quaternions by left multiplication (SNAPSNAP §13.3, fix 1).
+    ///
+    /// # Panics
+    /// If `transform` is a reflection: no quaternion can express the mirrored Gaussians.
+    pub fn transformed(mut self, transform: &RigidTransform) -> Self {
+        assert!(transform.rotation.determinant() > 0.0, "a reflection cannot rotate quaternions");
+        let q = DQuat::from_mat3(&transform.rotation);
+        let (w, x, y, z) = (q.w as f32, q.x as f32, q.y as f32, q.z as f32);
+        // Row i of this matrix is what component i of the right factor contributes to q ⊗ r, in (w, x, y, z) order.
+        let product = vec![w, x, y, z, -x, w, z, -y, -y, -z, w, x, -z, y, -x, w];
+        let product = Tensor::<2>::from_data(TensorData::new(product, [4, 4]), &self.device());
+        self.rotations = self.rotations.matmul(product);
+        self.with_means_transformed(transform)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Camera;
+    use glam::{DMat3, DVec3};
+
+    fn one(rotation: DQuat, mean: DVec3, device: &Device) -> Gaussians {
+        let row = |v: &[f64]| {
+            let v: Vec<f32> = v.iter().map(|&x| x as f32).collect();
+            let n = v.len();
+            Tensor::<2>::from_data(TensorData::new(v, [1, n]), device)
+        };
+        let q = row(&[rotation.w, rotation.x, rotation.y, rotation.z]);
+        let ones = Tensor::<2>::ones([1, 3], device);
+        Gaussians::new(row(&mean.to_array()), q, ones.clone(), Tensor::ones([1], device), ones).expect("shapes")
+    }
+
+    #[test]
+    fn transforming_rotates_the_covariance_with_the_means() {
+        let device = Device::flex();
+        let q = DQuat::from_axis_angle(DVec3::new(1.0, 2.0, -0.5).normalize(), 0.7);
+        let mean = DVec3::new(0.3, -0.2, 2.1);
+        let transform = Camera::orbit_at_yaw_degrees(40.0, 64).world_to_camera.inverse();
+        let moved = one(q, mean, &device).transformed(&transform);
+        let r: Vec<f32> = moved.rotations.into_data().to_vec().expect("f32");
+        let got = DMat3::from_quat(DQuat::from_xyzw(r[1].into(), r[2].into(), r[3].into(), r[0].into()));
+        let expected = transform.rotation * DMat3::from_quat(q);
+        assert!((got - expected).to_cols_array().iter().all(|d| d.abs() < 1e-6));
+        let m: Vec<f32> = moved.means.into_data().to_vec().expect("f32");
+        let got = DVec3::new(m[0].into(), m[1].into(), m[2].into());
+        assert!((got - transform.apply(mean)).length() < 1e-6, "{got}");
+    }
+
+    #[test]
+    fn mismatched_rows_are_refused_by_name() {
+        let device = Device::flex();
+        let three = |n: usize| Tensor::<2>::zeros([n, 3], &device);
+        let result =
+            Gaussians::new(three(2), Tensor::zeros([2, 4], &device), three(1), Tensor::zeros([2], &device), three(2));
+        assert!(matches!(result, Err(SplatError::Shape { field: "scales", .. })), "{result:?}");
+    }
+}

@@ -1,0 +1,103 @@
+//! Helpers of the parity and end-to-end tests: devices, fixtures, error norms.
+
+use std::path::{Path, PathBuf};
+
+use burn::tensor::{Device, DeviceKind, Tensor, TensorData};
+use safetensors::SafeTensors;
+
+/// The device that tests run on: `SNAPSNAP_TEST_DEVICE` = `flex` (default), `ndarray` or `wgpu`.
+///
+/// `wgpu` takes whatever adapter the machine has, a software one included; `cargo xtask test` runs the suite on each.
+pub fn device() -> Device {
+    match std::env::var("SNAPSNAP_TEST_DEVICE").as_deref().unwrap_or("flex") {
+        "flex" => Device::flex(),
+        "ndarray" => ndarray(),
+        "wgpu" => Device::wgpu(DeviceKind::DefaultDevice),
+        other => panic!("SNAPSNAP_TEST_DEVICE = {other}: allowed are flex, ndarray, wgpu"),
+    }
+}
+
+#[allow(deprecated, reason = "still the second CPU implementation that results are checked on")]
+fn ndarray() -> Device {
+    Device::ndarray()
+}
+
+/// Path of a reference fixture, or `None`, said aloud, where the fixtures are not beside the checkout.
+pub fn fixture(name: &str) -> Option<PathBuf> {
+    let path = shared("fixtures").join(name);
+    if path.exists() {
+        return Some(path);
+    }
+    println!("SKIPPED: no reference fixture {}", path.display());
+    None
+}
+
+/// A folder beside the checkout.
+pub fn shared(name: &str) -> PathBuf {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("the workspace root");
+    root.parent().expect("a folder around the workspace").join("shared").join(name)
+}
+
+/// A `.safetensors` file read whole.
+pub struct Numbers(Vec<u8>);
+
+impl Numbers {
+    /// Reads the file.
+    pub fn read(path: &Path) -> Self {
+        Self(std::fs::read(path).unwrap_or_else(|e| panic!("{}: {e}", path.display())))
+    }
+
+    /// Whether there is a tensor of this name.
+    pub fn has(&self, name: &str) -> bool {
+        self.file().tensor(name).is_ok()
+    }
+
+    /// Shape and values of an f32 tensor.
+    pub fn f32(&self, name: &str) -> (Vec<usize>, Vec<f32>) {
+        let file = self.file();
+        let view = file.tensor(name).unwrap_or_else(|e| panic!("{name}: {e}"));
+        assert_eq!(view.dtype(), safetensors::Dtype::F32, "{name}");
+        let values = view.data().chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]));
+        (view.shape().to_vec(), values.collect())
+    }
+
+    /// Shape and values of a u8 tensor.
+    pub fn u8(&self, name: &str) -> (Vec<usize>, Vec<u8>) {
+        let file = self.file();
+        let view = file.tensor(name).unwrap_or_else(|e| panic!("{name}: {e}"));
+        assert_eq!(view.dtype(), safetensors::Dtype::U8, "{name}");
+        (view.shape().to_vec(), view.data().to_vec())
+    }
+
+    /// An f32 tensor on a device.
+    pub fn tensor<const D: usize>(&self, name: &str, device: &Device) -> Tensor<D> {
+        let (shape, values) = self.f32(name);
+        Tensor::from_data(TensorData::new(values, shape), device)
+    }
+
+    fn file(&self) -> SafeTensors<'_> {
+        SafeTensors::deserialize(&self.0).expect("a safetensors file")
+    }
+}
+
+/// ‖got − expected‖₂ / ‖expected‖₂, in f64.
+pub fn relative_error(got: &[f32], expected: &[f32]) -> f64 {
+    assert_eq!(got.len(), expected.len(), "number of values");
+    let square = |x: f64| x * x;
+    let difference: f64 = got.iter().zip(expected).map(|(a, b)| square(f64::from(*a) - f64::from(*b))).sum();
+    let norm: f64 = expected.iter().map(|b| square(f64::from(*b))).sum();
+    (difference / norm.max(f64::MIN_POSITIVE)).sqrt()
+}
+
+/// Values of a tensor on the host.
+pub fn values<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
+    tensor.into_data().try_into_vec().expect("an f32 tensor")
+}
+
+/// Asserts a relative L2 error and prints it, so that a log shows what was reached.
+pub fn assert_close<const D: usize>(what: &str, got: Tensor<D>, expected: &(Vec<usize>, Vec<f32>), bound: f64) {
+    assert_eq!(got.dims().as_slice(), expected.0.as_slice(), "{what}: shape");
+    let error = relative_error(&values(got), &expected.1);
+    println!("{what}: relative error {error:.2e}");
+    assert!(error <= bound, "{what}: relative error {error:.3e} > {bound:.0e}");
+}

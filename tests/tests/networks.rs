@@ -1,0 +1,129 @@
+//! The networks against the authors' numbers (f64 arithmetic, stored as f32).
+//!
+//! Bounds: fixtures/README.md, relative L2 error 1e-5 for tokens, 1e-4 for points, features and attributes.
+
+use std::path::Path;
+
+use burn::tensor::{Device, Tensor};
+use snapsnap_net::config::{Config, ConfMode, Fusion, HeadKind};
+use snapsnap_net::network::{PointPredictor, View, activate};
+use snapsnap_net::regressor::{Attributes, Statistics};
+use snapsnap_net::weights::{ImportOptions, SideHeads, WeightFile, import};
+use snapsnap_tests::{Numbers, assert_close, device, fixture};
+
+const TOKENS: f64 = 1e-5;
+const POINTS: f64 = 1e-4;
+
+/// The config of a fixture from its `config.json`.
+fn config(folder: &Path) -> Config {
+    let text = std::fs::read_to_string(folder.join("config.json")).expect("config.json");
+    let json: serde_json::Value = serde_json::from_str(&text).expect("JSON");
+    let number = |key: &str| json[key].as_u64().unwrap_or_else(|| panic!("{key}")) as usize;
+    let four = |key: &str| std::array::from_fn(|i| json[key][i].as_u64().expect("a number") as usize);
+    let mut config = Config::default();
+    let n = &mut config.network;
+    (n.enc_dim, n.enc_depth, n.enc_heads) = (number("enc_dim"), number("enc_depth"), number("enc_heads"));
+    (n.dec_dim, n.dec_depth, n.dec_heads) = (number("dec_dim"), number("dec_depth"), number("dec_heads"));
+    (n.layer_dims, n.hooks) = (four("layer_dims"), four("hooks"));
+    (n.feature_dim, n.last_dim) = (number("feature_dim"), number("last_dim"));
+    n.head = if json["head"] == "dpt" { HeadKind::Dpt } else { HeadKind::Linear };
+    n.conf_mode = if json["conf_mode"][0] == "exp" { ConfMode::Exp } else { ConfMode::Sigmoid };
+    n.side_heads = number("heads") == 4;
+    config
+}
+
+fn predictor(folder: &Path, config: &Config, device: &Device) -> PointPredictor {
+    let file = tempfile::NamedTempFile::new().expect("temporary file");
+    let options = ImportOptions { side_heads: SideHeads::Seed, seed: 0 };
+    import(&[folder.join("weights.safetensors")], config, options, file.path()).expect("import");
+    WeightFile::open(file.path(), None).expect("our file").point_predictor(device).expect("weights")
+}
+
+fn network(name: &str) {
+    let Some(folder) = fixture(name) else { return };
+    let device = device();
+    let config = config(&folder);
+    let net = predictor(&folder, &config, &device);
+    let io = Numbers::read(&folder.join("io.safetensors"));
+    let image = |i: usize| io.tensor::<4>(&format!("image{i}"), &device);
+    let (front, back) = (image(1), image(2));
+    let [b, _, h, w] = front.dims();
+    let grid = net.dust3r.grid([h, w]);
+    let tokens = net.dust3r.encode(Tensor::cat(vec![front, back], 0));
+    let halves = [tokens.clone().narrow(0, 0, b), tokens.narrow(0, b, b)];
+    for (i, half) in halves.iter().enumerate() {
+        assert_close(&format!("{name} enc{}", i + 1), half.clone(), &io.f32(&format!("enc{}", i + 1)), TOKENS);
+    }
+    let [front, back] = halves;
+    let maps = net.dust3r.decode(front, back, grid);
+    for (side, maps) in maps.iter().enumerate() {
+        for (layer, tokens) in maps.iter().enumerate().skip(1) {
+            let key = format!("dec{}.{layer}", side + 1);
+            assert_close(&format!("{name} {key}"), tokens.clone(), &io.f32(&key), TOKENS);
+        }
+    }
+    let mut compared = 0;
+    for &view in net.dust3r.views() {
+        let k = view as usize + 1;
+        if !io.has(&format!("points.{k}")) {
+            continue;
+        }
+        let map = activate(net.dust3r.raw_points(view, &maps, grid), config.network.conf_mode);
+        let what = format!("{name} {}", view.name());
+        assert_close(&format!("{what} points"), map.points, &io.f32(&format!("points.{k}")), POINTS);
+        assert_close(&format!("{what} conf"), map.conf, &io.f32(&format!("conf.{k}")), POINTS);
+        compared += 1;
+    }
+    assert!(compared >= 2, "{name}: only {compared} heads compared");
+}
+
+#[test]
+fn four_dpt_heads_with_sigmoid_confidence() {
+    network("net-dpt");
+}
+
+#[test]
+fn stock_dust3r_with_exponential_confidence() {
+    network("net-dpt-exp");
+}
+
+#[test]
+fn linear_heads() {
+    network("net-linear");
+}
+
+#[test]
+fn point_predictor_of_the_pipeline() {
+    network("pipeline");
+}
+
+#[test]
+fn gaussian_regressor_and_its_activations() {
+    let Some(folder) = fixture("unet") else { return };
+    let device = device();
+    let file = tempfile::NamedTempFile::new().expect("temporary file");
+    let options = ImportOptions { side_heads: SideHeads::Seed, seed: 0 };
+    import(&[folder.join("weights.safetensors")], &Config::default(), options, file.path()).expect("import");
+    let regressors = WeightFile::open(file.path(), None).expect("our file").regressors(&device).expect("weights");
+    let io = Numbers::read(&folder.join("io.safetensors"));
+    let input = io.tensor::<4>("input", &device);
+    let features = regressors[0].forward(input, &mut Statistics::measured());
+    assert_close("features", features.clone(), &io.f32("features"), POINTS);
+    let [b, h, w, c] = features.dims();
+    let attributes = Attributes::from_features(features.reshape([b * h * w, c]));
+    let map = |x: Tensor<2>| {
+        let c = x.dims()[1];
+        x.reshape([b, h, w, c])
+    };
+    assert_close("opacity", map(attributes.opacity), &io.f32("opacity"), POINTS);
+    assert_close("scale", map(attributes.scale), &io.f32("scale"), POINTS);
+    assert_close("rotation", map(attributes.rotation), &io.f32("rotation"), POINTS);
+    assert_close("color", map(attributes.color), &io.f32("color"), POINTS);
+    assert_close("offset", map(attributes.offset), &io.f32("offset"), POINTS);
+}
+
+#[test]
+fn views_are_ordered_as_the_heads() {
+    assert_eq!(View::ALL.map(View::name), ["front", "back", "right", "left"]);
+    assert_eq!(Fusion::Mean, Config::default().network.fusion);
+}
