@@ -5,7 +5,7 @@
 use std::path::Path;
 
 use burn::tensor::{Device, Tensor};
-use snapsnap_net::config::{Config, ConfMode, Fusion, HeadKind};
+use snapsnap_net::config::{Config, ConfMode, HeadKind};
 use snapsnap_net::network::{PointPredictor, View, activate};
 use snapsnap_net::regressor::{Attributes, Statistics};
 use snapsnap_net::weights::{ImportOptions, SideHeads, WeightFile, import};
@@ -14,7 +14,8 @@ use snapsnap_tests::{Numbers, assert_close, device, fixture};
 const TOKENS: f64 = 1e-5;
 const POINTS: f64 = 1e-4;
 
-/// The config of a fixture from its `config.json`.
+/// The config of a fixture from its `config.json`. Every fixture's weights have four heads; `heads` says for how many
+/// of them there are numbers to compare with.
 fn config(folder: &Path) -> Config {
     let text = std::fs::read_to_string(folder.join("config.json")).expect("config.json");
     let json: serde_json::Value = serde_json::from_str(&text).expect("JSON");
@@ -28,7 +29,6 @@ fn config(folder: &Path) -> Config {
     (n.feature_dim, n.last_dim) = (number("feature_dim"), number("last_dim"));
     n.head = if json["head"] == "dpt" { HeadKind::Dpt } else { HeadKind::Linear };
     n.conf_mode = if json["conf_mode"][0] == "exp" { ConfMode::Exp } else { ConfMode::Sigmoid };
-    n.side_heads = number("heads") == 4;
     config
 }
 
@@ -125,5 +125,4 @@ fn gaussian_regressor_and_its_activations() {
 #[test]
 fn views_are_ordered_as_the_heads() {
     assert_eq!(View::ALL.map(View::name), ["front", "back", "right", "left"]);
-    assert_eq!(Fusion::Mean, Config::default().network.fusion);
-}
+    }

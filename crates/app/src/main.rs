@@ -1,1 +1,68 @@
-fn main(){}
+//! The command line of snapsnap: one file per subcommand, which parses, calls and reports.
+
+mod commands;
+mod device;
+mod dump;
+mod failure;
+mod weights;
+
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+use failure::Failure;
+
+/// Large tensors are allocated and freed on every operation; mimalloc keeps their pages, the system allocator returns
+/// them to the kernel and faults them in again.
+#[global_allocator]
+static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
+
+#[derive(Parser)]
+#[command(name = "snapsnap", version, about = "Two photographs of a person become a 3D Gaussian human.")]
+struct Arguments {
+    /// No progress, only errors.
+    #[arg(long, global = true)]
+    quiet: bool,
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Turn a front and a back photograph into a Gaussian PLY.
+    Reconstruct(commands::reconstruct::Arguments),
+    /// Read checkpoints of Snap-Snap, DUSt3R or CroCo and write one weight file.
+    ImportWeights(commands::import_weights::Arguments),
+    /// Write random weights for a config.
+    InitWeights(commands::init_weights::Arguments),
+    /// Write a weight file back in the authors' layout.
+    ExportWeights(commands::export_weights::Arguments),
+}
+
+fn main() -> ExitCode {
+    // Ctrl-C: 130 as shells expect, and no temporary file stays behind.
+    let handler = ctrlc::set_handler(|| {
+        snapsnap_splat::file::remove_unfinished();
+        std::process::exit(130);
+    });
+    if let Err(e) = handler {
+        eprintln!("warning: Ctrl-C will not clean up temporary files: {e}");
+    }
+    let Arguments { quiet, command } = match Arguments::try_parse() {
+        Ok(arguments) => arguments,
+        // clap prints usage errors and help itself, with exit codes 2 and 0.
+        Err(e) => e.exit(),
+    };
+    let result = match command {
+        Command::Reconstruct(arguments) => commands::reconstruct::run(&arguments, quiet),
+        Command::ImportWeights(arguments) => commands::import_weights::run(&arguments, quiet),
+        Command::InitWeights(arguments) => commands::init_weights::run(&arguments, quiet),
+        Command::ExportWeights(arguments) => commands::export_weights::run(&arguments, quiet),
+    };
+    match result {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(failure) => {
+            eprintln!("error: {failure}");
+            failure.exit_code()
+        }
+    }
+}

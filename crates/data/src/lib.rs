@@ -1,1 +1,4 @@
-#![doc = "placeholder"]
+//! Training data and photographs. So far: photographs.
+
+pub mod photo;
+mod resize;

@@ -2,7 +2,13 @@
 
 pub mod config;
 mod cpu;
+mod crop;
 pub mod network;
+mod reconstruct;
 pub mod regressor;
 pub mod resample;
+pub mod sides;
 pub mod weights;
+
+pub use crop::Window;
+pub use reconstruct::{Photograph, Reconstruction, Reconstructor};

@@ -2,7 +2,19 @@
 
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
+
+/// Temporary files that are being written.
+static UNFINISHED: Mutex<Vec<PathBuf>> = Mutex::new(Vec::new());
+
+/// Removes the temporary files of writes in progress: for a program that is about to be ended from outside.
+pub fn remove_unfinished() {
+    for path in UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner).drain(..) {
+        // Whoever renamed or removed it first has done the work.
+        let _ = fs::remove_file(path);
+    }
+}
 
 /// Writes `path` through `fill`: into a temporary file beside it, which is renamed when `fill` has succeeded, so that
 /// a failure leaves whatever was there before. A path that exists and is no regular file (a pipe, `/dev/stdout`) is
@@ -29,15 +41,15 @@ pub fn write_whole<E: From<io::Error>>(
         builder.permissions(fs::Permissions::from_mode(0o666));
     }
     let mut file = builder.tempfile_in(folder_of(path))?;
+    let unfinished = || UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner);
+    let temporary = file.path().to_owned();
+    unfinished().push(temporary.clone());
     let mut out = BufWriter::with_capacity(1 << 20, file.as_file_mut());
-    fill(&mut out)?;
-    out.flush()?;
+    let filled = fill(&mut out).and_then(|()| Ok(out.flush()?));
     drop(out);
-    if path.is_dir() {
-        return Err(io::Error::new(io::ErrorKind::IsADirectory, "is a directory").into());
-    }
-    file.persist(path).map_err(|e| e.error)?;
-    Ok(())
+    let written = filled.and_then(|()| file.persist(path).map(drop).map_err(|e| e.error.into()));
+    unfinished().retain(|p| *p != temporary);
+    written
 }
 
 /// Checks, before any work, that `path` can be written: its folder exists and lets us create a file.

@@ -31,7 +31,7 @@ impl SelfAttention {
         let dim = x.dims()[2];
         let qkv = self.qkv.forward(x);
         let part = |i: usize| qkv.clone().narrow(2, i * dim, dim);
-        self.proj.forward(rotary_attention(part(0), part(1), part(2), rope, rope, self.heads))
+        self.proj.forward(rotary_attention(part(0), part(1), part(2), rope, self.heads))
     }
 }
 
@@ -54,29 +54,22 @@ impl CrossAttention {
     /// Queries `x` `[B, N, dim]`, memory `y` `[B, M, dim]` → `[B, N, dim]`.
     pub(crate) fn forward(&self, x: Tensor<3>, y: Tensor<3>, rope: &Rope) -> Tensor<3> {
         let (q, k, v) = (self.projq.forward(x), self.projk.forward(y.clone()), self.projv.forward(y));
-        self.proj.forward(rotary_attention(q, k, v, rope, rope, self.heads))
+        self.proj.forward(rotary_attention(q, k, v, rope, self.heads))
     }
 }
 
 /// softmax(rope(q) · rope(k)ᵀ / √head_dim) · v, heads side by side in the channels: `[B, N, dim]`, `[B, M, dim]`
 /// twice → `[B, N, dim]`.
-fn rotary_attention(
-    q: Tensor<3>,
-    k: Tensor<3>,
-    v: Tensor<3>,
-    rope_q: &Rope,
-    rope_k: &Rope,
-    heads: usize,
-) -> Tensor<3> {
+fn rotary_attention(q: Tensor<3>, k: Tensor<3>, v: Tensor<3>, rope: &Rope, heads: usize) -> Tensor<3> {
     if cpu::is_fast(&q) {
-        return cpu::rotary_attention(q, k, v, rope_q, rope_k, heads);
+        return cpu::rotary_attention(q, k, v, rope, heads);
     }
     let [b, n, dim] = q.dims();
     let split = |x: Tensor<3>| {
         let m = x.dims()[1];
         x.reshape([b, m, heads, dim / heads]).swap_dims(1, 2)
     };
-    let (q, k) = (rope_q.apply(split(q)), rope_k.apply(split(k)));
+    let (q, k) = (rope.apply(split(q)), rope.apply(split(k)));
     let out = attention(q, k, split(v), None, None, Default::default());
     out.swap_dims(1, 2).reshape([b, n, dim])
 }

@@ -23,6 +23,20 @@ impl Statistics {
         Self { layers: self.layers.clone(), next: Some(0) }
     }
 
+    /// Frozen statistics of one image on the host, layer by layer: means and reciprocal standard deviations.
+    pub(crate) fn of_sample(&self, sample: usize) -> Option<Vec<[Vec<f32>; 2]>> {
+        self.next?;
+        let row = |x: &Tensor<2>| x.clone().narrow(0, sample, 1).into_data().try_into_vec().expect("f32");
+        Some(self.layers.iter().map(|[mean, rstd]| [row(mean), row(rstd)]).collect())
+    }
+
+    /// Adds the measured statistics of a whole pass; frozen ones stay as they are.
+    pub(crate) fn record(&mut self, layers: impl Iterator<Item = [Tensor<2>; 2]>) {
+        if self.next.is_none() {
+            self.layers.extend(layers);
+        }
+    }
+
     /// Mean and reciprocal standard deviation `[B, groups]` of the next layer: frozen, or from `measure`.
     pub(crate) fn layer(&mut self, measure: impl FnOnce() -> [Tensor<2>; 2]) -> [Tensor<2>; 2] {
         match &mut self.next {

@@ -1,0 +1,27 @@
+//! `snapsnap export-weights`.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use snapsnap_net::weights;
+
+use super::check_output;
+use crate::failure::Failure;
+
+#[derive(Args)]
+pub struct Arguments {
+    /// Weight file written by `import-weights`, `init-weights` or training.
+    input: PathBuf,
+    /// File to write, with the key names and aliases of the authors' state dicts.
+    #[arg(short, long, value_name = "FILE.safetensors")]
+    output: PathBuf,
+}
+
+pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
+    check_output(&arguments.output)?;
+    let tensors = weights::export(&arguments.input, &arguments.output)?;
+    if !quiet {
+        println!("{}: {tensors} tensors", arguments.output.display());
+    }
+    Ok(())
+}

@@ -1,0 +1,32 @@
+//! `snapsnap init-weights`.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use snapsnap_net::weights;
+
+use super::{ConfigArguments, check_output};
+use crate::failure::Failure;
+
+#[derive(Args)]
+pub struct Arguments {
+    #[command(flatten)]
+    config: ConfigArguments,
+    /// Seed of the random weights; the same seed gives the same file on every machine.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Weight file to write.
+    #[arg(short, long, value_name = "FILE.safetensors")]
+    output: PathBuf,
+}
+
+pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
+    let config = arguments.config.resolve(("the published size", ""))?;
+    check_output(&arguments.output)?;
+    let parameters = weights::init(&config, arguments.seed, &arguments.output)?;
+    if !quiet {
+        let (file, seed) = (arguments.output.display(), arguments.seed);
+        println!("{file}: {parameters} random parameters from seed {seed}");
+    }
+    Ok(())
+}

@@ -1,0 +1,87 @@
+//! `--device`: names of devices, and which of them this build and this machine have.
+
+use burn::tensor::{Device, DeviceKind, DeviceType};
+
+use crate::failure::Failure;
+
+/// The device called `name`.
+///
+/// # Errors
+/// [`Failure::Input`] listing what there is.
+pub fn choose(name: &str) -> Result<Device, Failure> {
+    let (kind, index) = match name.split_once(':') {
+        Some((kind, index)) => {
+            let index = index.parse::<usize>().map_err(|_| unknown(name, "the index is no number"))?;
+            (kind, Some(index))
+        }
+        None => (name, None),
+    };
+    if index.is_some() && ["auto", "cpu", "flex", "ndarray"].contains(&kind) {
+        return Err(unknown(name, "this device has no index"));
+    }
+    match kind {
+        "auto" => Ok(real_gpu().unwrap_or_else(Device::flex)),
+        "cpu" | "flex" => Ok(Device::flex()),
+        "ndarray" => Ok(ndarray()),
+        "wgpu" => nth(name, DeviceType::Wgpu, index),
+        #[cfg(feature = "vulkan")]
+        "vulkan" => nth(name, DeviceType::Vulkan, index),
+        #[cfg(feature = "cuda")]
+        "cuda" => nth(name, DeviceType::Cuda, index),
+        #[cfg(feature = "metal")]
+        "metal" => nth(name, DeviceType::Metal, index),
+        "vulkan" | "cuda" | "metal" => {
+            Err(unknown(name, &format!("not compiled in: build with --features {kind}")))
+        }
+        _ => Err(unknown(name, "no such kind of device")),
+    }
+}
+
+#[allow(deprecated, reason = "kept as the second CPU implementation")]
+fn ndarray() -> Device {
+    Device::ndarray()
+}
+
+/// A device that is a card, not a software adapter.
+fn real_gpu() -> Option<Device> {
+    wgpu_devices().into_iter().find(|d| d.identity().is_some_and(|i| i.physical.is_some()))
+}
+
+fn wgpu_devices() -> Vec<Device> {
+    quietly(|| Device::enumerate(DeviceType::Wgpu).into_vec())
+}
+
+/// Runs `look`, taking a panic for "nothing there": the graphics layer panics where no driver answers.
+fn quietly(look: impl FnOnce() -> Vec<Device> + std::panic::UnwindSafe) -> Vec<Device> {
+    let hook = std::panic::take_hook();
+    std::panic::set_hook(Box::new(|_| {}));
+    let found = std::panic::catch_unwind(look);
+    std::panic::set_hook(hook);
+    found.unwrap_or_default()
+}
+
+fn nth(name: &str, kind: DeviceType, index: Option<usize>) -> Result<Device, Failure> {
+    let devices = quietly(|| Device::enumerate(kind).into_vec());
+    let found = devices.len();
+    match index {
+        _ if found == 0 => Err(unknown(name, "no adapter answers")),
+        // Without an index the runtime's own choice: the fastest card.
+        None if name == "wgpu" => Ok(Device::wgpu(DeviceKind::DefaultDevice)),
+        _ => {
+            let message = format!("there are {found}, numbered from 0");
+            devices.into_iter().nth(index.unwrap_or(0)).ok_or_else(|| unknown(name, &message))
+        }
+    }
+}
+
+fn unknown(name: &str, why: &str) -> Failure {
+    let mut there = vec!["auto".to_owned(), "cpu (= flex)".into(), "ndarray".into()];
+    for (i, device) in wgpu_devices().iter().enumerate() {
+        let label = device.identity().map_or_else(String::new, |d| {
+            let software = if d.physical.is_none() { ", software" } else { "" };
+            format!(" ({}{software})", d.name)
+        });
+        there.push(format!("wgpu:{i}{label}"));
+    }
+    Failure::Input(format!("--device {name}: {why}. Here there are: {}", there.join(", ")))
+}

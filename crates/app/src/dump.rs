@@ -1,0 +1,49 @@
+//! `--dump`: every intermediate tensor, named and shaped as in the `pipeline` fixture.
+
+use std::io;
+use std::path::Path;
+
+use burn::tensor::Tensor;
+use safetensors::Dtype;
+use safetensors::tensor::TensorView;
+use snapsnap_net::Reconstruction;
+use snapsnap_splat::file::write_whole;
+
+use crate::failure::Failure;
+
+/// Writes `points conf valid side_images means opacity scale rotation rgb`, in the front camera's frame.
+pub fn write(result: &Reconstruction, path: &Path) -> Result<(), Failure> {
+    let [views, height, width, _] = result.maps.points.dims();
+    let g = &result.gaussians;
+    let mut tensors = Vec::new();
+    let mut push = |name: &str, dtype: Dtype, shape: Vec<usize>, bytes: Vec<u8>| {
+        tensors.push((name.to_owned(), dtype, shape, bytes));
+    };
+    let float = Dtype::F32;
+    push("points", float, vec![views, height, width, 3], bytes(&result.maps.points));
+    push("conf", float, vec![views, height, width], bytes(&result.maps.conf));
+    let valid = result.valid.iter().flatten().map(|v| u8::from(*v)).collect();
+    push("valid", Dtype::U8, vec![views, height, width], valid);
+    if !result.side_images.is_empty() {
+        let values = result.side_images.iter().flatten().flat_map(|v| v.to_le_bytes()).collect();
+        push("side_images", float, vec![result.side_images.len(), 3, height, width], values);
+    }
+    push("means", float, g.means.dims().to_vec(), bytes(&g.means));
+    push("opacity", float, vec![g.len(), 1], bytes(&g.opacities));
+    push("scale", float, g.scales.dims().to_vec(), bytes(&g.scales));
+    push("rotation", float, g.rotations.dims().to_vec(), bytes(&g.rotations));
+    push("rgb", float, g.colors.dims().to_vec(), bytes(&g.colors));
+
+    let views = tensors.iter().map(|(name, dtype, shape, bytes)| {
+        let view = TensorView::new(*dtype, shape.clone(), bytes).expect("as many bytes as the shape says");
+        (name.as_str(), view)
+    });
+    let file = safetensors::serialize(views, None).expect("valid tensors");
+    write_whole(path, |out| io::Write::write_all(out, &file))
+        .map_err(|e| Failure::Input(format!("{}: cannot write: {e}", path.display())))
+}
+
+fn bytes<const D: usize>(tensor: &Tensor<D>) -> Vec<u8> {
+    let values: Vec<f32> = tensor.to_data().try_into_vec().expect("all tensors here are f32");
+    values.iter().flat_map(|v| v.to_le_bytes()).collect()
+}

@@ -1,0 +1,56 @@
+//! How a command fails: bad input (exit code 2) or everything else (exit code 1).
+
+use std::fmt;
+use std::process::ExitCode;
+
+use snapsnap_data::photo::PhotoError;
+use snapsnap_net::config::ConfigError;
+use snapsnap_net::weights::WeightsError;
+use snapsnap_splat::SplatError;
+
+/// A failed command.
+#[derive(Debug)]
+pub enum Failure {
+    /// The user can mend it: a path, a file's content, a config, a device.
+    Input(String),
+    /// The user cannot.
+    Internal(String),
+}
+
+impl Failure {
+    pub fn exit_code(&self) -> ExitCode {
+        match self {
+            Self::Input(_) => ExitCode::from(2),
+            Self::Internal(_) => ExitCode::FAILURE,
+        }
+    }
+}
+
+impl fmt::Display for Failure {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Input(message) | Self::Internal(message) => f.write_str(message),
+        }
+    }
+}
+
+macro_rules! input_error {
+    ($($error:ty),+) => {
+        $(impl From<$error> for Failure {
+            fn from(e: $error) -> Self {
+                Self::Input(e.to_string())
+            }
+        })+
+    };
+}
+
+input_error!(PhotoError, ConfigError, WeightsError);
+
+impl From<SplatError> for Failure {
+    fn from(e: SplatError) -> Self {
+        match e {
+            SplatError::Write { .. } => Self::Input(e.to_string()),
+            SplatError::Shape { .. } | SplatError::NotFinite { .. } => Self::Internal(e.to_string()),
+        }
+    }
+}

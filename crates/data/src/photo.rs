@@ -1,0 +1,284 @@
+//! A photograph and its mask → a square canvas with the person where the networks expect one.
+
+use std::fs::File;
+use std::io::BufReader;
+use std::path::{Path, PathBuf};
+
+use image::{DynamicImage, GrayImage, ImageDecoder, ImageReader, RgbImage};
+
+use crate::resize::{Filter, resize};
+
+/// Photographs below this side are refused: nothing of a person is left.
+const MIN_SIDE: u32 = 64;
+/// From this share of the person on, a pixel counts as the person's.
+const THRESHOLD: f32 = 0.5;
+/// Height of a training subject in pixels of a canvas of 1024 (SNAPSNAP §5.3).
+const TRAINING_HEIGHT: f32 = 739.0;
+/// Row of a training subject's middle on a canvas of 1024 (SNAPSNAP §5.3: rows 124.39 to 862.52).
+const TRAINING_CENTRE: f32 = 493.5;
+/// Height in the published demo (SNAPSNAP §11).
+const DEMO_HEIGHT: f32 = 700.0;
+/// Canvas side that the three lengths above refer to.
+const REFERENCE_SIDE: f32 = 1024.0;
+
+/// How a photograph gets onto its canvas.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Placement {
+    /// The picture already is the canvas.
+    AsIs,
+    /// The person's box is scaled to the height of the training subjects and put where they stand. Antialiased.
+    Training,
+    /// The published demo's recipe: 700 of 1024 pixels high, in the middle, sampled without antialiasing, and only
+    /// pixels that the mask holds completely are valid.
+    Demo,
+}
+
+/// One photograph on its canvas; arrays are row-major, side S.
+#[derive(Debug, Clone)]
+pub struct Canvas {
+    /// `[3, S, S]`: colours in [−1, 1] times the mask; the background is 0.
+    pub rgb: Vec<f32>,
+    /// `[S, S]`: share of the person in each pixel, 0 to 1.
+    pub mask: Vec<f32>,
+    /// `[S, S]`: whether the pixel belongs to the person.
+    pub valid: Vec<bool>,
+    /// What was done, for a person to read.
+    pub report: String,
+}
+
+/// Why a photograph is refused.
+#[derive(Debug, thiserror::Error)]
+pub enum PhotoError {
+    /// Missing or unreadable file.
+    #[error("{path}: cannot read: {source}")]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// Not an image of a known format, or a damaged one.
+    #[error("{path}: not a readable image: {source}")]
+    Decode {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: image::ImageError,
+    },
+    /// An image that cannot be used.
+    #[error("{path}: {message}")]
+    Unsuitable {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong and what to do.
+        message: String,
+    },
+}
+
+/// Loads a photograph and puts it on a canvas of `side` pixels. The person is given by the `mask` file (white: person)
+/// or, without one, by the picture's alpha channel.
+///
+/// # Errors
+/// [`PhotoError`]: unreadable files, a mask of another size, an empty mask, no mask at all, a picture below 64 pixels
+/// or of a single colour, or, with [`Placement::AsIs`], of another size than the canvas.
+pub fn load(path: &Path, mask: Option<&Path>, side: usize, placement: Placement) -> Result<Canvas, PhotoError> {
+    let picture = decode(path)?;
+    let refuse = |message: String| PhotoError::Unsuitable { path: path.to_owned(), message };
+    let (width, height) = (picture.width(), picture.height());
+    if placement == Placement::AsIs {
+        if (width as usize, height as usize) != (side, side) {
+            return Err(refuse(format!("is {width}×{height}, --as-is wants the canvas itself, {side}×{side}")));
+        }
+    } else if width.min(height) < MIN_SIDE {
+        return Err(refuse(format!("is {width}×{height}; both sides must have at least {MIN_SIDE} pixels")));
+    }
+    let (mask, mask_path) = match mask {
+        Some(mask_path) => {
+            let mask = decode(mask_path)?.into_luma8();
+            if mask.dimensions() != (width, height) {
+                let message = format!(
+                    "the mask is {}×{}, its picture {} is {width}×{height}",
+                    mask.width(),
+                    mask.height(),
+                    path.display()
+                );
+                return Err(PhotoError::Unsuitable { path: mask_path.to_owned(), message });
+            }
+            (mask, mask_path)
+        }
+        None => (alpha(&picture).map_err(refuse)?, path),
+    };
+    let rgb = picture.into_rgb8();
+    let Some(person) = Box::around(&mask) else {
+        let message = "the mask is empty: no pixel belongs to the person".into();
+        return Err(PhotoError::Unsuitable { path: mask_path.to_owned(), message });
+    };
+    if is_single_colour(&rgb, &mask) {
+        return Err(refuse("the person is of a single colour: this is no photograph".into()));
+    }
+    let source = format!("{width}×{height}, person's box {}×{} at ({}, {})", person.width, person.height, person.x, person.y);
+    Ok(match placement {
+        Placement::AsIs => on_canvas(&rgb, &mask, side, source + ", used as it is"),
+        Placement::Training => placed(&rgb, &mask, person, side, &source),
+        Placement::Demo => placed_as_demo(&rgb, &mask, person, side, &source),
+    })
+}
+
+/// Reads an image and turns it as its EXIF orientation says.
+fn decode(path: &Path) -> Result<DynamicImage, PhotoError> {
+    let file = File::open(path).map_err(|source| PhotoError::Read { path: path.to_owned(), source })?;
+    let failed = |source| match source {
+        image::ImageError::IoError(source) if source.kind() == std::io::ErrorKind::IsADirectory => {
+            PhotoError::Read { path: path.to_owned(), source }
+        }
+        source => PhotoError::Decode { path: path.to_owned(), source },
+    };
+    let reader = ImageReader::new(BufReader::new(file))
+        .with_guessed_format()
+        .map_err(|source| PhotoError::Read { path: path.to_owned(), source })?;
+    let mut decoder = reader.into_decoder().map_err(failed)?;
+    let orientation = decoder.orientation().map_err(failed)?;
+    let mut picture = DynamicImage::from_decoder(decoder).map_err(failed)?;
+    picture.apply_orientation(orientation);
+    Ok(picture)
+}
+
+/// The alpha channel as a mask.
+fn alpha(picture: &DynamicImage) -> Result<GrayImage, String> {
+    if !picture.color().has_alpha() {
+        return Err("has no alpha channel: cut the person out, or give masks with --masks FRONT_MASK BACK_MASK".into());
+    }
+    let rgba = picture.to_rgba8();
+    let mask = GrayImage::from_fn(rgba.width(), rgba.height(), |x, y| image::Luma([rgba.get_pixel(x, y)[3]]));
+    if mask.pixels().all(|p| p[0] == u8::MAX) {
+        let message = "is opaque everywhere, so its alpha channel does not show the person: cut the person out, or \
+                       give masks with --masks FRONT_MASK BACK_MASK";
+        return Err(message.into());
+    }
+    Ok(mask)
+}
+
+fn is_single_colour(rgb: &RgbImage, mask: &GrayImage) -> bool {
+    let mut inside = rgb.pixels().zip(mask.pixels()).filter(|(_, m)| m[0] > 0).map(|(p, _)| p);
+    let first = inside.next();
+    inside.all(|p| Some(p) == first)
+}
+
+/// The tight box of the pixels that the mask touches.
+#[derive(Debug, Clone, Copy)]
+struct Box {
+    x: u32,
+    y: u32,
+    width: u32,
+    height: u32,
+}
+
+impl Box {
+    fn around(mask: &GrayImage) -> Option<Self> {
+        let set = mask.enumerate_pixels().filter(|(_, _, p)| p[0] > 0);
+        let bounds = set.fold(None, |bounds, (x, y, _)| {
+            let (x0, y0, x1, y1) = bounds.unwrap_or((x, y, x, y));
+            Some((x0.min(x), y0.min(y), x1.max(x), y1.max(y)))
+        });
+        bounds.map(|(x0, y0, x1, y1)| Self { x: x0, y: y0, width: x1 - x0 + 1, height: y1 - y0 + 1 })
+    }
+}
+
+/// The picture without any change of size (SNAPSNAP §5.7).
+fn on_canvas(rgb: &RgbImage, mask: &GrayImage, side: usize, report: String) -> Canvas {
+    let area = side * side;
+    let mask: Vec<f32> = mask.pixels().map(|p| unit(p[0])).collect();
+    let mut values = vec![0.0; 3 * area];
+    for (i, pixel) in rgb.pixels().enumerate() {
+        for c in 0..3 {
+            values[c * area + i] = (2.0 * unit(pixel[c]) - 1.0) * mask[i];
+        }
+    }
+    let valid = mask.iter().map(|m| *m >= THRESHOLD).collect();
+    Canvas { rgb: values, mask, valid, report }
+}
+
+/// The person's box at the size and place of the training subjects.
+fn placed(rgb: &RgbImage, mask: &GrayImage, person: Box, side: usize, source: &str) -> Canvas {
+    let canvas = side as f32;
+    let by_height = TRAINING_HEIGHT / REFERENCE_SIDE * canvas / person.height as f32;
+    // Somebody with outstretched arms may be wider than high.
+    let scale = by_height.min(canvas / person.width as f32);
+    let size = |length: u32| ((length as f32 * scale).round() as usize).clamp(1, side);
+    let (width, height) = (size(person.width), size(person.height));
+    let left = (side - width) / 2;
+    let centre = TRAINING_CENTRE / REFERENCE_SIDE * canvas;
+    let top = ((centre - height as f32 / 2.0).round().max(0.0) as usize).min(side - height);
+
+    // Colours travel multiplied by the mask, so that what lies behind the person never bleeds in.
+    let premultiplied = crop_planes(rgb, mask, person, |color, m| unit(color) * unit(m));
+    let planes = premultiplied.map(|plane| {
+        resize(&plane, [person.height as usize, person.width as usize], [height, width], Filter::Lanczos3)
+    });
+    let [r, g, b, m] = &planes;
+    let area = side * side;
+    let (mut values, mut on_canvas) = (vec![0.0; 3 * area], vec![0.0; area]);
+    for y in 0..height {
+        for x in 0..width {
+            let (from, to) = (y * width + x, (top + y) * side + left + x);
+            // Lanczos overshoots at edges.
+            let share = m[from].clamp(0.0, 1.0);
+            on_canvas[to] = share;
+            for (c, plane) in [r, g, b].into_iter().enumerate() {
+                values[c * area + to] = 2.0 * plane[from].clamp(0.0, share) - share;
+            }
+        }
+    }
+    let valid = on_canvas.iter().map(|m| *m >= THRESHOLD).collect();
+    let limited = if scale < by_height { " (limited by the width)" } else { "" };
+    let report = format!("{source}, scaled by {scale:.4}{limited} to {width}×{height} at ({left}, {top}) of {side}×{side}");
+    Canvas { rgb: values, mask: on_canvas, valid, report }
+}
+
+/// The published demo's recipe with its quirks: the box loses its last row and column, sampling is plain bilinear,
+/// colours are not multiplied by the mask but cut at ½, and only pixels with a full mask are valid.
+fn placed_as_demo(rgb: &RgbImage, mask: &GrayImage, person: Box, side: usize, source: &str) -> Canvas {
+    let person = Box { width: (person.width - 1).max(1), height: (person.height - 1).max(1), ..person };
+    let height = (DEMO_HEIGHT / REFERENCE_SIDE * side as f32).round() as usize;
+    let scaled = person.width as usize * height / person.height as usize;
+    let width = (scaled / 2 * 2).clamp(2, side);
+    let (left, top) = ((side - width) / 2, (side - height) / 2);
+    let from = [person.height as usize, person.width as usize];
+    let [r, g, b, m] = crop_planes(rgb, mask, person, |color, _| unit(color))
+        .map(|plane| resize(&plane, from, [height, width], Filter::Bilinear));
+    let area = side * side;
+    let (mut values, mut on_canvas) = (vec![0.0; 3 * area], vec![0.0; area]);
+    for y in 0..height {
+        for x in 0..width {
+            let (from, to) = (y * width + x, (top + y) * side + left + x);
+            on_canvas[to] = m[from];
+            if m[from] >= THRESHOLD {
+                for (c, plane) in [&r, &g, &b].into_iter().enumerate() {
+                    values[c * area + to] = 2.0 * plane[from] - 1.0;
+                }
+            }
+        }
+    }
+    let valid = on_canvas.iter().map(|m| *m >= 1.0).collect();
+    let report = format!("{source}, sampled to {width}×{height} at ({left}, {top}) of {side}×{side} as in the demo");
+    Canvas { rgb: values, mask: on_canvas, valid, report }
+}
+
+/// Red, green, blue (through `color`, which also gets the mask's value) and mask of the person's box.
+fn crop_planes(rgb: &RgbImage, mask: &GrayImage, person: Box, color: impl Fn(u8, u8) -> f32) -> [Vec<f32>; 4] {
+    let mut planes: [Vec<f32>; 4] = Default::default();
+    for y in person.y..person.y + person.height {
+        for x in person.x..person.x + person.width {
+            let m = mask.get_pixel(x, y)[0];
+            for (c, plane) in planes.iter_mut().take(3).enumerate() {
+                plane.push(color(rgb.get_pixel(x, y)[c], m));
+            }
+            planes[3].push(unit(m));
+        }
+    }
+    planes
+}
+
+fn unit(value: u8) -> f32 {
+    f32::from(value) / 255.0
+}

@@ -1,0 +1,343 @@
+//! The whole inference: two photographs on their canvas → Gaussians (SNAPSNAP §0).
+
+use std::time::{Duration, Instant};
+
+use burn::tensor::{Device, Int, Tensor, TensorData};
+use snapsnap_splat::{Camera, Gaussians, RigidTransform};
+
+use crate::config::{Config, Downsample, RotationFrame, Upsample, WorldFrame};
+use crate::crop::Window;
+use crate::network::{PointMap, PointPredictor, View, activate};
+use crate::regressor::{Attributes, FEATURES, Regressor, Statistics};
+use crate::resample::shrink;
+use crate::sides::{Cloud, EMPTY, is_finite};
+use crate::weights::{WeightFile, WeightsError};
+
+/// One photograph on its square canvas of `resolution` pixels; row-major, side S.
+#[derive(Debug, Clone)]
+pub struct Photograph {
+    /// `[3, S, S]`: colours in [−1, 1] times the mask; the background is 0.
+    pub rgb: Vec<f32>,
+    /// `[S, S]`: share of the person in each pixel, 0 to 1.
+    pub mask: Vec<f32>,
+    /// `[S, S]`: whether the pixel becomes a Gaussian.
+    pub valid: Vec<bool>,
+}
+
+/// Gaussians in the front camera's frame, and everything on the way to them.
+pub struct Reconstruction {
+    /// Views that were computed, in the order of the Gaussians.
+    pub views: Vec<View>,
+    /// Points in metres and confidences on the canvas, one view per batch entry.
+    pub maps: PointMap,
+    /// Per view, `[S, S]`: whether the pixel became a Gaussian.
+    pub valid: Vec<Vec<bool>>,
+    /// Pseudo images of the right and the left `[3, S, S]` in [−1, 1], −1 where there is no point.
+    pub side_images: Vec<Vec<f32>>,
+    /// The Gaussians, view after view, row-major; means and rotations as the regressor gave them.
+    pub gaussians: Gaussians,
+    /// What ran, what was left out and why.
+    pub plan: Vec<String>,
+    /// Time per module, the device synchronised before and after each.
+    pub times: Vec<(&'static str, Duration)>,
+}
+
+impl Reconstruction {
+    /// The Gaussians in the world frame that the config asks for.
+    pub fn in_world(&self, config: &Config) -> Gaussians {
+        let gaussians = self.gaussians.clone();
+        let camera_to_world = match config.world_frame() {
+            WorldFrame::Upright => {
+                Camera::orbit_at_yaw_degrees(0.0, config.network.resolution as u32).world_to_camera.inverse()
+            }
+            // The published demo: a determinant of −1, so the person comes out mirrored (SNAPSNAP §11).
+            WorldFrame::Mirrored => RigidTransform {
+                rotation: glam::DMat3::from_diagonal(glam::DVec3::NEG_ONE),
+                translation: glam::DVec3::new(0.0, 0.0, 2.0),
+            },
+        };
+        match config.rotation_frame() {
+            RotationFrame::Camera => gaussians.transformed(&camera_to_world),
+            RotationFrame::World => gaussians.with_means_transformed(&camera_to_world),
+        }
+    }
+}
+
+/// The networks of one weight file on one device.
+pub struct Reconstructor {
+    config: Config,
+    predictor: PointPredictor,
+    regressors: Vec<Regressor>,
+    device: Device,
+}
+
+impl Reconstructor {
+    /// Loads both parts of `weights`; `config` may change modes but not sizes.
+    ///
+    /// # Errors
+    /// [`WeightsError`] if a part is absent or a value is not finite.
+    pub fn load(weights: &WeightFile, device: &Device) -> Result<Self, WeightsError> {
+        Ok(Self {
+            config: weights.config.clone(),
+            predictor: weights.point_predictor(device)?,
+            regressors: weights.regressors(device)?,
+            device: device.clone(),
+        })
+    }
+
+    /// The config in force.
+    pub fn config(&self) -> &Config {
+        &self.config
+    }
+
+    /// Turns a front and a back photograph into Gaussians; `stage` hears the name of each module before it runs.
+    ///
+    /// # Panics
+    /// If a photograph's arrays do not have the canvas size.
+    pub fn reconstruct(&self, front: &Photograph, back: &Photograph, stage: &dyn Fn(&'static str)) -> Reconstruction {
+        let side = self.config.network.resolution;
+        for (photo, name) in [(front, "front"), (back, "back")] {
+            let sizes = [photo.rgb.len(), photo.mask.len(), photo.valid.len()];
+            assert_eq!(sizes, [3 * side * side, side * side, side * side], "{name} photograph on a canvas of {side}²");
+        }
+        let mut run = Run { model: self, stage, side, plan: Vec::new(), times: Vec::new() };
+        run.reconstruct([front, back])
+    }
+}
+
+struct Run<'a> {
+    model: &'a Reconstructor,
+    stage: &'a dyn Fn(&'static str),
+    side: usize,
+    plan: Vec<String>,
+    times: Vec<(&'static str, Duration)>,
+}
+
+impl Run<'_> {
+    fn timed<T>(&mut self, name: &'static str, work: impl FnOnce(&mut Self) -> T) -> T {
+        (self.stage)(name);
+        let start = Instant::now();
+        let result = work(self);
+        self.model.device.sync().expect("the device finishes its work");
+        self.times.push((name, start.elapsed()));
+        result
+    }
+
+    fn reconstruct(&mut self, photos: [&Photograph; 2]) -> Reconstruction {
+        let maps = self.point_maps(photos);
+        let views: Vec<View> = self.model.predictor.dust3r.views().to_vec();
+        let points = host::<4>(maps.points.clone());
+        let conf = host::<3>(maps.conf.clone());
+        let area = self.side * self.side;
+        let point = |view: usize, i: usize| -> [f32; 3] {
+            let at = 3 * (view * area + i);
+            [points[at], points[at + 1], points[at + 2]]
+        };
+        let threshold = self.model.config.network.conf_threshold;
+        let mut lost = 0;
+        let mut valid: Vec<Vec<bool>> = Vec::new();
+        for view in 0..views.len() {
+            let chosen = |i: usize| match photos.get(view) {
+                Some(photo) => photo.valid[i],
+                None => conf[view * area + i] > threshold,
+            };
+            let mut mask: Vec<bool> = (0..area).map(chosen).collect();
+            for (i, keep) in mask.iter_mut().enumerate() {
+                if *keep && !is_finite(&point(view, i)) {
+                    (*keep, lost) = (false, lost + 1);
+                }
+            }
+            valid.push(mask);
+        }
+        for (view, mask) in views.iter().zip(&valid) {
+            let n = count(mask);
+            self.plan.push(format!("{}: {n} of {area} pixels become Gaussians", view.name()));
+        }
+        if lost > 0 {
+            self.plan.push(format!("{lost} pixels left out: their points are not finite"));
+        }
+
+        let side_images = if views.len() > 2 {
+            self.timed("side colours", |_| {
+                let cloud = Cloud::new((0..2).flat_map(|view| {
+                    let (photo, mask) = (photos[view], &valid[view]);
+                    (0..area).filter(|&i| mask[i]).map(move |i| (point(view, i), pixel(&photo.rgb, area, i)))
+                }));
+                (2..4).map(|view| paint(cloud.as_ref(), |i| point(view, i), &valid[view])).collect()
+            })
+        } else {
+            self.plan.push("side colours left out: the network has no side heads".into());
+            Vec::new()
+        };
+
+        let gaussians = self.gaussians(photos, &side_images, &maps, &valid);
+        let (plan, times) = (std::mem::take(&mut self.plan), std::mem::take(&mut self.times));
+        Reconstruction { views, maps, valid, side_images, gaussians, plan, times }
+    }
+
+    /// Point maps of all views on the canvas `[views, S, S]`, in metres.
+    fn point_maps(&mut self, photos: [&Photograph; 2]) -> PointMap {
+        let (config, net) = (&self.model.config, &self.model.predictor);
+        let (side, factor) = (self.side, config.upsample_factor());
+        let upload = |values: &[f32], channels: usize| {
+            Tensor::<4>::from_data(TensorData::new(values.to_vec(), [1, channels, side, side]), &self.model.device)
+        };
+        let images = Tensor::cat(photos.map(|p| upload(&p.rgb, 3)).to_vec(), 0);
+        let images = shrink(images, factor, config.downsample());
+        let grid = net.dust3r.grid([config.network.net_resolution; 2]);
+        self.plan.push(format!(
+            "point predictor: 2 photographs of {0}×{0} ({1} of {side}×{side}), {2} tokens each",
+            config.network.net_resolution,
+            match config.downsample() {
+                _ if factor == 1 => "as they are instead",
+                Downsample::Area => "area means",
+                Downsample::Nearest => "every first pixel",
+            },
+            grid[0] * grid[1],
+        ));
+        let tokens = self.timed("encoder", |_| net.dust3r.encode(images));
+        let (front, back) = (tokens.clone().narrow(0, 0, 1), tokens.narrow(0, 1, 1));
+        let tokens = self.timed("decoders", |_| net.dust3r.decode(front, back, grid));
+        let heads = if net.dust3r.views().len() == 4 { "heads (4)" } else { "heads (2)" };
+        let maps = self.timed(heads, |_| {
+            let map = |&view: &View| activate(net.dust3r.raw_points(view, &tokens, grid), config.network.conf_mode);
+            net.dust3r.views().iter().map(map).collect::<Vec<_>>()
+        });
+        self.timed("up-sampling", |_| {
+            let method = config.upsample();
+            let on_canvas = net.dust3r.views().iter().zip(maps).map(|(&view, map)| {
+                let weights = (method == Upsample::MaskAware && factor > 1).then(|| match photos.get(view as usize) {
+                    Some(photo) => shrink(upload(&photo.mask, 1), factor, Downsample::Area),
+                    None => {
+                        let body = map.conf.clone().greater_elem(config.network.conf_threshold);
+                        body.float().unsqueeze_dim(1)
+                    }
+                });
+                net.to_canvas(map, factor, method, weights)
+            });
+            let (points, conf): (Vec<_>, Vec<_>) = on_canvas.map(|m| (m.points, m.conf)).unzip();
+            PointMap { points: Tensor::cat(points, 0), conf: Tensor::cat(conf, 0) }
+        })
+    }
+
+    /// Gaussians of all valid pixels, view after view.
+    fn gaussians(
+        &mut self,
+        photos: [&Photograph; 2],
+        side_images: &[Vec<f32>],
+        maps: &PointMap,
+        valid: &[Vec<bool>],
+    ) -> Gaussians {
+        let images: Vec<&[f32]> =
+            photos.iter().map(|p| p.rgb.as_slice()).chain(side_images.iter().map(Vec::as_slice)).collect();
+        let mut parts = Vec::new();
+        for (pair, what) in ["regressor (front, back)", "regressor (sides)"].into_iter().enumerate() {
+            let pair_views = 2 * pair..(2 * pair + 2).min(images.len());
+            if pair_views.is_empty() {
+                continue;
+            }
+            let Some(person) = Window::around(valid[pair_views.clone()].iter().map(Vec::as_slice), self.side) else {
+                self.plan.push(format!("{what} left out: no pixel of these views is valid"));
+                continue;
+            };
+            let window = if self.model.config.crop() { person.padded(self.side) } else { Window::whole(self.side) };
+            self.plan.push(format!("{what}: {window} of {0}×{0} pixels each, person's box {person}", self.side));
+            let network = &self.model.regressors[pair.min(self.model.regressors.len() - 1)];
+            let part = self.timed(what, |run| {
+                let views = pair_views.clone().map(|v| (images[v], maps.points.clone().narrow(0, v, 1)));
+                run.regress(network, views, &valid[pair_views], window)
+            });
+            parts.extend(part);
+        }
+        self.timed("activations", |run| run.assemble(parts))
+    }
+
+    /// Features `[n, 14]` and points `[n, 3]` of one pair's valid pixels, view by view.
+    fn regress<'a>(
+        &self,
+        network: &Regressor,
+        views: impl Iterator<Item = (&'a [f32], Tensor<4>)>,
+        valid: &[Vec<bool>],
+        window: Window,
+    ) -> Vec<[Tensor<2>; 2]> {
+        let device = &self.model.device;
+        let (h, w) = (window.rows.len(), window.columns.len());
+        let (colors, points): (Vec<_>, Vec<_>) = views
+            .map(|(image, points)| {
+                let crop = TensorData::new(window.crop(image, 3, self.side), [1, 3, h, w]);
+                let points = points.narrow(1, window.rows.start, h).narrow(2, window.columns.start, w);
+                (Tensor::<4>::from_data(crop, device), points)
+            })
+            .unzip();
+        let points = Tensor::cat(points, 0);
+        let input = Tensor::cat(vec![Tensor::cat(colors, 0), points.clone().permute([0, 3, 1, 2])], 1);
+        let features = network.forward(input, &mut Statistics::measured());
+        let mut parts = Vec::new();
+        for (view, mask) in valid.iter().enumerate() {
+            let rows = window.indices(mask, self.side);
+            if rows.is_empty() {
+                continue;
+            }
+            let n = rows.len();
+            let rows = Tensor::<1, Int>::from_data(TensorData::new(rows, [n]), device);
+            let pick = |x: Tensor<4>, c: usize| x.narrow(0, view, 1).reshape([h * w, c]).select(0, rows.clone());
+            parts.push([pick(features.clone(), FEATURES), pick(points.clone(), 3)]);
+        }
+        parts
+    }
+
+    /// Activates and joins the parts; Gaussians that are not finite are left out and counted.
+    fn assemble(&mut self, parts: Vec<[Tensor<2>; 2]>) -> Gaussians {
+        let device = &self.model.device;
+        if parts.is_empty() {
+            let empty = |c: usize| Tensor::<2>::zeros([0, c], device);
+            return Gaussians::new(empty(3), empty(4), empty(3), Tensor::zeros([0], device), empty(3))
+                .expect("consistent by construction");
+        }
+        let (features, points): (Vec<_>, Vec<_>) = parts.into_iter().map(|[f, p]| (f, p)).unzip();
+        let (features, points) = (Tensor::cat(features, 0), Tensor::cat(points, 0));
+        let n = points.dims()[0];
+        // A network that overflows shows it in its raw features; one pass on the host finds the rows.
+        let raw = host::<2>(features.clone());
+        let keep: Vec<i64> =
+            (0..n).filter(|i| raw[i * FEATURES..(i + 1) * FEATURES].iter().all(|v| v.is_finite())).map(|i| i as i64).collect();
+        let (features, points) = if keep.len() < n {
+            self.plan.push(format!("{} Gaussians left out: their attributes are not finite", n - keep.len()));
+            let rows = Tensor::<1, Int>::from_data(TensorData::new(keep.clone(), [keep.len()]), device);
+            (features.select(0, rows.clone()), points.select(0, rows))
+        } else {
+            (features, points)
+        };
+        let a = Attributes::from_features(features);
+        self.plan.push(format!("{} Gaussians", keep.len()));
+        Gaussians::new(points + a.offset, a.rotation, a.scale, a.opacity.squeeze_dim(1), a.color * 0.5 + 0.5)
+            .expect("consistent by construction")
+    }
+}
+
+/// A side's pseudo image `[3, S, S]`.
+fn paint(cloud: Option<&Cloud>, point: impl Fn(usize) -> [f32; 3], valid: &[bool]) -> Vec<f32> {
+    let area = valid.len();
+    let mut image = vec![EMPTY; 3 * area];
+    let Some(cloud) = cloud else { return image };
+    let pixels: Vec<usize> = (0..area).filter(|&i| valid[i]).collect();
+    let points: Vec<[f32; 3]> = pixels.iter().map(|&i| point(i)).collect();
+    for (&i, color) in pixels.iter().zip(cloud.nearest_colors(&points)) {
+        for (channel, value) in color.into_iter().enumerate() {
+            image[channel * area + i] = value;
+        }
+    }
+    image
+}
+
+fn pixel(rgb: &[f32], area: usize, i: usize) -> [f32; 3] {
+    [rgb[i], rgb[area + i], rgb[2 * area + i]]
+}
+
+fn count(mask: &[bool]) -> usize {
+    mask.iter().filter(|v| **v).count()
+}
+
+fn host<const D: usize>(x: Tensor<D>) -> Vec<f32> {
+    x.into_data().try_into_vec().expect("all tensors here are f32")
+}
