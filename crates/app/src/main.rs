@@ -9,7 +9,6 @@ mod weights;
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
-use failure::Failure;
 
 /// Large tensors are allocated and freed on every operation; mimalloc keeps their pages, the system allocator returns
 /// them to the kernel and faults them in again.

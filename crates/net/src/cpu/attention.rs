@@ -5,6 +5,7 @@ use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
 
 use super::math::exp;
+use super::multiply;
 
 /// Queries per block: 128 × 1024 scores of 4 bytes fit a second-level cache.
 const BLOCK: usize = 128;
@@ -128,38 +129,5 @@ impl WithSimd for Softmax<'_> {
             sum
         };
         self.scores.chunks_exact_mut(self.keys).map(row).collect()
-    }
-}
-
-/// out `[m, n]` row-major = lhs `[m, k]` · rhs `[k, n]`; strides are (column, row) in elements.
-fn multiply([m, n, k]: [usize; 3], lhs: &[f32], ls: [usize; 2], rhs: &[f32], rs: [usize; 2], out: &mut [f32]) {
-    let last = |rows: usize, columns: usize, [column, row]: [usize; 2]| (rows - 1) * row + (columns - 1) * column;
-    assert!(m > 0 && n > 0 && k > 0);
-    assert!(last(m, k, ls) < lhs.len() && last(k, n, rs) < rhs.len() && m * n <= out.len());
-    let s = |x: usize| x as isize;
-    // SAFETY: the assertions above bound every element that the strides reach; `out` is borrowed mutably.
-    #[allow(unsafe_code, reason = "the matrix product of the gemm crate takes pointers")]
-    unsafe {
-        gemm::gemm(
-            m,
-            n,
-            k,
-            out.as_mut_ptr(),
-            1,
-            s(n),
-            false,
-            lhs.as_ptr(),
-            s(ls[0]),
-            s(ls[1]),
-            rhs.as_ptr(),
-            s(rs[0]),
-            s(rs[1]),
-            0.0,
-            1.0,
-            false,
-            false,
-            false,
-            gemm::Parallelism::None,
-        );
     }
 }

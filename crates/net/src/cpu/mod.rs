@@ -1,18 +1,23 @@
-//! Faster CPU roads for inference on Burn's `flex` device: attention with rotary positions, GELU, and the regressor's
-//! thin convolutions. They compute what the plain tensor code beside each call computes, which remains the road for
+//! Faster CPU roads for inference on Burn's `flex` device: attention with rotary positions, GELU, bilinear
+//! resizing, the heads' wide convolutions and the regressor's thin ones. They compute what the plain tensor code beside each call computes, which remains the road for
 //! every other device and for training; tests hold the two together.
 
 mod attention;
+mod bilinear;
 mod conv;
 mod gelu;
 mod math;
 mod unet;
+mod winograd;
 
 use burn::nn::Linear;
+use burn::nn::conv::Conv2d;
+use burn::tensor::activation::relu;
 use burn::tensor::{Device, Tensor, TensorData};
 
 use crate::network::Rope;
 
+pub(crate) use bilinear::Tap;
 pub(crate) use unet::regress;
 
 /// Width of the UNet that the thin-convolution kernel is written for.
@@ -45,7 +50,63 @@ pub(crate) fn linear_gelu(layer: &Linear, x: Tensor<3>) -> Tensor<3> {
     Tensor::from_data(TensorData::new(values, [b, n, width]), &device)
 }
 
+/// Bilinear resize of `[B, C, H, W]` with the given taps per axis.
+pub(crate) fn bilinear(x: Tensor<4>, down: &[Tap], across: &[Tap]) -> Tensor<4> {
+    let ([b, c, h, w], device) = (x.dims(), x.device());
+    let out = bilinear::resize(&host(x), [h, w], down, across);
+    Tensor::from_data(TensorData::new(out, [b, c, down.len(), across.len()]), &device)
+}
+
+/// A 3×3 convolution with stride 1 and padding 1 of `[B, C, H, W]`, or of its positive part; on `flex` with even sides
+/// by Winograd's method, elsewhere by Burn's.
+pub(crate) fn conv3x3(conv: &Conv2d, x: Tensor<4>, rectified: bool) -> Tensor<4> {
+    let [batch, inputs, height, width] = x.dims();
+    if !is_fast(&x) || height % 2 != 0 || width % 2 != 0 {
+        return conv.forward(if rectified { relu(x) } else { x });
+    }
+    let device = x.device();
+    let weight = conv.weight.val();
+    let outputs = weight.dims()[0];
+    let bias = conv.bias.as_ref().map_or_else(|| vec![0.0; outputs], |bias| host(bias.val()));
+    let shape = winograd::Shape { batch, inputs, outputs, height, width };
+    let out = winograd::conv3x3(shape, &host(x), &host(weight), &bias, rectified);
+    Tensor::from_data(TensorData::new(out, [batch, outputs, height, width]), &device)
+}
+
 /// Values on the host; without a copy if the tensor is contiguous and nobody else holds it.
 fn host<const D: usize>(x: Tensor<D>) -> Vec<f32> {
     x.into_data().try_into_vec().expect("all tensors here are f32")
+}
+
+/// out `[m, n]` row-major = lhs `[m, k]` · rhs `[k, n]`; strides are (column, row) in elements.
+fn multiply([m, n, k]: [usize; 3], lhs: &[f32], ls: [usize; 2], rhs: &[f32], rs: [usize; 2], out: &mut [f32]) {
+    let last = |rows: usize, columns: usize, [column, row]: [usize; 2]| (rows - 1) * row + (columns - 1) * column;
+    assert!(m > 0 && n > 0 && k > 0);
+    assert!(last(m, k, ls) < lhs.len() && last(k, n, rs) < rhs.len() && m * n <= out.len());
+    let s = |x: usize| x as isize;
+    // SAFETY: the assertions above bound every element that the strides reach; `out` is borrowed mutably.
+    #[allow(unsafe_code, reason = "the matrix product of the gemm crate takes pointers")]
+    unsafe {
+        gemm::gemm(
+            m,
+            n,
+            k,
+            out.as_mut_ptr(),
+            1,
+            s(n),
+            false,
+            lhs.as_ptr(),
+            s(ls[0]),
+            s(ls[1]),
+            rhs.as_ptr(),
+            s(rs[0]),
+            s(rs[1]),
+            0.0,
+            1.0,
+            false,
+            false,
+            false,
+            gemm::Parallelism::None,
+        );
+    }
 }
