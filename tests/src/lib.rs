@@ -1,18 +1,32 @@
 //! Helpers of the parity and end-to-end tests: devices, fixtures, error norms.
 
 use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::sync::OnceLock;
 
-use burn::tensor::{Device, DeviceKind, Tensor, TensorData};
+use burn::tensor::{Device, DeviceKind, DeviceType, Tensor, TensorData};
 use safetensors::SafeTensors;
 
-/// The device that tests run on: `SNAPSNAP_TEST_DEVICE` = `flex` (default), `ndarray` or `wgpu`.
+/// Name of the device that tests run on: `SNAPSNAP_TEST_DEVICE` = `flex` (default), `ndarray` or `wgpu`.
+pub fn device_name() -> String {
+    std::env::var("SNAPSNAP_TEST_DEVICE").unwrap_or_else(|_| "flex".into())
+}
+
+/// The device that tests run on, or `None`, said aloud, where the machine has no adapter for `wgpu`.
 ///
-/// `wgpu` takes whatever adapter the machine has, a software one included; `cargo xtask test` runs the suite on each.
-pub fn device() -> Device {
-    match std::env::var("SNAPSNAP_TEST_DEVICE").as_deref().unwrap_or("flex") {
-        "flex" => Device::flex(),
-        "ndarray" => ndarray(),
-        "wgpu" => Device::wgpu(DeviceKind::DefaultDevice),
+/// `wgpu` takes whatever adapter there is, a software one included; `cargo xtask test` runs the suite on each device.
+pub fn device() -> Option<Device> {
+    match device_name().as_str() {
+        "flex" => Some(Device::flex()),
+        "ndarray" => Some(ndarray()),
+        "wgpu" => {
+            let found = std::panic::catch_unwind(|| !Device::enumerate(DeviceType::Wgpu).into_vec().is_empty());
+            if !found.unwrap_or(false) {
+                println!("SKIPPED: no wgpu adapter on this machine");
+                return None;
+            }
+            Some(Device::wgpu(DeviceKind::DefaultDevice))
+        }
         other => panic!("SNAPSNAP_TEST_DEVICE = {other}: allowed are flex, ndarray, wgpu"),
     }
 }
@@ -20,6 +34,45 @@ pub fn device() -> Device {
 #[allow(deprecated, reason = "still the second CPU implementation that results are checked on")]
 fn ndarray() -> Device {
     Device::ndarray()
+}
+
+/// The program as a user starts it, built if it is not.
+pub fn snapsnap() -> Command {
+    static PROGRAM: OnceLock<PathBuf> = OnceLock::new();
+    let program = PROGRAM.get_or_init(|| {
+        let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
+        let arguments = ["build", "--quiet", "--release", "--package", "snapsnap", "--bin", "snapsnap"];
+        let status = Command::new(cargo).args(arguments).status().expect("cargo starts");
+        assert!(status.success(), "the program builds");
+        let test = std::env::current_exe().expect("the test's own path");
+        let release = test.ancestors().nth(2).expect("target/release/deps/test");
+        release.join("snapsnap").with_extension(std::env::consts::EXE_EXTENSION)
+    });
+    let mut command = Command::new(program);
+    command.env_remove("RUST_BACKTRACE");
+    command
+}
+
+/// Runs a command that must succeed; returns what it printed.
+pub fn succeed(command: &mut Command) -> String {
+    let output = command.output().expect("the program starts");
+    let (out, err) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+    assert!(output.status.success(), "{command:?}: {}\n{out}\n{err}", output.status);
+    out.into_owned()
+}
+
+/// Runs a command that must refuse its input with exit code 2; returns its message.
+pub fn refused(command: &mut Command) -> String {
+    let output = command.output().expect("the program starts");
+    let err = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(2), "{command:?}: {err}");
+    assert!(!err.contains("panicked"), "{err}");
+    err
+}
+
+/// Test data of this repository.
+pub fn data(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("data").join(name)
 }
 
 /// Path of a reference fixture, or `None`, said aloud, where the fixtures are not beside the checkout.
@@ -95,7 +148,12 @@ pub fn values<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
 }
 
 /// Asserts a relative L2 error and prints it, so that a log shows what was reached.
-pub fn assert_close<const D: usize>(what: &str, got: Tensor<D>, expected: &(Vec<usize>, Vec<f32>), bound: f64) {
+pub fn assert_close<const D: usize>(
+    what: &str,
+    got: Tensor<D>,
+    expected: &(Vec<usize>, Vec<f32>),
+    bound: f64,
+) {
     assert_eq!(got.dims().as_slice(), expected.0.as_slice(), "{what}: shape");
     let error = relative_error(&values(got), &expected.1);
     println!("{what}: relative error {error:.2e}");

@@ -1,1 +1,76 @@
-fn main(){}
+//! `cargo xtask …`: tests, lints, and the program's own commands, on the one release build.
+
+use std::env;
+use std::process::{Command, ExitCode};
+
+const USAGE: &str = "usage: cargo xtask test [FILTER…] | lint | COMMAND…
+
+  test     the whole suite on flex, then the numerical tests on ndarray and wgpu
+  lint     formatting, clippy and documentation, warnings refused
+  COMMAND  a snapsnap command with its arguments, for example: cargo xtask reconstruct --help";
+
+/// Devices beside the default one that the numerical tests run on.
+const FURTHER_DEVICES: [&str; 2] = ["ndarray", "wgpu"];
+
+fn main() -> ExitCode {
+    let arguments: Vec<String> = env::args().skip(1).collect();
+    let rest = arguments.get(1..).unwrap_or_default();
+    let done = match arguments.first().map(String::as_str) {
+        None | Some("help" | "--help" | "-h") => {
+            println!("{USAGE}");
+            return ExitCode::SUCCESS;
+        }
+        Some("test") => test(rest),
+        Some("lint") => lint(),
+        Some(_) => {
+            let mut run = cargo(&["run", "--quiet", "--release", "--package", "snapsnap", "--"]);
+            let code = run.args(&arguments).status().ok().and_then(|status| status.code());
+            return ExitCode::from(code.and_then(|code| u8::try_from(code).ok()).unwrap_or(1));
+        }
+    };
+    if done { ExitCode::SUCCESS } else { ExitCode::FAILURE }
+}
+
+fn test(filter: &[String]) -> bool {
+    let all = ["test", "--release", "--workspace", "--no-fail-fast"];
+    let numerical =
+        ["test", "--release", "--workspace", "--no-fail-fast", "--test", "networks", "--test", "pipeline"];
+    let filter = || ["--"].into_iter().chain(filter.iter().map(String::as_str));
+    // Output is shown so that skipped tests are seen with their reasons.
+    let show = ["--show-output"];
+    let mut passed = succeeds("flex", cargo(&all).args(filter()).args(show));
+    for device in FURTHER_DEVICES {
+        let mut command = cargo(&numerical);
+        passed &= succeeds(device, command.args(filter()).args(show).env("SNAPSNAP_TEST_DEVICE", device));
+    }
+    passed
+}
+
+fn lint() -> bool {
+    let clippy = ["clippy", "--release", "--workspace", "--all-targets", "--", "-D", "warnings"];
+    let doc = ["doc", "--release", "--workspace", "--no-deps", "--document-private-items"];
+    succeeds("format", &mut cargo(&["fmt", "--all", "--check"]))
+        & succeeds("clippy", &mut cargo(&clippy))
+        & succeeds("documentation", cargo(&doc).env("RUSTDOCFLAGS", "-D warnings"))
+}
+
+fn cargo(arguments: &[&str]) -> Command {
+    let mut command = Command::new(env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
+    command.args(arguments);
+    command
+}
+
+fn succeeds(name: &str, command: &mut Command) -> bool {
+    println!("== {name}");
+    match command.status() {
+        Ok(status) if status.success() => true,
+        Ok(status) => {
+            eprintln!("{name}: {status}");
+            false
+        }
+        Err(e) => {
+            eprintln!("{name}: cannot run cargo: {e}");
+            false
+        }
+    }
+}

@@ -81,13 +81,20 @@ pub enum PhotoError {
 /// # Errors
 /// [`PhotoError`]: unreadable files, a mask of another size, an empty mask, no mask at all, a picture below 64 pixels
 /// or of a single colour, or, with [`Placement::AsIs`], of another size than the canvas.
-pub fn load(path: &Path, mask: Option<&Path>, side: usize, placement: Placement) -> Result<Canvas, PhotoError> {
+pub fn load(
+    path: &Path,
+    mask: Option<&Path>,
+    side: usize,
+    placement: Placement,
+) -> Result<Canvas, PhotoError> {
     let picture = decode(path)?;
     let refuse = |message: String| PhotoError::Unsuitable { path: path.to_owned(), message };
     let (width, height) = (picture.width(), picture.height());
     if placement == Placement::AsIs {
         if (width as usize, height as usize) != (side, side) {
-            return Err(refuse(format!("is {width}×{height}, --as-is wants the canvas itself, {side}×{side}")));
+            return Err(refuse(format!(
+                "is {width}×{height}, --as-is wants the canvas itself, {side}×{side}"
+            )));
         }
     } else if width.min(height) < MIN_SIDE {
         return Err(refuse(format!("is {width}×{height}; both sides must have at least {MIN_SIDE} pixels")));
@@ -116,7 +123,10 @@ pub fn load(path: &Path, mask: Option<&Path>, side: usize, placement: Placement)
     if is_single_colour(&rgb, &mask) {
         return Err(refuse("the person is of a single colour: this is no photograph".into()));
     }
-    let source = format!("{width}×{height}, person's box {}×{} at ({}, {})", person.width, person.height, person.x, person.y);
+    let source = format!(
+        "{width}×{height}, person's box {}×{} at ({}, {})",
+        person.width, person.height, person.x, person.y
+    );
     Ok(match placement {
         Placement::AsIs => on_canvas(&rgb, &mask, side, source + ", used as it is"),
         Placement::Training => placed(&rgb, &mask, person, side, &source),
@@ -146,7 +156,10 @@ fn decode(path: &Path) -> Result<DynamicImage, PhotoError> {
 /// The alpha channel as a mask.
 fn alpha(picture: &DynamicImage) -> Result<GrayImage, String> {
     if !picture.color().has_alpha() {
-        return Err("has no alpha channel: cut the person out, or give masks with --masks FRONT_MASK BACK_MASK".into());
+        return Err(
+            "has no alpha channel: cut the person out, or give masks with --masks FRONT_MASK BACK_MASK"
+                .into(),
+        );
     }
     let rgba = picture.to_rgba8();
     let mask = GrayImage::from_fn(rgba.width(), rgba.height(), |x, y| image::Luma([rgba.get_pixel(x, y)[3]]));
@@ -231,7 +244,9 @@ fn placed(rgb: &RgbImage, mask: &GrayImage, person: Box, side: usize, source: &s
     }
     let valid = on_canvas.iter().map(|m| *m >= THRESHOLD).collect();
     let limited = if scale < by_height { " (limited by the width)" } else { "" };
-    let report = format!("{source}, scaled by {scale:.4}{limited} to {width}×{height} at ({left}, {top}) of {side}×{side}");
+    let report = format!(
+        "{source}, scaled by {scale:.4}{limited} to {width}×{height} at ({left}, {top}) of {side}×{side}"
+    );
     Canvas { rgb: values, mask: on_canvas, valid, report }
 }
 
@@ -260,12 +275,18 @@ fn placed_as_demo(rgb: &RgbImage, mask: &GrayImage, person: Box, side: usize, so
         }
     }
     let valid = on_canvas.iter().map(|m| *m >= 1.0).collect();
-    let report = format!("{source}, sampled to {width}×{height} at ({left}, {top}) of {side}×{side} as in the demo");
+    let report =
+        format!("{source}, sampled to {width}×{height} at ({left}, {top}) of {side}×{side} as in the demo");
     Canvas { rgb: values, mask: on_canvas, valid, report }
 }
 
 /// Red, green, blue (through `color`, which also gets the mask's value) and mask of the person's box.
-fn crop_planes(rgb: &RgbImage, mask: &GrayImage, person: Box, color: impl Fn(u8, u8) -> f32) -> [Vec<f32>; 4] {
+fn crop_planes(
+    rgb: &RgbImage,
+    mask: &GrayImage,
+    person: Box,
+    color: impl Fn(u8, u8) -> f32,
+) -> [Vec<f32>; 4] {
     let mut planes: [Vec<f32>; 4] = Default::default();
     for y in person.y..person.y + person.height {
         for x in person.x..person.x + person.width {

@@ -17,8 +17,9 @@ pub fn resize(values: &[f32], from: [usize; 2], to: [usize; 2], filter: Filter) 
     match filter {
         Filter::Bilinear => bilinear(values, from, to),
         Filter::Lanczos3 => {
-            let plane = ImageBuffer::<Luma<f32>, _>::from_raw(from[1] as u32, from[0] as u32, values.to_vec())
-                .expect("as many values as pixels");
+            let plane =
+                ImageBuffer::<Luma<f32>, _>::from_raw(from[1] as u32, from[0] as u32, values.to_vec())
+                    .expect("as many values as pixels");
             imageops::resize(&plane, to[1] as u32, to[0] as u32, FilterType::Lanczos3).into_raw()
         }
     }

@@ -262,7 +262,8 @@ impl Config {
     /// # Errors
     /// [`ConfigError`], naming origin, key and allowed values.
     pub fn from_toml(text: &str, origin: &str, overrides: &[String]) -> Result<Self, ConfigError> {
-        let syntax = |origin: &str, message: String| ConfigError::Syntax { origin: origin.to_owned(), message };
+        let syntax =
+            |origin: &str, message: String| ConfigError::Syntax { origin: origin.to_owned(), message };
         // Straight from the text first: only this way do messages carry line numbers.
         let config: Self = toml::from_str(text).map_err(|e| syntax(origin, e.to_string()))?;
         if overrides.is_empty() {
@@ -270,11 +271,13 @@ impl Config {
         }
         let mut table: toml::Table = toml::from_str(text).map_err(|e| syntax(origin, e.to_string()))?;
         for assignment in overrides {
-            assign(&mut table, assignment).map_err(|message| syntax(&format!("--set {assignment}"), message))?;
+            assign(&mut table, assignment)
+                .map_err(|message| syntax(&format!("--set {assignment}"), message))?;
         }
         let origin = format!("{origin} with --set {}", overrides.join(" --set "));
-        let config: Self =
-            toml::Value::Table(table).try_into().map_err(|e: toml::de::Error| syntax(&origin, e.to_string()))?;
+        let config: Self = toml::Value::Table(table)
+            .try_into()
+            .map_err(|e: toml::de::Error| syntax(&origin, e.to_string()))?;
         config.checked(&origin)
     }
 
@@ -293,12 +296,20 @@ impl Config {
 
     /// Interpolation of points and confidences.
     pub fn upsample(&self) -> Upsample {
-        self.network.upsample.unwrap_or(if self.mode.compat { Upsample::Bilinear } else { Upsample::MaskAware })
+        self.network.upsample.unwrap_or(if self.mode.compat {
+            Upsample::Bilinear
+        } else {
+            Upsample::MaskAware
+        })
     }
 
     /// Frame of the predicted quaternions.
     pub fn rotation_frame(&self) -> RotationFrame {
-        self.mode.rotation_frame.unwrap_or(if self.mode.compat { RotationFrame::World } else { RotationFrame::Camera })
+        self.mode.rotation_frame.unwrap_or(if self.mode.compat {
+            RotationFrame::World
+        } else {
+            RotationFrame::Camera
+        })
     }
 
     /// Reduction of the canvas to the network's input.
@@ -308,7 +319,11 @@ impl Config {
 
     /// World frame of the PLY.
     pub fn world_frame(&self) -> WorldFrame {
-        self.mode.world_frame.unwrap_or(if self.mode.compat { WorldFrame::Mirrored } else { WorldFrame::Upright })
+        self.mode.world_frame.unwrap_or(if self.mode.compat {
+            WorldFrame::Mirrored
+        } else {
+            WorldFrame::Upright
+        })
     }
 
     /// Whether the regressor sees only the person's box.
@@ -370,7 +385,10 @@ impl Config {
             return Some(("network.hooks", format!("{hook} is beyond the last layer {}", n.dec_depth)));
         }
         if n.head == HeadKind::Dpt && n.patch != 16 {
-            return Some(("network.patch", format!("is {}; the DPT head is built for patches of 16 pixels", n.patch)));
+            return Some((
+                "network.patch",
+                format!("is {}; the DPT head is built for patches of 16 pixels", n.patch),
+            ));
         }
         if n.net_resolution % n.patch != 0 {
             let message = format!("{} is no multiple of the patch {}", n.net_resolution, n.patch);
@@ -394,23 +412,29 @@ impl Config {
             return Some(("regressor.networks", format!("is {}, allowed: 1, 2", r.networks)));
         }
         if r.networks == 2 && !n.side_heads {
-            return Some(("regressor.networks", "is 2, but `network.side_heads = false` leaves the second unused".into()));
+            return Some((
+                "regressor.networks",
+                "is 2, but `network.side_heads = false` leaves the second unused".into(),
+            ));
         }
         if r.channels % r.groups != 0 {
-            return Some(("regressor.channels", format!("{} is no multiple of {} groups", r.channels, r.groups)));
+            return Some((
+                "regressor.channels",
+                format!("{} is no multiple of {} groups", r.channels, r.groups),
+            ));
         }
         self.contradiction()
     }
 
     fn contradiction(&self) -> Option<(&'static str, String)> {
         if !self.mode.compat {
-            return (self.rotation_frame() == RotationFrame::Camera && self.world_frame() == WorldFrame::Mirrored).then(
-                || {
+            return (self.rotation_frame() == RotationFrame::Camera
+                && self.world_frame() == WorldFrame::Mirrored)
+                .then(|| {
                     let message = "\"mirrored\" is a reflection, which no quaternion can follow: set \
                                    `mode.rotation_frame = \"world\"` or `mode.world_frame = \"upright\"`";
                     ("mode.world_frame", message.into())
-                },
-            );
+                });
         }
         let quirks = [
             ("network.upsample", self.upsample() == Upsample::Bilinear, "\"bilinear\""),
@@ -420,7 +444,10 @@ impl Config {
             ("mode.crop", !self.crop(), "false"),
         ];
         let (key, _, allowed) = quirks.into_iter().find(|(_, holds, _)| !holds)?;
-        Some((key, format!("contradicts `mode.compat = true`, which means {allowed}; leave one of the two out")))
+        Some((
+            key,
+            format!("contradicts `mode.compat = true`, which means {allowed}; leave one of the two out"),
+        ))
     }
 }
 
@@ -460,7 +487,10 @@ mod tests {
     #[test]
     fn an_unknown_key_is_named_with_its_line() {
         let message = refusal("[network]\nenc_dim = 64\nenc_dims = 3\n", &[]);
-        assert!(message.contains("x.toml") && message.contains("line 3") && message.contains("enc_dims"), "{message}");
+        assert!(
+            message.contains("x.toml") && message.contains("line 3") && message.contains("enc_dims"),
+            "{message}"
+        );
     }
 
     #[test]

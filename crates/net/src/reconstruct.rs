@@ -94,11 +94,20 @@ impl Reconstructor {
     ///
     /// # Panics
     /// If a photograph's arrays do not have the canvas size.
-    pub fn reconstruct(&self, front: &Photograph, back: &Photograph, stage: &dyn Fn(&'static str)) -> Reconstruction {
+    pub fn reconstruct(
+        &self,
+        front: &Photograph,
+        back: &Photograph,
+        stage: &dyn Fn(&'static str),
+    ) -> Reconstruction {
         let side = self.config.network.resolution;
         for (photo, name) in [(front, "front"), (back, "back")] {
             let sizes = [photo.rgb.len(), photo.mask.len(), photo.valid.len()];
-            assert_eq!(sizes, [3 * side * side, side * side, side * side], "{name} photograph on a canvas of {side}²");
+            assert_eq!(
+                sizes,
+                [3 * side * side, side * side, side * side],
+                "{name} photograph on a canvas of {side}²"
+            );
         }
         let mut run = Run { model: self, stage, side, plan: Vec::new(), times: Vec::new() };
         run.reconstruct([front, back])
@@ -180,7 +189,10 @@ impl Run<'_> {
         let (config, net) = (&self.model.config, &self.model.predictor);
         let (side, factor) = (self.side, config.upsample_factor());
         let upload = |values: &[f32], channels: usize| {
-            Tensor::<4>::from_data(TensorData::new(values.to_vec(), [1, channels, side, side]), &self.model.device)
+            Tensor::<4>::from_data(
+                TensorData::new(values.to_vec(), [1, channels, side, side]),
+                &self.model.device,
+            )
         };
         let images = Tensor::cat(photos.map(|p| upload(&p.rgb, 3)).to_vec(), 0);
         let images = shrink(images, factor, config.downsample());
@@ -200,19 +212,21 @@ impl Run<'_> {
         let tokens = self.timed("decoders", |_| net.dust3r.decode(front, back, grid));
         let heads = if net.dust3r.views().len() == 4 { "heads (4)" } else { "heads (2)" };
         let maps = self.timed(heads, |_| {
-            let map = |&view: &View| activate(net.dust3r.raw_points(view, &tokens, grid), config.network.conf_mode);
+            let map =
+                |&view: &View| activate(net.dust3r.raw_points(view, &tokens, grid), config.network.conf_mode);
             net.dust3r.views().iter().map(map).collect::<Vec<_>>()
         });
         self.timed("up-sampling", |_| {
             let method = config.upsample();
             let on_canvas = net.dust3r.views().iter().zip(maps).map(|(&view, map)| {
-                let weights = (method == Upsample::MaskAware && factor > 1).then(|| match photos.get(view as usize) {
-                    Some(photo) => shrink(upload(&photo.mask, 1), factor, Downsample::Area),
-                    None => {
-                        let body = map.conf.clone().greater_elem(config.network.conf_threshold);
-                        body.float().unsqueeze_dim(1)
-                    }
-                });
+                let weights =
+                    (method == Upsample::MaskAware && factor > 1).then(|| match photos.get(view as usize) {
+                        Some(photo) => shrink(upload(&photo.mask, 1), factor, Downsample::Area),
+                        None => {
+                            let body = map.conf.clone().greater_elem(config.network.conf_threshold);
+                            body.float().unsqueeze_dim(1)
+                        }
+                    });
                 net.to_canvas(map, factor, method, weights)
             });
             let (points, conf): (Vec<_>, Vec<_>) = on_canvas.map(|m| (m.points, m.conf)).unzip();
@@ -236,12 +250,15 @@ impl Run<'_> {
             if pair_views.is_empty() {
                 continue;
             }
-            let Some(person) = Window::around(valid[pair_views.clone()].iter().map(Vec::as_slice), self.side) else {
+            let Some(person) = Window::around(valid[pair_views.clone()].iter().map(Vec::as_slice), self.side)
+            else {
                 self.plan.push(format!("{what} left out: no pixel of these views is valid"));
                 continue;
             };
-            let window = if self.model.config.crop() { person.padded(self.side) } else { Window::whole(self.side) };
-            self.plan.push(format!("{what}: {window} of {0}×{0} pixels each, person's box {person}", self.side));
+            let window =
+                if self.model.config.crop() { person.padded(self.side) } else { Window::whole(self.side) };
+            self.plan
+                .push(format!("{what}: {window} of {0}×{0} pixels each, person's box {person}", self.side));
             let network = &self.model.regressors[pair.min(self.model.regressors.len() - 1)];
             let part = self.timed(what, |run| {
                 let views = pair_views.clone().map(|v| (images[v], maps.points.clone().narrow(0, v, 1)));
@@ -280,7 +297,8 @@ impl Run<'_> {
             }
             let n = rows.len();
             let rows = Tensor::<1, Int>::from_data(TensorData::new(rows, [n]), device);
-            let pick = |x: Tensor<4>, c: usize| x.narrow(0, view, 1).reshape([h * w, c]).select(0, rows.clone());
+            let pick =
+                |x: Tensor<4>, c: usize| x.narrow(0, view, 1).reshape([h * w, c]).select(0, rows.clone());
             parts.push([pick(features.clone(), FEATURES), pick(points.clone(), 3)]);
         }
         parts
@@ -299,8 +317,10 @@ impl Run<'_> {
         let n = points.dims()[0];
         // A network that overflows shows it in its raw features; one pass on the host finds the rows.
         let raw = host::<2>(features.clone());
-        let keep: Vec<i64> =
-            (0..n).filter(|i| raw[i * FEATURES..(i + 1) * FEATURES].iter().all(|v| v.is_finite())).map(|i| i as i64).collect();
+        let keep: Vec<i64> = (0..n)
+            .filter(|i| raw[i * FEATURES..(i + 1) * FEATURES].iter().all(|v| v.is_finite()))
+            .map(|i| i as i64)
+            .collect();
         let (features, points) = if keep.len() < n {
             self.plan.push(format!("{} Gaussians left out: their attributes are not finite", n - keep.len()));
             let rows = Tensor::<1, Int>::from_data(TensorData::new(keep.clone(), [keep.len()]), device);

@@ -56,7 +56,9 @@ pub fn shrink(x: Tensor<4>, factor: usize, method: Downsample) -> Tensor<4> {
         return x;
     }
     match method {
-        Downsample::Area => avg_pool2d(x, AvgPoolOptions::new([factor, factor]).with_stride([factor, factor])),
+        Downsample::Area => {
+            avg_pool2d(x, AvgPoolOptions::new([factor, factor]).with_stride([factor, factor]))
+        }
         Downsample::Nearest => {
             let [b, c, h, w] = x.dims();
             let (h, w) = (h / factor, w / factor);

@@ -61,7 +61,8 @@ mod tests {
     fn neighbours_are_exact() {
         let (points, queries) = (random_points(3000, 1), random_points(500, 2));
         let cloud = Cloud::new(points.iter().map(|&p| (p, p))).expect("points");
-        let distance = |a: &[f32; 3], b: &[f32; 3]| a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum::<f32>();
+        let distance =
+            |a: &[f32; 3], b: &[f32; 3]| a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum::<f32>();
         for (query, found) in queries.iter().zip(cloud.nearest_colors(&queries)) {
             let best = points.iter().map(|p| distance(p, query)).fold(f32::INFINITY, f32::min);
             assert!(distance(&found, query) <= best * (1.0 + 1e-6), "{query:?}");

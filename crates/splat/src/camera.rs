@@ -89,9 +89,8 @@ mod tests {
     fn orbit_camera_matches_the_published_check_values() {
         let camera = Camera::orbit_at_yaw_degrees(0.0, 1024);
         let RigidTransform { rotation, translation } = camera.world_to_camera;
-        let expected = DMat3::from_cols_array(&[
-            1.0, 0.0, 0.0, 0.0, -0.990268, -0.139173, 0.0, 0.139173, -0.990268,
-        ]);
+        let expected =
+            DMat3::from_cols_array(&[1.0, 0.0, 0.0, 0.0, -0.990268, -0.139173, 0.0, 0.139173, -0.990268]);
         assert!((rotation - expected).to_cols_array().iter().all(|d| d.abs() < 1e-6), "{rotation}");
         assert!((translation - DVec3::new(0.0, 0.841728, 2.118297)).length() < 2e-6, "{translation}");
 

@@ -104,7 +104,8 @@ mod tests {
         };
         let q = row(&[rotation.w, rotation.x, rotation.y, rotation.z]);
         let ones = Tensor::<2>::ones([1, 3], device);
-        Gaussians::new(row(&mean.to_array()), q, ones.clone(), Tensor::ones([1], device), ones).expect("shapes")
+        Gaussians::new(row(&mean.to_array()), q, ones.clone(), Tensor::ones([1], device), ones)
+            .expect("shapes")
     }
 
     #[test]
@@ -127,8 +128,13 @@ mod tests {
     fn mismatched_rows_are_refused_by_name() {
         let device = Device::flex();
         let three = |n: usize| Tensor::<2>::zeros([n, 3], &device);
-        let result =
-            Gaussians::new(three(2), Tensor::zeros([2, 4], &device), three(1), Tensor::zeros([2], &device), three(2));
+        let result = Gaussians::new(
+            three(2),
+            Tensor::zeros([2, 4], &device),
+            three(1),
+            Tensor::zeros([2], &device),
+            three(2),
+        );
         assert!(matches!(result, Err(SplatError::Shape { field: "scales", .. })), "{result:?}");
     }
 }

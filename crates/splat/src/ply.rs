@@ -11,8 +11,8 @@ use crate::{Gaussians, SplatError};
 /// Properties of one vertex, in INRIA's order. No `f_rest_*`: every known viewer reads a missing band as zero, and 45
 /// zero floats would triple the file (SNAPSNAP §13.3, fix 17).
 pub const PROPERTIES: [&str; 17] = [
-    "x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2", "rot_0",
-    "rot_1", "rot_2", "rot_3",
+    "x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1",
+    "scale_2", "rot_0", "rot_1", "rot_2", "rot_3",
 ];
 
 /// Value of the constant spherical harmonic, 1 / (2√π).
@@ -50,7 +50,8 @@ pub fn write(gaussians: &Gaussians, path: &Path) -> Result<(), SplatError> {
         vertex[13..17].copy_from_slice(&rotations[4 * i..4 * i + 4]);
         vertex
     });
-    save(path, gaussians.len(), vertices).map_err(|source| SplatError::Write { path: path.to_owned(), source })
+    save(path, gaussians.len(), vertices)
+        .map_err(|source| SplatError::Write { path: path.to_owned(), source })
 }
 
 fn save(path: &Path, count: usize, values: impl Iterator<Item = f32>) -> io::Result<()> {
@@ -69,7 +70,8 @@ fn save(path: &Path, count: usize, values: impl Iterator<Item = f32>) -> io::Res
 
 fn rows(tensor: &Tensor<2>, field: &'static str) -> Result<Vec<f32>, SplatError> {
     let columns = tensor.dims()[1];
-    let values: Vec<f32> = tensor.to_data().convert::<f32>().try_into_vec().expect("converted to f32 on this very line");
+    let values: Vec<f32> =
+        tensor.to_data().convert::<f32>().try_into_vec().expect("converted to f32 on this very line");
     match values.iter().position(|v| !v.is_finite()) {
         Some(at) => Err(SplatError::NotFinite { field, index: at / columns }),
         None => Ok(values),

@@ -48,7 +48,12 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
         for note in &report.notes {
             println!("{note}");
         }
-        println!("{}: {} tensors, {} parameters", arguments.output.display(), report.tensors, report.parameters);
+        println!(
+            "{}: {} tensors, {} parameters",
+            arguments.output.display(),
+            report.tensors,
+            report.parameters
+        );
     }
     Ok(())
 }

@@ -112,7 +112,8 @@ impl Conv<'_> {
         let (height, width) = (rows.div_ceil(self.stride), columns.div_ceil(self.stride));
         let mut data = vec![0.0; height * width * CHANNELS];
         let band = |(i, out): (usize, &mut [f32])| self.band(i * BAND, [rows, columns], width, out);
-        let moments: Vec<Moments> = data.par_chunks_mut(BAND * width * CHANNELS).enumerate().map(band).collect();
+        let moments: Vec<Moments> =
+            data.par_chunks_mut(BAND * width * CHANNELS).enumerate().map(band).collect();
         // Joined in the order of the rows, whatever thread they ran on.
         let moments = moments.iter().fold(Moments::default(), Moments::join);
         Plane { height, width, data, moments }
@@ -261,7 +262,11 @@ fn row<S: Simd, const VECTORS: usize, const PIXELS: usize, const STRIDE: usize>(
 
 /// Output pixels x … x + PIXELS.
 #[inline(always)]
-fn pixels<S: Simd, const VECTORS: usize, const PIXELS: usize, const STRIDE: usize>(simd: S, row: &mut Row, x: usize) {
+fn pixels<S: Simd, const VECTORS: usize, const PIXELS: usize, const STRIDE: usize>(
+    simd: S,
+    row: &mut Row,
+    x: usize,
+) {
     let vectors = |values: &[f32]| -> [S::f32s; VECTORS] {
         let (vectors, _) = S::as_simd_f32s(values);
         std::array::from_fn(|v| vectors[v])

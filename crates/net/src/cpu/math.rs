@@ -60,7 +60,8 @@ mod tests {
         let phi = |x: f64| {
             let density = |u: f64| (-0.5 * u * u).exp() / (2.0 * std::f64::consts::PI).sqrt();
             let (n, h) = (20_000, x / 20_000.0);
-            let inner: f64 = (1..n).map(|i| density(f64::from(i) * h) * if i % 2 == 1 { 4.0 } else { 2.0 }).sum();
+            let inner: f64 =
+                (1..n).map(|i| density(f64::from(i) * h) * if i % 2 == 1 { 4.0 } else { 2.0 }).sum();
             0.5 + h / 3.0 * (density(0.0) + inner + density(x))
         };
         for i in -80..=80 {

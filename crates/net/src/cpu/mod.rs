@@ -31,7 +31,13 @@ pub(crate) fn is_fast<const D: usize>(x: &Tensor<D>) -> bool {
 
 /// softmax(rope(q) · rope(k)ᵀ / √head_dim) · v for `q` `[B, N, C]`, `k` and `v` `[B, M, C]` → `[B, N, C]`; both sides
 /// share one grid, hence one table.
-pub(crate) fn rotary_attention(q: Tensor<3>, k: Tensor<3>, v: Tensor<3>, rope: &Rope, heads: usize) -> Tensor<3> {
+pub(crate) fn rotary_attention(
+    q: Tensor<3>,
+    k: Tensor<3>,
+    v: Tensor<3>,
+    rope: &Rope,
+    heads: usize,
+) -> Tensor<3> {
     let ([b, n, c], m, device) = (q.dims(), k.dims()[1], q.device());
     let (cos, sin) = (host(rope.cos.clone()), host(rope.sin.clone()));
     let shape = attention::Shape { batch: b, queries: n, keys: m, heads, head_dim: c / heads };
@@ -79,8 +85,16 @@ fn host<const D: usize>(x: Tensor<D>) -> Vec<f32> {
 }
 
 /// out `[m, n]` row-major = lhs `[m, k]` · rhs `[k, n]`; strides are (column, row) in elements.
-fn multiply([m, n, k]: [usize; 3], lhs: &[f32], ls: [usize; 2], rhs: &[f32], rs: [usize; 2], out: &mut [f32]) {
-    let last = |rows: usize, columns: usize, [column, row]: [usize; 2]| (rows - 1) * row + (columns - 1) * column;
+fn multiply(
+    [m, n, k]: [usize; 3],
+    lhs: &[f32],
+    ls: [usize; 2],
+    rhs: &[f32],
+    rs: [usize; 2],
+    out: &mut [f32],
+) {
+    let last =
+        |rows: usize, columns: usize, [column, row]: [usize; 2]| (rows - 1) * row + (columns - 1) * column;
     assert!(m > 0 && n > 0 && k > 0);
     assert!(last(m, k, ls) < lhs.len() && last(k, n, rs) < rhs.len() && m * n <= out.len());
     let s = |x: usize| x as isize;

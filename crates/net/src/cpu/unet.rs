@@ -38,7 +38,8 @@ pub fn regress(regressor: &Regressor, input: Tensor<4>, statistics: &mut Statist
 fn interleave(planar: &[f32], channels: usize, [height, width]: [usize; 2]) -> Plane {
     let mut data = vec![0.0; height * width * CHANNELS];
     for c in 0..channels {
-        for (pixel, value) in data.as_chunks_mut::<CHANNELS>().0.iter_mut().zip(&planar[c * height * width..]) {
+        for (pixel, value) in data.as_chunks_mut::<CHANNELS>().0.iter_mut().zip(&planar[c * height * width..])
+        {
             pixel[c] = *value;
         }
     }
@@ -52,7 +53,8 @@ fn arrange(conv: &Conv2d) -> (Vec<f32>, [f32; CHANNELS]) {
     let values = host(weight);
     let taps = kh * kw;
     let mut arranged = vec![0.0; inputs.div_ceil(CHANNELS) * taps * CHANNELS * CHANNELS];
-    for (o, i, tap) in (0..out).flat_map(|o| (0..inputs).flat_map(move |i| (0..taps).map(move |t| (o, i, t)))) {
+    for (o, i, tap) in (0..out).flat_map(|o| (0..inputs).flat_map(move |i| (0..taps).map(move |t| (o, i, t))))
+    {
         let at = ((i / CHANNELS * taps + tap) * CHANNELS + i % CHANNELS) * CHANNELS + o;
         arranged[at] = values[(o * inputs + i) * taps + tap];
     }
@@ -113,12 +115,16 @@ impl Pass {
 
     fn residual(&mut self, block: &ResBlock, inputs: &[&Plane]) -> Plane {
         let affines = self.normalise(&block.norm1, inputs);
-        let sources: Vec<_> =
-            inputs.iter().zip(affines).map(|(plane, affine)| Source { plane, affine: Some(affine) }).collect();
+        let sources: Vec<_> = inputs
+            .iter()
+            .zip(affines)
+            .map(|(plane, affine)| Source { plane, affine: Some(affine) })
+            .collect();
         let (weights, bias) = arrange(&block.conv1);
         let (stride, enlarge) = (1, false);
         let shortcut = Shortcut::None;
-        let hidden = Conv { sources: &sources, weights: &weights, bias, stride, enlarge, shortcut, scale: 1.0 }.run();
+        let hidden =
+            Conv { sources: &sources, weights: &weights, bias, stride, enlarge, shortcut, scale: 1.0 }.run();
 
         let affine = self.normalise(&block.norm2, &[&hidden])[0];
         let (weights, mut bias) = arrange(&block.conv2);
@@ -149,7 +155,8 @@ impl Pass {
                 let group = |g: usize| {
                     let members = || (g * per_group..(g + 1) * per_group).map(channel);
                     let mean = members().map(|(mean, _)| mean).sum::<f64>() / per_group as f64;
-                    let squares: f64 = members().map(|(m, squares)| squares + count * (m - mean).powi(2)).sum();
+                    let squares: f64 =
+                        members().map(|(m, squares)| squares + count * (m - mean).powi(2)).sum();
                     let variance = squares / (count * per_group as f64);
                     (mean as f32, (variance + norm.epsilon).sqrt().recip() as f32)
                 };
@@ -180,7 +187,8 @@ impl Pass {
 fn plain(conv: &Conv2d, plane: &Plane, stride: usize, enlarge: bool) -> Plane {
     let (weights, bias) = arrange(conv);
     let sources = [Source { plane, affine: None }];
-    Conv { sources: &sources, weights: &weights, bias, stride, enlarge, shortcut: Shortcut::None, scale: 1.0 }.run()
+    Conv { sources: &sources, weights: &weights, bias, stride, enlarge, shortcut: Shortcut::None, scale: 1.0 }
+        .run()
 }
 
 /// A 3×3 convolution followed by a 1×1 convolution, as one: nothing lies between the two.

@@ -188,17 +188,21 @@ impl WithSimd for Output<'_> {
         let (columns, tiles) = (block.columns, block.rows * block.columns);
         for (channel, out) in out.chunks_exact_mut(4 * tiles).enumerate() {
             for (tile_row, out) in out.chunks_exact_mut(4 * columns).enumerate() {
-                let line = |point: usize| &m[(point * s.outputs + channel) * tiles + tile_row * columns..][..columns];
+                let line = |point: usize| {
+                    &m[(point * s.outputs + channel) * tiles + tile_row * columns..][..columns]
+                };
                 let points: [&[f32]; POINTS] = std::array::from_fn(line);
                 let (top, bottom) = out.split_at_mut(2 * columns);
                 let (top, bottom) = (top.as_chunks_mut::<2>().0, bottom.as_chunks_mut::<2>().0);
                 for t in 0..columns {
                     let row = |j: usize| {
-                        let [a, b, c, d] = [points[j][t], points[4 + j][t], points[8 + j][t], points[12 + j][t]];
+                        let [a, b, c, d] =
+                            [points[j][t], points[4 + j][t], points[8 + j][t], points[12 + j][t]];
                         [a + b + c, b - c - d]
                     };
                     let (a, b, c, d) = (row(0), row(1), row(2), row(3));
-                    let across = |k: usize| [a[k] + b[k] + c[k] + bias[channel], b[k] - c[k] - d[k] + bias[channel]];
+                    let across =
+                        |k: usize| [a[k] + b[k] + c[k] + bias[channel], b[k] - c[k] - d[k] + bias[channel]];
                     top[t] = across(0);
                     bottom[t] = across(1);
                 }

@@ -32,7 +32,8 @@ impl Mlp {
     }
 
     fn forward(&self, x: Tensor<3>) -> Tensor<3> {
-        let hidden = if cpu::is_fast(&x) { cpu::linear_gelu(&self.fc1, x) } else { gelu(self.fc1.forward(x)) };
+        let hidden =
+            if cpu::is_fast(&x) { cpu::linear_gelu(&self.fc1, x) } else { gelu(self.fc1.forward(x)) };
         self.fc2.forward(hidden)
     }
 }

@@ -35,7 +35,8 @@ struct Enlarge {
 
 impl Enlarge {
     fn new(from: usize, to: usize, stride: usize, device: &Device) -> Self {
-        let at_1 = ConvTranspose2dConfig::new([to, to], [stride, stride]).with_stride([stride, stride]).init(device);
+        let at_1 =
+            ConvTranspose2dConfig::new([to, to], [stride, stride]).with_stride([stride, stride]).init(device);
         Self { at_0: conv1x1(from, to, device), at_1 }
     }
 
@@ -185,9 +186,13 @@ impl DptHead {
         let (branches, s) = (&self.act_postprocess, &self.scratch);
         let l3 = branches.at_3.at_1.forward(branches.at_3.at_0.forward(m3));
         let path = s.refinenet4.forward(cpu::conv3x3(&s.layer4_rn, l3, false), None);
-        let path = s.refinenet3.forward(path, Some(cpu::conv3x3(&s.layer3_rn, branches.at_2.at_0.forward(m2), false)));
-        let path = s.refinenet2.forward(path, Some(cpu::conv3x3(&s.layer2_rn, branches.at_1.forward(m1), false)));
-        let path = s.refinenet1.forward(path, Some(cpu::conv3x3(&s.layer1_rn, branches.at_0.forward(m0), false)));
+        let path = s
+            .refinenet3
+            .forward(path, Some(cpu::conv3x3(&s.layer3_rn, branches.at_2.at_0.forward(m2), false)));
+        let path =
+            s.refinenet2.forward(path, Some(cpu::conv3x3(&s.layer2_rn, branches.at_1.forward(m1), false)));
+        let path =
+            s.refinenet1.forward(path, Some(cpu::conv3x3(&s.layer1_rn, branches.at_0.forward(m0), false)));
         let x = cpu::conv3x3(&self.head.at_0, path, false);
         let [_, _, h, w] = x.dims();
         let x = cpu::conv3x3(&self.head.at_2, bilinear(x, [2 * h, 2 * w], true), false);

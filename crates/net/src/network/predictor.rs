@@ -67,7 +67,13 @@ impl PointPredictor {
     /// Point map of one view on the canvas: enlarged `factor` times and multiplied by δ (in this order, SNAPSNAP §4).
     ///
     /// `weights` `[B, 1, H, W]` ≥ 0 are the body's share of each network pixel, for `mask-aware` interpolation.
-    pub fn to_canvas(&self, map: PointMap, factor: usize, method: Upsample, weights: Option<Tensor<4>>) -> PointMap {
+    pub fn to_canvas(
+        &self,
+        map: PointMap,
+        factor: usize,
+        method: Upsample,
+        weights: Option<Tensor<4>>,
+    ) -> PointMap {
         let [b, h, w, _] = map.points.dims();
         let size = [h * factor, w * factor];
         let up = |x: Tensor<4>| if factor == 1 { x } else { bilinear(x, size, false) };

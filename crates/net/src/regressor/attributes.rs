@@ -70,7 +70,8 @@ mod tests {
     #[test]
     fn quaternions_are_unit_even_when_huge_tiny_or_zero() {
         let device = Device::flex();
-        let rows = Tensor::from_data([[3.0, 0.0, -4.0, 0.0], [1e30, 1e30, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]], &device);
+        let rows =
+            Tensor::from_data([[3.0, 0.0, -4.0, 0.0], [1e30, 1e30, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]], &device);
         let got = values(unit(rows));
         let half = std::f32::consts::FRAC_1_SQRT_2;
         let expected = [0.6, 0.0, -0.8, 0.0, half, half, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0];

@@ -11,8 +11,8 @@ use burn::tensor::{Device, Tensor};
 
 pub use attributes::Attributes;
 pub use statistics::Statistics;
-pub use unet::{RECEPTIVE_RADIUS, UNet};
 pub(crate) use unet::{BRANCH_SCALE, ResBlock};
+pub use unet::{RECEPTIVE_RADIUS, UNet};
 
 use crate::config::RegressorConfig;
 use crate::cpu;

@@ -27,7 +27,8 @@ pub(super) fn write<'a, T: std::borrow::Borrow<TensorSpec> + 'a>(
     mut values: impl FnMut(&'a TensorSpec) -> Result<Vec<f32>, WeightsError>,
 ) -> Result<(), WeightsError> {
     let infos = tensors.iter().map(|t| (t.borrow().name.clone(), t.borrow().shape.clone()));
-    let metadata = HashMap::from([("format".into(), "pt".into()), (CONFIG_KEY.into(), config.to_toml())]);
+    // One entry only: the header lists metadata in no fixed order, and the same seed must give the same bytes.
+    let metadata = HashMap::from([(CONFIG_KEY.into(), config.to_toml())]);
     write_tensors(path, metadata, infos.collect(), |i| values(tensors[i].borrow()))
 }
 
@@ -96,7 +97,8 @@ impl WeightFile {
         };
         let mut problems = Vec::new();
         let parts = parts_of(source.tensors().keys());
-        let expected: Vec<_> = schema::tensors(&config).into_iter().filter(|t| parts.contains(t.part)).collect();
+        let expected: Vec<_> =
+            schema::tensors(&config).into_iter().filter(|t| parts.contains(t.part)).collect();
         for spec in &expected {
             match source.tensors().get(&spec.name) {
                 None => problems.push(format!("missing: {} {:?}", spec.name, spec.shape)),
@@ -127,7 +129,9 @@ impl WeightFile {
             return Ok(());
         }
         let message = match part {
-            Part::PointPredictor => "has no point predictor (`dust3r.*`): import a stage-1 checkpoint as well",
+            Part::PointPredictor => {
+                "has no point predictor (`dust3r.*`): import a stage-1 checkpoint as well"
+            }
             Part::Regressor => {
                 "has no Gaussian regressor (`pred_unet.*`, `gs_conv.*`): import a stage-2 checkpoint as well"
             }
@@ -139,7 +143,10 @@ impl WeightFile {
 /// The config in a file's metadata.
 fn stored_config(source: &Source) -> Result<Config, WeightsError> {
     let text = source.metadata.get(CONFIG_KEY).ok_or_else(|| {
-        WeightsError::format(source.path(), "has no config in its metadata; give one with --config, or import it first")
+        WeightsError::format(
+            source.path(),
+            "has no config in its metadata; give one with --config, or import it first",
+        )
     })?;
     Ok(Config::from_toml(text, &format!("{} (metadata {CONFIG_KEY})", source.path().display()), &[])?)
 }
@@ -163,7 +170,8 @@ impl Parts {
 pub(super) fn parts_of<'a>(keys: impl Iterator<Item = &'a String>) -> Parts {
     let mut parts = Parts { point_predictor: false, regressor: false };
     for key in keys {
-        let regressor = ["pred_unet.", "gs_conv."].iter().any(|p| key.trim_start_matches(schema::SIDE).starts_with(p));
+        let regressor =
+            ["pred_unet.", "gs_conv."].iter().any(|p| key.trim_start_matches(schema::SIDE).starts_with(p));
         parts.regressor |= regressor;
         parts.point_predictor |= !regressor;
     }
@@ -182,7 +190,8 @@ pub fn export(from: &Path, to: &Path) -> Result<usize, WeightsError> {
         entries.push((name.clone(), name));
         entries.extend(import::alias_of(name).map(|alias| (alias, name.as_str())));
     }
-    let shapes = entries.iter().map(|(alias, name)| (alias.clone(), file.source.tensors()[*name].shape.clone()));
+    let shapes =
+        entries.iter().map(|(alias, name)| (alias.clone(), file.source.tensors()[*name].shape.clone()));
     let metadata = HashMap::from([("format".to_owned(), "pt".to_owned())]);
     write_tensors(to, metadata, shapes.collect(), |i| file.source.read_f32(entries[i].1))?;
     Ok(entries.len())

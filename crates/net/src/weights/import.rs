@@ -3,11 +3,11 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use super::WeightsError;
 use super::file::{parts_of, write};
 use super::init::{SideHeads, draw};
 use super::schema::{self, DUST3R, SCALE, SIDE, TensorSpec};
 use super::source::{Entry, Source, is_readable};
-use super::WeightsError;
 use crate::config::Config;
 
 /// Choices an import leaves to the user.
@@ -65,7 +65,12 @@ fn canonical(key: &str) -> String {
 /// A line for a tensor of the wrong shape or type.
 pub(super) fn mismatch(spec: &TensorSpec, entry: &Entry, path: &Path) -> Option<String> {
     if !is_readable(&entry.dtype) {
-        return Some(format!("wrong type: {} is {} in {}, must be f32, f16 or bf16", spec.name, entry.dtype, path.display()));
+        return Some(format!(
+            "wrong type: {} is {} in {}, must be f32, f16 or bf16",
+            spec.name,
+            entry.dtype,
+            path.display()
+        ));
     }
     (entry.shape != spec.shape).then(|| {
         let (name, file, found) = (&spec.name, path.display(), &entry.shape);
@@ -96,7 +101,9 @@ pub fn import(
     let specs: Vec<_> = schema::tensors(config).into_iter().filter(|t| parts.contains(t.part)).collect();
     let released = found.contains_key(SCALE);
     let missing_heads: Vec<usize> = (1..=4)
-        .filter(|k| !released && !found.keys().any(|key| key.starts_with(&format!("{DUST3R}downstream_head{k}."))))
+        .filter(|k| {
+            !released && !found.keys().any(|key| key.starts_with(&format!("{DUST3R}downstream_head{k}.")))
+        })
         .collect();
 
     let mut plan: Vec<(&TensorSpec, Origin)> = Vec::new();
@@ -106,10 +113,12 @@ pub fn import(
             plan.push((spec, Origin::File(source, key)));
             continue;
         }
-        let head = missing_heads.iter().find(|k| spec.name.starts_with(&format!("{DUST3R}downstream_head{k}.")));
+        let head =
+            missing_heads.iter().find(|k| spec.name.starts_with(&format!("{DUST3R}downstream_head{k}.")));
         match (head, options.side_heads) {
             (Some(&k), SideHeads::Copy) if k > 2 => {
-                let twin = spec.name.replace(&format!("downstream_head{k}."), &format!("downstream_head{}.", k - 2));
+                let twin =
+                    spec.name.replace(&format!("downstream_head{k}."), &format!("downstream_head{}.", k - 2));
                 match plan.iter().find(|(s, _)| s.name == twin) {
                     Some((s, Origin::File(source, key))) if s.shape == spec.shape => {
                         let origin = Origin::File(source, key.clone());
@@ -124,7 +133,9 @@ pub fn import(
             }
             (Some(_), _) => plan.push((spec, Origin::Seed)),
             (None, _) if spec.name == SCALE => {
-                report.notes.push(format!("δ (`scale`) is in no file: {} from the config", config.network.delta));
+                report
+                    .notes
+                    .push(format!("δ (`scale`) is in no file: {} from the config", config.network.delta));
                 plan.push((spec, Origin::Seed));
             }
             (None, _) => problems.push(format!("missing: {} {:?}", spec.name, spec.shape)),
@@ -164,7 +175,10 @@ pub fn import(
         }
         // The last tensor decides: an error here discards the temporary file.
         if next.len() == 0 && !broken.is_empty() {
-            return Err(WeightsError::Tensors { origin: origin.clone(), problems: std::mem::take(&mut broken) });
+            return Err(WeightsError::Tensors {
+                origin: origin.clone(),
+                problems: std::mem::take(&mut broken),
+            });
         }
         Ok(values)
     });

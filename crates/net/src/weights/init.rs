@@ -37,7 +37,8 @@ pub(super) fn draw(spec: &TensorSpec, seed: u64) -> Vec<f32> {
 
 /// 64-bit FNV-1a hash: a fixed, published function, unlike the standard library's hasher.
 fn fnv1a(text: &str) -> u64 {
-    text.bytes().fold(0xcbf2_9ce4_8422_2325, |hash, byte| (hash ^ u64::from(byte)).wrapping_mul(0x100_0000_01b3))
+    text.bytes()
+        .fold(0xcbf2_9ce4_8422_2325, |hash, byte| (hash ^ u64::from(byte)).wrapping_mul(0x100_0000_01b3))
 }
 
 /// Writes random weights for every tensor of `config` to `path`; returns the number of parameters.

@@ -32,8 +32,14 @@ impl WeightFile {
     }
 
     fn fill<M: Module>(&self, module: M, prefix: &str, device: &Device) -> Result<M, WeightsError> {
-        let mut loader =
-            Loader { source: &self.source, prefix, device, path: Vec::new(), problems: Vec::new(), failure: None };
+        let mut loader = Loader {
+            source: &self.source,
+            prefix,
+            device,
+            path: Vec::new(),
+            problems: Vec::new(),
+            failure: None,
+        };
         let module = module.map(&mut loader);
         if let Some(failure) = loader.failure {
             return Err(failure);
@@ -71,7 +77,8 @@ fn component(name: &str, container: &str) -> String {
 
 impl Loader<'_> {
     fn name(&self) -> String {
-        let parts: Vec<&str> = self.path.iter().map(|(part, _)| part.as_str()).filter(|p| !p.is_empty()).collect();
+        let parts: Vec<&str> =
+            self.path.iter().map(|(part, _)| part.as_str()).filter(|p| !p.is_empty()).collect();
         format!("{}{}", self.prefix, parts.join("."))
     }
 

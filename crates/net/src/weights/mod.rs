@@ -15,7 +15,7 @@ use std::path::{Path, PathBuf};
 pub use file::{CONFIG_KEY, WeightFile, export};
 pub use import::{ImportOptions, ImportReport, import};
 pub use init::{SideHeads, init};
-pub use source::Source;
+pub use source::{Entry, Source};
 
 /// What can be wrong with weights.
 #[derive(Debug, thiserror::Error)]

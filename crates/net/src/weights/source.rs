@@ -52,7 +52,9 @@ impl Source {
         let filled = read_up_to(&mut file, &mut start).map_err(read)?;
         // A safetensors file starts with a little-endian header length and then JSON; every PyTorch container starts
         // with bytes that would make that length absurd.
-        let header = u64::from_le_bytes([start[0], start[1], start[2], start[3], start[4], start[5], start[6], start[7]]);
+        let header = u64::from_le_bytes([
+            start[0], start[1], start[2], start[3], start[4], start[5], start[6], start[7],
+        ]);
         if filled == 9 && start[8] == b'{' && header <= MAX_HEADER {
             return Self::safetensors(path, file, header);
         }
@@ -67,8 +69,9 @@ impl Source {
         let size = file.metadata().map_err(read)?.len();
         let mut text = vec![b'{'; 1];
         (&mut file).take(header - 1).read_to_end(&mut text).map_err(read)?;
-        let metadata: Metadata = serde_json::from_slice(&text)
-            .map_err(|e| WeightsError::format(path, &format!("damaged or truncated safetensors header: {e}")))?;
+        let metadata: Metadata = serde_json::from_slice(&text).map_err(|e| {
+            WeightsError::format(path, &format!("damaged or truncated safetensors header: {e}"))
+        })?;
         let data = 8 + header;
         let expected = data + metadata.data_len() as u64;
         if size != expected {
@@ -90,10 +93,13 @@ impl Source {
 
     fn pytorch(path: &Path) -> Result<Self, WeightsError> {
         let all = PytorchReader::new(path)
-            .map_err(|e| WeightsError::format(path, &format!("neither safetensors nor a PyTorch checkpoint: {e}")))?
+            .map_err(|e| {
+                WeightsError::format(path, &format!("neither safetensors nor a PyTorch checkpoint: {e}"))
+            })?
             .into_tensors();
         // Snap-Snap keeps its weights under `network`, DUSt3R and CroCo under `model`; beside them lie optimiser states.
-        let wrapper = ["network.", "model."].into_iter().find(|w| all.keys().any(|k| k.starts_with(w))).unwrap_or("");
+        let wrapper =
+            ["network.", "model."].into_iter().find(|w| all.keys().any(|k| k.starts_with(w))).unwrap_or("");
         let reader: BTreeMap<_, _> =
             all.into_iter().filter_map(|(k, t)| Some((k.strip_prefix(wrapper)?.to_owned(), t))).collect();
         let entry = |t: &pytorch_reader::Tensor| Entry {
@@ -103,7 +109,12 @@ impl Source {
             len: t.byte_len(),
         };
         let tensors = reader.iter().map(|(k, t)| (k.clone(), entry(t))).collect();
-        Ok(Self { path: path.to_owned(), tensors, reader: Reader::Pytorch(reader), metadata: BTreeMap::new() })
+        Ok(Self {
+            path: path.to_owned(),
+            tensors,
+            reader: Reader::Pytorch(reader),
+            metadata: BTreeMap::new(),
+        })
     }
 
     /// The file.

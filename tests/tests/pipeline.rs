@@ -1,0 +1,159 @@
+//! The whole inference through the command line, from the authors' checkpoints to the Gaussians, against the authors'
+//! numbers. The data are in this repository.
+
+use std::path::Path;
+use std::process::Command;
+
+use image::{GrayImage, RgbImage};
+use snapsnap_tests::{Numbers, data, device, device_name, relative_error, snapsnap, succeed};
+
+/// fixtures/README.md: relative L2 error of points and attributes.
+const BOUND: f64 = 1e-4;
+/// fixtures/README.md: a confidence this close to the threshold may fall on either side of it.
+const UNDECIDED: f32 = 1e-5;
+const THRESHOLD: f32 = 0.9;
+
+/// The TOML config of a fixture's `config.json`, with every quirk.
+fn toml_config(json: &Path) -> String {
+    let text = std::fs::read_to_string(json).expect("config.json");
+    let json: serde_json::Value = serde_json::from_str(&text).expect("JSON");
+    let same = [
+        "enc_dim", "enc_depth", "enc_heads", "dec_dim", "dec_depth", "dec_heads", "layer_dims", "feature_dim",
+        "last_dim", "hooks", "head", "resolution", "net_resolution", "conf_threshold",
+    ];
+    let lines: Vec<String> = same.iter().map(|key| format!("{key} = {}", json[key])).collect();
+    format!("[network]\n{}\n[mode]\ncompat = true\n", lines.join("\n"))
+}
+
+/// The fixture's pictures as files; returns the arguments that name them.
+fn pictures(numbers: &Numbers, folder: &Path) -> Vec<String> {
+    let path = |name: &str| folder.join(name).display().to_string();
+    for side in ["front", "back"] {
+        let (shape, rgb) = numbers.u8(&format!("{side}_rgb"));
+        let (h, w) = (shape[1], shape[2]);
+        let pixel = |x: u32, y: u32| {
+            let at = y as usize * w + x as usize;
+            image::Rgb([rgb[at], rgb[h * w + at], rgb[2 * h * w + at]])
+        };
+        RgbImage::from_fn(w as u32, h as u32, pixel).save(path(&format!("{side}.png"))).expect("PNG");
+        let (_, mask) = numbers.u8(&format!("{side}_mask"));
+        let high = if mask.iter().all(|v| *v <= 1) { 255 } else { 1 };
+        let mask = mask.iter().map(|v| v * high).collect();
+        let mask = GrayImage::from_raw(w as u32, h as u32, mask).expect("as many values as pixels");
+        mask.save(path(&format!("{side}_mask.png"))).expect("PNG");
+    }
+    ["front.png", "back.png", "--masks", "front_mask.png", "back_mask.png"]
+        .map(|a| if a.starts_with('-') { a.into() } else { path(a) })
+        .to_vec()
+}
+
+fn cli_device() -> String {
+    if device_name() == "flex" { "cpu".into() } else { device_name() }
+}
+
+fn run(arguments: &mut Command) -> String {
+    succeed(arguments.arg("--quiet"))
+}
+
+#[test]
+fn authors_checkpoints_give_the_authors_gaussians() {
+    if device().is_none() {
+        return;
+    }
+    let source = data("pipeline");
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let folder = temporary.path();
+    let config = folder.join("config.toml");
+    std::fs::write(&config, toml_config(&source.join("config.json"))).expect("write");
+    let weights = folder.join("weights.safetensors");
+    run(snapsnap()
+        .arg("import-weights")
+        .args([source.join("stage1.pth"), source.join("stage2.pth")])
+        .arg("--config")
+        .arg(&config)
+        .arg("-o")
+        .arg(&weights));
+    let expected = Numbers::read(&source.join("pipeline.safetensors"));
+    let dump = folder.join("dump.safetensors");
+    run(snapsnap()
+        .arg("reconstruct")
+        .args(pictures(&expected, folder))
+        .args(["--as-is", "--device", &cli_device(), "--weights"])
+        .arg(&weights)
+        .arg("--dump")
+        .arg(&dump)
+        .arg("-o")
+        .arg(folder.join("human.ply")));
+    compare(&Numbers::read(&dump), &expected);
+}
+
+fn compare(got: &Numbers, expected: &Numbers) {
+    let close = |name: &str, got: &[f32], expected: &[f32]| {
+        let error = relative_error(got, expected);
+        println!("{name}: relative error {error:.2e}");
+        assert!(error <= BOUND, "{name}: {error:e}");
+    };
+    for name in ["points", "conf"] {
+        let (got, expected) = (got.f32(name), expected.f32(name));
+        assert_eq!(got.0, expected.0, "{name}: shape");
+        close(name, &got.1, &expected.1);
+    }
+
+    let (valid, expected_valid) = (got.u8("valid"), expected.u8("valid"));
+    assert_eq!(valid.0, expected_valid.0, "valid: shape");
+    let conf = expected.f32("conf").1;
+    for (i, (a, b)) in valid.1.iter().zip(&expected_valid.1).enumerate() {
+        assert!(a == b || (conf[i] - THRESHOLD).abs() < UNDECIDED, "valid: pixel {i}");
+    }
+    side_images(got, expected, &valid.1, &expected_valid.1);
+
+    // Rows of the pixels that are valid in both, in the common order.
+    let both: Vec<bool> = valid.1.iter().zip(&expected_valid.1).map(|(a, b)| *a > 0 && *b > 0).collect();
+    let rows = |valid: &[u8], values: &[f32], width: usize| -> Vec<f32> {
+        let chosen = (0..valid.len()).filter(|&i| valid[i] > 0).zip(values.chunks_exact(width));
+        chosen.filter(|(i, _)| both[*i]).flat_map(|(_, row)| row.to_vec()).collect()
+    };
+    for (name, width) in [("means", 3), ("opacity", 1), ("scale", 3), ("rotation", 4), ("rgb", 3)] {
+        let (got, expected) = (got.f32(name), expected.f32(name));
+        assert_eq!(got.0[1], width, "{name}: shape");
+        close(name, &rows(&valid.1, &got.1, width), &rows(&expected_valid.1, &expected.1, width));
+    }
+}
+
+/// Side images agree except where two neighbours are equally near.
+fn side_images(got: &Numbers, expected: &Numbers, valid: &[u8], expected_valid: &[u8]) {
+    let points = expected.f32("points").1;
+    let (got, expected_images) = (got.f32("side_images"), expected.f32("side_images"));
+    assert_eq!(got.0, expected_images.0, "side_images: shape");
+    let area = got.0[2] * got.0[3];
+    let rgb = ["front", "back"].map(|side| expected.u8(&format!("{side}_rgb")).1);
+    let distance = |a: usize, b: usize| -> f32 {
+        (0..3).map(|k| points[3 * a + k] - points[3 * b + k]).map(|d| d * d).sum::<f32>().sqrt()
+    };
+    let (mut compared, mut ties) = (0, 0);
+    for side in 0..2 {
+        for i in 0..area {
+            let pixel = (2 + side) * area + i;
+            if valid[pixel] != expected_valid[pixel] {
+                continue;
+            }
+            compared += 1;
+            let color = |image: &[f32]| [0, 1, 2].map(|c| image[(side * 3 + c) * area + i]);
+            let (got, expected) = (color(&got.1), color(&expected_images.1));
+            if got.iter().zip(&expected).all(|(a, b)| (a - b).abs() <= 1e-6) {
+                continue;
+            }
+            ties += 1;
+            // A reference point of the colour we took must be as near as the nearest, to f32 rounding of ~2 m.
+            let references = || (0..2 * area).filter(|&r| expected_valid[r] > 0);
+            let nearest = references().map(|r| distance(pixel, r)).fold(f32::INFINITY, f32::min);
+            let has_color = |r: usize| {
+                let byte = |c: usize| f32::from(rgb[r / area][c * area + r % area]);
+                (0..3).all(|c| (2.0 * byte(c) / 255.0 - 1.0 - got[c]).abs() <= 1e-6)
+            };
+            let ours = references().filter(|&r| has_color(r)).map(|r| distance(pixel, r)).fold(f32::INFINITY, f32::min);
+            assert!(ours - nearest <= 2e-6, "side {side} pixel {i}: neighbour at {ours}, nearest {nearest}");
+        }
+    }
+    println!("side_images: {ties} ties among {compared} pixels");
+}

@@ -1,0 +1,286 @@
+//! What must hold whatever the weights: symmetries of the networks, and indifference to what is not the person.
+
+use std::path::Path;
+
+use burn::tensor::{Device, Tensor, TensorData};
+use snapsnap_net::config::{Config, NetworkConfig};
+use snapsnap_net::network::{PointPredictor, Rope, View, activate};
+use snapsnap_net::regressor::{RECEPTIVE_RADIUS, Statistics};
+use snapsnap_net::resample::bilinear;
+use snapsnap_net::weights::{WeightFile, init};
+use snapsnap_net::{Photograph, Reconstruction, Reconstructor, Window};
+use snapsnap_tests::{device, relative_error, values};
+
+fn config(overrides: &[&str]) -> Config {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/tiny.toml");
+    let overrides: Vec<String> = overrides.iter().map(|s| (*s).to_owned()).collect();
+    Config::from_file(&path, &overrides).expect("tiny.toml")
+}
+
+fn weights(config: &Config, seed: u64) -> (tempfile::NamedTempFile, WeightFile) {
+    let file = tempfile::NamedTempFile::new().expect("temporary file");
+    init(config, seed, file.path()).expect("written");
+    let weights = WeightFile::open(file.path(), None).expect("our file");
+    (file, weights)
+}
+
+/// Numbers in ±1 that depend on the index only.
+fn noise(n: usize, seed: u32) -> Vec<f32> {
+    let mut state = seed.wrapping_mul(0x9e37_79b9) | 1;
+    let mut next = || {
+        state ^= state << 13;
+        state ^= state >> 17;
+        state ^= state << 5;
+        state as f32 / u32::MAX as f32 * 2.0 - 1.0
+    };
+    (0..n).map(|_| next()).collect()
+}
+
+/// A photograph of noise with an upright ellipse as the person.
+fn photograph(side: usize, seed: u32) -> Photograph {
+    let inside = |i: usize| {
+        let (x, y) = ((i % side) as f32 / side as f32 - 0.5, (i / side) as f32 / side as f32 - 0.5);
+        (x / 0.2).powi(2) + (y / 0.4).powi(2) < 1.0
+    };
+    let valid: Vec<bool> = (0..side * side).map(inside).collect();
+    let mask: Vec<f32> = valid.iter().map(|v| if *v { 1.0 } else { 0.0 }).collect();
+    let rgb = noise(3 * side * side, seed).iter().zip(mask.iter().cycle()).map(|(c, m)| c * m).collect();
+    Photograph { rgb, mask, valid }
+}
+
+fn reconstruct(config: &Config, device: &Device) -> Reconstruction {
+    let (_file, weights) = weights(config, 4);
+    let model = Reconstructor::load(&weights, device).expect("weights");
+    let side = config.network.resolution;
+    model.reconstruct(&photograph(side, 1), &photograph(side, 2), &|_| ())
+}
+
+#[test]
+fn rope_depends_on_relative_positions_only() {
+    let Some(device) = device() else { return };
+    let (rows, columns, d) = (3, 4, 8);
+    let q = Tensor::<4>::from_data(TensorData::new(noise(rows * columns * d, 1), [1, 1, rows * columns, d]), &device);
+    let k = Tensor::<4>::from_data(TensorData::new(noise(rows * columns * d, 2), [1, 1, rows * columns, d]), &device);
+    let scores = |origin: [usize; 2]| {
+        let rope = Rope::with_origin(origin, rows, columns, d, 100.0, &device);
+        values(rope.apply(q.clone()).matmul(rope.apply(k.clone()).swap_dims(2, 3)))
+    };
+    let error = relative_error(&scores([5, 11]), &scores([0, 0]));
+    // f32 sines and cosines of angles up to 16: rounding of about 1e-6.
+    assert!(error < 1e-5, "{error:e}");
+}
+
+/// Check values of SNAPSNAP §1.3: at y = 1, x = 0 the first pair turns by 1 rad, the second by 0.749894 rad.
+#[test]
+fn rope_has_its_published_check_values() {
+    let Some(device) = device() else { return };
+    let rope = Rope::new(2, 1, 64, 100.0, &device);
+    let mut token = vec![0.0; 128];
+    token[64] = 1.0;
+    token[64 + 1] = 1.0;
+    token[64 + 32] = 1.0;
+    let x = Tensor::<4>::from_data(TensorData::new(token, [1, 1, 2, 64]), &device);
+    let turned = values(rope.apply(x));
+    let expected = [(0, 1.0_f32.cos()), (16, 1.0_f32.sin()), (1, 0.749_894_f32.cos()), (17, 0.749_894_f32.sin())];
+    for (i, value) in expected {
+        assert!((turned[64 + i] - value).abs() < 1e-6, "{i}: {}", turned[64 + i]);
+    }
+    assert!((turned[64 + 32] - 1.0).abs() < 1e-6, "column 0 does not turn");
+}
+
+/// Check value of SNAPSNAP §2.2: r = (0.3, 0, 0.4) gives d = 0.5 and p = (0.389233, 0, 0.518977).
+#[test]
+fn points_have_their_published_check_value_and_lose_nothing_near_zero() {
+    let Some(device) = device() else { return };
+    let raw = |r: [f32; 3]| {
+        let data = TensorData::new(vec![r[0], r[1], r[2], 0.0], [1, 4, 1, 1]);
+        values(activate(Tensor::from_data(data, &device), config(&[]).network.conf_mode).points)
+    };
+    let p = raw([0.3, 0.0, 0.4]);
+    assert!((p[0] - 0.389_233).abs() < 1e-6 && p[1] == 0.0 && (p[2] - 0.518_977).abs() < 1e-6, "{p:?}");
+    for length in [1e-6_f32, 1e-3, 0.25, 0.299, 0.301, 3.0] {
+        let got = f64::from(raw([0.0, length, 0.0])[1]);
+        let expected = f64::from(length).exp_m1();
+        assert!((got - expected).abs() < 1e-6 * expected, "{length}: {got} instead of {expected}");
+    }
+    assert_eq!(raw([0.0; 3]), [0.0; 3]);
+}
+
+/// Check values of SNAPSNAP §13.4: [0, 1] → [0, ⅓, ⅔, 1] with aligned corners, [0, ¼, ¾, 1] without.
+#[test]
+fn bilinear_has_its_published_check_values() {
+    let Some(device) = device() else { return };
+    let x = Tensor::<4>::from_data(TensorData::new(vec![0.0_f32, 1.0], [1, 1, 1, 2]), &device);
+    for (align, expected) in [(true, [0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0]), (false, [0.0, 0.25, 0.75, 1.0])] {
+        let got = values(bilinear(x.clone(), [1, 4], align));
+        assert!(got.iter().zip(expected).all(|(g, e): (&f32, f32)| (g - e).abs() < 1e-6), "{got:?}");
+    }
+}
+
+#[test]
+fn swapping_two_heads_weights_swaps_their_outputs() {
+    let Some(device) = device() else { return };
+    let config = config(&[]);
+    let (file, weights) = weights(&config, 7);
+    let bytes = std::fs::read(file.path()).expect("read");
+    let header = u64::from_le_bytes(bytes[..8].try_into().expect("8 bytes")) as usize;
+    // The same length, so that the data stay where they are.
+    let names = std::str::from_utf8(&bytes[8..8 + header]).expect("JSON");
+    let swapped =
+        names.replace("downstream_head3", "downstream_headX").replace("downstream_head4", "downstream_head3");
+    let swapped = swapped.replace("downstream_headX", "downstream_head4");
+    let other = tempfile::NamedTempFile::new().expect("temporary file");
+    std::fs::write(other.path(), [&bytes[..8], swapped.as_bytes(), &bytes[8 + header..]].concat()).expect("written");
+    let image = |seed| Tensor::<4>::from_data(TensorData::new(noise(3 * 64 * 64, seed), [1, 3, 64, 64]), &device);
+    let points = |weights: &WeightFile| {
+        let net = weights.point_predictor(&device).expect("weights");
+        let maps = net.forward(image(1), image(2), config.network.conf_mode);
+        maps.into_iter().map(|(_, map)| values(map.points)).collect::<Vec<_>>()
+    };
+    let before = points(&weights);
+    let after = points(&WeightFile::open(other.path(), None).expect("our file"));
+    let view = |v: View| v as usize;
+    assert_ne!(before[view(View::Right)], before[view(View::Left)]);
+    assert_eq!(before[view(View::Right)], after[view(View::Left)]);
+    assert_eq!(before[view(View::Left)], after[view(View::Right)]);
+    assert_eq!(before[view(View::Front)], after[view(View::Front)]);
+}
+
+#[test]
+fn every_fusion_head_and_view_count_runs_on_sizes_that_are_no_squares() {
+    let Some(device) = device() else { return };
+    let image = |seed| Tensor::<4>::from_data(TensorData::new(noise(3 * 48 * 80, seed), [1, 3, 48, 80]), &device);
+    let mut seen: Vec<Vec<f32>> = Vec::new();
+    for head in ["dpt", "linear"] {
+        for fusion in ["mean", "mirror-mean", "concat"] {
+            let config = config(&[&format!("network.head={head}"), &format!("network.fusion={fusion}")]);
+            let (_file, weights) = weights(&config, 2);
+            let net = weights.point_predictor(&device).expect("weights");
+            let maps = net.forward(image(1), image(2), config.network.conf_mode);
+            assert_eq!(maps.len(), 4);
+            let right = values(maps[2].1.points.clone());
+            assert_eq!(maps[2].1.points.dims(), [1, 48, 80, 3]);
+            assert!(right.iter().all(|v| v.is_finite()));
+            assert!(!seen.contains(&right), "{head} {fusion} computes what another variant computes");
+            seen.push(right);
+        }
+        let config = config(&[&format!("network.head={head}"), "network.side_heads=false"]);
+        let (_file, weights) = weights(&config, 2);
+        let net = weights.point_predictor(&device).expect("weights");
+        assert_eq!(net.forward(image(1), image(2), config.network.conf_mode).len(), 2);
+    }
+}
+
+/// If the back's tokens are the front's mirrored, mirroring them back and averaging gives the front's tokens.
+#[test]
+fn mirror_mean_undoes_a_mirror_image() {
+    let Some(device) = device() else { return };
+    let net = |fusion: &str| {
+        let config = config(&[&format!("network.fusion={fusion}"), "network.head=linear"]);
+        weights(&config, 2).1.point_predictor(&device).expect("weights")
+    };
+    let NetworkConfig { dec_dim: width, dec_depth, .. } = config(&[]).network;
+    let (rows, columns) = (3, 5);
+    let front = Tensor::<3>::from_data(TensorData::new(noise(15 * width, 3), [1, 15, width]), &device);
+    let mirrored = front.clone().reshape([1, rows, columns, width]).flip([2]).reshape([1, 15, width]);
+    let maps = |x: &Tensor<3>| vec![x.clone(); dec_depth + 1];
+    let right = |net: &PointPredictor, back: &Tensor<3>| {
+        values(net.dust3r.raw_points(View::Right, &[maps(&front), maps(back)], [rows, columns]))
+    };
+    let (mirror_mean, mean) = (net("mirror-mean"), net("mean"));
+    assert_eq!(right(&mirror_mean, &mirrored), right(&mean, &front));
+    assert_ne!(right(&mean, &mirrored), right(&mean, &front));
+}
+
+#[test]
+fn cropping_changes_nothing_inside_the_mask_with_frozen_statistics() {
+    let Some(device) = device() else { return };
+    let config = config(&[]);
+    let (_file, weights) = weights(&config, 9);
+    let regressor = &weights.regressors(&device).expect("weights")[0];
+    let side = 384;
+    let mut mask = vec![false; side * side];
+    for y in 170..214 {
+        mask[y * side + 160..y * side + 190].fill(true);
+    }
+    let person = Window::around([mask.as_slice()].into_iter(), side).expect("pixels");
+    let image = noise(6 * side * side, 5);
+    let tensor = |values: Vec<f32>, h, w| Tensor::<4>::from_data(TensorData::new(values, [1, 6, h, w]), &device);
+    let mut statistics = Statistics::measured();
+    let whole = values(regressor.forward(tensor(image.clone(), side, side), &mut statistics));
+    let inside = |features: &[f32], window: &Window| -> Vec<f32> {
+        let rows = window.indices(&mask, side);
+        rows.iter().flat_map(|&i| features[i as usize * 14..][..14].to_vec()).collect()
+    };
+    let cropped = |window: &Window| {
+        let crop = tensor(window.crop(&image, 6, side), window.rows.len(), window.columns.len());
+        inside(&values(regressor.forward(crop, &mut statistics.frozen())), window)
+    };
+    let expected = inside(&whole, &Window::whole(side));
+    let padded = person.padded(side);
+    assert!(padded.rows.len() < side && padded.columns.len() < side, "the window is a real crop");
+    let error = relative_error(&cropped(&padded), &expected);
+    println!("cropped with a margin of {RECEPTIVE_RADIUS} pixels: relative error {error:.2e}");
+    assert!(error < 1e-6, "{error:e}");
+    // Without the margin the difference shows, so the test can fail.
+    let tight = Window { rows: 168..216, columns: 160..192 };
+    let error = relative_error(&cropped(&tight), &expected);
+    println!("cropped without a margin: relative error {error:.2e}");
+    assert!(error > 1e-4, "{error:e}");
+}
+
+#[test]
+fn the_worlds_frames_are_upright_or_the_demos_mirror_image() {
+    let Some(device) = device() else { return };
+    let point = |overrides: &[&str]| {
+        let config = config(overrides);
+        let result = reconstruct(&config, &device);
+        (values(result.gaussians.means.clone()), values(result.in_world(&config).means))
+    };
+    let (camera, world) = point(&["mode.compat=true"]);
+    for (c, w) in camera.chunks_exact(3).zip(world.chunks_exact(3)) {
+        let expected = [-c[0], -c[1], 2.0 - c[2]];
+        assert!(w.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-5), "{c:?} {w:?}");
+    }
+    let (camera, world) = point(&[]);
+    let rig = snapsnap_splat::Camera::orbit_at_yaw_degrees(0.0, 128).world_to_camera.inverse();
+    for (c, w) in camera.chunks_exact(3).zip(world.chunks_exact(3)) {
+        let expected = rig.apply(glam::DVec3::new(c[0].into(), c[1].into(), c[2].into()));
+        assert!((0..3).all(|k| (f64::from(w[k]) - expected[k]).abs() < 1e-5), "{c:?} {w:?}");
+    }
+}
+
+#[test]
+fn two_runs_give_the_same_bits() {
+    let Some(device) = device() else { return };
+    let config = config(&["network.conf_threshold=0.4"]);
+    let runs = [(); 2].map(|()| reconstruct(&config, &device));
+    let [a, b] = runs.each_ref().map(|r| values(r.in_world(&config).means));
+    assert!(!a.is_empty());
+    assert_eq!(a, b);
+    let [a, b] = runs.map(|r| values(r.gaussians.rotations));
+    assert_eq!(a, b);
+}
+
+#[test]
+fn a_scene_without_side_heads_runs_neither_sides_nor_neighbour_search() {
+    let Some(device) = device() else { return };
+    let result = reconstruct(&config(&["network.side_heads=false"]), &device);
+    assert_eq!(result.views, [View::Front, View::Back]);
+    assert!(result.side_images.is_empty());
+    let ran: Vec<&str> = result.times.iter().map(|(name, _)| *name).collect();
+    assert!(!ran.contains(&"side colours") && !ran.contains(&"regressor (sides)"), "{ran:?}");
+    assert!(result.plan.iter().any(|line| line.contains("no side heads")), "{:?}", result.plan);
+}
+
+#[test]
+fn a_second_regressor_sees_the_sides_only() {
+    let Some(device) = device() else { return };
+    let one = config(&["network.conf_threshold=0.0"]);
+    let two = config(&["network.conf_threshold=0.0", "regressor.networks=2"]);
+    let [one, two] = [one, two].map(|config| reconstruct(&config, &device));
+    let fronts = 4 * one.valid[..2].iter().flatten().filter(|v| **v).count();
+    let [one, two] = [one, two].map(|r| values(r.gaussians.rotations));
+    assert_eq!(one[..fronts], two[..fronts]);
+    assert_ne!(one[fronts..], two[fronts..]);
+}

@@ -1,0 +1,286 @@
+//! Importing, exporting and refusing checkpoints.
+
+use std::collections::{BTreeMap, HashMap};
+use std::path::{Path, PathBuf};
+
+use safetensors::Dtype;
+use safetensors::tensor::TensorView;
+use snapsnap_net::config::Config;
+use snapsnap_net::weights::{
+    ImportOptions, SideHeads, Source, WeightFile, WeightsError, export, import, init, schema,
+};
+use snapsnap_tests::{data, fixture};
+
+const OPTIONS: ImportOptions = ImportOptions { side_heads: SideHeads::Seed, seed: 3 };
+
+fn tiny() -> Config {
+    Config::from_file(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/tiny.toml"), &[]).expect("tiny.toml")
+}
+
+type Tensors = BTreeMap<String, (Dtype, Vec<usize>, Vec<u8>)>;
+
+/// All tensors of a file, as f32 bytes.
+fn read(path: &Path) -> Tensors {
+    let source = Source::open(path).expect("readable");
+    let value = |name: &String| source.read_f32(name).expect("float").iter().flat_map(|v| v.to_le_bytes()).collect();
+    let entry = |(name, e): (&String, &_)| (name.clone(), (Dtype::F32, shape(e), value(name)));
+    source.tensors().iter().map(entry).collect()
+}
+
+fn shape(entry: &snapsnap_net::weights::Entry) -> Vec<usize> {
+    entry.shape.clone()
+}
+
+fn write(tensors: &Tensors, path: &Path) {
+    let views = tensors.iter().map(|(name, (dtype, shape, bytes))| {
+        (name.as_str(), TensorView::new(*dtype, shape.clone(), bytes).expect("consistent"))
+    });
+    std::fs::write(path, safetensors::serialize(views, None).expect("valid")).expect("written");
+}
+
+/// A temporary folder with random tiny weights in it.
+struct Workplace {
+    folder: tempfile::TempDir,
+    config: Config,
+}
+
+impl Workplace {
+    fn new() -> Self {
+        let place = Self { folder: tempfile::tempdir().expect("temporary folder"), config: tiny() };
+        init(&place.config, 1, &place.path("ours.safetensors")).expect("written");
+        place
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+
+    /// The random weights, changed.
+    fn changed(&self, change: impl FnOnce(&mut Tensors)) -> Tensors {
+        let mut tensors = read(&self.path("ours.safetensors"));
+        change(&mut tensors);
+        tensors
+    }
+
+    fn import(&self, tensors: &Tensors, options: ImportOptions) -> Result<(Tensors, Vec<String>), WeightsError> {
+        let (from, to) = (self.path("in.safetensors"), self.path("out.safetensors"));
+        write(tensors, &from);
+        let _ = std::fs::remove_file(&to);
+        let result = import(&[from], &self.config, options, &to);
+        assert_eq!(result.is_ok(), to.exists(), "a file is left exactly if the import succeeds");
+        result.map(|report| (read(&to), report.notes))
+    }
+
+    /// The problems for which changed weights are refused.
+    fn problems(&self, change: impl FnOnce(&mut Tensors)) -> Vec<String> {
+        match self.import(&self.changed(change), OPTIONS) {
+            Err(WeightsError::Tensors { problems, .. }) => problems,
+            other => panic!("expected a list of problems, got {other:?}"),
+        }
+    }
+}
+
+const QKV: &str = "dust3r.enc_blocks.1.attn.qkv.weight";
+
+#[test]
+fn the_authors_pickles_hold_what_their_safetensors_hold() {
+    let Some(folder) = fixture("pipeline") else { return };
+    let place = Workplace::new();
+    let ours = place.path("imported.safetensors");
+    let sources = ["stage1.pth", "stage2.pth"].map(|name| folder.join(name));
+    let report = import(&sources, &place.config, OPTIONS, &ours).expect("imports");
+    let imported = read(&ours);
+    let direct = read(&folder.join("weights.safetensors"));
+    assert_eq!(report.tensors, imported.len());
+    let mut compared = 0;
+    for (name, tensor) in direct.iter().filter(|(name, _)| *name != "mask_token") {
+        assert_eq!(imported.get(&format!("dust3r.{name}")), Some(tensor), "{name}");
+        compared += 1;
+    }
+    assert_eq!(compared, imported.keys().filter(|k| k.starts_with("dust3r.")).count());
+    let delta = f32::from_le_bytes(imported["scale"].2.clone().try_into().expect("one f32"));
+    assert!((delta - 1.7).abs() < 1e-6, "{delta}");
+}
+
+#[test]
+fn export_gives_every_name_of_the_authors_state_dicts() {
+    let place = Workplace::new();
+    let (ours, exported) = (place.path("imported.safetensors"), place.path("exported.safetensors"));
+    let sources = ["stage1.pth", "stage2.pth"].map(|name| data("pipeline").join(name));
+    import(&sources, &place.config, OPTIONS, &ours).expect("imports");
+    export(&ours, &exported).expect("exports");
+    let exported = read(&exported);
+    let authors: Tensors = sources.iter().flat_map(|path| read(path)).collect();
+    let names = |tensors: &Tensors| tensors.keys().cloned().collect::<Vec<_>>();
+    assert_eq!(names(&exported), names(&authors));
+    assert_eq!(exported, authors);
+}
+
+#[test]
+fn a_dust3r_pickle_gets_delta_and_side_heads_and_says_so() {
+    let place = Workplace::new();
+    let Some(folder) = fixture("pipeline") else { return };
+    let to = place.path("out.safetensors");
+    let with = |side_heads| {
+        let options = ImportOptions { side_heads, seed: 5 };
+        let report = import(&[folder.join("dust3r.pth")], &place.config, options, &to).expect("imports");
+        (read(&to), report.notes.join("\n"))
+    };
+    let (seeded, notes) = with(SideHeads::Seed);
+    assert!(notes.contains("head 3 is in no file: drawn from seed 5") && notes.contains("δ"), "{notes}");
+    assert!(notes.contains("mask_token"), "{notes}");
+    let (copied, notes) = with(SideHeads::Copy);
+    assert!(notes.contains("head 4 is in no file: copied from head 2"), "{notes}");
+    let weight = |tensors: &Tensors, k: usize| tensors[&format!("dust3r.downstream_head{k}.dpt.head.2.weight")].clone();
+    assert_eq!(weight(&copied, 3), weight(&copied, 1));
+    assert_eq!(weight(&copied, 4), weight(&copied, 2));
+    assert_ne!(weight(&seeded, 3), weight(&seeded, 1));
+    let Err(e) = WeightFile::open(&to, None).expect("opens").require(schema::Part::Regressor) else {
+        panic!("a file without a regressor is complete");
+    };
+    assert!(e.to_string().contains("stage-2"), "{e}");
+}
+
+#[test]
+fn a_croco_file_gives_both_decoders_and_no_heads() {
+    let place = Workplace::new();
+    let croco = place.changed(|t| {
+        t.retain(|k, _| k.starts_with("dust3r.") && !k.contains("dec_blocks2") && !k.contains("downstream_head"));
+        *t = t.iter().map(|(k, v)| (k.trim_start_matches("dust3r.").to_owned(), v.clone())).collect();
+        t.insert("prediction_head.bias".into(), (Dtype::F32, vec![2], vec![0; 8]));
+    });
+    let (imported, notes) = place.import(&croco, OPTIONS).expect("imports");
+    let weight = |stack: &str| imported[&format!("dust3r.{stack}.2.cross_attn.projk.weight")].clone();
+    assert_eq!(weight("dec_blocks"), weight("dec_blocks2"));
+    let notes = notes.join("\n");
+    assert!(notes.contains("dec_blocks2") && notes.contains("head 1 is in no file"), "{notes}");
+    assert!(notes.contains("prediction_head.bias"), "{notes}");
+}
+
+#[test]
+fn half_precision_files_load() {
+    let place = Workplace::new();
+    let bf16 = place.changed(|t| {
+        for (dtype, _, bytes) in t.values_mut() {
+            *dtype = Dtype::BF16;
+            *bytes = bytes.chunks_exact(4).flat_map(|b| [b[2], b[3]]).collect();
+        }
+    });
+    let (imported, _) = place.import(&bf16, OPTIONS).expect("imports");
+    for (name, (_, _, bytes)) in &imported {
+        assert!(bytes.chunks_exact(4).zip(bf16[name].2.chunks_exact(2)).all(|(w, n)| w == [0, 0, n[0], n[1]]), "{name}");
+    }
+    // 1.5 and −2⁻¹⁴ are exact in f16.
+    let f16 = place.changed(|t| {
+        *t.get_mut("gs_conv.bias").expect("there") = (Dtype::F16, vec![14], [0x00, 0x3e, 0x00, 0x84].repeat(7));
+    });
+    let (imported, _) = place.import(&f16, OPTIONS).expect("imports");
+    let expected: Vec<u8> = [1.5_f32, -(2.0_f32.powi(-14))].repeat(7).iter().flat_map(|v| v.to_le_bytes()).collect();
+    assert_eq!(imported["gs_conv.bias"].2, expected);
+}
+
+#[test]
+fn missing_unused_and_misshaped_tensors_are_all_named() {
+    let place = Workplace::new();
+    let problems = place.problems(|t| {
+        t.remove("dust3r.enc_norm.bias");
+        t.insert("dust3r.extra".into(), (Dtype::F32, vec![1], vec![0; 4]));
+        t.get_mut(QKV).expect("there").1 = vec![64, 192];
+        t.get_mut("dust3r.dec_norm.weight").expect("there").0 = Dtype::I32;
+    });
+    let all = problems.join("\n");
+    assert_eq!(problems.len(), 4, "{all}");
+    assert!(all.contains("missing: dust3r.enc_norm.bias [64]"), "{all}");
+    assert!(all.contains("not part of the configured networks: dust3r.extra"), "{all}");
+    assert!(all.contains(QKV) && all.contains("[64, 192]") && all.contains("[192, 64]"), "{all}");
+    assert!(all.contains("dust3r.dec_norm.weight is i32"), "{all}");
+}
+
+#[test]
+fn every_tensor_with_a_value_that_is_not_finite_is_named() {
+    let place = Workplace::new();
+    let problems = place.problems(|t| {
+        t.get_mut(QKV).expect("there").2[..4].copy_from_slice(&f32::NAN.to_le_bytes());
+        t.get_mut("gs_conv.bias").expect("there").2[..4].copy_from_slice(&f32::INFINITY.to_le_bytes());
+    });
+    assert_eq!(problems.len(), 2, "{problems:?}");
+    assert!(problems[0].contains(QKV) && problems[1].contains("gs_conv.bias"), "{problems:?}");
+}
+
+#[test]
+fn aliases_that_contradict_each_other_are_refused() {
+    let place = Workplace::new();
+    let name = "dust3r.downstream_head1.dpt.scratch.layer2_rn.weight";
+    let alias = "dust3r.downstream_head1.dpt.scratch.layer_rn.1.weight";
+    let agreeing = place.changed(|t| {
+        let value = t[name].clone();
+        t.insert(alias.into(), value);
+    });
+    assert!(place.import(&agreeing, OPTIONS).is_ok());
+    let problems = place.problems(|t| {
+        let mut value = t[name].clone();
+        value.2[0] ^= 1;
+        t.insert(alias.into(), value);
+    });
+    assert!(problems.len() == 1 && problems[0].contains("layer_rn.1"), "{problems:?}");
+}
+
+#[test]
+fn only_one_name_of_an_alias_is_enough() {
+    let place = Workplace::new();
+    let renamed = place.changed(|t| {
+        let value = t.remove("dust3r.downstream_head1.dpt.scratch.layer2_rn.weight").expect("there");
+        t.insert("dust3r.downstream_head1.dpt.scratch.layer_rn.1.weight".into(), value);
+    });
+    let (imported, _) = place.import(&renamed, OPTIONS).expect("imports");
+    assert_eq!(imported, read(&place.path("ours.safetensors")));
+}
+
+#[test]
+fn damaged_files_are_refused_not_misread() {
+    let place = Workplace::new();
+    let path = place.path("damaged.safetensors");
+    let good = std::fs::read(place.path("ours.safetensors")).expect("read");
+    let mut header = good.clone();
+    header[0..8].copy_from_slice(&u64::MAX.to_le_bytes());
+    let mut text = good.clone();
+    text[20] = b'}';
+    let cases: HashMap<&str, &[u8]> = HashMap::from([
+        ("truncated", &good[..good.len() - 7]),
+        ("header only", &good[..100]),
+        ("empty", &[]),
+        ("absurd header length", &header),
+        ("damaged header", &text),
+        ("text", b"these are no weights"),
+    ]);
+    for (case, bytes) in cases {
+        std::fs::write(&path, bytes).expect("written");
+        assert!(matches!(Source::open(&path), Err(WeightsError::Format { .. })), "{case}");
+    }
+    let pickle = std::fs::read(data("pipeline").join("stage2.pth")).expect("read");
+    let path = place.path("damaged.pth");
+    for keep in [10, pickle.len() / 2, pickle.len() - 30] {
+        std::fs::write(&path, &pickle[..keep]).expect("written");
+        assert!(matches!(Source::open(&path), Err(WeightsError::Format { .. })), "pickle cut at {keep}");
+    }
+}
+
+#[test]
+fn the_schema_is_the_full_size_state_dict() {
+    let Some(path) = fixture("full_size_keys.json") else { return };
+    let text = std::fs::read_to_string(path).expect("read");
+    let keys: BTreeMap<String, Vec<usize>> = serde_json::from_str(&text).expect("JSON");
+    let ours: BTreeMap<String, Vec<usize>> =
+        schema::tensors(&Config::default()).into_iter().map(|t| (t.name, t.shape)).collect();
+    let (mut aliases, mut checked) = (0, 0);
+    for (key, shape) in keys.iter().filter(|(key, _)| *key != "mask_token") {
+        if key.contains("scratch.layer_rn.") {
+            aliases += 1;
+            continue;
+        }
+        assert_eq!(ours.get(&format!("dust3r.{key}")), Some(shape), "{key}");
+        checked += 1;
+    }
+    assert_eq!(checked, ours.keys().filter(|k| k.starts_with("dust3r.")).count());
+    assert_eq!(aliases, 16);
+}
