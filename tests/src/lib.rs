@@ -20,7 +20,8 @@ pub fn device() -> Option<Device> {
         "flex" => Some(Device::flex()),
         "ndarray" => Some(ndarray()),
         "wgpu" => {
-            let found = std::panic::catch_unwind(|| !Device::enumerate(DeviceType::Wgpu).into_vec().is_empty());
+            let found =
+                std::panic::catch_unwind(|| !Device::enumerate(DeviceType::Wgpu).into_vec().is_empty());
             if !found.unwrap_or(false) {
                 println!("SKIPPED: no wgpu adapter on this machine");
                 return None;

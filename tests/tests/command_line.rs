@@ -13,7 +13,13 @@ struct Workplace(tempfile::TempDir);
 impl Workplace {
     fn new() -> Self {
         let place = Self(tempfile::tempdir().expect("temporary folder"));
-        succeed(snapsnap().args(["init-weights", "--seed", "1", "--config"]).arg(tiny()).arg("-o").arg(place.path("w")));
+        succeed(
+            snapsnap()
+                .args(["init-weights", "--seed", "1", "--config"])
+                .arg(tiny())
+                .arg("-o")
+                .arg(place.path("w")),
+        );
         for (name, seed) in [("front.png", 1), ("back.png", 2)] {
             person(200, 320, seed, 0).save(place.path(name)).expect("PNG");
         }
@@ -79,8 +85,10 @@ fn read_ply(path: &Path) -> (Vec<String>, Vec<Vec<f32>>) {
     let body = bytes.windows(end.len()).position(|w| w == end).expect("a header") + end.len();
     let header = std::str::from_utf8(&bytes[..body]).expect("ASCII");
     assert!(header.starts_with("ply\nformat binary_little_endian 1.0\nelement vertex "), "{header}");
-    let count: usize = header.lines().nth(2).and_then(|l| l.rsplit(' ').next()).expect("count").parse().expect("number");
-    let names: Vec<String> = header.lines().filter_map(|l| l.strip_prefix("property float ")).map(str::to_owned).collect();
+    let count: usize =
+        header.lines().nth(2).and_then(|l| l.rsplit(' ').next()).expect("count").parse().expect("number");
+    let names: Vec<String> =
+        header.lines().filter_map(|l| l.strip_prefix("property float ")).map(str::to_owned).collect();
     assert_eq!(bytes.len() - body, count * names.len() * 4);
     let floats: Vec<f32> =
         bytes[body..].chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
@@ -91,12 +99,15 @@ fn read_ply(path: &Path) -> (Vec<String>, Vec<Vec<f32>>) {
 fn two_pictures_become_a_finite_ply_with_config_and_plan() {
     let place = Workplace::new();
     let printed = succeed(place.reconstruct("front.png", "back.png").args(["-v", "-o", "human.ply"]));
-    for line in ["encoder", "decoders", "heads (4)", "regressor (front, back)", "pixels become Gaussians", "total"] {
+    for line in
+        ["encoder", "decoders", "heads (4)", "regressor (front, back)", "pixels become Gaussians", "total"]
+    {
         assert!(printed.contains(line), "{line}: {printed}");
     }
     let (names, rows) = read_ply(&place.path("human.ply"));
     // INRIA's order.
-    let expected = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3";
+    let expected =
+        "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3";
     assert_eq!(names.join(" "), expected);
     assert!(rows.len() > 1000, "{}", rows.len());
     assert!(rows.iter().flatten().all(|v| v.is_finite()));
@@ -181,9 +192,13 @@ fn unsuitable_pictures_are_refused_by_name() {
     case("cut.png", &["not a readable image"]);
     RgbImage::from_pixel(100, 100, Rgb([1, 2, 3])).save(place.path("rgb.png")).expect("PNG");
     case("rgb.png", &["no alpha channel", "--masks"]);
-    RgbaImage::from_fn(100, 100, |x, y| Rgba([x as u8, y as u8, 0, 255])).save(place.path("solid.png")).expect("PNG");
+    RgbaImage::from_fn(100, 100, |x, y| Rgba([x as u8, y as u8, 0, 255]))
+        .save(place.path("solid.png"))
+        .expect("PNG");
     case("solid.png", &["opaque everywhere"]);
-    RgbaImage::from_fn(100, 100, |x, y| Rgba([x as u8, y as u8, 0, 0])).save(place.path("clear.png")).expect("PNG");
+    RgbaImage::from_fn(100, 100, |x, y| Rgba([x as u8, y as u8, 0, 0]))
+        .save(place.path("clear.png"))
+        .expect("PNG");
     case("clear.png", &["mask is empty"]);
     person(63, 200, 1, 0).save(place.path("small.png")).expect("PNG");
     case("small.png", &["at least 64 pixels"]);
@@ -196,7 +211,10 @@ fn unsuitable_pictures_are_refused_by_name() {
     GrayImage::new(199, 320).save(place.path("narrow.png")).expect("PNG");
     let masks = ["--masks", "narrow.png", "narrow.png"];
     let message = place.refusal(place.reconstruct("front.png", "back.png").args(masks));
-    assert!(message.contains("narrow.png") && message.contains("199×320") && message.contains("200×320"), "{message}");
+    assert!(
+        message.contains("narrow.png") && message.contains("199×320") && message.contains("200×320"),
+        "{message}"
+    );
     let message = place.refusal(place.reconstruct("front.png", "back.png").arg("--as-is"));
     assert!(message.contains("200×320") && message.contains("128×128"), "{message}");
 }
@@ -232,7 +250,10 @@ fn unsuitable_configs_weights_devices_and_outputs_are_refused_by_name() {
     weights[at..].copy_from_slice(&f32::NAN.to_le_bytes());
     fs::write(place.path("w"), weights).expect("written");
     case(&["--device", "cpu"], &["not finite", "gs_conv.bias"]);
-    assert_eq!(refused(snapsnap().arg("reconstruct")).lines().next().map(|l| l.starts_with("error")), Some(true));
+    assert_eq!(
+        refused(snapsnap().arg("reconstruct")).lines().next().map(|l| l.starts_with("error")),
+        Some(true)
+    );
 }
 
 #[test]
@@ -255,7 +276,8 @@ fn weights_can_be_a_folder_and_seeds_give_the_same_bytes() {
     assert!(fs::read(&file).expect("read") == fs::read(place.path("w")).expect("read"));
     succeed(place.reconstruct("front.png", "back.png").args(["-o", "a.ply"]));
     let mut command = snapsnap();
-    let arguments = ["reconstruct", "front.png", "back.png", "--weights", "model", "--device", "cpu", "-o", "b.ply"];
+    let arguments =
+        ["reconstruct", "front.png", "back.png", "--weights", "model", "--device", "cpu", "-o", "b.ply"];
     succeed(command.current_dir(place.path("")).args(arguments));
     assert!(fs::read(place.path("a.ply")).expect("read") == fs::read(place.path("b.ply")).expect("read"));
 }

@@ -18,8 +18,20 @@ fn toml_config(json: &Path) -> String {
     let text = std::fs::read_to_string(json).expect("config.json");
     let json: serde_json::Value = serde_json::from_str(&text).expect("JSON");
     let same = [
-        "enc_dim", "enc_depth", "enc_heads", "dec_dim", "dec_depth", "dec_heads", "layer_dims", "feature_dim",
-        "last_dim", "hooks", "head", "resolution", "net_resolution", "conf_threshold",
+        "enc_dim",
+        "enc_depth",
+        "enc_heads",
+        "dec_dim",
+        "dec_depth",
+        "dec_heads",
+        "layer_dims",
+        "feature_dim",
+        "last_dim",
+        "hooks",
+        "head",
+        "resolution",
+        "net_resolution",
+        "conf_threshold",
     ];
     let lines: Vec<String> = same.iter().map(|key| format!("{key} = {}", json[key])).collect();
     format!("[network]\n{}\n[mode]\ncompat = true\n", lines.join("\n"))
@@ -151,7 +163,10 @@ fn side_images(got: &Numbers, expected: &Numbers, valid: &[u8], expected_valid: 
                 let byte = |c: usize| f32::from(rgb[r / area][c * area + r % area]);
                 (0..3).all(|c| (2.0 * byte(c) / 255.0 - 1.0 - got[c]).abs() <= 1e-6)
             };
-            let ours = references().filter(|&r| has_color(r)).map(|r| distance(pixel, r)).fold(f32::INFINITY, f32::min);
+            let ours = references()
+                .filter(|&r| has_color(r))
+                .map(|r| distance(pixel, r))
+                .fold(f32::INFINITY, f32::min);
             assert!(ours - nearest <= 2e-6, "side {side} pixel {i}: neighbour at {ours}, nearest {nearest}");
         }
     }

@@ -59,8 +59,14 @@ fn reconstruct(config: &Config, device: &Device) -> Reconstruction {
 fn rope_depends_on_relative_positions_only() {
     let Some(device) = device() else { return };
     let (rows, columns, d) = (3, 4, 8);
-    let q = Tensor::<4>::from_data(TensorData::new(noise(rows * columns * d, 1), [1, 1, rows * columns, d]), &device);
-    let k = Tensor::<4>::from_data(TensorData::new(noise(rows * columns * d, 2), [1, 1, rows * columns, d]), &device);
+    let q = Tensor::<4>::from_data(
+        TensorData::new(noise(rows * columns * d, 1), [1, 1, rows * columns, d]),
+        &device,
+    );
+    let k = Tensor::<4>::from_data(
+        TensorData::new(noise(rows * columns * d, 2), [1, 1, rows * columns, d]),
+        &device,
+    );
     let scores = |origin: [usize; 2]| {
         let rope = Rope::with_origin(origin, rows, columns, d, 100.0, &device);
         values(rope.apply(q.clone()).matmul(rope.apply(k.clone()).swap_dims(2, 3)))
@@ -81,7 +87,8 @@ fn rope_has_its_published_check_values() {
     token[64 + 32] = 1.0;
     let x = Tensor::<4>::from_data(TensorData::new(token, [1, 1, 2, 64]), &device);
     let turned = values(rope.apply(x));
-    let expected = [(0, 1.0_f32.cos()), (16, 1.0_f32.sin()), (1, 0.749_894_f32.cos()), (17, 0.749_894_f32.sin())];
+    let expected =
+        [(0, 1.0_f32.cos()), (16, 1.0_f32.sin()), (1, 0.749_894_f32.cos()), (17, 0.749_894_f32.sin())];
     for (i, value) in expected {
         assert!((turned[64 + i] - value).abs() < 1e-6, "{i}: {}", turned[64 + i]);
     }
@@ -130,8 +137,10 @@ fn swapping_two_heads_weights_swaps_their_outputs() {
         names.replace("downstream_head3", "downstream_headX").replace("downstream_head4", "downstream_head3");
     let swapped = swapped.replace("downstream_headX", "downstream_head4");
     let other = tempfile::NamedTempFile::new().expect("temporary file");
-    std::fs::write(other.path(), [&bytes[..8], swapped.as_bytes(), &bytes[8 + header..]].concat()).expect("written");
-    let image = |seed| Tensor::<4>::from_data(TensorData::new(noise(3 * 64 * 64, seed), [1, 3, 64, 64]), &device);
+    std::fs::write(other.path(), [&bytes[..8], swapped.as_bytes(), &bytes[8 + header..]].concat())
+        .expect("written");
+    let image =
+        |seed| Tensor::<4>::from_data(TensorData::new(noise(3 * 64 * 64, seed), [1, 3, 64, 64]), &device);
     let points = |weights: &WeightFile| {
         let net = weights.point_predictor(&device).expect("weights");
         let maps = net.forward(image(1), image(2), config.network.conf_mode);
@@ -149,7 +158,8 @@ fn swapping_two_heads_weights_swaps_their_outputs() {
 #[test]
 fn every_fusion_head_and_view_count_runs_on_sizes_that_are_no_squares() {
     let Some(device) = device() else { return };
-    let image = |seed| Tensor::<4>::from_data(TensorData::new(noise(3 * 48 * 80, seed), [1, 3, 48, 80]), &device);
+    let image =
+        |seed| Tensor::<4>::from_data(TensorData::new(noise(3 * 48 * 80, seed), [1, 3, 48, 80]), &device);
     let mut seen: Vec<Vec<f32>> = Vec::new();
     for head in ["dpt", "linear"] {
         for fusion in ["mean", "mirror-mean", "concat"] {
@@ -205,7 +215,8 @@ fn cropping_changes_nothing_inside_the_mask_with_frozen_statistics() {
     }
     let person = Window::around([mask.as_slice()].into_iter(), side).expect("pixels");
     let image = noise(6 * side * side, 5);
-    let tensor = |values: Vec<f32>, h, w| Tensor::<4>::from_data(TensorData::new(values, [1, 6, h, w]), &device);
+    let tensor =
+        |values: Vec<f32>, h, w| Tensor::<4>::from_data(TensorData::new(values, [1, 6, h, w]), &device);
     let mut statistics = Statistics::measured();
     let whole = values(regressor.forward(tensor(image.clone(), side, side), &mut statistics));
     let inside = |features: &[f32], window: &Window| -> Vec<f32> {

@@ -14,7 +14,8 @@ use snapsnap_tests::{data, fixture};
 const OPTIONS: ImportOptions = ImportOptions { side_heads: SideHeads::Seed, seed: 3 };
 
 fn tiny() -> Config {
-    Config::from_file(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/tiny.toml"), &[]).expect("tiny.toml")
+    Config::from_file(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/tiny.toml"), &[])
+        .expect("tiny.toml")
 }
 
 type Tensors = BTreeMap<String, (Dtype, Vec<usize>, Vec<u8>)>;
@@ -22,7 +23,8 @@ type Tensors = BTreeMap<String, (Dtype, Vec<usize>, Vec<u8>)>;
 /// All tensors of a file, as f32 bytes.
 fn read(path: &Path) -> Tensors {
     let source = Source::open(path).expect("readable");
-    let value = |name: &String| source.read_f32(name).expect("float").iter().flat_map(|v| v.to_le_bytes()).collect();
+    let value =
+        |name: &String| source.read_f32(name).expect("float").iter().flat_map(|v| v.to_le_bytes()).collect();
     let entry = |(name, e): (&String, &_)| (name.clone(), (Dtype::F32, shape(e), value(name)));
     source.tensors().iter().map(entry).collect()
 }
@@ -62,7 +64,11 @@ impl Workplace {
         tensors
     }
 
-    fn import(&self, tensors: &Tensors, options: ImportOptions) -> Result<(Tensors, Vec<String>), WeightsError> {
+    fn import(
+        &self,
+        tensors: &Tensors,
+        options: ImportOptions,
+    ) -> Result<(Tensors, Vec<String>), WeightsError> {
         let (from, to) = (self.path("in.safetensors"), self.path("out.safetensors"));
         write(tensors, &from);
         let _ = std::fs::remove_file(&to);
@@ -131,7 +137,9 @@ fn a_dust3r_pickle_gets_delta_and_side_heads_and_says_so() {
     assert!(notes.contains("mask_token"), "{notes}");
     let (copied, notes) = with(SideHeads::Copy);
     assert!(notes.contains("head 4 is in no file: copied from head 2"), "{notes}");
-    let weight = |tensors: &Tensors, k: usize| tensors[&format!("dust3r.downstream_head{k}.dpt.head.2.weight")].clone();
+    let weight = |tensors: &Tensors, k: usize| {
+        tensors[&format!("dust3r.downstream_head{k}.dpt.head.2.weight")].clone()
+    };
     assert_eq!(weight(&copied, 3), weight(&copied, 1));
     assert_eq!(weight(&copied, 4), weight(&copied, 2));
     assert_ne!(weight(&seeded, 3), weight(&seeded, 1));
@@ -145,7 +153,9 @@ fn a_dust3r_pickle_gets_delta_and_side_heads_and_says_so() {
 fn a_croco_file_gives_both_decoders_and_no_heads() {
     let place = Workplace::new();
     let croco = place.changed(|t| {
-        t.retain(|k, _| k.starts_with("dust3r.") && !k.contains("dec_blocks2") && !k.contains("downstream_head"));
+        t.retain(|k, _| {
+            k.starts_with("dust3r.") && !k.contains("dec_blocks2") && !k.contains("downstream_head")
+        });
         *t = t.iter().map(|(k, v)| (k.trim_start_matches("dust3r.").to_owned(), v.clone())).collect();
         t.insert("prediction_head.bias".into(), (Dtype::F32, vec![2], vec![0; 8]));
     });
@@ -168,14 +178,19 @@ fn half_precision_files_load() {
     });
     let (imported, _) = place.import(&bf16, OPTIONS).expect("imports");
     for (name, (_, _, bytes)) in &imported {
-        assert!(bytes.chunks_exact(4).zip(bf16[name].2.chunks_exact(2)).all(|(w, n)| w == [0, 0, n[0], n[1]]), "{name}");
+        assert!(
+            bytes.chunks_exact(4).zip(bf16[name].2.chunks_exact(2)).all(|(w, n)| w == [0, 0, n[0], n[1]]),
+            "{name}"
+        );
     }
     // 1.5 and −2⁻¹⁴ are exact in f16.
     let f16 = place.changed(|t| {
-        *t.get_mut("gs_conv.bias").expect("there") = (Dtype::F16, vec![14], [0x00, 0x3e, 0x00, 0x84].repeat(7));
+        *t.get_mut("gs_conv.bias").expect("there") =
+            (Dtype::F16, vec![14], [0x00, 0x3e, 0x00, 0x84].repeat(7));
     });
     let (imported, _) = place.import(&f16, OPTIONS).expect("imports");
-    let expected: Vec<u8> = [1.5_f32, -(2.0_f32.powi(-14))].repeat(7).iter().flat_map(|v| v.to_le_bytes()).collect();
+    let expected: Vec<u8> =
+        [1.5_f32, -(2.0_f32.powi(-14))].repeat(7).iter().flat_map(|v| v.to_le_bytes()).collect();
     assert_eq!(imported["gs_conv.bias"].2, expected);
 }
 

@@ -367,7 +367,7 @@ impl Config {
         for (key, dim, heads) in
             [("network.enc_heads", n.enc_dim, n.enc_heads), ("network.dec_heads", n.dec_dim, n.dec_heads)]
         {
-            if dim % heads != 0 || (dim / heads) % 4 != 0 {
+            if !dim.is_multiple_of(4 * heads) {
                 let message = format!(
                     "{dim} channels over {heads} heads: the channels of one head must be a multiple of 4 (rotary \
                      position embedding)"
@@ -378,7 +378,7 @@ impl Config {
         if !n.rope_base.is_finite() || n.rope_base <= 0.0 {
             return Some(("network.rope_base", format!("is {}, must be positive", n.rope_base)));
         }
-        if n.feature_dim % 2 != 0 {
+        if !n.feature_dim.is_multiple_of(2) {
             return Some(("network.feature_dim", format!("is {}, must be even", n.feature_dim)));
         }
         if let Some(hook) = n.hooks.into_iter().find(|&h| h > n.dec_depth) {
@@ -390,11 +390,11 @@ impl Config {
                 format!("is {}; the DPT head is built for patches of 16 pixels", n.patch),
             ));
         }
-        if n.net_resolution % n.patch != 0 {
+        if !n.net_resolution.is_multiple_of(n.patch) {
             let message = format!("{} is no multiple of the patch {}", n.net_resolution, n.patch);
             return Some(("network.net_resolution", message));
         }
-        if n.resolution % n.net_resolution != 0 || n.resolution % 4 != 0 {
+        if !n.resolution.is_multiple_of(n.net_resolution) || !n.resolution.is_multiple_of(4) {
             let message = format!(
                 "is {}, must be a multiple of `network.net_resolution` ({}) and of 4",
                 n.resolution, n.net_resolution
@@ -417,7 +417,7 @@ impl Config {
                 "is 2, but `network.side_heads = false` leaves the second unused".into(),
             ));
         }
-        if r.channels % r.groups != 0 {
+        if !r.channels.is_multiple_of(r.groups) {
             return Some((
                 "regressor.channels",
                 format!("{} is no multiple of {} groups", r.channels, r.groups),

@@ -115,11 +115,11 @@ mod tests {
         let mean = DVec3::new(0.3, -0.2, 2.1);
         let transform = Camera::orbit_at_yaw_degrees(40.0, 64).world_to_camera.inverse();
         let moved = one(q, mean, &device).transformed(&transform);
-        let r: Vec<f32> = moved.rotations.into_data().to_vec().expect("f32");
+        let r: Vec<f32> = moved.rotations.into_data().try_into_vec().expect("f32");
         let got = DMat3::from_quat(DQuat::from_xyzw(r[1].into(), r[2].into(), r[3].into(), r[0].into()));
         let expected = transform.rotation * DMat3::from_quat(q);
         assert!((got - expected).to_cols_array().iter().all(|d| d.abs() < 1e-6));
-        let m: Vec<f32> = moved.means.into_data().to_vec().expect("f32");
+        let m: Vec<f32> = moved.means.into_data().try_into_vec().expect("f32");
         let got = DVec3::new(m[0].into(), m[1].into(), m[2].into());
         assert!((got - transform.apply(mean)).length() < 1e-6, "{got}");
     }

@@ -32,7 +32,7 @@ pub struct Arguments {
     weights: Option<PathBuf>,
     #[command(flatten)]
     config: ConfigArguments,
-    /// auto, cpu, ndarray, wgpu[:i], vulkan[:i], cuda[:i] or metal[:i].
+    /// auto, cpu, ndarray, wgpu, vulkan, cuda or metal; wgpu:1 is the second adapter.
     #[arg(long, default_value = "auto")]
     device: String,
     /// Gaussian PLY to write; the config in force is written beside it.

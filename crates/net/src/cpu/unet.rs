@@ -169,13 +169,11 @@ impl Pass {
         };
         let (gamma, beta) = (affine(&norm.gamma), affine(&norm.beta));
         let affine = |plane: usize| {
-            let mut map = [[0.0; CHANNELS]; 2];
-            for c in 0..CHANNELS {
-                let i = plane * CHANNELS + c;
-                map[0][c] = layer[1][i / per_group] * gamma[i];
-                map[1][c] = beta[i] - layer[0][i / per_group] * map[0][c];
-            }
-            map
+            let index = |c: usize| plane * CHANNELS + c;
+            let scale: [f32; CHANNELS] =
+                std::array::from_fn(|c| layer[1][index(c) / per_group] * gamma[index(c)]);
+            let shift = std::array::from_fn(|c| beta[index(c)] - layer[0][index(c) / per_group] * scale[c]);
+            [scale, shift]
         };
         let affines = (0..planes.len()).map(affine).collect();
         self.layers.push(layer);

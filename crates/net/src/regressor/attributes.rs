@@ -53,7 +53,7 @@ mod tests {
     use burn::tensor::Device;
 
     fn values(x: Tensor<2>) -> Vec<f32> {
-        x.into_data().to_vec().expect("f32")
+        x.into_data().try_into_vec().expect("f32")
     }
 
     /// Check value of SNAPSNAP §13.4: the scale head at 0 gives 6.931e-4.

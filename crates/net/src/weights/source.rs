@@ -144,7 +144,7 @@ impl Source {
             Reader::Pytorch(tensors) => tensors[name].read(),
         };
         let bytes = bytes.map_err(|source| WeightsError::Read { path: self.path.clone(), source })?;
-        widen(bytes, &entry.dtype).ok_or_else(|| {
+        widen(&bytes, &entry.dtype).ok_or_else(|| {
             WeightsError::format(&self.path, &format!("`{name}` is {}, not f32, f16 or bf16", entry.dtype))
         })
     }
@@ -155,7 +155,7 @@ pub fn is_readable(dtype: &str) -> bool {
     matches!(dtype, "f32" | "f16" | "bf16")
 }
 
-fn widen(bytes: Vec<u8>, dtype: &str) -> Option<Vec<f32>> {
+fn widen(bytes: &[u8], dtype: &str) -> Option<Vec<f32>> {
     let two = |widen: fn([u8; 2]) -> f32| bytes.chunks_exact(2).map(|b| widen([b[0], b[1]])).collect();
     match dtype {
         "f32" => Some(bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect()),
