@@ -35,7 +35,7 @@ fn config(folder: &Path) -> Config {
 fn predictor(folder: &Path, config: &Config, device: &Device) -> PointPredictor {
     let file = tempfile::NamedTempFile::new().expect("temporary file");
     let options = ImportOptions { side_heads: SideHeads::Seed, seed: 0 };
-    import(&[folder.join("weights.safetensors")], config, options, file.path()).expect("import");
+    import(&[folder.join("weights.safetensors")], config, options, file.path(), &|_, _| ()).expect("import");
     WeightFile::open(file.path(), None).expect("our file").point_predictor(device).expect("weights")
 }
 
@@ -108,7 +108,8 @@ fn gaussian_regressor_and_its_activations() {
     let Some(device) = device() else { return };
     let file = tempfile::NamedTempFile::new().expect("temporary file");
     let options = ImportOptions { side_heads: SideHeads::Seed, seed: 0 };
-    import(&[folder.join("weights.safetensors")], &Config::default(), options, file.path()).expect("import");
+    import(&[folder.join("weights.safetensors")], &Config::default(), options, file.path(), &|_, _| ())
+        .expect("import");
     let regressors =
         WeightFile::open(file.path(), None).expect("our file").regressors(&device).expect("weights");
     let io = Numbers::read(&folder.join("io.safetensors"));

@@ -19,7 +19,7 @@ fn config(overrides: &[&str]) -> Config {
 
 fn weights(config: &Config, seed: u64) -> (tempfile::NamedTempFile, WeightFile) {
     let file = tempfile::NamedTempFile::new().expect("temporary file");
-    init(config, seed, file.path()).expect("written");
+    init(config, seed, file.path(), &|_, _| ()).expect("written");
     let weights = WeightFile::open(file.path(), None).expect("our file");
     (file, weights)
 }

@@ -49,7 +49,7 @@ struct Workplace {
 impl Workplace {
     fn new() -> Self {
         let place = Self { folder: tempfile::tempdir().expect("temporary folder"), config: tiny() };
-        init(&place.config, 1, &place.path("ours.safetensors")).expect("written");
+        init(&place.config, 1, &place.path("ours.safetensors"), &|_, _| ()).expect("written");
         place
     }
 
@@ -72,7 +72,7 @@ impl Workplace {
         let (from, to) = (self.path("in.safetensors"), self.path("out.safetensors"));
         write(tensors, &from);
         let _ = std::fs::remove_file(&to);
-        let result = import(&[from], &self.config, options, &to);
+        let result = import(&[from], &self.config, options, &to, &|_, _| ());
         assert_eq!(result.is_ok(), to.exists(), "a file is left exactly if the import succeeds");
         result.map(|report| (read(&to), report.notes))
     }
@@ -94,7 +94,7 @@ fn the_authors_pickles_hold_what_their_safetensors_hold() {
     let place = Workplace::new();
     let ours = place.path("imported.safetensors");
     let sources = ["stage1.pth", "stage2.pth"].map(|name| folder.join(name));
-    let report = import(&sources, &place.config, OPTIONS, &ours).expect("imports");
+    let report = import(&sources, &place.config, OPTIONS, &ours, &|_, _| ()).expect("imports");
     let imported = read(&ours);
     let direct = read(&folder.join("weights.safetensors"));
     assert_eq!(report.tensors, imported.len());
@@ -113,8 +113,8 @@ fn export_gives_every_name_of_the_authors_state_dicts() {
     let place = Workplace::new();
     let (ours, exported) = (place.path("imported.safetensors"), place.path("exported.safetensors"));
     let sources = ["stage1.pth", "stage2.pth"].map(|name| data("pipeline").join(name));
-    import(&sources, &place.config, OPTIONS, &ours).expect("imports");
-    export(&ours, &exported).expect("exports");
+    import(&sources, &place.config, OPTIONS, &ours, &|_, _| ()).expect("imports");
+    export(&ours, &exported, &|_, _| ()).expect("exports");
     let exported = read(&exported);
     let authors: Tensors = sources.iter().flat_map(|path| read(path)).collect();
     let names = |tensors: &Tensors| tensors.keys().cloned().collect::<Vec<_>>();
@@ -129,7 +129,8 @@ fn a_dust3r_pickle_gets_delta_and_side_heads_and_says_so() {
     let to = place.path("out.safetensors");
     let with = |side_heads| {
         let options = ImportOptions { side_heads, seed: 5 };
-        let report = import(&[folder.join("dust3r.pth")], &place.config, options, &to).expect("imports");
+        let report =
+            import(&[folder.join("dust3r.pth")], &place.config, options, &to, &|_, _| ()).expect("imports");
         (read(&to), report.notes.join("\n"))
     };
     let (seeded, notes) = with(SideHeads::Seed);

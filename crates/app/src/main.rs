@@ -4,6 +4,7 @@ mod commands;
 mod device;
 mod dump;
 mod failure;
+mod progress;
 mod weights;
 
 use std::process::ExitCode;

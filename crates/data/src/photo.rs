@@ -12,13 +12,9 @@ use crate::resize::{Filter, resize};
 const MIN_SIDE: u32 = 64;
 /// From this share of the person on, a pixel counts as the person's.
 const THRESHOLD: f32 = 0.5;
-/// Height of a training subject in pixels of a canvas of 1024 (SNAPSNAP §5.3).
-const TRAINING_HEIGHT: f32 = 739.0;
 /// Row of a training subject's middle on a canvas of 1024 (SNAPSNAP §5.3: rows 124.39 to 862.52).
 const TRAINING_CENTRE: f32 = 493.5;
-/// Height in the published demo (SNAPSNAP §11).
-const DEMO_HEIGHT: f32 = 700.0;
-/// Canvas side that the three lengths above refer to.
+/// Canvas side that heights and rows refer to.
 const REFERENCE_SIDE: f32 = 1024.0;
 
 /// How a photograph gets onto its canvas.
@@ -26,11 +22,17 @@ const REFERENCE_SIDE: f32 = 1024.0;
 pub enum Placement {
     /// The picture already is the canvas.
     AsIs,
-    /// The person's box is scaled to the height of the training subjects and put where they stand. Antialiased.
-    Training,
-    /// The published demo's recipe: 700 of 1024 pixels high, in the middle, sampled without antialiasing, and only
-    /// pixels that the mask holds completely are valid.
-    Demo,
+    /// The person's box is scaled, antialiased, and put where the training subjects stand.
+    Training {
+        /// Height of the person in pixels of a canvas of 1024.
+        height: usize,
+    },
+    /// The published demo's recipe: in the middle, sampled without antialiasing, and only pixels that the mask holds
+    /// completely are valid.
+    Demo {
+        /// Height of the person in pixels of a canvas of 1024.
+        height: usize,
+    },
 }
 
 /// One photograph on its canvas; arrays are row-major, side S.
@@ -116,10 +118,13 @@ pub fn load(
         None => (alpha(&picture).map_err(refuse)?, path),
     };
     let rgb = picture.into_rgb8();
-    let Some(person) = Box::around(&mask) else {
+    let empty = || {
         let message = "the mask is empty: no pixel belongs to the person".into();
-        return Err(PhotoError::Unsuitable { path: mask_path.to_owned(), message });
+        PhotoError::Unsuitable { path: mask_path.to_owned(), message }
     };
+    // The demo takes whatever the mask touches; a lossy mask touches much that is not the person.
+    let least = if matches!(placement, Placement::Demo { .. }) { 1 } else { u8::MAX.div_ceil(2) };
+    let person = Rect::around(&mask, least).ok_or_else(empty)?;
     if is_single_colour(&rgb, &mask) {
         return Err(refuse("the person is of a single colour: this is no photograph".into()));
     }
@@ -127,11 +132,12 @@ pub fn load(
         "{width}×{height}, person's box {}×{} at ({}, {})",
         person.width, person.height, person.x, person.y
     );
-    Ok(match placement {
+    let canvas = match placement {
         Placement::AsIs => on_canvas(&rgb, &mask, side, source + ", used as it is"),
-        Placement::Training => placed(&rgb, &mask, person, side, &source),
-        Placement::Demo => placed_as_demo(&rgb, &mask, person, side, &source),
-    })
+        Placement::Training { height } => placed(&rgb, &mask, person, [height, side], &source),
+        Placement::Demo { height } => placed_as_demo(&rgb, &mask, person, [height, side], &source),
+    };
+    if canvas.valid.contains(&true) { Ok(canvas) } else { Err(empty()) }
 }
 
 /// Reads an image and turns it as its EXIF orientation says.
@@ -177,18 +183,19 @@ fn is_single_colour(rgb: &RgbImage, mask: &GrayImage) -> bool {
     inside.all(|p| Some(p) == first)
 }
 
-/// The tight box of the pixels that the mask touches.
+/// A box of pixels.
 #[derive(Debug, Clone, Copy)]
-struct Box {
+struct Rect {
     x: u32,
     y: u32,
     width: u32,
     height: u32,
 }
 
-impl Box {
-    fn around(mask: &GrayImage) -> Option<Self> {
-        let set = mask.enumerate_pixels().filter(|(_, _, p)| p[0] > 0);
+impl Rect {
+    /// The tight box of the pixels whose mask is at least `least`.
+    fn around(mask: &GrayImage, least: u8) -> Option<Self> {
+        let set = mask.enumerate_pixels().filter(|(_, _, p)| p[0] >= least);
         let bounds = set.fold(None, |bounds, (x, y, _)| {
             let (x0, y0, x1, y1) = bounds.unwrap_or((x, y, x, y));
             Some((x0.min(x), y0.min(y), x1.max(x), y1.max(y)))
@@ -212,9 +219,15 @@ fn on_canvas(rgb: &RgbImage, mask: &GrayImage, side: usize, report: String) -> C
 }
 
 /// The person's box at the size and place of the training subjects.
-fn placed(rgb: &RgbImage, mask: &GrayImage, person: Box, side: usize, source: &str) -> Canvas {
+fn placed(
+    rgb: &RgbImage,
+    mask: &GrayImage,
+    person: Rect,
+    [height, side]: [usize; 2],
+    source: &str,
+) -> Canvas {
     let canvas = side as f32;
-    let by_height = TRAINING_HEIGHT / REFERENCE_SIDE * canvas / person.height as f32;
+    let by_height = height as f32 / REFERENCE_SIDE * canvas / person.height as f32;
     // Somebody with outstretched arms may be wider than high.
     let scale = by_height.min(canvas / person.width as f32);
     let size = |length: u32| ((length as f32 * scale).round() as usize).clamp(1, side);
@@ -252,9 +265,15 @@ fn placed(rgb: &RgbImage, mask: &GrayImage, person: Box, side: usize, source: &s
 
 /// The published demo's recipe with its quirks: the box loses its last row and column, sampling is plain bilinear,
 /// colours are not multiplied by the mask but cut at ½, and only pixels with a full mask are valid.
-fn placed_as_demo(rgb: &RgbImage, mask: &GrayImage, person: Box, side: usize, source: &str) -> Canvas {
-    let person = Box { width: (person.width - 1).max(1), height: (person.height - 1).max(1), ..person };
-    let height = (DEMO_HEIGHT / REFERENCE_SIDE * side as f32).round() as usize;
+fn placed_as_demo(
+    rgb: &RgbImage,
+    mask: &GrayImage,
+    person: Rect,
+    [height, side]: [usize; 2],
+    source: &str,
+) -> Canvas {
+    let person = Rect { width: (person.width - 1).max(1), height: (person.height - 1).max(1), ..person };
+    let height = (height as f32 / REFERENCE_SIDE * side as f32).round() as usize;
     let scaled = person.width as usize * height / person.height as usize;
     let width = (scaled / 2 * 2).clamp(2, side);
     let (left, top) = ((side - width) / 2, (side - height) / 2);
@@ -284,7 +303,7 @@ fn placed_as_demo(rgb: &RgbImage, mask: &GrayImage, person: Box, side: usize, so
 fn crop_planes(
     rgb: &RgbImage,
     mask: &GrayImage,
-    person: Box,
+    person: Rect,
     color: impl Fn(u8, u8) -> f32,
 ) -> [Vec<f32>; 4] {
     let mut planes: [Vec<f32>; 4] = Default::default();

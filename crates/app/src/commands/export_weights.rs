@@ -7,6 +7,7 @@ use snapsnap_net::weights;
 
 use super::check_output;
 use crate::failure::Failure;
+use crate::progress::Progress;
 
 #[derive(Args)]
 pub struct Arguments {
@@ -18,8 +19,11 @@ pub struct Arguments {
 }
 
 pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
-    check_output(&arguments.output)?;
-    let tensors = weights::export(&arguments.input, &arguments.output)?;
+    check_output(&arguments.output, &[&arguments.input])?;
+    let progress = Progress::bytes(quiet);
+    let tensors =
+        weights::export(&arguments.input, &arguments.output, &|done, total| progress.advance(done, total))?;
+    drop(progress);
     if !quiet {
         println!("{}: {tensors} tensors", arguments.output.display());
     }

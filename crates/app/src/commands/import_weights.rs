@@ -1,12 +1,13 @@
 //! `snapsnap import-weights`.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
 use snapsnap_net::weights::{self, ImportOptions, SideHeads};
 
 use super::{ConfigArguments, check_output};
 use crate::failure::Failure;
+use crate::progress::Progress;
 
 #[derive(Args)]
 pub struct Arguments {
@@ -37,13 +38,18 @@ enum Sides {
 pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     // The only published weights of this size were trained with every quirk of the published code.
     let config = arguments.config.resolve(("the published size", "[mode]\ncompat = true\n"))?;
-    check_output(&arguments.output)?;
+    let inputs: Vec<&Path> = arguments.sources.iter().map(PathBuf::as_path).collect();
+    check_output(&arguments.output, &inputs)?;
+    let progress = Progress::bytes(quiet);
     let side_heads = match arguments.side_heads {
         Sides::Seed => SideHeads::Seed,
         Sides::Copy => SideHeads::Copy,
     };
     let options = ImportOptions { side_heads, seed: arguments.seed };
-    let report = weights::import(&arguments.sources, &config, options, &arguments.output)?;
+    let report = weights::import(&arguments.sources, &config, options, &arguments.output, &|done, total| {
+        progress.advance(done, total);
+    })?;
+    drop(progress);
     if !quiet {
         for note in &report.notes {
             println!("{note}");

@@ -7,6 +7,7 @@ use snapsnap_net::weights;
 
 use super::{ConfigArguments, check_output};
 use crate::failure::Failure;
+use crate::progress::Progress;
 
 #[derive(Args)]
 pub struct Arguments {
@@ -22,8 +23,12 @@ pub struct Arguments {
 
 pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let config = arguments.config.resolve(("the published size", ""))?;
-    check_output(&arguments.output)?;
-    let parameters = weights::init(&config, arguments.seed, &arguments.output)?;
+    check_output(&arguments.output, &[])?;
+    let progress = Progress::bytes(quiet);
+    let parameters = weights::init(&config, arguments.seed, &arguments.output, &|done, total| {
+        progress.advance(done, total);
+    })?;
+    drop(progress);
     if !quiet {
         let (file, seed) = (arguments.output.display(), arguments.seed);
         println!("{file}: {parameters} random parameters from seed {seed}");

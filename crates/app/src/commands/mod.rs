@@ -33,8 +33,18 @@ impl ConfigArguments {
     }
 }
 
-/// Refuses an output path that could not be written in the end.
-pub fn check_output(path: &Path) -> Result<(), Failure> {
+/// Refuses an output path that could not be written in the end, or that is one of the inputs.
+pub fn check_output(path: &Path, inputs: &[&Path]) -> Result<(), Failure> {
+    let same = |input: &&&Path| match (path.canonicalize(), input.canonicalize()) {
+        (Ok(output), Ok(input)) => output == input && output.is_file(),
+        _ => false,
+    };
+    if inputs.iter().any(|input| same(&input)) {
+        return Err(Failure::Input(format!(
+            "{}: is an input of this command and would be overwritten",
+            path.display()
+        )));
+    }
     snapsnap_splat::file::check_writable(path)
         .map_err(|e| Failure::Input(format!("{}: cannot write: {e}", path.display())))
 }

@@ -5,14 +5,14 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use clap::Args;
-use indicatif::{ProgressBar, ProgressStyle};
 use snapsnap_data::photo::{self, Canvas, Placement};
 use snapsnap_net::weights::schema::Part;
-use snapsnap_net::{Photograph, Reconstruction, Reconstructor};
+use snapsnap_net::{Photograph, Reconstructor};
 use snapsnap_splat::{file, ply};
 
 use super::{ConfigArguments, check_output};
 use crate::failure::Failure;
+use crate::progress::Progress;
 use crate::{device, dump, weights};
 
 #[derive(Args)]
@@ -47,9 +47,19 @@ pub struct Arguments {
 }
 
 pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
-    let config_path = arguments.output.with_extension("config.toml");
-    for path in [Some(&arguments.output), arguments.dump.as_ref(), Some(&config_path)].into_iter().flatten() {
-        check_output(path)?;
+    let inputs: Vec<&Path> = [&arguments.front, &arguments.back]
+        .into_iter()
+        .chain(arguments.masks.iter().flatten())
+        .chain(&arguments.weights)
+        .chain(&arguments.config.config)
+        .map(PathBuf::as_path)
+        .collect();
+    // Beside a pipe or a device there is no place for a config.
+    let beside = std::fs::metadata(&arguments.output).map_or(true, |m| m.is_file());
+    let config_path = beside.then(|| arguments.output.with_extension("config.toml"));
+    for path in [Some(&arguments.output), arguments.dump.as_ref(), config_path.as_ref()].into_iter().flatten()
+    {
+        check_output(path, &inputs)?;
     }
     let weights = weights::open(arguments.weights.as_deref(), &arguments.config)?;
     weights.require(Part::PointPredictor)?;
@@ -57,8 +67,8 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let config = weights.config.clone();
     let placement = match (arguments.as_is, config.mode.compat) {
         (true, _) => Placement::AsIs,
-        (false, true) => Placement::Demo,
-        (false, false) => Placement::Training,
+        (false, true) => Placement::Demo { height: config.person_height() },
+        (false, false) => Placement::Training { height: config.person_height() },
     };
     let masks = arguments.masks.as_deref().unwrap_or_default();
     let mut times = Vec::new();
@@ -70,7 +80,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     times.push(("photographs", start.elapsed()));
     let device = device::choose(&arguments.device)?;
 
-    let progress = Progress::new(quiet);
+    let progress = Progress::stages(quiet);
     progress.stage("loading weights");
     let start = Instant::now();
     let reconstructor = Reconstructor::load(&weights, &device)?;
@@ -89,21 +99,19 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     if let Some(path) = &arguments.dump {
         dump::write(&result, path)?;
     }
-    write_text(&config_path, &config.to_toml())?;
+    if let Some(path) = &config_path {
+        write_text(path, &config.to_toml())?;
+    }
     ply::write(&result.in_world(&config), &arguments.output)?;
     times.push(("writing", start.elapsed()));
-    progress.done();
+    drop(progress);
     if arguments.verbose {
         report(&plan, &times);
     }
     if !quiet {
-        println!("{}: {} Gaussians", arguments.output.display(), count(&result));
+        println!("{}: {} Gaussians", arguments.output.display(), result.gaussians.len());
     }
     Ok(())
-}
-
-fn count(result: &Reconstruction) -> usize {
-    result.gaussians.len()
 }
 
 fn write_text(path: &Path, text: &str) -> Result<(), Failure> {
@@ -122,39 +130,4 @@ fn report(plan: &[String], times: &[(&str, Duration)]) {
     }
     let total: Duration = times.iter().map(|(_, time)| *time).sum();
     println!("  {:<26} {:>9.1} ms", "total", total.as_secs_f64() * 1e3);
-}
-
-/// The name of the running module with the time so far: a spinner on a terminal, plain lines elsewhere.
-struct Progress {
-    bar: Option<ProgressBar>,
-    plain: bool,
-}
-
-impl Progress {
-    fn new(quiet: bool) -> Self {
-        let terminal = std::io::IsTerminal::is_terminal(&std::io::stderr());
-        let bar = (!quiet && terminal).then(|| {
-            let bar = ProgressBar::new_spinner();
-            bar.set_style(
-                ProgressStyle::with_template("{spinner} {msg} [{elapsed}]").expect("a valid template"),
-            );
-            bar.enable_steady_tick(Duration::from_millis(100));
-            bar
-        });
-        Self { bar, plain: !quiet && !terminal }
-    }
-
-    fn stage(&self, name: &str) {
-        if let Some(bar) = &self.bar {
-            bar.set_message(name.to_owned());
-        } else if self.plain {
-            eprintln!("{name} …");
-        }
-    }
-
-    fn done(&self) {
-        if let Some(bar) = &self.bar {
-            bar.finish_and_clear();
-        }
-    }
 }

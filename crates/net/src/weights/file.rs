@@ -16,6 +16,9 @@ use crate::config::Config;
 /// Metadata key under which the config (TOML) is stored.
 pub const CONFIG_KEY: &str = "snapsnap.config";
 
+/// Hears how many bytes of how many have been written.
+pub type Progress<'a> = &'a dyn Fn(u64, u64);
+
 /// Bytes of an f32.
 const F32: usize = 4;
 
@@ -25,11 +28,12 @@ pub(super) fn write<'a, T: std::borrow::Borrow<TensorSpec> + 'a>(
     config: &Config,
     tensors: &'a [T],
     mut values: impl FnMut(&'a TensorSpec) -> Result<Vec<f32>, WeightsError>,
+    progress: Progress,
 ) -> Result<(), WeightsError> {
     let infos = tensors.iter().map(|t| (t.borrow().name.clone(), t.borrow().shape.clone()));
     // One entry only: the header lists metadata in no fixed order, and the same seed must give the same bytes.
     let metadata = HashMap::from([(CONFIG_KEY.into(), config.to_toml())]);
-    write_tensors(path, metadata, infos.collect(), |i| values(tensors[i].borrow()))
+    write_tensors(path, metadata, infos.collect(), |i| values(tensors[i].borrow()), progress)
 }
 
 fn write_tensors(
@@ -37,6 +41,7 @@ fn write_tensors(
     metadata: HashMap<String, String>,
     tensors: Vec<(String, Vec<usize>)>,
     mut values: impl FnMut(usize) -> Result<Vec<f32>, WeightsError>,
+    progress: Progress,
 ) -> Result<(), WeightsError> {
     let count = tensors.len();
     let mut at = 0;
@@ -63,10 +68,13 @@ fn write_tensors(
     write_whole(path, |out| {
         out.write_all(&(header.len() as u64).to_le_bytes())?;
         out.write_all(&header)?;
+        let mut written = 0;
         for i in 0..count {
             let values = values(i).map_err(Failure::Weights)?;
             let bytes: Vec<u8> = values.iter().flat_map(|v| v.to_le_bytes()).collect();
             out.write_all(&bytes)?;
+            written += bytes.len();
+            progress(written as u64, at as u64);
         }
         Ok(())
     })
@@ -183,7 +191,7 @@ pub(super) fn parts_of<'a>(keys: impl Iterator<Item = &'a String>) -> Parts {
 ///
 /// # Errors
 /// [`WeightsError`].
-pub fn export(from: &Path, to: &Path) -> Result<usize, WeightsError> {
+pub fn export(from: &Path, to: &Path, progress: Progress) -> Result<usize, WeightsError> {
     let file = WeightFile::open(from, None)?;
     let mut entries: Vec<(String, &str)> = Vec::new();
     for name in file.source.tensors().keys() {
@@ -193,6 +201,6 @@ pub fn export(from: &Path, to: &Path) -> Result<usize, WeightsError> {
     let shapes =
         entries.iter().map(|(alias, name)| (alias.clone(), file.source.tensors()[*name].shape.clone()));
     let metadata = HashMap::from([("format".to_owned(), "pt".to_owned())]);
-    write_tensors(to, metadata, shapes.collect(), |i| file.source.read_f32(entries[i].1))?;
+    write_tensors(to, metadata, shapes.collect(), |i| file.source.read_f32(entries[i].1), progress)?;
     Ok(entries.len())
 }

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use super::WeightsError;
-use super::file::{parts_of, write};
+use super::file::{Progress, parts_of, write};
 use super::init::{SideHeads, draw};
 use super::schema::{self, DUST3R, SCALE, SIDE, TensorSpec};
 use super::source::{Entry, Source, is_readable};
@@ -31,9 +31,11 @@ pub struct ImportReport {
 }
 
 /// Where a tensor's values come from.
+#[derive(Clone)]
 enum Origin<'a> {
     File(&'a Source, String),
-    Seed,
+    /// Its initial distribution.
+    Drawn,
 }
 
 /// Keys of the authors' files that play no part in inference or training here.
@@ -90,90 +92,37 @@ pub fn import(
     config: &Config,
     options: ImportOptions,
     to: &Path,
+    progress: Progress,
 ) -> Result<ImportReport, WeightsError> {
     let sources = from.iter().map(|path| Source::open(path)).collect::<Result<Vec<_>, _>>()?;
+    let origin = from.iter().map(|p| p.display().to_string()).collect::<Vec<_>>().join(", ");
     let mut report = ImportReport::default();
     let mut problems = Vec::new();
     let mut found = collect(&sources, &mut problems, &mut report)?;
-    copy_decoder(config, &mut found, &mut report);
-
+    copy_decoder(&mut found, &mut report);
     let parts = parts_of(found.keys());
     let specs: Vec<_> = schema::tensors(config).into_iter().filter(|t| parts.contains(t.part)).collect();
-    let released = found.contains_key(SCALE);
-    let missing_heads: Vec<usize> = (1..=4)
-        .filter(|k| {
-            !released && !found.keys().any(|key| key.starts_with(&format!("{DUST3R}downstream_head{k}.")))
-        })
-        .collect();
-
-    let mut plan: Vec<(&TensorSpec, Origin)> = Vec::new();
-    for spec in &specs {
-        if let Some((source, key)) = found.remove(&spec.name) {
-            problems.extend(mismatch(spec, &source.tensors()[&key], source.path()));
-            plan.push((spec, Origin::File(source, key)));
-            continue;
-        }
-        let head =
-            missing_heads.iter().find(|k| spec.name.starts_with(&format!("{DUST3R}downstream_head{k}.")));
-        match (head, options.side_heads) {
-            (Some(&k), SideHeads::Copy) if k > 2 => {
-                let twin =
-                    spec.name.replace(&format!("downstream_head{k}."), &format!("downstream_head{}.", k - 2));
-                match plan.iter().find(|(s, _)| s.name == twin) {
-                    Some((s, Origin::File(source, key))) if s.shape == spec.shape => {
-                        let origin = Origin::File(source, key.clone());
-                        plan.push((spec, origin));
-                    }
-                    Some((s, _)) if s.shape != spec.shape => problems.push(format!(
-                        "cannot copy: {} needs {:?}, {} has {:?} (fusion = \"concat\" doubles the side heads' inputs)",
-                        spec.name, spec.shape, twin, s.shape
-                    )),
-                    _ => plan.push((spec, Origin::Seed)),
-                }
-            }
-            (Some(_), _) => plan.push((spec, Origin::Seed)),
-            (None, _) if spec.name == SCALE => {
-                report
-                    .notes
-                    .push(format!("δ (`scale`) is in no file: {} from the config", config.network.delta));
-                plan.push((spec, Origin::Seed));
-            }
-            (None, _) => problems.push(format!("missing: {} {:?}", spec.name, spec.shape)),
-        }
-    }
-    if parts.contains(schema::Part::PointPredictor) {
-        let wanted = if config.network.side_heads { 4 } else { 2 };
-        for k in missing_heads.into_iter().filter(|&k| k <= wanted) {
-            report.notes.push(match options.side_heads {
-                SideHeads::Copy if k > 2 => format!("head {k} is in no file: copied from head {}", k - 2),
-                _ => format!("head {k} is in no file: drawn from seed {}", options.seed),
-            });
-        }
-    }
-    for (name, (source, _)) in &found {
-        problems.push(format!("not part of the configured networks: {name} in {}", source.path().display()));
-    }
-    let origin = from.iter().map(|p| p.display().to_string()).collect::<Vec<_>>().join(", ");
     if specs.is_empty() {
         problems.push("no tensor of a point predictor or a regressor".into());
     }
+    let plan = plan(&specs, found, options, &mut problems, &mut report);
     if !problems.is_empty() {
         return Err(WeightsError::Tensors { origin, problems });
     }
 
-    let ordered: Vec<&TensorSpec> = plan.iter().map(|(spec, _)| *spec).collect();
+    let ordered: Vec<&TensorSpec> = specs.iter().collect();
     let mut next = plan.iter();
     let mut broken = Vec::new();
-    let result = write(to, config, &ordered, |spec| {
-        let values = match &next.next().expect("one origin per tensor").1 {
-            Origin::Seed => draw(spec, options.seed),
+    let values = |spec: &TensorSpec| {
+        let values = match next.next().expect("one origin per tensor") {
+            Origin::Drawn => draw(spec, options.seed),
             Origin::File(source, key) => source.read_f32(key)?,
         };
         let bad = values.iter().filter(|v| !v.is_finite()).count();
         if bad > 0 {
             broken.push(format!("not finite: {} ({bad} of {} values)", spec.name, values.len()));
         }
-        // The last tensor decides: an error here discards the temporary file.
+        // Only the last tensor refuses, so that all broken ones are named; the temporary file is then discarded.
         if next.len() == 0 && !broken.is_empty() {
             return Err(WeightsError::Tensors {
                 origin: origin.clone(),
@@ -181,11 +130,77 @@ pub fn import(
             });
         }
         Ok(values)
-    });
-    result?;
-    report.tensors = ordered.len();
-    report.parameters = ordered.iter().map(|t| t.elements()).sum();
+    };
+    write(to, config, &ordered, values, progress)?;
+    report.tensors = specs.len();
+    report.parameters = specs.iter().map(TensorSpec::elements).sum();
     Ok(report)
+}
+
+/// The key of head `k`'s tensors up to their own names.
+fn head(k: usize) -> String {
+    format!("{DUST3R}downstream_head{k}.")
+}
+
+/// One origin per tensor of `specs`, in order; what has none, and what no tensor wants, are problems.
+fn plan<'a>(
+    specs: &[TensorSpec],
+    mut found: Found<'a>,
+    options: ImportOptions,
+    problems: &mut Vec<String>,
+    report: &mut ImportReport,
+) -> Vec<Origin<'a>> {
+    // DUSt3R's files lack δ and the side heads, CroCo's all heads; Snap-Snap's are complete, or damaged.
+    let complete = found.contains_key(SCALE);
+    let wanted = |k: &usize| specs.iter().any(|spec| spec.name.starts_with(&head(*k)));
+    let given = |k: &usize| found.keys().any(|key| key.starts_with(&head(*k)));
+    let absent: Vec<usize> = (1..=4).filter(|k| !complete && wanted(k) && !given(k)).collect();
+    for &k in &absent {
+        report.notes.push(match options.side_heads {
+            SideHeads::Copy if k > 2 && !absent.contains(&(k - 2)) => {
+                format!("head {k} is in no file: copied from head {}", k - 2)
+            }
+            _ => format!("head {k} is in no file: drawn from seed {}", options.seed),
+        });
+    }
+
+    let mut plan: Vec<Origin> = Vec::new();
+    for spec in specs {
+        let of_absent_head = absent.iter().find(|k| spec.name.starts_with(&head(**k)));
+        let origin = match (found.remove(&spec.name), of_absent_head) {
+            (Some((source, key)), _) => {
+                problems.extend(mismatch(spec, &source.tensors()[&key], source.path()));
+                Origin::File(source, key)
+            }
+            (None, Some(&k)) if k > 2 && options.side_heads == SideHeads::Copy => {
+                let twin = spec.name.replace(&head(k), &head(k - 2));
+                let at = specs.iter().position(|s| s.name == twin).expect("heads have the same tensors");
+                if specs[at].shape == spec.shape {
+                    plan[at].clone()
+                } else {
+                    problems.push(format!(
+                        "cannot copy: {} needs {:?}, {twin} has {:?} (fusion = \"concat\" doubles the side heads' inputs)",
+                        spec.name, spec.shape, specs[at].shape
+                    ));
+                    Origin::Drawn
+                }
+            }
+            (None, Some(_)) => Origin::Drawn,
+            (None, None) if spec.name == SCALE => {
+                report.notes.push("δ (`scale`) is in no file: `network.delta` of the config".into());
+                Origin::Drawn
+            }
+            (None, None) => {
+                problems.push(format!("missing: {} {:?}", spec.name, spec.shape));
+                Origin::Drawn
+            }
+        };
+        plan.push(origin);
+    }
+    for (name, (source, _)) in &found {
+        problems.push(format!("not part of the configured networks: {name} in {}", source.path().display()));
+    }
+    plan
 }
 
 type Found<'a> = BTreeMap<String, (&'a Source, String)>;
@@ -229,9 +244,9 @@ fn same_bits(source: &Source, a: &str, b: &str) -> Result<bool, WeightsError> {
 }
 
 /// CroCo checkpoints have one decoder; both sides start from it (SNAPSNAP §3.3).
-fn copy_decoder(config: &Config, found: &mut Found, report: &mut ImportReport) {
+fn copy_decoder(found: &mut Found, report: &mut ImportReport) {
     let (first, second) = (format!("{DUST3R}dec_blocks."), format!("{DUST3R}dec_blocks2."));
-    if config.network.dec_depth == 0 || found.keys().any(|k| k.starts_with(&second)) {
+    if found.keys().any(|k| k.starts_with(&second)) {
         return;
     }
     let copies: Vec<_> = found

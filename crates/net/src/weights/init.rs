@@ -7,7 +7,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use super::WeightsError;
-use super::file::write;
+use super::file::{Progress, write};
 use super::schema::{self, Init, TensorSpec};
 use crate::config::Config;
 
@@ -45,9 +45,9 @@ fn fnv1a(text: &str) -> u64 {
 ///
 /// # Errors
 /// [`WeightsError::Write`].
-pub fn init(config: &Config, seed: u64, path: &Path) -> Result<usize, WeightsError> {
+pub fn init(config: &Config, seed: u64, path: &Path, progress: Progress) -> Result<usize, WeightsError> {
     let tensors = schema::tensors(config);
-    write(path, config, &tensors, |spec| Ok(draw(spec, seed)))?;
+    write(path, config, &tensors, |spec| Ok(draw(spec, seed)), progress)?;
     Ok(tensors.iter().map(TensorSpec::elements).sum())
 }
 

@@ -12,7 +12,7 @@ mod source;
 
 use std::path::{Path, PathBuf};
 
-pub use file::{CONFIG_KEY, WeightFile, export};
+pub use file::{CONFIG_KEY, Progress, WeightFile, export};
 pub use import::{ImportOptions, ImportReport, import};
 pub use init::{SideHeads, init};
 pub use source::{Entry, Source};

@@ -1,0 +1,69 @@
+//! Progress on stderr: a bar or a spinner on a terminal, plain lines elsewhere, nothing with --quiet.
+
+use std::cell::Cell;
+use std::io::IsTerminal;
+use std::time::Duration;
+
+use indicatif::{ProgressBar, ProgressStyle};
+
+/// Bytes between two plain lines.
+const LINE_BYTES: u64 = 500_000_000;
+
+/// Progress of one command.
+pub struct Progress {
+    bar: Option<ProgressBar>,
+    plain: bool,
+    /// Bytes reported by the last plain line.
+    reported: Cell<u64>,
+}
+
+impl Progress {
+    /// Named modules one after another.
+    pub fn stages(quiet: bool) -> Self {
+        Self::new(quiet, ProgressBar::new_spinner(), "{spinner} {msg} [{elapsed}]")
+    }
+
+    /// Bytes of a file, with rate and time left.
+    pub fn bytes(quiet: bool) -> Self {
+        let template = "{bar:40} {bytes}/{total_bytes} {bytes_per_sec} {eta} left";
+        Self::new(quiet, ProgressBar::new(0), template)
+    }
+
+    fn new(quiet: bool, bar: ProgressBar, template: &str) -> Self {
+        let terminal = std::io::stderr().is_terminal();
+        let bar = (!quiet && terminal).then(|| {
+            bar.set_style(ProgressStyle::with_template(template).expect("a valid template"));
+            bar.enable_steady_tick(Duration::from_millis(100));
+            bar
+        });
+        Self { bar, plain: !quiet && !terminal, reported: Cell::new(0) }
+    }
+
+    /// A module starts.
+    pub fn stage(&self, name: &str) {
+        if let Some(bar) = &self.bar {
+            bar.set_message(name.to_owned());
+        } else if self.plain {
+            eprintln!("{name} …");
+        }
+    }
+
+    /// So many bytes of so many are done.
+    pub fn advance(&self, done: u64, total: u64) {
+        if let Some(bar) = &self.bar {
+            bar.set_length(total);
+            bar.set_position(done);
+        } else if self.plain && done >= self.reported.get() + LINE_BYTES {
+            self.reported.set(done);
+            eprintln!("{} of {} MB", done / 1_000_000, total / 1_000_000);
+        }
+    }
+}
+
+impl Drop for Progress {
+    fn drop(&mut self) {
+        if let Some(bar) = &self.bar {
+            bar.finish_and_clear();
+        }
+    }
+}

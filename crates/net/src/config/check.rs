@@ -1,0 +1,122 @@
+//! Which values of a config make sense, alone and beside each other.
+
+use super::{Config, Downsample, HeadKind, RotationFrame, Upsample, WorldFrame};
+
+impl Config {
+    /// The first value that makes no sense: its key, and what is wrong.
+    pub(super) fn problem(&self) -> Option<(&'static str, String)> {
+        let n = &self.network;
+        let sizes = [
+            ("network.enc_dim", n.enc_dim, 65_536),
+            ("network.enc_depth", n.enc_depth, 1_024),
+            ("network.enc_heads", n.enc_heads, 1_024),
+            ("network.dec_dim", n.dec_dim, 65_536),
+            ("network.dec_depth", n.dec_depth, 1_024),
+            ("network.dec_heads", n.dec_heads, 1_024),
+            ("network.mlp_ratio", n.mlp_ratio, 64),
+            ("network.patch", n.patch, 1_024),
+            ("network.layer_dims", n.layer_dims.into_iter().min().unwrap_or(0), usize::MAX),
+            ("network.layer_dims", n.layer_dims.into_iter().max().unwrap_or(0), 65_536),
+            ("network.feature_dim", n.feature_dim, 65_536),
+            ("network.last_dim", n.last_dim, 65_536),
+            ("network.resolution", n.resolution, 16_384),
+            ("network.net_resolution", n.net_resolution, 16_384),
+            ("regressor.channels", self.regressor.channels, 4_096),
+            ("regressor.groups", self.regressor.groups, 4_096),
+        ];
+        for (key, value, most) in sizes {
+            if value == 0 || value > most {
+                return Some((key, format!("is {value}, must be between 1 and {most}")));
+            }
+        }
+        for (key, dim, heads) in
+            [("network.enc_heads", n.enc_dim, n.enc_heads), ("network.dec_heads", n.dec_dim, n.dec_heads)]
+        {
+            if !dim.is_multiple_of(4 * heads) {
+                let message = format!(
+                    "{dim} channels over {heads} heads: the channels of one head must be a multiple of 4 (rotary \
+                     position embedding)"
+                );
+                return Some((key, message));
+            }
+        }
+        if !n.rope_base.is_finite() || n.rope_base <= 0.0 {
+            return Some(("network.rope_base", format!("is {}, must be positive", n.rope_base)));
+        }
+        if !n.feature_dim.is_multiple_of(2) {
+            return Some(("network.feature_dim", format!("is {}, must be even", n.feature_dim)));
+        }
+        if let Some(hook) = n.hooks.into_iter().find(|&h| h > n.dec_depth) {
+            return Some(("network.hooks", format!("{hook} is beyond the last layer {}", n.dec_depth)));
+        }
+        if n.head == HeadKind::Dpt && n.patch != 16 {
+            return Some((
+                "network.patch",
+                format!("is {}; the DPT head is built for patches of 16 pixels", n.patch),
+            ));
+        }
+        if !n.net_resolution.is_multiple_of(n.patch) {
+            let message = format!("{} is no multiple of the patch {}", n.net_resolution, n.patch);
+            return Some(("network.net_resolution", message));
+        }
+        if !n.resolution.is_multiple_of(n.net_resolution) || !n.resolution.is_multiple_of(4) {
+            let message = format!(
+                "is {}, must be a multiple of `network.net_resolution` ({}) and of 4",
+                n.resolution, n.net_resolution
+            );
+            return Some(("network.resolution", message));
+        }
+        if n.conf_threshold.is_nan() {
+            return Some(("network.conf_threshold", "is not a number".into()));
+        }
+        if !n.delta.is_finite() || n.delta == 0.0 {
+            return Some(("network.delta", format!("is {}, must be finite and not 0", n.delta)));
+        }
+        if !(16..=1024).contains(&self.person_height()) {
+            let message =
+                format!("is {}, must be between 16 and 1024 (of a canvas of 1024)", self.person_height());
+            return Some(("mode.person_height", message));
+        }
+        let r = &self.regressor;
+        if !(1..=2).contains(&r.networks) {
+            return Some(("regressor.networks", format!("is {}, allowed: 1, 2", r.networks)));
+        }
+        if r.networks == 2 && !n.side_heads {
+            return Some((
+                "regressor.networks",
+                "is 2, but `network.side_heads = false` leaves the second unused".into(),
+            ));
+        }
+        if !r.channels.is_multiple_of(r.groups) {
+            return Some((
+                "regressor.channels",
+                format!("{} is no multiple of {} groups", r.channels, r.groups),
+            ));
+        }
+        self.contradiction()
+    }
+
+    fn contradiction(&self) -> Option<(&'static str, String)> {
+        if !self.mode.compat {
+            return (self.rotation_frame() == RotationFrame::Camera
+                && self.world_frame() == WorldFrame::Mirrored)
+                .then(|| {
+                    let message = "\"mirrored\" is a reflection, which no quaternion can follow: set \
+                                   `mode.rotation_frame = \"world\"` or `mode.world_frame = \"upright\"`";
+                    ("mode.world_frame", message.into())
+                });
+        }
+        let quirks = [
+            ("network.upsample", self.upsample() == Upsample::Bilinear, "\"bilinear\""),
+            ("mode.rotation_frame", self.rotation_frame() == RotationFrame::World, "\"world\""),
+            ("mode.downsample", self.downsample() == Downsample::Nearest, "\"nearest\""),
+            ("mode.world_frame", self.world_frame() == WorldFrame::Mirrored, "\"mirrored\""),
+            ("mode.crop", !self.crop(), "false"),
+        ];
+        let (key, _, allowed) = quirks.into_iter().find(|(_, holds, _)| !holds)?;
+        Some((
+            key,
+            format!("contradicts `mode.compat = true`, which means {allowed}; leave one of the two out"),
+        ))
+    }
+}
