@@ -23,6 +23,10 @@ pub fn device() -> Option<Device> {
             let found =
                 std::panic::catch_unwind(|| !Device::enumerate(DeviceType::Wgpu).into_vec().is_empty());
             if !found.unwrap_or(false) {
+                assert!(
+                    std::env::var_os("SNAPSNAP_REQUIRE_WGPU").is_none(),
+                    "no wgpu adapter, but one is required"
+                );
                 println!("SKIPPED: no wgpu adapter on this machine");
                 return None;
             }
@@ -76,10 +80,11 @@ pub fn data(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("data").join(name)
 }
 
-/// Path of a reference fixture, or `None`, said aloud, where the fixtures are not beside the checkout.
+/// Path of a reference fixture: in this repository, or in the folder of all of them beside the checkout; `None`, said
+/// aloud, where neither has it.
 pub fn fixture(name: &str) -> Option<PathBuf> {
     let path = shared("fixtures").join(name);
-    if path.exists() {
+    if let Some(path) = [data(name), path.clone()].into_iter().find(|path| path.exists()) {
         return Some(path);
     }
     println!("SKIPPED: no reference fixture {}", path.display());

@@ -115,7 +115,7 @@ fn two_pictures_become_a_finite_ply_with_config_and_plan() {
         let length: f32 = row[13..17].iter().map(|v| v * v).sum();
         assert!((length - 1.0).abs() < 1e-4, "{row:?}");
     }
-    let config = fs::read_to_string(place.path("human.config.toml")).expect("config beside the PLY");
+    let config = fs::read_to_string(place.path("human.ply.config.toml")).expect("config beside the PLY");
     assert!(config.contains("enc_dim = 64"), "{config}");
 }
 
@@ -254,6 +254,76 @@ fn unsuitable_configs_weights_devices_and_outputs_are_refused_by_name() {
         refused(snapsnap().arg("reconstruct")).lines().next().map(|l| l.starts_with("error")),
         Some(true)
     );
+}
+
+#[test]
+fn no_input_and_no_other_output_is_ever_overwritten() {
+    let place = Workplace::new();
+    fs::create_dir(place.path("model")).expect("folder");
+    fs::copy(place.path("w"), place.path("model/weights.safetensors")).expect("copied");
+    let refuse = |arguments: &[&str]| {
+        let mut command = snapsnap();
+        let common = ["reconstruct", "front.png", "back.png", "--device", "cpu"];
+        place.refusal(command.current_dir(place.path("")).args(common).args(arguments))
+    };
+    for arguments in [
+        ["--weights", "w", "-o", "front.png"],
+        ["--weights", "w", "-o", "w"],
+        ["--weights", "model", "-o", "model/weights.safetensors"],
+        ["--weights", "model", "--dump", "model/weights.safetensors"],
+    ] {
+        assert!(refuse(&arguments).contains("is an input"), "{arguments:?}");
+    }
+    for dump in ["h.ply", "h.ply.config.toml"] {
+        assert!(refuse(&["--weights", "w", "-o", "h.ply", "--dump", dump]).contains("two outputs"), "{dump}");
+    }
+    fs::copy(tiny(), place.path("c.toml")).expect("copied");
+    let mut command = snapsnap();
+    let arguments = ["init-weights", "--config", "c.toml", "-o", "c.toml"];
+    assert!(place.refusal(command.current_dir(place.path("")).args(arguments)).contains("is an input"));
+
+    // The config that a run wrote repeats the run in place.
+    succeed(place.reconstruct("front.png", "back.png").args(["-o", "human.ply"]));
+    let first = fs::read(place.path("human.ply")).expect("read");
+    let again = ["-o", "human.ply", "--config", "human.ply.config.toml"];
+    succeed(place.reconstruct("front.png", "back.png").args(again));
+    assert!(first == fs::read(place.path("human.ply")).expect("read"));
+}
+
+#[test]
+fn weights_that_give_nothing_are_an_error_and_write_nothing() {
+    let place = Workplace::new();
+    let mut init = snapsnap();
+    init.current_dir(place.path("")).args([
+        "init-weights",
+        "--set",
+        "network.delta=1e38",
+        "-o",
+        "w",
+        "--config",
+    ]);
+    succeed(init.arg(tiny()));
+    let message = place.refusal(&mut place.reconstruct("front.png", "back.png"));
+    assert!(message.contains("no Gaussian came out") && message.contains("not finite"), "{message}");
+}
+
+#[test]
+fn a_closed_or_full_output_stream_never_panics() {
+    let place = Workplace::new();
+    let full = || fs::File::options().write(true).open("/dev/full");
+    if full().is_err() {
+        println!("SKIPPED: no /dev/full on this system");
+        return;
+    }
+    let status = place
+        .reconstruct("front.png", "back.png")
+        .args(["-v", "-o", "human.ply"])
+        .stdout(full().expect("opened"))
+        .stderr(full().expect("opened"))
+        .status()
+        .expect("the program starts");
+    assert!(status.success(), "{status}");
+    assert!(place.path("human.ply").exists());
 }
 
 #[test]

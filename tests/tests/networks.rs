@@ -35,7 +35,10 @@ fn config(folder: &Path) -> Config {
 fn predictor(folder: &Path, config: &Config, device: &Device) -> PointPredictor {
     let file = tempfile::NamedTempFile::new().expect("temporary file");
     let options = ImportOptions { side_heads: SideHeads::Seed, seed: 0 };
-    import(&[folder.join("weights.safetensors")], config, options, file.path(), &|_, _| ()).expect("import");
+    let names = ["weights.safetensors", "stage1.pth"];
+    let weights =
+        names.map(|name| folder.join(name)).into_iter().find(|path| path.exists()).expect("weights");
+    import(&[weights], config, options, file.path(), &|_, _| ()).expect("import");
     WeightFile::open(file.path(), None).expect("our file").point_predictor(device).expect("weights")
 }
 

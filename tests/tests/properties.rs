@@ -3,10 +3,10 @@
 use std::path::Path;
 
 use burn::tensor::{Device, Tensor, TensorData};
-use snapsnap_net::config::{Config, NetworkConfig};
-use snapsnap_net::network::{PointPredictor, Rope, View, activate};
+use snapsnap_net::config::{Config, Downsample, NetworkConfig, Upsample};
+use snapsnap_net::network::{PointMap, PointPredictor, Rope, View, activate};
 use snapsnap_net::regressor::{RECEPTIVE_RADIUS, Statistics};
-use snapsnap_net::resample::bilinear;
+use snapsnap_net::resample::{bilinear, shrink};
 use snapsnap_net::weights::{WeightFile, init};
 use snapsnap_net::{Photograph, Reconstruction, Reconstructor, Window};
 use snapsnap_tests::{device, relative_error, values};
@@ -121,6 +121,100 @@ fn bilinear_has_its_published_check_values() {
     for (align, expected) in [(true, [0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0]), (false, [0.0, 0.25, 0.75, 1.0])] {
         let got = values(bilinear(x.clone(), [1, 4], align));
         assert!(got.iter().zip(expected).all(|(g, e): (&f32, f32)| (g - e).abs() < 1e-6), "{got:?}");
+    }
+}
+
+#[test]
+fn shrinking_takes_means_or_first_pixels() {
+    let Some(device) = device() else { return };
+    let values_of = |factor: usize, method: Downsample| {
+        let image: Vec<f32> = (0..72).map(|v| v as f32).collect();
+        values(shrink(Tensor::from_data(TensorData::new(image, [1, 2, 6, 6]), &device), factor, method))
+    };
+    let first = [0.0, 3.0, 18.0, 21.0, 36.0, 39.0, 54.0, 57.0];
+    assert_eq!(values_of(3, Downsample::Nearest), first);
+    // The mean of a 3×3 cell of this ramp is its middle: one right and one down of its first pixel.
+    assert_eq!(values_of(3, Downsample::Area), first.map(|v| v + 7.0));
+    assert_eq!(values_of(1, Downsample::Area).len(), 72);
+}
+
+/// A point map of a single row: two body points at 1 and 2, then a background point at 1000 or beyond f32.
+#[test]
+fn mask_aware_enlargement_never_blends_in_the_background() {
+    let Some(device) = device() else { return };
+    let net = weights(&config(&[]), 1).1.point_predictor(&device).expect("weights");
+    let delta = values(net.delta())[0];
+    let row = |method: Upsample, background: f32| -> Vec<f32> {
+        let points: Vec<f32> = [1.0, 2.0, background].iter().flat_map(|v| [*v; 3]).collect();
+        let map = PointMap {
+            points: Tensor::from_data(TensorData::new(points, [1, 1, 3, 3]), &device),
+            conf: Tensor::zeros([1, 1, 3], &device),
+        };
+        let body = Tensor::from_data(TensorData::new(vec![1.0_f32, 1.0, 0.0], [1, 1, 1, 3]), &device);
+        let points = values(net.to_canvas(map, 2, method, Some(body)).points);
+        points.chunks_exact(3).take(6).map(|p| p[0] / delta).collect()
+    };
+    let close = |got: &[f32], expected: &[f32]| got.iter().zip(expected).all(|(g, e)| (g - e).abs() < 1e-3);
+    let plain = row(Upsample::Bilinear, 1000.0);
+    assert!(close(&plain, &[1.0, 1.25, 1.75, 251.5, 750.5, 1000.0]), "{plain:?}");
+    // The fourth pixel is three quarters body, the fifth one quarter: both are the second body point.
+    let aware = row(Upsample::MaskAware, 1000.0);
+    assert!(close(&aware, &[1.0, 1.25, 1.75, 2.0, 2.0, 1000.0]), "{aware:?}");
+    let overflowed = row(Upsample::MaskAware, f32::INFINITY);
+    assert!(close(&overflowed[..5], &aware[..5]), "{overflowed:?}");
+}
+
+#[test]
+fn concatenation_puts_the_front_first() {
+    let Some(device) = device() else { return };
+    let config = config(&["network.fusion=concat", "network.head=linear"]);
+    let net = weights(&config, 2).1.point_predictor(&device).expect("weights");
+    let NetworkConfig { dec_dim: width, dec_depth, .. } = config.network;
+    let tokens =
+        |seed| Tensor::<3>::from_data(TensorData::new(noise(4 * width, seed), [1, 4, width]), &device);
+    let maps = |x: Tensor<3>| vec![x; dec_depth + 1];
+    let zero = || Tensor::<3>::zeros([1, 4, width], &device);
+    let right = |front: Tensor<3>, back: Tensor<3>| {
+        net.dust3r.raw_points(View::Right, &[maps(front), maps(back)], [2, 2])
+    };
+    // A linear head is affine: the two halves' contributions add up, and they are different matrices.
+    let both = values(right(tokens(1), tokens(2)) + right(zero(), zero()));
+    let halves = values(right(tokens(1), zero()) + right(zero(), tokens(2)));
+    assert!(relative_error(&both, &halves) < 1e-5);
+    assert!(relative_error(&values(right(tokens(1), zero())), &values(right(zero(), tokens(1)))) > 0.1);
+}
+
+/// Points of e⁻⁸⁷ to e⁶⁰ units: squares vanish or overflow on the way, the Gaussians must not.
+#[test]
+fn points_of_extreme_size_give_finite_gaussians() {
+    let Some(device) = device() else { return };
+    let config = config(&["network.conf_threshold=0.4"]);
+    for bias in [-40.0_f32, 1e-38, 40.0, 60.0] {
+        let (file, _) = weights(&config, 4);
+        let mut bytes = std::fs::read(file.path()).expect("read");
+        for head in 1..=4 {
+            let name = format!("dust3r.downstream_head{head}.dpt.head.4.bias");
+            let parsed = safetensors::SafeTensors::deserialize(&bytes).expect("our file");
+            let data = parsed.tensor(&name).expect("the last layer's bias").data();
+            let at = data.as_ptr() as usize - bytes.as_ptr() as usize;
+            for channel in 0..3 {
+                bytes[at + 4 * channel..at + 4 * channel + 4].copy_from_slice(&bias.to_le_bytes());
+            }
+        }
+        std::fs::write(file.path(), bytes).expect("written");
+        let weights = WeightFile::open(file.path(), None).expect("our file");
+        let model = Reconstructor::load(&weights, &device).expect("weights");
+        let side = config.network.resolution;
+        let result = model.reconstruct(&photograph(side, 1), &photograph(side, 2), &|_| ());
+        let pixels = result.valid.iter().flatten().filter(|v| **v).count();
+        assert!(pixels > 1000, "bias {bias}: {pixels}");
+        assert_eq!(result.gaussians.len(), pixels, "bias {bias}: {:?}", result.plan);
+        let world = result.in_world(&config);
+        for values in
+            [values(world.means), values(world.rotations), values(world.scales), values(world.colors)]
+        {
+            assert!(values.iter().all(|v| v.is_finite()), "bias {bias}");
+        }
     }
 }
 

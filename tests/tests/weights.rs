@@ -90,7 +90,7 @@ const QKV: &str = "dust3r.enc_blocks.1.attn.qkv.weight";
 
 #[test]
 fn the_authors_pickles_hold_what_their_safetensors_hold() {
-    let Some(folder) = fixture("pipeline") else { return };
+    let Some(folder) = fixture("full_size_keys.json").map(|p| p.with_file_name("pipeline")) else { return };
     let place = Workplace::new();
     let ours = place.path("imported.safetensors");
     let sources = ["stage1.pth", "stage2.pth"].map(|name| folder.join(name));
@@ -125,7 +125,7 @@ fn export_gives_every_name_of_the_authors_state_dicts() {
 #[test]
 fn a_dust3r_pickle_gets_delta_and_side_heads_and_says_so() {
     let place = Workplace::new();
-    let Some(folder) = fixture("pipeline") else { return };
+    let Some(folder) = fixture("full_size_keys.json").map(|p| p.with_file_name("pipeline")) else { return };
     let to = place.path("out.safetensors");
     let with = |side_heads| {
         let options = ImportOptions { side_heads, seed: 5 };

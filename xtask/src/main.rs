@@ -33,15 +33,17 @@ fn main() -> ExitCode {
 
 fn test(filter: &[String]) -> bool {
     let all = ["test", "--release", "--workspace", "--no-fail-fast"];
-    let numerical =
-        ["test", "--release", "--workspace", "--no-fail-fast", "--test", "networks", "--test", "pipeline"];
+    let numerical = ["--test", "networks", "--test", "pipeline", "--test", "properties"];
     let filter = || ["--"].into_iter().chain(filter.iter().map(String::as_str));
     // Output is shown so that skipped tests are seen with their reasons.
     let show = ["--show-output"];
     let mut passed = succeeds("flex", cargo(&all).args(filter()).args(show));
     for device in FURTHER_DEVICES {
-        let mut command = cargo(&numerical);
-        passed &= succeeds(device, command.args(filter()).args(show).env("SNAPSNAP_TEST_DEVICE", device));
+        let mut command = cargo(&all);
+        passed &= succeeds(
+            device,
+            command.args(numerical).args(filter()).args(show).env("SNAPSNAP_TEST_DEVICE", device),
+        );
     }
     passed
 }

@@ -37,14 +37,28 @@ pub fn choose(name: &str) -> Result<Device, Failure> {
     }
 }
 
+/// A device in words.
+pub fn describe(device: &Device) -> String {
+    let Some(identity) = device.identity() else {
+        return if *device == Device::flex() { "cpu (flex)".into() } else { "cpu (ndarray)".into() };
+    };
+    let software = if identity.physical.is_none() { ", software" } else { "" };
+    format!("{}{software}", identity.name)
+}
+
 #[allow(deprecated, reason = "kept as the second CPU implementation")]
 fn ndarray() -> Device {
     Device::ndarray()
 }
 
-/// A device that is a card, not a software adapter.
+/// A device that is a card, not a software adapter; CUDA before wgpu where it is compiled in.
 fn real_gpu() -> Option<Device> {
-    wgpu_devices().into_iter().find(|d| d.identity().is_some_and(|i| i.physical.is_some()))
+    #[cfg(feature = "cuda")]
+    let cuda = quietly(|| Device::enumerate(DeviceType::Cuda).into_vec());
+    #[cfg(not(feature = "cuda"))]
+    let cuda: Vec<Device> = Vec::new();
+    let is_card = |d: &Device| d.identity().is_some_and(|i| i.physical.is_some());
+    cuda.into_iter().chain(wgpu_devices()).find(is_card)
 }
 
 fn wgpu_devices() -> Vec<Device> {
@@ -77,11 +91,7 @@ fn nth(name: &str, kind: DeviceType, index: Option<usize>) -> Result<Device, Fai
 fn unknown(name: &str, why: &str) -> Failure {
     let mut there = vec!["auto".to_owned(), "cpu (= flex)".into(), "ndarray".into()];
     for (i, device) in wgpu_devices().iter().enumerate() {
-        let label = device.identity().map_or_else(String::new, |d| {
-            let software = if d.physical.is_none() { ", software" } else { "" };
-            format!(" ({}{software})", d.name)
-        });
-        there.push(format!("wgpu:{i}{label}"));
+        there.push(format!("wgpu:{i} ({})", describe(device)));
     }
     Failure::Input(format!("--device {name}: {why}. Here there are: {}", there.join(", ")))
 }

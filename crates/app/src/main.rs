@@ -5,6 +5,7 @@ mod device;
 mod dump;
 mod failure;
 mod progress;
+mod say;
 mod weights;
 
 use std::process::ExitCode;
@@ -45,7 +46,7 @@ fn main() -> ExitCode {
         std::process::exit(130);
     });
     if let Err(e) = handler {
-        eprintln!("warning: Ctrl-C will not clean up temporary files: {e}");
+        say::err(&format!("warning: Ctrl-C will not clean up temporary files: {e}"));
     }
     let Arguments { quiet, command } = match Arguments::try_parse() {
         Ok(arguments) => arguments,
@@ -61,7 +62,7 @@ fn main() -> ExitCode {
     match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {
-            eprintln!("error: {failure}");
+            say::err(&format!("error: {failure}"));
             failure.exit_code()
         }
     }

@@ -4,6 +4,7 @@ use std::cell::Cell;
 use std::io::IsTerminal;
 use std::time::Duration;
 
+use crate::say;
 use indicatif::{ProgressBar, ProgressStyle};
 
 /// Bytes between two plain lines.
@@ -44,7 +45,7 @@ impl Progress {
         if let Some(bar) = &self.bar {
             bar.set_message(name.to_owned());
         } else if self.plain {
-            eprintln!("{name} …");
+            say::err(&format!("{name} …"));
         }
     }
 
@@ -55,7 +56,7 @@ impl Progress {
             bar.set_position(done);
         } else if self.plain && done >= self.reported.get() + LINE_BYTES {
             self.reported.set(done);
-            eprintln!("{} of {} MB", done / 1_000_000, total / 1_000_000);
+            say::err(&format!("{} of {} MB", done / 1_000_000, total / 1_000_000));
         }
     }
 }

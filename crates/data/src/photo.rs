@@ -10,6 +10,8 @@ use crate::resize::{Filter, resize};
 
 /// Photographs below this side are refused: nothing of a person is left.
 const MIN_SIDE: u32 = 64;
+/// Photographs above this number of pixels are refused before they are decoded: 16 bytes each are needed at least.
+const MAX_PIXELS: u64 = 256_000_000;
 /// From this share of the person on, a pixel counts as the person's.
 const THRESHOLD: f32 = 0.5;
 /// Row of a training subject's middle on a canvas of 1024 (SNAPSNAP §5.3: rows 124.39 to 862.52).
@@ -103,7 +105,7 @@ pub fn load(
     }
     let (mask, mask_path) = match mask {
         Some(mask_path) => {
-            let mask = decode(mask_path)?.into_luma8();
+            let mask = grey(&decode(mask_path)?);
             if mask.dimensions() != (width, height) {
                 let message = format!(
                     "the mask is {}×{}, its picture {} is {width}×{height}",
@@ -119,7 +121,9 @@ pub fn load(
     };
     let rgb = picture.into_rgb8();
     let empty = || {
-        let message = "the mask is empty: no pixel belongs to the person".into();
+        let least =
+            if matches!(placement, Placement::Demo { .. }) { "255, as `mode.compat` asks" } else { "128" };
+        let message = format!("the mask is empty: no pixel of the person reaches {least}");
         PhotoError::Unsuitable { path: mask_path.to_owned(), message }
     };
     // The demo takes whatever the mask touches; a lossy mask touches much that is not the person.
@@ -153,10 +157,24 @@ fn decode(path: &Path) -> Result<DynamicImage, PhotoError> {
         .with_guessed_format()
         .map_err(|source| PhotoError::Read { path: path.to_owned(), source })?;
     let mut decoder = reader.into_decoder().map_err(failed)?;
+    let (width, height) = decoder.dimensions();
+    if u64::from(width) * u64::from(height) > MAX_PIXELS {
+        let message = format!("is {width}×{height}, more than {} million pixels", MAX_PIXELS / 1_000_000);
+        return Err(PhotoError::Unsuitable { path: path.to_owned(), message });
+    }
     let orientation = decoder.orientation().map_err(failed)?;
     let mut picture = DynamicImage::from_decoder(decoder).map_err(failed)?;
     picture.apply_orientation(orientation);
     Ok(picture)
+}
+
+/// A mask picture's brightness, on black where it is transparent.
+fn grey(picture: &DynamicImage) -> GrayImage {
+    let pixels = picture.to_luma_alpha8();
+    GrayImage::from_fn(pixels.width(), pixels.height(), |x, y| {
+        let [value, alpha] = pixels.get_pixel(x, y).0;
+        image::Luma([(u16::from(value) * u16::from(alpha) / 255) as u8])
+    })
 }
 
 /// The alpha channel as a mask.
@@ -218,7 +236,8 @@ fn on_canvas(rgb: &RgbImage, mask: &GrayImage, side: usize, report: String) -> C
     Canvas { rgb: values, mask, valid, report }
 }
 
-/// The person's box at the size and place of the training subjects.
+/// The person's box at the size and place of the training subjects; what of a soft edge lies outside the box comes
+/// along.
 fn placed(
     rgb: &RgbImage,
     mask: &GrayImage,
@@ -236,21 +255,28 @@ fn placed(
     let centre = TRAINING_CENTRE / REFERENCE_SIDE * canvas;
     let top = ((centre - height as f32 / 2.0).round().max(0.0) as usize).min(side - height);
 
+    // Everything the mask touches, and where it comes to lie relative to the person's box.
+    let touched = Rect::around(mask, 1).expect("the person's box is not empty");
+    let (sx, sy) = (width as f32 / person.width as f32, height as f32 / person.height as f32);
+    let target = |length: u32, scale: f32| ((length as f32 * scale).round() as usize).max(1);
+    let (wide, high) = (target(touched.width, sx), target(touched.height, sy));
+    let x0 = left as i64 - ((person.x - touched.x) as f32 * sx).round() as i64;
+    let y0 = top as i64 - ((person.y - touched.y) as f32 * sy).round() as i64;
+
     // Colours travel multiplied by the mask, so that what lies behind the person never bleeds in.
-    let premultiplied = crop_planes(rgb, mask, person, |color, m| unit(color) * unit(m));
-    let planes = premultiplied.map(|plane| {
-        resize(&plane, [person.height as usize, person.width as usize], [height, width], Filter::Lanczos3)
-    });
-    let [r, g, b, m] = &planes;
+    let premultiplied = crop_planes(rgb, mask, touched, |color, m| unit(color) * unit(m));
+    let from = [touched.height as usize, touched.width as usize];
+    let [r, g, b, m] = premultiplied.map(|plane| resize(&plane, from, [high, wide], Filter::Lanczos3));
     let area = side * side;
     let (mut values, mut on_canvas) = (vec![0.0; 3 * area], vec![0.0; area]);
-    for y in 0..height {
-        for x in 0..width {
-            let (from, to) = (y * width + x, (top + y) * side + left + x);
+    for y in (0..high).filter(|y| (0..side as i64).contains(&(y0 + *y as i64))) {
+        for x in (0..wide).filter(|x| (0..side as i64).contains(&(x0 + *x as i64))) {
+            let from = y * wide + x;
+            let to = (y0 + y as i64) as usize * side + (x0 + x as i64) as usize;
             // Lanczos overshoots at edges.
             let share = m[from].clamp(0.0, 1.0);
             on_canvas[to] = share;
-            for (c, plane) in [r, g, b].into_iter().enumerate() {
+            for (c, plane) in [&r, &g, &b].into_iter().enumerate() {
                 values[c * area + to] = 2.0 * plane[from].clamp(0.0, share) - share;
             }
         }
@@ -273,9 +299,12 @@ fn placed_as_demo(
     source: &str,
 ) -> Canvas {
     let person = Rect { width: (person.width - 1).max(1), height: (person.height - 1).max(1), ..person };
-    let height = (height as f32 / REFERENCE_SIDE * side as f32).round() as usize;
+    let height = ((height as f32 / REFERENCE_SIDE * side as f32).round() as usize).clamp(1, side);
     let scaled = person.width as usize * height / person.height as usize;
-    let width = (scaled / 2 * 2).clamp(2, side);
+    // The demo fails on a person wider than its canvas; ours gets smaller.
+    let height =
+        if scaled > side { (person.height as usize * side / person.width as usize).max(1) } else { height };
+    let width = (scaled / 2 * 2).clamp(2.min(side), side / 2 * 2);
     let (left, top) = ((side - width) / 2, (side - height) / 2);
     let from = [person.height as usize, person.width as usize];
     let [r, g, b, m] = crop_planes(rgb, mask, person, |color, _| unit(color))

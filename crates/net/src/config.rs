@@ -41,12 +41,14 @@ pub struct NetworkConfig {
     /// Base of the rotary position embedding.
     pub rope_base: f64,
     /// Channels of the four DPT branches.
+    #[serde(deserialize_with = "four")]
     pub layer_dims: [usize; 4],
     /// Channels inside the DPT fusion blocks.
     pub feature_dim: usize,
     /// Channels before the last DPT convolution.
     pub last_dim: usize,
     /// Which token maps feed the DPT branches: 0 is the encoder's output, l the l-th decoder layer's.
+    #[serde(deserialize_with = "four")]
     pub hooks: [usize; 4],
     /// Kind of head.
     pub head: HeadKind,
@@ -138,7 +140,8 @@ pub struct ModeConfig {
     /// World frame of the PLY.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub world_frame: Option<WorldFrame>,
-    /// Whether the regressor sees only the person's box (with the margin its receptive field needs).
+    /// Whether the regressor sees only the person's box (with the margin its receptive field needs). Its group norms
+    /// then measure less background, which changes what weights trained on the whole canvas give (docs/inference.md).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub crop: Option<bool>,
     /// Height to which the person is scaled, in pixels of a canvas of 1024.
@@ -271,10 +274,17 @@ impl Config {
             |origin: &str, message: String| ConfigError::Syntax { origin: origin.to_owned(), message };
         // Straight from the text first: only this way do messages carry line numbers.
         let config: Self = toml::from_str(text).map_err(|e| syntax(origin, e.to_string()))?;
+        let mut table: toml::Table = toml::from_str(text).map_err(|e| syntax(origin, e.to_string()))?;
+        // A list of values would pass for a section.
+        if let Some((key, value)) = table.iter().find(|(_, value)| !value.is_table()) {
+            return Err(syntax(
+                origin,
+                format!("`{key}` is a {}, must be a section [{key}]", value.type_str()),
+            ));
+        }
         if overrides.is_empty() {
             return config.checked(origin);
         }
-        let mut table: toml::Table = toml::from_str(text).map_err(|e| syntax(origin, e.to_string()))?;
         for assignment in overrides {
             assign(&mut table, assignment)
                 .map_err(|message| syntax(&format!("--set {assignment}"), message))?;
@@ -292,6 +302,21 @@ impl Config {
     /// Never: every field is representable in TOML.
     pub fn to_toml(&self) -> String {
         toml::to_string_pretty(self).expect("the config has only TOML types")
+    }
+
+    /// The same config with every key set that follows `mode.compat` otherwise.
+    pub fn resolved(&self) -> Self {
+        let mut config = self.clone();
+        config.network.upsample = Some(self.upsample());
+        config.mode = ModeConfig {
+            compat: self.mode.compat,
+            rotation_frame: Some(self.rotation_frame()),
+            downsample: Some(self.downsample()),
+            world_frame: Some(self.world_frame()),
+            crop: Some(self.crop()),
+            person_height: Some(self.person_height()),
+        };
+        config
     }
 
     /// The size the network wants: canvas pixels per network pixel.
@@ -350,12 +375,20 @@ impl Config {
     }
 }
 
+/// Exactly four numbers; an array type alone would drop a fifth without a word.
+fn four<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<[usize; 4], D::Error> {
+    let values = Vec::<usize>::deserialize(deserializer)?;
+    let count = values.len();
+    values.try_into().map_err(|_| serde::de::Error::custom(format!("{count} numbers, must be 4")))
+}
+
 /// Applies `a.b=c`: `c` is a TOML value, or a bare word for a string.
 fn assign(table: &mut toml::Table, assignment: &str) -> Result<(), String> {
     let Some((key, value)) = assignment.split_once('=') else {
         return Err("expected SECTION.KEY=VALUE".into());
     };
-    let parsed = toml::from_str::<toml::Table>(&format!("v = {value}")).ok().and_then(|mut t| t.remove("v"));
+    let parsed = toml::from_str::<toml::Table>(&format!("v = {value}")).ok();
+    let parsed = parsed.filter(|table| table.len() == 1).and_then(|mut table| table.remove("v"));
     let value = parsed.unwrap_or_else(|| toml::Value::String(value.trim().to_owned()));
     let mut path: Vec<&str> = key.split('.').map(str::trim).collect();
     let last = path.pop().filter(|k| !k.is_empty()).ok_or("the key is empty")?;

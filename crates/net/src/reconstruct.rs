@@ -125,6 +125,7 @@ struct Run<'a> {
 impl Run<'_> {
     fn timed<T>(&mut self, name: &'static str, work: impl FnOnce(&mut Self) -> T) -> T {
         (self.stage)(name);
+        self.model.device.sync().expect("the device finishes its work");
         let start = Instant::now();
         let result = work(self);
         self.model.device.sync().expect("the device finishes its work");
@@ -135,8 +136,8 @@ impl Run<'_> {
     fn reconstruct(&mut self, photos: [&Photograph; 2]) -> Reconstruction {
         let maps = self.point_maps(photos);
         let views: Vec<View> = self.model.predictor.dust3r.views().to_vec();
-        let points = host::<4>(maps.points.clone());
-        let conf = host::<3>(maps.conf.clone());
+        let (points, conf) =
+            self.timed("reading back", |_| (host::<4>(maps.points.clone()), host::<3>(maps.conf.clone())));
         let area = self.side * self.side;
         let point = |view: usize, i: usize| -> [f32; 3] {
             let at = 3 * (view * area + i);
@@ -179,7 +180,14 @@ impl Run<'_> {
             Vec::new()
         };
 
-        let gaussians = self.gaussians(photos, &side_images, &maps, &valid);
+        // One overflow would spoil the normalisation of a whole view.
+        let usable = if points.iter().all(|v| v.is_finite()) {
+            maps.points.clone()
+        } else {
+            let points: Vec<f32> = points.iter().map(|v| if v.is_finite() { *v } else { 0.0 }).collect();
+            Tensor::from_data(TensorData::new(points, maps.points.dims()), &self.model.device)
+        };
+        let gaussians = self.gaussians(photos, &side_images, &usable, &valid);
         let (plan, times) = (std::mem::take(&mut self.plan), std::mem::take(&mut self.times));
         Reconstruction { views, maps, valid, side_images, gaussians, plan, times }
     }
@@ -194,8 +202,10 @@ impl Run<'_> {
                 &self.model.device,
             )
         };
-        let images = Tensor::cat(photos.map(|p| upload(&p.rgb, 3)).to_vec(), 0);
-        let images = shrink(images, factor, config.downsample());
+        let images = self.timed("input", |_| {
+            let images = Tensor::cat(photos.map(|p| upload(&p.rgb, 3)).to_vec(), 0);
+            shrink(images, factor, config.downsample())
+        });
         let grid = net.dust3r.grid([config.network.net_resolution; 2]);
         self.plan.push(format!(
             "point predictor: 2 photographs of {0}×{0} ({1} of {side}×{side}), {2} tokens each",
@@ -239,7 +249,7 @@ impl Run<'_> {
         &mut self,
         photos: [&Photograph; 2],
         side_images: &[Vec<f32>],
-        maps: &PointMap,
+        points: &Tensor<4>,
         valid: &[Vec<bool>],
     ) -> Gaussians {
         let images: Vec<&[f32]> =
@@ -261,7 +271,7 @@ impl Run<'_> {
                 .push(format!("{what}: {window} of {0}×{0} pixels each, person's box {person}", self.side));
             let network = &self.model.regressors[pair.min(self.model.regressors.len() - 1)];
             let part = self.timed(what, |run| {
-                let views = pair_views.clone().map(|v| (images[v], maps.points.clone().narrow(0, v, 1)));
+                let views = pair_views.clone().map(|v| (images[v], points.clone().narrow(0, v, 1)));
                 run.regress(network, views, &valid[pair_views], window)
             });
             parts.extend(part);
@@ -312,26 +322,37 @@ impl Run<'_> {
             return Gaussians::new(empty(3), empty(4), empty(3), Tensor::zeros([0], device), empty(3))
                 .expect("consistent by construction");
         }
+        /// Coordinates beyond this could overflow on their way to the world frame.
+        const FARTHEST: f32 = 1e30;
         let (features, points): (Vec<_>, Vec<_>) = parts.into_iter().map(|[f, p]| (f, p)).unzip();
         let (features, points) = (Tensor::cat(features, 0), Tensor::cat(points, 0));
-        let n = points.dims()[0];
-        // A network that overflows shows it in its raw features; one pass on the host finds the rows.
-        let raw = host::<2>(features.clone());
-        let keep: Vec<i64> = (0..n)
-            .filter(|i| raw[i * FEATURES..(i + 1) * FEATURES].iter().all(|v| v.is_finite()))
-            .map(|i| i as i64)
-            .collect();
-        let (features, points) = if keep.len() < n {
-            self.plan.push(format!("{} Gaussians left out: their attributes are not finite", n - keep.len()));
-            let rows = Tensor::<1, Int>::from_data(TensorData::new(keep.clone(), [keep.len()]), device);
-            (features.select(0, rows.clone()), points.select(0, rows))
-        } else {
-            (features, points)
+        let attributes = Attributes::from_features(features.clone());
+        let means = points + attributes.offset.clone();
+        let (raw, centres) = (host::<2>(features), host::<2>(means.clone()));
+        let rows = raw.chunks_exact(FEATURES).zip(centres.chunks_exact(3)).enumerate();
+        let sound = |raw: &[f32], centre: &[f32]| {
+            raw.iter().all(|v| v.is_finite()) && centre.iter().all(|v| v.abs() <= FARTHEST)
         };
-        let a = Attributes::from_features(features);
-        self.plan.push(format!("{} Gaussians", keep.len()));
-        Gaussians::new(points + a.offset, a.rotation, a.scale, a.opacity.squeeze_dim(1), a.color * 0.5 + 0.5)
-            .expect("consistent by construction")
+        let keep: Vec<i64> =
+            rows.filter(|(_, (raw, centre))| sound(raw, centre)).map(|(i, _)| i as i64).collect();
+        let (n, kept) = (means.dims()[0], keep.len());
+        self.plan.push(format!("{kept} Gaussians"));
+        if kept < n {
+            self.plan.push(format!("{} Gaussians left out: their attributes are not finite", n - kept));
+        }
+        if kept == 0 {
+            return self.assemble(Vec::new());
+        }
+        let index = Tensor::<1, Int>::from_data(TensorData::new(keep, [kept]), device);
+        let pick = |x: Tensor<2>| if kept < n { x.select(0, index.clone()) } else { x };
+        Gaussians::new(
+            pick(means),
+            pick(attributes.rotation),
+            pick(attributes.scale),
+            pick(attributes.opacity).squeeze_dim(1),
+            pick(attributes.color) * 0.5 + 0.5,
+        )
+        .expect("consistent by construction")
     }
 }
 

@@ -17,8 +17,8 @@ pub fn remove_unfinished() {
 }
 
 /// Writes `path` through `fill`: into a temporary file beside it, which is renamed when `fill` has succeeded, so that
-/// a failure leaves whatever was there before. A path that exists and is no regular file (a pipe, `/dev/stdout`) is
-/// written in place: renaming would replace the device itself.
+/// a failure leaves whatever was there before. A symbolic link keeps pointing at the file, which is replaced; a path
+/// that exists and is no regular file (a pipe, a device) is written in place: renaming would replace the device itself.
 ///
 /// # Errors
 /// What `fill` returns, or the operating system's refusal to create, write or rename the file.
@@ -26,12 +26,13 @@ pub fn write_whole<E: From<io::Error>>(
     path: &Path,
     fill: impl FnOnce(&mut BufWriter<&mut File>) -> Result<(), E>,
 ) -> Result<(), E> {
-    if fs::metadata(path).is_ok_and(|m| !m.is_file() && !m.is_dir()) {
+    if is_special(path) {
         let mut file = File::options().write(true).open(path)?;
         let mut out = BufWriter::new(&mut file);
         fill(&mut out)?;
         return Ok(out.flush()?);
     }
+    let path = &target_of(path);
     let mut builder = tempfile::Builder::new();
     builder.prefix(".snapsnap-");
     #[cfg(unix)]
@@ -52,18 +53,29 @@ pub fn write_whole<E: From<io::Error>>(
     written
 }
 
-/// Checks, before any work, that `path` can be written: its folder exists and lets us create a file.
+/// Whether `path` exists and is neither a regular file nor a folder.
+pub fn is_special(path: &Path) -> bool {
+    fs::metadata(path).is_ok_and(|m| !m.is_file() && !m.is_dir())
+}
+
+/// The file behind a symbolic link.
+fn target_of(path: &Path) -> PathBuf {
+    if path.is_symlink() { path.canonicalize().unwrap_or_else(|_| path.to_owned()) } else { path.to_owned() }
+}
+
+/// Checks, before any work, that `path` can be written: its folder exists and lets us create a file. A pipe or a device
+/// is not touched: opening it is already an event for whoever reads it.
 ///
 /// # Errors
 /// The operating system's reason.
 pub fn check_writable(path: &Path) -> io::Result<()> {
-    if path.is_dir() {
+    if path.is_dir() || path.as_os_str().to_string_lossy().ends_with(['/', std::path::MAIN_SEPARATOR]) {
         return Err(io::Error::new(io::ErrorKind::IsADirectory, "is a directory"));
     }
-    if fs::metadata(path).is_ok_and(|m| !m.is_file()) {
-        return File::options().write(true).open(path).map(drop);
+    if is_special(path) {
+        return Ok(());
     }
-    tempfile::tempfile_in(folder_of(path)).map(drop)
+    tempfile::tempfile_in(folder_of(&target_of(path))).map(drop)
 }
 
 fn folder_of(path: &Path) -> &Path {

@@ -64,6 +64,9 @@ impl Gaussians {
 
     /// Moves the centres by `transform`; leaves the quaternions alone.
     pub fn with_means_transformed(mut self, transform: &RigidTransform) -> Self {
+        if self.is_empty() {
+            return self; // not every backend multiplies matrices without rows
+        }
         let device = self.device();
         // Row vectors: (R·p)ᵀ = pᵀ·Rᵀ, and glam's column-major array read row by row is Rᵀ.
         let rotation = transform.rotation.to_cols_array().map(|v| v as f32);
@@ -80,6 +83,9 @@ impl Gaussians {
     /// If `transform` is a reflection: no quaternion can express the mirrored Gaussians.
     pub fn transformed(mut self, transform: &RigidTransform) -> Self {
         assert!(transform.rotation.determinant() > 0.0, "a reflection cannot rotate quaternions");
+        if self.is_empty() {
+            return self;
+        }
         let q = DQuat::from_mat3(&transform.rotation);
         let (w, x, y, z) = (q.w as f32, q.x as f32, q.y as f32, q.z as f32);
         // Row i of this matrix is what component i of the right factor contributes to q ⊗ r, in (w, x, y, z) order.

@@ -5,9 +5,10 @@ use std::path::PathBuf;
 use clap::Args;
 use snapsnap_net::weights;
 
-use super::check_output;
+use super::check_outputs;
 use crate::failure::Failure;
 use crate::progress::Progress;
+use crate::say;
 
 #[derive(Args)]
 pub struct Arguments {
@@ -19,13 +20,13 @@ pub struct Arguments {
 }
 
 pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
-    check_output(&arguments.output, &[&arguments.input])?;
+    check_outputs(&[&arguments.output], &[&arguments.input])?;
     let progress = Progress::bytes(quiet);
     let tensors =
         weights::export(&arguments.input, &arguments.output, &|done, total| progress.advance(done, total))?;
     drop(progress);
     if !quiet {
-        println!("{}: {tensors} tensors", arguments.output.display());
+        say::out(&format!("{}: {tensors} tensors", arguments.output.display()));
     }
     Ok(())
 }

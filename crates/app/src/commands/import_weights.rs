@@ -5,9 +5,10 @@ use std::path::{Path, PathBuf};
 use clap::{Args, ValueEnum};
 use snapsnap_net::weights::{self, ImportOptions, SideHeads};
 
-use super::{ConfigArguments, check_output};
+use super::{ConfigArguments, check_outputs};
 use crate::failure::Failure;
 use crate::progress::Progress;
+use crate::say;
 
 #[derive(Args)]
 pub struct Arguments {
@@ -38,8 +39,9 @@ enum Sides {
 pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     // The only published weights of this size were trained with every quirk of the published code.
     let config = arguments.config.resolve(("the published size", "[mode]\ncompat = true\n"))?;
-    let inputs: Vec<&Path> = arguments.sources.iter().map(PathBuf::as_path).collect();
-    check_output(&arguments.output, &inputs)?;
+    let inputs: Vec<&Path> =
+        arguments.sources.iter().map(PathBuf::as_path).chain(arguments.config.file()).collect();
+    check_outputs(&[&arguments.output], &inputs)?;
     let progress = Progress::bytes(quiet);
     let side_heads = match arguments.side_heads {
         Sides::Seed => SideHeads::Seed,
@@ -52,14 +54,14 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     drop(progress);
     if !quiet {
         for note in &report.notes {
-            println!("{note}");
+            say::out(note);
         }
-        println!(
+        say::out(&format!(
             "{}: {} tensors, {} parameters",
             arguments.output.display(),
             report.tensors,
             report.parameters
-        );
+        ));
     }
     Ok(())
 }

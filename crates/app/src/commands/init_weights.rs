@@ -5,9 +5,10 @@ use std::path::PathBuf;
 use clap::Args;
 use snapsnap_net::weights;
 
-use super::{ConfigArguments, check_output};
+use super::{ConfigArguments, check_outputs};
 use crate::failure::Failure;
 use crate::progress::Progress;
+use crate::say;
 
 #[derive(Args)]
 pub struct Arguments {
@@ -23,7 +24,8 @@ pub struct Arguments {
 
 pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let config = arguments.config.resolve(("the published size", ""))?;
-    check_output(&arguments.output, &[])?;
+    let inputs: Vec<_> = arguments.config.file().into_iter().collect();
+    check_outputs(&[&arguments.output], &inputs)?;
     let progress = Progress::bytes(quiet);
     let parameters = weights::init(&config, arguments.seed, &arguments.output, &|done, total| {
         progress.advance(done, total);
@@ -31,7 +33,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     drop(progress);
     if !quiet {
         let (file, seed) = (arguments.output.display(), arguments.seed);
-        println!("{file}: {parameters} random parameters from seed {seed}");
+        say::out(&format!("{file}: {parameters} random parameters from seed {seed}"));
     }
     Ok(())
 }

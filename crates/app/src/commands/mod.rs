@@ -9,6 +9,7 @@ use std::path::Path;
 
 use clap::Args;
 use snapsnap_net::config::Config;
+use snapsnap_splat::file;
 
 use crate::failure::Failure;
 
@@ -24,6 +25,11 @@ pub struct ConfigArguments {
 }
 
 impl ConfigArguments {
+    /// The config file, if one is given.
+    pub fn file(&self) -> Option<&Path> {
+        self.config.as_deref()
+    }
+
     /// The config of the file given, or else of `fallback` (name and TOML text), with the overrides applied.
     pub fn resolve(&self, fallback: (&str, &str)) -> Result<Config, Failure> {
         Ok(match &self.config {
@@ -33,18 +39,23 @@ impl ConfigArguments {
     }
 }
 
-/// Refuses an output path that could not be written in the end, or that is one of the inputs.
-pub fn check_output(path: &Path, inputs: &[&Path]) -> Result<(), Failure> {
-    let same = |input: &&&Path| match (path.canonicalize(), input.canonicalize()) {
-        (Ok(output), Ok(input)) => output == input && output.is_file(),
-        _ => false,
-    };
-    if inputs.iter().any(|input| same(&input)) {
-        return Err(Failure::Input(format!(
-            "{}: is an input of this command and would be overwritten",
-            path.display()
-        )));
+/// Refuses output paths that could not be written in the end, that are one another, or that are an input.
+pub fn check_outputs(outputs: &[&Path], inputs: &[&Path]) -> Result<(), Failure> {
+    for (i, output) in outputs.iter().enumerate() {
+        file::check_writable(output)
+            .map_err(|e| Failure::Input(format!("{}: cannot write: {e}", output.display())))?;
+        if inputs.iter().any(|input| is_same_file(output, input)) {
+            let message = "is an input of this command and would be overwritten";
+            return Err(Failure::Input(format!("{}: {message}", output.display())));
+        }
+        if outputs[..i].iter().any(|other| other == output || is_same_file(output, other)) {
+            return Err(Failure::Input(format!("{}: is given for two outputs", output.display())));
+        }
     }
-    snapsnap_splat::file::check_writable(path)
-        .map_err(|e| Failure::Input(format!("{}: cannot write: {e}", path.display())))
+    Ok(())
+}
+
+/// Whether both paths lead to one existing regular file.
+fn is_same_file(a: &Path, b: &Path) -> bool {
+    matches!((a.canonicalize(), b.canonicalize()), (Ok(a), Ok(b)) if a == b && a.is_file())
 }

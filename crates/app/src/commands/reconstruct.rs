@@ -10,10 +10,10 @@ use snapsnap_net::weights::schema::Part;
 use snapsnap_net::{Photograph, Reconstructor};
 use snapsnap_splat::{file, ply};
 
-use super::{ConfigArguments, check_output};
+use super::{ConfigArguments, check_outputs, is_same_file};
 use crate::failure::Failure;
 use crate::progress::Progress;
-use crate::{device, dump, weights};
+use crate::{device, dump, say, weights};
 
 #[derive(Args)]
 pub struct Arguments {
@@ -47,45 +47,39 @@ pub struct Arguments {
 }
 
 pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
-    let inputs: Vec<&Path> = [&arguments.front, &arguments.back]
-        .into_iter()
-        .chain(arguments.masks.iter().flatten())
-        .chain(&arguments.weights)
-        .chain(&arguments.config.config)
-        .map(PathBuf::as_path)
-        .collect();
-    // Beside a pipe or a device there is no place for a config.
-    let beside = std::fs::metadata(&arguments.output).map_or(true, |m| m.is_file());
-    let config_path = beside.then(|| arguments.output.with_extension("config.toml"));
-    for path in [Some(&arguments.output), arguments.dump.as_ref(), config_path.as_ref()].into_iter().flatten()
-    {
-        check_output(path, &inputs)?;
-    }
+    let start = Instant::now();
     let weights = weights::open(arguments.weights.as_deref(), &arguments.config)?;
     weights.require(Part::PointPredictor)?;
     weights.require(Part::Regressor)?;
     let config = weights.config.clone();
+    let config_path = check_paths(arguments, weights.path())?;
     let placement = match (arguments.as_is, config.mode.compat) {
         (true, _) => Placement::AsIs,
         (false, true) => Placement::Demo { height: config.person_height() },
         (false, false) => Placement::Training { height: config.person_height() },
     };
     let masks = arguments.masks.as_deref().unwrap_or_default();
-    let mut times = Vec::new();
-    let start = Instant::now();
+    let mut times = vec![("opening weights", start.elapsed())];
+    let mut timed = |name: &'static str, since: Instant| times.push((name, since.elapsed()));
+    let since = Instant::now();
     let load = |path: &Path, mask: Option<&PathBuf>| {
         photo::load(path, mask.map(PathBuf::as_path), config.network.resolution, placement)
     };
     let canvases = [load(&arguments.front, masks.first())?, load(&arguments.back, masks.get(1))?];
-    times.push(("photographs", start.elapsed()));
+    timed("photographs", since);
+    let since = Instant::now();
     let device = device::choose(&arguments.device)?;
+    timed("finding the device", since);
 
     let progress = Progress::stages(quiet);
     progress.stage("loading weights");
-    let start = Instant::now();
+    let since = Instant::now();
     let reconstructor = Reconstructor::load(&weights, &device)?;
-    times.push(("loading weights", start.elapsed()));
-    let mut plan = vec![format!("device: {device:?}"), format!("weights: {}", weights.path().display())];
+    timed("loading weights", since);
+    let mut plan = vec![
+        format!("device: {}", device::describe(&device)),
+        format!("weights: {}", weights.path().display()),
+    ];
     for (name, canvas) in ["front", "back"].into_iter().zip(&canvases) {
         plan.push(format!("{name}: {}", canvas.report));
     }
@@ -93,25 +87,50 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let mut result = reconstructor.reconstruct(&front, &back, &|name| progress.stage(name));
     plan.append(&mut result.plan);
     times.append(&mut result.times);
+    if result.gaussians.is_empty() {
+        let (file, plan) = (weights.path().display(), plan.join("\n  "));
+        let message = format!("{file}: no Gaussian came out, nothing was written; what happened:\n  {plan}");
+        return Err(Failure::Input(message));
+    }
 
     progress.stage("writing");
-    let start = Instant::now();
+    let since = Instant::now();
+    ply::write(&result.in_world(&config), &arguments.output)?;
+    if let Some(path) = &config_path {
+        write_text(path, &config.resolved().to_toml())?;
+    }
     if let Some(path) = &arguments.dump {
         dump::write(&result, path)?;
     }
-    if let Some(path) = &config_path {
-        write_text(path, &config.to_toml())?;
-    }
-    ply::write(&result.in_world(&config), &arguments.output)?;
-    times.push(("writing", start.elapsed()));
+    times.push(("writing", since.elapsed()));
     drop(progress);
+    // What goes into a pipe must stay a PLY.
+    let say = if file::is_special(&arguments.output) { say::err } else { say::out };
     if arguments.verbose {
-        report(&plan, &times);
+        report(say, &plan, &times, start.elapsed());
     }
     if !quiet {
-        println!("{}: {} Gaussians", arguments.output.display(), result.gaussians.len());
+        say(&format!("{}: {} Gaussians", arguments.output.display(), result.gaussians.len()));
     }
     Ok(())
+}
+
+/// Refuses outputs that cannot be written or would destroy an input; returns where the config goes. Beside a pipe or a
+/// device there is no place for it, and a config that was given is not overwritten by itself.
+fn check_paths(arguments: &Arguments, weights: &Path) -> Result<Option<PathBuf>, Failure> {
+    let mut inputs: Vec<&Path> = vec![&arguments.front, &arguments.back, weights];
+    inputs.extend(arguments.masks.iter().flatten().map(PathBuf::as_path));
+    let mut config_path = arguments.output.clone().into_os_string();
+    config_path.push(".config.toml");
+    let config_path = PathBuf::from(config_path);
+    let given = arguments.config.file();
+    let itself = given.is_some_and(|given| is_same_file(given, &config_path));
+    let config_path = (!itself && !file::is_special(&arguments.output)).then_some(config_path);
+    inputs.extend(given);
+    let outputs = [Some(&arguments.output), arguments.dump.as_ref(), config_path.as_ref()];
+    let outputs: Vec<&Path> = outputs.into_iter().flatten().map(PathBuf::as_path).collect();
+    check_outputs(&outputs, &inputs)?;
+    Ok(config_path)
 }
 
 fn write_text(path: &Path, text: &str) -> Result<(), Failure> {
@@ -119,15 +138,12 @@ fn write_text(path: &Path, text: &str) -> Result<(), Failure> {
         .map_err(|e| Failure::Input(format!("{}: cannot write: {e}", path.display())))
 }
 
-fn report(plan: &[String], times: &[(&str, Duration)]) {
-    println!("plan");
-    for line in plan {
-        println!("  {line}");
-    }
-    println!("time, device synchronised");
-    for (name, time) in times {
-        println!("  {name:<26} {:>9.1} ms", time.as_secs_f64() * 1e3);
-    }
-    let total: Duration = times.iter().map(|(_, time)| *time).sum();
-    println!("  {:<26} {:>9.1} ms", "total", total.as_secs_f64() * 1e3);
+fn report(say: fn(&str), plan: &[String], times: &[(&str, Duration)], total: Duration) {
+    let time =
+        |name: &str, time: Duration| say(&format!("  {name:<26} {:>9.1} ms", time.as_secs_f64() * 1e3));
+    say("plan");
+    plan.iter().for_each(|line| say(&format!("  {line}")));
+    say("time, device synchronised");
+    times.iter().for_each(|(name, spent)| time(name, *spent));
+    time("total", total);
 }

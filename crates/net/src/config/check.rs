@@ -1,28 +1,33 @@
 //! Which values of a config make sense, alone and beside each other.
 
+use crate::weights::schema::{self, TensorSpec};
+
 use super::{Config, Downsample, HeadKind, RotationFrame, Upsample, WorldFrame};
+
+/// Seven times the published size; 16 GB of f32. Beyond, a slip of the finger is likelier than a wish.
+const MAX_PARAMETERS: usize = 4_000_000_000;
 
 impl Config {
     /// The first value that makes no sense: its key, and what is wrong.
     pub(super) fn problem(&self) -> Option<(&'static str, String)> {
         let n = &self.network;
         let sizes = [
-            ("network.enc_dim", n.enc_dim, 65_536),
-            ("network.enc_depth", n.enc_depth, 1_024),
+            ("network.enc_dim", n.enc_dim, 8_192),
+            ("network.enc_depth", n.enc_depth, 128),
             ("network.enc_heads", n.enc_heads, 1_024),
-            ("network.dec_dim", n.dec_dim, 65_536),
-            ("network.dec_depth", n.dec_depth, 1_024),
+            ("network.dec_dim", n.dec_dim, 8_192),
+            ("network.dec_depth", n.dec_depth, 128),
             ("network.dec_heads", n.dec_heads, 1_024),
-            ("network.mlp_ratio", n.mlp_ratio, 64),
-            ("network.patch", n.patch, 1_024),
-            ("network.layer_dims", n.layer_dims.into_iter().min().unwrap_or(0), usize::MAX),
-            ("network.layer_dims", n.layer_dims.into_iter().max().unwrap_or(0), 65_536),
-            ("network.feature_dim", n.feature_dim, 65_536),
-            ("network.last_dim", n.last_dim, 65_536),
-            ("network.resolution", n.resolution, 16_384),
-            ("network.net_resolution", n.net_resolution, 16_384),
-            ("regressor.channels", self.regressor.channels, 4_096),
-            ("regressor.groups", self.regressor.groups, 4_096),
+            ("network.mlp_ratio", n.mlp_ratio, 16),
+            ("network.patch", n.patch, 64),
+            ("network.layer_dims", n.layer_dims.into_iter().min().unwrap_or(0), 8_192),
+            ("network.layer_dims", n.layer_dims.into_iter().max().unwrap_or(0), 8_192),
+            ("network.feature_dim", n.feature_dim, 8_192),
+            ("network.last_dim", n.last_dim, 8_192),
+            ("network.resolution", n.resolution, 4_096),
+            ("network.net_resolution", n.net_resolution, 4_096),
+            ("regressor.channels", self.regressor.channels, 1_024),
+            ("regressor.groups", self.regressor.groups, 1_024),
         ];
         for (key, value, most) in sizes {
             if value == 0 || value > most {
@@ -69,8 +74,11 @@ impl Config {
         if n.conf_threshold.is_nan() {
             return Some(("network.conf_threshold", "is not a number".into()));
         }
-        if !n.delta.is_finite() || n.delta == 0.0 {
-            return Some(("network.delta", format!("is {}, must be finite and not 0", n.delta)));
+        if !(n.delta as f32).is_normal() {
+            return Some((
+                "network.delta",
+                format!("is {}, which as f32 is zero, tiny or infinite", n.delta),
+            ));
         }
         if !(16..=1024).contains(&self.person_height()) {
             let message =
@@ -93,6 +101,12 @@ impl Config {
                 format!("{} is no multiple of {} groups", r.channels, r.groups),
             ));
         }
+        let parameters: usize = schema::tensors(self).iter().map(TensorSpec::elements).sum();
+        if parameters > MAX_PARAMETERS {
+            let message =
+                format!("all sizes together make {parameters} parameters, more than {MAX_PARAMETERS}");
+            return Some(("network", message));
+        }
         self.contradiction()
     }
 
@@ -112,6 +126,7 @@ impl Config {
             ("mode.downsample", self.downsample() == Downsample::Nearest, "\"nearest\""),
             ("mode.world_frame", self.world_frame() == WorldFrame::Mirrored, "\"mirrored\""),
             ("mode.crop", !self.crop(), "false"),
+            ("mode.person_height", self.person_height() == 700, "700"),
         ];
         let (key, _, allowed) = quirks.into_iter().find(|(_, holds, _)| !holds)?;
         Some((

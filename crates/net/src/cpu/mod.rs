@@ -10,6 +10,9 @@ mod math;
 mod unet;
 mod winograd;
 
+#[cfg(test)]
+mod tests;
+
 use burn::nn::Linear;
 use burn::nn::conv::Conv2d;
 use burn::tensor::activation::relu;

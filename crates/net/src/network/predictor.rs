@@ -84,7 +84,10 @@ impl PointPredictor {
                 /// A canvas pixel with less body than this around it keeps the plain interpolation.
                 const MIN_WEIGHT: f64 = 1e-4;
                 let total = up(weights.clone());
-                let inside = up(points * weights) / total.clone().clamp_min(MIN_WEIGHT);
+                // Where there is no body the point may be anything, an overflow included.
+                let nobody = weights.clone().lower_equal_elem(0.0).expand(points.dims());
+                let weighted = (points * weights).mask_fill(nobody, 0.0);
+                let inside = up(weighted) / total.clone().clamp_min(MIN_WEIGHT);
                 let outside = total.lower_elem(MIN_WEIGHT).expand(plain.dims());
                 inside.mask_where(outside, plain)
             }

@@ -115,7 +115,7 @@ impl WeightFile {
         }
         let names: BTreeSet<_> = expected.iter().map(|t| t.name.as_str()).collect();
         let unused = source.tensors().keys().filter(|k| !names.contains(k.as_str()));
-        problems.extend(unused.map(|k| format!("not part of the configured networks: {k}")));
+        problems.extend(unused.map(|k| format!("not part of the configured networks: {}", k.escape_debug())));
         if problems.is_empty() {
             return Ok(Self { source, config });
         }

@@ -198,6 +198,7 @@ fn plan<'a>(
         plan.push(origin);
     }
     for (name, (source, _)) in &found {
+        let name = name.escape_debug();
         problems.push(format!("not part of the configured networks: {name} in {}", source.path().display()));
     }
     plan
@@ -239,8 +240,12 @@ fn collect<'a>(
 }
 
 fn same_bits(source: &Source, a: &str, b: &str) -> Result<bool, WeightsError> {
+    let entry = |key: &str| &source.tensors()[key];
+    if entry(a).shape != entry(b).shape || entry(a).dtype != entry(b).dtype || !is_readable(&entry(a).dtype) {
+        return Ok(false);
+    }
     let (a, b) = (source.read_f32(a)?, source.read_f32(b)?);
-    Ok(a.len() == b.len() && a.iter().zip(&b).all(|(a, b)| a.to_bits() == b.to_bits()))
+    Ok(a.iter().zip(&b).all(|(a, b)| a.to_bits() == b.to_bits()))
 }
 
 /// CroCo checkpoints have one decoder; both sides start from it (SNAPSNAP §3.3).

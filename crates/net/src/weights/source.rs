@@ -55,7 +55,7 @@ impl Source {
         let header = u64::from_le_bytes([
             start[0], start[1], start[2], start[3], start[4], start[5], start[6], start[7],
         ]);
-        if filled == 9 && start[8] == b'{' && header <= MAX_HEADER {
+        if filled == 9 && start[8] == b'{' && (1..=MAX_HEADER).contains(&header) {
             return Self::safetensors(path, file, header);
         }
         if path.extension().is_some_and(|e| e == "safetensors") {
