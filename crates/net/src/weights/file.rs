@@ -23,17 +23,17 @@ pub type Progress<'a> = &'a dyn Fn(u64, u64);
 const F32: usize = 4;
 
 /// Writes `tensors` in order, asking `values` for one at a time, so that never more than one is in memory.
-pub(super) fn write<'a, T: std::borrow::Borrow<TensorSpec> + 'a>(
+pub(super) fn write(
     path: &Path,
     config: &Config,
-    tensors: &'a [T],
-    mut values: impl FnMut(&'a TensorSpec) -> Result<Vec<f32>, WeightsError>,
+    tensors: &[TensorSpec],
+    mut values: impl FnMut(&TensorSpec) -> Result<Vec<f32>, WeightsError>,
     progress: Progress,
 ) -> Result<(), WeightsError> {
-    let infos = tensors.iter().map(|t| (t.borrow().name.clone(), t.borrow().shape.clone()));
+    let infos = tensors.iter().map(|t| (t.name.clone(), t.shape.clone()));
     // One entry only: the header lists metadata in no fixed order, and the same seed must give the same bytes.
     let metadata = HashMap::from([(CONFIG_KEY.into(), config.to_toml())]);
-    write_tensors(path, metadata, infos.collect(), |i| values(tensors[i].borrow()), progress)
+    write_tensors(path, metadata, infos.collect(), |i| values(&tensors[i]), progress)
 }
 
 fn write_tensors(

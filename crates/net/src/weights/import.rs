@@ -110,7 +110,6 @@ pub fn import(
         return Err(WeightsError::Tensors { origin, problems });
     }
 
-    let ordered: Vec<&TensorSpec> = specs.iter().collect();
     let mut next = plan.iter();
     let mut broken = Vec::new();
     let values = |spec: &TensorSpec| {
@@ -131,7 +130,7 @@ pub fn import(
         }
         Ok(values)
     };
-    write(to, config, &ordered, values, progress)?;
+    write(to, config, &specs, values, progress)?;
     report.tensors = specs.len();
     report.parameters = specs.iter().map(TensorSpec::elements).sum();
     Ok(report)
