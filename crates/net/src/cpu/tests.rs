@@ -1,18 +1,24 @@
 //! The fast roads against the plain tensor code, at sizes that reach their corners: blocks that do not divide, widths
 //! below a register block, strides, groups of several channels.
 
+use burn::module::Param;
 use burn::nn::conv::Conv2dConfig;
 use burn::nn::{LinearConfig, PaddingConfig2d};
 use burn::tensor::activation::{gelu, relu};
 use burn::tensor::module::attention;
-use burn::tensor::{Device, Distribution, Tensor};
+use burn::tensor::{Device, Tensor, TensorData};
+use rand::{RngCore, SeedableRng};
 
-use crate::config::RegressorConfig;
+use crate::config::Config;
 use crate::network::Rope;
-use crate::regressor::{Regressor, Statistics};
+use crate::regressor::Statistics;
+use crate::weights::{WeightFile, init};
 
-fn random<const D: usize>(shape: [usize; D]) -> Tensor<D> {
-    Tensor::random(shape, Distribution::Normal(0.0, 1.0), &Device::flex())
+/// Uniform in ±1; the same numbers on every run.
+fn random<const D: usize>(shape: [usize; D], seed: u64) -> Tensor<D> {
+    let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
+    let values = (0..shape.iter().product()).map(|_| random.next_u32() as f32 / u32::MAX as f32 * 2.0 - 1.0);
+    Tensor::from_data(TensorData::new(values.collect::<Vec<f32>>(), shape), &Device::flex())
 }
 
 /// Relative L2 error; both roads are f32, whose rounding over some hundred terms stays below a few 1e-6.
@@ -20,6 +26,7 @@ fn assert_equal<const D: usize>(what: &str, got: Tensor<D>, expected: Tensor<D>)
     assert_eq!(got.dims(), expected.dims(), "{what}");
     let norm = |x: Tensor<D>| x.square().sum().sqrt().into_scalar::<f32>();
     let error = norm(got - expected.clone()) / norm(expected);
+    println!("{what}: {error:e}");
     assert!(error < 5e-6, "{what}: {error:e}");
 }
 
@@ -28,10 +35,12 @@ fn winograd_equals_direct_convolution() {
     for [batch, inputs, outputs, height, width] in
         [[2, 5, 7, 2, 2], [1, 3, 4, 10, 34], [3, 16, 16, 6, 8], [1, 200, 70, 6, 300], [1, 64, 96, 64, 20]]
     {
-        let conv = Conv2dConfig::new([inputs, outputs], [3, 3])
+        let mut conv = Conv2dConfig::new([inputs, outputs], [3, 3])
             .with_padding(PaddingConfig2d::Explicit(1, 1, 1, 1))
             .init(&Device::flex());
-        let x = random([batch, inputs, height, width]);
+        conv.weight = Param::from_tensor(random([outputs, inputs, 3, 3], 1));
+        conv.bias = Some(Param::from_tensor(random([outputs], 2)));
+        let x = random([batch, inputs, height, width], 3);
         let what = format!("{batch}×{inputs}→{outputs} at {height}×{width}");
         assert_equal(&what, super::conv3x3(&conv, x.clone(), false), conv.forward(x.clone()));
         assert_equal(
@@ -47,7 +56,7 @@ fn rotary_attention_equals_its_composition() {
     for (rows, columns, heads, head_dim) in [(2, 3, 2, 4), (13, 11, 3, 16), (16, 17, 1, 64)] {
         let (n, dim) = (rows * columns, heads * head_dim);
         let rope = Rope::new(rows, columns, head_dim, 100.0, &Device::flex());
-        let [q, k, v] = [(); 3].map(|()| random([2, n, dim]));
+        let [q, k, v] = [1, 2, 3].map(|seed| random([2, n, dim], seed));
         let split = |x: &Tensor<3>| x.clone().reshape([2, n, heads, head_dim]).swap_dims(1, 2);
         let (rq, rk) = (rope.apply(split(&q)), rope.apply(split(&k)));
         let expected = attention(rq, rk, split(&v), None, None, Default::default());
@@ -58,28 +67,37 @@ fn rotary_attention_equals_its_composition() {
 
 #[test]
 fn linear_gelu_equals_its_composition() {
-    let layer = LinearConfig::new(20, 37).init(&Device::flex());
-    let x = random([2, 19, 20]);
+    let mut layer = LinearConfig::new(20, 37).init(&Device::flex());
+    layer.weight = Param::from_tensor(random([20, 37], 1));
+    layer.bias = Some(Param::from_tensor(random([37], 2)));
+    let x = random([2, 19, 20], 3);
     assert_equal("gelu", super::linear_gelu(&layer, x.clone()), gelu(layer.forward(x)));
 }
 
 #[test]
 fn the_fused_regressor_equals_the_composed_one() {
     for (groups, height, width) in [(16, 32, 44), (8, 20, 36), (4, 36, 64), (1, 24, 28)] {
-        let regressor =
-            Regressor::new(&RegressorConfig { networks: 1, channels: 16, groups }, &Device::flex());
-        // A mean far from 0, as z ≈ 2 m is.
-        let x = random([2, 6, height, width]) + 3.0;
+        let mut config = Config::default();
+        (config.network.enc_depth, config.network.dec_depth) = (1, 1);
+        (config.network.enc_dim, config.network.dec_dim, config.network.hooks) = (64, 48, [0, 1, 1, 1]);
+        config.regressor.groups = groups;
+        let file = tempfile::NamedTempFile::new().expect("temporary file");
+        init(&config, 5, file.path(), &|_, _| ()).expect("written");
+        let weights = WeightFile::open(file.path(), None).expect("our file");
+        let regressor = &weights.regressors(&Device::flex()).expect("weights")[0];
+        // Means away from 0, as z ≈ 2 m is.
+        let image = |seed| random([2, 6, height, width], seed) + 2.0;
+        let x = image(1);
         let (mut fast, mut plain) = (Statistics::measured(), Statistics::measured());
-        let got = super::regress(&regressor, x.clone(), &mut fast);
+        let got = super::regress(regressor, x.clone(), &mut fast);
         let composed = |x: Tensor<4>, statistics: &mut Statistics| {
             regressor.gs_conv.forward(regressor.pred_unet.forward(x, statistics)).permute([0, 2, 3, 1])
         };
         let what = format!("{groups} groups at {height}×{width}");
         assert_equal(&what, got.clone(), composed(x.clone(), &mut plain));
         // Each road understands the statistics of the other.
-        let other = random([2, 6, height, width]);
-        let by_fast = super::regress(&regressor, other.clone(), &mut plain.frozen());
+        let other = image(2);
+        let by_fast = super::regress(regressor, other.clone(), &mut plain.frozen());
         assert_equal(&format!("{what}, frozen"), by_fast, composed(other, &mut fast.frozen()));
     }
 }
