@@ -45,12 +45,22 @@ fn ndarray() -> Device {
 pub fn snapsnap() -> Command {
     static PROGRAM: OnceLock<PathBuf> = OnceLock::new();
     let program = PROGRAM.get_or_init(|| {
-        let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
-        let arguments = ["build", "--quiet", "--release", "--package", "snapsnap", "--bin", "snapsnap"];
-        let status = Command::new(cargo).args(arguments).status().expect("cargo starts");
-        assert!(status.success(), "the program builds");
         let test = std::env::current_exe().expect("the test's own path");
         let release = test.ancestors().nth(2).expect("target/release/deps/test");
+        let target = release.parent().expect("target/release");
+        let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
+        let mut build = Command::new(cargo);
+        build.args([
+            "build",
+            "--quiet",
+            "--release",
+            "--package",
+            "snapsnap",
+            "--bin",
+            "snapsnap",
+            "--target-dir",
+        ]);
+        assert!(build.arg(target).status().expect("cargo starts").success(), "the program builds");
         release.join("snapsnap").with_extension(std::env::consts::EXE_EXTENSION)
     });
     let mut command = Command::new(program);
