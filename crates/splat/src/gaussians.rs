@@ -1,6 +1,6 @@
 //! A set of 3D Gaussians as tensors on one device.
 
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::{Device, Tensor};
 use glam::DQuat;
 
 use crate::{RigidTransform, SplatError};
@@ -64,16 +64,11 @@ impl Gaussians {
 
     /// Moves the centres by `transform`; leaves the quaternions alone.
     pub fn with_means_transformed(mut self, transform: &RigidTransform) -> Self {
-        if self.is_empty() {
-            return self; // not every backend multiplies matrices without rows
-        }
-        let device = self.device();
-        // Row vectors: (R·p)ᵀ = pᵀ·Rᵀ, and glam's column-major array read row by row is Rᵀ.
-        let rotation = transform.rotation.to_cols_array().map(|v| v as f32);
-        let rotation = Tensor::<2>::from_data(TensorData::new(rotation.to_vec(), [3, 3]), &device);
-        let translation = transform.translation.to_array().map(|v| v as f32);
-        let translation = Tensor::<2>::from_data(TensorData::new(translation.to_vec(), [1, 3]), &device);
-        self.means = self.means.matmul(rotation) + translation;
+        // Row vectors: (R·p)ᵀ = pᵀ·Rᵀ, and glam's columns are the rows of Rᵀ.
+        let rows = transform.rotation.to_cols_array_2d().map(|column| column.map(|v| v as f32));
+        let translation = [transform.translation.to_array().map(|v| v as f32)];
+        let translation = Tensor::<2>::from_floats(translation, &self.device());
+        self.means = times(self.means, &rows) + translation;
         self
     }
 
@@ -83,23 +78,29 @@ impl Gaussians {
     /// If `transform` is a reflection: no quaternion can express the mirrored Gaussians.
     pub fn transformed(mut self, transform: &RigidTransform) -> Self {
         assert!(transform.rotation.determinant() > 0.0, "a reflection cannot rotate quaternions");
-        if self.is_empty() {
-            return self;
-        }
         let q = DQuat::from_mat3(&transform.rotation);
         let (w, x, y, z) = (q.w as f32, q.x as f32, q.y as f32, q.z as f32);
-        // Row i of this matrix is what component i of the right factor contributes to q ⊗ r, in (w, x, y, z) order.
-        let product = vec![w, x, y, z, -x, w, z, -y, -y, -z, w, x, -z, y, -x, w];
-        let product = Tensor::<2>::from_data(TensorData::new(product, [4, 4]), &self.device());
-        self.rotations = self.rotations.matmul(product);
+        // Row i is what component i of the right factor contributes to q ⊗ r, in (w, x, y, z) order.
+        let product = [[w, x, y, z], [-x, w, z, -y], [-y, -z, w, x], [-z, y, -x, w]];
+        self.rotations = times(self.rotations, &product);
         self.with_means_transformed(transform)
     }
+}
+
+/// `x` `[N, K]` times a small constant matrix given by its K rows. As a sum of K scaled rows: a GPU would tune a matrix
+/// product for seconds, and not every backend multiplies matrices without rows.
+fn times<const C: usize>(x: Tensor<2>, rows: &[[f32; C]]) -> Tensor<2> {
+    let device = x.device();
+    let term =
+        |(i, row): (usize, &[f32; C])| x.clone().narrow(1, i, 1) * Tensor::<2>::from_floats([*row], &device);
+    rows.iter().enumerate().map(term).reduce(|sum, term| sum + term).expect("K > 0")
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::Camera;
+    use burn::tensor::TensorData;
     use glam::{DMat3, DVec3};
 
     fn one(rotation: DQuat, mean: DVec3, device: &Device) -> Gaussians {
