@@ -1,0 +1,54 @@
+//! What is accepted, what is refused, and in which words.
+
+use super::*;
+
+fn refusal(text: &str, overrides: &[&str]) -> String {
+    let overrides: Vec<String> = overrides.iter().map(|s| (*s).to_owned()).collect();
+    Config::from_toml(text, "x.toml", &overrides).expect_err("refused").to_string()
+}
+
+#[test]
+fn the_default_survives_a_round_trip_through_toml() {
+    let config = Config::default();
+    assert_eq!(Config::from_toml(&config.to_toml(), "x", &[]).expect("valid"), config);
+}
+
+#[test]
+fn an_unknown_key_is_named_with_its_line() {
+    let message = refusal("[network]\nenc_dim = 64\nenc_dims = 3\n", &[]);
+    assert!(
+        message.contains("x.toml") && message.contains("line 3") && message.contains("enc_dims"),
+        "{message}"
+    );
+}
+
+#[test]
+fn an_unknown_name_lists_the_allowed_ones() {
+    let message = refusal("[network]\nfusion = \"sum\"\n", &[]);
+    assert!(message.contains("mirror-mean") && message.contains("concat"), "{message}");
+}
+
+#[test]
+fn impossible_sizes_name_the_key() {
+    assert!(refusal("[network]\nenc_heads = 7\n", &[]).contains("network.enc_heads"));
+    assert!(refusal("[network]\nnet_resolution = 500\n", &[]).contains("network.net_resolution"));
+    assert!(refusal("[network]\nhooks = [0, 6, 9, 13]\n", &[]).contains("network.hooks"));
+    assert!(refusal("[regressor]\nnetworks = 3\n", &[]).contains("regressor.networks"));
+    assert!(refusal("[regressor]\nchannels = 24\n", &[]).contains("regressor.channels"));
+}
+
+#[test]
+fn a_fix_beside_compat_is_a_contradiction() {
+    let message = refusal("[mode]\ncompat = true\ndownsample = \"area\"\n", &[]);
+    assert!(message.contains("mode.downsample") && message.contains("nearest"), "{message}");
+}
+
+#[test]
+fn set_overrides_one_key_and_is_named_when_wrong() {
+    let set = |s: &str| Config::from_toml("", "x", &[s.to_owned()]);
+    assert!(set("mode.compat=true").expect("valid").mode.compat);
+    assert_eq!(set("network.fusion=concat").expect("valid").network.fusion, Fusion::Concat);
+    assert_eq!(set("network.hooks=[0,1,2,3]").expect("valid").network.hooks, [0, 1, 2, 3]);
+    assert!(refusal("", &["network.nothing=1"]).contains("nothing"));
+    assert!(refusal("", &["network"]).contains("SECTION.KEY=VALUE"));
+}
