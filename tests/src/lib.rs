@@ -130,6 +130,21 @@ impl Numbers {
         (view.shape().to_vec(), values.collect())
     }
 
+    /// Shape and values of an f64 tensor.
+    pub fn f64(&self, name: &str) -> (Vec<usize>, Vec<f64>) {
+        let file = self.file();
+        let view = file.tensor(name).unwrap_or_else(|e| panic!("{name}: {e}"));
+        assert_eq!(view.dtype(), safetensors::Dtype::F64, "{name}");
+        let value = |b: &[u8]| f64::from_le_bytes(b.try_into().expect("eight bytes"));
+        (view.shape().to_vec(), view.data().chunks_exact(8).map(value).collect())
+    }
+
+    /// The string that the file's metadata has under `key`.
+    pub fn metadata(&self, key: &str) -> String {
+        let (_, metadata) = SafeTensors::read_metadata(&self.0).expect("a safetensors file");
+        metadata.metadata().as_ref().and_then(|m| m.get(key).cloned()).unwrap_or_else(|| panic!("no {key}"))
+    }
+
     /// Shape and values of a u8 tensor.
     pub fn u8(&self, name: &str) -> (Vec<usize>, Vec<u8>) {
         let file = self.file();

@@ -49,8 +49,8 @@ input_error!(PhotoError, ConfigError, WeightsError);
 impl From<SplatError> for Failure {
     fn from(e: SplatError) -> Self {
         match e {
-            SplatError::Write { .. } => Self::Input(e.to_string()),
             SplatError::Shape { .. } | SplatError::NotFinite { .. } => Self::Internal(e.to_string()),
+            _ => Self::Input(e.to_string()),
         }
     }
 }

@@ -2,6 +2,8 @@
 
 use glam::{DMat3, DVec2, DVec3};
 
+use crate::op::MAX_SIDE;
+
 /// `x ↦ rotation · x + translation`; `rotation` is orthonormal but may be a reflection (the published demo's is).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RigidTransform {
@@ -70,6 +72,40 @@ impl Camera {
             principal_point: DVec2::new(0.5 * side, 537.0 / 1024.0 * side),
             world_to_camera: RigidTransform { rotation, translation: -(rotation * eye) },
         }
+    }
+
+    /// Whether an image can be rendered into this camera; if not, what is wrong.
+    pub(crate) fn check(&self) -> Result<(), String> {
+        for (field, side) in [("width", self.width), ("height", self.height)] {
+            if side == 0 || side > MAX_SIDE {
+                return Err(format!("`{field}` is {side}, expected 1 to {MAX_SIDE} pixels"));
+            }
+        }
+        for (field, focal) in [("fx", self.focal.x), ("fy", self.focal.y)] {
+            // The upper bound keeps f32 arithmetic in range; it is far beyond any lens.
+            if !(focal > 0.0 && focal <= 1e9) {
+                return Err(format!(
+                    "`{field}` is {focal}, expected a focal length in pixels, above 0 and at most 1e9"
+                ));
+            }
+        }
+        for (field, value) in [("cx", self.principal_point.x), ("cy", self.principal_point.y)] {
+            if value.is_nan() || value.abs() > 1e9 {
+                return Err(format!("`{field}` is {value}, expected pixels within ±1e9"));
+            }
+        }
+        let RigidTransform { rotation, translation } = self.world_to_camera;
+        let off = (rotation * rotation.transpose() - DMat3::IDENTITY).to_cols_array();
+        // Written so that a NaN fails as well.
+        if !off.iter().all(|d| d.abs() <= 1e-3) {
+            return Err(
+                "the upper left 3×3 of `world_to_camera` is not a rotation or reflection (R·Rᵀ ≠ I)".into()
+            );
+        }
+        if !translation.to_array().iter().all(|t| t.abs() <= 1e12) {
+            return Err("the translation of `world_to_camera` is not finite or beyond 1e12 m".into());
+        }
+        Ok(())
     }
 
     /// Projects a world point (metres): pixel coordinates (pixel centres at +½) and depth along the optical axis

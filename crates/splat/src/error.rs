@@ -15,6 +15,35 @@ pub enum SplatError {
         /// Shape it should have.
         expected: Vec<usize>,
     },
+    /// A render without a view.
+    #[error("no camera to render into")]
+    NoCamera,
+    /// A camera that cannot be rendered into.
+    #[error("camera {index}: {problem}")]
+    Camera {
+        /// Position in the list, from 0.
+        index: usize,
+        /// What is wrong with it.
+        problem: String,
+    },
+    /// A constant of the rasteriser that makes no sense.
+    #[error("render option `{field}` must be {allowed}")]
+    Option {
+        /// Name of the option.
+        field: &'static str,
+        /// What it may be.
+        allowed: &'static str,
+    },
+    /// More pairs of splats and tiles than memory on the device can hold.
+    #[error(
+        "{found} pairs of a splat and a 16×16 tile, at most {limit} fit: render fewer views at once, or a smaller image"
+    )]
+    TooManyIntersections {
+        /// Pairs in this scene.
+        found: u64,
+        /// Pairs that fit.
+        limit: u64,
+    },
     /// A value that may not be written: a NaN or an infinity in a PLY blinds most viewers.
     #[error("Gaussian {index}: `{field}` is not finite")]
     NotFinite {
@@ -22,6 +51,22 @@ pub enum SplatError {
         field: &'static str,
         /// Row of the offending value.
         index: usize,
+    },
+    /// A camera file that cannot be used.
+    #[error("{path}: {problem}")]
+    Cameras {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        problem: String,
+    },
+    /// A file could not be read.
+    #[error("{path}: cannot read: {source}")]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
     },
     /// A file could not be written.
     #[error("{path}: cannot write: {source}")]

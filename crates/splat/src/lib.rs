@@ -1,12 +1,19 @@
-//! Cameras, 3D Gaussians and their PLY files: the lowest floor of snapsnap, on which the differentiable
-//! rasteriser will stand.
+//! Cameras, 3D Gaussians, their PLY files and the differentiable rasteriser: the lowest floor of snapsnap.
 
 mod camera;
+pub mod cameras;
 mod error;
 pub mod file;
 mod gaussians;
+mod op;
+mod options;
 pub mod ply;
+mod render;
+mod vjp;
 
 pub use camera::{Camera, RigidTransform};
 pub use error::SplatError;
 pub use gaussians::Gaussians;
+pub use op::{Counts, MAX_SIDE};
+pub use options::{MIN_ALPHA, MIN_TRANSMITTANCE, RenderOptions, TILE};
+pub use render::{Rendered, render};

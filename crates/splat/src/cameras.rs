@@ -1,0 +1,147 @@
+//! `cameras.json`: a list of pinhole cameras.
+
+use std::fs;
+use std::io::Write;
+use std::path::Path;
+
+use glam::{DMat3, DVec2, DVec3};
+use serde::{Deserialize, Serialize};
+
+use crate::file::write_whole;
+use crate::{Camera, RigidTransform, SplatError};
+
+/// Largest file that is read; a camera takes about 400 bytes.
+const MAX_BYTES: u64 = 256 << 20;
+
+/// One entry of the file. OpenCV axes (x right, y down, z forward), metres, pixels, pixel centres at +½.
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Entry {
+    width: u32,
+    height: u32,
+    fx: f64,
+    fy: f64,
+    cx: f64,
+    cy: f64,
+    /// Row by row.
+    world_to_camera: [[f64; 4]; 4],
+}
+
+/// Reads the cameras of `path`.
+///
+/// # Errors
+/// [`SplatError::Read`] if the file cannot be read, [`SplatError::Cameras`] if it is not such a list, names the entry
+/// and the field, or if a camera in it cannot be rendered into.
+pub fn read(path: &Path) -> Result<Vec<Camera>, SplatError> {
+    let wrong = |problem: String| SplatError::Cameras { path: path.to_owned(), problem };
+    let cannot = |source| SplatError::Read { path: path.to_owned(), source };
+    let length = fs::metadata(path).map_err(cannot)?.len();
+    if length > MAX_BYTES {
+        return Err(wrong(format!("{length} bytes; at most {MAX_BYTES} are read")));
+    }
+    let text = fs::read_to_string(path).map_err(cannot)?;
+    // In two steps, so that an error can name the camera.
+    let entries: Vec<serde_json::Value> = serde_json::from_str(&text).map_err(|e| wrong(e.to_string()))?;
+    if entries.is_empty() {
+        return Err(wrong("the list is empty".into()));
+    }
+    let camera = |(index, value)| {
+        let entry: Entry =
+            serde_json::from_value(value).map_err(|e| wrong(format!("camera {index}: {e}")))?;
+        let [a, b, c, d] = entry.world_to_camera;
+        if d != [0.0, 0.0, 0.0, 1.0] {
+            return Err(wrong(format!(
+                "camera {index}: the last row of `world_to_camera` is {d:?}, expected [0, 0, 0, 1]"
+            )));
+        }
+        let row = |r: [f64; 4]| DVec3::new(r[0], r[1], r[2]);
+        let camera = Camera {
+            width: entry.width,
+            height: entry.height,
+            focal: DVec2::new(entry.fx, entry.fy),
+            principal_point: DVec2::new(entry.cx, entry.cy),
+            world_to_camera: RigidTransform {
+                rotation: DMat3::from_cols(row(a), row(b), row(c)).transpose(),
+                translation: DVec3::new(a[3], b[3], c[3]),
+            },
+        };
+        camera.check().map_err(|problem| wrong(format!("camera {index}: {problem}")))?;
+        Ok(camera)
+    };
+    entries.into_iter().enumerate().map(camera).collect()
+}
+
+/// Writes `cameras` to `path`, whole or not at all.
+///
+/// # Errors
+/// [`SplatError::Write`].
+pub fn write(cameras: &[Camera], path: &Path) -> Result<(), SplatError> {
+    let entry = |camera: &Camera| {
+        let RigidTransform { rotation, translation } = camera.world_to_camera;
+        let row = |i: usize| {
+            let r = rotation.row(i);
+            [r.x, r.y, r.z, translation[i]]
+        };
+        Entry {
+            width: camera.width,
+            height: camera.height,
+            fx: camera.focal.x,
+            fy: camera.focal.y,
+            cx: camera.principal_point.x,
+            cy: camera.principal_point.y,
+            world_to_camera: [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]],
+        }
+    };
+    let entries: Vec<Entry> = cameras.iter().map(entry).collect();
+    write_whole(path, |out| {
+        serde_json::to_writer_pretty(&mut *out, &entries)?;
+        writeln!(out)
+    })
+    .map_err(|source| SplatError::Write { path: path.to_owned(), source })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn read_text(text: &str) -> Result<Vec<Camera>, SplatError> {
+        let folder = tempfile::tempdir().expect("folder");
+        let path = folder.path().join("cameras.json");
+        fs::write(&path, text).expect("written");
+        read(&path)
+    }
+
+    #[test]
+    fn what_was_written_is_read_again() {
+        let folder = tempfile::tempdir().expect("folder");
+        let path = folder.path().join("cameras.json");
+        let cameras = [0.0, 77.0].map(|yaw| Camera::orbit_at_yaw_degrees(yaw, 640));
+        write(&cameras, &path).expect("written");
+        assert_eq!(read(&path).expect("read"), cameras);
+    }
+
+    #[test]
+    fn errors_name_the_camera_and_the_field() {
+        let good = r#"{"width":4,"height":4,"fx":1,"fy":1,"cx":2,"cy":2,
+            "world_to_camera":[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}"#;
+        assert_eq!(read_text(&format!("[{good}]")).expect("good").len(), 1);
+        for (from, to, expected) in [
+            (r#""width":4"#, r#""width":0"#, "camera 1: `width` is 0"),
+            (r#""width":4"#, r#""width":-4"#, "camera 1: invalid value: integer `-4`"),
+            (r#""width":4,"#, "", "camera 1: missing field `width`"),
+            (r#""fx":1"#, r#""fx":-1"#, "camera 1: `fx` is -1"),
+            (r#""fx":1"#, r#""focal":1"#, "unknown field `focal`"),
+            (r#""cx":2"#, r#""cx":1e300"#, "camera 1: `cx`"),
+            ("[1,0,0,0]", "[2,0,0,0]", "not a rotation"),
+            ("[0,0,0,1]", "[0,0,1,1]", "last row"),
+            ("[1,0,0,0]", "[1,0,0]", "camera 1: invalid length 3"),
+            ("[1,0,0,0]", "[1,0,0,1e99]", "translation"),
+        ] {
+            let bad = good.replace(from, to);
+            let error = read_text(&format!("[{good},{bad}]")).expect_err(to).to_string();
+            assert!(error.contains("cameras.json") && error.contains(expected), "{to}: {error}");
+        }
+        assert!(read_text("[]").expect_err("empty").to_string().contains("empty"));
+        assert!(read_text("{").expect_err("no JSON").to_string().contains("line 1"));
+    }
+}

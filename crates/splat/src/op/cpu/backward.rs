@@ -1,0 +1,406 @@
+//! Gradients of one call: per pixel back to front, then per Gaussian through the projection.
+
+use pulp::{Arch, Simd, WithSimd};
+use rayon::prelude::*;
+
+use super::super::job::{Job, Wanted};
+use super::lanes::{Lanes, row, rows};
+use super::splats::{Splat, parameters, projection};
+use super::{Scene, State, ViewState};
+use crate::options::{MIN_ALPHA, TILE};
+use crate::vjp::{FootprintGradient, project_vjp};
+
+/// Gaussians per task.
+const CHUNK: usize = 2048;
+
+/// Gradients in the shapes of the inputs; empty where not wanted.
+#[derive(Debug, Default)]
+pub struct Gradients {
+    pub means: Vec<f32>,
+    pub rotations: Vec<f32>,
+    pub scales: Vec<f32>,
+    pub opacities: Vec<f32>,
+    pub colors: Vec<f32>,
+    pub background: Vec<f32>,
+}
+
+/// Where the sums of one entry lie in its record; what is not wanted has no place.
+#[derive(Clone, Copy)]
+struct Record {
+    wanted: Wanted,
+    depth: bool,
+    len: usize,
+}
+
+impl Record {
+    fn new(wanted: Wanted, job: &Job) -> Self {
+        // The compensation of antialiasing carries the opacity's gradient on to the geometry.
+        let wanted = Wanted { opacities: wanted.opacities || (wanted.geometry && job.antialiased), ..wanted };
+        let depth = wanted.geometry && job.depth;
+        let len = 3 * usize::from(wanted.colors)
+            + usize::from(wanted.opacities)
+            + 5 * usize::from(wanted.geometry)
+            + usize::from(depth);
+        Self { wanted, depth, len }
+    }
+
+    fn opacity(&self) -> usize {
+        3 * usize::from(self.wanted.colors)
+    }
+
+    fn geometry(&self) -> usize {
+        self.opacity() + usize::from(self.wanted.opacities)
+    }
+
+    fn depth(&self) -> usize {
+        self.geometry() + 5
+    }
+}
+
+/// Gradients of the inputs that `wanted` names, from `upstream`, ∂L/∂image `[V,H,W,C]`.
+pub fn backward(scene: Scene, job: &Job, state: &State, upstream: &[f32], wanted: Wanted) -> Gradients {
+    let n = scene.len();
+    let room = |columns: usize, wanted: bool| vec![0.0_f32; if wanted { n * columns } else { 0 }];
+    let mut gradients = Gradients {
+        means: room(3, wanted.geometry),
+        rotations: room(4, wanted.geometry),
+        scales: room(3, wanted.geometry),
+        opacities: room(1, wanted.opacities),
+        colors: room(3, wanted.colors),
+        background: vec![0.0; if wanted.background { 3 } else { 0 }],
+    };
+    let record = Record::new(wanted, job);
+    let image = job.width * job.height * job.channels();
+    for (index, view) in state.views.iter().enumerate() {
+        let upstream = &upstream[index * image..][..image];
+        if wanted.background {
+            let sums = background(view, job, upstream);
+            gradients.background.iter_mut().zip(sums).for_each(|(g, s)| *g += s);
+        }
+        if record.len > 0 {
+            let records = pixels(scene, job, view, upstream, record);
+            gather(scene, job, index, view, &records, record, &mut gradients);
+        }
+    }
+    gradients
+}
+
+/// ∂L/∂background = Σ T_final·v_colour, image row by image row in f64.
+fn background(view: &ViewState, job: &Job, upstream: &[f32]) -> [f32; 3] {
+    let rows: Vec<[f64; 3]> = view
+        .transmittance
+        .par_chunks(job.width)
+        .zip(upstream.par_chunks(job.width * job.channels()))
+        .map(|(transmittance, upstream)| {
+            let mut sum = [0.0; 3];
+            for (t, v) in transmittance.iter().zip(upstream.chunks_exact(job.channels())) {
+                for c in 0..3 {
+                    sum[c] += f64::from(t * v[c]);
+                }
+            }
+            sum
+        })
+        .collect();
+    [0, 1, 2].map(|c| rows.iter().map(|sum| sum[c]).sum::<f64>() as f32)
+}
+
+/// One record of sums over pixels per entry of the tiles' lists, in the lists' order.
+fn pixels(scene: Scene, job: &Job, view: &ViewState, upstream: &[f32], record: Record) -> Vec<f32> {
+    let mut records = vec![0.0_f32; view.lists.len() * record.len];
+    let mut rest = records.as_mut_slice();
+    let mut bands = Vec::with_capacity(job.tiles_y());
+    for y in 0..job.tiles_y() {
+        let tiles = y * job.tiles_x()..(y + 1) * job.tiles_x();
+        let entries = view.lists.starts[tiles.end] - view.lists.starts[tiles.start];
+        let (records, others) = rest.split_at_mut(entries as usize * record.len);
+        rest = others;
+        bands.push(Band { job, view, upstream, background: scene.background(), y, records, record });
+    }
+    let arch = Arch::new();
+    bands.into_par_iter().for_each(|band| arch.dispatch(band));
+    records
+}
+
+/// One row of tiles.
+struct Band<'a> {
+    job: &'a Job,
+    view: &'a ViewState,
+    upstream: &'a [f32],
+    background: [f32; 3],
+    y: usize,
+    records: &'a mut [f32],
+    record: Record,
+}
+
+/// A tile's pixels while splats are taken off them again.
+struct Pixels {
+    /// Transmittance in front of the splat last visited.
+    transmittance: [Lanes; TILE],
+    /// Σ α_j T_j e_j over the splats behind, plus the background's part.
+    behind: [Lanes; TILE],
+    last: [[u32; TILE]; TILE],
+    /// ∂L/∂(red, green, blue, alpha, depth).
+    upstream: [[Lanes; TILE]; 5],
+}
+
+/// Sums over the pixels of one entry, lane by lane.
+struct Sums {
+    color: [Lanes; 3],
+    alpha: Lanes,
+    mean: [Lanes; 2],
+    covariance: [Lanes; 3],
+    depth: Lanes,
+}
+
+impl WithSimd for Band<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(mut self, _simd: S) {
+        let colors_only = !self.record.wanted.geometry && !self.record.wanted.opacities;
+        for x in 0..self.job.tiles_x() {
+            match (colors_only, self.job.depth) {
+                (true, _) => self.tile::<false, false>(x),
+                (false, false) => self.tile::<true, false>(x),
+                (false, true) => self.tile::<true, true>(x),
+            }
+        }
+    }
+}
+
+impl Band<'_> {
+    /// Without `SHAPE`, only colours are wanted; with it everything is computed and the record takes its share.
+    #[inline(always)]
+    fn tile<const SHAPE: bool, const DEPTH: bool>(&mut self, x: usize) {
+        let tile = self.y * self.job.tiles_x() + x;
+        let list = self.view.lists.tile(tile);
+        if list.is_empty() {
+            return;
+        }
+        let mut p = self.load::<SHAPE, DEPTH>(x);
+        let visited = p.last.iter().flatten().copied().max().unwrap_or(0) as usize;
+        let first =
+            (self.view.lists.starts[tile] - self.view.lists.starts[self.y * self.job.tiles_x()]) as usize;
+        let (left, top) = ((x * TILE) as f32, self.y * TILE);
+        for n in (0..visited).rev() {
+            let splat = &self.view.splats[list[n] as usize];
+            let mut sums = Sums {
+                color: [[0.0; TILE]; 3],
+                alpha: [0.0; TILE],
+                mean: [[0.0; TILE]; 2],
+                covariance: [[0.0; TILE]; 3],
+                depth: [0.0; TILE],
+            };
+            for y in rows(splat, top) {
+                take_off::<SHAPE, DEPTH>(
+                    &mut p,
+                    &mut sums,
+                    splat,
+                    n as u32,
+                    left,
+                    top,
+                    y,
+                    self.job.max_alpha,
+                );
+            }
+            let at = (first + n) * self.record.len;
+            write(&sums, splat, self.record, &mut self.records[at..at + self.record.len]);
+        }
+    }
+
+    #[inline(always)]
+    fn load<const SHAPE: bool, const DEPTH: bool>(&self, x: usize) -> Pixels {
+        let mut p = Pixels {
+            transmittance: [[1.0; TILE]; TILE],
+            behind: [[0.0; TILE]; TILE],
+            last: [[0; TILE]; TILE],
+            upstream: [[[0.0; TILE]; TILE]; 5],
+        };
+        let (width, channels) = (self.job.width, self.job.channels());
+        let columns = TILE.min(width - x * TILE);
+        for y in 0..TILE.min(self.job.height - self.y * TILE) {
+            let first = (self.y * TILE + y) * width + x * TILE;
+            p.transmittance[y][..columns].copy_from_slice(&self.view.transmittance[first..first + columns]);
+            p.last[y][..columns].copy_from_slice(&self.view.last[first..first + columns]);
+            let upstream = &self.upstream[first * channels..(first + columns) * channels];
+            for (i, v) in upstream.chunks_exact(channels).enumerate() {
+                for c in 0..3 {
+                    p.upstream[c][y][i] = v[c];
+                }
+                if SHAPE {
+                    p.upstream[3][y][i] = v[3];
+                    if DEPTH {
+                        p.upstream[4][y][i] = v[4];
+                    }
+                    let b = self.background;
+                    p.behind[y][i] = p.transmittance[y][i] * (b[0] * v[0] + b[1] * v[1] + b[2] * v[2]);
+                }
+            }
+        }
+        p
+    }
+}
+
+/// Adds row `y`'s part of the gradients of the splat, number `n` of the tile, to `sums`.
+#[inline(always)]
+#[allow(clippy::too_many_arguments, reason = "an inner loop, inlined into its only caller")]
+fn take_off<const SHAPE: bool, const DEPTH: bool>(
+    p: &mut Pixels,
+    sums: &mut Sums,
+    splat: &Splat,
+    n: u32,
+    left: f32,
+    top: usize,
+    y: usize,
+    max_alpha: f32,
+) {
+    let row = row(splat, left, (top + y) as f32 + 0.5);
+    let (transmittance, behind, last) = (&mut p.transmittance[y], &mut p.behind[y], &p.last[y]);
+    let [red, green, blue, opaque, deep] = &p.upstream;
+    let [red, green, blue, opaque, deep] = [&red[y], &green[y], &blue[y], &opaque[y], &deep[y]];
+    for i in 0..TILE {
+        let alpha = row.alpha[i].min(max_alpha);
+        let taken = (n < last[i]) & (alpha >= MIN_ALPHA);
+        let alpha = if taken { alpha } else { 0.0 };
+        let inverse = 1.0 / (1.0 - alpha);
+        let t = transmittance[i] * inverse;
+        transmittance[i] = t;
+        let weight = alpha * t;
+        sums.color[0][i] += weight * red[i];
+        sums.color[1][i] += weight * green[i];
+        sums.color[2][i] += weight * blue[i];
+        if SHAPE {
+            let mut e =
+                splat.color[0] * red[i] + splat.color[1] * green[i] + splat.color[2] * blue[i] + opaque[i];
+            if DEPTH {
+                e += splat.depth * deep[i];
+                sums.depth[i] += weight * deep[i];
+            }
+            let v_alpha = t * e - behind[i] * inverse;
+            behind[i] += weight * e;
+            // Where α is clamped it does not depend on the splat.
+            let g = if row.alpha[i] < max_alpha { v_alpha * alpha } else { 0.0 };
+            let y_y = splat.l1 * (splat.l1 * row.sheared[i]);
+            let y_x = splat.l0 * (splat.l0 * row.dx[i]) + splat.k * y_y;
+            let (g_x, g_y) = (g * y_x, g * y_y);
+            sums.alpha[i] += g;
+            sums.mean[0][i] += g_x;
+            sums.mean[1][i] += g_y;
+            sums.covariance[0][i] += g_x * y_x;
+            sums.covariance[1][i] += g_x * y_y;
+            sums.covariance[2][i] += g_y * y_y;
+        }
+    }
+}
+
+#[inline(always)]
+fn write(sums: &Sums, splat: &Splat, record: Record, out: &mut [f32]) {
+    let sum = |lanes: &Lanes| {
+        // Halves upon halves: a fixed order that the compiler can turn into SIMD.
+        let mut lanes = *lanes;
+        let mut width = TILE / 2;
+        while width > 0 {
+            for i in 0..width {
+                lanes[i] += lanes[i + width];
+            }
+            width /= 2;
+        }
+        lanes[0]
+    };
+    if record.wanted.colors {
+        out[..3].copy_from_slice(&[sum(&sums.color[0]), sum(&sums.color[1]), sum(&sums.color[2])]);
+    }
+    if record.wanted.opacities {
+        out[record.opacity()] = sum(&sums.alpha) / splat.opacity;
+    }
+    if record.wanted.geometry {
+        let [a, b, c] = &sums.covariance;
+        out[record.geometry()..record.geometry() + 5].copy_from_slice(&[
+            sum(&sums.mean[0]),
+            sum(&sums.mean[1]),
+            0.5 * sum(a),
+            sum(b),
+            0.5 * sum(c),
+        ]);
+    }
+    if record.depth {
+        out[record.depth()] = sum(&sums.depth);
+    }
+}
+
+/// Adds up the records of each Gaussian and takes them through its projection.
+fn gather(
+    scene: Scene,
+    job: &Job,
+    index: usize,
+    view: &ViewState,
+    records: &[f32],
+    record: Record,
+    gradients: &mut Gradients,
+) {
+    let mut splat_of = vec![u32::MAX; scene.len()];
+    for (i, splat) in view.splats.iter().enumerate() {
+        splat_of[splat.gaussian as usize] = i as u32;
+    }
+    let mut means = gradients.means.chunks_mut(3 * CHUNK);
+    let mut rotations = gradients.rotations.chunks_mut(4 * CHUNK);
+    let mut scales = gradients.scales.chunks_mut(3 * CHUNK);
+    let mut opacities = gradients.opacities.chunks_mut(CHUNK);
+    let mut colors = gradients.colors.chunks_mut(3 * CHUNK);
+    let tasks: Vec<_> = splat_of
+        .chunks(CHUNK)
+        .map(|splats| {
+            let geometry = [
+                means.next().unwrap_or_default(),
+                rotations.next().unwrap_or_default(),
+                scales.next().unwrap_or_default(),
+            ];
+            (splats, geometry, opacities.next().unwrap_or_default(), colors.next().unwrap_or_default())
+        })
+        .collect();
+    let (wanted, camera) = (record.wanted, &job.views[index]);
+    tasks.into_par_iter().for_each(|(splats, [means, rotations, scales], opacities, colors)| {
+        for (i, &at) in splats.iter().enumerate() {
+            if at == u32::MAX {
+                continue;
+            }
+            let splat = &view.splats[at as usize];
+            let places = view.lists.first_place[at as usize] as usize
+                ..view.lists.first_place[at as usize + 1] as usize;
+            let mut sum = [0.0_f32; 10];
+            for &place in &view.lists.places[places] {
+                let at = place as usize * record.len;
+                sum.iter_mut().zip(&records[at..at + record.len]).for_each(|(s, r)| *s += r);
+            }
+            if wanted.colors {
+                add(colors, 3 * i, &sum[..3]);
+            }
+            let v_opacity = if wanted.opacities { sum[record.opacity()] } else { 0.0 };
+            if !opacities.is_empty() {
+                opacities[i] += v_opacity * splat.compensation;
+            }
+            if wanted.geometry {
+                let g = splat.gaussian as usize;
+                let at = record.geometry();
+                let gradient = FootprintGradient {
+                    u: sum[at],
+                    v: sum[at + 1],
+                    a: sum[at + 2],
+                    b: sum[at + 3],
+                    c: sum[at + 4],
+                    depth: if record.depth { sum[record.depth()] } else { 0.0 },
+                    compensation: if job.antialiased { v_opacity * scene.opacities[g] } else { 0.0 },
+                };
+                let p = projection(&scene, g, camera, job);
+                let v = project_vjp(camera, &p, &parameters(&scene, g).2, &gradient);
+                add(means, 3 * i, &[v.mean.x, v.mean.y, v.mean.z]);
+                add(rotations, 4 * i, &[v.rotation.w, v.rotation.x, v.rotation.y, v.rotation.z]);
+                add(scales, 3 * i, &[v.scale.x, v.scale.y, v.scale.z]);
+            }
+        }
+    });
+}
+
+fn add(out: &mut [f32], at: usize, values: &[f32]) {
+    out[at..at + values.len()].iter_mut().zip(values).for_each(|(o, v)| *o += v);
+}

@@ -1,0 +1,138 @@
+//! What one call of the operation is to do, and what it counted: plain host data.
+
+use crate::options::{RenderOptions, TILE};
+use crate::vjp::{Mat3, Vec3, View};
+use crate::{Camera, SplatError};
+
+/// Values beyond this are treated like infinities: their products leave the range of f32.
+pub(super) const MAX_MAGNITUDE: f32 = 1e18;
+/// Least |q|² of a quaternion that still names a rotation.
+pub(super) const MIN_QUATERNION: f32 = 1e-12;
+/// Added to the squared radius inside which a splat's α can reach [`MIN_ALPHA`](crate::options::MIN_ALPHA), so that
+/// rounding cannot cut off a pixel that the exact test would have taken.
+pub(super) const RADIUS_MARGIN: f32 = 1e-3;
+/// Largest image side; keeps pixel coordinates exact in f32 and tile numbers in 32 bits.
+pub const MAX_SIDE: u32 = 32_768;
+
+/// How many Gaussians a render saw and why it left some out, summed over its views.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Counts {
+    /// Gaussians that reach at least one pixel's footprint.
+    pub visible: u64,
+    /// At or before the near plane.
+    pub near: u64,
+    /// No pixel within reach.
+    pub outside: u64,
+    /// Opacity (after antialiasing) below 1/255.
+    pub transparent: u64,
+    /// A zero quaternion, or a covariance or position that f32 cannot hold once projected.
+    pub degenerate: u64,
+    /// A parameter that is NaN, infinite, or beyond ±1e18.
+    pub invalid: u64,
+    /// Pairs of a splat and a 16×16 tile that it reaches: what the run time follows.
+    pub intersections: u64,
+}
+
+/// One call: cameras and constants in the form that the kernels use.
+#[derive(Debug, Clone)]
+pub struct Job {
+    pub(super) views: Vec<View>,
+    pub(super) width: usize,
+    pub(super) height: usize,
+    pub(super) max_alpha: f32,
+    pub(super) blur: f32,
+    pub(super) near: f32,
+    pub(super) antialiased: bool,
+    pub(super) depth: bool,
+}
+
+impl Job {
+    pub(crate) fn new(cameras: &[Camera], options: &RenderOptions) -> Result<Self, SplatError> {
+        let first = cameras.first().ok_or(SplatError::NoCamera)?;
+        for (index, camera) in cameras.iter().enumerate() {
+            camera.check().map_err(|problem| SplatError::Camera { index, problem })?;
+            if (camera.width, camera.height) != (first.width, first.height) {
+                let problem = format!(
+                    "its image is {}×{}, the first camera's is {}×{}; render different sizes in separate calls",
+                    camera.width, camera.height, first.width, first.height
+                );
+                return Err(SplatError::Camera { index, problem });
+            }
+        }
+        let RenderOptions { max_alpha, blur, near, antialiased, depth, .. } = *options;
+        let check = |field, holds: bool, allowed| {
+            if holds { Ok(()) } else { Err(SplatError::Option { field, allowed }) }
+        };
+        check("max_alpha", max_alpha > 0.0 && max_alpha < 1.0, "within (0, 1)")?;
+        check("blur", blur > 0.0 && blur.is_finite(), "positive and finite")?;
+        check("near", near > 0.0 && near.is_finite(), "positive and finite")?;
+        Ok(Self {
+            views: cameras.iter().map(view).collect(),
+            width: first.width as usize,
+            height: first.height as usize,
+            max_alpha,
+            blur,
+            near,
+            antialiased,
+            depth,
+        })
+    }
+
+    /// Channels of the output: red, green, blue, alpha, and depth if asked for.
+    pub(super) fn channels(&self) -> usize {
+        if self.depth { 5 } else { 4 }
+    }
+
+    pub(super) fn tiles_x(&self) -> usize {
+        self.width.div_ceil(TILE)
+    }
+
+    pub(super) fn tiles_y(&self) -> usize {
+        self.height.div_ceil(TILE)
+    }
+}
+
+/// Which tracked inputs need gradients.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Wanted {
+    /// Means, rotations or scales.
+    pub geometry: bool,
+    /// Opacities.
+    pub opacities: bool,
+    /// Colours.
+    pub colors: bool,
+    /// Background.
+    pub background: bool,
+}
+
+fn view(camera: &Camera) -> View {
+    let r = camera.world_to_camera.rotation;
+    let row = |i: usize| {
+        let v = r.row(i);
+        Vec3 { x: v.x as f32, y: v.y as f32, z: v.z as f32 }
+    };
+    // The true inverse: a matrix from a file may be orthonormal to a few digits only.
+    let centre = -(r.inverse() * camera.world_to_camera.translation);
+    let high = centre.as_vec3();
+    let low = (centre - high.as_dvec3()).as_vec3();
+    // The image border as seen from the centre, plus 15 % of the image on either side.
+    let limits = |side: u32, focal: f64, principal: f64| {
+        let margin = 0.15 * f64::from(side);
+        ((-(principal + margin) / focal) as f32, ((f64::from(side) - principal + margin) / focal) as f32)
+    };
+    let (x_min, x_max) = limits(camera.width, camera.focal.x, camera.principal_point.x);
+    let (y_min, y_max) = limits(camera.height, camera.focal.y, camera.principal_point.y);
+    View {
+        rotation: Mat3 { r0: row(0), r1: row(1), r2: row(2) },
+        centre: Vec3 { x: high.x, y: high.y, z: high.z },
+        centre_rest: Vec3 { x: low.x, y: low.y, z: low.z },
+        fx: camera.focal.x as f32,
+        fy: camera.focal.y as f32,
+        cx: camera.principal_point.x as f32,
+        cy: camera.principal_point.y as f32,
+        x_min,
+        x_max,
+        y_min,
+        y_max,
+    }
+}

@@ -1,0 +1,47 @@
+//! What a render does besides placing Gaussians: constants of the rasteriser, background, optional outputs.
+
+use burn::tensor::Tensor;
+
+/// Side of the square image tiles that share one list of splats, in pixels.
+pub const TILE: usize = 16;
+/// A splat is skipped at a pixel where its α is below this.
+pub const MIN_ALPHA: f32 = 1.0 / 255.0;
+/// A pixel takes no further splat once that would bring its transmittance below this.
+pub const MIN_TRANSMITTANCE: f32 = 1e-4;
+
+/// Constants and wishes of a render. Start from a preset and change fields.
+#[derive(Debug, Clone)]
+pub struct RenderOptions {
+    /// Largest α of a single splat, in (0, 1). Bounds 1/(1 − α) in the gradient.
+    pub max_alpha: f32,
+    /// Added to both diagonal entries of the projected covariance, in square pixels: a splat never gets thinner than
+    /// a pixel's own footprint.
+    pub blur: f32,
+    /// Gaussians whose centre is at this camera depth (metres) or nearer are left out.
+    pub near: f32,
+    /// Multiply opacity by √(det Σ'_raw / det Σ'), which keeps the total weight of a splat that the blur enlarges.
+    pub antialiased: bool,
+    /// Render the depth channel as well; without it, nothing is computed for it.
+    pub depth: bool,
+    /// Colour `[3]` behind the Gaussians; differentiable. `None` is black and costs nothing.
+    pub background: Option<Tensor<1>>,
+}
+
+impl RenderOptions {
+    /// Constants of the original 3D Gaussian splatting rasteriser; what the published weights were trained with.
+    pub fn inria() -> Self {
+        Self { max_alpha: 0.99, blur: 0.3, near: 0.2, antialiased: false, depth: false, background: None }
+    }
+
+    /// Constants of gsplat 1.5.
+    pub fn gsplat_1_5() -> Self {
+        Self { max_alpha: 0.999, near: 0.01, ..Self::inria() }
+    }
+}
+
+impl Default for RenderOptions {
+    /// [`RenderOptions::inria`].
+    fn default() -> Self {
+        Self::inria()
+    }
+}

@@ -1,0 +1,456 @@
+//! Projection of one Gaussian and its vector-Jacobian product (VJP): the formulas of the rasteriser.
+//!
+//! Every function here is compiled twice from this one source: as plain Rust for the CPU and, through CubeCL's
+//! `#[cube]`, into the GPU kernels. Notation: `v_x` is ∂L/∂x for the scalar loss L.
+//!
+//! # Projection
+//! With the camera's rotation R, its centre c, the Gaussian's mean μ, unit quaternion q and standard deviations s:
+//!
+//! * t = R·(μ − c). The subtraction comes first and c is kept as an unevaluated sum of two f32: for a scene far from
+//!   the origin R·μ + T would cancel, μ − c does not.
+//! * u = f ⊙ (t_x, t_y)/t_z + principal point; depth = t_z.
+//! * m = J·R·R(q)·diag(s), the 2×3 projected square root of the covariance, with J = ∂u/∂t where t_x/t_z and t_y/t_z
+//!   are clamped to the image border plus 15 % of its size.
+//! * Σ' = m·mᵀ + ε·I = [[a, b], [b, c]].
+//!
+//! # Inverse of Σ' without cancellation
+//! For a needle a·c − b² loses every digit in f32. With n = m₀ × m₁ (the cross product of m's rows) Lagrange's identity
+//! gives det(m·mᵀ) = |n|², hence det Σ' = |n|² + ε(|m₀|² + |m₁|²) + ε², a sum of squares. The quadratic form is
+//! evaluated in factored form,
+//!
+//! dᵀ Σ'⁻¹ d = (l₀·d_x)² + (l₁·(d_y + k·d_x))²,  l₀ = 1/√a, k = −b/a, l₁ = √(a/det Σ'),
+//!
+//! which cannot become negative, so the argument of exp is never positive. All of it is computed from m divided by
+//! its largest entry where that exceeds one pixel, so that no square overflows.
+//!
+//! # Gradients of a splat
+//! α = min(α_max, o·exp(−½·dᵀΛd)) with Λ = Σ'⁻¹ and d = pixel − u. Let g = ∂L/∂α·α (zero where α is clamped) and
+//! y = Λ·d. Then ∂power/∂u = y and ∂power/∂Σ' = ½·y·yᵀ, so a splat's gradients are sums over pixels:
+//! v_u = Σ g·y, v_a = ½ Σ g·y_x², v_b = Σ g·y_x·y_y, v_c = ½ Σ g·y_y², v_o = Σ g/o.
+//! In factored form y_y = l₁²·(d_y + k·d_x), y_x = l₀²·d_x + k·y_y.
+//!
+//! # Gradient of a pixel
+//! With e_i = c_i·v_colour + t_z,i·v_depth + v_alpha, the pixel's part of the loss is
+//! Σ α_i T_i e_i + T_final·(background·v_colour), hence
+//! ∂L/∂α_i = T_i·e_i − (Σ_{j>i} α_j T_j e_j + T_final·background·v_colour)/(1 − α_i).
+//! Splats are visited back to front, so the bracket is a running sum and T_i = T_{i+1}/(1 − α_i).
+
+use cubecl::prelude::*;
+
+/// Three numbers.
+#[derive(CubeType, Clone, Copy, Debug)]
+pub struct Vec3 {
+    /// First.
+    pub x: f32,
+    /// Second.
+    pub y: f32,
+    /// Third.
+    pub z: f32,
+}
+
+/// Quaternion in (w, x, y, z) order.
+#[derive(CubeType, Clone, Copy, Debug)]
+pub struct Quat {
+    /// Real part.
+    pub w: f32,
+    /// i.
+    pub x: f32,
+    /// j.
+    pub y: f32,
+    /// k.
+    pub z: f32,
+}
+
+/// Three rows of three.
+#[derive(CubeType, Clone, Copy, Debug)]
+pub struct Mat3 {
+    /// First row.
+    pub r0: Vec3,
+    /// Second row.
+    pub r1: Vec3,
+    /// Third row.
+    pub r2: Vec3,
+}
+
+/// A camera as the rasteriser uses it.
+#[derive(CubeType, Clone, Copy, Debug)]
+pub struct View {
+    /// World → camera rotation.
+    pub rotation: Mat3,
+    /// Camera centre in the world, metres, rounded to f32 …
+    pub centre: Vec3,
+    /// … and what the rounding left over.
+    pub centre_rest: Vec3,
+    /// Focal length, pixels.
+    pub fx: f32,
+    /// Focal length, pixels.
+    pub fy: f32,
+    /// Principal point, pixels.
+    pub cx: f32,
+    /// Principal point, pixels.
+    pub cy: f32,
+    /// Least t_x/t_z that J is linearised at.
+    pub x_min: f32,
+    /// Largest t_x/t_z that J is linearised at.
+    pub x_max: f32,
+    /// Least t_y/t_z that J is linearised at.
+    pub y_min: f32,
+    /// Largest t_y/t_z that J is linearised at.
+    pub y_max: f32,
+}
+
+/// What the forward and the backward pass both need of a projected Gaussian.
+#[derive(CubeType, Clone, Copy, Debug)]
+pub struct Projection {
+    /// Mean in the camera's frame.
+    pub t: Vec3,
+    /// t_x/t_z, clamped for J.
+    pub x: f32,
+    /// t_y/t_z, clamped for J.
+    pub y: f32,
+    /// fx/t_z.
+    pub jx: f32,
+    /// fy/t_z.
+    pub jy: f32,
+    /// Unit quaternion.
+    pub q: Quat,
+    /// 1/|q|.
+    pub q_inverse_norm: f32,
+    /// R·R(q): its columns are the Gaussian's axes in the camera's frame.
+    pub axes: Mat3,
+    /// First row of m, divided by `unit`.
+    pub m0: Vec3,
+    /// Second row of m, divided by `unit`.
+    pub m1: Vec3,
+    /// max(1, largest entry of m), pixels.
+    pub unit: f32,
+    /// ε/unit².
+    pub blur: f32,
+}
+
+/// A splat: a projected Gaussian as the pixels see it.
+#[derive(CubeType, Clone, Copy, Debug)]
+pub struct Footprint {
+    /// Centre, pixels.
+    pub u: f32,
+    /// Centre, pixels.
+    pub v: f32,
+    /// Factor of Σ'⁻¹, see the module.
+    pub l0: f32,
+    /// Factor of Σ'⁻¹, see the module.
+    pub k: f32,
+    /// Factor of Σ'⁻¹, see the module.
+    pub l1: f32,
+    /// √a: standard deviation along image x, pixels.
+    pub sigma_x: f32,
+    /// √c: standard deviation along image y, pixels.
+    pub sigma_y: f32,
+    /// √(det Σ'_raw / det Σ').
+    pub compensation: f32,
+    /// det Σ'/unit⁴; not positive where f32 cannot hold it.
+    pub determinant: f32,
+}
+
+/// ∂L/∂(projected quantities) of one Gaussian in one view.
+#[derive(CubeType, Clone, Copy, Debug)]
+pub struct FootprintGradient {
+    /// ∂L/∂u.
+    pub u: f32,
+    /// ∂L/∂v.
+    pub v: f32,
+    /// ∂L/∂a.
+    pub a: f32,
+    /// ∂L/∂b, b counted once.
+    pub b: f32,
+    /// ∂L/∂c.
+    pub c: f32,
+    /// ∂L/∂depth.
+    pub depth: f32,
+    /// ∂L/∂compensation; zero without antialiasing.
+    pub compensation: f32,
+}
+
+/// ∂L/∂(parameters) of one Gaussian.
+#[derive(CubeType, Clone, Copy, Debug)]
+pub struct GaussianGradient {
+    /// ∂L/∂mean.
+    pub mean: Vec3,
+    /// ∂L/∂rotation, through the normalisation.
+    pub rotation: Quat,
+    /// ∂L/∂scale.
+    pub scale: Vec3,
+}
+
+/// a·b.
+#[cube]
+pub fn dot(a: &Vec3, b: &Vec3) -> f32 {
+    a.x * b.x + a.y * b.y + a.z * b.z
+}
+
+/// a × b.
+#[cube]
+pub fn cross(a: &Vec3, b: &Vec3) -> Vec3 {
+    Vec3 { x: a.y * b.z - a.z * b.y, y: a.z * b.x - a.x * b.z, z: a.x * b.y - a.y * b.x }
+}
+
+/// f·a + g·b.
+#[cube]
+pub fn combine(f: f32, a: &Vec3, g: f32, b: &Vec3) -> Vec3 {
+    Vec3 { x: f * a.x + g * b.x, y: f * a.y + g * b.y, z: f * a.z + g * b.z }
+}
+
+/// M·a.
+#[cube]
+pub fn times(m: &Mat3, a: &Vec3) -> Vec3 {
+    Vec3 { x: dot(&m.r0, a), y: dot(&m.r1, a), z: dot(&m.r2, a) }
+}
+
+/// Mᵀ·a.
+#[cube]
+pub fn transposed_times(m: &Mat3, a: &Vec3) -> Vec3 {
+    Vec3 {
+        x: m.r0.x * a.x + m.r1.x * a.y + m.r2.x * a.z,
+        y: m.r0.y * a.x + m.r1.y * a.y + m.r2.y * a.z,
+        z: m.r0.z * a.x + m.r1.z * a.y + m.r2.z * a.z,
+    }
+}
+
+/// A·B.
+#[cube]
+pub fn product(a: &Mat3, b: &Mat3) -> Mat3 {
+    Mat3 { r0: transposed_times(b, &a.r0), r1: transposed_times(b, &a.r1), r2: transposed_times(b, &a.r2) }
+}
+
+/// Aᵀ·B.
+#[cube]
+pub fn transposed_product(a: &Mat3, b: &Mat3) -> Mat3 {
+    let c0 = Vec3 { x: a.r0.x, y: a.r1.x, z: a.r2.x };
+    let c1 = Vec3 { x: a.r0.y, y: a.r1.y, z: a.r2.y };
+    let c2 = Vec3 { x: a.r0.z, y: a.r1.z, z: a.r2.z };
+    Mat3 { r0: transposed_times(b, &c0), r1: transposed_times(b, &c1), r2: transposed_times(b, &c2) }
+}
+
+/// Mean in the camera's frame.
+#[cube]
+pub fn to_camera(view: &View, mean: &Vec3) -> Vec3 {
+    let d = Vec3 {
+        x: (mean.x - view.centre.x) - view.centre_rest.x,
+        y: (mean.y - view.centre.y) - view.centre_rest.y,
+        z: (mean.z - view.centre.z) - view.centre_rest.z,
+    };
+    times(&view.rotation, &d)
+}
+
+/// Rotation matrix of a unit quaternion.
+#[cube]
+pub fn rotation_matrix(q: &Quat) -> Mat3 {
+    Mat3 {
+        r0: Vec3 {
+            x: 1.0 - 2.0 * (q.y * q.y + q.z * q.z),
+            y: 2.0 * (q.x * q.y - q.w * q.z),
+            z: 2.0 * (q.x * q.z + q.w * q.y),
+        },
+        r1: Vec3 {
+            x: 2.0 * (q.x * q.y + q.w * q.z),
+            y: 1.0 - 2.0 * (q.x * q.x + q.z * q.z),
+            z: 2.0 * (q.y * q.z - q.w * q.x),
+        },
+        r2: Vec3 {
+            x: 2.0 * (q.x * q.z - q.w * q.y),
+            y: 2.0 * (q.y * q.z + q.w * q.x),
+            z: 1.0 - 2.0 * (q.x * q.x + q.y * q.y),
+        },
+    }
+}
+
+/// Projects a Gaussian whose camera depth t_z is positive and whose quaternion is not zero.
+#[cube]
+pub fn project(view: &View, t: &Vec3, rotation: &Quat, scale: &Vec3, blur: f32) -> Projection {
+    let x = (t.x / t.z).max(view.x_min).min(view.x_max);
+    let y = (t.y / t.z).max(view.y_min).min(view.y_max);
+    let jx = view.fx / t.z;
+    let jy = view.fy / t.z;
+
+    // Divided by the largest component first: the square of a huge or tiny quaternion leaves f32's range.
+    let largest = rotation.w.abs().max(rotation.x.abs()).max(rotation.y.abs().max(rotation.z.abs()));
+    let p = Quat {
+        w: rotation.w / largest,
+        x: rotation.x / largest,
+        y: rotation.y / largest,
+        z: rotation.z / largest,
+    };
+    let norm = (p.w * p.w + p.x * p.x + p.y * p.y + p.z * p.z).sqrt();
+    let q = Quat { w: p.w / norm, x: p.x / norm, y: p.y / norm, z: p.z / norm };
+
+    let axes = product(&view.rotation, &rotation_matrix(&q));
+    let m0 = Vec3 {
+        x: jx * (axes.r0.x - x * axes.r2.x) * scale.x,
+        y: jx * (axes.r0.y - x * axes.r2.y) * scale.y,
+        z: jx * (axes.r0.z - x * axes.r2.z) * scale.z,
+    };
+    let m1 = Vec3 {
+        x: jy * (axes.r1.x - y * axes.r2.x) * scale.x,
+        y: jy * (axes.r1.y - y * axes.r2.y) * scale.y,
+        z: jy * (axes.r1.z - y * axes.r2.z) * scale.z,
+    };
+    let first = m0.x.abs().max(m0.y.abs()).max(m0.z.abs());
+    let second = m1.x.abs().max(m1.y.abs()).max(m1.z.abs());
+    let unit = first.max(second).max(1.0);
+    Projection {
+        t: Vec3 { x: t.x, y: t.y, z: t.z },
+        x,
+        y,
+        jx,
+        jy,
+        q,
+        q_inverse_norm: 1.0 / (norm * largest),
+        axes,
+        m0: Vec3 { x: m0.x / unit, y: m0.y / unit, z: m0.z / unit },
+        m1: Vec3 { x: m1.x / unit, y: m1.y / unit, z: m1.z / unit },
+        unit,
+        blur: blur / unit / unit,
+    }
+}
+
+/// The splat of a projected Gaussian.
+#[cube]
+pub fn footprint(view: &View, p: &Projection) -> Footprint {
+    let n = cross(&p.m0, &p.m1);
+    let raw = dot(&n, &n);
+    let p00 = dot(&p.m0, &p.m0);
+    let p11 = dot(&p.m1, &p.m1);
+    let determinant = raw + p.blur * (p00 + p11) + p.blur * p.blur;
+    let a = p00 + p.blur;
+    let c = p11 + p.blur;
+    let sqrt_a = a.sqrt();
+    Footprint {
+        u: p.jx * p.t.x + view.cx,
+        v: p.jy * p.t.y + view.cy,
+        l0: 1.0 / (p.unit * sqrt_a),
+        k: -(dot(&p.m0, &p.m1) / a),
+        l1: sqrt_a / (determinant.sqrt() * p.unit),
+        sigma_x: sqrt_a * p.unit,
+        sigma_y: c.sqrt() * p.unit,
+        compensation: (raw / determinant).sqrt(),
+        determinant,
+    }
+}
+
+/// Least value over the rectangle [x0, x1] × [y0, y1] (relative to the splat's centre, pixels) of the quadratic form
+/// dᵀΛd. The form is convex, so outside its centre the minimum lies on an edge that faces the centre: for a fixed d_x
+/// at d_y = −k·d_x, for a fixed d_y at d_x = −l₁²k·d_y/(l₀² + l₁²k²), both clamped to the edge.
+#[cube]
+pub fn least_form(l0: f32, k: f32, l1: f32, x0: f32, x1: f32, y0: f32, y1: f32) -> f32 {
+    let dx = x0.max(0.0) + x1.min(0.0);
+    let dy = y0.max(0.0) + y1.min(0.0);
+    let along_y = (-(k * dx)).max(y0).min(y1);
+    let b = l1 * k;
+    let along_x = (-(b * l1 * dy / (l0 * l0 + b * b))).max(x0).min(x1);
+    form(l0, k, l1, dx, along_y).min(form(l0, k, l1, along_x, dy))
+}
+
+/// The quadratic form dᵀΛd.
+#[cube]
+pub fn form(l0: f32, k: f32, l1: f32, dx: f32, dy: f32) -> f32 {
+    let p = l0 * dx;
+    let q = l1 * (dy + k * dx);
+    p * p + q * q
+}
+
+/// VJP of the projection.
+///
+/// * Covariance: Σ' = m·mᵀ + εI gives v_m₀ = 2·v_a·m₀ + v_b·m₁ and v_m₁ = 2·v_c·m₁ + v_b·m₀.
+/// * Compensation ρ = |n|/√D with n = m₀ × m₁, D = |n|² + ε(|m₀|² + |m₁|²) + ε²: with the part of D that does not come
+///   from n, E = D − |n|², v_n = v_ρ·E/D^{3/2}·n/|n|, which stays bounded as n → 0 (where the unit vector, and with it
+///   the gradient, is taken to be zero); v_m₀ += m₁ × v_n, v_m₁ += v_n × m₀, and through E: v_m += −v_ρ·ρ·ε/D·m.
+///   ρ depends on m/unit only, so that unit counts as a constant.
+/// * m's entry (0,k) = jx·(A₀ₖ − x·A₂ₖ)·sₖ with A = R·R(q); row 1 alike with y.
+/// * jx = fx/t_z: ∂jx/∂t_z = −jx/t_z. x = t_x/t_z where it is not clamped; a clamped x is a constant.
+/// * u = jx·t_x + cx.
+/// * R(q) entry by entry; q = p/|p| gives v_p = (v_q − q·(q·v_q))/|p|.
+#[cube]
+pub fn project_vjp(view: &View, p: &Projection, scale: &Vec3, g: &FootprintGradient) -> GaussianGradient {
+    // Σ' is in pixels², m here in units of `unit`: one factor `unit` remains for v_m in pixels.
+    let from_a = combine(2.0 * g.a * p.unit, &p.m0, g.b * p.unit, &p.m1);
+    let from_c = combine(2.0 * g.c * p.unit, &p.m1, g.b * p.unit, &p.m0);
+
+    let n = cross(&p.m0, &p.m1);
+    let raw = dot(&n, &n);
+    let other = p.blur * (dot(&p.m0, &p.m0) + dot(&p.m1, &p.m1)) + p.blur * p.blur;
+    let d = raw + other;
+    let root = d.sqrt();
+    let n_norm = raw.sqrt();
+    let n_factor = select(n_norm > 0.0, g.compensation * other / (d * root * n_norm.max(1e-30)), 0.0);
+    let m_factor = -(g.compensation * (n_norm / root) * p.blur / d);
+    let v_n = Vec3 { x: n.x * n_factor, y: n.y * n_factor, z: n.z * n_factor };
+    let through_n0 = cross(&p.m1, &v_n);
+    let through_n1 = cross(&v_n, &p.m0);
+    let ones = combine(1.0, &through_n0, m_factor, &p.m0);
+    let twos = combine(1.0, &through_n1, m_factor, &p.m1);
+    let v_m0 = combine(1.0, &from_a, 1.0 / p.unit, &ones);
+    let v_m1 = combine(1.0, &from_c, 1.0 / p.unit, &twos);
+
+    // Rows of J·A and their gradients, entry by entry.
+    let h0 = Vec3 {
+        x: p.axes.r0.x - p.x * p.axes.r2.x,
+        y: p.axes.r0.y - p.x * p.axes.r2.y,
+        z: p.axes.r0.z - p.x * p.axes.r2.z,
+    };
+    let h1 = Vec3 {
+        x: p.axes.r1.x - p.y * p.axes.r2.x,
+        y: p.axes.r1.y - p.y * p.axes.r2.y,
+        z: p.axes.r1.z - p.y * p.axes.r2.z,
+    };
+    let v_scale = Vec3 {
+        x: v_m0.x * p.jx * h0.x + v_m1.x * p.jy * h1.x,
+        y: v_m0.y * p.jx * h0.y + v_m1.y * p.jy * h1.y,
+        z: v_m0.z * p.jx * h0.z + v_m1.z * p.jy * h1.z,
+    };
+    // v_h/jx, before the factor that all of its uses share.
+    let w0 = Vec3 { x: v_m0.x * scale.x, y: v_m0.y * scale.y, z: v_m0.z * scale.z };
+    let w1 = Vec3 { x: v_m1.x * scale.x, y: v_m1.y * scale.y, z: v_m1.z * scale.z };
+    let v_jx = dot(&w0, &h0);
+    let v_jy = dot(&w1, &h1);
+    let v_axes = Mat3 {
+        r0: Vec3 { x: p.jx * w0.x, y: p.jx * w0.y, z: p.jx * w0.z },
+        r1: Vec3 { x: p.jy * w1.x, y: p.jy * w1.y, z: p.jy * w1.z },
+        r2: combine(-(p.jx * p.x), &w0, -(p.jy * p.y), &w1),
+    };
+    let ratio_x = p.t.x / p.t.z;
+    let ratio_y = p.t.y / p.t.z;
+    let v_x = select(ratio_x == p.x, -(p.jx * dot(&w0, &p.axes.r2)), 0.0);
+    let v_y = select(ratio_y == p.y, -(p.jy * dot(&w1, &p.axes.r2)), 0.0);
+
+    let v_tx = g.u * p.jx + v_x / p.t.z;
+    let v_ty = g.v * p.jy + v_y / p.t.z;
+    let v_tz = g.depth
+        - ((g.u * p.t.x + v_jx) * p.jx + (g.v * p.t.y + v_jy) * p.jy + v_x * ratio_x + v_y * ratio_y) / p.t.z;
+    let v_mean = transposed_times(&view.rotation, &Vec3 { x: v_tx, y: v_ty, z: v_tz });
+
+    let r = transposed_product(&view.rotation, &v_axes);
+    let q = &p.q;
+    let v_q = Quat {
+        w: 2.0 * (q.x * (r.r2.y - r.r1.z) + q.y * (r.r0.z - r.r2.x) + q.z * (r.r1.x - r.r0.y)),
+        x: 2.0
+            * (q.y * (r.r0.y + r.r1.x) + q.z * (r.r0.z + r.r2.x) + q.w * (r.r2.y - r.r1.z)
+                - 2.0 * q.x * (r.r1.y + r.r2.z)),
+        y: 2.0
+            * (q.x * (r.r0.y + r.r1.x) + q.z * (r.r1.z + r.r2.y) + q.w * (r.r0.z - r.r2.x)
+                - 2.0 * q.y * (r.r0.x + r.r2.z)),
+        z: 2.0
+            * (q.x * (r.r0.z + r.r2.x) + q.y * (r.r1.z + r.r2.y) + q.w * (r.r1.x - r.r0.y)
+                - 2.0 * q.z * (r.r0.x + r.r1.y)),
+    };
+    let along = q.w * v_q.w + q.x * v_q.x + q.y * v_q.y + q.z * v_q.z;
+    let s = p.q_inverse_norm;
+    GaussianGradient {
+        mean: v_mean,
+        rotation: Quat {
+            w: (v_q.w - q.w * along) * s,
+            x: (v_q.x - q.x * along) * s,
+            y: (v_q.y - q.y * along) * s,
+            z: (v_q.z - q.z * along) * s,
+        },
+        scale: v_scale,
+    }
+}
