@@ -1,1 +1,5 @@
+//! The splatting operation as CubeCL kernels.
 
+mod buffers;
+mod scan;
+mod sort;
