@@ -41,7 +41,7 @@ pub struct SplatOutput<B: Backend> {
 }
 
 /// Backends that can splat. Users call [`render`](crate::render).
-#[backend_extension(Flex, NdArray, Autodiff)]
+#[backend_extension(Cube, Flex, NdArray, Autodiff)]
 pub trait SplatBackend: Backend {
     /// Renders `inputs` as `job` says.
     fn splat(#[extension_type] inputs: SplatInputs<Self>, job: Arc<Job>) -> SplatOutput<Self>;

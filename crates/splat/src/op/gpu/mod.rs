@@ -1,5 +1,396 @@
-//! The splatting operation as CubeCL kernels.
+//! The splatting operation as CubeCL kernels: the same source for WGSL, SPIR-V, Metal and CUDA.
+//!
+//! 1. Project every Gaussian into every view, cull, count the tiles that each splat reaches.
+//! 2. Sort the splats of all views by depth, sum up their tile counts, read the total back (the only read-back).
+//! 3. Write one intersection per splat and tile, in depth order, and sort these by tile; the sort is stable, so each
+//!    tile's list is front to back.
+//! 4. Blend, one cube per tile.
+//!
+//! Backward: one record of sums per intersection, written by the cube of its tile; then each Gaussian adds up its own
+//! records, which lie side by side, and takes them through the projection.
 
+mod backward;
+mod blend;
 mod buffers;
+mod project;
 mod scan;
 mod sort;
+
+use std::sync::Arc;
+
+use burn::backend::tensor::FloatTensor;
+use burn::tensor::DType;
+use burn_cubecl::CubeBackend;
+use burn_cubecl::kernel::into_contiguous;
+use burn_cubecl::ops::into_data_sync;
+use burn_cubecl::tensor::CubeTensor;
+use cubecl::prelude::*;
+
+use super::job::{Counts, Job, Wanted};
+use super::{Forward, SplatBackend, SplatInputs, SplatKernels, SplatOutput, splat_untracked};
+use crate::SplatError;
+use backward::Record;
+use buffers::Buffers;
+use project::{REACH, SPLAT, STATISTICS};
+
+/// Units of a cube where each unit has work of its own.
+const UNITS: u32 = 256;
+/// Bytes per intersection in the largest buffer, the records of the backward pass.
+const RECORD_BYTES: u64 = 40;
+
+/// Channels of the image, for kernels.
+fn channels(depth: bool) -> usize {
+    if depth { 5 } else { 4 }
+}
+
+/// What the backward pass needs.
+#[derive(Debug, Clone)]
+pub struct State {
+    views: CubeTensor,
+    splats: CubeTensor,
+    reach: CubeTensor,
+    lists: Lists,
+    transmittance: CubeTensor,
+    last: CubeTensor,
+}
+
+/// One list of splats per tile and view, back to back.
+#[derive(Debug, Clone)]
+struct Lists {
+    /// Splat of each entry.
+    entries: CubeTensor,
+    /// Number, in order of emission, of each entry's intersection.
+    slots: CubeTensor,
+    starts: CubeTensor,
+    ends: CubeTensor,
+    len: usize,
+}
+
+impl SplatBackend for CubeBackend {
+    fn splat(inputs: SplatInputs<Self>, job: Arc<Job>) -> SplatOutput<Self> {
+        splat_untracked(inputs, &job)
+    }
+}
+
+impl SplatKernels for CubeBackend {
+    type State = State;
+
+    fn forward(inputs: &SplatInputs<Self>, job: &Job, keep: bool) -> Forward<Self> {
+        let inputs = contiguous(inputs);
+        let buffers = Buffers::of(&inputs.means);
+        let numbers: Vec<f32> = job.views.iter().flat_map(project::view_numbers).collect();
+        let views = buffers.upload(&numbers);
+        let (splats, reach, lists, counts) = lists(&buffers, &inputs, &views, job, keep)?;
+
+        let shape = [job.views.len(), job.height, job.width, job.channels()];
+        let image = buffers.empty(shape, DType::F32);
+        let kept = if keep { job.views.len() * job.height * job.width } else { 1 };
+        let (transmittance, last) = (buffers.f32(kept), buffers.u32(kept));
+        let all_tiles = job.views.len() * job.tiles_x() * job.tiles_y();
+        blend::blend::launch(
+            &buffers.client,
+            buffers.cubes(all_tiles),
+            CubeDim::new_1d(blend::UNITS as u32),
+            splats.clone().into_buffer_arg(),
+            inputs.colors.into_buffer_arg(),
+            inputs.background.into_buffer_arg(),
+            lists.entries.clone().into_buffer_arg(),
+            lists.starts.clone().into_buffer_arg(),
+            lists.ends.clone().into_buffer_arg(),
+            image.clone().into_buffer_arg(),
+            transmittance.clone().into_buffer_arg(),
+            last.clone().into_buffer_arg(),
+            inputs.len.max(1),
+            job.tiles_x(),
+            job.tiles_x() * job.tiles_y(),
+            all_tiles,
+            job.width,
+            job.height,
+            job.max_alpha,
+            job.depth,
+            keep,
+        );
+        let state = State { views, splats, reach, lists, transmittance, last };
+        Ok((image, keep.then_some(state), counts))
+    }
+
+    fn backward(
+        inputs: &SplatInputs<Self>,
+        job: &Job,
+        state: &State,
+        upstream: FloatTensor<Self>,
+        wanted: Wanted,
+    ) -> [Option<FloatTensor<Self>>; 6] {
+        let inputs = contiguous(inputs);
+        let upstream = into_contiguous(upstream);
+        let buffers = Buffers::of(&inputs.means);
+        let n = inputs.len;
+        let room = |shape: [usize; 2], wanted: bool| {
+            wanted.then(|| match shape {
+                [0, columns] => zero_rows(&buffers, columns),
+                shape => buffers.empty(shape, DType::F32),
+            })
+        };
+        let means = room([n, 3], wanted.geometry);
+        let rotations = room([n, 4], wanted.geometry);
+        let scales = room([n, 3], wanted.geometry);
+        let colors = room([n, 3], wanted.colors);
+        let opacities = wanted.opacities.then(|| buffers.empty([n], DType::F32));
+        let background = wanted.background.then(|| background(&buffers, job, state, &upstream));
+        let record = Record {
+            colors: wanted.colors,
+            // The compensation of antialiasing carries the opacity's gradient on to the geometry.
+            opacities: wanted.opacities || (wanted.geometry && job.antialiased),
+            geometry: wanted.geometry,
+            depth: wanted.geometry && job.depth,
+        };
+        if record.len() > 0 && n > 0 {
+            let records = records(&buffers, &inputs, job, state, upstream, record);
+            let unused = |tensor: &Option<CubeTensor>| {
+                tensor.clone().unwrap_or_else(|| buffers.f32(1)).into_buffer_arg()
+            };
+            backward::gather::launch(
+                &buffers.client,
+                buffers.cubes(n.div_ceil(UNITS as usize)),
+                CubeDim::new_1d(UNITS),
+                inputs.means.into_buffer_arg(),
+                inputs.rotations.into_buffer_arg(),
+                inputs.scales.into_buffer_arg(),
+                inputs.opacities.into_buffer_arg(),
+                state.views.clone().into_buffer_arg(),
+                state.reach.clone().into_buffer_arg(),
+                records.into_buffer_arg(),
+                unused(&means),
+                unused(&rotations),
+                unused(&scales),
+                unused(&opacities),
+                unused(&colors),
+                n,
+                job.views.len(),
+                job.blur,
+                job.antialiased,
+                record,
+                wanted.opacities,
+            );
+        }
+        [means, rotations, scales, opacities, colors, background]
+    }
+}
+
+/// A tensor without rows: the kernels need at least one number, its shape says that there is none.
+fn zero_rows(buffers: &Buffers, columns: usize) -> CubeTensor {
+    let tensor = buffers.f32(1);
+    CubeTensor::new_contiguous(tensor.client, tensor.device, [0, columns].into(), tensor.handle, DType::F32)
+}
+
+/// Contiguous inputs and the number of Gaussians.
+struct Inputs {
+    means: CubeTensor,
+    rotations: CubeTensor,
+    scales: CubeTensor,
+    opacities: CubeTensor,
+    colors: CubeTensor,
+    background: CubeTensor,
+    len: usize,
+}
+
+fn contiguous(inputs: &SplatInputs<CubeBackend>) -> Inputs {
+    let len = inputs.opacities.meta.num_elements();
+    let buffers = Buffers::of(&inputs.means);
+    let contiguous = |tensor: &CubeTensor| {
+        if len == 0 { buffers.f32(1) } else { into_contiguous(tensor.clone()) }
+    };
+    Inputs {
+        means: contiguous(&inputs.means),
+        rotations: contiguous(&inputs.rotations),
+        scales: contiguous(&inputs.scales),
+        opacities: contiguous(&inputs.opacities),
+        colors: contiguous(&inputs.colors),
+        background: into_contiguous(inputs.background.clone()),
+        len,
+    }
+}
+
+/// Steps 1 to 3: splats, their reach, the tiles' lists, and what was counted.
+fn lists(
+    buffers: &Buffers,
+    inputs: &Inputs,
+    views: &CubeTensor,
+    job: &Job,
+    keep: bool,
+) -> Result<(CubeTensor, CubeTensor, Lists, Counts), SplatError> {
+    let (n, tiles) = (inputs.len, job.tiles_x() * job.tiles_y());
+    let total = n * job.views.len();
+    let all_tiles = tiles * job.views.len();
+    let (width, height) = (job.width as u32, job.height as u32);
+    let dim = CubeDim::new_1d(UNITS);
+    let one_each = |n: usize| buffers.cubes(n.div_ceil(UNITS as usize));
+    let limit = (buffers.largest() / if keep { RECORD_BYTES } else { 4 }).min(i32::MAX as u64);
+
+    let splats = buffers.f32(total * SPLAT);
+    let reach = buffers.u32(total * REACH);
+    let keys = buffers.u32(total);
+    let statistics = buffers.zeros(STATISTICS);
+    let (starts, ends) = (buffers.zeros(all_tiles), buffers.zeros(all_tiles));
+    if total == 0 {
+        let lists = Lists { entries: buffers.u32(1), slots: buffers.u32(1), starts, ends, len: 0 };
+        return Ok((splats, reach, lists, Counts::default()));
+    }
+    project::project_all::launch(
+        &buffers.client,
+        one_each(total),
+        dim,
+        inputs.means.clone().into_buffer_arg(),
+        inputs.rotations.clone().into_buffer_arg(),
+        inputs.scales.clone().into_buffer_arg(),
+        inputs.opacities.clone().into_buffer_arg(),
+        inputs.colors.clone().into_buffer_arg(),
+        views.clone().into_buffer_arg(),
+        splats.clone().into_buffer_arg(),
+        reach.clone().into_buffer_arg(),
+        keys.clone().into_buffer_arg(),
+        statistics.clone().into_buffer_arg(),
+        n,
+        total,
+        width,
+        height,
+        job.near,
+        job.blur,
+        job.antialiased,
+    );
+    let (_, order) = sort::sort_pairs(buffers, keys, None, total, u32::BITS);
+    let sorted = buffers.u32(total);
+    project::sort_counts::launch(
+        &buffers.client,
+        one_each(total),
+        dim,
+        reach.clone().into_buffer_arg(),
+        order.clone().into_buffer_arg(),
+        sorted.clone().into_buffer_arg(),
+        total,
+    );
+    let offsets = scan::exclusive_sum(buffers, &sorted, total);
+    project::note_total::launch(
+        &buffers.client,
+        buffers.cubes(1),
+        CubeDim::new_1d(1),
+        offsets.clone().into_buffer_arg(),
+        statistics.clone().into_buffer_arg(),
+        total,
+    );
+    let s: Vec<u32> = into_data_sync(statistics).try_into_vec().expect("u32 as allocated");
+    // The coarse count is too high by less than 1024 per splat, so it decides only where the fine one can have wrapped.
+    let coarse = u64::from(s[7]) << 10;
+    let wrapped = coarse.saturating_sub(u64::from(s[0]) << 10) > u64::from(u32::MAX) / 2;
+    let found = if wrapped { coarse } else { u64::from(s[6]) };
+    if found > limit {
+        return Err(SplatError::TooManyIntersections { found, limit });
+    }
+    let [visible, near, outside, transparent, degenerate, invalid] = [0, 1, 2, 3, 4, 5].map(|i| u64::from(s[i]));
+    let counts = Counts { visible, near, outside, transparent, degenerate, invalid, intersections: found };
+
+    let len = found as usize;
+    let (tile_of, splat_of) = (buffers.u32(len), buffers.u32(len));
+    let entries = buffers.u32(len);
+    if len == 0 {
+        let lists = Lists { entries, slots: splat_of, starts, ends, len };
+        return Ok((splats, reach, lists, counts));
+    }
+    project::emit::launch(
+        &buffers.client,
+        one_each(total),
+        dim,
+        splats.clone().into_buffer_arg(),
+        order.into_buffer_arg(),
+        offsets.into_buffer_arg(),
+        reach.clone().into_buffer_arg(),
+        tile_of.clone().into_buffer_arg(),
+        splat_of.clone().into_buffer_arg(),
+        n,
+        total,
+        width,
+        height,
+        job.tiles_x() as u32,
+        tiles as u32,
+    );
+    let bits = usize::BITS - (all_tiles - 1).leading_zeros();
+    let (sorted_tiles, slots) = sort::sort_pairs(buffers, tile_of, None, len, bits.max(1));
+    project::lists::launch(
+        &buffers.client,
+        one_each(len),
+        dim,
+        sorted_tiles.into_buffer_arg(),
+        slots.clone().into_buffer_arg(),
+        splat_of.into_buffer_arg(),
+        entries.clone().into_buffer_arg(),
+        starts.clone().into_buffer_arg(),
+        ends.clone().into_buffer_arg(),
+        len,
+    );
+    Ok((splats, reach, Lists { entries, slots, starts, ends, len }, counts))
+}
+
+/// The records of all intersections.
+fn records(
+    buffers: &Buffers,
+    inputs: &Inputs,
+    job: &Job,
+    state: &State,
+    upstream: CubeTensor,
+    record: Record,
+) -> CubeTensor {
+    let records = buffers.f32(state.lists.len * record.len());
+    let tiles = job.tiles_x() * job.tiles_y();
+    let all_tiles = tiles * job.views.len();
+    backward::pixels::launch(
+        &buffers.client,
+        buffers.cubes(all_tiles),
+        CubeDim::new_1d(blend::UNITS as u32),
+        state.splats.clone().into_buffer_arg(),
+        inputs.colors.clone().into_buffer_arg(),
+        inputs.background.clone().into_buffer_arg(),
+        state.lists.entries.clone().into_buffer_arg(),
+        state.lists.slots.clone().into_buffer_arg(),
+        state.lists.starts.clone().into_buffer_arg(),
+        state.lists.ends.clone().into_buffer_arg(),
+        state.transmittance.clone().into_buffer_arg(),
+        state.last.clone().into_buffer_arg(),
+        upstream.into_buffer_arg(),
+        records.clone().into_buffer_arg(),
+        inputs.len,
+        job.tiles_x(),
+        tiles,
+        all_tiles,
+        job.width,
+        job.height,
+        job.max_alpha,
+        job.depth,
+        record,
+    );
+    records
+}
+
+fn background(buffers: &Buffers, job: &Job, state: &State, upstream: &CubeTensor) -> CubeTensor {
+    let count = job.views.len() * job.height;
+    let (rows, out) = (buffers.f32(3 * count), buffers.f32(3));
+    backward::background_rows::launch(
+        &buffers.client,
+        buffers.cubes(count.div_ceil(UNITS as usize)),
+        CubeDim::new_1d(UNITS),
+        state.transmittance.clone().into_buffer_arg(),
+        upstream.clone().into_buffer_arg(),
+        rows.clone().into_buffer_arg(),
+        count,
+        job.width,
+        job.channels(),
+    );
+    backward::background_sum::launch(
+        &buffers.client,
+        buffers.cubes(1),
+        CubeDim::new_1d(32),
+        rows.into_buffer_arg(),
+        out.clone().into_buffer_arg(),
+        count,
+    );
+    out
+}
