@@ -1,5 +1,7 @@
 //! Helpers of the parity and end-to-end tests: devices, fixtures, error norms.
 
+pub mod scenes;
+
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::OnceLock;

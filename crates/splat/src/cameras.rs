@@ -123,7 +123,8 @@ mod tests {
             assert_eq!((got.width, got.height, got.focal), (expected.width, expected.height, expected.focal));
             // The last digit of a number may change on its way through text.
             let point = DVec3::new(0.3, 1.1, -0.2);
-            let ((a, depth), (b, expected)) = got.project(point).zip(expected.project(point)).expect("in front");
+            let ((a, depth), (b, expected)) =
+                got.project(point).zip(expected.project(point)).expect("in front");
             assert!((a - b).length() < 1e-9 && (depth - expected).abs() < 1e-12);
         }
     }

@@ -60,6 +60,14 @@ pub enum SplatError {
         /// What is wrong with it.
         problem: String,
     },
+    /// A PLY file that holds no Gaussians that can be read.
+    #[error("{path}: {problem}")]
+    Ply {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        problem: String,
+    },
     /// A file could not be read.
     #[error("{path}: cannot read: {source}")]
     Read {

@@ -8,7 +8,9 @@ mod gaussians;
 mod op;
 mod options;
 pub mod ply;
+pub mod reference;
 mod render;
+pub mod sh;
 mod vjp;
 
 pub use camera::{Camera, RigidTransform};

@@ -1,4 +1,8 @@
-//! 3D Gaussian PLY files in the layout of the INRIA viewer: binary little-endian, SH degree 0.
+//! 3D Gaussian PLY files in the layout of the INRIA viewer. Written: binary little-endian, SH degree 0. Read: whatever
+//! follows that layout.
+
+mod header;
+mod read;
 
 use std::io::{self, Write};
 use std::path::Path;
@@ -6,7 +10,9 @@ use std::path::Path;
 use burn::tensor::Tensor;
 
 use crate::file::write_whole;
-use crate::{Gaussians, SplatError};
+use crate::{Gaussians, SplatError, sh};
+
+pub use read::{Loaded, read};
 
 /// Properties of one vertex, in INRIA's order. No `f_rest_*`: every known viewer reads a missing band as zero, and 45
 /// zero floats would triple the file (SNAPSNAP §13.3, fix 17).
@@ -15,9 +21,6 @@ pub const PROPERTIES: [&str; 17] = [
     "scale_2", "rot_0", "rot_1", "rot_2", "rot_3",
 ];
 
-/// Value of the constant spherical harmonic, 1 / (2√π).
-pub const SH_C0: f32 = 0.282_094_79;
-
 /// Opacities are written as logits; f32 saturates to ±∞ at 0 and 1, so they are kept this far away from both.
 const OPACITY_MARGIN: f32 = 1e-6;
 /// Scales are written as logarithms; a scale that underflowed to 0 is written as this many metres.
@@ -25,7 +28,7 @@ const MIN_SCALE: f32 = 1e-10;
 
 /// Writes `gaussians` to `path`, whole or not at all.
 ///
-/// `rgb` is stored as `(rgb − ½) / SH_C0`, opacity as its logit, scales as natural logarithms, quaternions as
+/// `rgb` is stored as `(rgb − ½) / `[`sh::C0`], opacity as its logit, scales as natural logarithms, quaternions as
 /// (w, x, y, z).
 ///
 /// # Errors
@@ -44,7 +47,7 @@ pub fn write(gaussians: &Gaussians, path: &Path) -> Result<(), SplatError> {
         let logit = (opacity / (1.0 - opacity)).ln();
         let mut vertex = [0.0_f32; PROPERTIES.len()];
         vertex[0..3].copy_from_slice(&three(&means));
-        vertex[6..9].copy_from_slice(&three(&colors).map(|c| (c - 0.5) / SH_C0));
+        vertex[6..9].copy_from_slice(&three(&colors).map(|c| (c - 0.5) / sh::C0));
         vertex[9] = logit;
         vertex[10..13].copy_from_slice(&three(&scales).map(|s| s.max(MIN_SCALE).ln()));
         vertex[13..17].copy_from_slice(&rotations[4 * i..4 * i + 4]);

@@ -24,10 +24,12 @@
 //! its largest entry where that exceeds one pixel, so that no square overflows.
 //!
 //! # Gradients of a splat
-//! α = min(α_max, o·exp(−½·dᵀΛd)) with Λ = Σ'⁻¹ and d = pixel − u. Let g = ∂L/∂α·α (zero where α is clamped) and
-//! y = Λ·d. Then ∂power/∂u = y and ∂power/∂Σ' = ½·y·yᵀ, so a splat's gradients are sums over pixels:
-//! v_u = Σ g·y, v_a = ½ Σ g·y_x², v_b = Σ g·y_x·y_y, v_c = ½ Σ g·y_y², v_o = Σ g/o.
-//! In factored form y_y = l₁²·(d_y + k·d_x), y_x = l₀²·d_x + k·y_y.
+//! α = min(α_max, o·exp(−½·dᵀΛd)) with Λ = Σ'⁻¹ = FᵀF, F = [[l₀, 0], [l₁·k, l₁]] and d = pixel − u. Let
+//! g = ∂L/∂α·α (zero where α is clamped) and w = F·d, so that the power is −½|w|². Then ∂power/∂u = Λd = Fᵀw and
+//! ∂power/∂Σ' = ½·(Λd)(Λd)ᵀ, and a splat's gradients follow from five sums over pixels, r = Σ g·w and S = Σ g·w·wᵀ:
+//! v_u = Fᵀ·r, v_m = 2·v_Σ'·m = Fᵀ·S·(F·m); and v_o = Σ g/o.
+//! F·m is bounded by 1 whatever the splat's shape, because (F·m)(F·m)ᵀ = 1 − ε·F·Fᵀ; its second row
+//! l₁·(m₁ + k·m₀) would cancel for a needle, but equals l₁·(n × m₀ + ε·m₁)/a, which does not.
 //!
 //! # Gradient of a pixel
 //! With e_i = c_i·v_colour + t_z,i·v_depth + v_alpha, the pixel's part of the loss is
@@ -151,19 +153,19 @@ pub struct Footprint {
     pub determinant: f32,
 }
 
-/// ∂L/∂(projected quantities) of one Gaussian in one view.
+/// Sums over the pixels of one Gaussian in one view.
 #[derive(CubeType, Clone, Copy, Debug)]
 pub struct FootprintGradient {
-    /// ∂L/∂u.
-    pub u: f32,
-    /// ∂L/∂v.
-    pub v: f32,
-    /// ∂L/∂a.
-    pub a: f32,
-    /// ∂L/∂b, b counted once.
-    pub b: f32,
-    /// ∂L/∂c.
-    pub c: f32,
+    /// Σ g·w₀.
+    pub r0: f32,
+    /// Σ g·w₁.
+    pub r1: f32,
+    /// Σ g·w₀².
+    pub s00: f32,
+    /// Σ g·w₀·w₁.
+    pub s01: f32,
+    /// Σ g·w₁².
+    pub s11: f32,
     /// ∂L/∂depth.
     pub depth: f32,
     /// ∂L/∂compensation; zero without antialiasing.
@@ -359,7 +361,7 @@ pub fn form(l0: f32, k: f32, l1: f32, dx: f32, dy: f32) -> f32 {
 
 /// VJP of the projection.
 ///
-/// * Covariance: Σ' = m·mᵀ + εI gives v_m₀ = 2·v_a·m₀ + v_b·m₁ and v_m₁ = 2·v_c·m₁ + v_b·m₀.
+/// * Centre and covariance: v_u = Fᵀ·r and v_m = Fᵀ·S·(F·m), see the module.
 /// * Compensation ρ = |n|/√D with n = m₀ × m₁, D = |n|² + ε(|m₀|² + |m₁|²) + ε²: with the part of D that does not come
 ///   from n, E = D − |n|², v_n = v_ρ·E/D^{3/2}·n/|n|, which stays bounded as n → 0 (where the unit vector, and with it
 ///   the gradient, is taken to be zero); v_m₀ += m₁ × v_n, v_m₁ += v_n × m₀, and through E: v_m += −v_ρ·ρ·ε/D·m.
@@ -370,25 +372,34 @@ pub fn form(l0: f32, k: f32, l1: f32, dx: f32, dy: f32) -> f32 {
 /// * R(q) entry by entry; q = p/|p| gives v_p = (v_q − q·(q·v_q))/|p|.
 #[cube]
 pub fn project_vjp(view: &View, p: &Projection, scale: &Vec3, g: &FootprintGradient) -> GaussianGradient {
-    // Σ' is in pixels², m here in units of `unit`: one factor `unit` remains for v_m in pixels.
-    let from_a = combine(2.0 * g.a * p.unit, &p.m0, g.b * p.unit, &p.m1);
-    let from_c = combine(2.0 * g.c * p.unit, &p.m1, g.b * p.unit, &p.m0);
-
+    let f = footprint(view, p);
     let n = cross(&p.m0, &p.m1);
+    // F·m and v_m = Fᵀ·S·(F·m).
+    let a = dot(&p.m0, &p.m0) + p.blur;
+    let across = cross(&n, &p.m0);
+    let fm0 = Vec3 { x: f.l0 * p.unit * p.m0.x, y: f.l0 * p.unit * p.m0.y, z: f.l0 * p.unit * p.m0.z };
+    let fm1 = combine(f.l1 * p.unit / a, &across, f.l1 * p.unit * p.blur / a, &p.m1);
+    let q0 = combine(g.s00, &fm0, g.s01, &fm1);
+    let q1 = combine(g.s01, &fm0, g.s11, &fm1);
+    let from_shape0 = combine(f.l0, &q0, f.l1 * f.k, &q1);
+    let v_u = f.l0 * g.r0 + f.l1 * f.k * g.r1;
+    let v_v = f.l1 * g.r1;
+
     let raw = dot(&n, &n);
     let other = p.blur * (dot(&p.m0, &p.m0) + dot(&p.m1, &p.m1)) + p.blur * p.blur;
     let d = raw + other;
     let root = d.sqrt();
     let n_norm = raw.sqrt();
-    let n_factor = select(n_norm > 0.0, g.compensation * other / (d * root * n_norm.max(1e-30)), 0.0);
+    // Divided step by step: the product of the divisors may underflow.
+    let n_factor = select(n_norm > 0.0, g.compensation * (other / d) / root / n_norm.max(1e-30), 0.0);
     let m_factor = -(g.compensation * (n_norm / root) * p.blur / d);
     let v_n = Vec3 { x: n.x * n_factor, y: n.y * n_factor, z: n.z * n_factor };
     let through_n0 = cross(&p.m1, &v_n);
     let through_n1 = cross(&v_n, &p.m0);
     let ones = combine(1.0, &through_n0, m_factor, &p.m0);
     let twos = combine(1.0, &through_n1, m_factor, &p.m1);
-    let v_m0 = combine(1.0, &from_a, 1.0 / p.unit, &ones);
-    let v_m1 = combine(1.0, &from_c, 1.0 / p.unit, &twos);
+    let v_m0 = combine(1.0, &from_shape0, 1.0 / p.unit, &ones);
+    let v_m1 = combine(f.l1, &q1, 1.0 / p.unit, &twos);
 
     // Rows of J·A and their gradients, entry by entry.
     let h0 = Vec3 {
@@ -421,10 +432,10 @@ pub fn project_vjp(view: &View, p: &Projection, scale: &Vec3, g: &FootprintGradi
     let v_x = select(ratio_x == p.x, -(p.jx * dot(&w0, &p.axes.r2)), 0.0);
     let v_y = select(ratio_y == p.y, -(p.jy * dot(&w1, &p.axes.r2)), 0.0);
 
-    let v_tx = g.u * p.jx + v_x / p.t.z;
-    let v_ty = g.v * p.jy + v_y / p.t.z;
+    let v_tx = v_u * p.jx + v_x / p.t.z;
+    let v_ty = v_v * p.jy + v_y / p.t.z;
     let v_tz = g.depth
-        - ((g.u * p.t.x + v_jx) * p.jx + (g.v * p.t.y + v_jy) * p.jy + v_x * ratio_x + v_y * ratio_y) / p.t.z;
+        - ((v_u * p.t.x + v_jx) * p.jx + (v_v * p.t.y + v_jy) * p.jy + v_x * ratio_x + v_y * ratio_y) / p.t.z;
     let v_mean = transposed_times(&view.rotation, &Vec3 { x: v_tx, y: v_ty, z: v_tz });
 
     let r = transposed_product(&view.rotation, &v_axes);

@@ -147,8 +147,10 @@ struct Pixels {
 struct Sums {
     color: [Lanes; 3],
     alpha: Lanes,
-    mean: [Lanes; 2],
-    covariance: [Lanes; 3],
+    /// Σ g·w.
+    first: [Lanes; 2],
+    /// Σ g·w·wᵀ.
+    second: [Lanes; 3],
     depth: Lanes,
 }
 
@@ -187,8 +189,8 @@ impl Band<'_> {
             let mut sums = Sums {
                 color: [[0.0; TILE]; 3],
                 alpha: [0.0; TILE],
-                mean: [[0.0; TILE]; 2],
-                covariance: [[0.0; TILE]; 3],
+                first: [[0.0; TILE]; 2],
+                second: [[0.0; TILE]; 3],
                 depth: [0.0; TILE],
             };
             for y in rows(splat, top) {
@@ -280,15 +282,14 @@ fn take_off<const SHAPE: bool, const DEPTH: bool>(
             behind[i] += weight * e;
             // Where α is clamped it does not depend on the splat.
             let g = if row.alpha[i] < max_alpha { v_alpha * alpha } else { 0.0 };
-            let y_y = splat.l1 * (splat.l1 * row.sheared[i]);
-            let y_x = splat.l0 * (splat.l0 * row.dx[i]) + splat.k * y_y;
-            let (g_x, g_y) = (g * y_x, g * y_y);
+            let (w_0, w_1) = (splat.l0 * row.dx[i], splat.l1 * row.sheared[i]);
+            let (g_0, g_1) = (g * w_0, g * w_1);
             sums.alpha[i] += g;
-            sums.mean[0][i] += g_x;
-            sums.mean[1][i] += g_y;
-            sums.covariance[0][i] += g_x * y_x;
-            sums.covariance[1][i] += g_x * y_y;
-            sums.covariance[2][i] += g_y * y_y;
+            sums.first[0][i] += g_0;
+            sums.first[1][i] += g_1;
+            sums.second[0][i] += g_0 * w_0;
+            sums.second[1][i] += g_0 * w_1;
+            sums.second[2][i] += g_1 * w_1;
         }
     }
 }
@@ -314,13 +315,13 @@ fn write(sums: &Sums, splat: &Splat, record: Record, out: &mut [f32]) {
         out[record.opacity()] = sum(&sums.alpha) / splat.opacity;
     }
     if record.wanted.geometry {
-        let [a, b, c] = &sums.covariance;
+        let [a, b, c] = &sums.second;
         out[record.geometry()..record.geometry() + 5].copy_from_slice(&[
-            sum(&sums.mean[0]),
-            sum(&sums.mean[1]),
-            0.5 * sum(a),
+            sum(&sums.first[0]),
+            sum(&sums.first[1]),
+            sum(a),
             sum(b),
-            0.5 * sum(c),
+            sum(c),
         ]);
     }
     if record.depth {
@@ -383,11 +384,11 @@ fn gather(
                 let g = splat.gaussian as usize;
                 let at = record.geometry();
                 let gradient = FootprintGradient {
-                    u: sum[at],
-                    v: sum[at + 1],
-                    a: sum[at + 2],
-                    b: sum[at + 3],
-                    c: sum[at + 4],
+                    r0: sum[at],
+                    r1: sum[at + 1],
+                    s00: sum[at + 2],
+                    s01: sum[at + 3],
+                    s11: sum[at + 4],
                     depth: if record.depth { sum[record.depth()] } else { 0.0 },
                     compensation: if job.antialiased { v_opacity * scene.opacities[g] } else { 0.0 },
                 };

@@ -60,6 +60,12 @@ fn for_each_tile(splat: &Splat, job: &Job, mut found: impl FnMut(u32) -> bool) {
     }
 }
 
+/// At least as many tiles as the splat reaches.
+fn bound(splat: &Splat) -> u64 {
+    let tiles = |[first, last]: [u16; 2]| u64::from(last) / TILE as u64 - u64::from(first) / TILE as u64 + 1;
+    tiles(splat.columns) * tiles(splat.rows)
+}
+
 /// Whether the splat is in any tile's list.
 pub fn reaches_a_tile(splat: &Splat, job: &Job) -> bool {
     let mut reached = false;
@@ -75,6 +81,22 @@ pub fn reaches_a_tile(splat: &Splat, job: &Job) -> bool {
 /// # Errors
 /// [`SplatError::TooManyIntersections`] beyond 2³¹ entries.
 pub fn lists(splats: &[Splat], job: &Job, keep_places: bool) -> Result<Lists, SplatError> {
+    // Counted before anything is stored, where it could be too much.
+    let limit = i32::MAX as u64;
+    if splats.iter().map(|splat| bound(splat)).sum::<u64>() > limit {
+        let count = |splat: &Splat| {
+            let mut count = 0_u64;
+            for_each_tile(splat, job, |_| {
+                count += 1;
+                true
+            });
+            count
+        };
+        let found = splats.par_iter().map(count).sum();
+        if found > limit {
+            return Err(SplatError::TooManyIntersections { found, limit });
+        }
+    }
     // Per task: the tiles of its splats in order, and how many each splat has.
     let chunks: Vec<(Vec<u32>, Vec<u32>)> = splats
         .par_chunks(CHUNK)
@@ -93,9 +115,6 @@ pub fn lists(splats: &[Splat], job: &Job, keep_places: bool) -> Result<Lists, Sp
         })
         .collect();
     let total: usize = chunks.iter().map(|(tiles, _)| tiles.len()).sum();
-    if total > i32::MAX as usize {
-        return Err(SplatError::TooManyIntersections { found: total as u64, limit: i32::MAX as u64 });
-    }
 
     let mut starts = vec![0_u32; job.tiles_x() * job.tiles_y() + 1];
     for (tiles, _) in &chunks {

@@ -193,11 +193,11 @@ pub fn pixels(
         let mut v_green = 0.0f32;
         let mut v_blue = 0.0f32;
         let mut v_power = 0.0f32;
-        let mut v_u = 0.0f32;
-        let mut v_v = 0.0f32;
-        let mut v_a = 0.0f32;
-        let mut v_b = 0.0f32;
-        let mut v_c = 0.0f32;
+        let mut r_0 = 0.0f32;
+        let mut r_1 = 0.0f32;
+        let mut s_00 = 0.0f32;
+        let mut s_01 = 0.0f32;
+        let mut s_11 = 0.0f32;
         let mut v_depth = 0.0f32;
         if own < rest {
             let at = entries[start + rest - 1 - own] as usize * comptime!(SPLAT);
@@ -223,13 +223,13 @@ pub fn pixels(
                     if comptime!(record.geometry) {
                         let dx = f32::cast_from((left + pixel % comptime!(TILE)) as u32) + 0.5 - u;
                         let dy = f32::cast_from((top + pixel / comptime!(TILE)) as u32) + 0.5 - v;
-                        let y_y = l1 * (l1 * (dy + k * dx));
-                        let y_x = l0 * (l0 * dx) + k * y_y;
-                        v_u += g * y_x;
-                        v_v += g * y_y;
-                        v_a += 0.5 * (g * y_x * y_x);
-                        v_b += g * y_x * y_y;
-                        v_c += 0.5 * (g * y_y * y_y);
+                        let w_0 = l0 * dx;
+                        let w_1 = l1 * (dy + k * dx);
+                        r_0 += g * w_0;
+                        r_1 += g * w_1;
+                        s_00 += g * w_0 * w_0;
+                        s_01 += g * w_0 * w_1;
+                        s_11 += g * w_1 * w_1;
                     }
                 }
             }
@@ -247,11 +247,11 @@ pub fn pixels(
         }
         if comptime!(record.geometry) {
             let at = comptime!(record.geometry_at() * UNITS) + unit;
-            sums[at] = v_u;
-            sums[at + comptime!(UNITS)] = v_v;
-            sums[at + comptime!(2 * UNITS)] = v_a;
-            sums[at + comptime!(3 * UNITS)] = v_b;
-            sums[at + comptime!(4 * UNITS)] = v_c;
+            sums[at] = r_0;
+            sums[at + comptime!(UNITS)] = r_1;
+            sums[at + comptime!(2 * UNITS)] = s_00;
+            sums[at + comptime!(3 * UNITS)] = s_01;
+            sums[at + comptime!(4 * UNITS)] = s_11;
         }
         if comptime!(record.depth) {
             sums[comptime!(record.depth_at() * UNITS) + unit] = v_depth;
@@ -323,11 +323,11 @@ pub fn gather(
         if count > 0 {
             let first = reach[at + 3] as usize;
             let mut v_visible = 0.0f32;
-            let mut u = 0.0f32;
-            let mut v = 0.0f32;
-            let mut a = 0.0f32;
-            let mut b = 0.0f32;
-            let mut c = 0.0f32;
+            let mut r0 = 0.0f32;
+            let mut r1 = 0.0f32;
+            let mut s00 = 0.0f32;
+            let mut s01 = 0.0f32;
+            let mut s11 = 0.0f32;
             let mut depth = 0.0f32;
             for slot in first..first + count {
                 let r = slot * len;
@@ -341,11 +341,11 @@ pub fn gather(
                 }
                 if comptime!(record.geometry) {
                     let r = r + comptime!(record.geometry_at());
-                    u += records[r];
-                    v += records[r + 1];
-                    a += records[r + 2];
-                    b += records[r + 3];
-                    c += records[r + 4];
+                    r0 += records[r];
+                    r1 += records[r + 1];
+                    s00 += records[r + 2];
+                    s01 += records[r + 3];
+                    s11 += records[r + 4];
                 }
                 if comptime!(record.depth) {
                     depth += records[r + comptime!(record.depth_at())];
@@ -362,7 +362,7 @@ pub fn gather(
                     v_visible *= crate::vjp::footprint(&view, &p).compensation;
                 }
                 if comptime!(record.geometry) {
-                    let gradient = FootprintGradient { u, v, a, b, c, depth, compensation };
+                    let gradient = FootprintGradient { r0, r1, s00, s01, s11, depth, compensation };
                     let r = project_vjp(&view, &p, &scale, &gradient);
                     mean_x += r.mean.x;
                     mean_y += r.mean.y;

@@ -32,8 +32,7 @@ impl Buffers {
     pub fn empty<const D: usize>(&self, shape: [usize; D], dtype: DType) -> CubeTensor {
         // A binding of no bytes is not allowed.
         let shape = if shape.contains(&0) { Shape::new([1]) } else { Shape::new(shape) };
-        let tensor =
-            empty_device_contiguous_dtype(self.client.clone(), self.device.clone(), shape, dtype);
+        let tensor = empty_device_contiguous_dtype(self.client.clone(), self.device.clone(), shape, dtype);
         #[cfg(test)]
         self.fill(&tensor, 0xFFC0_1234);
         tensor
@@ -113,13 +112,7 @@ pub mod testing {
         let bytes: Vec<u8> = values.iter().flat_map(|v| v.to_ne_bytes()).chain([0; 4]).collect();
         let handle = buffers.client.create_from_slice(&bytes);
         let shape = Shape::new([values.len() + 1]);
-        CubeTensor::new_contiguous(
-            buffers.client.clone(),
-            buffers.device.clone(),
-            shape,
-            handle,
-            DType::U32,
-        )
+        CubeTensor::new_contiguous(buffers.client.clone(), buffers.device.clone(), shape, handle, DType::U32)
     }
 
     /// u32 numbers to the host.

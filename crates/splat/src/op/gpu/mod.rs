@@ -286,7 +286,8 @@ fn lists(
     if found > limit {
         return Err(SplatError::TooManyIntersections { found, limit });
     }
-    let [visible, near, outside, transparent, degenerate, invalid] = [0, 1, 2, 3, 4, 5].map(|i| u64::from(s[i]));
+    let [visible, near, outside, transparent, degenerate, invalid] =
+        [0, 1, 2, 3, 4, 5].map(|i| u64::from(s[i]));
     let counts = Counts { visible, near, outside, transparent, degenerate, invalid, intersections: found };
 
     let len = found as usize;

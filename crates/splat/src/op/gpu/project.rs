@@ -24,9 +24,29 @@ const UNITS: usize = 256;
 pub fn view_numbers(v: &View) -> [f32; VIEW] {
     let Mat3 { r0, r1, r2 } = v.rotation;
     [
-        r0.x, r0.y, r0.z, r1.x, r1.y, r1.z, r2.x, r2.y, r2.z, v.centre.x, v.centre.y, v.centre.z,
-        v.centre_rest.x, v.centre_rest.y, v.centre_rest.z, v.fx, v.fy, v.cx, v.cy, v.x_min, v.x_max,
-        v.y_min, v.y_max,
+        r0.x,
+        r0.y,
+        r0.z,
+        r1.x,
+        r1.y,
+        r1.z,
+        r2.x,
+        r2.y,
+        r2.z,
+        v.centre.x,
+        v.centre.y,
+        v.centre.z,
+        v.centre_rest.x,
+        v.centre_rest.y,
+        v.centre_rest.z,
+        v.fx,
+        v.fy,
+        v.cx,
+        v.cy,
+        v.x_min,
+        v.x_max,
+        v.y_min,
+        v.y_max,
     ]
 }
 
@@ -81,7 +101,7 @@ fn tiles_within(centre: f32, extent: f32, side: u32) -> u32 {
     let mut packed = comptime!(CULLED).runtime();
     if first <= last {
         let tile = comptime!(TILE as u32);
-        packed = u32::cast_from(first) / tile | (u32::cast_from(last) / tile) << 16u32;
+        packed = (u32::cast_from(first) / tile) | ((u32::cast_from(last) / tile) << 16u32);
     }
     packed
 }

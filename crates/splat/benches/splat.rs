@@ -1,0 +1,248 @@
+//! Times and memory of the splatting operation:
+//! `cargo bench --workspace --bench splat -- [--device cpu|wgpu|vulkan|cuda] [--full] [--only TEXT]`.
+//!
+//! Inputs are built outside the timed part and the device is synchronised before and after it. Each figure is the
+//! median of the runs that fit into the time per case, at least three, after one warm-up.
+
+use std::time::{Duration, Instant};
+
+use burn::tensor::{Device, DeviceKind, Tensor, TensorData};
+use peak_alloc::PeakAlloc;
+use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
+
+#[global_allocator]
+static MEMORY: PeakAlloc = PeakAlloc;
+
+/// Time to spend on one figure.
+const TIME_PER_FIGURE: Duration = Duration::from_millis(1500);
+
+/// SplitMix64: the same scene on every machine.
+struct Random(u64);
+
+impl Random {
+    fn uniform(&mut self) -> f32 {
+        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
+        let z = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        let z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+        ((z ^ (z >> 31)) >> 40) as f32 / (1_u64 << 24) as f32
+    }
+
+    fn between(&mut self, low: f32, high: f32) -> f32 {
+        low + (high - low) * self.uniform()
+    }
+
+    /// Uniform on the unit sphere.
+    fn direction(&mut self) -> [f32; 3] {
+        let z = self.between(-1.0, 1.0);
+        let (sin, cos) = self.between(0.0, std::f32::consts::TAU).sin_cos();
+        let r = (1.0 - z * z).sqrt();
+        [r * cos, r * sin, z]
+    }
+}
+
+/// Which inputs are tracked.
+#[derive(Clone, Copy, PartialEq)]
+enum Tracked {
+    Nothing,
+    Colors,
+    Everything,
+}
+
+struct Scene {
+    gaussians: Gaussians,
+    inputs: Vec<Input>,
+}
+
+enum Input {
+    Rows(Tensor<2>),
+    Flat(Tensor<1>),
+}
+
+/// `n` Gaussians on an ellipsoid as high as a person, which covers 30 % of a training camera's square image, with a
+/// standard deviation of `sigma` pixels of an image of `size` pixels, half as thick along a random axis.
+fn human(n: usize, size: u32, sigma: f32, tracked: Tracked, device: &Device) -> Scene {
+    let mut random = Random(7);
+    let pixel = 2.0 / (0.8 * size as f32);
+    let (mut means, mut rotations, mut scales) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut opacities, mut colors) = (Vec::new(), Vec::new());
+    for _ in 0..n {
+        let [x, y, z] = random.direction();
+        means.extend([0.64 * x, 0.85 + 0.9 * y, 0.3 * z]);
+        let q: [f32; 4] = std::array::from_fn(|_| random.between(-1.0, 1.0));
+        rotations.extend(q);
+        let scale = sigma * pixel * random.between(0.8, 1.25);
+        scales.extend([scale, scale, 0.5 * scale]);
+        opacities.push(random.between(0.3, 1.0));
+        colors.extend([random.uniform(), random.uniform(), random.uniform()]);
+    }
+    let all = tracked == Tracked::Everything;
+    let device = if tracked == Tracked::Nothing { device.clone() } else { device.clone().autodiff() };
+    let rows = |values: Vec<f32>, columns: usize, tracked: bool| {
+        let tensor = Tensor::<2>::from_data(TensorData::new(values, [n, columns]), &device);
+        if tracked { tensor.require_grad() } else { tensor }
+    };
+    let means = rows(means, 3, all);
+    let rotations = rows(rotations, 4, all);
+    let scales = rows(scales, 3, all);
+    let colors = rows(colors, 3, tracked != Tracked::Nothing);
+    let opacities = Tensor::<1>::from_data(TensorData::new(opacities, [n]), &device);
+    let opacities = if all { opacities.require_grad() } else { opacities };
+    let inputs = match tracked {
+        Tracked::Nothing => Vec::new(),
+        Tracked::Colors => vec![Input::Rows(colors.clone())],
+        Tracked::Everything => {
+            let rows = [means.clone(), rotations.clone(), scales.clone(), colors.clone()];
+            rows.into_iter().map(Input::Rows).chain([Input::Flat(opacities.clone())]).collect()
+        }
+    };
+    let gaussians = Gaussians::new(means, rotations, scales, opacities, colors).expect("shapes");
+    Scene { gaussians, inputs }
+}
+
+fn cameras(count: usize, size: u32) -> Vec<Camera> {
+    (0..count).map(|i| Camera::orbit_at_yaw_degrees(i as f64 * 360.0 / count as f64, size)).collect()
+}
+
+/// Median time and peak of additional host memory.
+#[derive(Clone, Copy)]
+struct Figure {
+    time: Duration,
+    bytes: usize,
+}
+
+/// Runs `part` on what `prepare` makes, again and again.
+fn measure<T, R>(device: &Device, mut prepare: impl FnMut() -> T, mut part: impl FnMut(T) -> R) -> Figure {
+    let mut times = Vec::new();
+    let mut bytes = 0;
+    let begin = Instant::now();
+    while times.len() < 4 || (begin.elapsed() < TIME_PER_FIGURE && times.len() < 50) {
+        let input = prepare();
+        device.sync().expect("the device finishes");
+        MEMORY.reset_peak_usage();
+        let before = MEMORY.current_usage();
+        let start = Instant::now();
+        let output = part(input);
+        device.sync().expect("the device finishes");
+        times.push(start.elapsed());
+        bytes = MEMORY.peak_usage().saturating_sub(before);
+        drop(output);
+    }
+    times.remove(0);
+    times.sort();
+    Figure { time: times[times.len() / 2], bytes }
+}
+
+struct Case {
+    n: usize,
+    size: u32,
+    views: usize,
+    /// Standard deviation in pixels.
+    sigma: f32,
+}
+
+/// One line of the table.
+fn run(case: &Case, tracked: Tracked, device: &Device, on_host: bool) {
+    let cameras = cameras(case.views, case.size);
+    let options = RenderOptions::inria();
+    let scene = human(case.n, case.size, case.sigma, tracked, device);
+    let counts = render(&scene.gaussians, &cameras, &options).expect("rendered").counts;
+    let forward =
+        measure(device, || (), |()| render(&scene.gaussians, &cameras, &options).expect("rendered"));
+    let shape = [case.views, case.size as usize, case.size as usize, 3];
+    let inner = scene.gaussians.device();
+    let upstream = Tensor::<4>::ones(shape, &inner) * 0.5;
+    let backward = (tracked != Tracked::Nothing).then(|| {
+        let prepare = || {
+            let rendered = render(&scene.gaussians, &cameras, &options).expect("rendered");
+            (rendered.color * upstream.clone()).sum()
+        };
+        let part = |loss: Tensor<1>| {
+            let gradients = loss.backward();
+            for input in &scene.inputs {
+                match input {
+                    Input::Rows(tensor) => assert!(tensor.grad(&gradients).is_some()),
+                    Input::Flat(tensor) => assert!(tensor.grad(&gradients).is_some()),
+                }
+            }
+            gradients
+        };
+        measure(device, prepare, part)
+    });
+    let ms = |figure: Figure| format!("{:.1}", figure.time.as_secs_f64() * 1e3);
+    let pixels = case.views * case.size as usize * case.size as usize;
+    let mb =
+        |figure: Figure| if on_host { format!("{:.1}", figure.bytes as f64 / 1e6) } else { "–".into() };
+    // The image comes out and the gradients come out: they are not scratch memory.
+    let image = 16 * pixels;
+    let budget = (400 * case.n + 40 * pixels) as f64;
+    let share = |figure: Figure, outputs: usize| match on_host {
+        true => format!("{:.0} %", 100.0 * figure.bytes.saturating_sub(outputs) as f64 / budget),
+        false => "–".into(),
+    };
+    let tracked = match tracked {
+        Tracked::Nothing => "nothing",
+        Tracked::Colors => "colours",
+        Tracked::Everything => "everything",
+    };
+    println!(
+        "| {}k | {}² | {} | {:.1} | {tracked} | {:.2} M | {} | {} | {} | {} | {} | {} |",
+        case.n / 1000,
+        case.size,
+        case.views,
+        case.sigma,
+        counts.intersections as f64 / 1e6,
+        ms(forward),
+        mb(forward),
+        share(forward, image),
+        backward.map_or("–".into(), ms),
+        backward.map_or("–".into(), mb),
+        backward.map_or("–".into(), |figure| share(figure, 56 * case.n)),
+    );
+}
+
+fn main() {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let value = |name: &str| {
+        arguments.iter().position(|a| a == name).and_then(|i| arguments.get(i + 1)).map(String::as_str)
+    };
+    let full = arguments.iter().any(|a| a == "--full");
+    let only = value("--only").unwrap_or_default();
+    let name = value("--device").unwrap_or("cpu");
+    let device = match name {
+        "cpu" => Device::flex(),
+        "wgpu" | "vulkan" => Device::wgpu(DeviceKind::DefaultDevice),
+        other => {
+            eprintln!("--device {other}: allowed are cpu, wgpu, vulkan");
+            std::process::exit(2);
+        }
+    };
+    let commit = std::process::Command::new("git").args(["rev-parse", "--short", "HEAD"]).output();
+    let commit = commit.ok().and_then(|o| String::from_utf8(o.stdout).ok()).unwrap_or_default();
+    println!("device {}, {} threads, commit {}", name, threads(), commit.trim());
+    println!(
+        "\n| N | image | V | σ, px | tracked | intersections | forward, ms | peak, MB | of budget | backward, ms | peak, MB | of budget |"
+    );
+    println!("|{}", " ---: |".repeat(12));
+    let mut cases = vec![Case { n: 400_000, size: 1024, views: 1, sigma: 1.0 }];
+    if full {
+        for n in [50_000, 200_000, 400_000, 1_000_000] {
+            for size in [512, 1024, 2048] {
+                cases.extend([1, 4].map(|views| Case { n, size, views, sigma: 1.0 }));
+            }
+        }
+        // The same splats on a larger, emptier canvas, and larger splats on the same canvas.
+        cases.extend([0.5, 2.0, 4.0].map(|sigma| Case { n: 400_000, size: 1024, views: 1, sigma }));
+    }
+    for case in &cases {
+        for tracked in [Tracked::Nothing, Tracked::Colors, Tracked::Everything] {
+            let label = format!("{}k {} {}", case.n / 1000, case.size, case.views);
+            if label.contains(only) {
+                run(case, tracked, &device, name == "cpu");
+            }
+        }
+    }
+}
+
+fn threads() -> usize {
+    std::thread::available_parallelism().map_or(1, usize::from)
+}

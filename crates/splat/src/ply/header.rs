@@ -1,0 +1,159 @@
+//! The header of a PLY file: format, elements and their properties.
+
+/// Longest header that is read, in bytes.
+const MAX_HEADER: usize = 1 << 20;
+
+/// How the values of the body are written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Format {
+    Ascii,
+    LittleEndian,
+    BigEndian,
+}
+
+/// Type of a value.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Scalar {
+    I8,
+    U8,
+    I16,
+    U16,
+    I32,
+    U32,
+    F32,
+    F64,
+}
+
+impl Scalar {
+    fn parse(name: &str) -> Option<Self> {
+        Some(match name {
+            "char" | "int8" => Self::I8,
+            "uchar" | "uint8" => Self::U8,
+            "short" | "int16" => Self::I16,
+            "ushort" | "uint16" => Self::U16,
+            "int" | "int32" => Self::I32,
+            "uint" | "uint32" => Self::U32,
+            "float" | "float32" => Self::F32,
+            "double" | "float64" => Self::F64,
+            _ => return None,
+        })
+    }
+
+    /// Bytes of a value in a binary body.
+    pub fn size(self) -> usize {
+        match self {
+            Self::I8 | Self::U8 => 1,
+            Self::I16 | Self::U16 => 2,
+            Self::I32 | Self::U32 | Self::F32 => 4,
+            Self::F64 => 8,
+        }
+    }
+
+    /// The value at the start of `bytes`, which are little-endian.
+    pub fn read(self, bytes: &[u8]) -> f32 {
+        let four = || [bytes[0], bytes[1], bytes[2], bytes[3]];
+        match self {
+            Self::I8 => f32::from(i8::from_le_bytes([bytes[0]])),
+            Self::U8 => f32::from(bytes[0]),
+            Self::I16 => f32::from(i16::from_le_bytes([bytes[0], bytes[1]])),
+            Self::U16 => f32::from(u16::from_le_bytes([bytes[0], bytes[1]])),
+            Self::I32 => i32::from_le_bytes(four()) as f32,
+            Self::U32 => u32::from_le_bytes(four()) as f32,
+            Self::F32 => f32::from_le_bytes(four()),
+            Self::F64 => {
+                let mut eight = [0; 8];
+                eight.copy_from_slice(&bytes[..8]);
+                f64::from_le_bytes(eight) as f32
+            }
+        }
+    }
+}
+
+/// A property of an element.
+#[derive(Clone, Debug)]
+pub struct Property {
+    pub name: String,
+    pub kind: Scalar,
+    /// Type of the length, where the property is a list.
+    pub list: Option<Scalar>,
+}
+
+/// An element: so many rows of these properties.
+#[derive(Clone, Debug)]
+pub struct Element {
+    pub name: String,
+    pub count: usize,
+    pub properties: Vec<Property>,
+}
+
+/// What stands before the body.
+#[derive(Clone, Debug)]
+pub struct Header {
+    pub format: Format,
+    pub elements: Vec<Element>,
+    /// Where the body begins.
+    pub len: usize,
+}
+
+/// Reads the header at the start of `bytes`.
+pub fn parse(bytes: &[u8]) -> Result<Header, String> {
+    let mut rest = &bytes[..bytes.len().min(MAX_HEADER)];
+    let mut number = 0;
+    let mut line = || -> Result<(usize, String), String> {
+        number += 1;
+        let end = rest.iter().position(|&b| b == b'\n').ok_or_else(|| match number {
+            1 => "not a PLY file: it does not start with `ply`".to_owned(),
+            _ => "the header has no end: `end_header` is missing".to_owned(),
+        })?;
+        let text =
+            std::str::from_utf8(&rest[..end]).map_err(|_| format!("header line {number}: not text"))?;
+        rest = &rest[end + 1..];
+        Ok((number, text.trim_end_matches('\r').to_owned()))
+    };
+    if line().map_or(true, |(_, first)| first.trim_end() != "ply") {
+        return Err("not a PLY file: it does not start with `ply`".into());
+    }
+    let mut format = None;
+    let mut elements: Vec<Element> = Vec::new();
+    loop {
+        let (number, text) = line()?;
+        let words: Vec<&str> = text.split_ascii_whitespace().collect();
+        let wrong = |problem: &str| Err(format!("header line {number}, `{text}`: {problem}"));
+        match words.as_slice() {
+            [] | ["comment" | "obj_info", ..] => {}
+            ["format", name, _version] => {
+                format = match *name {
+                    "ascii" => Some(Format::Ascii),
+                    "binary_little_endian" => Some(Format::LittleEndian),
+                    "binary_big_endian" => Some(Format::BigEndian),
+                    _ => return wrong("expected ascii, binary_little_endian or binary_big_endian"),
+                };
+            }
+            ["element", name, count] => {
+                let Ok(count) = count.parse() else { return wrong("the count is not a whole number") };
+                elements.push(Element { name: (*name).to_owned(), count, properties: Vec::new() });
+            }
+            ["property", kind @ .., name] => {
+                let Some(element) = elements.last_mut() else { return wrong("no element before it") };
+                let types: Option<Vec<Scalar>> = match kind {
+                    ["list", types @ ..] if types.len() == 2 => {
+                        types.iter().map(|t| Scalar::parse(t)).collect()
+                    }
+                    [kind] => Scalar::parse(kind).map(|kind| vec![kind]),
+                    _ => None,
+                };
+                let (kind, list) = match types.as_deref() {
+                    Some([kind]) => (*kind, None),
+                    Some([length, kind]) => (*kind, Some(*length)),
+                    _ => return wrong("no such type"),
+                };
+                element.properties.push(Property { name: (*name).to_owned(), kind, list });
+            }
+            ["end_header"] => break,
+            _ => return wrong("not understood"),
+        }
+    }
+    let format = format.ok_or("the header names no format")?;
+    let len = bytes.len().min(MAX_HEADER) - rest.len();
+    Ok(Header { format, elements, len })
+}

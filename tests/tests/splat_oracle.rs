@@ -1,0 +1,320 @@
+//! The splatting operation against the dense f64 oracle, and the oracle against itself and the fixtures.
+
+use snapsnap_splat::reference::{self, Cutoff, Scene};
+use snapsnap_splat::{Camera, RenderOptions, cameras};
+use snapsnap_tests::scenes::{HostScene, forward_camera, random_scene, random_upstream};
+use snapsnap_tests::{Numbers, device, device_name, fixture};
+
+/// Names of the 14 numbers of a Gaussian, and where each name's numbers lie.
+const PARTS: [(&str, std::ops::Range<usize>); 5] =
+    [("means", 0..3), ("rotations", 3..7), ("scales", 7..10), ("opacities", 10..11), ("colors", 11..14)];
+
+/// Relative L2 error and 1 − cosine of `found` against `expected`.
+fn compare(found: &[f64], expected: &[f64]) -> (f64, f64) {
+    let (mut dot, mut ff, mut ee, mut dd) = (0.0, 0.0, 0.0, 0.0);
+    for (f, e) in found.iter().zip(expected) {
+        (dot, ff, ee, dd) = (dot + f * e, ff + f * f, ee + e * e, dd + (f - e) * (f - e));
+    }
+    if ee == 0.0 { (ff.sqrt(), 0.0) } else { ((dd / ee).sqrt(), 1.0 - dot / (ff * ee).sqrt()) }
+}
+
+fn flat(gaussians: &[[f64; 14]], part: &std::ops::Range<usize>) -> Vec<f64> {
+    gaussians.iter().flat_map(|g| g[part.clone()].to_vec()).collect()
+}
+
+fn preset(numbers: &Numbers) -> RenderOptions {
+    let preset = match numbers.metadata("preset").as_str() {
+        "inria" => RenderOptions::inria(),
+        "gsplat_1_5" => RenderOptions::gsplat_1_5(),
+        other => panic!("preset {other}"),
+    };
+    RenderOptions { antialiased: numbers.metadata("antialiased") == "true", ..preset }
+}
+
+/// The oracle needs no device: once is enough.
+fn once() -> bool {
+    device_name() == "flex"
+}
+
+/// Pixels of all fixtures, and gradients of those that are quick enough.
+#[test]
+fn the_oracle_agrees_with_the_fixtures() {
+    let names = [
+        "plain",
+        "antialiased",
+        "human_like",
+        "stack",
+        "unnormalised_rotations",
+        "needles",
+        "near_plane",
+        "far_from_origin",
+    ];
+    for name in names.into_iter().filter(|_| once()) {
+        let Some(path) = fixture(&format!("splat/{name}.safetensors")) else { continue };
+        let Some(cameras_path) = fixture(&format!("splat/{name}.cameras.json")) else { continue };
+        let numbers = Numbers::read(&path);
+        let options = preset(&numbers);
+        let columns = |name: &str| numbers.f32(name).1;
+        let [m, q, s, o, c] = ["means", "rotations", "scales", "opacities", "colors"].map(columns);
+        let gaussian = |i: usize| {
+            let all = [
+                &m[3 * i..3 * i + 3],
+                &q[4 * i..4 * i + 4],
+                &s[3 * i..3 * i + 3],
+                &o[i..=i],
+                &c[3 * i..3 * i + 3],
+            ];
+            <[f32; 14]>::try_from(all.concat()).expect("14 numbers")
+        };
+        let background = columns("background").try_into().expect("three");
+        let scene = HostScene { gaussians: (0..o.len()).map(gaussian).collect(), background }.in_f64();
+        let mut gradient: Option<Scene<f64>> = None;
+        for (i, camera) in cameras::read(&cameras_path).expect("cameras").iter().enumerate() {
+            let pixels = reference::render(&scene, camera, &options, Cutoff::Hard);
+            let mut worst = 0.0_f64;
+            for (part, first, count) in [("color", 0, 3), ("alpha", 3, 1), ("depth", 4, 1)] {
+                let (_, expected) = numbers.f64(&format!("{part}.{i}"));
+                for (pixel, expected) in pixels.iter().zip(expected.chunks(count)) {
+                    for (f, e) in pixel.channels()[first..first + count].iter().zip(expected) {
+                        worst = worst.max((f - e).abs());
+                    }
+                }
+            }
+            println!("{name}, camera {i}: pixels {worst:.1e}");
+            // The constants ε, α_max and 1/255 are f32 here, f64 in the fixtures.
+            assert!(worst < 1e-7, "{name}: {worst:e}");
+            let upstream = |part: &str| numbers.f32(&format!("grad_{part}.{i}")).1;
+            let [color, alpha, depth] = ["color", "alpha", "depth"].map(upstream);
+            let upstream: Vec<[f64; 5]> = (0..alpha.len())
+                .map(|p| {
+                    [color[3 * p], color[3 * p + 1], color[3 * p + 2], alpha[p], depth[p]].map(f64::from)
+                })
+                .collect();
+            if ["antialiased", "near_plane", "far_from_origin"].contains(&name) {
+                let part = reference::gradient(&scene, camera, &options, Cutoff::Hard, &upstream);
+                match &mut gradient {
+                    None => gradient = Some(part),
+                    Some(sum) => {
+                        let pairs = sum.gaussians.iter_mut().flatten().zip(part.gaussians.iter().flatten());
+                        pairs.for_each(|(s, p)| *s += p);
+                    }
+                }
+            }
+        }
+        if let Some(gradient) = gradient {
+            for (part, range) in PARTS {
+                let (_, expected) = numbers.f64(&format!("vjp.{part}"));
+                let (error, _) = compare(&flat(&gradient.gaussians, &range), &expected);
+                println!("{name}: {part} {error:.1e}");
+                assert!(error < 1e-6, "{name}: gradient of {part}: {error:e}");
+            }
+        }
+    }
+}
+
+/// With the smooth cut-off the image is differentiable, so that differences must agree with the dual numbers, for every
+/// single input.
+#[test]
+fn the_oracles_gradients_agree_with_finite_differences() {
+    if !once() {
+        return;
+    }
+    for (seed, antialiased) in [(1, false), (2, true)] {
+        let camera = forward_camera(20, 16);
+        let options = RenderOptions { antialiased, max_alpha: 0.9999, ..RenderOptions::inria() };
+        let mut host = random_scene(8, seed);
+        host.gaussians.iter_mut().for_each(|g| g[10] = 0.9 * g[10]);
+        let scene = host.in_f64();
+        let upstream: Vec<[f64; 5]> =
+            random_upstream(320, seed).chunks(5).map(|c| std::array::from_fn(|k| f64::from(c[k]))).collect();
+        let loss = |scene: &Scene<f64>| -> f64 {
+            let pixels = reference::render(scene, &camera, &options, Cutoff::Smooth);
+            pixels
+                .iter()
+                .zip(&upstream)
+                .flat_map(|(p, u)| p.channels().into_iter().zip(u))
+                .map(|(p, u)| p * u)
+                .sum()
+        };
+        let gradient = reference::gradient(&scene, &camera, &options, Cutoff::Smooth, &upstream);
+        let check = |what: String, analytic: f64, difference: f64| {
+            assert!(
+                (analytic - difference).abs() < 1e-5 * (1.0 + analytic.abs()),
+                "{what}: {analytic} {difference}"
+            );
+        };
+        let step = 1e-6;
+        for i in 0..scene.gaussians.len() {
+            for k in 0..14 {
+                let at = |h: f64| {
+                    let mut moved = scene.clone();
+                    moved.gaussians[i][k] += h;
+                    loss(&moved)
+                };
+                let difference = (at(step) - at(-step)) / (2.0 * step);
+                check(format!("Gaussian {i}, number {k}"), gradient.gaussians[i][k], difference);
+            }
+        }
+        for k in 0..3 {
+            let at = |h: f64| {
+                let mut moved = scene.clone();
+                moved.background[k] += h;
+                loss(&moved)
+            };
+            check(format!("background {k}"), gradient.background[k], (at(step) - at(-step)) / (2.0 * step));
+        }
+    }
+}
+
+/// One random scene on the device and in the oracle.
+fn check(name: &str, host: &HostScene, camera: &Camera, options: &RenderOptions) {
+    let Some(device) = device() else { return };
+    let scene = host.in_f64();
+    let pixels = (camera.width * camera.height) as usize;
+    let banded = reference::banded(&scene, camera, options);
+    let mut upstream = random_upstream(pixels, 5);
+    for (pixel, _) in banded.iter().enumerate().filter(|(_, banded)| **banded) {
+        upstream[5 * pixel..5 * pixel + 5].fill(0.0);
+    }
+    let pass = host.pass(std::slice::from_ref(camera), options, &upstream, &device);
+    let expected = reference::render(&scene, camera, options, Cutoff::Hard);
+    let mut worst = 0.0_f64;
+    for (pixel, (found, expected)) in pass.image.chunks(5).zip(&expected).enumerate() {
+        for (f, e) in found.iter().zip(expected.channels()) {
+            if !banded[pixel] {
+                worst = worst.max((f64::from(*f) - e).abs());
+            }
+        }
+    }
+    let upstream: Vec<[f64; 5]> =
+        upstream.chunks(5).map(|c| std::array::from_fn(|k| f64::from(c[k]))).collect();
+    let gradient = reference::gradient(&scene, camera, options, Cutoff::Hard, &upstream);
+    let share = banded.iter().filter(|b| **b).count() as f64 / pixels as f64;
+    assert!(share < 0.2 || pixels < 100, "{name}: {share} of the pixels are banded, nothing is tested");
+    assert!(worst < 2e-5, "{name}: pixels differ by {worst:e}");
+    let found: Vec<[f64; 14]> = pass.gradient.iter().map(|g| g.map(f64::from)).collect();
+    let mut report = format!("{name}: pixels {worst:.0e}");
+    for (part, range) in PARTS {
+        let (error, angle) = compare(&flat(&found, &range), &flat(&gradient.gaussians, &range));
+        report += &format!(", {part} {error:.0e}");
+        assert!(error < 1e-3 && angle < 1e-5, "{name}: gradient of {part}: {error:e}, 1 - cosine {angle:e}");
+        // Where the oracle has exactly zero, so has the operation.
+        for (f, e) in found.iter().zip(&gradient.gaussians) {
+            if e[range.clone()].iter().all(|e| *e == 0.0) {
+                assert!(f[range.clone()].iter().all(|f| *f == 0.0), "{name}: {part} of an unseen Gaussian");
+            }
+        }
+    }
+    let (error, _) = compare(&pass.background.map(f64::from), &gradient.background);
+    assert!(error < 1e-4, "{name}: gradient of the background: {error:e}");
+    println!("{report}");
+}
+
+#[test]
+fn odd_sizes() {
+    for (seed, (width, height)) in [(1, 1), (15, 47), (17, 17), (97, 129), (64, 16)].into_iter().enumerate() {
+        let host = random_scene(16, seed as u64);
+        check(&format!("{width}x{height}"), &host, &forward_camera(width, height), &RenderOptions::inria());
+    }
+}
+
+#[test]
+fn presets_and_antialiasing() {
+    for (name, preset) in [("inria", RenderOptions::inria()), ("gsplat", RenderOptions::gsplat_1_5())] {
+        for antialiased in [false, true] {
+            let options = RenderOptions { antialiased, ..preset.clone() };
+            let name = format!("{name}, antialiased {antialiased}");
+            check(&name, &random_scene(30, 11), &forward_camera(40, 33), &options);
+            // Below a pixel, where antialiasing matters most.
+            let mut tiny = random_scene(30, 12);
+            tiny.gaussians.iter_mut().for_each(|g| (7..10).for_each(|k| g[k] *= 0.05));
+            check(&format!("{name}, tiny"), &tiny, &forward_camera(40, 33), &options);
+        }
+    }
+}
+
+/// Thin disks and needles of one to a thousand pixels, some of no thickness at all.
+#[test]
+fn needles_and_disks() {
+    let mut host = random_scene(24, 21);
+    for (i, g) in host.gaussians.iter_mut().enumerate() {
+        g[7] *= 10.0_f32.powi(i as i32 % 4 - 1);
+        g[8] *= 1e-3;
+        g[9] *= if i % 3 == 0 { 0.0 } else { 1e-4 };
+    }
+    check("needles", &host, &forward_camera(40, 33), &RenderOptions::inria());
+    // Thick enough that antialiasing leaves some opacity.
+    let mut host = random_scene(24, 22);
+    for (i, g) in host.gaussians.iter_mut().enumerate() {
+        g[7] *= 10.0_f32.powi(i as i32 % 3);
+        g[8] *= 0.05;
+        g[9] *= 0.1;
+        g[10] = 1.0;
+    }
+    check(
+        "needles, antialiased",
+        &host,
+        &forward_camera(40, 33),
+        &RenderOptions { antialiased: true, ..RenderOptions::inria() },
+    );
+}
+
+/// Opaque layers: pixels close, and α is clamped.
+#[test]
+fn opaque_layers() {
+    let mut host = random_scene(40, 31);
+    host.gaussians.iter_mut().for_each(|g| g[10] = 1.0);
+    check("opaque", &host, &forward_camera(33, 40), &RenderOptions::inria());
+    check("opaque, gsplat", &host, &forward_camera(33, 40), &RenderOptions::gsplat_1_5());
+}
+
+/// Centres far outside the image, where J is clamped, and large enough to reach into it.
+#[test]
+fn beyond_the_border() {
+    let mut host = random_scene(24, 41);
+    for g in &mut host.gaussians {
+        (g[0], g[1]) = (2.2 * g[0], 2.2 * g[1]);
+        (7..10).for_each(|k| g[k] *= 4.0);
+    }
+    check("beyond the border", &host, &forward_camera(40, 33), &RenderOptions::inria());
+}
+
+/// Where no cut-off is met, finite differences of the operation itself, over every input.
+#[test]
+fn finite_differences_of_the_operation() {
+    let Some(device) = device() else { return };
+    let camera = forward_camera(18, 14);
+    let options = RenderOptions::inria();
+    let mut host = random_scene(5, 51);
+    for g in &mut host.gaussians {
+        // Wide and half transparent: every pixel lies well inside.
+        (g[0], g[1]) = (0.2 * g[0], 0.2 * g[1]);
+        (7..10).for_each(|k| g[k] = 0.4 * g[2] + 0.3 * g[k]);
+        g[10] = 0.3 + 0.4 * g[10];
+    }
+    let upstream = random_upstream(18 * 14, 6);
+    let pass = host.pass(&[camera], &options, &upstream, &device);
+    let loss = |host: &HostScene| -> f64 {
+        let image = host.pass(&[camera], &options, &upstream, &device).image;
+        image.iter().zip(&upstream).map(|(i, u)| f64::from(*i) * f64::from(*u)).sum()
+    };
+    let scale = pass.gradient.iter().flatten().fold(0.0_f32, |m, g| m.max(g.abs()));
+    for i in 0..host.gaussians.len() {
+        for k in 0..14 {
+            let step = 2e-3;
+            let at = |h: f32| {
+                let mut moved = host.clone();
+                moved.gaussians[i][k] += h;
+                loss(&moved)
+            };
+            let difference = (at(step) - at(-step)) / (2.0 * f64::from(step));
+            let analytic = f64::from(pass.gradient[i][k]);
+            // f32 leaves 1e-7 of the loss, divided by the step; the rest is the third derivative.
+            let bound = 1e-3 * f64::from(scale) + 0.02 * analytic.abs();
+            assert!(
+                (analytic - difference).abs() < bound,
+                "Gaussian {i}, number {k}: {analytic} {difference}"
+            );
+        }
+    }
+}
