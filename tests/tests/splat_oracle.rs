@@ -123,7 +123,7 @@ fn the_oracles_gradients_agree_with_finite_differences() {
         let camera = forward_camera(20, 16);
         let options = RenderOptions { antialiased, max_alpha: 0.9999, ..RenderOptions::inria() };
         let mut host = random_scene(8, seed);
-        host.gaussians.iter_mut().for_each(|g| g[10] = 0.9 * g[10]);
+        host.gaussians.iter_mut().for_each(|g| g[10] *= 0.9);
         let scene = host.in_f64();
         let upstream: Vec<[f64; 5]> =
             random_upstream(320, seed).chunks(5).map(|c| std::array::from_fn(|k| f64::from(c[k]))).collect();

@@ -4,8 +4,10 @@ mod commands;
 mod device;
 mod dump;
 mod failure;
+mod pictures;
 mod progress;
 mod say;
+mod turntable;
 mod weights;
 
 use std::process::ExitCode;
@@ -31,6 +33,8 @@ struct Arguments {
 enum Command {
     /// Turn a front and a back photograph into a Gaussian PLY.
     Reconstruct(commands::reconstruct::Arguments),
+    /// Render a Gaussian PLY into pictures.
+    Render(commands::render::Arguments),
     /// Read checkpoints of Snap-Snap, DUSt3R or CroCo and write one weight file.
     ImportWeights(commands::import_weights::Arguments),
     /// Write random weights for a config.
@@ -55,6 +59,7 @@ fn main() -> ExitCode {
     };
     let result = match command {
         Command::Reconstruct(arguments) => commands::reconstruct::run(&arguments, quiet),
+        Command::Render(arguments) => commands::render::run(&arguments, quiet),
         Command::ImportWeights(arguments) => commands::import_weights::run(&arguments, quiet),
         Command::InitWeights(arguments) => commands::init_weights::run(&arguments, quiet),
         Command::ExportWeights(arguments) => commands::export_weights::run(&arguments, quiet),

@@ -74,6 +74,25 @@ impl Camera {
         }
     }
 
+    /// `count` cameras evenly around the training orbit, the first in front. A subject is as high in an image of any
+    /// width as in a square one.
+    pub fn orbit(count: usize, width: u32, height: u32) -> Vec<Self> {
+        let camera = |index| {
+            let square = Self::orbit_at_yaw_degrees(360.0 * index as f64 / count as f64, height);
+            let principal_point = DVec2::new(0.5 * f64::from(width), square.principal_point.y);
+            Self { width, principal_point, ..square }
+        };
+        (0..count).map(camera).collect()
+    }
+
+    /// The same view in an image of another size.
+    pub fn resized(&self, width: u32, height: u32) -> Self {
+        let factor =
+            DVec2::new(f64::from(width) / f64::from(self.width), f64::from(height) / f64::from(self.height));
+        let (focal, principal_point) = (self.focal * factor, self.principal_point * factor);
+        Self { width, height, focal, principal_point, ..*self }
+    }
+
     /// Whether an image can be rendered into this camera; if not, what is wrong.
     pub(crate) fn check(&self) -> Result<(), String> {
         for (field, side) in [("width", self.width), ("height", self.height)] {
@@ -144,6 +163,16 @@ mod tests {
             let rotation = Camera::orbit_at_yaw_degrees(yaw, 512).world_to_camera.rotation;
             assert!((rotation.determinant() - 1.0).abs() < 1e-12, "yaw {yaw}");
         }
+    }
+
+    #[test]
+    fn orbits_of_any_shape_and_resized_cameras_see_the_same_directions() {
+        let [square, wide] = [64, 96].map(|width| Camera::orbit(8, width, 64)[3]);
+        let small = wide.resized(48, 32);
+        let point = DVec3::new(0.2, 1.3, -0.1);
+        let [a, b, c] = [square, wide, small].map(|camera| camera.project(point).expect("in front").0);
+        assert!((b - a - DVec2::new(16.0, 0.0)).length() < 1e-12, "{a} {b}");
+        assert!((2.0 * c - b).length() < 1e-12, "{b} {c}");
     }
 
     #[test]

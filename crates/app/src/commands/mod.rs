@@ -4,6 +4,7 @@ pub mod export_weights;
 pub mod import_weights;
 pub mod init_weights;
 pub mod reconstruct;
+pub mod render;
 
 use std::path::Path;
 

@@ -13,6 +13,7 @@ use snapsnap_splat::{file, ply};
 use super::{ConfigArguments, check_outputs, is_same_file};
 use crate::failure::Failure;
 use crate::progress::Progress;
+use crate::turntable::{self, Turntable};
 use crate::{device, dump, say, weights};
 
 #[derive(Args)]
@@ -38,6 +39,9 @@ pub struct Arguments {
     /// Gaussian PLY to write; the config in force is written beside it.
     #[arg(short, long, default_value = "human.ply")]
     output: PathBuf,
+    /// Also render the result all around: an animation, a sheet of eight views, or a folder of pictures.
+    #[arg(long, value_name = "OUT.gif|OUT.png|DIR")]
+    turntable: Option<PathBuf>,
     /// Also write every intermediate tensor.
     #[arg(long, value_name = "FILE.safetensors")]
     dump: Option<PathBuf>,
@@ -53,6 +57,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     weights.require(Part::Regressor)?;
     let config = weights.config.clone();
     let config_path = check_paths(arguments, weights.path())?;
+    let turntable = arguments.turntable.as_deref().map(Turntable::new).transpose()?;
     let placement = match (arguments.as_is, config.mode.compat) {
         (true, _) => Placement::AsIs,
         (false, true) => Placement::Demo { height: config.person_height() },
@@ -95,7 +100,8 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
 
     progress.stage("writing");
     let since = Instant::now();
-    ply::write(&result.in_world(&config), &arguments.output)?;
+    let world = result.in_world(&config);
+    ply::write(&world, &arguments.output)?;
     if let Some(path) = &config_path {
         write_text(path, &config.resolved().to_toml())?;
     }
@@ -104,6 +110,11 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     }
     times.push(("writing", since.elapsed()));
     drop(progress);
+    if let Some(turntable) = &turntable {
+        let since = Instant::now();
+        turntable.write(&world, quiet)?;
+        times.push(("turntable", since.elapsed()));
+    }
     // What goes into a pipe must stay a PLY.
     let say = if file::is_special(&arguments.output) { say::err } else { say::out };
     if arguments.verbose {
@@ -127,7 +138,9 @@ fn check_paths(arguments: &Arguments, weights: &Path) -> Result<Option<PathBuf>,
     let itself = given.is_some_and(|given| is_same_file(given, &config_path));
     let config_path = (!itself && !file::is_special(&arguments.output)).then_some(config_path);
     inputs.extend(given);
-    let outputs = [Some(&arguments.output), arguments.dump.as_ref(), config_path.as_ref()];
+    // A turntable's folder is made when it is needed; only a file can be in the way.
+    let turntable = arguments.turntable.as_ref().filter(|path| turntable::is_file(path));
+    let outputs = [Some(&arguments.output), arguments.dump.as_ref(), config_path.as_ref(), turntable];
     let outputs: Vec<&Path> = outputs.into_iter().flatten().map(PathBuf::as_path).collect();
     check_outputs(&outputs, &inputs)?;
     Ok(config_path)

@@ -83,7 +83,7 @@ pub fn reaches_a_tile(splat: &Splat, job: &Job) -> bool {
 pub fn lists(splats: &[Splat], job: &Job, keep_places: bool) -> Result<Lists, SplatError> {
     // Counted before anything is stored, where it could be too much.
     let limit = i32::MAX as u64;
-    if splats.iter().map(|splat| bound(splat)).sum::<u64>() > limit {
+    if splats.iter().map(bound).sum::<u64>() > limit {
         let count = |splat: &Splat| {
             let mut count = 0_u64;
             for_each_tile(splat, job, |_| {

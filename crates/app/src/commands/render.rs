@@ -1,0 +1,282 @@
+//! `snapsnap render`.
+
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use burn::tensor::{Device, Tensor};
+use clap::{Args, ValueEnum};
+use safetensors::Dtype;
+use safetensors::tensor::TensorView;
+use snapsnap_splat::ply::{self, Loaded};
+use snapsnap_splat::{
+    Camera, Counts, Gaussians, MAX_SIDE, RenderOptions, Rendered, cameras, file, render, sh,
+};
+
+use super::check_outputs;
+use crate::failure::Failure;
+use crate::pictures::{make_folder, picture, write_png};
+use crate::progress::Progress;
+use crate::{device, say};
+
+/// Side of an orbit's pictures.
+const DEFAULT_SIDE: u32 = 1024;
+/// Where pictures go if no output is named.
+const DEFAULT_FOLDER: &str = "renders";
+
+#[derive(Clone, Copy, ValueEnum)]
+enum Preset {
+    /// The original rasteriser: largest α 0.99, near plane 0.2 m.
+    Inria,
+    /// gsplat 1.5: largest α 0.999, near plane 0.01 m.
+    Gsplat,
+}
+
+#[derive(Args)]
+#[command(group = clap::ArgGroup::new("views").required(true).args(["cameras", "orbit"]))]
+pub struct Arguments {
+    /// Gaussian PLY, SH degree 0 to 3.
+    ply: PathBuf,
+    /// Cameras to render into.
+    #[arg(long, value_name = "cameras.json")]
+    cameras: Option<PathBuf>,
+    /// So many views around a person, the first from the front.
+    #[arg(long, value_name = "N")]
+    orbit: Option<usize>,
+    /// Size of the pictures [default: the cameras' own; 1024x1024 for an orbit].
+    #[arg(long, value_name = "WxH", value_parser = size)]
+    size: Option<[u32; 2]>,
+    /// Colour behind the Gaussians, each from 0 to 1.
+    #[arg(long, value_name = "R,G,B", value_parser = color, default_value = "0,0,0")]
+    background: [f32; 3],
+    /// Folder for 000.png, 001.png, … and cameras.json [default: renders, unless --raw is given].
+    #[arg(short, long, value_name = "DIR")]
+    output: Option<PathBuf>,
+    /// Also write colour, alpha and depth as f32 tensors.
+    #[arg(long, value_name = "FILE.safetensors")]
+    raw: Option<PathBuf>,
+    /// Constants of the rasteriser.
+    #[arg(long, value_enum, default_value = "inria")]
+    preset: Preset,
+    /// Keep the weight of splats smaller than a pixel.
+    #[arg(long)]
+    antialiased: bool,
+    /// auto, cpu, ndarray, wgpu, vulkan, cuda or metal; wgpu:1 is the second adapter.
+    #[arg(long, default_value = "auto")]
+    device: String,
+    /// Print what was left out and why, and the time.
+    #[arg(short, long)]
+    verbose: bool,
+}
+
+pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
+    let views = views(arguments)?;
+    let folder = match (&arguments.output, &arguments.raw) {
+        (None, Some(_)) => None,
+        (given, _) => Some(given.clone().unwrap_or_else(|| DEFAULT_FOLDER.into())),
+    };
+    if arguments.raw.is_some() {
+        check_raw(&views)?;
+    }
+    check_paths(arguments, folder.as_deref())?;
+    let device = device::choose(&arguments.device)?;
+    let start = Instant::now();
+    let loaded = ply::read(&arguments.ply, &device)?;
+    let reading = start.elapsed();
+    let (preset, antialiased) = (arguments.preset, arguments.antialiased);
+    let preset = match preset {
+        Preset::Inria => RenderOptions::inria(),
+        Preset::Gsplat => RenderOptions::gsplat_1_5(),
+    };
+    // Black costs nothing, and depth is computed for --raw only.
+    let background =
+        (arguments.background != [0.0; 3]).then(|| Tensor::<1>::from_floats(arguments.background, &device));
+    let options = RenderOptions { antialiased, background, depth: arguments.raw.is_some(), ..preset };
+
+    if let Some(folder) = &folder {
+        make_folder(folder)?;
+        let path = folder.join("cameras.json");
+        if arguments.cameras.as_ref().is_none_or(|given| !super::is_same_file(given, &path)) {
+            cameras::write(&views, &path)?;
+        }
+    }
+    let progress = Progress::steps(quiet, views.len(), "views");
+    let start = Instant::now();
+    let mut raw = Raw::default();
+    let mut counts = Vec::with_capacity(views.len());
+    for (i, camera) in views.iter().enumerate() {
+        let rendered = view(&loaded, camera, &options)?;
+        counts.push(rendered.counts);
+        if let Some(folder) = &folder {
+            write_png(&folder.join(format!("{i:03}.png")), &picture(&rendered.color))?;
+        }
+        if arguments.raw.is_some() {
+            raw.add(rendered);
+        }
+        progress.step(i + 1, views.len(), "views");
+    }
+    if let Some(path) = &arguments.raw {
+        raw.write(path, &views)?;
+    }
+    drop(progress);
+    let rendering = start.elapsed();
+    let n = loaded.gaussians.len();
+    if arguments.verbose {
+        report(n, &counts, &device);
+        say::out(&format!("reading {:.1} ms, rendering and writing {:.1} ms", ms(reading), ms(rendering)));
+    }
+    let visible = counts.iter().filter(|c| c.visible > 0).count();
+    if visible < counts.len() && !quiet {
+        let empty = counts.len() - visible;
+        say::err(&format!("warning: {empty} of {} views show no Gaussian (see --verbose)", counts.len()));
+    }
+    if !quiet {
+        let outputs: Vec<String> =
+            folder.iter().chain(&arguments.raw).map(|path| path.display().to_string()).collect();
+        say::out(&format!("{}: {} views of {n} Gaussians", outputs.join(", "), views.len()));
+    }
+    Ok(())
+}
+
+/// Renders one view, with the colours that its direction gives.
+fn view(loaded: &Loaded, camera: &Camera, options: &RenderOptions) -> Result<Rendered, Failure> {
+    let gaussians = match &loaded.harmonics {
+        None => loaded.gaussians.clone(),
+        Some(harmonics) => {
+            let colors = sh::colors(harmonics, &loaded.gaussians.means, camera)?;
+            Gaussians { colors, ..loaded.gaussians.clone() }
+        }
+    };
+    Ok(render(&gaussians, std::slice::from_ref(camera), options)?)
+}
+
+fn views(arguments: &Arguments) -> Result<Vec<Camera>, Failure> {
+    match (&arguments.cameras, arguments.orbit) {
+        (Some(path), _) => {
+            let mut views = cameras::read(path)?;
+            if let Some([width, height]) = arguments.size {
+                for (i, camera) in views.iter_mut().enumerate() {
+                    // One pixel of rounding is no other shape.
+                    let scaled = f64::from(camera.height) * f64::from(width) / f64::from(camera.width);
+                    if (scaled - f64::from(height)).abs() > 1.0 {
+                        let (w, h) = (camera.width, camera.height);
+                        let message = format!(
+                            "--size {width}x{height}: camera {i} of {} is {w}x{h}, another shape",
+                            path.display()
+                        );
+                        return Err(Failure::Input(message));
+                    }
+                    *camera = camera.resized(width, height);
+                }
+            }
+            Ok(views)
+        }
+        (None, Some(count @ 1..=100_000)) => {
+            let [width, height] = arguments.size.unwrap_or([DEFAULT_SIDE; 2]);
+            Ok(Camera::orbit(count, width, height))
+        }
+        (None, count) => {
+            let count = count.unwrap_or(0);
+            Err(Failure::Input(format!("--orbit {count}: expected 1 to 100000 views")))
+        }
+    }
+}
+
+fn check_paths(arguments: &Arguments, folder: Option<&Path>) -> Result<(), Failure> {
+    let inputs: Vec<&Path> = [Some(&arguments.ply), arguments.cameras.as_ref()]
+        .into_iter()
+        .flatten()
+        .map(PathBuf::as_path)
+        .collect();
+    if let Some(folder) = folder.filter(|folder| folder.exists() && !folder.is_dir()) {
+        return Err(Failure::Input(format!("{}: exists and is no folder", folder.display())));
+    }
+    let outputs: Vec<&Path> = arguments.raw.iter().map(PathBuf::as_path).collect();
+    check_outputs(&outputs, &inputs)
+}
+
+/// A tensor has one shape: all views must have one size.
+fn check_raw(views: &[Camera]) -> Result<(), Failure> {
+    let size = |camera: &Camera| [camera.width, camera.height];
+    let other = views.iter().position(|camera| size(camera) != size(&views[0]));
+    other.map_or(Ok(()), |i| {
+        let ([w, h], [first_w, first_h]) = (size(&views[i]), size(&views[0]));
+        let message = format!("camera {i} is {w}x{h}, camera 0 is {first_w}x{first_h}");
+        Err(Failure::Input(format!("--raw: all views must have one size; {message} (see --size)")))
+    })
+}
+
+/// Colour `[V,H,W,3]`, alpha and depth `[V,H,W]`, collected view by view.
+#[derive(Default)]
+struct Raw {
+    color: Vec<u8>,
+    alpha: Vec<u8>,
+    depth: Vec<u8>,
+}
+
+impl Raw {
+    fn add(&mut self, rendered: Rendered) {
+        let depth = rendered.depth.expect("asked for together with --raw");
+        append(&mut self.color, rendered.color.reshape([-1]));
+        append(&mut self.alpha, rendered.alpha.reshape([-1]));
+        append(&mut self.depth, depth.reshape([-1]));
+    }
+
+    fn write(&self, path: &Path, views: &[Camera]) -> Result<(), Failure> {
+        let [v, h, w] = [views.len(), views[0].height as usize, views[0].width as usize];
+        let tensor = |shape: &[usize], bytes| {
+            TensorView::new(Dtype::F32, shape.to_vec(), bytes).expect("as many bytes as the shape says")
+        };
+        let tensors = [
+            ("color", tensor(&[v, h, w, 3], &self.color)),
+            ("alpha", tensor(&[v, h, w], &self.alpha)),
+            ("depth", tensor(&[v, h, w], &self.depth)),
+        ];
+        let bytes = safetensors::serialize(tensors, None).expect("valid tensors");
+        file::write_whole(path, |out| std::io::Write::write_all(out, &bytes))
+            .map_err(|e| Failure::Input(format!("{}: cannot write: {e}", path.display())))
+    }
+}
+
+fn append(bytes: &mut Vec<u8>, tensor: Tensor<1>) {
+    let values: Vec<f32> = tensor.into_data().try_into_vec().expect("renders are f32");
+    bytes.extend(values.iter().flat_map(|v| v.to_le_bytes()));
+}
+
+/// One of the counts.
+type Field = fn(&Counts) -> u64;
+
+fn report(n: usize, counts: &[Counts], device: &Device) {
+    say::out(&format!("device: {}", device::describe(device)));
+    let mean = |count: fn(&Counts) -> u64| counts.iter().map(count).sum::<u64>() as f64 / counts.len() as f64;
+    say::out(&format!("{n} Gaussians; per view, on average:"));
+    let lines: [(&str, Field); 7] = [
+        ("visible", |c| c.visible),
+        ("left out: before the near plane", |c| c.near),
+        ("left out: outside the picture", |c| c.outside),
+        ("left out: transparent", |c| c.transparent),
+        ("left out: degenerate", |c| c.degenerate),
+        ("left out: not finite or huge", |c| c.invalid),
+        ("pairs of a splat and a tile", |c| c.intersections),
+    ];
+    for (name, count) in lines {
+        say::out(&format!("  {name:<34} {:>12.1}", mean(count)));
+    }
+}
+
+fn ms(time: std::time::Duration) -> f64 {
+    time.as_secs_f64() * 1e3
+}
+
+fn size(text: &str) -> Result<[u32; 2], String> {
+    let side = |text: &str| text.trim().parse::<u32>().ok().filter(|side| (1..=MAX_SIDE).contains(side));
+    let sides = text.split_once(['x', 'X']).and_then(|(w, h)| Some([side(w)?, side(h)?]));
+    sides.ok_or_else(|| format!("expected WIDTHxHEIGHT, each from 1 to {MAX_SIDE} pixels"))
+}
+
+fn color(text: &str) -> Result<[f32; 3], String> {
+    let channel = |text: &str| text.trim().parse::<f32>().ok().filter(|c| (0.0..=1.0).contains(c));
+    let channels: Option<Vec<f32>> = text.split(',').map(channel).collect();
+    channels
+        .and_then(|channels| channels.try_into().ok())
+        .ok_or_else(|| "expected three numbers from 0 to 1, for example 1,1,1".into())
+}

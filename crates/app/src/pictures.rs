@@ -1,0 +1,74 @@
+//! Rendered views as picture files.
+
+use std::fs;
+use std::io::Cursor;
+use std::path::Path;
+
+use burn::tensor::Tensor;
+use image::codecs::gif::{GifEncoder, Repeat};
+use image::{Delay, Frame, ImageFormat, RgbImage, RgbaImage, imageops};
+use snapsnap_splat::file;
+
+use crate::failure::Failure;
+
+/// Speed of the search for a GIF's colours: 1 is best, 30 fastest.
+const GIF_SPEED: i32 = 10;
+
+/// The first view of colours `[V,H,W,3]`, clamped to [0, 1], in 8 bits.
+pub fn picture(color: &Tensor<4>) -> RgbImage {
+    let [_, height, width, _] = color.dims();
+    let values: Vec<f32> = color.clone().narrow(0, 0, 1).into_data().try_into_vec().expect("renders are f32");
+    let bytes = values.iter().map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
+    RgbImage::from_raw(width as u32, height as u32, bytes).expect("three bytes per pixel")
+}
+
+/// Writes a PNG, whole or not at all.
+pub fn write_png(path: &Path, picture: &RgbImage) -> Result<(), Failure> {
+    let mut bytes = Cursor::new(Vec::new());
+    picture.write_to(&mut bytes, ImageFormat::Png).map_err(|e| failed(path, &e))?;
+    write(path, &bytes.into_inner())
+}
+
+/// Writes an endless animation, whole or not at all.
+pub fn write_gif(path: &Path, pictures: &[RgbImage], frames_per_second: u32) -> Result<(), Failure> {
+    let mut bytes = Vec::new();
+    let mut encoder = GifEncoder::new_with_speed(&mut bytes, GIF_SPEED);
+    encoder.set_repeat(Repeat::Infinite).map_err(|e| failed(path, &e))?;
+    for picture in pictures {
+        let rgba = RgbaImage::from_fn(picture.width(), picture.height(), |x, y| {
+            let [r, g, b] = picture.get_pixel(x, y).0;
+            image::Rgba([r, g, b, 255])
+        });
+        let delay = Delay::from_numer_denom_ms(1000, frames_per_second);
+        encoder.encode_frame(Frame::from_parts(rgba, 0, 0, delay)).map_err(|e| failed(path, &e))?;
+    }
+    drop(encoder);
+    write(path, &bytes)
+}
+
+/// Pictures of one size side by side, so many in a row.
+pub fn sheet(pictures: &[RgbImage], columns: u32) -> RgbImage {
+    let (width, height) = pictures.first().map_or((0, 0), RgbImage::dimensions);
+    let rows = (pictures.len() as u32).div_ceil(columns);
+    let mut sheet = RgbImage::new(width * columns, height * rows);
+    for (i, picture) in (0..).zip(pictures) {
+        let (x, y) = (i64::from(i % columns * width), i64::from(i / columns * height));
+        imageops::replace(&mut sheet, picture, x, y);
+    }
+    sheet
+}
+
+/// Makes the folder `path` and those around it, unless it is there.
+pub fn make_folder(path: &Path) -> Result<(), Failure> {
+    fs::create_dir_all(path)
+        .map_err(|e| Failure::Input(format!("{}: cannot make this folder: {e}", path.display())))
+}
+
+fn write(path: &Path, bytes: &[u8]) -> Result<(), Failure> {
+    file::write_whole(path, |out| std::io::Write::write_all(out, bytes))
+        .map_err(|e| Failure::Input(format!("{}: cannot write: {e}", path.display())))
+}
+
+fn failed(path: &Path, e: &image::ImageError) -> Failure {
+    Failure::Internal(format!("{}: cannot encode: {e}", path.display()))
+}
