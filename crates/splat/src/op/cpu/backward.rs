@@ -4,7 +4,7 @@ use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
 
 use super::super::job::{Job, Wanted};
-use super::lanes::{Lanes, row, rows};
+use super::lanes::{BATCH, Lanes, fetch, row, rows};
 use super::splats::{Splat, parameters, projection};
 use super::{Scene, State, ViewState};
 use crate::options::{MIN_ALPHA, TILE};
@@ -184,29 +184,32 @@ impl Band<'_> {
         let first =
             (self.view.lists.starts[tile] - self.view.lists.starts[self.y * self.job.tiles_x()]) as usize;
         let (left, top) = ((x * TILE) as f32, self.y * TILE);
-        for n in (0..visited).rev() {
-            let splat = &self.view.splats[list[n] as usize];
-            let mut sums = Sums {
-                color: [[0.0; TILE]; 3],
-                alpha: [0.0; TILE],
-                first: [[0.0; TILE]; 2],
-                second: [[0.0; TILE]; 3],
-                depth: [0.0; TILE],
-            };
-            for y in rows(splat, top) {
-                take_off::<SHAPE, DEPTH>(
-                    &mut p,
-                    &mut sums,
-                    splat,
-                    n as u32,
-                    left,
-                    top,
-                    y,
-                    self.job.max_alpha,
-                );
+        let mut batch = [Splat::default(); BATCH];
+        for (begin, entries) in (0..visited).step_by(BATCH).zip(list[..visited].chunks(BATCH)).rev() {
+            fetch(&self.view.splats, entries, &mut batch);
+            for (n, splat) in (begin..begin + entries.len()).zip(&batch).rev() {
+                let mut sums = Sums {
+                    color: [[0.0; TILE]; 3],
+                    alpha: [0.0; TILE],
+                    first: [[0.0; TILE]; 2],
+                    second: [[0.0; TILE]; 3],
+                    depth: [0.0; TILE],
+                };
+                for y in rows(splat, top) {
+                    take_off::<SHAPE, DEPTH>(
+                        &mut p,
+                        &mut sums,
+                        splat,
+                        n as u32,
+                        left,
+                        top,
+                        y,
+                        self.job.max_alpha,
+                    );
+                }
+                let at = (first + n) * self.record.len;
+                write(&sums, splat, self.record, &mut self.records[at..at + self.record.len]);
             }
-            let at = (first + n) * self.record.len;
-            write(&sums, splat, self.record, &mut self.records[at..at + self.record.len]);
         }
     }
 

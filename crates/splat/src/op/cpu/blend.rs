@@ -4,7 +4,7 @@ use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
 
 use super::super::job::Job;
-use super::lanes::{Lanes, row, rows};
+use super::lanes::{BATCH, Lanes, fetch, row, rows};
 use super::{ViewState, splats::Splat, tiles::Lists};
 use crate::options::{MIN_ALPHA, MIN_TRANSMITTANCE, TILE};
 
@@ -121,12 +121,15 @@ impl Band<'_> {
         }
         let mut rows_alive = height;
         let (left, top) = ((x * TILE) as f32, self.y * TILE);
-        for (n, &entry) in list.iter().enumerate() {
-            let splat = &self.splats[entry as usize];
-            for y in rows(splat, top) {
-                if p.alive[y] && add::<DEPTH>(&mut p, splat, n as u32 + 1, left, top, y, self.job.max_alpha) {
-                    p.alive[y] = p.open[y].iter().any(|&t| t > 0.0);
-                    rows_alive -= usize::from(!p.alive[y]);
+        let mut batch = [Splat::default(); BATCH];
+        for (first, entries) in (0..).step_by(BATCH).zip(list.chunks(BATCH)) {
+            fetch(self.splats, entries, &mut batch);
+            for (n, splat) in (first + 1..).zip(&batch[..entries.len()]) {
+                for y in rows(splat, top) {
+                    if p.alive[y] && add::<DEPTH>(&mut p, splat, n, left, top, y, self.job.max_alpha) {
+                        p.alive[y] = p.open[y].iter().any(|&t| t > 0.0);
+                        rows_alive -= usize::from(!p.alive[y]);
+                    }
                 }
             }
             if rows_alive == 0 {

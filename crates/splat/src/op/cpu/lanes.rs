@@ -72,6 +72,18 @@ pub fn row(splat: &Splat, left: f32, y: f32) -> Row {
     row
 }
 
+/// Splats that [`fetch`] copies at once.
+pub const BATCH: usize = 64;
+
+/// Copies the splats of `entries` side by side. They lie all over a large array; loads that nothing waits for overlap,
+/// one after another they would each take the whole way to memory.
+#[inline(always)]
+pub fn fetch(splats: &[Splat], entries: &[u32], batch: &mut [Splat; BATCH]) {
+    for (slot, &entry) in batch.iter_mut().zip(entries) {
+        *slot = splats[entry as usize];
+    }
+}
+
 /// First and last row of the tile that starts at image row `top` within the splat's reach.
 #[inline(always)]
 pub fn rows(splat: &Splat, top: usize) -> std::ops::RangeInclusive<usize> {

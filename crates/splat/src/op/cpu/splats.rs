@@ -11,7 +11,7 @@ use crate::vjp::{Projection, Quat, Vec3, View, footprint, project, to_camera};
 const CHUNK: usize = 4096;
 
 /// A visible Gaussian as the tiles and pixels of one view see it. One cache line.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Default)]
 #[repr(C, align(64))]
 pub struct Splat {
     /// Centre, pixels.
