@@ -120,6 +120,49 @@ fn two_pictures_become_a_finite_ply_with_config_and_plan() {
 }
 
 #[test]
+fn turntables_are_animations_sheets_and_folders() {
+    let place = Workplace::new();
+    for name in ["turn.gif", "turn.png", "turn"] {
+        let printed = succeed(place.reconstruct("front.png", "back.png").args(["-v", "--turntable", name]));
+        assert!(printed.contains("turntable"), "{printed}");
+    }
+    let gif = fs::read(place.path("turn.gif")).expect("animation");
+    assert!(gif.starts_with(b"GIF89a"));
+    let frames = image::codecs::gif::GifDecoder::new(std::io::Cursor::new(gif)).expect("a GIF");
+    let frames = image::AnimationDecoder::into_frames(frames).collect_frames().expect("frames");
+    assert_eq!(frames.len(), 40);
+    assert_eq!(frames[0].buffer().dimensions(), (512, 512));
+    assert!(frames[0].buffer().pixels().any(|p| p.0[..3] != [0, 0, 0]), "the blob is seen");
+    assert!(frames[0].buffer() != frames[10].buffer(), "it turns");
+    let sheet = image::open(place.path("turn.png")).expect("sheet").into_rgb8();
+    assert_eq!(sheet.dimensions(), (2048, 1024));
+    assert!(place.path("turn/039.png").exists() && place.path("turn/cameras.json").exists());
+    // The folder's pictures are what `render` makes of the PLY.
+    let cameras = ["render", "human.ply", "--cameras", "turn/cameras.json", "-o", "again", "--device", "cpu"];
+    succeed(snapsnap().current_dir(place.0.path()).args(cameras));
+    let [a, b] =
+        ["turn/007.png", "again/007.png"].map(|p| image::open(place.path(p)).expect("PNG").into_rgb8());
+    let far = a.as_raw().iter().zip(b.as_raw()).filter(|(a, b)| a.abs_diff(**b) > 2).count();
+    assert!(far * 1000 < a.as_raw().len(), "{far} values differ");
+}
+
+#[test]
+fn unsuitable_turntables_are_refused_before_any_work() {
+    let place = Workplace::new();
+    fs::write(place.path("file"), "").expect("written");
+    for (name, expected) in [
+        ("turn.mp4", "is a .gif, a .png or a folder"),
+        ("file", "exists and is no folder"),
+        ("no/turn.gif", "cannot write"),
+        ("front.png", "would be overwritten"),
+        ("human.ply", "two outputs"),
+    ] {
+        let message = place.refusal(place.reconstruct("front.png", "back.png").args(["--turntable", name]));
+        assert!(message.contains(expected), "{name}: {message}");
+    }
+}
+
+#[test]
 fn background_pixels_change_nothing() {
     let place = Workplace::new();
     person(200, 320, 1, 17).save(place.path("other.png")).expect("PNG");

@@ -33,7 +33,17 @@ fn main() -> ExitCode {
 
 fn test(filter: &[String]) -> bool {
     let all = ["test", "--release", "--workspace", "--no-fail-fast"];
-    let numerical = ["--test", "networks", "--test", "pipeline", "--test", "properties"];
+    let numerical = [
+        "networks",
+        "pipeline",
+        "properties",
+        "splat_fit",
+        "splat_fixtures",
+        "splat_invariants",
+        "splat_oracle",
+    ]
+    .into_iter()
+    .flat_map(|suite| ["--test", suite]);
     let filter = || ["--"].into_iter().chain(filter.iter().map(String::as_str));
     // Output is shown so that skipped tests are seen with their reasons.
     let show = ["--show-output"];
@@ -42,7 +52,7 @@ fn test(filter: &[String]) -> bool {
         let mut command = cargo(&all);
         passed &= succeeds(
             device,
-            command.args(numerical).args(filter()).args(show).env("SNAPSNAP_TEST_DEVICE", device),
+            command.args(numerical.clone()).args(filter()).args(show).env("SNAPSNAP_TEST_DEVICE", device),
         );
     }
     passed

@@ -1,0 +1,441 @@
+//! `snapsnap render` and PLY files as a user has them.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use burn::tensor::{Device, Tensor};
+use snapsnap_splat::{Camera, Gaussians, RenderOptions, cameras, ply, render, sh};
+use snapsnap_tests::scenes::Random;
+use snapsnap_tests::{Numbers, refused, snapsnap, succeed, values};
+
+/// A Gaussian's numbers by property name, as text.
+type Row = Vec<(String, f64)>;
+
+/// A person-sized cloud in the files' own terms (logits, logarithms, SH coefficients).
+fn cloud(n: usize, degree: usize) -> Vec<Row> {
+    let mut random = Random(4);
+    let mut between = |low: f32, high: f32| f64::from(random.between(low, high));
+    let rest = 3 * ((degree + 1) * (degree + 1) - 1);
+    (0..n)
+        .map(|_| {
+            let mut row: Row = Vec::new();
+            let mut put = |name: &str, value: f64| row.push((name.to_owned(), f64::from(value as f32)));
+            put("x", between(-0.3, 0.3));
+            put("y", between(0.0, 1.8));
+            put("z", between(-0.2, 0.2));
+            for axis in ["nx", "ny", "nz"] {
+                put(axis, 0.0);
+            }
+            for c in 0..3 {
+                put(&format!("f_dc_{c}"), between(-1.0, 1.5));
+            }
+            for i in 0..rest {
+                put(&format!("f_rest_{i}"), between(-0.3, 0.3));
+            }
+            put("opacity", between(-1.0, 8.0));
+            for c in 0..3 {
+                put(&format!("scale_{c}"), between(-5.0, -3.5));
+            }
+            for c in 0..4 {
+                put(&format!("rot_{c}"), between(-1.0, 1.0));
+            }
+            row
+        })
+        .collect()
+}
+
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Format {
+    Ascii,
+    Little,
+    Big,
+    /// Doubles in little-endian order.
+    Double,
+}
+
+/// A PLY file of these rows, in `format`, with `before` in the header ahead of the vertices and `prefix` in the body.
+fn ply_bytes(rows: &[Row], format: Format, before: &str, prefix: &[u8]) -> Vec<u8> {
+    let name = match format {
+        Format::Ascii => "ascii",
+        Format::Big => "binary_big_endian",
+        Format::Little | Format::Double => "binary_little_endian",
+    };
+    let kind = if format == Format::Double { "double" } else { "float" };
+    let mut bytes =
+        format!("ply\nformat {name} 1.0\ncomment test\n{before}element vertex {}\n", rows.len()).into_bytes();
+    for (property, _) in rows.first().into_iter().flatten() {
+        bytes.extend(format!("property {kind} {property}\n").bytes());
+    }
+    bytes.extend(b"end_header\n");
+    bytes.extend(prefix);
+    for row in rows {
+        for (_, value) in row {
+            match format {
+                Format::Ascii => bytes.extend(format!("{value} ").bytes()),
+                Format::Little => bytes.extend((*value as f32).to_le_bytes()),
+                Format::Big => bytes.extend((*value as f32).to_be_bytes()),
+                Format::Double => bytes.extend(value.to_le_bytes()),
+            }
+        }
+        if format == Format::Ascii {
+            bytes.push(b'\n');
+        }
+    }
+    bytes
+}
+
+struct Place(tempfile::TempDir);
+
+impl Place {
+    fn new() -> Self {
+        Self(tempfile::tempdir().expect("temporary folder"))
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.0.path().join(name)
+    }
+
+    fn file(&self, name: &str, bytes: &[u8]) -> PathBuf {
+        let path = self.path(name);
+        fs::write(&path, bytes).expect("written");
+        path
+    }
+
+    /// `render` in this folder on the CPU.
+    fn render(&self, arguments: &[&str]) -> Command {
+        let mut command = snapsnap();
+        command.current_dir(self.0.path()).args(["render", "--device", "cpu"]).args(arguments);
+        command
+    }
+
+    fn files(&self) -> Vec<String> {
+        let mut names: Vec<String> = fs::read_dir(self.0.path())
+            .expect("list")
+            .map(|e| e.expect("entry").file_name().to_string_lossy().into_owned())
+            .collect();
+        names.sort();
+        names
+    }
+}
+
+fn picture(path: &Path) -> image::RgbImage {
+    image::open(path).unwrap_or_else(|e| panic!("{}: {e}", path.display())).into_rgb8()
+}
+
+/// All formats, properties in another order, extra properties and elements: the same tensors.
+#[test]
+fn every_layout_of_one_cloud_is_the_same_cloud() {
+    let place = Place::new();
+    let device = Device::flex();
+    for degree in 0..=3 {
+        let rows = cloud(50, degree);
+        let read = |name: &str, bytes: &[u8]| {
+            let loaded =
+                ply::read(&place.file(name, bytes), &device).unwrap_or_else(|e| panic!("{name}: {e}"));
+            let g = loaded.gaussians;
+            let mut all = vec![
+                values(g.means),
+                values(g.rotations),
+                values(g.scales),
+                values(g.colors),
+                values(g.opacities),
+            ];
+            assert_eq!(loaded.harmonics.is_some(), degree > 0);
+            all.extend(loaded.harmonics.map(values));
+            all
+        };
+        let expected = read("little.ply", &ply_bytes(&rows, Format::Little, "", b""));
+        for format in [Format::Ascii, Format::Big, Format::Double] {
+            let name = format!("{format:?}.ply");
+            assert!(read(&name, &ply_bytes(&rows, format, "", b"")) == expected, "{name}, degree {degree}");
+        }
+        let mut other = rows.clone();
+        for row in &mut other {
+            row.retain(|(name, _)| !name.starts_with('n'));
+            row.reverse();
+            row.insert(3, ("weight".into(), 17.0));
+        }
+        assert!(read("other.ply", &ply_bytes(&other, Format::Big, "", b"")) == expected, "degree {degree}");
+        // A list ahead of the vertices: two faces, of 3 and 1 corners.
+        let faces = "element face 2\nproperty list uchar int vertex_indices\n";
+        let mut prefix = vec![3];
+        prefix.extend([7_i32, 8, 9].iter().flat_map(|v| v.to_be_bytes()));
+        prefix.push(1);
+        prefix.extend(5_i32.to_be_bytes());
+        assert!(read("faces.ply", &ply_bytes(&rows, Format::Big, faces, &prefix)) == expected);
+        let lines = b"3 7 8 9\n1 5\n";
+        assert!(read("lines.ply", &ply_bytes(&rows, Format::Ascii, faces, lines)) == expected);
+
+        // And the numbers are what they should be.
+        let row = |name: &str| rows[7].iter().find(|(n, _)| n == name).expect(name).1 as f32;
+        assert_eq!(expected[0][21..24], ["x", "y", "z"].map(row));
+        assert_eq!(expected[1][28..32], ["rot_0", "rot_1", "rot_2", "rot_3"].map(row));
+        assert_eq!(expected[2][21..24], ["scale_0", "scale_1", "scale_2"].map(|n| row(n).exp()));
+        assert_eq!(expected[4][7], 1.0 / (1.0 + (-row("opacity")).exp()));
+        if degree > 0 {
+            let k = (degree + 1) * (degree + 1);
+            // Coefficient 2 of green: the second of green's block.
+            assert_eq!(expected[5][(7 * k + 2) * 3 + 1], row(&format!("f_rest_{}", k - 1 + 1)));
+            assert_eq!(expected[5][7 * k * 3 + 2], row("f_dc_2"));
+        }
+    }
+}
+
+#[test]
+fn what_is_written_is_read_again() {
+    let place = Place::new();
+    let device = Device::flex();
+    let loaded =
+        ply::read(&place.file("in.ply", &ply_bytes(&cloud(300, 0), Format::Little, "", b"")), &device);
+    let first = loaded.expect("read").gaussians;
+    ply::write(&first, &place.path("out.ply")).expect("written");
+    let second = ply::read(&place.path("out.ply"), &device).expect("read").gaussians;
+    let close =
+        |a: Vec<f32>, b: Vec<f32>| a.iter().zip(&b).all(|(a, b)| (a - b).abs() <= 2e-6 * (1.0 + b.abs()));
+    assert_eq!(values(first.means), values(second.means));
+    assert_eq!(values(first.rotations), values(second.rotations));
+    assert!(close(values(first.scales), values(second.scales)));
+    assert!(close(values(first.opacities), values(second.opacities)));
+    assert!(close(values(first.colors), values(second.colors)));
+}
+
+#[test]
+fn an_orbit_gives_pictures_cameras_and_raw_tensors() {
+    let place = Place::new();
+    let path = place.file("in.ply", &ply_bytes(&cloud(3000, 2), Format::Little, "", b""));
+    let orbit = [
+        "in.ply",
+        "--orbit",
+        "3",
+        "--size",
+        "80x64",
+        "--background",
+        "0.2,0.4,1",
+        "-o",
+        "out",
+        "--raw",
+        "raw",
+    ];
+    let printed = succeed(place.render(&orbit).arg("-v"));
+    assert!(printed.contains("3 views of 3000 Gaussians") && printed.contains("visible"), "{printed}");
+
+    // The library, asked directly.
+    let device = Device::flex();
+    let views = Camera::orbit(3, 80, 64);
+    let loaded = ply::read(&path, &device).expect("read");
+    let background = Some(Tensor::<1>::from_floats([0.2, 0.4, 1.0], &device));
+    let options = RenderOptions { depth: true, background, ..RenderOptions::inria() };
+    let raw = Numbers::read(&place.path("raw"));
+    assert_eq!(raw.f32("color").0, [3, 64, 80, 3]);
+    assert_eq!(raw.f32("alpha").0, [3, 64, 80]);
+    assert_eq!(raw.f32("depth").0, [3, 64, 80]);
+    for (i, camera) in views.iter().enumerate() {
+        let harmonics = loaded.harmonics.as_ref().expect("degree 2");
+        let colors = sh::colors(harmonics, &loaded.gaussians.means, camera).expect("colours");
+        let gaussians = Gaussians { colors, ..loaded.gaussians.clone() };
+        let rendered = render(&gaussians, std::slice::from_ref(camera), &options).expect("rendered");
+        let color = values(rendered.color);
+        assert!(raw.f32("color").1[i * color.len()..][..color.len()] == color);
+        let depth = values(rendered.depth.expect("asked for"));
+        assert!(raw.f32("depth").1[i * depth.len()..][..depth.len()] == depth);
+        assert!(depth.iter().any(|d| *d > 1.0));
+        let picture = picture(&place.path(&format!("out/{i:03}.png")));
+        assert_eq!(picture.dimensions(), (80, 64));
+        let bytes: Vec<u8> = color.iter().map(|c| (c.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
+        assert!(picture.as_raw() == &bytes);
+        assert_eq!(picture.get_pixel(0, 0).0, [51, 102, 255]);
+    }
+
+    // The cameras it wrote give the same pictures, and fit another size of the same shape.
+    succeed(&mut place.render(&[
+        "in.ply",
+        "--cameras",
+        "out/cameras.json",
+        "--background",
+        "0.2,0.4,1",
+        "-o",
+        "again",
+    ]));
+    assert_eq!(
+        fs::read(place.path("out/002.png")).expect("old"),
+        fs::read(place.path("again/002.png")).expect("new")
+    );
+    succeed(&mut place.render(&[
+        "in.ply",
+        "--cameras",
+        "out/cameras.json",
+        "--size",
+        "40x32",
+        "-o",
+        "small",
+    ]));
+    assert_eq!(picture(&place.path("small/000.png")).dimensions(), (40, 32));
+    // Without --raw's name for a folder, nothing but the raw file.
+    succeed(&mut place.render(&["in.ply", "--orbit", "1", "--size", "8x8", "--raw", "only"]));
+    assert!(!place.files().contains(&"renders".to_owned()));
+    succeed(&mut place.render(&["in.ply", "--orbit", "1", "--size", "8x8"]));
+    assert!(place.path("renders/000.png").exists());
+}
+
+#[test]
+fn presets_change_what_is_seen() {
+    let place = Place::new();
+    place.file("in.ply", &ply_bytes(&cloud(500, 0), Format::Little, "", b""));
+    let render = |more: &[&str], out: &str| {
+        succeed(
+            place.render(&["in.ply", "--orbit", "1", "--size", "48x48", "--quiet", "--raw", out]).args(more),
+        );
+        Numbers::read(&place.path(out)).f32("alpha").1
+    };
+    let plain = render(&[], "a");
+    assert!(plain != render(&["--preset", "gsplat"], "b"));
+    assert!(plain != render(&["--antialiased"], "c"));
+    assert!(plain == render(&["--preset", "inria"], "d"));
+}
+
+#[test]
+fn unsuitable_files_and_arguments_are_refused_by_name() {
+    let place = Place::new();
+    let rows = cloud(20, 1);
+    let good = ply_bytes(&rows, Format::Little, "", b"");
+    place.file("good.ply", &good);
+    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+    let header_end = text(&good).find("end_header").expect("header");
+    let mut case = |bytes: &[u8], expected: &[&str]| {
+        place.file("bad.ply", bytes);
+        let before = place.files();
+        let message = refused(&mut place.render(&["bad.ply", "--orbit", "1", "--size", "8x8"]));
+        for part in expected.iter().chain(&["bad.ply"]) {
+            assert!(message.contains(part), "{part}: {message}");
+        }
+        assert_eq!(place.files(), before);
+    };
+    case(b"", &["not a PLY"]);
+    case(b"solid cube", &["not a PLY"]);
+    case(b"\x89PNG\r\n\x1a\n", &["not a PLY"]);
+    case(&good[..30], &["end_header"]);
+    case(&good[..good.len() - 1], &["20 vertices", "ends too early"]);
+    case(&good[..header_end + 11], &["ends too early"]);
+    let header = |from: &str, to: &str| {
+        let mut bytes = text(&good[..header_end]).replace(from, to).into_bytes();
+        bytes.extend(&good[header_end..]);
+        bytes
+    };
+    case(&header("vertex 20", "vertex 1000000000000"), &["1000000000000 vertices"]);
+    case(&header("vertex 20", "vertex 99999999999999999999999"), &["header line 4", "not a whole number"]);
+    case(&header("vertex 20", "vertex -1"), &["not a whole number"]);
+    case(&header("vertex 20", "points 20"), &["no element `vertex`"]);
+    case(&header("float opacity", "float transparency"), &["no property `opacity`"]);
+    case(&header("float f_rest_8", "float g_rest_8"), &["8 properties `f_rest_*`"]);
+    case(&header("float f_rest_8", "float f_rest_9"), &["no property `f_rest_8`"]);
+    case(&header("float x", "quad x"), &["header line 5", "no such type"]);
+    case(&header("float x", "list uchar float x"), &["list, `x`"]);
+    case(&header("binary_little_endian", "binary_middle_endian"), &["binary_middle_endian"]);
+    case(&header("format binary_little_endian 1.0\n", ""), &["no format"]);
+    case(&header("comment test", "nonsense"), &["header line 3", "not understood"]);
+    case(&header("comment test", "property float x"), &["no element before it"]);
+    // Far more than the file has, in an element that is skipped.
+    let skipped = "element vertex 20";
+    let lists = "element face 4000000000\nproperty list uchar int i\nelement vertex 20";
+    case(&header(skipped, lists), &["element `face`"]);
+    case(
+        &header(skipped, "element junk 9000000000000000000\nproperty double a\nelement vertex 20"),
+        &["element `junk`"],
+    );
+    let ascii = text(&ply_bytes(&rows, Format::Ascii, "", b""));
+    case(ascii.replace("vertex 20", "vertex 21").as_bytes(), &["21 vertices", "20 are there"]);
+    case(ascii.replace("vertex 20", "vertex 1000000000").as_bytes(), &["1000000000 vertices"]);
+    let last = ascii.trim_end().rfind(' ').expect("numbers");
+    case(&ascii.as_bytes()[..last], &["vertex 19", "values, expected 26"]);
+    case(format!("{} zero\n", &ascii[..last]).as_bytes(), &["vertex 19: `rot_3` is `zero`"]);
+
+    place.file("folder", b"");
+    place.file("wide.json", br#"[{"width":8,"height":4,"fx":9,"fy":9,"cx":4,"cy":2,"world_to_camera":[[1,0,0,0],[0,1,0,0],[0,0,1,2],[0,0,0,1]]},{"width":4,"height":4,"fx":9,"fy":9,"cx":4,"cy":2,"world_to_camera":[[1,0,0,0],[0,1,0,0],[0,0,1,2],[0,0,0,1]]}]"#);
+    let before = place.files();
+    let long = ["--orbit", "1", "--size"];
+    for (arguments, expected) in [
+        (vec!["missing.ply", "--orbit", "1"], "missing.ply"),
+        (vec!["good.ply"], "--cameras"),
+        (vec!["good.ply", "--orbit", "1", "--cameras", "wide.json"], "cannot be used with"),
+        (vec!["good.ply", "--orbit", "0"], "--orbit 0"),
+        (vec!["good.ply", "--cameras", "missing.json"], "missing.json"),
+        (vec!["good.ply", "--cameras", "good.ply"], "good.ply"),
+        (vec!["good.ply", "--cameras", "wide.json", "--size", "8x8"], "another shape"),
+        (vec!["good.ply", "--cameras", "wide.json", "--raw", "r"], "one size"),
+        ([&["good.ply"], &long[..], &["8"]].concat(), "WIDTHxHEIGHT"),
+        ([&["good.ply"], &long[..], &["0x8"]].concat(), "WIDTHxHEIGHT"),
+        ([&["good.ply"], &long[..], &["8x99999"]].concat(), "32768"),
+        (vec!["good.ply", "--orbit", "1", "--background", "1,1"], "three numbers"),
+        (vec!["good.ply", "--orbit", "1", "--background", "1,1,nan"], "three numbers"),
+        (vec!["good.ply", "--orbit", "1", "--raw", "good.ply"], "would be overwritten"),
+        (vec!["good.ply", "--orbit", "1", "--raw", "no/raw"], "no/raw"),
+        (vec!["good.ply", "--orbit", "1", "-o", "folder"], "is no folder"),
+    ] {
+        let message = refused(&mut place.render(&arguments));
+        assert!(message.contains(expected), "{arguments:?}: {message}");
+        assert_eq!(place.files(), before, "{arguments:?}");
+    }
+}
+
+/// Values that are not finite in a file are counted and left out.
+#[test]
+fn poisoned_files_still_render() {
+    let place = Place::new();
+    let mut rows = cloud(40, 0);
+    for (i, value) in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY].into_iter().enumerate() {
+        rows[i][0].1 = value;
+        rows[i + 3][9].1 = value;
+        rows[i + 6][10].1 = value;
+    }
+    place.file("in.ply", &ply_bytes(&rows, Format::Little, "", b""));
+    let printed =
+        succeed(&mut place.render(&["in.ply", "--orbit", "1", "--size", "64x64", "--raw", "raw", "-v"]));
+    // Opacity ±∞ is 1 and 0, scale −∞ is 0: those are no poison.
+    assert!(
+        printed.lines().any(|l| l.contains("not finite or huge") && l.trim_end().ends_with(" 6.0")),
+        "{printed}"
+    );
+    assert!(Numbers::read(&place.path("raw")).f32("color").1.iter().all(|c| c.is_finite()));
+}
+
+#[test]
+fn views_that_show_nothing_are_said_aloud() {
+    let place = Place::new();
+    let mut rows = cloud(10, 0);
+    rows.iter_mut().for_each(|row| row[0].1 = 1e6);
+    place.file("in.ply", &ply_bytes(&rows, Format::Little, "", b""));
+    let output = place.render(&["in.ply", "--orbit", "2", "--size", "8x8"]).output().expect("started");
+    assert!(output.status.success());
+    let message = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(message.contains("2 of 2 views show no Gaussian"), "{message}");
+    // A file without Gaussians is a picture of the background.
+    let mut empty = ply_bytes(&rows, Format::Little, "", b"");
+    let header = String::from_utf8_lossy(&empty).find("end_header").expect("header") + 11;
+    empty.truncate(header);
+    let empty = String::from_utf8(empty).expect("header").replace("vertex 10", "vertex 0");
+    place.file("empty.ply", empty.as_bytes());
+    succeed(&mut place.render(&[
+        "empty.ply",
+        "--orbit",
+        "1",
+        "--size",
+        "8x8",
+        "--background",
+        "1,0,0",
+        "-o",
+        "empty",
+    ]));
+    assert!(picture(&place.path("empty/000.png")).pixels().all(|p| p.0 == [255, 0, 0]));
+}
+
+/// The renders of Gaussians written to a PLY and read again are those of the Gaussians.
+#[test]
+fn cameras_files_are_the_fixtures_format() {
+    let place = Place::new();
+    cameras::write(&Camera::orbit(2, 30, 20), &place.path("c.json")).expect("written");
+    let text = fs::read_to_string(place.path("c.json")).expect("read");
+    for key in ["width", "height", "fx", "fy", "cx", "cy", "world_to_camera"] {
+        assert!(text.contains(&format!("\"{key}\"")), "{key}: {text}");
+    }
+}
