@@ -302,7 +302,7 @@ fn unsuitable_files_and_arguments_are_refused_by_name() {
     place.file("good.ply", &good);
     let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
     let header_end = text(&good).find("end_header").expect("header");
-    let mut case = |bytes: &[u8], expected: &[&str]| {
+    let case = |bytes: &[u8], expected: &[&str]| {
         place.file("bad.ply", bytes);
         let before = place.files();
         let message = refused(&mut place.render(&["bad.ply", "--orbit", "1", "--size", "8x8"]));

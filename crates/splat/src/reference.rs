@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use crate::options::{MIN_ALPHA, MIN_TRANSMITTANCE};
 use crate::{Camera, RenderOptions};
 
-/// What the oracle computes with: f64, or f64 with derivatives.
+/// What the oracle computes with: f64, f64 with derivatives, or f32 for comparison.
 pub trait Number:
     Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> + Div<Output = Self> + Neg<Output = Self>
 {
@@ -40,6 +40,25 @@ impl Number for f64 {
 
     fn sqrt(self) -> Self {
         f64::sqrt(self)
+    }
+}
+
+/// Only to show what the plain formulas reach in single precision.
+impl Number for f32 {
+    fn new(value: f64) -> Self {
+        value as f32
+    }
+
+    fn value(self) -> f64 {
+        f64::from(self)
+    }
+
+    fn exp(self) -> Self {
+        f32::exp(self)
+    }
+
+    fn sqrt(self) -> Self {
+        f32::sqrt(self)
     }
 }
 
