@@ -28,6 +28,26 @@ pub struct Rendered {
 /// the backward pass. On the CPU and on the GPU, equal inputs give equal bits, forward and backward. A Gaussian whose
 /// parameters are not finite or leave f32's range when projected is left out, counted, and gets a zero gradient.
 ///
+/// ```
+/// use burn::tensor::{Device, Tensor};
+/// use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
+///
+/// let device = Device::flex().autodiff();
+/// let colors = Tensor::<2>::ones([1, 3], &device).require_grad();
+/// let gaussians = Gaussians::new(
+///     Tensor::from_floats([[0.0, 0.85, 0.0]], &device),
+///     Tensor::from_floats([[1.0, 0.0, 0.0, 0.0]], &device),
+///     Tensor::full([1, 3], 0.1, &device),
+///     Tensor::full([1], 0.9, &device),
+///     colors.clone(),
+/// )?;
+/// let rendered = render(&gaussians, &Camera::orbit(4, 256, 256), &RenderOptions::inria())?;
+/// let gradients = rendered.color.mean().backward();
+/// assert!(colors.grad(&gradients).is_some());
+/// assert_eq!(rendered.counts.visible, 4);
+/// # Ok::<(), snapsnap_splat::SplatError>(())
+/// ```
+///
 /// # Errors
 /// [`SplatError::NoCamera`], [`SplatError::Camera`] for a camera that cannot be used, [`SplatError::Option`],
 /// [`SplatError::Shape`] for a background that is not `[3]`, [`SplatError::TooManyIntersections`] if splats and tiles
