@@ -150,6 +150,7 @@ impl HostScene {
         let rows = tracked.rows.each_ref().map(|t| values(t.grad(&grads).expect("tracked")));
         let opacities = values(tracked.opacities.grad(&grads).expect("tracked"));
         let background = values(tracked.background.grad(&grads).expect("tracked"));
+        assert_eq!(opacities.len(), self.gaussians.len());
         let gradient = (0..self.gaussians.len())
             .map(|i| {
                 let [means, rotations, scales, colors] = &rows;

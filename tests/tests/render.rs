@@ -333,6 +333,14 @@ fn unsuitable_files_and_arguments_are_refused_by_name() {
     case(&header("float x", "list uchar float x"), &["list, `x`"]);
     case(&header("binary_little_endian", "binary_middle_endian"), &["binary_middle_endian"]);
     case(&header("format binary_little_endian 1.0\n", ""), &["no format"]);
+    case(&header("comment test", "format ascii 1.0"), &["a second format"]);
+    case(&header("float f_rest_8", "float x"), &["a second property"]);
+    case(&header("element vertex 20", "element vertex 0\nelement vertex 20"), &["a second element"]);
+    case(
+        &header("comment test", &format!("comment {}", "x".repeat(2 << 20))),
+        &["longer than 1048576 bytes"],
+    );
+    case(&header("comment test", &"\u{1b}[31mx".repeat(900)), &["not understood", "\\u{1b}[31mx"]);
     case(&header("comment test", "nonsense"), &["header line 3", "not understood"]);
     case(&header("comment test", "property float x"), &["no element before it"]);
     // Far more than the file has, in an element that is skipped.
@@ -366,6 +374,7 @@ fn unsuitable_files_and_arguments_are_refused_by_name() {
         ([&["good.ply"], &long[..], &["8"]].concat(), "WIDTHxHEIGHT"),
         ([&["good.ply"], &long[..], &["0x8"]].concat(), "WIDTHxHEIGHT"),
         ([&["good.ply"], &long[..], &["8x99999"]].concat(), "32768"),
+        ([&["good.ply"], &long[..], &["32768x32768"]].concat(), "megapixels"),
         (vec!["good.ply", "--orbit", "1", "--background", "1,1"], "three numbers"),
         (vec!["good.ply", "--orbit", "1", "--background", "1,1,nan"], "three numbers"),
         (vec!["good.ply", "--orbit", "1", "--raw", "good.ply"], "would be overwritten"),
@@ -376,6 +385,73 @@ fn unsuitable_files_and_arguments_are_refused_by_name() {
         assert!(message.contains(expected), "{arguments:?}: {message}");
         assert_eq!(place.files(), before, "{arguments:?}");
     }
+}
+
+/// Pictures and cameras go into a folder: nothing that the command reads, and no other output, may be among them.
+#[test]
+fn no_input_and_no_other_output_is_overwritten() {
+    let place = Place::new();
+    let bytes = ply_bytes(&cloud(20, 0), Format::Little, "", b"");
+    let orbit = ["--orbit", "2", "--size", "8x8"];
+    fs::create_dir(place.path("d")).expect("folder");
+    for name in ["d/000.png", "d/001.png", "d/cameras.json"] {
+        place.file(name, &bytes);
+        let message = refused(place.render(&[name]).args(orbit).args(["-o", "d"]));
+        assert!(message.contains("would be overwritten"), "{name}: {message}");
+        assert!(fs::read(place.path(name)).expect("still there") == bytes);
+        fs::remove_file(place.path(name)).expect("removed");
+    }
+    place.file("a.ply", &bytes);
+    #[cfg(unix)]
+    {
+        std::os::unix::fs::symlink(place.path("a.ply"), place.path("d/001.png")).expect("link");
+        let message = refused(place.render(&["a.ply"]).args(orbit).args(["-o", "d"]));
+        assert!(message.contains("would be overwritten"), "{message}");
+        assert!(fs::read(place.path("a.ply")).expect("still there") == bytes);
+        fs::remove_file(place.path("d/001.png")).expect("removed");
+    }
+    for raw in ["d/000.png", "./d/../d/001.png", "d/cameras.json", "new/000.png"] {
+        let folder = if raw.starts_with("new") { "new" } else { "d" };
+        let message = refused(place.render(&["a.ply"]).args(orbit).args(["-o", folder, "--raw", raw]));
+        assert!(message.contains("two outputs"), "{raw}: {message}");
+    }
+    // A picture's place taken by a folder is seen before anything is rendered.
+    fs::create_dir(place.path("d/001.png")).expect("folder");
+    assert!(refused(place.render(&["a.ply"]).args(orbit).args(["-o", "d"])).contains("001.png"));
+    assert!(!place.path("d/000.png").exists());
+    fs::remove_dir(place.path("d/001.png")).expect("removed");
+    // The cameras that are read stay as they are, pictures of an earlier run are replaced.
+    succeed(place.render(&["a.ply"]).args(orbit).args(["-o", "d"]));
+    let cameras = fs::read(place.path("d/cameras.json")).expect("cameras");
+    succeed(&mut place.render(&["a.ply", "--cameras", "d/cameras.json", "-o", "d"]));
+    assert!(fs::read(place.path("d/cameras.json")).expect("cameras") == cameras);
+}
+
+/// What goes into a pipe is the tensors and nothing else.
+#[cfg(target_os = "linux")]
+#[test]
+fn raw_tensors_go_into_a_pipe() {
+    let place = Place::new();
+    place.file("a.ply", &ply_bytes(&cloud(20, 0), Format::Little, "", b""));
+    let orbit = ["a.ply", "--orbit", "2", "--size", "24x16", "-v", "--raw"];
+    succeed(place.render(&orbit).arg("file"));
+    let output = place.render(&orbit).arg("/dev/stdout").output().expect("started");
+    assert!(output.status.success());
+    assert!(output.stdout == fs::read(place.path("file")).expect("read"));
+    assert!(String::from_utf8_lossy(&output.stderr).contains("2 views of 20 Gaussians"));
+}
+
+/// A colour that is no number is not black.
+#[test]
+fn colours_that_are_not_finite_are_kept() {
+    let place = Place::new();
+    let mut rows = cloud(3, 0);
+    for (row, value) in rows.iter_mut().zip([f64::NAN, f64::INFINITY, f64::NEG_INFINITY]) {
+        row[6].1 = value;
+    }
+    let path = place.file("in.ply", &ply_bytes(&rows, Format::Little, "", b""));
+    let colors = values(ply::read(&path, &Device::flex()).expect("read").gaussians.colors);
+    assert!([0, 3, 6].iter().all(|i| !colors[*i].is_finite()), "{colors:?}");
 }
 
 /// Values that are not finite in a file are counted and left out.

@@ -3,7 +3,7 @@
 use burn::tensor::{Device, Tensor};
 use snapsnap_splat::{Camera, Counts, Gaussians, MAX_SIDE, RenderOptions, SplatError, render};
 use snapsnap_tests::scenes::{HostScene, Pass, Random, forward_camera, random_scene, random_upstream};
-use snapsnap_tests::{device, values};
+use snapsnap_tests::{device, device_name, values};
 
 fn pass(host: &HostScene, cameras: &[Camera], options: &RenderOptions, device: &Device) -> Pass {
     let pixels = cameras.iter().map(|c| (c.width * c.height) as usize).sum();
@@ -345,6 +345,36 @@ fn what_cannot_be_rendered_is_refused() {
     refused(&[camera], RenderOptions { background, ..inria() }, "background");
 }
 
+/// An image that no memory holds is an error, not the end of the process.
+#[test]
+fn images_beyond_all_memory_are_refused() {
+    let Some(device) = device() else { return };
+    let gaussians = random_scene(3, 1).on(&device).gaussians();
+    let views = vec![forward_camera(MAX_SIDE, MAX_SIDE); 20_000];
+    let error = render(&gaussians, &views, &RenderOptions::inria()).expect_err("344 TB");
+    assert!(matches!(error, SplatError::Memory { .. }), "{error}");
+}
+
+/// Inputs of another precision are rendered in single precision.
+#[test]
+fn double_precision_inputs_give_the_same_image() {
+    let Some(device) = device() else { return };
+    if device_name() == "wgpu" {
+        println!("SKIPPED: wgpu has no double precision");
+        return;
+    }
+    let single = random_scene(30, 14).on(&device).gaussians();
+    let double = Gaussians {
+        means: single.means.clone().cast(burn::tensor::DType::F64),
+        opacities: single.opacities.clone().cast(burn::tensor::DType::F64),
+        ..single.clone()
+    };
+    let image = |gaussians: &Gaussians| {
+        values(render(gaussians, &[forward_camera(20, 20)], &RenderOptions::inria()).expect("rendered").color)
+    };
+    assert!(image(&single) == image(&double));
+}
+
 /// Pairs of splats and tiles beyond what fits are counted, not computed.
 #[test]
 fn too_many_intersections_are_refused() {
@@ -356,8 +386,26 @@ fn too_many_intersections_are_refused() {
     // 2048² tiles each: more than 2³¹ pairs, and more than 2³² / 2.
     let error = render(&host.on(&device).gaussians(), &[forward_camera(side, side)], &RenderOptions::inria());
     match error {
-        Err(SplatError::TooManyIntersections { found, limit }) => assert!(found > limit),
+        Err(SplatError::TooManyIntersections { found, limit }) => {
+            assert!(found > limit);
+            assert_eq!(found, 520 << 22);
+        }
         Err(other) => panic!("{other}"),
         Ok(_) => panic!("rendered"),
     }
+}
+
+/// The count is exact beyond 32 bits' halves, with few tiles per splat as with many.
+#[test]
+fn intersections_of_many_small_counts_are_refused_too() {
+    let Some(device) = device() else { return };
+    let n = 600_000;
+    let full_screen = [0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0, 1e3, 1e3, 1e3, 0.9, 1.0, 1.0, 1.0];
+    let host = HostScene { gaussians: vec![full_screen; n], background: [0.0; 3] };
+    let views = [forward_camera(512, 512); 2];
+    let error = render(&host.on(&device).gaussians(), &views, &RenderOptions::inria()).expect_err("too many");
+    let SplatError::TooManyIntersections { found, .. } = error else { panic!("{error}") };
+    // The CPU goes view by view.
+    let views = if device_name() == "wgpu" { 2 } else { 1 };
+    assert_eq!(found, views * 1024 * n as u64);
 }

@@ -15,11 +15,18 @@ use crate::failure::Failure;
 const GIF_SPEED: i32 = 10;
 
 /// The first view of colours `[V,H,W,3]`, clamped to [0, 1], in 8 bits.
-pub fn picture(color: &Tensor<4>) -> RgbImage {
+pub fn picture(color: &Tensor<4>) -> Result<RgbImage, Failure> {
     let [_, height, width, _] = color.dims();
-    let values: Vec<f32> = color.clone().narrow(0, 0, 1).into_data().try_into_vec().expect("renders are f32");
+    let values = read_back(color.clone().narrow(0, 0, 1))?;
     let bytes = values.iter().map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
-    RgbImage::from_raw(width as u32, height as u32, bytes).expect("three bytes per pixel")
+    Ok(RgbImage::from_raw(width as u32, height as u32, bytes).expect("three bytes per pixel"))
+}
+
+/// Values of a render on the host.
+pub fn read_back<const D: usize>(tensor: Tensor<D>) -> Result<Vec<f32>, Failure> {
+    let data =
+        tensor.try_into_data().map_err(|e| Failure::Internal(format!("reading a picture back: {e:?}")))?;
+    Ok(data.try_into_vec().expect("renders are f32"))
 }
 
 /// Writes a PNG, whole or not at all.

@@ -62,7 +62,7 @@ impl Turntable {
         let mut pictures = Vec::with_capacity(count);
         for (i, camera) in orbit.iter().enumerate() {
             let rendered = render(gaussians, std::slice::from_ref(camera), &options)?;
-            pictures.push(picture(&rendered.color));
+            pictures.push(picture(&rendered.color)?);
             progress.step(i + 1, count, "views");
         }
         match self.form {

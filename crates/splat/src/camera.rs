@@ -93,6 +93,12 @@ impl Camera {
         Self { width, height, focal, principal_point, ..*self }
     }
 
+    /// Where the camera stands in the world, metres. By the true inverse: a matrix from a file may be orthonormal to a few
+    /// digits only.
+    pub fn centre(&self) -> DVec3 {
+        -(self.world_to_camera.rotation.inverse() * self.world_to_camera.translation)
+    }
+
     /// Whether an image can be rendered into this camera; if not, what is wrong.
     pub(crate) fn check(&self) -> Result<(), String> {
         for (field, side) in [("width", self.width), ("height", self.height)] {
@@ -104,13 +110,13 @@ impl Camera {
             // The upper bound keeps f32 arithmetic in range; it is far beyond any lens.
             if !(focal > 0.0 && focal <= 1e9) {
                 return Err(format!(
-                    "`{field}` is {focal}, expected a focal length in pixels, above 0 and at most 1e9"
+                    "`{field}` is {focal:e}, expected a focal length in pixels, above 0 and at most 1e9"
                 ));
             }
         }
         for (field, value) in [("cx", self.principal_point.x), ("cy", self.principal_point.y)] {
             if value.is_nan() || value.abs() > 1e9 {
-                return Err(format!("`{field}` is {value}, expected pixels within ±1e9"));
+                return Err(format!("`{field}` is {value:e}, expected pixels within ±1e9"));
             }
         }
         let RigidTransform { rotation, translation } = self.world_to_camera;

@@ -1,12 +1,14 @@
 //! `cameras.json`: a list of pinhole cameras.
 
-use std::fs;
-use std::io::Write;
+use std::fs::File;
+use std::io::{Read, Write};
 use std::path::Path;
 
 use glam::{DMat3, DVec2, DVec3};
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
+use serde_json::Value;
 
+use crate::error::quoted;
 use crate::file::write_whole;
 use crate::{Camera, RigidTransform, SplatError};
 
@@ -14,8 +16,7 @@ use crate::{Camera, RigidTransform, SplatError};
 const MAX_BYTES: u64 = 256 << 20;
 
 /// One entry of the file. OpenCV axes (x right, y down, z forward), metres, pixels, pixel centres at +½.
-#[derive(Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[derive(Debug, Serialize)]
 struct Entry {
     width: u32,
     height: u32,
@@ -27,6 +28,45 @@ struct Entry {
     world_to_camera: [[f64; 4]; 4],
 }
 
+const FIELDS: [&str; 7] = ["width", "height", "fx", "fy", "cx", "cy", "world_to_camera"];
+
+impl Entry {
+    fn parse(value: &Value) -> Result<Self, String> {
+        let fields = value.as_object().ok_or("is no object with `width`, `height`, `fx`, …")?;
+        if let Some(unknown) = fields.keys().find(|key| !FIELDS.contains(&key.as_str())) {
+            return Err(format!("unknown field `{}`, expected {}", quoted(unknown), FIELDS.join(", ")));
+        }
+        let field = |name: &str| fields.get(name).ok_or_else(|| format!("`{name}` is missing"));
+        let number = |name: &str| field(name)?.as_f64().ok_or_else(|| format!("`{name}` is no number"));
+        let side = |name: &str| {
+            let side = field(name)?.as_u64().and_then(|side| side.try_into().ok());
+            side.ok_or_else(|| format!("`{name}` is no whole number of pixels"))
+        };
+        let matrix = || {
+            let rows = fields.get("world_to_camera")?.as_array()?;
+            let row = |row: &Value| -> Option<[f64; 4]> {
+                let numbers: Option<Vec<f64>> = row.as_array()?.iter().map(Value::as_f64).collect();
+                numbers?.try_into().ok()
+            };
+            let rows: Option<Vec<[f64; 4]>> = rows.iter().map(row).collect();
+            rows?.try_into().ok()
+        };
+        let world_to_camera = {
+            field("world_to_camera")?;
+            matrix().ok_or("`world_to_camera` is no list of 4 rows of 4 numbers")?
+        };
+        Ok(Self {
+            width: side("width")?,
+            height: side("height")?,
+            fx: number("fx")?,
+            fy: number("fy")?,
+            cx: number("cx")?,
+            cy: number("cy")?,
+            world_to_camera,
+        })
+    }
+}
+
 /// Reads the cameras of `path`.
 ///
 /// # Errors
@@ -34,20 +74,21 @@ struct Entry {
 /// and the field, or if a camera in it cannot be rendered into.
 pub fn read(path: &Path) -> Result<Vec<Camera>, SplatError> {
     let wrong = |problem: String| SplatError::Cameras { path: path.to_owned(), problem };
-    let cannot = |source| SplatError::Read { path: path.to_owned(), source };
-    let length = fs::metadata(path).map_err(cannot)?.len();
-    if length > MAX_BYTES {
-        return Err(wrong(format!("{length} bytes; at most {MAX_BYTES} are read")));
+    let mut text = String::new();
+    File::open(path)
+        .and_then(|file| file.take(MAX_BYTES + 1).read_to_string(&mut text))
+        .map_err(|source| SplatError::Read { path: path.to_owned(), source })?;
+    if text.len() as u64 > MAX_BYTES {
+        return Err(wrong(format!("more than {MAX_BYTES} bytes")));
     }
-    let text = fs::read_to_string(path).map_err(cannot)?;
     // In two steps, so that an error can name the camera.
-    let entries: Vec<serde_json::Value> = serde_json::from_str(&text).map_err(|e| wrong(e.to_string()))?;
+    let text = text.trim_start_matches('\u{feff}');
+    let entries: Vec<Value> = serde_json::from_str(text).map_err(|e| wrong(quoted(&e.to_string())))?;
     if entries.is_empty() {
         return Err(wrong("the list is empty".into()));
     }
-    let camera = |(index, value)| {
-        let entry: Entry =
-            serde_json::from_value(value).map_err(|e| wrong(format!("camera {index}: {e}")))?;
+    let camera = |(index, value): (usize, Value)| {
+        let entry = Entry::parse(&value).map_err(|problem| wrong(format!("camera {index}: {problem}")))?;
         let [a, b, c, d] = entry.world_to_camera;
         if d != [0.0, 0.0, 0.0, 1.0] {
             return Err(wrong(format!(
@@ -107,7 +148,7 @@ mod tests {
     fn read_text(text: &str) -> Result<Vec<Camera>, SplatError> {
         let folder = tempfile::tempdir().expect("folder");
         let path = folder.path().join("cameras.json");
-        fs::write(&path, text).expect("written");
+        std::fs::write(&path, text).expect("written");
         read(&path)
     }
 
@@ -136,14 +177,15 @@ mod tests {
         assert_eq!(read_text(&format!("[{good}]")).expect("good").len(), 1);
         for (from, to, expected) in [
             (r#""width":4"#, r#""width":0"#, "camera 1: `width` is 0"),
-            (r#""width":4"#, r#""width":-4"#, "camera 1: invalid value: integer `-4`"),
-            (r#""width":4,"#, "", "camera 1: missing field `width`"),
+            (r#""width":4"#, r#""width":-4"#, "camera 1: `width` is no whole number"),
+            (r#""width":4,"#, "", "camera 1: `width` is missing"),
             (r#""fx":1"#, r#""fx":-1"#, "camera 1: `fx` is -1"),
             (r#""fx":1"#, r#""focal":1"#, "unknown field `focal`"),
             (r#""cx":2"#, r#""cx":1e300"#, "camera 1: `cx`"),
             ("[1,0,0,0]", "[2,0,0,0]", "not a rotation"),
             ("[0,0,0,1]", "[0,0,1,1]", "last row"),
-            ("[1,0,0,0]", "[1,0,0]", "camera 1: invalid length 3"),
+            ("[1,0,0,0]", "[1,0,0]", "camera 1: `world_to_camera` is no list"),
+            (r#""fx":1"#, r#""fx":"1""#, "camera 1: `fx` is no number"),
             ("[1,0,0,0]", "[1,0,0,1e99]", "translation"),
         ] {
             let bad = good.replace(from, to);

@@ -34,6 +34,16 @@ pub enum SplatError {
         /// What it may be.
         allowed: &'static str,
     },
+    /// An array that memory does not hold, or that the device does not allow in one piece.
+    #[error(
+        "{what} needs {bytes} bytes, more than this device holds in one piece: render fewer views at once, or a smaller image"
+    )]
+    Memory {
+        /// The array.
+        what: &'static str,
+        /// Its size.
+        bytes: u64,
+    },
     /// More pairs of splats and tiles than memory on the device can hold.
     #[error(
         "{found} pairs of a splat and a 16×16 tile, at most {limit} fit: render fewer views at once, or a smaller image"
@@ -84,4 +94,15 @@ pub enum SplatError {
         /// Why.
         source: std::io::Error,
     },
+}
+
+/// Text from a file as it may appear in a message: escaped and short.
+pub(crate) fn quoted(text: &str) -> String {
+    /// Characters that are shown.
+    const SHOWN: usize = 80;
+    let mut shown: String = text.chars().take(SHOWN).flat_map(char::escape_debug).collect();
+    if text.chars().nth(SHOWN).is_some() {
+        shown.push('…');
+    }
+    shown
 }

@@ -3,17 +3,44 @@
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 /// Temporary files that are being written.
-static UNFINISHED: Mutex<Vec<PathBuf>> = Mutex::new(Vec::new());
+#[derive(Default)]
+struct Unfinished {
+    paths: Vec<PathBuf>,
+    /// The program is about to end: no new ones.
+    ending: bool,
+}
 
-/// Removes the temporary files of writes in progress: for a program that is about to be ended from outside.
+static UNFINISHED: Mutex<Unfinished> = Mutex::new(Unfinished { paths: Vec::new(), ending: false });
+
+fn unfinished() -> MutexGuard<'static, Unfinished> {
+    UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Removes the temporary files of writes in progress and lets no new ones begin: for a program that is about to be ended
+/// from outside.
 pub fn remove_unfinished() {
-    for path in UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner).drain(..) {
+    let mut unfinished = unfinished();
+    unfinished.ending = true;
+    for path in unfinished.paths.drain(..) {
         // Whoever renamed or removed it first has done the work.
         let _ = fs::remove_file(path);
     }
+}
+
+/// Creates a temporary file and notes it, in one step as seen from [`remove_unfinished`].
+fn create(path: &Path) -> io::Result<File> {
+    let mut unfinished = unfinished();
+    if unfinished.ending {
+        return Err(io::Error::new(io::ErrorKind::Interrupted, "the program is being ended"));
+    }
+    let mut options = File::options();
+    options.read(true).write(true).create_new(true);
+    let file = options.open(path)?;
+    unfinished.paths.push(path.to_owned());
+    Ok(file)
 }
 
 /// Writes `path` through `fill`: into a temporary file beside it, which is renamed when `fill` has succeeded, so that
@@ -33,23 +60,17 @@ pub fn write_whole<E: From<io::Error>>(
         return Ok(out.flush()?);
     }
     let path = &target_of(path);
-    let mut builder = tempfile::Builder::new();
-    builder.prefix(".snapsnap-");
-    #[cfg(unix)]
-    {
-        // What an ordinary new file gets (the umask still applies), not the private mode of temporary files.
-        use std::os::unix::fs::PermissionsExt;
-        builder.permissions(fs::Permissions::from_mode(0o666));
-    }
-    let mut file = builder.tempfile_in(folder_of(path))?;
-    let unfinished = || UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner);
+    // Created with the mode of an ordinary new file (the umask applies), not the private one of temporary files.
+    let mut file = tempfile::Builder::new()
+        .prefix(".snapsnap-")
+        .make_in(folder_of(path), create)
+        .map_err(|e| io::Error::from(e.kind()))?;
     let temporary = file.path().to_owned();
-    unfinished().push(temporary.clone());
     let mut out = BufWriter::with_capacity(1 << 20, file.as_file_mut());
     let filled = fill(&mut out).and_then(|()| Ok(out.flush()?));
     drop(out);
     let written = filled.and_then(|()| file.persist(path).map(drop).map_err(|e| e.error.into()));
-    unfinished().retain(|p| *p != temporary);
+    unfinished().paths.retain(|p| *p != temporary);
     written
 }
 

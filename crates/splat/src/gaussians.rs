@@ -32,19 +32,28 @@ impl Gaussians {
         opacities: Tensor<1>,
         colors: Tensor<2>,
     ) -> Result<Self, SplatError> {
-        let n = means.dims()[0];
+        let gaussians = Self { means, rotations, scales, opacities, colors };
+        gaussians.check()?;
+        Ok(gaussians)
+    }
+
+    /// Whether the shapes fit together.
+    ///
+    /// # Errors
+    /// [`SplatError::Shape`].
+    pub(crate) fn check(&self) -> Result<(), SplatError> {
+        let n = self.len();
         let check = |field, found: &[usize], expected: &[usize]| {
             if found == expected {
                 return Ok(());
             }
             Err(SplatError::Shape { field, found: found.to_vec(), expected: expected.to_vec() })
         };
-        check("means", &means.dims(), &[n, 3])?;
-        check("rotations", &rotations.dims(), &[n, 4])?;
-        check("scales", &scales.dims(), &[n, 3])?;
-        check("opacities", &opacities.dims(), &[n])?;
-        check("colors", &colors.dims(), &[n, 3])?;
-        Ok(Self { means, rotations, scales, opacities, colors })
+        check("means", &self.means.dims(), &[n, 3])?;
+        check("rotations", &self.rotations.dims(), &[n, 4])?;
+        check("scales", &self.scales.dims(), &[n, 3])?;
+        check("opacities", &self.opacities.dims(), &[n])?;
+        check("colors", &self.colors.dims(), &[n, 3])
     }
 
     /// Number of Gaussians.

@@ -50,14 +50,15 @@ pub struct Rendered {
 ///
 /// # Errors
 /// [`SplatError::NoCamera`], [`SplatError::Camera`] for a camera that cannot be used, [`SplatError::Option`],
-/// [`SplatError::Shape`] for a background that is not `[3]`, [`SplatError::TooManyIntersections`] if splats and tiles
-/// meet more often than the device can hold.
+/// [`SplatError::Shape`] for tensors that do not fit together, [`SplatError::TooManyIntersections`] and
+/// [`SplatError::Memory`] for what the device cannot hold.
 pub fn render(
     gaussians: &Gaussians,
     cameras: &[Camera],
     options: &RenderOptions,
 ) -> Result<Rendered, SplatError> {
     let job = Job::new(cameras, options)?;
+    gaussians.check()?;
     let device = gaussians.device();
     let background = match &options.background {
         None => Tensor::<1>::zeros([3], &device),

@@ -34,7 +34,7 @@ pub fn colors(coefficients: &Tensor<3>, means: &Tensor<2>, camera: &Camera) -> R
     let band = |index: usize| coefficients.clone().narrow(1, index, 1).squeeze_dim::<2>(1);
     let mut sum = band(0) * C0 + 0.5;
     if k > 1 {
-        let centre = camera.world_to_camera.inverse().translation.as_vec3();
+        let centre = camera.centre().as_vec3();
         let centre = Tensor::<2>::from_floats([centre.to_array()], &means.device());
         let offset = means.clone() - centre;
         // Clamped before the root: its derivative at zero is infinite.

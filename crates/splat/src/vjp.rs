@@ -338,25 +338,36 @@ pub fn footprint(view: &View, p: &Projection) -> Footprint {
     }
 }
 
-/// Least value over the rectangle [x0, x1] × [y0, y1] (relative to the splat's centre, pixels) of the quadratic form
-/// dᵀΛd. The form is convex, so outside its centre the minimum lies on an edge that faces the centre: for a fixed d_x
-/// at d_y = −k·d_x, for a fixed d_y at d_x = −l₁²k·d_y/(l₀² + l₁²k²), both clamped to the edge.
-#[cube]
-pub fn least_form(l0: f32, k: f32, l1: f32, x0: f32, x1: f32, y0: f32, y1: f32) -> f32 {
-    let dx = x0.max(0.0) + x1.min(0.0);
-    let dy = y0.max(0.0) + y1.min(0.0);
-    let along_y = (-(k * dx)).max(y0).min(y1);
-    let b = l1 * k;
-    let along_x = (-(b * l1 * dy / (l0 * l0 + b * b))).max(x0).min(x1);
-    form(l0, k, l1, dx, along_y).min(form(l0, k, l1, along_x, dy))
+/// Where an ellipse lies within a strip of the image.
+#[derive(CubeType, Clone, Copy, Debug)]
+pub struct Span {
+    /// Least x, relative to the ellipse's centre, pixels.
+    pub left: f32,
+    /// Largest x.
+    pub right: f32,
 }
 
-/// The quadratic form dᵀΛd.
+/// The x that the ellipse dᵀΛd ≤ `radius_squared` reaches within the strip `top` ≤ d_y ≤ `bottom`, which it meets.
+///
+/// Its rightmost point is (r/l₀, −k·r/l₀). Where the strip does not hold that point, the strip's part reaches furthest on
+/// the edge next to it: at d_y = e the boundary is A·x² + 2·l₁²k·e·x + l₁²e² − r² = 0 with A = l₀² + l₁²k², so
+/// x = (−l₁²k·e ± √(r²A − (l₀l₁e)²))/A; for e = −k·r/l₀ this is r/l₀ again. The left end alike.
 #[cube]
-pub fn form(l0: f32, k: f32, l1: f32, dx: f32, dy: f32) -> f32 {
-    let p = l0 * dx;
-    let q = l1 * (dy + k * dx);
-    p * p + q * q
+pub fn span(l0: f32, k: f32, l1: f32, radius_squared: f32, top: f32, bottom: f32) -> Span {
+    let b = l1 * k;
+    let a = l0 * l0 + b * b;
+    let tip = k * (radius_squared.sqrt() / l0);
+    let right_at = (-tip).max(top).min(bottom);
+    let left_at = tip.max(top).min(bottom);
+    let right_root = l0 * l1 * right_at;
+    let left_root = l0 * l1 * left_at;
+    // Just beyond the ellipse's top or bottom rounding may leave a negative number.
+    let right_square = (radius_squared * a - right_root * right_root).max(0.0);
+    let left_square = (radius_squared * a - left_root * left_root).max(0.0);
+    Span {
+        left: (-(b * l1 * left_at) - left_square.sqrt()) / a,
+        right: (right_square.sqrt() - b * l1 * right_at) / a,
+    }
 }
 
 /// VJP of the projection.
@@ -429,8 +440,10 @@ pub fn project_vjp(view: &View, p: &Projection, scale: &Vec3, g: &FootprintGradi
     };
     let ratio_x = p.t.x / p.t.z;
     let ratio_y = p.t.y / p.t.z;
-    let v_x = select(ratio_x == p.x, -(p.jx * dot(&w0, &p.axes.r2)), 0.0);
-    let v_y = select(ratio_y == p.y, -(p.jy * dot(&w1, &p.axes.r2)), 0.0);
+    let free_x = ratio_x >= view.x_min && ratio_x <= view.x_max;
+    let free_y = ratio_y >= view.y_min && ratio_y <= view.y_max;
+    let v_x = select(free_x, -(p.jx * dot(&w0, &p.axes.r2)), 0.0);
+    let v_y = select(free_y, -(p.jy * dot(&w1, &p.axes.r2)), 0.0);
 
     let v_tx = v_u * p.jx + v_x / p.t.z;
     let v_ty = v_v * p.jy + v_y / p.t.z;

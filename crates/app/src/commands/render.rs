@@ -1,12 +1,12 @@
 //! `snapsnap render`.
 
+use std::fs::File;
+use std::io::{self, BufWriter, Seek, Write};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use burn::tensor::{Device, Tensor};
 use clap::{Args, ValueEnum};
-use safetensors::Dtype;
-use safetensors::tensor::TensorView;
 use snapsnap_splat::ply::{self, Loaded};
 use snapsnap_splat::{
     Camera, Counts, Gaussians, MAX_SIDE, RenderOptions, Rendered, cameras, file, render, sh,
@@ -14,12 +14,16 @@ use snapsnap_splat::{
 
 use super::check_outputs;
 use crate::failure::Failure;
-use crate::pictures::{make_folder, picture, write_png};
+use crate::pictures::{make_folder, picture, read_back, write_png};
 use crate::progress::Progress;
 use crate::{device, say};
 
 /// Side of an orbit's pictures.
 const DEFAULT_SIDE: u32 = 1024;
+/// Largest picture, in pixels.
+const MAX_PIXELS: u64 = 1 << 26;
+/// Name of the cameras beside the pictures.
+const CAMERAS: &str = "cameras.json";
 /// Where pictures go if no output is named.
 const DEFAULT_FOLDER: &str = "renders";
 
@@ -77,7 +81,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     if arguments.raw.is_some() {
         check_raw(&views)?;
     }
-    check_paths(arguments, folder.as_deref())?;
+    check_paths(arguments, folder.as_deref(), views.len())?;
     let device = device::choose(&arguments.device)?;
     let start = Instant::now();
     let loaded = ply::read(&arguments.ply, &device)?;
@@ -94,35 +98,41 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
 
     if let Some(folder) = &folder {
         make_folder(folder)?;
-        let path = folder.join("cameras.json");
-        if arguments.cameras.as_ref().is_none_or(|given| !super::is_same_file(given, &path)) {
-            cameras::write(&views, &path)?;
-        }
     }
     let progress = Progress::steps(quiet, views.len(), "views");
     let start = Instant::now();
-    let mut raw = Raw::default();
+    let mut raw = arguments.raw.as_deref().map(Raw::new).transpose()?;
     let mut counts = Vec::with_capacity(views.len());
     for (i, camera) in views.iter().enumerate() {
         let rendered = view(&loaded, camera, &options)?;
         counts.push(rendered.counts);
         if let Some(folder) = &folder {
-            write_png(&folder.join(format!("{i:03}.png")), &picture(&rendered.color))?;
+            write_png(&folder.join(picture_name(i)), &picture(&rendered.color)?)?;
         }
-        if arguments.raw.is_some() {
-            raw.add(rendered);
+        if let Some(raw) = &mut raw {
+            raw.add(rendered)?;
         }
         progress.step(i + 1, views.len(), "views");
     }
-    if let Some(path) = &arguments.raw {
-        raw.write(path, &views)?;
+    if let Some(raw) = raw {
+        raw.write(&views)?;
+    }
+    // Last: where there are cameras, there are all of their pictures.
+    let path = folder.as_ref().map(|folder| folder.join(CAMERAS));
+    let given =
+        |path: &Path| arguments.cameras.as_ref().is_some_and(|given| super::is_same_file(given, path));
+    if let Some(path) = path.filter(|path| !given(path)) {
+        cameras::write(&views, &path)?;
     }
     drop(progress);
     let rendering = start.elapsed();
     let n = loaded.gaussians.len();
+    // What goes into a pipe must stay a tensor file.
+    let special = arguments.raw.as_ref().is_some_and(|path| file::is_special(path));
+    let say = if special { say::err } else { say::out };
     if arguments.verbose {
-        report(n, &counts, &device);
-        say::out(&format!("reading {:.1} ms, rendering and writing {:.1} ms", ms(reading), ms(rendering)));
+        report(say, n, &counts, &device);
+        say(&format!("reading {:.1} ms, rendering and writing {:.1} ms", ms(reading), ms(rendering)));
     }
     let visible = counts.iter().filter(|c| c.visible > 0).count();
     if visible < counts.len() && !quiet {
@@ -132,7 +142,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     if !quiet {
         let outputs: Vec<String> =
             folder.iter().chain(&arguments.raw).map(|path| path.display().to_string()).collect();
-        say::out(&format!("{}: {} views of {n} Gaussians", outputs.join(", "), views.len()));
+        say(&format!("{}: {} views of {n} Gaussians", outputs.join(", "), views.len()));
     }
     Ok(())
 }
@@ -150,6 +160,17 @@ fn view(loaded: &Loaded, camera: &Camera, options: &RenderOptions) -> Result<Ren
 }
 
 fn views(arguments: &Arguments) -> Result<Vec<Camera>, Failure> {
+    let views = unchecked_views(arguments)?;
+    let pixels = |camera: &Camera| u64::from(camera.width) * u64::from(camera.height);
+    if let Some(i) = views.iter().position(|camera| pixels(camera) > MAX_PIXELS) {
+        let Camera { width, height, .. } = views[i];
+        let most = MAX_PIXELS / 1_000_000;
+        return Err(Failure::Input(format!("camera {i}: {width}x{height} is more than {most} megapixels")));
+    }
+    Ok(views)
+}
+
+fn unchecked_views(arguments: &Arguments) -> Result<Vec<Camera>, Failure> {
     match (&arguments.cameras, arguments.orbit) {
         (Some(path), _) => {
             let mut views = cameras::read(path)?;
@@ -181,17 +202,46 @@ fn views(arguments: &Arguments) -> Result<Vec<Camera>, Failure> {
     }
 }
 
-fn check_paths(arguments: &Arguments, folder: Option<&Path>) -> Result<(), Failure> {
-    let inputs: Vec<&Path> = [Some(&arguments.ply), arguments.cameras.as_ref()]
-        .into_iter()
-        .flatten()
-        .map(PathBuf::as_path)
-        .collect();
-    if let Some(folder) = folder.filter(|folder| folder.exists() && !folder.is_dir()) {
-        return Err(Failure::Input(format!("{}: exists and is no folder", folder.display())));
+/// Refuses outputs that cannot be written, that are one another or that are an input.
+fn check_paths(arguments: &Arguments, folder: Option<&Path>, views: usize) -> Result<(), Failure> {
+    let mut inputs = vec![arguments.ply.as_path()];
+    let mut outputs: Vec<PathBuf> = Vec::new();
+    if let Some(folder) = folder {
+        if folder.exists() && !folder.is_dir() {
+            return Err(Failure::Input(format!("{}: exists and is no folder", folder.display())));
+        }
+        // What is there already is overwritten; a folder that is yet to be made holds nothing to lose.
+        let pictures = (0..views).map(|i| folder.join(picture_name(i)));
+        outputs.extend(pictures.filter(|path| path.symlink_metadata().is_ok()));
+        let path = folder.join(CAMERAS);
+        let own = arguments.cameras.as_ref().is_some_and(|given| super::is_same_file(given, &path));
+        if !own && path.symlink_metadata().is_ok() {
+            outputs.push(path);
+        }
     }
-    let outputs: Vec<&Path> = arguments.raw.iter().map(PathBuf::as_path).collect();
+    if let Some(raw) = &arguments.raw {
+        let inside = raw.parent().is_some_and(|parent| folder.is_some_and(|f| same_folder(parent, f)));
+        let name = raw.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+        if inside && (name == CAMERAS || (0..views).any(|i| picture_name(i) == name)) {
+            return Err(Failure::Input(format!("{}: is given for two outputs", raw.display())));
+        }
+        outputs.push(raw.clone());
+    }
+    inputs.extend(arguments.cameras.as_deref());
+    let outputs: Vec<&Path> = outputs.iter().map(PathBuf::as_path).collect();
     check_outputs(&outputs, &inputs)
+}
+
+fn picture_name(view: usize) -> String {
+    format!("{view:03}.png")
+}
+
+/// Whether two paths lead to one folder, which need not be there yet.
+fn same_folder(a: &Path, b: &Path) -> bool {
+    match (a.canonicalize(), b.canonicalize()) {
+        (Ok(a), Ok(b)) => a == b,
+        _ => a.components().eq(b.components()),
+    }
 }
 
 /// A tensor has one shape: all views must have one size.
@@ -205,50 +255,79 @@ fn check_raw(views: &[Camera]) -> Result<(), Failure> {
     })
 }
 
-/// Colour `[V,H,W,3]`, alpha and depth `[V,H,W]`, collected view by view.
-#[derive(Default)]
+/// Colour `[V,H,W,3]`, alpha and depth `[V,H,W]`, view by view into temporary files: together they may be larger than
+/// memory.
 struct Raw {
-    color: Vec<u8>,
-    alpha: Vec<u8>,
-    depth: Vec<u8>,
+    path: PathBuf,
+    parts: [(&'static str, BufWriter<File>); 3],
 }
 
 impl Raw {
-    fn add(&mut self, rendered: Rendered) {
-        let depth = rendered.depth.expect("asked for together with --raw");
-        append(&mut self.color, rendered.color.reshape([-1]));
-        append(&mut self.alpha, rendered.alpha.reshape([-1]));
-        append(&mut self.depth, depth.reshape([-1]));
-    }
-
-    fn write(&self, path: &Path, views: &[Camera]) -> Result<(), Failure> {
-        let [v, h, w] = [views.len(), views[0].height as usize, views[0].width as usize];
-        let tensor = |shape: &[usize], bytes| {
-            TensorView::new(Dtype::F32, shape.to_vec(), bytes).expect("as many bytes as the shape says")
+    fn new(path: &Path) -> Result<Self, Failure> {
+        // Beside the file that they become, where there is room for it; a pipe has no such place.
+        let folder = path.parent().filter(|parent| !parent.as_os_str().is_empty());
+        let folder = if file::is_special(path) {
+            std::env::temp_dir()
+        } else {
+            folder.unwrap_or(Path::new(".")).into()
         };
-        let tensors = [
-            ("color", tensor(&[v, h, w, 3], &self.color)),
-            ("alpha", tensor(&[v, h, w], &self.alpha)),
-            ("depth", tensor(&[v, h, w], &self.depth)),
-        ];
-        let bytes = safetensors::serialize(tensors, None).expect("valid tensors");
-        file::write_whole(path, |out| std::io::Write::write_all(out, &bytes))
-            .map_err(|e| Failure::Input(format!("{}: cannot write: {e}", path.display())))
+        let part = |name| io::Result::Ok((name, BufWriter::new(tempfile::tempfile_in(&folder)?)));
+        let parts = || -> io::Result<_> { Ok([part("color")?, part("alpha")?, part("depth")?]) };
+        Ok(Self { path: path.to_owned(), parts: parts().map_err(|e| Self::failed(path, &e))? })
     }
-}
 
-fn append(bytes: &mut Vec<u8>, tensor: Tensor<1>) {
-    let values: Vec<f32> = tensor.into_data().try_into_vec().expect("renders are f32");
-    bytes.extend(values.iter().flat_map(|v| v.to_le_bytes()));
+    fn failed(path: &Path, e: &io::Error) -> Failure {
+        Failure::Input(format!("{}: cannot write: {e}", path.display()))
+    }
+
+    fn add(&mut self, rendered: Rendered) -> Result<(), Failure> {
+        let depth = rendered.depth.expect("asked for together with --raw");
+        let tensors = [rendered.color.reshape([-1]), rendered.alpha.reshape([-1]), depth.reshape([-1])];
+        for ((_, file), tensor) in self.parts.iter_mut().zip(tensors) {
+            let bytes: Vec<u8> = read_back(tensor)?.iter().flat_map(|v| v.to_le_bytes()).collect();
+            file.write_all(&bytes).map_err(|e| Self::failed(&self.path, &e))?;
+        }
+        Ok(())
+    }
+
+    /// A safetensors file: the length of the header, the header, the tensors one after another.
+    fn write(self, views: &[Camera]) -> Result<(), Failure> {
+        let [v, h, w] = [views.len(), views[0].height as usize, views[0].width as usize];
+        let mut header = serde_json::Map::new();
+        let mut start = 0;
+        for (name, shape) in [("color", vec![v, h, w, 3]), ("alpha", vec![v, h, w]), ("depth", vec![v, h, w])]
+        {
+            let end = start + 4 * shape.iter().product::<usize>();
+            let entry = serde_json::json!({ "dtype": "F32", "shape": shape, "data_offsets": [start, end] });
+            header.insert(name.into(), entry);
+            start = end;
+        }
+        let mut header = serde_json::Value::Object(header).to_string();
+        while !header.len().is_multiple_of(8) {
+            header.push(' ');
+        }
+        let path = self.path;
+        file::write_whole(&path, |out| -> io::Result<()> {
+            out.write_all(&(header.len() as u64).to_le_bytes())?;
+            out.write_all(header.as_bytes())?;
+            for (_, part) in self.parts {
+                let mut part = part.into_inner().map_err(io::IntoInnerError::into_error)?;
+                part.rewind()?;
+                io::copy(&mut part, out)?;
+            }
+            Ok(())
+        })
+        .map_err(|e| Self::failed(&path, &e))
+    }
 }
 
 /// One of the counts.
 type Field = fn(&Counts) -> u64;
 
-fn report(n: usize, counts: &[Counts], device: &Device) {
-    say::out(&format!("device: {}", device::describe(device)));
+fn report(say: fn(&str), n: usize, counts: &[Counts], device: &Device) {
+    say(&format!("device: {}", device::describe(device)));
     let mean = |count: fn(&Counts) -> u64| counts.iter().map(count).sum::<u64>() as f64 / counts.len() as f64;
-    say::out(&format!("{n} Gaussians; per view, on average:"));
+    say(&format!("{n} Gaussians; per view, on average:"));
     let lines: [(&str, Field); 7] = [
         ("visible", |c| c.visible),
         ("left out: before the near plane", |c| c.near),
@@ -259,7 +338,7 @@ fn report(n: usize, counts: &[Counts], device: &Device) {
         ("pairs of a splat and a tile", |c| c.intersections),
     ];
     for (name, count) in lines {
-        say::out(&format!("  {name:<34} {:>12.1}", mean(count)));
+        say(&format!("  {name:<34} {:>12.1}", mean(count)));
     }
 }
 

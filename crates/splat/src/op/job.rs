@@ -1,6 +1,6 @@
 //! What one call of the operation is to do, and what it counted: plain host data.
 
-use crate::options::{RenderOptions, TILE};
+use crate::options::{MIN_TRANSMITTANCE, RenderOptions, TILE};
 use crate::vjp::{Mat3, Vec3, View};
 use crate::{Camera, SplatError};
 
@@ -9,8 +9,8 @@ pub(super) const MAX_MAGNITUDE: f32 = 1e18;
 /// Least |q|² of a quaternion that still names a rotation.
 pub(super) const MIN_QUATERNION: f32 = 1e-12;
 /// Added to the squared radius inside which a splat's α can reach [`MIN_ALPHA`](crate::options::MIN_ALPHA), so that
-/// rounding cannot cut off a pixel that the exact test would have taken.
-pub(super) const RADIUS_MARGIN: f32 = 1e-3;
+/// rounding does not cut off a pixel that the exact test would have taken (needles of 4,000 pixels included).
+pub(super) const RADIUS_MARGIN: f32 = 1e-2;
 /// Largest image side; keeps pixel coordinates exact in f32 and tile numbers in 32 bits.
 pub const MAX_SIDE: u32 = 32_768;
 
@@ -63,8 +63,10 @@ impl Job {
         let check = |field, holds: bool, allowed| {
             if holds { Ok(()) } else { Err(SplatError::Option { field, allowed }) }
         };
-        check("max_alpha", max_alpha > 0.0 && max_alpha < 1.0, "within (0, 1)")?;
-        check("blur", blur > 0.0 && blur.is_finite(), "positive and finite")?;
+        // Beyond, a single clamped splat would close the pixel and be left out itself.
+        let largest = 1.0 - MIN_TRANSMITTANCE;
+        check("max_alpha", max_alpha > 0.0 && max_alpha < largest, "within (0, 0.9999)")?;
+        check("blur", blur > 0.0 && blur <= 1e6, "positive and at most 1e6 square pixels")?;
         check("near", near > 0.0 && near.is_finite(), "positive and finite")?;
         Ok(Self {
             views: cameras.iter().map(view).collect(),
@@ -111,8 +113,7 @@ fn view(camera: &Camera) -> View {
         let v = r.row(i);
         Vec3 { x: v.x as f32, y: v.y as f32, z: v.z as f32 }
     };
-    // The true inverse: a matrix from a file may be orthonormal to a few digits only.
-    let centre = -(r.inverse() * camera.world_to_camera.translation);
+    let centre = camera.centre();
     let high = centre.as_vec3();
     let low = (centre - high.as_dvec3()).as_vec3();
     // The image border as seen from the centre, plus 15 % of the image on either side.

@@ -1,7 +1,12 @@
 //! The header of a PLY file: format, elements and their properties.
 
+use crate::error::quoted;
+
 /// Longest header that is read, in bytes.
-const MAX_HEADER: usize = 1 << 20;
+pub const MAX_HEADER: usize = 1 << 20;
+
+/// Most properties of an element; a Gaussian has at most 62.
+const MAX_PROPERTIES: usize = 1000;
 
 /// How the values of the body are written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -69,6 +74,19 @@ impl Scalar {
     }
 }
 
+impl Scalar {
+    /// The length of a list at the start of `bytes`, which are little-endian. `None` for what is no length.
+    pub fn read_length(self, bytes: &[u8]) -> Option<usize> {
+        match self {
+            Self::F32 | Self::F64 => None,
+            Self::U32 => Some(u32::from_le_bytes(bytes.try_into().ok()?) as usize),
+            Self::I32 => i32::from_le_bytes(bytes.try_into().ok()?).try_into().ok(),
+            // Small enough to be exact in f32.
+            small => Some(small.read(bytes)).filter(|length| *length >= 0.0).map(|length| length as usize),
+        }
+    }
+}
+
 /// A property of an element.
 #[derive(Clone, Debug)]
 pub struct Property {
@@ -103,6 +121,7 @@ pub fn parse(bytes: &[u8]) -> Result<Header, String> {
         number += 1;
         let end = rest.iter().position(|&b| b == b'\n').ok_or_else(|| match number {
             1 => "not a PLY file: it does not start with `ply`".to_owned(),
+            _ if bytes.len() > MAX_HEADER => format!("the header is longer than {MAX_HEADER} bytes"),
             _ => "the header has no end: `end_header` is missing".to_owned(),
         })?;
         let text =
@@ -118,9 +137,10 @@ pub fn parse(bytes: &[u8]) -> Result<Header, String> {
     loop {
         let (number, text) = line()?;
         let words: Vec<&str> = text.split_ascii_whitespace().collect();
-        let wrong = |problem: &str| Err(format!("header line {number}, `{text}`: {problem}"));
+        let wrong = |problem: &str| Err(format!("header line {number}, `{}`: {problem}", quoted(&text)));
         match words.as_slice() {
             [] | ["comment" | "obj_info", ..] => {}
+            ["format", ..] if format.is_some() => return wrong("a second format"),
             ["format", name, _version] => {
                 format = match *name {
                     "ascii" => Some(Format::Ascii),
@@ -131,6 +151,9 @@ pub fn parse(bytes: &[u8]) -> Result<Header, String> {
             }
             ["element", name, count] => {
                 let Ok(count) = count.parse() else { return wrong("the count is not a whole number") };
+                if elements.len() == MAX_PROPERTIES || elements.iter().any(|e| e.name == *name) {
+                    return wrong("a second element of this name, or too many of them");
+                }
                 elements.push(Element { name: (*name).to_owned(), count, properties: Vec::new() });
             }
             ["property", kind @ .., name] => {
@@ -147,6 +170,12 @@ pub fn parse(bytes: &[u8]) -> Result<Header, String> {
                     Some([length, kind]) => (*kind, Some(*length)),
                     _ => return wrong("no such type"),
                 };
+                if element.properties.len() == MAX_PROPERTIES {
+                    return wrong("too many properties");
+                }
+                if element.properties.iter().any(|p| p.name == *name) {
+                    return wrong("a second property of this name");
+                }
                 element.properties.push(Property { name: (*name).to_owned(), kind, list });
             }
             ["end_header"] => break,

@@ -1,12 +1,14 @@
 //! Reading of Gaussian PLY files: ASCII and binary of either endianness, SH degree 0 to 3, properties in any order,
 //! further properties and elements ignored.
 
-use std::fs;
+use std::fs::File;
+use std::io::Read;
 use std::path::Path;
 
 use burn::tensor::{Device, Tensor, TensorData};
 
-use super::header::{Element, Format, Header, Property, parse};
+use super::header::{Element, Format, Header, MAX_HEADER, Property, parse};
+use crate::error::quoted;
 use crate::{Gaussians, SplatError, sh};
 
 /// Every property that must be there, in the order in which they are gathered.
@@ -31,8 +33,15 @@ pub struct Loaded {
 /// [`SplatError::Read`] if the file cannot be read, [`SplatError::Ply`] if it is no PLY, is shorter than its header
 /// says, or lacks a property.
 pub fn read(path: &Path, device: &Device) -> Result<Loaded, SplatError> {
-    let mut bytes = fs::read(path).map_err(|source| SplatError::Read { path: path.to_owned(), source })?;
-    let table = table(&mut bytes).map_err(|problem| SplatError::Ply { path: path.to_owned(), problem })?;
+    let wrong = |problem| SplatError::Ply { path: path.to_owned(), problem };
+    let cannot = |source| SplatError::Read { path: path.to_owned(), source };
+    let mut file = File::open(path).map_err(cannot)?;
+    let mut bytes = Vec::new();
+    (&mut file).take(MAX_HEADER as u64 + 1).read_to_end(&mut bytes).map_err(cannot)?;
+    // Before the rest of a file that may be anything.
+    parse(&bytes).map_err(wrong)?;
+    file.read_to_end(&mut bytes).map_err(cannot)?;
+    let table = table(&mut bytes).map_err(wrong)?;
     drop(bytes);
     let Table { n, coefficients: k, columns } = table;
     let rows = |names: usize, first: usize, f: fn(f32) -> f32| {
@@ -48,7 +57,11 @@ pub fn read(path: &Path, device: &Device) -> Result<Loaded, SplatError> {
         rows(4, 3, |v| v),
         rows(3, 7, f32::exp),
         Tensor::from_data(TensorData::new(opacities, [n]), device),
-        rows(3, 11, |v| (0.5 + sh::C0 * v).max(0.0)),
+        rows(3, 11, |v| {
+            let color = 0.5 + sh::C0 * v;
+            // Not `max`: it would turn a NaN into black.
+            if color < 0.0 && color.is_finite() { 0.0 } else { color }
+        }),
     )?;
     let harmonics = (k > 1).then(|| {
         // In the file all coefficients of red come first, then green, then blue.
@@ -77,13 +90,13 @@ fn table(bytes: &mut [u8]) -> Result<Table, String> {
     let at = header.elements.iter().position(|e| e.name == "vertex").ok_or("it has no element `vertex`")?;
     let vertex = &header.elements[at];
     if let Some(list) = vertex.properties.iter().find(|p| p.list.is_some()) {
-        return Err(format!("`vertex` has a list, `{}`; Gaussians are single values", list.name));
+        return Err(format!("`vertex` has a list, `{}`; Gaussians are single values", quoted(&list.name)));
     }
     let position = |name: &str| vertex.properties.iter().position(|p| p.name == name);
     let mut wanted = Vec::new();
     for name in REQUIRED {
         wanted.push(position(name).ok_or_else(|| {
-            let found: Vec<&str> = vertex.properties.iter().map(|p| p.name.as_str()).take(12).collect();
+            let found: Vec<String> = vertex.properties.iter().map(|p| quoted(&p.name)).take(12).collect();
             format!(
                 "`vertex` has no property `{name}`: not a file of Gaussians (it has {})",
                 found.join(", ")
@@ -139,7 +152,9 @@ fn ascii(header: &Header, at: usize, body: &[u8], wanted: &[usize]) -> Result<Ve
             let name = &vertex.properties[index].name;
             let value = values[index].parse();
             column.push(
-                value.map_err(|_| format!("vertex {row}: `{name}` is `{}`, no number", values[index]))?,
+                value.map_err(|_| {
+                    format!("vertex {row}: `{name}` is `{}`, no number", quoted(values[index]))
+                })?,
             );
         }
     }
@@ -151,7 +166,7 @@ fn binary(header: &Header, at: usize, body: &mut [u8], wanted: &[usize]) -> Resu
     let mut start = 0;
     for element in &header.elements[..at] {
         start = skip(element, body, start, big)
-            .ok_or_else(|| format!("the file ends too early: in element `{}`", element.name))?;
+            .ok_or_else(|| format!("the file ends too early: in element `{}`", quoted(&element.name)))?;
     }
     let vertex = &header.elements[at];
     let stride: usize = vertex.properties.iter().map(|p| p.kind.size()).sum();
@@ -194,7 +209,7 @@ fn skip(element: &Element, body: &[u8], start: usize, big: bool) -> Option<usize
                         bytes.reverse();
                     }
                     at += length.size();
-                    length.read(&bytes) as usize
+                    length.read_length(&bytes)?
                 }
             };
             at = at.checked_add(items.checked_mul(kind.size())?).filter(|end| *end <= body.len())?;

@@ -66,15 +66,19 @@ struct ViewState {
 pub fn forward(scene: Scene, job: &Job, keep: bool) -> Result<(Vec<f32>, State, Counts), SplatError> {
     let pixels = job.width * job.height;
     let channels = job.channels();
-    let mut image = vec![0.0_f32; job.views.len() * pixels * channels];
+    let mut image = Vec::new();
     let mut state = State::default();
     let mut counts = Counts::default();
     for (index, view) in job.views.iter().enumerate() {
         let splats = splats::visible(scene, view, job, &mut counts);
         let lists = tiles::lists(&splats, job, keep)?;
+        if image.is_empty() {
+            image = zeros("the image", job.views.len() * pixels * channels)?;
+        }
         counts.intersections += lists.len() as u64;
         let kept = if keep { pixels } else { 0 };
-        let mut view = ViewState { splats, lists, transmittance: vec![0.0; kept], last: vec![0; kept] };
+        let transmittance = zeros("the state of all pixels", kept)?;
+        let mut view = ViewState { splats, lists, transmittance, last: vec![0; kept] };
         let out = &mut image[index * pixels * channels..][..pixels * channels];
         blend::blend(&mut view, scene.background(), job, out);
         if keep {
@@ -82,4 +86,15 @@ pub fn forward(scene: Scene, job: &Job, keep: bool) -> Result<(Vec<f32>, State, 
         }
     }
     Ok((image, state, counts))
+}
+
+/// So many zeros, or an error where the system refuses the memory.
+fn zeros(what: &'static str, n: usize) -> Result<Vec<f32>, SplatError> {
+    // Asked for and given back: `vec!` gets its zeros from the system, page by page when they are first touched, but ends
+    // the process where it gets none.
+    let mut probe = Vec::<f32>::new();
+    let bytes = (n as u64).saturating_mul(4);
+    probe.try_reserve_exact(n).map_err(|_| SplatError::Memory { what, bytes })?;
+    drop(probe);
+    Ok(vec![0.0; n])
 }

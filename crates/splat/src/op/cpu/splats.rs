@@ -28,8 +28,7 @@ pub struct Splat {
     pub depth: f32,
     /// Squared radius, in standard deviations, beyond which α < 1/255.
     pub radius_squared: f32,
-    /// First and last pixel column and row within reach.
-    pub columns: [u16; 2],
+    /// First and last pixel row within reach.
     pub rows: [u16; 2],
     /// Row of the Gaussian in the input.
     pub gaussian: u32,
@@ -141,7 +140,6 @@ fn splat(scene: Scene, g: usize, view: &View, job: &Job) -> Result<Splat, Cull> 
     }
     let radius_squared = 2.0 * (opacity / MIN_ALPHA).ln() + RADIUS_MARGIN;
     let radius = radius_squared.sqrt();
-    let columns = reach(f.u, radius * f.sigma_x, job.width).ok_or(Cull::Outside)?;
     let rows = reach(f.v, radius * f.sigma_y, job.height).ok_or(Cull::Outside)?;
     let splat = Splat {
         u: f.u,
@@ -153,7 +151,6 @@ fn splat(scene: Scene, g: usize, view: &View, job: &Job) -> Result<Splat, Cull> 
         color,
         depth: t.z,
         radius_squared,
-        columns,
         rows,
         gaussian: g as u32,
         compensation,

@@ -1,15 +1,22 @@
 //! Which splats each tile must look at, front to back.
 
+use std::ops::RangeInclusive;
+
 use rayon::prelude::*;
 
 use super::super::job::Job;
 use super::splats::Splat;
 use crate::SplatError;
 use crate::options::TILE;
-use crate::vjp::least_form;
+use crate::vjp::span;
 
 /// Splats per task.
 const CHUNK: usize = 4096;
+
+/// Most entries of all lists together: 4 GB here, and as much again while they are made …
+const MAX_ENTRIES: u64 = 1 << 29;
+/// … and where a gradient is wanted, whose records take 40 bytes per entry.
+const MAX_KEPT: u64 = 1 << 28;
 
 /// One list of splats per tile, back to back in one array, tiles row by row.
 #[derive(Debug, Default)]
@@ -36,66 +43,46 @@ impl Lists {
     }
 }
 
-/// Calls `found` with every tile in which a pixel centre may lie inside the splat's ellipse, until that returns false.
+/// The tiles of one row that the splat reaches: first and last, over the columns of pixel centres that its ellipse holds
+/// within that row.
 #[inline]
-fn for_each_tile(splat: &Splat, job: &Job, mut found: impl FnMut(u32) -> bool) {
-    let [x0, x1] = splat.columns.map(|x| usize::from(x) / TILE);
-    let [y0, y1] = splat.rows.map(|y| usize::from(y) / TILE);
-    let alone = x0 == x1 && y0 == y1;
-    // Pixel centres of a tile along one axis, relative to the splat.
-    let span = |tile: usize, side: usize, centre: f32| {
-        let (first, last) = (tile * TILE, (tile * TILE + TILE - 1).min(side - 1));
-        (first as f32 + 0.5 - centre, last as f32 + 0.5 - centre)
-    };
-    for y in y0..=y1 {
-        let (top, bottom) = span(y, job.height, splat.v);
-        for x in x0..=x1 {
-            let (left, right) = span(x, job.width, splat.u);
-            let inside = alone
-                || least_form(splat.l0, splat.k, splat.l1, left, right, top, bottom) <= splat.radius_squared;
-            if inside && !found((y * job.tiles_x() + x) as u32) {
-                return;
-            }
-        }
-    }
+fn tiles_in_row(splat: &Splat, y: usize, job: &Job) -> Option<RangeInclusive<usize>> {
+    let first = (y * TILE) as f32 + 0.5 - splat.v;
+    let last = (y * TILE + TILE - 1).min(job.height - 1) as f32 + 0.5 - splat.v;
+    let span = span(splat.l0, splat.k, splat.l1, splat.radius_squared, first, last);
+    let left = (splat.u + span.left - 0.5).max(0.0).ceil();
+    let right = (splat.u + span.right - 0.5).min((job.width - 1) as f32).floor();
+    (left <= right).then_some(left as usize / TILE..=right as usize / TILE)
 }
 
-/// At least as many tiles as the splat reaches.
-fn bound(splat: &Splat) -> u64 {
-    let tiles = |[first, last]: [u16; 2]| u64::from(last) / TILE as u64 - u64::from(first) / TILE as u64 + 1;
-    tiles(splat.columns) * tiles(splat.rows)
+/// The rows of tiles that the splat reaches.
+#[inline]
+fn tile_rows(splat: &Splat) -> RangeInclusive<usize> {
+    usize::from(splat.rows[0]) / TILE..=usize::from(splat.rows[1]) / TILE
 }
 
 /// Whether the splat is in any tile's list.
 pub fn reaches_a_tile(splat: &Splat, job: &Job) -> bool {
-    let mut reached = false;
-    for_each_tile(splat, job, |_| {
-        reached = true;
-        false
-    });
-    reached
+    tile_rows(splat).any(|y| tiles_in_row(splat, y, job).is_some())
+}
+
+/// How many tiles the splat reaches.
+fn count(splat: &Splat, job: &Job) -> u64 {
+    tile_rows(splat)
+        .filter_map(|y| tiles_in_row(splat, y, job))
+        .map(|tiles| (tiles.end() - tiles.start() + 1) as u64)
+        .sum()
 }
 
 /// The lists of all tiles for `splats`, which are ordered front to back.
 ///
 /// # Errors
-/// [`SplatError::TooManyIntersections`] beyond 2³¹ entries.
+/// [`SplatError::TooManyIntersections`] beyond [`MAX_ENTRIES`] or [`MAX_KEPT`].
 pub fn lists(splats: &[Splat], job: &Job, keep_places: bool) -> Result<Lists, SplatError> {
-    // Counted before anything is stored, where it could be too much.
-    let limit = i32::MAX as u64;
-    if splats.iter().map(bound).sum::<u64>() > limit {
-        let count = |splat: &Splat| {
-            let mut count = 0_u64;
-            for_each_tile(splat, job, |_| {
-                count += 1;
-                true
-            });
-            count
-        };
-        let found = splats.par_iter().map(count).sum();
-        if found > limit {
-            return Err(SplatError::TooManyIntersections { found, limit });
-        }
+    let limit = if keep_places { MAX_KEPT } else { MAX_ENTRIES };
+    let found = splats.par_iter().map(|splat| count(splat, job)).sum();
+    if found > limit {
+        return Err(SplatError::TooManyIntersections { found, limit });
     }
     // Per task: the tiles of its splats in order, and how many each splat has.
     let chunks: Vec<(Vec<u32>, Vec<u32>)> = splats
@@ -105,16 +92,16 @@ pub fn lists(splats: &[Splat], job: &Job, keep_places: bool) -> Result<Lists, Sp
             let mut counts = Vec::with_capacity(splats.len());
             for splat in splats {
                 let before = tiles.len();
-                for_each_tile(splat, job, |tile| {
-                    tiles.push(tile);
-                    true
-                });
+                for y in tile_rows(splat) {
+                    let row = (y * job.tiles_x()) as u32;
+                    tiles.extend(tiles_in_row(splat, y, job).into_iter().flatten().map(|x| row + x as u32));
+                }
                 counts.push((tiles.len() - before) as u32);
             }
             (tiles, counts)
         })
         .collect();
-    let total: usize = chunks.iter().map(|(tiles, _)| tiles.len()).sum();
+    let total = found as usize;
 
     let mut starts = vec![0_u32; job.tiles_x() * job.tiles_y() + 1];
     for (tiles, _) in &chunks {

@@ -319,9 +319,9 @@ pub fn gather(
     let mut blue = 0.0f32;
     for index in 0..view_count {
         let at = (index * n + g) * comptime!(REACH);
-        let count = reach[at + 2] as usize;
+        let count = reach[at + 1] as usize;
         if count > 0 {
-            let first = reach[at + 3] as usize;
+            let first = reach[at + 2] as usize;
             let mut v_visible = 0.0f32;
             let mut r0 = 0.0f32;
             let mut r1 = 0.0f32;

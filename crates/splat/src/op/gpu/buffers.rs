@@ -6,6 +6,8 @@ use burn_cubecl::ops::numeric::empty_device_contiguous_dtype;
 use burn_cubecl::tensor::CubeTensor;
 use cubecl::prelude::*;
 
+use crate::SplatError;
+
 /// A device to allocate on and launch to.
 pub struct Buffers {
     pub client: Client,
@@ -60,6 +62,19 @@ impl Buffers {
         CubeCount::Static(n.div_ceil(y) as u32, y as u32, 1)
     }
 
+    /// Whether an array of `n` numbers is allowed; kernels count in 32 bits.
+    ///
+    /// # Errors
+    /// [`SplatError::Memory`].
+    pub fn check(&self, what: &'static str, n: usize) -> Result<(), SplatError> {
+        let bytes = (n as u64).saturating_mul(4);
+        if bytes > self.largest() || n > u32::MAX as usize {
+            Err(SplatError::Memory { what, bytes })
+        } else {
+            Ok(())
+        }
+    }
+
     /// Largest buffer in bytes.
     pub fn largest(&self) -> u64 {
         self.client.properties().memory.max_page_size
@@ -82,6 +97,22 @@ impl Buffers {
 fn fill(out: &mut [u32], n: usize, value: u32) {
     if ABSOLUTE_POS < n {
         out[ABSOLUTE_POS] = value;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::testing::{read, with_buffers};
+
+    /// More groups of 256 than one axis of a launch takes.
+    #[test]
+    fn long_buffers_are_filled_to_the_end() {
+        with_buffers(|buffers| {
+            let n = 17_000_000;
+            assert!(read(buffers.zeros(n)).iter().all(|v| *v == 0));
+            assert!(buffers.check("a test", n).is_ok());
+            assert!(buffers.check("a test", usize::MAX / 8).is_err());
+        });
     }
 }
 

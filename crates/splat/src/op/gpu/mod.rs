@@ -1,7 +1,7 @@
 //! The splatting operation as CubeCL kernels: the same source for WGSL, SPIR-V, Metal and CUDA.
 //!
 //! 1. Project every Gaussian into every view, cull, count the tiles that each splat reaches.
-//! 2. Sort the splats of all views by depth, sum up their tile counts, read the total back (the only read-back).
+//! 2. Sort the splats of all views by depth, sum up their tile counts, read the counts back (the only read-back).
 //! 3. Write one intersection per splat and tile, in depth order, and sort these by tile; the sort is stable, so each
 //!    tile's list is front to back.
 //! 4. Blend, one cube per tile.
@@ -19,7 +19,7 @@ mod sort;
 use std::sync::Arc;
 
 use burn::backend::tensor::FloatTensor;
-use burn::tensor::DType;
+use burn::tensor::{DType, Shape};
 use burn_cubecl::CubeBackend;
 use burn_cubecl::kernel::into_contiguous;
 use burn_cubecl::ops::into_data_sync;
@@ -35,8 +35,8 @@ use project::{REACH, SPLAT, STATISTICS};
 
 /// Units of a cube where each unit has work of its own.
 const UNITS: u32 = 256;
-/// Bytes per intersection in the largest buffer, the records of the backward pass.
-const RECORD_BYTES: u64 = 40;
+/// Most numbers in a record of the backward pass.
+const RECORD: u64 = 10;
 
 /// Channels of the image, for kernels.
 fn channels(depth: bool) -> usize {
@@ -83,6 +83,7 @@ impl SplatKernels for CubeBackend {
         let (splats, reach, lists, counts) = lists(&buffers, &inputs, &views, job, keep)?;
 
         let shape = [job.views.len(), job.height, job.width, job.channels()];
+        buffers.check("the image", shape.iter().product())?;
         let image = buffers.empty(shape, DType::F32);
         let kept = if keep { job.views.len() * job.height * job.width } else { 1 };
         let (transmittance, last) = (buffers.f32(kept), buffers.u32(kept));
@@ -125,17 +126,12 @@ impl SplatKernels for CubeBackend {
         let upstream = into_contiguous(upstream);
         let buffers = Buffers::of(&inputs.means);
         let n = inputs.len;
-        let room = |shape: [usize; 2], wanted: bool| {
-            wanted.then(|| match shape {
-                [0, columns] => zero_rows(&buffers, columns),
-                shape => buffers.empty(shape, DType::F32),
-            })
-        };
+        let room = |shape: [usize; 2], wanted: bool| wanted.then(|| gradient(&buffers, shape));
         let means = room([n, 3], wanted.geometry);
         let rotations = room([n, 4], wanted.geometry);
         let scales = room([n, 3], wanted.geometry);
         let colors = room([n, 3], wanted.colors);
-        let opacities = wanted.opacities.then(|| buffers.empty([n], DType::F32));
+        let opacities = wanted.opacities.then(|| gradient(&buffers, [n]));
         let background = wanted.background.then(|| background(&buffers, job, state, &upstream));
         let record = Record {
             colors: wanted.colors,
@@ -177,10 +173,10 @@ impl SplatKernels for CubeBackend {
     }
 }
 
-/// A tensor without rows: the kernels need at least one number, its shape says that there is none.
-fn zero_rows(buffers: &Buffers, columns: usize) -> CubeTensor {
-    let tensor = buffers.f32(1);
-    CubeTensor::new_contiguous(tensor.client, tensor.device, [0, columns].into(), tensor.handle, DType::F32)
+/// Room for a gradient. Where there is nothing, its shape says so, though the kernels need at least one number.
+fn gradient<const D: usize>(buffers: &Buffers, shape: [usize; D]) -> CubeTensor {
+    let CubeTensor { client, device, handle, .. } = buffers.empty(shape, DType::F32);
+    CubeTensor::new_contiguous(client, device, Shape::new(shape), handle, DType::F32)
 }
 
 /// Contiguous inputs and the number of Gaussians.
@@ -225,13 +221,18 @@ fn lists(
     let (width, height) = (job.width as u32, job.height as u32);
     let dim = CubeDim::new_1d(UNITS);
     let one_each = |n: usize| buffers.cubes(n.div_ceil(UNITS as usize));
-    let limit = (buffers.largest() / if keep { RECORD_BYTES } else { 4 }).min(i32::MAX as u64);
+    // The largest array per intersection: its record of the backward pass, or a number.
+    let numbers = if keep { RECORD } else { 1 };
+    let limit = (buffers.largest() / 4).min(u32::MAX.into()) / numbers;
 
+    buffers.check("the list of splats", total.saturating_mul(SPLAT))?;
+    buffers.check("the list of tiles", all_tiles.saturating_add(1))?;
     let splats = buffers.f32(total * SPLAT);
     let reach = buffers.u32(total * REACH);
     let keys = buffers.u32(total);
     let statistics = buffers.zeros(STATISTICS);
-    let (starts, ends) = (buffers.zeros(all_tiles), buffers.zeros(all_tiles));
+    // One more for the tile that does not exist.
+    let (starts, ends) = (buffers.zeros(all_tiles + 1), buffers.zeros(all_tiles + 1));
     if total == 0 {
         let lists = Lists { entries: buffers.u32(1), slots: buffers.u32(1), starts, ends, len: 0 };
         return Ok((splats, reach, lists, Counts::default()));
@@ -270,19 +271,8 @@ fn lists(
         total,
     );
     let offsets = scan::exclusive_sum(buffers, &sorted, total);
-    project::note_total::launch(
-        &buffers.client,
-        buffers.cubes(1),
-        CubeDim::new_1d(1),
-        offsets.clone().into_buffer_arg(),
-        statistics.clone().into_buffer_arg(),
-        total,
-    );
     let s: Vec<u32> = into_data_sync(statistics).try_into_vec().expect("u32 as allocated");
-    // The coarse count is too high by less than 1024 per splat, so it decides only where the fine one can have wrapped.
-    let coarse = u64::from(s[7]) << 10;
-    let wrapped = coarse.saturating_sub(u64::from(s[0]) << 10) > u64::from(u32::MAX) / 2;
-    let found = if wrapped { coarse } else { u64::from(s[6]) };
+    let found = u64::from(s[6]) + (u64::from(s[7]) << 10) + (u64::from(s[8]) << 20);
     if found > limit {
         return Err(SplatError::TooManyIntersections { found, limit });
     }
@@ -313,9 +303,10 @@ fn lists(
         height,
         job.tiles_x() as u32,
         tiles as u32,
+        all_tiles as u32,
     );
-    let bits = usize::BITS - (all_tiles - 1).leading_zeros();
-    let (sorted_tiles, slots) = sort::sort_pairs(buffers, tile_of, None, len, bits.max(1));
+    let bits = usize::BITS - all_tiles.leading_zeros();
+    let (sorted_tiles, slots) = sort::sort_pairs(buffers, tile_of, None, len, bits);
     project::lists::launch(
         &buffers.client,
         one_each(len),

@@ -4,20 +4,22 @@ use cubecl::prelude::*;
 
 use super::super::job::{MAX_MAGNITUDE, MIN_QUATERNION, RADIUS_MARGIN};
 use crate::options::{MIN_ALPHA, TILE};
-use crate::vjp::{Mat3, Quat, Vec3, View, footprint, least_form, project, to_camera};
+use crate::vjp::{Mat3, Quat, Vec3, View, footprint, project, span, to_camera};
 
 /// f32 per splat: u, v, l₀, k, l₁, opacity after antialiasing, depth, squared radius.
 pub const SPLAT: usize = 8;
-/// u32 per splat: first and last tile column, first and last tile row (two in each number), how many tiles it reaches,
-/// number of its first intersection.
-pub const REACH: usize = 4;
+/// u32 per splat: first and last tile row (`first | last << 16`), how many tiles it reaches, number of its first
+/// intersection.
+pub const REACH: usize = 3;
 /// f32 per camera.
 pub const VIEW: usize = 23;
 /// Key of a culled Gaussian: behind all others.
 const CULLED: u32 = 0xFFFF_FFFF;
-/// Numbers in the statistics: visible, near, outside, transparent, degenerate, invalid, intersections, and the
-/// intersections in units of 1024, rounded up cube by cube, for when the former wraps.
-pub const STATISTICS: usize = 8;
+/// No tile.
+const NONE: u32 = 0xFFFF_FFFF;
+/// Numbers in the statistics: visible, near, outside, transparent, degenerate, invalid, and the intersections in three
+/// limbs of 10 bits and more, lowest first.
+pub const STATISTICS: usize = 9;
 const UNITS: usize = 256;
 
 /// A camera in the order that [`load_view`] reads.
@@ -92,13 +94,12 @@ fn in_range3(v: &Vec3) -> bool {
     in_range(v.x) && in_range(v.y) && in_range(v.z)
 }
 
-/// First and last tile along one axis in which a pixel centre lies within `extent` of `centre`: `first | last << 16`,
-/// or [`CULLED`] where there is none.
+/// First and last tile along one axis with a pixel centre between `low` and `high`: `first | last << 16`, or [`NONE`].
 #[cube]
-fn tiles_within(centre: f32, extent: f32, side: u32) -> u32 {
-    let first = (centre - extent - 0.5).max(0.0).ceil();
-    let last = (centre + extent - 0.5).min(f32::cast_from(side) - 1.0).floor();
-    let mut packed = comptime!(CULLED).runtime();
+fn tiles_between(low: f32, high: f32, side: u32) -> u32 {
+    let first = (low - 0.5).max(0.0).ceil();
+    let last = (high - 0.5).min(f32::cast_from(side) - 1.0).floor();
+    let mut packed = comptime!(NONE).runtime();
     if first <= last {
         let tile = comptime!(TILE as u32);
         packed = (u32::cast_from(first) / tile) | ((u32::cast_from(last) / tile) << 16u32);
@@ -117,15 +118,14 @@ struct Ellipse {
     radius_squared: f32,
 }
 
-/// Whether a pixel centre of tile (x, y) may lie inside the splat's ellipse.
+/// The tiles that the ellipse reaches in tile row `y`, packed as by [`tiles_between`].
 #[cube]
-fn tile_is_reached(s: &Ellipse, x: u32, y: u32, width: u32, height: u32) -> bool {
+fn tiles_in_row(s: &Ellipse, y: u32, width: u32, height: u32) -> u32 {
     let tile = comptime!(TILE as u32);
-    let left = f32::cast_from(x * tile) + 0.5 - s.u;
-    let right = f32::cast_from((x * tile + tile - 1u32).min(width - 1u32)) + 0.5 - s.u;
     let top = f32::cast_from(y * tile) + 0.5 - s.v;
     let bottom = f32::cast_from((y * tile + tile - 1u32).min(height - 1u32)) + 0.5 - s.v;
-    least_form(s.l0, s.k, s.l1, left, right, top, bottom) <= s.radius_squared
+    let reached = span(s.l0, s.k, s.l1, s.radius_squared, top, bottom);
+    tiles_between(s.u + reached.left, s.u + reached.right, width)
 }
 
 /// Projects every Gaussian into every view: `splats` `[V·N, SPLAT]`, `reach` `[V·N, REACH]` (without the last),
@@ -205,7 +205,6 @@ pub fn project_all(
                         if visible >= comptime!(MIN_ALPHA) {
                             let radius_squared =
                                 2.0 * (visible / comptime!(MIN_ALPHA)).ln() + comptime!(RADIUS_MARGIN);
-                            let radius = radius_squared.sqrt();
                             splats[at] = f.u;
                             splats[at + 1] = f.v;
                             splats[at + 2] = f.l0;
@@ -214,19 +213,17 @@ pub fn project_all(
                             splats[at + 5] = visible;
                             splats[at + 6] = t.z;
                             splats[at + 7] = radius_squared;
-                            let columns = tiles_within(f.u, radius * f.sigma_x, width);
-                            let rows = tiles_within(f.v, radius * f.sigma_y, height);
+                            let extent = radius_squared.sqrt() * f.sigma_y;
+                            let rows = tiles_between(f.v - extent, f.v + extent, height);
                             fate = 2u32;
-                            if columns != comptime!(CULLED) && rows != comptime!(CULLED) {
-                                reach[reach_at] = columns;
-                                reach[reach_at + 1] = rows;
+                            if rows != comptime!(NONE) {
+                                reach[reach_at] = rows;
                                 let ellipse =
                                     Ellipse { u: f.u, v: f.v, l0: f.l0, k: f.k, l1: f.l1, radius_squared };
                                 for y in rows & 0xFFFFu32..(rows >> 16u32) + 1u32 {
-                                    for x in columns & 0xFFFFu32..(columns >> 16u32) + 1u32 {
-                                        if tile_is_reached(&ellipse, x, y, width, height) {
-                                            count += 1u32;
-                                        }
+                                    let row = tiles_in_row(&ellipse, y, width, height);
+                                    if row != comptime!(NONE) {
+                                        count += (row >> 16u32) - (row & 0xFFFFu32) + 1u32;
                                     }
                                 }
                                 if count > 0u32 {
@@ -239,7 +236,7 @@ pub fn project_all(
                 }
             }
         }
-        reach[reach_at + 2] = count;
+        reach[reach_at + 1] = count;
         keys[ABSOLUTE_POS] = key;
     }
     fates[unit] = fate;
@@ -257,14 +254,14 @@ pub fn project_all(
         }
     }
     if UNIT_POS == 6u32 {
+        // At most 256 · 2²² and exact; three limbs of 10 bits keep the sum over all cubes exact too.
         let mut sum = 0u32;
         for i in 0..comptime!(UNITS) {
-            // Rounded up one by one: 256 of the largest would not fit into 32 bits.
-            sum += (tiles[i] + 1023u32) >> 10u32;
+            sum += tiles[i];
         }
-        if sum > 0u32 {
-            statistics[7].fetch_add(sum);
-        }
+        statistics[6].fetch_add(sum & 0x3FFu32);
+        statistics[7].fetch_add((sum >> 10u32) & 0x3FFu32);
+        statistics[8].fetch_add(sum >> 20u32);
     }
 }
 
@@ -272,19 +269,14 @@ pub fn project_all(
 #[cube(launch)]
 pub fn sort_counts(reach: &[u32], order: &[u32], sorted: &mut [u32], total: usize) {
     if ABSOLUTE_POS < total {
-        sorted[ABSOLUTE_POS] = reach[order[ABSOLUTE_POS] as usize * comptime!(REACH) + 2];
-    }
-}
-
-/// Notes the number of intersections beside the other statistics, for a single read-back.
-#[cube(launch)]
-pub fn note_total(offsets: &[u32], statistics: &mut [u32], total: usize) {
-    if ABSOLUTE_POS == 0 {
-        statistics[6] = offsets[total];
+        sorted[ABSOLUTE_POS] = reach[order[ABSOLUTE_POS] as usize * comptime!(REACH) + 1];
     }
 }
 
 /// One intersection per splat and tile, splats front to back: its tile (counted over all views) and its splat.
+///
+/// A splat has as many places as [`project_all`] counted. Should this kernel be compiled to round differently, it fills
+/// what is left with a tile that does not exist rather than touch another splat's places.
 #[cube(launch)]
 #[allow(clippy::too_many_arguments, reason = "a kernel takes its buffers one by one")]
 pub fn emit(
@@ -300,18 +292,19 @@ pub fn emit(
     height: u32,
     tiles_x: u32,
     tiles: u32,
+    all_tiles: u32,
 ) {
     if ABSOLUTE_POS >= total {
         terminate!();
     }
     let splat = order[ABSOLUTE_POS] as usize;
     let at = splat * comptime!(REACH);
-    if reach[at + 2] > 0u32 {
+    if reach[at + 1] > 0u32 {
         let mut next = offsets[ABSOLUTE_POS];
-        reach[at + 3] = next;
+        let end = offsets[ABSOLUTE_POS + 1];
+        reach[at + 2] = next;
         let first_tile = (splat / n) as u32 * tiles;
-        let columns = reach[at];
-        let rows = reach[at + 1];
+        let rows = reach[at];
         let s = splat * comptime!(SPLAT);
         let ellipse = Ellipse {
             u: splats[s],
@@ -322,13 +315,21 @@ pub fn emit(
             radius_squared: splats[s + 7],
         };
         for y in rows & 0xFFFFu32..(rows >> 16u32) + 1u32 {
-            for x in columns & 0xFFFFu32..(columns >> 16u32) + 1u32 {
-                if tile_is_reached(&ellipse, x, y, width, height) {
-                    tile_of[next as usize] = first_tile + y * tiles_x + x;
-                    splat_of[next as usize] = splat as u32;
-                    next += 1u32;
+            let row = tiles_in_row(&ellipse, y, width, height);
+            if row != comptime!(NONE) {
+                for x in row & 0xFFFFu32..(row >> 16u32) + 1u32 {
+                    if next < end {
+                        tile_of[next as usize] = first_tile + y * tiles_x + x;
+                        splat_of[next as usize] = splat as u32;
+                        next += 1u32;
+                    }
                 }
             }
+        }
+        while next < end {
+            tile_of[next as usize] = all_tiles;
+            splat_of[next as usize] = splat as u32;
+            next += 1u32;
         }
     }
 }
