@@ -30,6 +30,8 @@ pub struct Splat {
     pub radius_squared: f32,
     /// First and last pixel row within reach.
     pub rows: [u16; 2],
+    /// How many tiles it reaches.
+    pub tiles: u32,
     /// Row of the Gaussian in the input.
     pub gaussian: u32,
     /// √(det Σ'_raw / det Σ') with antialiasing, else 1.
@@ -141,7 +143,7 @@ fn splat(scene: Scene, g: usize, view: &View, job: &Job) -> Result<Splat, Cull> 
     let radius_squared = 2.0 * (opacity / MIN_ALPHA).ln() + RADIUS_MARGIN;
     let radius = radius_squared.sqrt();
     let rows = reach(f.v, radius * f.sigma_y, job.height).ok_or(Cull::Outside)?;
-    let splat = Splat {
+    let mut splat = Splat {
         u: f.u,
         v: f.v,
         l0: f.l0,
@@ -152,10 +154,12 @@ fn splat(scene: Scene, g: usize, view: &View, job: &Job) -> Result<Splat, Cull> 
         depth: t.z,
         radius_squared,
         rows,
+        tiles: 0,
         gaussian: g as u32,
         compensation,
     };
-    if super::tiles::reaches_a_tile(&splat, job) { Ok(splat) } else { Err(Cull::Outside) }
+    splat.tiles = super::tiles::count(&splat, job);
+    if splat.tiles > 0 { Ok(splat) } else { Err(Cull::Outside) }
 }
 
 /// First and last pixel whose centre lies within `extent` of `centre`, in an image of `side` pixels.

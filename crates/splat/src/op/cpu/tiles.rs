@@ -61,17 +61,10 @@ fn tile_rows(splat: &Splat) -> RangeInclusive<usize> {
     usize::from(splat.rows[0]) / TILE..=usize::from(splat.rows[1]) / TILE
 }
 
-/// Whether the splat is in any tile's list.
-pub fn reaches_a_tile(splat: &Splat, job: &Job) -> bool {
-    tile_rows(splat).any(|y| tiles_in_row(splat, y, job).is_some())
-}
-
 /// How many tiles the splat reaches.
-fn count(splat: &Splat, job: &Job) -> u64 {
-    tile_rows(splat)
-        .filter_map(|y| tiles_in_row(splat, y, job))
-        .map(|tiles| (tiles.end() - tiles.start() + 1) as u64)
-        .sum()
+pub fn count(splat: &Splat, job: &Job) -> u32 {
+    let rows = tile_rows(splat).filter_map(|y| tiles_in_row(splat, y, job));
+    rows.map(|tiles| (tiles.end() - tiles.start() + 1) as u32).sum()
 }
 
 /// The lists of all tiles for `splats`, which are ordered front to back.
@@ -80,31 +73,28 @@ fn count(splat: &Splat, job: &Job) -> u64 {
 /// [`SplatError::TooManyIntersections`] beyond [`MAX_ENTRIES`] or [`MAX_KEPT`].
 pub fn lists(splats: &[Splat], job: &Job, keep_places: bool) -> Result<Lists, SplatError> {
     let limit = if keep_places { MAX_KEPT } else { MAX_ENTRIES };
-    let found = splats.par_iter().map(|splat| count(splat, job)).sum();
+    let found = splats.iter().map(|splat| u64::from(splat.tiles)).sum();
     if found > limit {
         return Err(SplatError::TooManyIntersections { found, limit });
     }
-    // Per task: the tiles of its splats in order, and how many each splat has.
-    let chunks: Vec<(Vec<u32>, Vec<u32>)> = splats
+    // Per task: the tiles of its splats in order.
+    let chunks: Vec<Vec<u32>> = splats
         .par_chunks(CHUNK)
         .map(|splats| {
-            let mut tiles = Vec::with_capacity(3 * splats.len());
-            let mut counts = Vec::with_capacity(splats.len());
+            let mut tiles = Vec::with_capacity(splats.iter().map(|splat| splat.tiles as usize).sum());
             for splat in splats {
-                let before = tiles.len();
                 for y in tile_rows(splat) {
                     let row = (y * job.tiles_x()) as u32;
                     tiles.extend(tiles_in_row(splat, y, job).into_iter().flatten().map(|x| row + x as u32));
                 }
-                counts.push((tiles.len() - before) as u32);
             }
-            (tiles, counts)
+            tiles
         })
         .collect();
     let total = found as usize;
 
     let mut starts = vec![0_u32; job.tiles_x() * job.tiles_y() + 1];
-    for (tiles, _) in &chunks {
+    for tiles in &chunks {
         for &tile in tiles {
             starts[tile as usize + 1] += 1;
         }
@@ -119,22 +109,18 @@ pub fn lists(splats: &[Splat], job: &Job, keep_places: bool) -> Result<Lists, Sp
         lists.places = Vec::with_capacity(total);
         lists.first_place = Vec::with_capacity(splats.len() + 1);
     }
-    let mut splat = 0;
-    for (tiles, counts) in &chunks {
-        let mut tiles = tiles.iter();
-        for &count in counts {
+    let mut tiles = chunks.iter().flatten();
+    for (index, splat) in (0..).zip(splats) {
+        if keep_places {
+            lists.first_place.push(lists.places.len() as u32);
+        }
+        for &tile in tiles.by_ref().take(splat.tiles as usize) {
+            let place = next[tile as usize];
+            next[tile as usize] += 1;
+            lists.entries[place as usize] = index;
             if keep_places {
-                lists.first_place.push(lists.places.len() as u32);
+                lists.places.push(place);
             }
-            for &tile in tiles.by_ref().take(count as usize) {
-                let place = next[tile as usize];
-                next[tile as usize] += 1;
-                lists.entries[place as usize] = splat;
-                if keep_places {
-                    lists.places.push(place);
-                }
-            }
-            splat += 1;
         }
     }
     if keep_places {
