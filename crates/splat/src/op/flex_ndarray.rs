@@ -1,4 +1,4 @@
-//! Burn's two CPU backends on top of [`cpu`](super::cpu).
+//! Burn's two CPU backends on top of [`cpu`].
 
 use std::sync::Arc;
 

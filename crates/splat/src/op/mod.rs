@@ -40,7 +40,7 @@ pub struct SplatOutput<B: Backend> {
     pub(crate) counts: Result<Counts, SplatError>,
 }
 
-/// Backends that can splat. Users call [`render`](crate::render).
+/// Backends that can splat. Users call [`render`](crate::render()).
 #[backend_extension(Cube, Flex, NdArray, Autodiff)]
 pub trait SplatBackend: Backend {
     /// Renders `inputs` as `job` says.

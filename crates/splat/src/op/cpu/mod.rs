@@ -3,7 +3,7 @@
 //! A view goes through four steps: project every Gaussian ([`splats`]), order what is visible by depth, hand each
 //! 16×16 tile the list of splats whose ellipse reaches one of its pixels ([`tiles`]), and blend tile by tile
 //! ([`blend`]). Empty tiles have empty lists and cost nothing but the writing of their pixels. The backward pass walks
-//! the same lists from the back ([`backward`]).
+//! the same lists from the back ([`mod@backward`]).
 //!
 //! Whatever is shared out among threads is joined again in a fixed order, so results do not depend on their number.
 

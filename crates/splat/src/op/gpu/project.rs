@@ -22,7 +22,7 @@ const NONE: u32 = 0xFFFF_FFFF;
 pub const STATISTICS: usize = 9;
 const UNITS: usize = 256;
 
-/// A camera in the order that [`load_view`] reads.
+/// A camera in the order that [`load_view()`] reads.
 pub fn view_numbers(v: &View) -> [f32; VIEW] {
     let Mat3 { r0, r1, r2 } = v.rotation;
     [
@@ -118,7 +118,7 @@ struct Ellipse {
     radius_squared: f32,
 }
 
-/// The tiles that the ellipse reaches in tile row `y`, packed as by [`tiles_between`].
+/// The tiles that the ellipse reaches in tile row `y`, packed as by [`tiles_between()`].
 #[cube]
 fn tiles_in_row(s: &Ellipse, y: u32, width: u32, height: u32) -> u32 {
     let tile = comptime!(TILE as u32);
@@ -275,7 +275,7 @@ pub fn sort_counts(reach: &[u32], order: &[u32], sorted: &mut [u32], total: usiz
 
 /// One intersection per splat and tile, splats front to back: its tile (counted over all views) and its splat.
 ///
-/// A splat has as many places as [`project_all`] counted. Should this kernel be compiled to round differently, it fills
+/// A splat has as many places as [`project_all()`] counted. Should this kernel be compiled to round differently, it fills
 /// what is left with a tile that does not exist rather than touch another splat's places.
 #[cube(launch)]
 #[allow(clippy::too_many_arguments, reason = "a kernel takes its buffers one by one")]
