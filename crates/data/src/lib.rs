@@ -1,4 +1,6 @@
-//! Training data and photographs. So far: photographs.
+//! Training data and photographs. So far: photographs, meshes and their views.
 
+pub mod mesh;
 pub mod photo;
 mod resize;
+pub mod view;

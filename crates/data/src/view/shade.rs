@@ -1,0 +1,194 @@
+//! Light and textures.
+
+use std::collections::HashMap;
+use std::f32::consts::TAU;
+use std::sync::Arc;
+
+use glam::{DVec2, DVec3, Vec2, Vec3};
+use image::RgbImage;
+use snapsnap_splat::Camera;
+
+use crate::mesh::Mesh;
+
+/// Soft directional lights, so strong together that the brightest direction reflects exactly the surface's own colour:
+/// nothing is ever clipped.
+#[derive(Debug, Clone)]
+pub struct Lights {
+    /// Unit vectors towards the lights, world axes, and their strengths.
+    directional: Vec<(Vec3, f32)>,
+    /// Light from everywhere.
+    ambient: f32,
+}
+
+impl Lights {
+    /// Lights from directions with strengths, and light from everywhere; scaled as a whole.
+    pub fn new(directional: &[(Vec3, f32)], ambient: f32) -> Self {
+        let directional = directional.iter().map(|(d, s)| (d.normalize_or_zero(), *s)).collect();
+        let mut lights = Self { directional, ambient };
+        // The brightest of many directions, evenly spread over the sphere.
+        let count = 4000;
+        let golden = TAU * (1.0 - 1.0 / 1.618_034);
+        let brightest = (0..count)
+            .map(|i| {
+                let y = 1.0 - (2 * i + 1) as f32 / count as f32;
+                let (sin, cos) = (golden * i as f32).sin_cos();
+                let r = (1.0 - y * y).sqrt();
+                lights.strength(Vec3::new(r * cos, y, r * sin))
+            })
+            .fold(f32::MIN_POSITIVE, f32::max);
+        lights.ambient /= brightest;
+        lights.directional.iter_mut().for_each(|(_, strength)| *strength /= brightest);
+        lights
+    }
+
+    /// Light that a surface with this unit normal reflects, 0 to 1.
+    pub fn strength(&self, normal: Vec3) -> f32 {
+        let soft = |(direction, strength): &(Vec3, f32)| {
+            // Reaches a little beyond the terminator, as light from an area does.
+            let cosine = (normal.dot(*direction) + 0.3) / 1.3;
+            strength * cosine.max(0.0)
+        };
+        (self.ambient + self.directional.iter().map(soft).sum::<f32>()).min(1.0)
+    }
+}
+
+impl Default for Lights {
+    /// Six weak lights all around, from above, and one stronger.
+    fn default() -> Self {
+        let mut directional: Vec<(Vec3, f32)> = (0..6)
+            .map(|i| {
+                let (sin, cos) = (TAU * i as f32 / 6.0).sin_cos();
+                (Vec3::new(sin, 0.6, cos), 0.25)
+            })
+            .collect();
+        directional.push((Vec3::new(0.4, 0.8, 0.9), 0.35));
+        Self::new(&directional, 0.5)
+    }
+}
+
+/// A texture and its halvings.
+struct Pyramid {
+    levels: Vec<RgbImage>,
+}
+
+impl Pyramid {
+    fn new(texture: &RgbImage) -> Self {
+        let mut levels = vec![texture.clone()];
+        while let Some(last) = levels.last().filter(|l| l.width() > 1 || l.height() > 1) {
+            let (w, h) = ((last.width() / 2).max(1), (last.height() / 2).max(1));
+            levels.push(image::imageops::thumbnail(last, w, h));
+        }
+        Self { levels }
+    }
+
+    /// Colour at `at`, filtered over `footprint` texture coordinates.
+    fn sample(&self, at: Vec2, footprint: Vec2) -> Vec3 {
+        let [w, h] = [self.levels[0].width() as f32, self.levels[0].height() as f32];
+        let texels = (footprint * Vec2::new(w, h)).max_element().max(1.0);
+        let level = texels.log2().min((self.levels.len() - 1) as f32);
+        let (low, fraction) = (level.floor() as usize, level.fract());
+        let fine = bilinear(&self.levels[low], at);
+        match self.levels.get(low + 1).filter(|_| fraction > 0.0) {
+            Some(coarse) => fine.lerp(bilinear(coarse, at), fraction),
+            None => fine,
+        }
+    }
+}
+
+/// Texture coordinates have (0, 0) at the lower left; texel centres lie at +½; the texture repeats.
+fn bilinear(texture: &RgbImage, at: Vec2) -> Vec3 {
+    let (w, h) = (i64::from(texture.width()), i64::from(texture.height()));
+    let x = at.x.rem_euclid(1.0) * w as f32 - 0.5;
+    let y = (1.0 - at.y).rem_euclid(1.0) * h as f32 - 0.5;
+    let (x0, y0) = (x.floor(), y.floor());
+    let texel = |dx: i64, dy: i64| {
+        let (x, y) = ((x0 as i64 + dx).rem_euclid(w), (y0 as i64 + dy).rem_euclid(h));
+        let [r, g, b] = texture.get_pixel(x as u32, y as u32).0;
+        Vec3::new(f32::from(r), f32::from(g), f32::from(b)) / 255.0
+    };
+    let (fx, fy) = (x - x0, y - y0);
+    texel(0, 0).lerp(texel(1, 0), fx).lerp(texel(0, 1).lerp(texel(1, 1), fx), fy)
+}
+
+/// What drawing needs of a mesh, whatever the camera.
+pub struct Surface<'a> {
+    pub mesh: &'a Mesh,
+    normals: Vec<Vec3>,
+    /// One per material.
+    textures: Vec<Option<Arc<Pyramid>>>,
+}
+
+impl<'a> Surface<'a> {
+    pub fn new(mesh: &'a Mesh) -> Self {
+        // Materials often share a texture.
+        let mut pyramids: HashMap<*const RgbImage, Arc<Pyramid>> = HashMap::new();
+        let textures = mesh
+            .materials
+            .iter()
+            .map(|material| {
+                material.texture.as_ref().map(|texture| {
+                    let pyramid = pyramids.entry(Arc::as_ptr(texture));
+                    pyramid.or_insert_with(|| Arc::new(Pyramid::new(texture))).clone()
+                })
+            })
+            .collect();
+        Self { mesh, normals: mesh.normals(), textures }
+    }
+}
+
+/// Colours of a mesh's surfaces as one camera sees them.
+pub struct Shader<'a> {
+    pub surface: &'a Surface<'a>,
+    pub camera: &'a Camera,
+    /// Positions in the camera's frame.
+    pub corners: &'a [DVec3],
+    pub lights: &'a Lights,
+}
+
+impl Shader<'_> {
+    /// Colour of `face` at pixel coordinates `at`; `plane` gives 1/z there.
+    pub fn color(&self, face: usize, at: DVec2, plane: DVec3) -> Vec3 {
+        let Surface { mesh, normals, textures } = self.surface;
+        let face = &mesh.faces[face];
+        let weights = self.weights(face.positions, at, plane);
+        let mix = |values: [Vec3; 3]| values[0] * weights.x + values[1] * weights.y + values[2] * weights.z;
+        let mut normal = mix(face.positions.map(|row| normals[row as usize])).normalize_or_zero();
+        // Seen from behind, the other side of the surface is lit.
+        let corners = face.positions.map(|row| self.corners[row as usize]);
+        let towards = (corners[1] - corners[0]).cross(corners[2] - corners[0]).dot(corners[0]);
+        if towards > 0.0 {
+            normal = -normal;
+        }
+        let material = &mesh.materials[face.material as usize];
+        let mut color = material.color * self.lights.strength(normal);
+        if !mesh.colors.is_empty() {
+            color *= mix(face.positions.map(|row| mesh.colors[row as usize]));
+        }
+        if let Some((texture, rows)) = textures[face.material as usize].as_ref().zip(face.texcoords) {
+            let coordinates = rows.map(|row| mesh.texcoords[row as usize]);
+            let at_weights = |w: Vec3| coordinates[0] * w.x + coordinates[1] * w.y + coordinates[2] * w.z;
+            let here = at_weights(weights);
+            // How far the texture moves over a pixel, either way.
+            let right = at_weights(self.weights(face.positions, at + DVec2::X, plane)) - here;
+            let down = at_weights(self.weights(face.positions, at + DVec2::Y, plane)) - here;
+            color *= texture.sample(here, right.abs().max(down.abs()));
+        }
+        color
+    }
+
+    /// Barycentric weights of the point of the triangle's plane that is seen at `at`, clamped to the triangle's
+    /// surroundings so that grazing views do not run away.
+    fn weights(&self, rows: [u32; 3], at: DVec2, plane: DVec3) -> Vec3 {
+        let [a, b, c] = rows.map(|row| self.corners[row as usize]);
+        let inverse_depth = plane.dot(DVec3::new(at.x, at.y, 1.0));
+        let ray = ((at - self.camera.principal_point) / self.camera.focal).extend(1.0);
+        let p = ray / inverse_depth;
+        let n = (b - a).cross(c - a);
+        let area = n.length_squared();
+        let first = (c - b).cross(p - b).dot(n) / area;
+        let second = (a - c).cross(p - c).dot(n) / area;
+        let weights = DVec3::new(first, second, 1.0 - first - second);
+        let weights = if weights.is_finite() { weights } else { DVec3::splat(1.0 / 3.0) };
+        weights.clamp(DVec3::splat(-1.0), DVec3::splat(2.0)).as_vec3()
+    }
+}

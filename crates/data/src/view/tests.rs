@@ -1,0 +1,303 @@
+use std::sync::Arc;
+
+use glam::{DMat3, DVec2, DVec3, Vec2, Vec3};
+use image::{Rgb, RgbImage};
+use snapsnap_splat::{Camera, RigidTransform};
+
+use super::{Renderer, View, ViewOptions};
+use crate::mesh::{Face, Material, Mesh};
+use crate::view::Lights;
+
+/// At the origin, looking along z.
+fn camera(width: u32, height: u32) -> Camera {
+    Camera {
+        width,
+        height,
+        focal: DVec2::new(100.0, 110.0),
+        principal_point: DVec2::new(0.47 * f64::from(width), 0.55 * f64::from(height)),
+        world_to_camera: RigidTransform { rotation: DMat3::IDENTITY, translation: DVec3::ZERO },
+    }
+}
+
+fn draw(mesh: &Mesh, camera: &Camera, options: &ViewOptions) -> View {
+    Renderer::new(mesh).expect("a sound mesh").draw(camera, options)
+}
+
+/// Light of strength 1 from everywhere.
+fn flat(samples: usize) -> ViewOptions {
+    ViewOptions { samples, lights: Lights::new(&[], 1.0) }
+}
+
+fn mesh(positions: Vec<Vec3>, faces: &[[u32; 3]]) -> Mesh {
+    let face = |positions: &[u32; 3]| Face { positions: *positions, texcoords: None, material: 0 };
+    let faces = faces.iter().map(face).collect();
+    Mesh { positions, faces, materials: vec![Material::default()], ..Mesh::default() }
+}
+
+/// A sphere from an octahedron, every edge halved `levels` times.
+fn sphere(centre: Vec3, radius: f32, levels: usize) -> Mesh {
+    let mut triangles: Vec<[Vec3; 3]> = Vec::new();
+    for (x, y, z) in [(1., 1., 1.), (-1., 1., 1.), (-1., -1., 1.), (1., -1., 1.)] {
+        for z in [z, -z] {
+            let corner = [Vec3::X * x, Vec3::Y * y, Vec3::Z * z];
+            triangles.push(if x * y * z > 0.0 { corner } else { [corner[1], corner[0], corner[2]] });
+        }
+    }
+    for _ in 0..levels {
+        triangles = triangles
+            .iter()
+            .flat_map(|[a, b, c]| {
+                let [ab, bc, ca] = [*a + *b, *b + *c, *c + *a].map(Vec3::normalize);
+                [[*a, ab, ca], [ab, *b, bc], [ca, bc, *c], [ab, bc, ca]]
+            })
+            .collect();
+    }
+    let positions: Vec<Vec3> = triangles.iter().flatten().map(|p| centre + radius * *p).collect();
+    let faces: Vec<[u32; 3]> = (0..triangles.len() as u32).map(|i| [3 * i, 3 * i + 1, 3 * i + 2]).collect();
+    mesh(positions, &faces)
+}
+
+/// Unit ray through a pixel's centre, scaled to z = 1.
+fn ray(camera: &Camera, pixel: usize) -> DVec3 {
+    let (x, y) = (pixel % camera.width as usize, pixel / camera.width as usize);
+    let at = DVec2::new(x as f64 + 0.5, y as f64 + 0.5);
+    ((at - camera.principal_point) / camera.focal).extend(1.0)
+}
+
+fn depth_error(view: &View, camera: &Camera, exact: impl Fn(DVec3) -> Option<f64>) -> f64 {
+    let mut worst = 0.0_f64;
+    let mut checked = 0;
+    for (pixel, depth) in view.depth.iter().enumerate() {
+        if let Some(exact) = exact(ray(camera, pixel)) {
+            assert!(*depth > 0.0, "pixel {pixel} sees nothing");
+            worst = worst.max((f64::from(*depth) - exact).abs());
+            checked += 1;
+        }
+    }
+    assert!(checked > 500, "{checked}");
+    worst
+}
+
+#[test]
+fn the_depth_of_a_tilted_plane_is_exact() {
+    let camera = camera(64, 48);
+    // z = 2 + 0.7·x − 0.4·y, far beyond the image on all sides.
+    let at = |x: f32, y: f32| Vec3::new(x, y, 2.0 + 0.7 * x - 0.4 * y);
+    let plane =
+        mesh(vec![at(-1.5, -1.5), at(1.5, -1.5), at(1.5, 1.5), at(-1.5, 1.5)], &[[0, 1, 2], [0, 2, 3]]);
+    let view = draw(&plane, &camera, &flat(2));
+    let error = depth_error(&view, &camera, |d| Some(2.0 / (1.0 - 0.7 * d.x + 0.4 * d.y)));
+    println!("plane: {error:.1e} m");
+    assert!(error < 1e-6, "{error}");
+    assert!(view.alpha.iter().all(|a| *a == 1.0));
+    assert!(view.color.iter().all(|c| *c == [1.0; 3]));
+}
+
+#[test]
+fn the_depth_and_outline_of_a_sphere_are_those_of_the_formula() {
+    let camera = camera(96, 96);
+    let (centre, radius) = (DVec3::new(0.05, -0.1, 2.0), 0.5);
+    let view = draw(&sphere(centre.as_vec3(), radius as f32, 9), &camera, &flat(3));
+    let hit = |d: DVec3, radius: f64| {
+        let (b, c) = (d.dot(centre), centre.length_squared() - radius * radius);
+        let square = b * b - d.length_squared() * c;
+        (square > 0.0).then(|| (b - square.sqrt()) / d.length_squared())
+    };
+    // Not at the outline, where depth changes by metres per pixel.
+    let error = depth_error(&view, &camera, |d| hit(d, 0.95 * radius).and_then(|_| hit(d, radius)));
+    println!("sphere: {error:.1e} m");
+    assert!(error < 1e-5, "{error}");
+    for (pixel, alpha) in view.alpha.iter().enumerate() {
+        // A pixel and a half inside and outside of the outline.
+        let d = ray(&camera, pixel);
+        if hit(d, 0.97 * radius).is_some() {
+            assert_eq!(*alpha, 1.0, "pixel {pixel}");
+        }
+        if hit(d, 1.03 * radius).is_none() {
+            assert_eq!((*alpha, view.depth[pixel]), (0.0, 0.0), "pixel {pixel}");
+        }
+    }
+}
+
+/// A rectangle with edges at known places: coverage is the share of the pixel to within one sample.
+#[test]
+fn edges_are_where_they_should_be() {
+    let camera = camera(40, 30);
+    let point = |u: f64, v: f64| {
+        let p = (DVec2::new(u, v) - camera.principal_point) / camera.focal * 2.0;
+        p.extend(2.0).as_vec3()
+    };
+    for samples in 1..=6 {
+        for (left, right, top, bottom) in
+            [(5.3, 30.8, 4.6, 22.1), (7.0, 29.0, 6.0, 20.0), (9.5, 9.9, 3.2, 27.7)]
+        {
+            let corners =
+                vec![point(left, top), point(right, top), point(right, bottom), point(left, bottom)];
+            let view = draw(&mesh(corners, &[[0, 1, 2], [0, 2, 3]]), &camera, &flat(samples));
+            for (pixel, alpha) in view.alpha.iter().enumerate() {
+                let (x, y) = ((pixel % 40) as f64, (pixel / 40) as f64);
+                let share = |low: f64, high: f64, at: f64| (high.min(at + 1.0) - low.max(at)).max(0.0);
+                let (across, down) = (share(left, right, x), share(top, bottom, y));
+                // Each axis rounds to its samples.
+                let n = samples as f64;
+                let bound = 1.0 / n + 1.0 / (n * n) + 1e-3;
+                assert!(
+                    (f64::from(*alpha) - across * down).abs() <= bound,
+                    "{samples}: pixel {x}, {y}: {alpha}"
+                );
+                if across * down == 1.0 || across * down == 0.0 {
+                    assert_eq!(f64::from(*alpha), across * down, "{samples}: pixel {x}, {y}");
+                }
+            }
+        }
+    }
+}
+
+/// Points on a grid, shaken, and triangulated: no sample is missed, and none belongs to two triangles.
+#[test]
+fn neighbouring_triangles_share_no_sample_and_leave_none_out() {
+    let camera = camera(50, 40);
+    let mut state = 1_u64;
+    let mut random = || {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (state >> 40) as f32 / (1_u64 << 24) as f32
+    };
+    let n = 24_u32;
+    let mut positions = Vec::new();
+    for y in 0..=n {
+        for x in 0..=n {
+            let inner = |i: u32, shift: f32| if i == 0 || i == n { 0.0 } else { shift };
+            let (dx, dy) = (inner(x, random() - 0.5), inner(y, random() - 0.5));
+            let z = 2.0 + 0.3 * random();
+            let at = Vec3::new(
+                (x as f32 + 0.7 * dx) / n as f32 - 0.5,
+                (y as f32 + 0.7 * dy) / n as f32 - 0.5,
+                1.0,
+            );
+            positions.push(at * z);
+        }
+    }
+    let mut faces = Vec::new();
+    for y in 0..n {
+        for x in 0..n {
+            let [a, b, c, d] =
+                [y * (n + 1) + x, y * (n + 1) + x + 1, (y + 1) * (n + 1) + x + 1, (y + 1) * (n + 1) + x];
+            faces.extend([[a, b, c], [a, c, d]]);
+        }
+    }
+    let whole = draw(&mesh(positions.clone(), &faces), &camera, &flat(3));
+    let mut sum = vec![0.0; whole.alpha.len()];
+    for part in 0..5 {
+        let some: Vec<[u32; 3]> = faces.iter().skip(part).step_by(5).copied().collect();
+        let view = draw(&mesh(positions.clone(), &some), &camera, &flat(3));
+        sum.iter_mut().zip(&view.alpha).for_each(|(s, a)| *s += a);
+    }
+    for (pixel, (sum, whole)) in sum.iter().zip(&whole.alpha).enumerate() {
+        assert!((sum - whole).abs() < 1e-6, "pixel {pixel}: {sum} and {whole}");
+    }
+    // The grid is larger than the image: there is no hole.
+    assert!(whole.alpha.iter().all(|alpha| *alpha == 1.0));
+}
+
+/// A cube with a picture on every side, seen from a corner: each point of the picture is where the camera projects it.
+#[test]
+fn a_textured_cube_shows_its_picture_undistorted() {
+    let mut positions = Vec::new();
+    let mut texcoords = Vec::new();
+    let mut faces = Vec::new();
+    for axis in 0..3 {
+        for sign in [-1.0, 1.0] {
+            let first = positions.len() as u32;
+            for (s, t) in [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)] {
+                let mut p = [s * sign, t, 0.0];
+                p.rotate_right(axis);
+                p[(axis + 2) % 3] = sign;
+                positions.push(0.4 * Vec3::from_array(p));
+                texcoords.push(Vec2::new(0.5 + 0.5 * s, 0.5 + 0.5 * t));
+            }
+            for rows in [[first, first + 1, first + 2], [first, first + 2, first + 3]] {
+                faces.push(Face { positions: rows, texcoords: Some(rows), material: 0 });
+            }
+        }
+    }
+    // Smooth: red grows to the right, green upwards.
+    let texture = RgbImage::from_fn(256, 256, |x, y| Rgb([x as u8, 255 - y as u8, 128]));
+    let material = Material { color: Vec3::ONE, texture: Some(Arc::new(texture)) };
+    let cube = Mesh { positions, texcoords, faces, materials: vec![material], ..Mesh::default() };
+    let mut camera = camera(120, 120);
+    let rotation = DMat3::from_rotation_x(0.6) * DMat3::from_rotation_y(0.7);
+    camera.world_to_camera = RigidTransform { rotation, translation: DVec3::new(0.0, 0.0, 2.0) };
+    let view = draw(&cube, &camera, &flat(3));
+    let mut checked = 0;
+    for face in cube.faces.iter().step_by(2) {
+        let corner = |i: usize| cube.positions[face.positions[i] as usize].as_dvec3();
+        let normal = (corner(1) - corner(0)).cross(corner(2) - corner(0));
+        let facing = rotation * normal;
+        if facing.dot(camera.world_to_camera.apply(corner(0))) >= 0.0 {
+            continue;
+        }
+        let (right, up) = (corner(1) - corner(0), corner(2) - corner(1));
+        for i in 1..10 {
+            for j in 1..10 {
+                let (s, t) = (f64::from(i) / 10.0, f64::from(j) / 10.0);
+                let (at, depth) = camera.project(corner(0) + right * s + up * t).expect("in front");
+                let pixel = at.y as usize * 120 + at.x as usize;
+                // The pixel's middle is up to 0.7 pixels from the point, a pixel is at most 1/25 of the picture.
+                let [red, green, blue] = view.color[pixel];
+                assert!((f64::from(red) - s).abs() < 0.04, "{s} {t}: {red}");
+                assert!((f64::from(green) - t).abs() < 0.04, "{s} {t}: {green}");
+                assert!((f64::from(blue) - 128.0 / 255.0).abs() < 0.01);
+                assert!((f64::from(view.depth[pixel]) - depth).abs() < 0.04);
+                checked += 1;
+            }
+        }
+    }
+    assert_eq!(checked, 3 * 81, "three sides are seen");
+}
+
+/// A fine checkerboard far away is grey, not noise.
+#[test]
+fn distant_textures_are_averaged() {
+    let texture = RgbImage::from_fn(512, 512, |x, y| Rgb([if (x + y) % 2 == 0 { 0 } else { 255 }; 3]));
+    let corners = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)];
+    let rows = [[0, 1, 2], [0, 2, 3]];
+    let plane = Mesh {
+        positions: corners.map(|(x, y)| Vec3::new(x, y, 4.0)).to_vec(),
+        texcoords: corners.map(|(x, y)| Vec2::new(0.5 + 0.5 * x, 0.5 - 0.5 * y)).to_vec(),
+        faces: rows.map(|rows| Face { positions: rows, texcoords: Some(rows), material: 0 }).to_vec(),
+        materials: vec![Material { color: Vec3::ONE, texture: Some(Arc::new(texture)) }],
+        ..Mesh::default()
+    };
+    let view = draw(&plane, &camera(40, 40), &flat(1));
+    for color in view.color.iter().zip(&view.alpha).filter(|(_, a)| **a == 1.0).map(|(c, _)| c) {
+        assert!((color[0] - 0.5).abs() < 0.02, "{color:?}");
+    }
+}
+
+#[test]
+fn light_is_never_clipped_and_the_nearer_surface_is_seen_from_both_sides() {
+    let lights = Lights::default();
+    let ball = draw(&sphere(Vec3::new(0.0, 0.0, 2.0), 0.5, 4), &camera(64, 64), &ViewOptions::default());
+    let inside = || ball.color.iter().zip(&ball.alpha).filter(|(_, a)| **a == 1.0).map(|(c, _)| c[0]);
+    let (low, high) = (inside().fold(1.0, f32::min), inside().fold(0.0, f32::max));
+    assert!(low > 0.2 && high <= 1.0 && high > low + 0.1, "{low} {high}");
+    assert!(lights.strength(Vec3::new(0.4, 0.8, 0.9).normalize()) > 0.9);
+
+    let triangle = |z: f32, turned: bool| {
+        let p = vec![Vec3::new(-1.0, -1.0, z), Vec3::new(1.0, -1.0, z), Vec3::new(0.0, 1.0, z)];
+        mesh(p, &[if turned { [0, 2, 1] } else { [0, 1, 2] }])
+    };
+    let mut both = triangle(2.0, false);
+    let far = triangle(3.0, true);
+    both.positions.extend(&far.positions);
+    both.faces.push(Face { positions: [3, 5, 4], texcoords: None, material: 1 });
+    both.materials.push(Material { color: Vec3::X, texture: None });
+    let view = draw(&both, &camera(32, 32), &flat(2));
+    let middle = 17 * 32 + 15;
+    assert_eq!((view.color[middle], view.depth[middle]), ([1.0; 3], 2.0));
+    both.faces.swap(0, 1);
+    assert_eq!(draw(&both, &camera(32, 32), &flat(2)).color, view.color, "whatever the order");
+    // Behind the camera there is nothing to see.
+    let nothing = draw(&triangle(-2.0, false), &camera(32, 32), &flat(2));
+    assert!(nothing.alpha.iter().all(|a| *a == 0.0) && nothing.depth.iter().all(|d| *d == 0.0));
+}
