@@ -1,9 +1,10 @@
 //! The splatting operation against the dense f64 oracle, and the oracle against itself and the fixtures.
 
+use burn::tensor::{Tensor, TensorData};
 use snapsnap_splat::reference::{self, Cutoff, Scene};
-use snapsnap_splat::{Camera, RenderOptions, cameras};
-use snapsnap_tests::scenes::{HostScene, forward_camera, random_scene, random_upstream};
-use snapsnap_tests::{Numbers, device, device_name, fixture};
+use snapsnap_splat::{Camera, RenderOptions, cameras, sh};
+use snapsnap_tests::scenes::{HostScene, Random, forward_camera, random_scene, random_upstream};
+use snapsnap_tests::{Numbers, device, device_name, fixture, values};
 
 /// Names of the 14 numbers of a Gaussian, and where each name's numbers lie.
 const PARTS: [(&str, std::ops::Range<usize>); 5] =
@@ -367,6 +368,62 @@ fn finite_differences_of_the_operation() {
                 (analytic - difference).abs() < bound,
                 "Gaussian {i}, number {k}: {analytic} {difference}"
             );
+        }
+    }
+}
+
+/// Spherical harmonics are an ordinary tensor function: their gradients agree with finite differences, in the coefficients
+/// and, through the direction of view, in the means.
+#[test]
+fn harmonics_are_differentiable() {
+    let Some(device) = device() else { return };
+    let tracking = device.autodiff();
+    let camera = Camera::orbit_at_yaw_degrees(30.0, 16);
+    let mut random = Random(61);
+    // Every shape is tuned anew on a GPU: one degree is enough there.
+    let all: &[usize] = if device_name() == "wgpu" { &[16] } else { &[1, 4, 9, 16] };
+    for &k in all {
+        let n = 3;
+        let coefficients: Vec<f32> = (0..n * k * 3).map(|_| random.between(-0.1, 0.2)).collect();
+        let means: Vec<f32> = (0..n * 3).map(|_| random.between(-0.5, 1.0)).collect();
+        let weights: Vec<f32> = (0..n * 3).map(|_| random.between(-1.0, 1.0)).collect();
+        let colors = |coefficients: &[f32], means: &[f32]| {
+            let coefficients = TensorData::new(coefficients.to_vec(), [n, k, 3]);
+            let means = TensorData::new(means.to_vec(), [n, 3]);
+            let coefficients = Tensor::<3>::from_data(coefficients, &tracking).require_grad();
+            let means = Tensor::<2>::from_data(means, &tracking).require_grad();
+            let colors = sh::colors(&coefficients, &means, &camera).expect("shapes");
+            let weights = Tensor::<2>::from_data(TensorData::new(weights.clone(), [n, 3]), &tracking);
+            (coefficients, means, (colors * weights).sum())
+        };
+        let (c, m, loss) = colors(&coefficients, &means);
+        let grads = loss.backward();
+        let loss_at =
+            |coefficients: &[f32], means: &[f32]| values(colors(coefficients, means).2.reshape([1]))[0];
+        let step = 1e-2;
+        let check = |what: &str, analytic: f32, difference: f32| {
+            assert!(
+                (analytic - difference).abs() < 2e-3 + 0.01 * analytic.abs(),
+                "{k} {what}: {analytic} {difference}"
+            );
+        };
+        for (i, analytic) in values(c.grad(&grads).expect("tracked").reshape([-1])).into_iter().enumerate() {
+            let at = |h: f32| {
+                let mut moved = coefficients.clone();
+                moved[i] += h;
+                loss_at(&moved, &means)
+            };
+            check("coefficient", analytic, (at(step) - at(-step)) / (2.0 * step));
+        }
+        let gradient = m.grad(&grads).map(|g| values(g.reshape([-1]))).unwrap_or_default();
+        assert_eq!(gradient.is_empty(), k == 1, "a constant colour does not depend on the direction");
+        for (i, analytic) in gradient.into_iter().enumerate() {
+            let at = |h: f32| {
+                let mut moved = means.clone();
+                moved[i] += h;
+                loss_at(&coefficients, &moved)
+            };
+            check("mean", analytic, (at(step) - at(-step)) / (2.0 * step));
         }
     }
 }
