@@ -3,4 +3,5 @@
 pub mod mesh;
 pub mod photo;
 mod resize;
+pub mod scan;
 pub mod view;

@@ -72,6 +72,9 @@ pub enum MeshError {
         /// How many there are.
         count: usize,
     },
+    /// All positions at one height: nothing that could be stood up.
+    #[error("the mesh has no height")]
+    NoHeight,
     /// Colours that do not belong to the positions.
     #[error("{colors} vertex colours for {positions} positions")]
     Colors {

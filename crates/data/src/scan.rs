@@ -1,0 +1,189 @@
+//! Scans of people: where the known sets keep which subject, and how a scan is stood up for the cameras.
+
+use glam::{Mat3, Vec3};
+use rand::Rng;
+
+use crate::mesh::{Mesh, MeshError};
+
+/// Height of a normalised subject in metres (SNAPSNAP §5.4). Real stature is lost on purpose: two photographs do not show it.
+pub const HEIGHT: f32 = 1.8;
+/// Training subjects are up to this much taller or shorter.
+const HEIGHT_JITTER: f32 = 0.05;
+
+/// A collection of scans, each with conventions of its own.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Collection {
+    /// THuman2.0: subjects 0 to 525.
+    Thuman20,
+    /// THuman2.1's further subjects, from 526.
+    Thuman21,
+    /// CustomHumans.
+    CustomHumans,
+    /// 2K2K.
+    TwoK2K,
+    /// 4D-Dress.
+    FourDDress,
+    /// Any other: y up, facing +z.
+    Other,
+}
+
+impl Collection {
+    /// Turns the set's axes into ours (y up).
+    fn axes(self) -> Mat3 {
+        match self {
+            // Rows of SNAPSNAP §5.4's matrix: (0, −1, 0), (0, 0, 1), (−1, 0, 0).
+            Self::Thuman21 => Mat3::from_cols(Vec3::NEG_Z, Vec3::NEG_X, Vec3::Y),
+            _ => Mat3::IDENTITY,
+        }
+    }
+
+    /// Whether subjects stand anywhere in the set, and are moved to the middle by the mean of their vertices.
+    fn is_centred(self) -> bool {
+        matches!(self, Self::TwoK2K | Self::FourDDress)
+    }
+}
+
+/// Subjects of THuman2.0 that are never trained on.
+pub const VALIDATION: [u32; 100] = [
+    0, 1, 2, 3, 6, 9, 12, 18, 19, 21, 23, 24, 25, 30, 36, 42, 48, 54, 60, 66, 68, 72, 78, 84, 90, 96, 102,
+    108, 114, 120, 126, 132, 138, 144, 150, 156, 162, 168, 174, 180, 186, 192, 198, 204, 210, 216, 222, 228,
+    234, 240, 246, 252, 258, 264, 270, 276, 282, 288, 294, 300, 302, 306, 312, 318, 324, 330, 336, 342, 348,
+    354, 360, 366, 372, 378, 384, 390, 396, 402, 408, 414, 420, 426, 432, 438, 444, 450, 456, 462, 468, 474,
+    480, 486, 492, 498, 504, 510, 516, 518, 522, 523,
+];
+
+/// Subjects of THuman2.1 in loose clothing, for testing: to be left out of training.
+pub const LOOSE: [u32; 50] = [
+    2397, 1685, 2396, 2398, 2414, 2403, 1678, 2252, 835, 1403, 2251, 836, 951, 1321, 2410, 1679, 2199, 1391,
+    2264, 1350, 1982, 1981, 1122, 2413, 1819, 1043, 1267, 2186, 865, 2148, 1392, 2092, 2198, 2409, 839, 2250,
+    1681, 837, 2109, 1398, 1115, 659, 1123, 1816, 2230, 1693, 1367, 713, 2258, 1124,
+];
+
+/// The training subjects of THuman2.0.
+pub fn training_ids() -> impl Iterator<Item = u32> {
+    (0..526).filter(|id| !VALIDATION.contains(id))
+}
+
+/// Stands a scan up: axes, height, feet on y = 0 (SNAPSNAP §5.4). With `jitter`, as for training: another height, and not
+/// quite in the middle.
+///
+/// # Errors
+/// [`MeshError::NoHeight`].
+pub fn normalise(
+    mesh: &mut Mesh,
+    collection: Collection,
+    jitter: Option<&mut impl Rng>,
+) -> Result<(), MeshError> {
+    let axes = collection.axes();
+    mesh.positions.iter_mut().for_each(|p| *p = axes * *p);
+    let (low, high) = mesh.bounds();
+    // Written so that a NaN and an empty mesh fail as well.
+    if !(high.y - low.y > 0.0 && (high - low).is_finite()) {
+        return Err(MeshError::NoHeight);
+    }
+    let mut height = HEIGHT;
+    let mut move_by = Vec3::ZERO;
+    if let Some(random) = jitter {
+        height += random.random_range(-HEIGHT_JITTER..HEIGHT_JITTER);
+        let size = (high - low) * height / (high.y - low.y);
+        let reach = match height {
+            _ if size.x > 1.0 || size.z > 1.0 => 0.01,
+            height if height < HEIGHT => 0.1,
+            _ => 0.05,
+        };
+        move_by = Vec3::new(random.random_range(-reach..reach), 0.0, random.random_range(-reach..reach));
+    }
+    let scale = height / (high.y - low.y);
+    let mut origin = Vec3::new(0.0, low.y, 0.0);
+    if collection.is_centred() {
+        let sum: glam::DVec3 = mesh.positions.iter().map(|p| p.as_dvec3()).sum();
+        let mean = (sum / mesh.positions.len() as f64).as_vec3();
+        (origin.x, origin.z) = (mean.x, mean.z);
+    }
+    mesh.positions.iter_mut().for_each(|p| *p = (*p - origin) * scale + move_by);
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::HashSet;
+
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+
+    use super::*;
+
+    fn cloud(positions: &[[f32; 3]]) -> Mesh {
+        Mesh { positions: positions.iter().map(|p| Vec3::from_array(*p)).collect(), ..Mesh::default() }
+    }
+
+    fn none() -> Option<&'static mut ChaCha8Rng> {
+        None
+    }
+
+    #[test]
+    fn the_lists_are_those_of_the_paper() {
+        assert_eq!(training_ids().count(), 426);
+        assert_eq!(VALIDATION.iter().collect::<HashSet<_>>().len(), 100);
+        assert_eq!(LOOSE.iter().collect::<HashSet<_>>().len(), 50);
+        assert!(LOOSE.iter().all(|id| (526..2500).contains(id)));
+    }
+
+    #[test]
+    fn a_scan_stands_on_the_floor_at_its_height() {
+        let mut mesh = cloud(&[[0.2, -3.0, 0.1], [0.4, 9.0, -0.3]]);
+        normalise(&mut mesh, Collection::Thuman20, none()).expect("has height");
+        let (low, high) = mesh.bounds();
+        assert!(low.y.abs() < 1e-6 && (high.y - 1.8).abs() < 1e-6);
+        // Not moved sideways, only scaled by 0.15.
+        assert!((mesh.positions[0] - Vec3::new(0.03, 0.0, 0.015)).length() < 1e-6, "{mesh:?}");
+    }
+
+    #[test]
+    fn scans_without_height_are_refused() {
+        for positions in [&[][..], &[[1.0, 2.0, 3.0]], &[[0.0, 1.0, 0.0], [1.0, 1.0, 0.0]]] {
+            let result = normalise(&mut cloud(positions), Collection::Other, none());
+            assert_eq!(result, Err(MeshError::NoHeight));
+        }
+    }
+
+    #[test]
+    fn sets_with_other_axes_and_places_are_turned_and_centred() {
+        // M·(a, b, c) = (−b, c, −a): height runs along the third axis.
+        let mut mesh = cloud(&[[1.0, 2.0, 0.0], [1.0, 2.0, 3.6]]);
+        normalise(&mut mesh, Collection::Thuman21, none()).expect("has height");
+        assert!((mesh.positions[1] - Vec3::new(-1.0, 1.8, -0.5)).length() < 1e-6, "{mesh:?}");
+        let mut mesh = cloud(&[[5.0, 0.0, 7.0], [5.4, 1.8, 7.2], [5.2, 0.9, 7.4]]);
+        normalise(&mut mesh, Collection::TwoK2K, none()).expect("has height");
+        let mean = mesh.positions.iter().sum::<Vec3>() / 3.0;
+        assert!(mean.x.abs() < 1e-5 && mean.z.abs() < 1e-5);
+    }
+
+    #[test]
+    fn training_scans_vary_within_the_published_ranges() {
+        let mut random = ChaCha8Rng::seed_from_u64(1);
+        let (mut lowest, mut highest, mut furthest) = (9.0_f32, 0.0_f32, 0.0_f32);
+        for wide in [false, true] {
+            for _ in 0..300 {
+                let x = if wide { 0.7 } else { 0.2 };
+                let mut mesh = cloud(&[[-x, 0.0, -0.1], [x, 1.8, 0.1]]);
+                normalise(&mut mesh, Collection::Thuman20, Some(&mut random)).expect("has height");
+                let (low, high) = mesh.bounds();
+                let middle = (low + high) / 2.0;
+                let reach = if wide {
+                    0.01
+                } else if high.y < 1.8 {
+                    0.1
+                } else {
+                    0.05
+                };
+                assert!(middle.x.abs() <= reach + 1e-6 && middle.z.abs() <= reach + 1e-6);
+                assert!(low.y.abs() < 1e-6);
+                (lowest, highest) = (lowest.min(high.y), highest.max(high.y));
+                furthest = furthest.max(middle.x.abs());
+            }
+        }
+        assert!((1.75..1.76).contains(&lowest) && (1.84..1.85).contains(&highest), "{lowest} {highest}");
+        assert!(furthest > 0.09);
+    }
+}
