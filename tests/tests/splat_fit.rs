@@ -112,6 +112,6 @@ fn random_gaussians_become_a_given_scene() {
         let relative = losses.iter().zip(&expected).map(|(a, b)| (a / b - 1.0).abs()).fold(0.0, f32::max);
         println!("against the CPU: loss within {worst:.1e}, relatively {relative:.1e}; {cpu:.2} dB there");
         // Rounding grows along the way, but the descent is the same: to 1e-3 of where it starts.
-        assert!(worst < 1e-3 * expected[0] && (after - cpu).abs() < 1.0);
+        assert!(worst < 1e-3 * expected[0] && (after - cpu).abs() < 0.3);
     }
 }

@@ -86,15 +86,19 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let start = Instant::now();
     let loaded = ply::read(&arguments.ply, &device)?;
     let reading = start.elapsed();
-    let (preset, antialiased) = (arguments.preset, arguments.antialiased);
-    let preset = match preset {
+    let preset = match arguments.preset {
         Preset::Inria => RenderOptions::inria(),
         Preset::Gsplat => RenderOptions::gsplat_1_5(),
     };
     // Black costs nothing, and depth is computed for --raw only.
     let background =
         (arguments.background != [0.0; 3]).then(|| Tensor::<1>::from_floats(arguments.background, &device));
-    let options = RenderOptions { antialiased, background, depth: arguments.raw.is_some(), ..preset };
+    let options = RenderOptions {
+        antialiased: arguments.antialiased,
+        background,
+        depth: arguments.raw.is_some(),
+        ..preset
+    };
 
     if let Some(folder) = &folder {
         make_folder(folder)?;

@@ -72,9 +72,7 @@ impl Scalar {
             }
         }
     }
-}
 
-impl Scalar {
     /// The length of a list at the start of `bytes`, which are little-endian. `None` for what is no length.
     pub fn read_length(self, bytes: &[u8]) -> Option<usize> {
         match self {

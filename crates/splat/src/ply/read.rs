@@ -39,9 +39,9 @@ pub fn read(path: &Path, device: &Device) -> Result<Loaded, SplatError> {
     let mut bytes = Vec::new();
     (&mut file).take(MAX_HEADER as u64 + 1).read_to_end(&mut bytes).map_err(cannot)?;
     // Before the rest of a file that may be anything.
-    parse(&bytes).map_err(wrong)?;
+    let header = parse(&bytes).map_err(wrong)?;
     file.read_to_end(&mut bytes).map_err(cannot)?;
-    let table = table(&mut bytes).map_err(wrong)?;
+    let table = table(&header, &mut bytes).map_err(wrong)?;
     drop(bytes);
     let Table { n, coefficients: k, columns } = table;
     let rows = |names: usize, first: usize, f: fn(f32) -> f32| {
@@ -85,8 +85,7 @@ struct Table {
     columns: Vec<Vec<f32>>,
 }
 
-fn table(bytes: &mut [u8]) -> Result<Table, String> {
-    let header = parse(bytes)?;
+fn table(header: &Header, bytes: &mut [u8]) -> Result<Table, String> {
     let at = header.elements.iter().position(|e| e.name == "vertex").ok_or("it has no element `vertex`")?;
     let vertex = &header.elements[at];
     if let Some(list) = vertex.properties.iter().find(|p| p.list.is_some()) {
@@ -117,8 +116,8 @@ fn table(bytes: &mut [u8]) -> Result<Table, String> {
     }
     let body = &mut bytes[header.len..];
     let columns = match header.format {
-        Format::Ascii => ascii(&header, at, body, &wanted)?,
-        Format::LittleEndian | Format::BigEndian => binary(&header, at, body, &wanted)?,
+        Format::Ascii => ascii(header, at, body, &wanted)?,
+        Format::LittleEndian | Format::BigEndian => binary(header, at, body, &wanted)?,
     };
     Ok(Table { n: vertex.count, coefficients, columns })
 }

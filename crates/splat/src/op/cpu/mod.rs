@@ -23,7 +23,7 @@ use crate::SplatError;
 
 pub(super) use backward::{Gradients, backward};
 
-/// The Gaussians of a call as contiguous f32 slices: `[N,3]`, `[N,4]`, `[N,3]`, `[N]`, `[N,3]`, and `[3]` or nothing.
+/// The Gaussians of a call as contiguous f32 slices: `[N,3]`, `[N,4]`, `[N,3]`, `[N]`, `[N,3]`, `[3]`.
 #[derive(Clone, Copy)]
 pub struct Scene<'a> {
     pub means: &'a [f32],
@@ -39,9 +39,8 @@ impl Scene<'_> {
         self.opacities.len()
     }
 
-    /// Background colour; black where none was given.
     fn background(&self) -> [f32; 3] {
-        self.background.try_into().unwrap_or([0.0; 3])
+        self.background.try_into().expect("`render` checks its shape")
     }
 }
 
