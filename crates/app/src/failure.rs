@@ -3,7 +3,7 @@
 use std::fmt;
 use std::process::ExitCode;
 
-use snapsnap_data::photo::PhotoError;
+use snapsnap_data::DataError;
 use snapsnap_net::config::ConfigError;
 use snapsnap_net::weights::WeightsError;
 use snapsnap_splat::SplatError;
@@ -44,7 +44,7 @@ macro_rules! input_error {
     };
 }
 
-input_error!(PhotoError, ConfigError, WeightsError);
+input_error!(DataError, ConfigError, WeightsError);
 
 impl From<SplatError> for Failure {
     fn from(e: SplatError) -> Self {

@@ -1,7 +1,13 @@
-//! Training data and photographs. So far: photographs, meshes and their views.
+//! Training data and photographs: scans, from files or generated → rendered views → data-set folders → samples.
 
+pub mod dataset;
+mod error;
+pub mod import;
 pub mod mesh;
 pub mod photo;
+mod picture;
 mod resize;
 pub mod scan;
 pub mod view;
+
+pub use error::DataError;

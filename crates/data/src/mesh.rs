@@ -1,5 +1,6 @@
 //! Textured triangle meshes: what scans and synthetic people are made of.
 
+use std::collections::HashMap;
 use std::sync::Arc;
 
 use glam::{Vec2, Vec3};
@@ -131,6 +132,28 @@ impl Mesh {
         normals.into_iter().map(Vec3::normalize_or_zero).collect()
     }
 
+    /// Makes positions one that are equal in place and colour: files repeat them along the seams of textures, where
+    /// shading would show an edge.
+    pub fn weld(&mut self) {
+        let bits = |v: Vec3| v.to_array().map(|x| if x == 0.0 { 0 } else { x.to_bits() });
+        let mut rows = HashMap::with_capacity(self.positions.len());
+        let mut kept = Vec::new();
+        let places: Vec<u32> = (0..self.positions.len())
+            .map(|row| {
+                let color = self.colors.get(row).map(|color| bits(*color));
+                *rows.entry((bits(self.positions[row]), color)).or_insert_with(|| {
+                    kept.push(row);
+                    kept.len() as u32 - 1
+                })
+            })
+            .collect();
+        self.positions = kept.iter().map(|row| self.positions[*row]).collect();
+        if !self.colors.is_empty() {
+            self.colors = kept.iter().map(|row| self.colors[*row]).collect();
+        }
+        self.faces.iter_mut().for_each(|f| f.positions = f.positions.map(|row| places[row as usize]));
+    }
+
     /// Smallest and largest coordinates.
     pub fn bounds(&self) -> (Vec3, Vec3) {
         let start = (Vec3::INFINITY, Vec3::NEG_INFINITY);
@@ -166,6 +189,17 @@ mod tests {
         let texcoord = wrong(|m| m.faces[0].texcoords = Some([0; 3]));
         assert_eq!(texcoord, "face 0 refers to texture coordinate 0, there are 0");
         assert_eq!(wrong(|m| m.colors = vec![Vec3::ONE]), "1 vertex colours for 3 positions");
+    }
+
+    #[test]
+    fn equal_positions_become_one() {
+        let mut mesh = triangle();
+        mesh.positions.extend([Vec3::X, Vec3::new(1.0, 1.0, 0.0), Vec3::Y]);
+        mesh.faces.push(Face { positions: [3, 4, 5], texcoords: None, material: 0 });
+        mesh.weld();
+        assert_eq!(mesh.positions.len(), 4);
+        assert_eq!(mesh.faces[1].positions, [1, 3, 2]);
+        assert_eq!(mesh.check(), Ok(()));
     }
 
     #[test]

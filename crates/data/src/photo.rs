@@ -3,18 +3,16 @@
 #[cfg(test)]
 mod tests;
 
-use std::fs::File;
-use std::io::BufReader;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-use image::{DynamicImage, GrayImage, ImageDecoder, ImageReader, RgbImage};
+use image::{DynamicImage, GrayImage, RgbImage};
 
+use crate::DataError;
+use crate::picture::decode;
 use crate::resize::{Filter, resize};
 
 /// Photographs below this side are refused: nothing of a person is left.
 const MIN_SIDE: u32 = 64;
-/// Photographs above this number of pixels are refused before they are decoded: 16 bytes each are needed at least.
-const MAX_PIXELS: u64 = 256_000_000;
 /// From this share of the person on, a pixel counts as the person's.
 const THRESHOLD: f32 = 0.5;
 /// Row of a training subject's middle on a canvas of 1024 (SNAPSNAP §5.3: rows 124.39 to 862.52).
@@ -53,49 +51,20 @@ pub struct Canvas {
     pub report: String,
 }
 
-/// Why a photograph is refused.
-#[derive(Debug, thiserror::Error)]
-pub enum PhotoError {
-    /// Missing or unreadable file.
-    #[error("{path}: cannot read: {source}")]
-    Read {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        source: std::io::Error,
-    },
-    /// Not an image of a known format, or a damaged one.
-    #[error("{path}: not a readable image: {source}")]
-    Decode {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        source: image::ImageError,
-    },
-    /// An image that cannot be used.
-    #[error("{path}: {message}")]
-    Unsuitable {
-        /// The file.
-        path: PathBuf,
-        /// What is wrong and what to do.
-        message: String,
-    },
-}
-
 /// Loads a photograph and puts it on a canvas of `side` pixels. The person is given by the `mask` file (white: person)
 /// or, without one, by the picture's alpha channel.
 ///
 /// # Errors
-/// [`PhotoError`]: unreadable files, a mask of another size, an empty mask, no mask at all, a picture below 64 pixels
+/// [`DataError`]: unreadable files, a mask of another size, an empty mask, no mask at all, a picture below 64 pixels
 /// or of a single colour, or, with [`Placement::AsIs`], of another size than the canvas.
 pub fn load(
     path: &Path,
     mask: Option<&Path>,
     side: usize,
     placement: Placement,
-) -> Result<Canvas, PhotoError> {
+) -> Result<Canvas, DataError> {
     let picture = decode(path)?;
-    let refuse = |message: String| PhotoError::Unsuitable { path: path.to_owned(), message };
+    let refuse = |message: String| DataError::Unsuitable { path: path.to_owned(), message };
     let (width, height) = (picture.width(), picture.height());
     if placement == Placement::AsIs {
         if (width as usize, height as usize) != (side, side) {
@@ -116,7 +85,7 @@ pub fn load(
                     mask.height(),
                     path.display()
                 );
-                return Err(PhotoError::Unsuitable { path: mask_path.to_owned(), message });
+                return Err(DataError::Unsuitable { path: mask_path.to_owned(), message });
             }
             (mask, mask_path)
         }
@@ -127,7 +96,7 @@ pub fn load(
         let least =
             if matches!(placement, Placement::Demo { .. }) { "255, as `mode.compat` asks" } else { "128" };
         let message = format!("the mask is empty: no pixel of the person reaches {least}");
-        PhotoError::Unsuitable { path: mask_path.to_owned(), message }
+        DataError::Unsuitable { path: mask_path.to_owned(), message }
     };
     // The demo takes whatever the mask touches; a lossy mask touches much that is not the person.
     let least = if matches!(placement, Placement::Demo { .. }) { 1 } else { u8::MAX.div_ceil(2) };
@@ -148,29 +117,6 @@ pub fn load(
 }
 
 /// Reads an image and turns it as its EXIF orientation says.
-fn decode(path: &Path) -> Result<DynamicImage, PhotoError> {
-    let file = File::open(path).map_err(|source| PhotoError::Read { path: path.to_owned(), source })?;
-    let failed = |source| match source {
-        image::ImageError::IoError(source) if source.kind() == std::io::ErrorKind::IsADirectory => {
-            PhotoError::Read { path: path.to_owned(), source }
-        }
-        source => PhotoError::Decode { path: path.to_owned(), source },
-    };
-    let reader = ImageReader::new(BufReader::new(file))
-        .with_guessed_format()
-        .map_err(|source| PhotoError::Read { path: path.to_owned(), source })?;
-    let mut decoder = reader.into_decoder().map_err(failed)?;
-    let (width, height) = decoder.dimensions();
-    if u64::from(width) * u64::from(height) > MAX_PIXELS {
-        let message = format!("is {width}×{height}, more than {} million pixels", MAX_PIXELS / 1_000_000);
-        return Err(PhotoError::Unsuitable { path: path.to_owned(), message });
-    }
-    let orientation = decoder.orientation().map_err(failed)?;
-    let mut picture = DynamicImage::from_decoder(decoder).map_err(failed)?;
-    picture.apply_orientation(orientation);
-    Ok(picture)
-}
-
 /// A mask picture's brightness, on black where it is transparent.
 fn grey(picture: &DynamicImage) -> GrayImage {
     let pixels = picture.to_luma_alpha8();

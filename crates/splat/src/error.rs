@@ -97,7 +97,7 @@ pub enum SplatError {
 }
 
 /// Text from a file as it may appear in a message: escaped and short.
-pub(crate) fn quoted(text: &str) -> String {
+pub fn quoted(text: &str) -> String {
     /// Characters that are shown.
     const SHOWN: usize = 80;
     let mut shown: String = text.chars().take(SHOWN).flat_map(char::escape_debug).collect();

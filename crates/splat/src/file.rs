@@ -26,7 +26,32 @@ pub fn remove_unfinished() {
     unfinished.ending = true;
     for path in unfinished.paths.drain(..) {
         // Whoever renamed or removed it first has done the work.
-        let _ = fs::remove_file(path);
+        let _ = if path.is_dir() { fs::remove_dir_all(path) } else { fs::remove_file(path) };
+    }
+}
+
+/// Makes the folder `path`, and those around it, for files that are to be moved elsewhere once all of them are written.
+/// [`remove_unfinished`] removes it with all that is in it, until the guard is dropped.
+///
+/// # Errors
+/// The operating system's refusal, or that the program is being ended.
+pub fn unfinished_folder(path: &Path) -> io::Result<UnfinishedFolder> {
+    let mut unfinished = unfinished();
+    if unfinished.ending {
+        return Err(io::Error::new(io::ErrorKind::Interrupted, "the program is being ended"));
+    }
+    fs::create_dir_all(path)?;
+    unfinished.paths.push(path.to_owned());
+    Ok(UnfinishedFolder(path.to_owned()))
+}
+
+/// Ends the watch over a folder of [`unfinished_folder`]; the folder itself stays.
+#[derive(Debug)]
+pub struct UnfinishedFolder(PathBuf);
+
+impl Drop for UnfinishedFolder {
+    fn drop(&mut self) {
+        unfinished().paths.retain(|path| *path != self.0);
     }
 }
 

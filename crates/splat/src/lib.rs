@@ -14,7 +14,7 @@ pub mod sh;
 mod vjp;
 
 pub use camera::{Camera, RigidTransform};
-pub use error::SplatError;
+pub use error::{SplatError, quoted};
 pub use gaussians::Gaussians;
 pub use op::{Counts, MAX_SIDE};
 pub use options::{MIN_ALPHA, MIN_TRANSMITTANCE, RenderOptions, TILE};

@@ -1,7 +1,7 @@
 //! 3D Gaussian PLY files in the layout of the INRIA viewer. Written: binary little-endian, SH degree 0. Read: whatever
 //! follows that layout.
 
-mod header;
+pub mod header;
 mod read;
 
 use std::io::{self, Write};

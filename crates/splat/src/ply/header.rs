@@ -1,4 +1,4 @@
-//! The header of a PLY file: format, elements and their properties.
+//! The header of any PLY file, of Gaussians or of triangles: format, elements and their properties.
 
 use crate::error::quoted;
 
@@ -11,13 +11,17 @@ const MAX_PROPERTIES: usize = 1000;
 /// How the values of the body are written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Format {
+    /// Text, one row per line.
     Ascii,
+    /// Numbers, lowest byte first.
     LittleEndian,
+    /// Numbers, highest byte first.
     BigEndian,
 }
 
 /// Type of a value.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[allow(missing_docs, reason = "the names say it")]
 pub enum Scalar {
     I8,
     U8,
@@ -73,8 +77,8 @@ impl Scalar {
         }
     }
 
-    /// The length of a list at the start of `bytes`, which are little-endian. `None` for what is no length.
-    pub fn read_length(self, bytes: &[u8]) -> Option<usize> {
+    /// The length or the index at the start of `bytes`, which are little-endian. `None` for what is neither.
+    pub fn read_count(self, bytes: &[u8]) -> Option<usize> {
         match self {
             Self::F32 | Self::F64 => None,
             Self::U32 => Some(u32::from_le_bytes(bytes.try_into().ok()?) as usize),
@@ -88,7 +92,9 @@ impl Scalar {
 /// A property of an element.
 #[derive(Clone, Debug)]
 pub struct Property {
+    /// As in the file.
     pub name: String,
+    /// Type of the value, or of the list's values.
     pub kind: Scalar,
     /// Type of the length, where the property is a list.
     pub list: Option<Scalar>,
@@ -97,21 +103,31 @@ pub struct Property {
 /// An element: so many rows of these properties.
 #[derive(Clone, Debug)]
 pub struct Element {
+    /// As in the file.
     pub name: String,
+    /// Rows that the header promises.
     pub count: usize,
+    /// What each row holds, in order.
     pub properties: Vec<Property>,
 }
 
 /// What stands before the body.
 #[derive(Clone, Debug)]
 pub struct Header {
+    /// How the body is written.
     pub format: Format,
+    /// In the order of the body.
     pub elements: Vec<Element>,
+    /// Texts of the comments.
+    pub comments: Vec<String>,
     /// Where the body begins.
     pub len: usize,
 }
 
 /// Reads the header at the start of `bytes`.
+///
+/// # Errors
+/// What is wrong with it, without the file's name.
 pub fn parse(bytes: &[u8]) -> Result<Header, String> {
     let mut rest = &bytes[..bytes.len().min(MAX_HEADER)];
     let mut number = 0;
@@ -132,12 +148,16 @@ pub fn parse(bytes: &[u8]) -> Result<Header, String> {
     }
     let mut format = None;
     let mut elements: Vec<Element> = Vec::new();
+    let mut comments = Vec::new();
     loop {
         let (number, text) = line()?;
         let words: Vec<&str> = text.split_ascii_whitespace().collect();
         let wrong = |problem: &str| Err(format!("header line {number}, `{}`: {problem}", quoted(&text)));
         match words.as_slice() {
-            [] | ["comment" | "obj_info", ..] => {}
+            ["comment", ..] => {
+                comments.push(text.trim_start().trim_start_matches("comment").trim().to_owned())
+            }
+            [] | ["obj_info", ..] => {}
             ["format", ..] if format.is_some() => return wrong("a second format"),
             ["format", name, _version] => {
                 format = match *name {
@@ -182,5 +202,5 @@ pub fn parse(bytes: &[u8]) -> Result<Header, String> {
     }
     let format = format.ok_or("the header names no format")?;
     let len = bytes.len().min(MAX_HEADER) - rest.len();
-    Ok(Header { format, elements, len })
+    Ok(Header { format, elements, comments, len })
 }

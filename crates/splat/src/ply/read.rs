@@ -208,7 +208,7 @@ fn skip(element: &Element, body: &[u8], start: usize, big: bool) -> Option<usize
                         bytes.reverse();
                     }
                     at += length.size();
-                    length.read_length(&bytes)?
+                    length.read_count(&bytes)?
                 }
             };
             at = at.checked_add(items.checked_mul(kind.size())?).filter(|end| *end <= body.len())?;

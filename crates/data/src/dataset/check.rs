@@ -1,0 +1,144 @@
+//! What is wrong with a data set.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::Path;
+
+use rayon::prelude::*;
+
+use super::{Folder, Split};
+use crate::DataError;
+
+/// A camera's rotation may be off by this much: matrices are stored with at least five digits.
+const ORTHONORMAL: f64 = 1e-4;
+
+/// What was looked at and found.
+#[derive(Debug, Default)]
+pub struct Checked {
+    /// Subjects that were looked at.
+    pub subjects: usize,
+    /// Views that were looked at.
+    pub views: usize,
+    /// One line per fault: file and what is wrong.
+    pub problems: Vec<String>,
+}
+
+/// Reads everything in a data set; `progress` is told how many of how many subjects are done.
+///
+/// # Errors
+/// [`DataError`] if `root` is no data set at all; every other fault is a line of the result.
+pub fn check(root: &Path, mut progress: impl FnMut(usize, usize)) -> Result<Checked, DataError> {
+    let folder = Folder::open(root)?;
+    let mut checked = Checked::default();
+    let mut all: Vec<(Option<Split>, String)> = Vec::new();
+    for split in folder.splits() {
+        let subjects = folder.subjects(split)?;
+        checked.problems.extend(orphans(&folder, split, &subjects));
+        all.extend(subjects.into_iter().map(|subject| (split, subject)));
+    }
+    if all.is_empty() {
+        checked.problems.push(format!("{}: there is no subject", root.display()));
+    }
+    if root.join(".unfinished").exists() {
+        let path = root.join(".unfinished");
+        checked.problems.push(format!("{}: a run was killed, or is at work", path.display()));
+    }
+    for (done, (split, subject)) in all.iter().enumerate() {
+        progress(done, all.len());
+        checked.subjects += 1;
+        checked.views += folder.description().views;
+        checked.problems.extend(unexpected(&folder, *split, subject));
+        let found: Vec<Vec<String>> = (0..folder.description().views)
+            .into_par_iter()
+            .map(|view| faults(&folder, *split, subject, view))
+            .collect();
+        checked.problems.extend(found.into_iter().flatten());
+    }
+    progress(all.len(), all.len());
+    Ok(checked)
+}
+
+/// Parts of subjects that have no pictures.
+fn orphans(folder: &Folder, split: Option<Split>, subjects: &[String]) -> Vec<String> {
+    let kinds = folder.kinds();
+    let mut problems = Vec::new();
+    for kind in kinds.iter().filter(|kind| **kind != "img") {
+        let path = folder.split_path(split).join(kind);
+        for entry in fs::read_dir(&path).into_iter().flatten().flatten() {
+            let name = entry.file_name().to_string_lossy().into_owned();
+            let subject = name.strip_suffix(".json").unwrap_or(&name).to_owned();
+            if !subjects.contains(&subject) {
+                problems.push(format!("{}: its subject has no pictures", entry.path().display()));
+            }
+        }
+    }
+    problems.sort_unstable();
+    problems
+}
+
+/// Files that belong to no view: the set has more views than its description says.
+fn unexpected(folder: &Folder, split: Option<Split>, subject: &str) -> Vec<String> {
+    let views = folder.description().views;
+    let mut extra = BTreeSet::new();
+    for kind in folder.kinds().iter().filter(|kind| **kind != "cameras") {
+        let path = folder.path(split, kind, subject);
+        for entry in fs::read_dir(&path).into_iter().flatten().flatten() {
+            let name = entry.file_name().to_string_lossy().into_owned();
+            let number: String = name.chars().take_while(char::is_ascii_digit).collect();
+            if !number.parse().is_ok_and(|view: usize| view < views) {
+                extra.insert(format!("{}: belongs to none of the {views} views", entry.path().display()));
+            }
+        }
+    }
+    extra.into_iter().collect()
+}
+
+/// What is wrong with one view.
+fn faults(folder: &Folder, split: Option<Split>, subject: &str, view: usize) -> Vec<String> {
+    let mut problems = Vec::new();
+    // Missing and damaged files, sizes: the error names the file.
+    if folder.description().high_resolution
+        && let Err(e) = folder.picture(split, subject, view, true)
+    {
+        problems.push(e.to_string());
+    }
+    match folder.view(split, subject, view) {
+        Err(e) => problems.push(e.to_string()),
+        Ok(stored) => {
+            let at = folder.path(split, "img", subject).join(view.to_string());
+            let mut report = |problem: String| problems.push(format!("{}: {problem}", at.display()));
+            if let Some(z) = stored.depth.iter().find(|z| !z.is_finite() || **z < 0.0) {
+                report(format!("its depth holds {z}"));
+            }
+            let seen = |v: u8| v >= 128;
+            let mask = stored.mask.as_raw();
+            if !mask.iter().any(|v| seen(*v)) {
+                report("its mask is empty".into());
+            }
+            // At the outline coverage and sample may part by a pixel; inside they agree.
+            let (width, height) = stored.mask.dimensions();
+            let inside = |x: u32, y: u32| {
+                (x.saturating_sub(1)..=(x + 1).min(width - 1)).all(|x| {
+                    (y.saturating_sub(1)..=(y + 1).min(height - 1))
+                        .all(|y| seen(stored.mask.get_pixel(x, y).0[0]))
+                })
+            };
+            let missing = (0..height)
+                .flat_map(|y| (0..width).map(move |x| (x, y)))
+                .filter(|&(x, y)| stored.depth[(y * width + x) as usize] <= 0.0 && inside(x, y));
+            let missing = missing.count();
+            if missing > 0 {
+                report(format!("{missing} pixels of the person have no depth"));
+            }
+            let rotation = stored.camera.world_to_camera.rotation;
+            let off = rotation * rotation.transpose() - glam::DMat3::IDENTITY;
+            if off.to_cols_array().iter().any(|d| d.abs() > ORTHONORMAL) {
+                report("its camera's rotation is none (R·Rᵀ ≠ 1)".into());
+            }
+            if stored.camera.focal.min_element() <= 0.0 {
+                report("its camera's focal length is not above 0".into());
+            }
+        }
+    }
+    problems
+}

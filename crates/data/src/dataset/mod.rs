@@ -1,0 +1,396 @@
+//! Data-set folders: rendered views of many subjects, in the layout of the authors' tools (SNAPSNAP §5.2) or in our exact
+//! one.
+//!
+//! ```text
+//! authors' layout                          exact layout
+//! ROOT_1024_24/dataset.toml (ours)         ROOT/dataset.toml
+//! └ train, val                             └ train, val, test
+//!   ├ img/S/v.jpg, v_hr.jpg                  ├ img/S/v.png, v_hr.png   RGBA, straight alpha
+//!   ├ mask/S/v.png          0 or 255         ├ depth/S/v.npz           `depth`, f32 metres, 0: background
+//!   ├ depth/S/v.png         ⌊2¹⁵/z⌋          └ cameras/S.json          one camera per view
+//!   └ parm/S/v_intrinsic.npy, v_extrinsic.npy
+//! ```
+//!
+//! A subject appears whole or not at all: it is written under another name and its `img` folder, which says that the
+//! subject is there, is renamed last.
+
+mod check;
+mod files;
+#[cfg(test)]
+mod tests;
+mod write;
+
+use std::fmt;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use glam::DVec2;
+use image::{GrayImage, RgbImage};
+use serde::{Deserialize, Serialize};
+use snapsnap_splat::{Camera, cameras, file, quoted};
+
+use crate::DataError;
+pub use check::{Checked, check};
+
+/// Name of the file that describes a folder.
+const DESCRIPTION: &str = "dataset.toml";
+/// Largest description that is read.
+const MAX_DESCRIPTION: u64 = 1 << 20;
+/// Most views of a subject.
+pub const MAX_VIEWS: usize = 4096;
+/// Largest side of a view.
+pub const MAX_RESOLUTION: u32 = 8192;
+
+/// How views are stored.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Layout {
+    /// JPEG, depth in 16 bits, sampled at the pixels' corners: what the authors' tools write and read.
+    Authors,
+    /// Lossless, depth in f32, sampled at the pixels' centres.
+    Exact,
+}
+
+/// What a data set is kept for. Subjects of different splits are different people.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Split {
+    /// To learn from.
+    Train,
+    /// To choose among what was learned.
+    Val,
+    /// To report on.
+    Test,
+}
+
+impl Split {
+    /// Every split.
+    pub const ALL: [Self; 3] = [Self::Train, Self::Val, Self::Test];
+
+    /// Name of the split's folder.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Train => "train",
+            Self::Val => "val",
+            Self::Test => "test",
+        }
+    }
+}
+
+impl fmt::Display for Split {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+/// What `dataset.toml` says.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Description {
+    /// How views are stored.
+    pub layout: Layout,
+    /// Views of each subject, evenly around it.
+    pub views: usize,
+    /// Side of a view in pixels.
+    pub resolution: u32,
+    /// Whether each view is there at twice the side as well.
+    pub high_resolution: bool,
+    /// Where in the first pixel the camera's coordinates (0, 0) and (½, ½) put its sample: 0 in the authors' sets, ½ in
+    /// ours. Points from depth are half a pixel off where this is not heeded.
+    pub pixel_centre: f64,
+    /// What the subjects are and how they were made.
+    pub source: String,
+}
+
+impl Description {
+    fn problem(&self) -> Option<String> {
+        if self.views == 0 || self.views > MAX_VIEWS {
+            return Some(format!("`views` is {}, must be 1 to {MAX_VIEWS}", self.views));
+        }
+        if self.resolution == 0 || self.resolution > MAX_RESOLUTION {
+            return Some(format!("`resolution` is {}, must be 1 to {MAX_RESOLUTION}", self.resolution));
+        }
+        if self.pixel_centre != 0.0 && self.pixel_centre != 0.5 {
+            return Some(format!("`pixel_centre` is {}, must be 0 or 0.5", self.pixel_centre));
+        }
+        None
+    }
+}
+
+/// One stored view.
+#[derive(Debug, Clone)]
+pub struct StoredView {
+    /// `[H,W]` colours; meaningless where the mask is 0.
+    pub color: RgbImage,
+    /// `[H,W]` coverage.
+    pub mask: GrayImage,
+    /// `[H,W]` metres along the optical axis; 0 where nothing was seen.
+    pub depth: Vec<f32>,
+    /// As stored: pixel coordinates follow [`Description::pixel_centre`].
+    pub camera: Camera,
+}
+
+/// A data-set folder.
+#[derive(Debug, Clone)]
+pub struct Folder {
+    root: PathBuf,
+    description: Description,
+}
+
+impl Folder {
+    /// Opens a data set. Without a `dataset.toml` it is taken for one that the authors' tools wrote.
+    ///
+    /// # Errors
+    /// [`DataError`]: no folder, a `dataset.toml` that is wrong, or neither one nor the authors' layout.
+    pub fn open(root: &Path) -> Result<Self, DataError> {
+        let path = root.join(DESCRIPTION);
+        if path.is_file() {
+            let description = read_description(&path)?;
+            return Ok(Self { root: root.to_owned(), description });
+        }
+        let entries = fs::read_dir(root).map_err(DataError::read(root))?;
+        drop(entries);
+        let foreign = |message: &str| {
+            DataError::unsuitable(root, format!("is no data set: it has no {DESCRIPTION}, and {message}"))
+        };
+        let views = views_in_name(root)
+            .ok_or_else(|| foreign("its name does not end in the number of views, as `_1024_24`"))?;
+        let mut folder = Self {
+            root: root.to_owned(),
+            description: Description {
+                layout: Layout::Authors,
+                views,
+                resolution: 1,
+                high_resolution: false,
+                pixel_centre: 0.0,
+                source: "written by the authors' tools".into(),
+            },
+        };
+        let (split, subject) = folder
+            .splits()
+            .into_iter()
+            .find_map(|split| Some((split, folder.subjects(split).ok()?.into_iter().next()?)))
+            .ok_or_else(|| foreign("no subject lies in img, train/img, val/img or test/img"))?;
+        let first = folder.path(split, "img", &subject).join("0.jpg");
+        let size = image::image_dimensions(&first)
+            .map_err(|source| DataError::Decode { path: first.clone(), source })?;
+        folder.description.resolution = size.0;
+        folder.description.high_resolution = first.with_file_name("0_hr.jpg").is_file();
+        if let Some(problem) = folder.description.problem() {
+            return Err(DataError::unsuitable(&first, problem));
+        }
+        Ok(folder)
+    }
+
+    /// Opens the folder `root` for writing subjects into it, making it if it is not there.
+    ///
+    /// # Errors
+    /// [`DataError`] if it cannot be made, holds a data set of another kind, or, in the authors' layout, if its name does
+    /// not say how many views there are: the authors' loader reads the number there.
+    pub fn create(root: &Path, description: Description) -> Result<Self, DataError> {
+        if let Some(problem) = description.problem() {
+            return Err(DataError::unsuitable(root, problem));
+        }
+        let Description { layout, views, resolution, .. } = description;
+        if layout == Layout::Authors && views_in_name(root) != Some(views) {
+            let message = format!(
+                "the authors' loader reads the number of views from the folder's name: it must end in `_{resolution}_{views}`"
+            );
+            return Err(DataError::unsuitable(root, message));
+        }
+        fs::create_dir_all(root).map_err(DataError::write(root))?;
+        let path = root.join(DESCRIPTION);
+        if path.exists() {
+            let there = read_description(&path)?;
+            if there != description {
+                let text = |d: &Description| toml::to_string(d).unwrap_or_default().replace('\n', ", ");
+                let message = format!(
+                    "describes another data set than the one to be written: {}instead of {}give another folder",
+                    text(&there),
+                    text(&description)
+                );
+                return Err(DataError::unsuitable(&path, message));
+            }
+        } else {
+            let text = toml::to_string(&description).expect("the description has only TOML types");
+            let text = format!("# Written by `snapsnap prepare`.\n{text}");
+            file::write_whole(&path, |out| std::io::Write::write_all(out, text.as_bytes()))
+                .map_err(DataError::write(&path))?;
+        }
+        Ok(Self { root: root.to_owned(), description })
+    }
+
+    /// The folder itself.
+    pub fn root(&self) -> &Path {
+        &self.root
+    }
+
+    /// What is in it.
+    pub fn description(&self) -> &Description {
+        &self.description
+    }
+
+    /// The splits that are there; `None` where subjects lie in the root itself, as in the authors' test sets.
+    pub fn splits(&self) -> Vec<Option<Split>> {
+        let there = |split: &Option<Split>| self.split_path(*split).join("img").is_dir();
+        std::iter::once(None).chain(Split::ALL.map(Some)).filter(there).collect()
+    }
+
+    /// Names of the subjects of a split, in order.
+    ///
+    /// # Errors
+    /// [`DataError::Read`] if the split is not there.
+    pub fn subjects(&self, split: Option<Split>) -> Result<Vec<String>, DataError> {
+        let folder = self.split_path(split).join("img");
+        let mut subjects = Vec::new();
+        for entry in fs::read_dir(&folder).map_err(DataError::read(&folder))? {
+            let entry = entry.map_err(DataError::read(&folder))?;
+            let name = entry.file_name().to_string_lossy().into_owned();
+            if !name.starts_with('.') && entry.path().is_dir() {
+                subjects.push(name);
+            }
+        }
+        subjects.sort_unstable();
+        Ok(subjects)
+    }
+
+    /// Reads one view.
+    ///
+    /// # Errors
+    /// [`DataError`] naming the file that is missing, damaged, or of another size than the set's.
+    pub fn view(&self, split: Option<Split>, subject: &str, view: usize) -> Result<StoredView, DataError> {
+        let camera = self.camera(split, subject, view)?;
+        let (color, mask) = self.picture(split, subject, view, false)?;
+        let depth = match self.description.layout {
+            Layout::Authors => {
+                files::read_inverse_depth(&self.path(split, "depth", subject).join(format!("{view}.png")))
+            }
+            Layout::Exact => {
+                files::read_depth(&self.path(split, "depth", subject).join(format!("{view}.npz")))
+            }
+        }?;
+        let side = self.description.resolution;
+        let path = self.path(split, "depth", subject);
+        self.check_size(&path, (depth.1[1], depth.1[0]), side)?;
+        Ok(StoredView { color, mask, depth: depth.0, camera })
+    }
+
+    /// Reads the picture of a view, at twice the side if `high_resolution`: colours and coverage.
+    ///
+    /// # Errors
+    /// As [`Self::view`].
+    pub fn picture(
+        &self,
+        split: Option<Split>,
+        subject: &str,
+        view: usize,
+        high_resolution: bool,
+    ) -> Result<(RgbImage, GrayImage), DataError> {
+        let folder = self.path(split, "img", subject);
+        let suffix = if high_resolution { "_hr" } else { "" };
+        let side = self.description.resolution * if high_resolution { 2 } else { 1 };
+        match self.description.layout {
+            Layout::Exact => {
+                let path = folder.join(format!("{view}{suffix}.png"));
+                let picture = crate::picture::decode(&path)?;
+                self.check_size(&path, (picture.width(), picture.height()), side)?;
+                let rgba = picture.into_rgba8();
+                let mask = GrayImage::from_fn(side, side, |x, y| image::Luma([rgba.get_pixel(x, y).0[3]]));
+                Ok((image::DynamicImage::ImageRgba8(rgba).into_rgb8(), mask))
+            }
+            Layout::Authors => {
+                let path = folder.join(format!("{view}{suffix}.jpg"));
+                let color = crate::picture::decode(&path)?;
+                self.check_size(&path, (color.width(), color.height()), side)?;
+                let path = self.path(split, "mask", subject).join(format!("{view}.png"));
+                let mask = crate::picture::decode(&path)?.into_luma8();
+                self.check_size(&path, mask.dimensions(), self.description.resolution)?;
+                let mask = if high_resolution {
+                    image::imageops::resize(&mask, side, side, image::imageops::FilterType::Nearest)
+                } else {
+                    mask
+                };
+                Ok((color.into_rgb8(), mask))
+            }
+        }
+    }
+
+    /// Reads the camera of a view, in the pixel coordinates that [`Description::pixel_centre`] says.
+    ///
+    /// # Errors
+    /// As [`Self::view`].
+    pub fn camera(&self, split: Option<Split>, subject: &str, view: usize) -> Result<Camera, DataError> {
+        let side = self.description.resolution;
+        match self.description.layout {
+            Layout::Authors => {
+                let folder = self.path(split, "parm", subject);
+                files::read_camera(&folder, view, side)
+            }
+            Layout::Exact => {
+                let path = self.split_path(split).join("cameras").join(format!("{subject}.json"));
+                let cameras = cameras::read(&path).map_err(|e| DataError::splat(&path, e))?;
+                let count = cameras.len();
+                let camera = cameras.into_iter().nth(view).ok_or_else(|| {
+                    DataError::unsuitable(&path, format!("holds {count} cameras, view {view} has none"))
+                })?;
+                self.check_size(&path, (camera.width, camera.height), side)?;
+                Ok(camera)
+            }
+        }
+    }
+
+    /// A stored camera in our coordinates, in which the first pixel's sample lies at (½, ½).
+    pub fn exact_camera(&self, stored: &Camera) -> Camera {
+        let shift = DVec2::splat(0.5 - self.description.pixel_centre);
+        Camera { principal_point: stored.principal_point + shift, ..*stored }
+    }
+
+    fn check_size(&self, path: &Path, found: (u32, u32), side: u32) -> Result<(), DataError> {
+        if found == (side, side) {
+            return Ok(());
+        }
+        let message = format!("is {}×{}, the data set has views of {side}×{side}", found.0, found.1);
+        Err(DataError::unsuitable(path, message))
+    }
+
+    fn split_path(&self, split: Option<Split>) -> PathBuf {
+        match split {
+            Some(split) => self.root.join(split.name()),
+            None => self.root.clone(),
+        }
+    }
+
+    fn path(&self, split: Option<Split>, kind: &str, subject: &str) -> PathBuf {
+        self.split_path(split).join(kind).join(subject)
+    }
+}
+
+fn read_description(path: &Path) -> Result<Description, DataError> {
+    if fs::metadata(path).map_err(DataError::read(path))?.len() > MAX_DESCRIPTION {
+        return Err(DataError::unsuitable(path, "is far too long for a description"));
+    }
+    let text = fs::read_to_string(path).map_err(DataError::read(path))?;
+    let description: Description =
+        toml::from_str(&text).map_err(|e| DataError::unsuitable(path, e.to_string().trim_end()))?;
+    match description.problem() {
+        Some(problem) => Err(DataError::unsuitable(path, problem)),
+        None => Ok(description),
+    }
+}
+
+/// The number behind the last underscore of the folder's name.
+fn views_in_name(root: &Path) -> Option<usize> {
+    let name = root.canonicalize().unwrap_or_else(|_| root.to_owned());
+    let name = name.file_name()?.to_string_lossy().into_owned();
+    let (_, views) = name.rsplit_once('_')?;
+    views.parse().ok().filter(|views| (1..=MAX_VIEWS).contains(views))
+}
+
+/// Whether a subject may be called so: a name that is one folder everywhere.
+pub fn check_subject_name(name: &str) -> Result<(), String> {
+    let fine = |c: char| c.is_alphanumeric() || "-_. ".contains(c);
+    if name.is_empty() || name.starts_with('.') || name.len() > 128 || !name.chars().all(fine) {
+        return Err(format!("`{}` is no name for a subject", quoted(name)));
+    }
+    Ok(())
+}

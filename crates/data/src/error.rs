@@ -1,0 +1,61 @@
+//! What can go wrong on this floor.
+
+use std::path::{Path, PathBuf};
+
+/// Errors of photographs, scans and data sets; each names its file.
+#[derive(Debug, thiserror::Error)]
+pub enum DataError {
+    /// Missing or unreadable file.
+    #[error("{path}: cannot read: {source}")]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// A file that could not be written.
+    #[error("{path}: cannot write: {source}")]
+    Write {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// Not an image of a known format, or a damaged one.
+    #[error("{path}: not a readable image: {source}")]
+    Decode {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: image::ImageError,
+    },
+    /// A file that can be read but not used.
+    #[error("{path}: {message}")]
+    Unsuitable {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong and what to do.
+        message: String,
+    },
+}
+
+impl DataError {
+    pub(crate) fn read(path: &Path) -> impl Fn(std::io::Error) -> Self {
+        move |source| Self::Read { path: path.to_owned(), source }
+    }
+
+    pub(crate) fn write(path: &Path) -> impl Fn(std::io::Error) -> Self {
+        move |source| Self::Write { path: path.to_owned(), source }
+    }
+
+    /// A camera file's error, which names the file itself.
+    pub(crate) fn splat(path: &Path, error: snapsnap_splat::SplatError) -> Self {
+        let message = error.to_string();
+        let message = message.strip_prefix(&format!("{}: ", path.display())).unwrap_or(&message).to_owned();
+        Self::Unsuitable { path: path.to_owned(), message }
+    }
+
+    pub(crate) fn unsuitable(path: &Path, message: impl ToString) -> Self {
+        Self::Unsuitable { path: path.to_owned(), message: message.to_string() }
+    }
+}
