@@ -8,6 +8,7 @@ pub mod photo;
 mod picture;
 mod resize;
 pub mod scan;
+pub mod smplx;
 pub mod view;
 
 pub use error::DataError;
