@@ -35,6 +35,8 @@ enum Command {
     Reconstruct(commands::reconstruct::Arguments),
     /// Render a Gaussian PLY into pictures.
     Render(commands::render::Arguments),
+    /// Make or check a data set of people to train on.
+    Prepare(commands::prepare::Arguments),
     /// Read checkpoints of Snap-Snap, DUSt3R or CroCo and write one weight file.
     ImportWeights(commands::import_weights::Arguments),
     /// Write random weights for a config.
@@ -60,6 +62,7 @@ fn main() -> ExitCode {
     let result = match command {
         Command::Reconstruct(arguments) => commands::reconstruct::run(&arguments, quiet),
         Command::Render(arguments) => commands::render::run(&arguments, quiet),
+        Command::Prepare(arguments) => commands::prepare::run(&arguments, quiet),
         Command::ImportWeights(arguments) => commands::import_weights::run(&arguments, quiet),
         Command::InitWeights(arguments) => commands::init_weights::run(&arguments, quiet),
         Command::ExportWeights(arguments) => commands::export_weights::run(&arguments, quiet),

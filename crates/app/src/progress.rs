@@ -63,8 +63,12 @@ impl Progress {
     pub fn step(&self, done: usize, total: usize, unit: &str) {
         let (done, total) = (done as u64, total as u64);
         if let Some(bar) = &self.bar {
+            bar.set_length(total);
             bar.set_position(done);
-        } else if self.plain && (done == total || done >= self.reported.get() + total.div_ceil(LINES)) {
+        } else if self.plain
+            && done > 0
+            && (done == total || done >= self.reported.get() + total.div_ceil(LINES))
+        {
             self.reported.set(done);
             let rate = done as f64 / self.start.elapsed().as_secs_f64();
             let left = (total - done) as f64 / rate;

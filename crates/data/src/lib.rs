@@ -6,6 +6,8 @@ pub mod import;
 pub mod mesh;
 pub mod photo;
 mod picture;
+pub mod prepare;
+pub mod random;
 mod resize;
 pub mod scan;
 pub mod smplx;

@@ -1,9 +1,15 @@
 //! Scans of people: where the known sets keep which subject, and how a scan is stood up for the cameras.
 
+use std::fs;
+use std::path::{Path, PathBuf};
+
 use glam::{Mat3, Vec3};
 use rand::Rng;
+use serde::{Deserialize, Serialize};
 
+use crate::dataset::{Split, check_subject_name};
 use crate::mesh::{Mesh, MeshError};
+use crate::{DataError, import};
 
 /// Height of a normalised subject in metres (SNAPSNAP §5.4). Real stature is lost on purpose: two photographs do not show it.
 pub const HEIGHT: f32 = 1.8;
@@ -11,23 +17,51 @@ pub const HEIGHT: f32 = 1.8;
 const HEIGHT_JITTER: f32 = 0.05;
 
 /// A collection of scans, each with conventions of its own.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Collection {
     /// THuman2.0: subjects 0 to 525.
+    #[serde(rename = "thuman2.0")]
     Thuman20,
     /// THuman2.1's further subjects, from 526.
+    #[serde(rename = "thuman2.1")]
     Thuman21,
     /// CustomHumans.
+    #[serde(rename = "customhumans")]
     CustomHumans,
     /// 2K2K.
+    #[serde(rename = "2k2k")]
     TwoK2K,
     /// 4D-Dress.
+    #[serde(rename = "4d-dress")]
     FourDDress,
     /// Any other: y up, facing +z.
+    #[serde(rename = "other")]
     Other,
 }
 
 impl Collection {
+    /// Where a subject belongs: the published lists for THuman; other sets are trained on unless told otherwise.
+    pub fn split(self, subject: &str) -> Split {
+        match (self, subject.parse::<u32>()) {
+            (Self::Thuman20, Ok(id)) if VALIDATION.contains(&id) => Split::Val,
+            (Self::Thuman21, Ok(id)) if LOOSE.contains(&id) => Split::Test,
+            _ => Split::Train,
+        }
+    }
+
+    /// The conventions of one subject: THuman2.1 includes THuman2.0, whose axes are others.
+    pub fn of(self, subject: &str) -> Self {
+        match (self, subject.parse::<u32>()) {
+            (Self::Thuman21, Ok(id)) if id < 526 => Self::Thuman20,
+            _ => self,
+        }
+    }
+
+    /// Whether SMPL-X parameters say which way its subjects face; those of the other sets face +z (SNAPSNAP §5.3).
+    pub fn has_orientation(self) -> bool {
+        matches!(self, Self::Thuman20 | Self::Thuman21)
+    }
+
     /// Turns the set's axes into ours (y up).
     fn axes(self) -> Mat3 {
         match self {
@@ -58,6 +92,78 @@ pub const LOOSE: [u32; 50] = [
     2264, 1350, 1982, 1981, 1122, 2413, 1819, 1043, 1267, 2186, 865, 2148, 1392, 2092, 2198, 2409, 839, 2250,
     1681, 837, 2109, 1398, 1115, 659, 1123, 1816, 2230, 1693, 1367, 713, 2258, 1124,
 ];
+
+/// A scan's file and the subject that it becomes.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Source {
+    /// Name of the subject.
+    pub subject: String,
+    /// The scan.
+    pub path: PathBuf,
+}
+
+/// Deepest folder below the given one that is searched for scans.
+const MAX_DEPTH: usize = 4;
+
+/// The scans below `root`, or `root` itself, in the order of their paths. A folder that holds a scan of its own name
+/// (`0001/0001.obj`) holds nothing else. A subject is called as its file, if that is a
+/// number, or else as its folder and its file; numbers get four digits, as the authors' loader wants them.
+///
+/// # Errors
+/// [`DataError`] if `root` cannot be read, holds no scan, or two scans would be the same subject.
+pub fn find(root: &Path) -> Result<Vec<Source>, DataError> {
+    let mut paths = Vec::new();
+    if root.is_file() {
+        paths.push(root.to_owned());
+    } else {
+        search(root, 0, &mut paths)?;
+    }
+    if paths.is_empty() {
+        let message = format!("holds no scan: no file .{}", import::EXTENSIONS.join(", ."));
+        return Err(DataError::unsuitable(root, message));
+    }
+    let stem = |path: &Path| path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+    let mut sources: Vec<Source> = Vec::new();
+    for path in &paths {
+        let (name, folder) = (stem(path), path.parent().unwrap_or(root));
+        let tells = folder == root || root == path || stem(folder) == name || name.parse::<u32>().is_ok();
+        let name = if tells { name } else { format!("{}-{name}", stem(folder)) };
+        let subject = name.parse::<u32>().map_or(name, |number| format!("{number:04}"));
+        check_subject_name(&subject).map_err(|e| DataError::unsuitable(path, e))?;
+        if let Some(other) = sources.iter().find(|other| other.subject == subject) {
+            let message = format!("and {} would both be subject {subject}", other.path.display());
+            return Err(DataError::unsuitable(path, message));
+        }
+        sources.push(Source { subject, path: path.clone() });
+    }
+    Ok(sources)
+}
+
+fn search(folder: &Path, depth: usize, found: &mut Vec<PathBuf>) -> Result<(), DataError> {
+    let mut entries = Vec::new();
+    for entry in fs::read_dir(folder).map_err(DataError::read(folder))? {
+        entries.push(entry.map_err(DataError::read(folder))?.path());
+    }
+    entries.sort_unstable();
+    let is_scan = |path: &Path| {
+        let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
+        path.is_file() && extension.is_some_and(|e| import::EXTENSIONS.contains(&e.as_str()))
+    };
+    let own = entries.iter().find(|path| is_scan(path) && path.file_stem() == folder.file_name());
+    if let Some(own) = own {
+        found.push(own.clone());
+        return Ok(());
+    }
+    for path in entries {
+        let hidden = path.file_name().is_some_and(|name| name.to_string_lossy().starts_with('.'));
+        if is_scan(&path) {
+            found.push(path);
+        } else if path.is_dir() && !hidden && depth < MAX_DEPTH {
+            search(&path, depth + 1, found)?;
+        }
+    }
+    Ok(())
+}
 
 /// The training subjects of THuman2.0.
 pub fn training_ids() -> impl Iterator<Item = u32> {
@@ -127,6 +233,43 @@ mod tests {
         assert_eq!(VALIDATION.iter().collect::<HashSet<_>>().len(), 100);
         assert_eq!(LOOSE.iter().collect::<HashSet<_>>().len(), 50);
         assert!(LOOSE.iter().all(|id| (526..2500).contains(id)));
+    }
+
+    #[test]
+    fn scans_are_found_in_the_layouts_of_the_known_sets() {
+        let folder = tempfile::tempdir().expect("temporary folder");
+        let root = folder.path();
+        let touch = |name: &str| {
+            let path = root.join(name);
+            fs::create_dir_all(path.parent().expect("in the folder")).expect("make");
+            fs::write(path, "").expect("write");
+        };
+        let subjects = |below: &str| -> Vec<String> {
+            find(&root.join(below)).expect("finds").into_iter().map(|source| source.subject).collect()
+        };
+        ["th/0007/0007.obj", "th/0007/other.ply", "th/12/12.OBJ", "th/.x/a.obj", "th/notes.txt"]
+            .into_iter()
+            .for_each(touch);
+        assert_eq!(subjects("th"), ["0007", "0012"]);
+        ["ch/a/mesh-f00011.obj", "ch/a/mesh-f00021.obj", "ch/b/mesh-f00011.obj"].into_iter().for_each(touch);
+        assert_eq!(subjects("ch"), ["a-mesh-f00011", "a-mesh-f00021", "b-mesh-f00011"]);
+        ["2k/Training/00003/00003.ply"].into_iter().for_each(touch);
+        assert_eq!(subjects("2k"), ["0003"]);
+        assert_eq!(subjects("2k/Training/00003/00003.ply"), ["0003"]);
+        ["twice/0001.obj", "twice/1.ply"].into_iter().for_each(touch);
+        assert!(find(&root.join("twice")).expect_err("same").to_string().contains("both be subject 0001"));
+        fs::create_dir(root.join("empty")).expect("make");
+        assert!(find(&root.join("empty")).expect_err("empty").to_string().contains("holds no scan"));
+        assert!(find(&root.join("absent")).is_err());
+    }
+
+    #[test]
+    fn subjects_go_where_the_published_lists_say() {
+        let collection = Collection::Thuman21;
+        assert_eq!((collection.of("0525"), collection.of("0526")), (Collection::Thuman20, collection));
+        assert_eq!(Collection::Thuman20.split("0006"), Split::Val);
+        assert_eq!(Collection::Thuman20.split("0004"), Split::Train);
+        assert_eq!(collection.split("0659"), Split::Test);
     }
 
     #[test]

@@ -6,6 +6,7 @@ mod tests;
 
 use std::path::{Path, PathBuf};
 
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 /// Everything that decides what the networks compute.
@@ -272,29 +273,7 @@ impl Config {
     /// # Errors
     /// [`ConfigError`], naming origin, key and allowed values.
     pub fn from_toml(text: &str, origin: &str, overrides: &[String]) -> Result<Self, ConfigError> {
-        let syntax =
-            |origin: &str, message: String| ConfigError::Syntax { origin: origin.to_owned(), message };
-        // Straight from the text first: only this way do messages carry line numbers.
-        let config: Self = toml::from_str(text).map_err(|e| syntax(origin, e.to_string()))?;
-        let mut table: toml::Table = toml::from_str(text).map_err(|e| syntax(origin, e.to_string()))?;
-        // A list of values would pass for a section.
-        if let Some((key, value)) = table.iter().find(|(_, value)| !value.is_table()) {
-            return Err(syntax(
-                origin,
-                format!("`{key}` is a {}, must be a section [{key}]", value.type_str()),
-            ));
-        }
-        if overrides.is_empty() {
-            return config.checked(origin);
-        }
-        for assignment in overrides {
-            assign(&mut table, assignment)
-                .map_err(|message| syntax(&format!("--set {assignment}"), message))?;
-        }
-        let origin = format!("{origin} with --set {}", overrides.join(" --set "));
-        let config: Self = toml::Value::Table(table)
-            .try_into()
-            .map_err(|e: toml::de::Error| syntax(&origin, e.to_string()))?;
+        let (config, origin): (Self, String) = parse(text, origin, overrides)?;
         config.checked(&origin)
     }
 
@@ -375,6 +354,36 @@ impl Config {
             None => Ok(self),
         }
     }
+}
+
+/// Parses TOML text of sections as any config; `origin` names it in errors, `overrides` are `a.b=c` assignments applied on
+/// top. Returns the config, unchecked, and the origin for errors about its values.
+///
+/// # Errors
+/// [`ConfigError::Syntax`], naming origin and key.
+pub fn parse<T: DeserializeOwned>(
+    text: &str,
+    origin: &str,
+    overrides: &[String],
+) -> Result<(T, String), ConfigError> {
+    let syntax = |origin: &str, message: String| ConfigError::Syntax { origin: origin.to_owned(), message };
+    // Straight from the text first: only this way do messages carry line numbers.
+    let config: T = toml::from_str(text).map_err(|e| syntax(origin, e.to_string()))?;
+    let mut table: toml::Table = toml::from_str(text).map_err(|e| syntax(origin, e.to_string()))?;
+    // A list of values would pass for a section.
+    if let Some((key, value)) = table.iter().find(|(_, value)| !value.is_table()) {
+        return Err(syntax(origin, format!("`{key}` is a {}, must be a section [{key}]", value.type_str())));
+    }
+    if overrides.is_empty() {
+        return Ok((config, origin.to_owned()));
+    }
+    for assignment in overrides {
+        assign(&mut table, assignment).map_err(|message| syntax(&format!("--set {assignment}"), message))?;
+    }
+    let origin = format!("{origin} with --set {}", overrides.join(" --set "));
+    let config =
+        toml::Value::Table(table).try_into().map_err(|e: toml::de::Error| syntax(&origin, e.to_string()))?;
+    Ok((config, origin))
 }
 
 /// Exactly four numbers; an array type alone would drop a fifth without a word.

@@ -44,34 +44,68 @@ pub struct Camera {
     pub world_to_camera: RigidTransform,
 }
 
-/// Radius of the training orbit in metres (SNAPSNAP §5.3).
-const ORBIT_RADIUS: f64 = 2.0;
-/// Point that the training cameras look at, in metres (SNAPSNAP §5.3).
-const ORBIT_CENTRE: DVec3 = DVec3::new(0.0, 0.85, 0.0);
-/// Downward pitch of the training cameras in degrees (SNAPSNAP §5.3).
-const ORBIT_PITCH_DEGREES: f64 = 8.0;
+/// A camera that looks at a subject from around it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Orbit {
+    /// Point that the camera looks at, world metres.
+    pub centre: DVec3,
+    /// Distance of the camera from `centre` in metres.
+    pub radius: f64,
+    /// Angle around the world's y axis in degrees; 0 stands on +z and sees the front of a subject that faces +z.
+    pub yaw_degrees: f64,
+    /// How far the camera looks down, in degrees.
+    pub pitch_degrees: f64,
+    /// Turn of the image around the optical axis in degrees, clockwise as seen from behind the camera.
+    pub roll_degrees: f64,
+    /// Focal length as a share of the image's side.
+    pub focal: f64,
+}
+
+impl Default for Orbit {
+    /// The training camera in front of the subject (SNAPSNAP §5.3).
+    fn default() -> Self {
+        Self {
+            centre: DVec3::new(0.0, 0.85, 0.0),
+            radius: 2.0,
+            yaw_degrees: 0.0,
+            pitch_degrees: 8.0,
+            roll_degrees: 0.0,
+            focal: 0.8,
+        }
+    }
+}
+
+impl Orbit {
+    /// The camera with a square image of `size` pixels; its principal point is moved down by 25/1024 of the size, as that
+    /// of the training cameras (SNAPSNAP §5.3).
+    pub fn camera(&self, size: u32) -> Camera {
+        let (sin, cos) = self.yaw_degrees.to_radians().sin_cos();
+        let (pitch_sin, pitch_cos) = self.pitch_degrees.to_radians().sin_cos();
+        let backward = DVec3::new(pitch_cos * sin, pitch_sin, pitch_cos * cos);
+        let forward = -backward;
+        let right = DVec3::new(cos, 0.0, -sin);
+        let down = forward.cross(right);
+        let (roll_sin, roll_cos) = self.roll_degrees.to_radians().sin_cos();
+        let (right, down) = (roll_cos * right + roll_sin * down, roll_cos * down - roll_sin * right);
+        let rotation = DMat3::from_cols(right, down, forward).transpose();
+        let eye = self.centre + self.radius * backward;
+        let side = f64::from(size);
+        Camera {
+            width: size,
+            height: size,
+            focal: DVec2::splat(self.focal * side),
+            principal_point: DVec2::new(0.5 * side, 537.0 / 1024.0 * side),
+            world_to_camera: RigidTransform { rotation, translation: -(rotation * eye) },
+        }
+    }
+}
 
 impl Camera {
     /// The training orbit's camera at `yaw_degrees` with a square image of `size` pixels (SNAPSNAP §5.3): 2 m from
     /// (0, 0.85, 0), 8° downward pitch, focal length 0.8·size, principal point moved down by 25/1024 of the size.
     /// World: y up, floor at y = 0; yaw 0 stands on +z and sees the front of a subject that faces +z.
     pub fn orbit_at_yaw_degrees(yaw_degrees: f64, size: u32) -> Self {
-        let (sin, cos) = yaw_degrees.to_radians().sin_cos();
-        let (pitch_sin, pitch_cos) = ORBIT_PITCH_DEGREES.to_radians().sin_cos();
-        let backward = DVec3::new(pitch_cos * sin, pitch_sin, pitch_cos * cos);
-        let forward = -backward;
-        let right = DVec3::new(cos, 0.0, -sin);
-        let down = forward.cross(right);
-        let rotation = DMat3::from_cols(right, down, forward).transpose();
-        let eye = ORBIT_CENTRE + ORBIT_RADIUS * backward;
-        let side = f64::from(size);
-        Self {
-            width: size,
-            height: size,
-            focal: DVec2::splat(0.8 * side),
-            principal_point: DVec2::new(0.5 * side, 537.0 / 1024.0 * side),
-            world_to_camera: RigidTransform { rotation, translation: -(rotation * eye) },
-        }
+        Orbit { yaw_degrees, ..Orbit::default() }.camera(size)
     }
 
     /// `count` cameras evenly around the training orbit, the first in front. A subject is as high in an image of any
@@ -169,6 +203,17 @@ mod tests {
             let rotation = Camera::orbit_at_yaw_degrees(yaw, 512).world_to_camera.rotation;
             assert!((rotation.determinant() - 1.0).abs() < 1e-12, "yaw {yaw}");
         }
+    }
+
+    #[test]
+    fn a_roll_turns_the_image_around_the_optical_axis() {
+        let orbit = Orbit { yaw_degrees: 20.0, ..Orbit::default() };
+        let (level, rolled) = (orbit.camera(64), Orbit { roll_degrees: 90.0, ..orbit }.camera(64));
+        assert!((level.centre() - rolled.centre()).length() < 1e-12);
+        let point = DVec3::new(0.1, 1.4, 0.2);
+        let [a, b] = [level, rolled].map(|c| c.project(point).expect("in front").0 - c.principal_point);
+        // What was below is now on the left's side of the image's own axes: (x, y) → (y, −x).
+        assert!((b - DVec2::new(a.y, -a.x)).length() < 1e-9, "{a} {b}");
     }
 
     #[test]

@@ -13,7 +13,7 @@ mod render;
 pub mod sh;
 mod vjp;
 
-pub use camera::{Camera, RigidTransform};
+pub use camera::{Camera, Orbit, RigidTransform};
 pub use error::{SplatError, quoted};
 pub use gaussians::Gaussians;
 pub use op::{Counts, MAX_SIDE};

@@ -3,6 +3,7 @@
 pub mod export_weights;
 pub mod import_weights;
 pub mod init_weights;
+pub mod prepare;
 pub mod reconstruct;
 pub mod render;
 

@@ -1,0 +1,33 @@
+//! `snapsnap prepare check`.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use snapsnap_data::dataset;
+
+use crate::failure::Failure;
+use crate::progress::Progress;
+use crate::say;
+
+#[derive(Args)]
+pub struct Arguments {
+    /// Folder of the data set: ours, or one that the authors' tools wrote.
+    dataset: PathBuf,
+}
+
+pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
+    let progress = Progress::steps(quiet, 0, "subjects");
+    let checked = dataset::check(&arguments.dataset, |done, all| progress.step(done, all, "subjects"))?;
+    drop(progress);
+    for problem in &checked.problems {
+        say::out(problem);
+    }
+    let looked = format!("{} subjects, {} views", checked.subjects, checked.views);
+    if !checked.problems.is_empty() {
+        return Err(Failure::Input(format!("{looked}: {} faults", checked.problems.len())));
+    }
+    if !quiet {
+        say::out(&format!("{looked}: no fault"));
+    }
+    Ok(())
+}

@@ -1,0 +1,170 @@
+//! `snapsnap prepare`: people, from files or generated, become data sets.
+
+mod check;
+mod preview;
+mod scan;
+
+use std::path::PathBuf;
+
+use clap::{Args, Subcommand, ValueEnum};
+use snapsnap_data::DataError;
+use snapsnap_data::dataset::{Folder, Split};
+use snapsnap_data::mesh::Mesh;
+use snapsnap_data::prepare::{PrepareConfig, Shard};
+use snapsnap_net::config::parse;
+
+use crate::failure::Failure;
+use crate::progress::Progress;
+use crate::say;
+
+#[derive(Args)]
+pub struct Arguments {
+    #[command(subcommand)]
+    kind: Kind,
+}
+
+#[derive(Subcommand)]
+enum Kind {
+    /// Render scans, OBJ, PLY or GLB, into a data set.
+    Scan(scan::Arguments),
+    /// List what is wrong with a data set.
+    Check(check::Arguments),
+}
+
+pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
+    match &arguments.kind {
+        Kind::Scan(arguments) => scan::run(arguments, quiet),
+        Kind::Check(arguments) => check::run(arguments, quiet),
+    }
+}
+
+#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum SplitArgument {
+    /// To learn from.
+    Train,
+    /// To choose among what was learned.
+    Val,
+    /// To report on.
+    Test,
+}
+
+impl From<SplitArgument> for Split {
+    fn from(split: SplitArgument) -> Self {
+        match split {
+            SplitArgument::Train => Self::Train,
+            SplitArgument::Val => Self::Val,
+            SplitArgument::Test => Self::Test,
+        }
+    }
+}
+
+/// What every way of making a data set is told.
+#[derive(Args)]
+struct Common {
+    /// Folder of the data set; subjects that are there already are kept.
+    #[arg(short, long, value_name = "DATASET")]
+    output: PathBuf,
+    /// Views and cameras, as in configs/data [default: 24 views of 1024 pixels, lossless].
+    #[arg(long, value_name = "TOML")]
+    config: Option<PathBuf>,
+    /// Override one config key; may be repeated.
+    #[arg(long, value_name = "SECTION.KEY=VALUE")]
+    set: Vec<String>,
+    /// Decides everything that is random.
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Only every n-th subject, from the i-th (counted from 0): to share the work among machines.
+    #[arg(long, value_name = "i/n", default_value = "0/1")]
+    shard: Shard,
+    /// Also put front, back and side of the first subjects into one picture.
+    #[arg(long, value_name = "SHEET.png")]
+    preview: Option<PathBuf>,
+}
+
+impl Common {
+    fn config(&self) -> Result<PrepareConfig, Failure> {
+        let (text, origin) = match &self.config {
+            Some(path) => {
+                let text = std::fs::read_to_string(path).map_err(|e| {
+                    Failure::Input(format!("{}: cannot read the config: {e}", path.display()))
+                })?;
+                (text, path.display().to_string())
+            }
+            None => (String::new(), "the built-in config".to_owned()),
+        };
+        let (config, origin): (PrepareConfig, String) = parse(&text, &origin, &self.set)?;
+        match config.problem() {
+            Some((key, message)) => Err(Failure::Input(format!("{origin}: `{key}`: {message}"))),
+            None => Ok(config),
+        }
+    }
+}
+
+/// One subject to be made.
+struct Work {
+    split: Split,
+    /// Its name in the data set.
+    subject: String,
+    /// Its name among all subjects that were ever made: what is random about it follows from this.
+    identity: String,
+}
+
+/// A subject, standing at the origin.
+struct Person {
+    mesh: Mesh,
+    /// Where it faces, degrees around y.
+    yaw_degrees: f64,
+}
+
+/// Makes this shard's subjects, those that are not there yet. What cannot be made is reported and left out.
+fn make(
+    common: &Common,
+    quiet: bool,
+    source: &str,
+    works: &[Work],
+    person: impl Fn(usize, &Work) -> Result<Person, DataError>,
+) -> Result<(), Failure> {
+    let config = common.config()?;
+    if let Some(sheet) = &common.preview {
+        super::check_outputs(&[sheet], &[])?;
+    }
+    let folder = Folder::create(&common.output, config.description(source))?;
+    let mine: Vec<(usize, &Work)> =
+        works.iter().enumerate().filter(|(place, _)| common.shard.has(*place)).collect();
+    let missing: Vec<&(usize, &Work)> =
+        mine.iter().filter(|(_, work)| !folder.has(work.split, &work.subject)).collect();
+    if missing.len() < mine.len() && !quiet {
+        say::err(&format!("{} of {} subjects are there already", mine.len() - missing.len(), mine.len()));
+    }
+    let progress = Progress::steps(quiet, missing.len(), "subjects");
+    let mut failed = 0;
+    for (done, (place, work)) in missing.iter().enumerate() {
+        progress.step(done, missing.len(), "subjects");
+        let Work { split, subject, identity } = work;
+        let made = person(*place, work).and_then(|person| {
+            config.add(&folder, *split, subject, &person.mesh, person.yaw_degrees, identity)
+        });
+        match made {
+            Ok(()) => {}
+            // Nothing more can be written: to go on would only repeat it.
+            Err(e @ DataError::Write { .. }) => return Err(e.into()),
+            Err(e) => {
+                failed += 1;
+                say::err(&format!("skipped {subject}: {e}"));
+            }
+        }
+    }
+    progress.step(missing.len(), missing.len(), "subjects");
+    drop(progress);
+    if let Some(sheet) = &common.preview {
+        let there: Vec<(Split, &str)> =
+            works.iter().map(|work| (work.split, work.subject.as_str())).collect();
+        preview::write(sheet, &folder, &there)?;
+    }
+    if failed > 0 {
+        let message =
+            format!("{failed} of {} subjects could not be made; the others are there", missing.len());
+        return Err(Failure::Input(message));
+    }
+    Ok(())
+}

@@ -1,0 +1,119 @@
+//! `snapsnap prepare scan`.
+
+use std::path::{Path, PathBuf};
+
+use clap::{Args, ValueEnum};
+use snapsnap_data::dataset::Split;
+use snapsnap_data::random::stream;
+use snapsnap_data::scan::{Collection, find, normalise};
+use snapsnap_data::{DataError, import, smplx};
+
+use super::{Common, Person, SplitArgument, Work, make};
+use crate::failure::Failure;
+
+#[derive(Clone, Copy, ValueEnum)]
+enum CollectionArgument {
+    /// Subjects 0 to 525; those of the published list become val.
+    #[value(name = "thuman2.0")]
+    Thuman20,
+    /// THuman2.0 and what was added; the published loose subjects become test.
+    #[value(name = "thuman2.1")]
+    Thuman21,
+    #[value(name = "customhumans")]
+    CustomHumans,
+    #[value(name = "2k2k")]
+    TwoK2K,
+    #[value(name = "4d-dress")]
+    FourDDress,
+    /// Any scan, y up and facing +z.
+    Other,
+}
+
+impl From<CollectionArgument> for Collection {
+    fn from(collection: CollectionArgument) -> Self {
+        match collection {
+            CollectionArgument::Thuman20 => Self::Thuman20,
+            CollectionArgument::Thuman21 => Self::Thuman21,
+            CollectionArgument::CustomHumans => Self::CustomHumans,
+            CollectionArgument::TwoK2K => Self::TwoK2K,
+            CollectionArgument::FourDDress => Self::FourDDress,
+            CollectionArgument::Other => Self::Other,
+        }
+    }
+}
+
+#[derive(Args)]
+pub struct Arguments {
+    /// A scan, or a folder of scans.
+    source: PathBuf,
+    #[command(flatten)]
+    common: Common,
+    /// The set that the scans come from, for its axes, places and lists of subjects.
+    #[arg(long, value_enum, default_value = "other")]
+    collection: CollectionArgument,
+    /// Folder of SMPL-X parameters, ID/smplx_param.pkl or ID.pkl or .json, that say which way each subject faces; without
+    /// it they are looked for beside each scan.
+    #[arg(long, value_name = "DIR")]
+    smplx: Option<PathBuf>,
+    /// Put all subjects there [default: as the set's published lists say, otherwise train].
+    #[arg(long, value_enum)]
+    split: Option<SplitArgument>,
+}
+
+pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
+    let collection = Collection::from(arguments.collection);
+    let sources = find(&arguments.source)?;
+    let works: Vec<Work> = sources
+        .iter()
+        .map(|source| {
+            let subject = source.subject.clone();
+            let split = arguments.split.map_or_else(|| collection.split(&subject), Split::from);
+            let identity = format!("scan/{}/{split}/{subject}", arguments.common.seed);
+            Work { split, subject, identity }
+        })
+        .collect();
+    let name = arguments.source.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let description = format!("scans of {name}");
+    make(&arguments.common, quiet, &description, &works, |place, work| {
+        let path = &sources[place].path;
+        let collection = collection.of(&work.subject);
+        let parameters = parameters(path, &work.subject, arguments.smplx.as_deref())?;
+        let yaw_degrees =
+            match parameters.filter(|_| collection.has_orientation() || arguments.smplx.is_some()) {
+                Some(parameters) => smplx::yaw_degrees(&parameters)?,
+                None => 0.0,
+            };
+        let mut mesh = import::read(path)?;
+        let mut random = stream(&format!("place/{}", work.identity));
+        let jitter = (work.split == Split::Train).then_some(&mut random);
+        normalise(&mut mesh, collection, jitter)
+            .map_err(|e| DataError::Unsuitable { path: path.clone(), message: e.to_string() })?;
+        Ok(Person { mesh, yaw_degrees })
+    })
+}
+
+/// The subject's SMPL-X parameters; an error if a folder of them was named and has none.
+fn parameters(scan: &Path, subject: &str, folder: Option<&Path>) -> Result<Option<PathBuf>, DataError> {
+    let stem = scan.file_stem().unwrap_or_default();
+    let names = [stem.to_string_lossy().into_owned(), subject.to_owned()];
+    let beside = scan.parent().unwrap_or(Path::new("."));
+    let mut candidates = Vec::new();
+    match folder {
+        Some(folder) => {
+            for name in &names {
+                let below = folder.join(name);
+                candidates.extend(["smplx_param.pkl", "smplx_param.json"].map(|file| below.join(file)));
+                candidates.extend(["pkl", "json"].map(|kind| folder.join(format!("{name}.{kind}"))));
+            }
+        }
+        None => candidates.extend(["smplx_param.pkl", "smplx_param.json"].map(|file| beside.join(file))),
+    }
+    let found = candidates.into_iter().find(|path| path.is_file());
+    match (folder, &found) {
+        (Some(folder), None) => Err(DataError::Unsuitable {
+            path: folder.to_owned(),
+            message: format!("has no SMPL-X parameters of subject {subject}"),
+        }),
+        _ => Ok(found),
+    }
+}

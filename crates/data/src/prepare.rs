@@ -1,0 +1,257 @@
+//! From a mesh to a subject of a data set: which cameras, which names, which machine.
+
+use std::str::FromStr;
+
+use glam::DVec3;
+use rand::Rng;
+use serde::{Deserialize, Serialize};
+use snapsnap_splat::{Camera, Orbit};
+
+use crate::DataError;
+use crate::dataset::{Description, Folder, Layout, MAX_RESOLUTION, MAX_VIEWS, Split};
+use crate::mesh::Mesh;
+use crate::random::stream;
+use crate::view::{Lights, Renderer, ViewOptions};
+
+/// How subjects become views: `configs/data/*.toml`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct PrepareConfig {
+    /// Which views.
+    pub views: ViewsConfig,
+    /// How cameras stray from the training orbit.
+    pub jitter: JitterConfig,
+}
+
+/// Which views.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ViewsConfig {
+    /// Views of each subject, evenly around it.
+    pub count: usize,
+    /// Side in pixels.
+    pub resolution: u32,
+    /// Whether each view is drawn at twice the side as well, for stage 2's supervision.
+    pub high_resolution: bool,
+    /// Samples per pixel along each axis, 1 to 6.
+    pub samples: usize,
+    /// How views are stored.
+    pub layout: Layout,
+}
+
+/// How cameras stray, evenly within ± each value: all views of a subject together (`rig`), and each by itself (`view`).
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct JitterConfig {
+    /// All views of a subject together.
+    pub rig: Jitter,
+    /// Each view by itself.
+    pub view: Jitter,
+}
+
+/// Ranges, each ±.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Jitter {
+    /// Around the subject, degrees.
+    pub yaw: f64,
+    /// Up and down, degrees.
+    pub pitch: f64,
+    /// Around the optical axis, degrees.
+    pub roll: f64,
+    /// Metres.
+    pub distance: f64,
+    /// Share of the focal length.
+    pub focal: f64,
+    /// Of the point looked at, metres per axis.
+    pub look_at: f64,
+}
+
+impl Default for PrepareConfig {
+    /// The published cameras in our exact layout.
+    fn default() -> Self {
+        Self { views: ViewsConfig::default(), jitter: JitterConfig::default() }
+    }
+}
+
+impl Default for ViewsConfig {
+    fn default() -> Self {
+        Self { count: 24, resolution: 1024, high_resolution: false, samples: 3, layout: Layout::Exact }
+    }
+}
+
+impl Jitter {
+    fn problem(&self) -> Option<(&'static str, String)> {
+        let Self { yaw, pitch, roll, distance, focal, look_at } = *self;
+        let limits = [
+            ("yaw", yaw, 180.0),
+            ("pitch", pitch, 80.0),
+            ("roll", roll, 180.0),
+            // Beyond these the camera would stand in the subject, or see nothing of it.
+            ("distance", distance, 0.7),
+            ("focal", focal, 0.5),
+            ("look_at", look_at, 0.5),
+        ];
+        let (key, value, limit) =
+            limits.into_iter().find(|(_, value, limit)| !(0.0..=*limit).contains(value))?;
+        Some((key, format!("is {value}, must be 0 to {limit}")))
+    }
+
+    fn apply(&self, orbit: &mut Orbit, random: &mut impl Rng) {
+        // Drawn even where the range is 0, so that one range does not change what another draws.
+        let mut stray = |range: f64| range * random.random_range(-1.0..1.0);
+        orbit.yaw_degrees += stray(self.yaw);
+        orbit.pitch_degrees += stray(self.pitch);
+        orbit.roll_degrees += stray(self.roll);
+        orbit.radius += stray(self.distance);
+        orbit.focal *= 1.0 + stray(self.focal);
+        orbit.centre += DVec3::new(stray(self.look_at), stray(self.look_at), stray(self.look_at));
+    }
+}
+
+impl PrepareConfig {
+    /// The first key that makes no sense, and why.
+    pub fn problem(&self) -> Option<(String, String)> {
+        let ViewsConfig { count, resolution, samples, .. } = self.views;
+        if count == 0 || count > MAX_VIEWS {
+            return Some(("views.count".into(), format!("is {count}, must be 1 to {MAX_VIEWS}")));
+        }
+        let most = if self.views.high_resolution { MAX_RESOLUTION / 2 } else { MAX_RESOLUTION };
+        if resolution == 0 || resolution > most {
+            return Some(("views.resolution".into(), format!("is {resolution}, must be 1 to {most}")));
+        }
+        if !(1..=6).contains(&samples) {
+            return Some(("views.samples".into(), format!("is {samples}, must be 1 to 6")));
+        }
+        let sections = [("jitter.rig", &self.jitter.rig), ("jitter.view", &self.jitter.view)];
+        sections.into_iter().find_map(|(section, jitter)| {
+            jitter.problem().map(|(key, message)| (format!("{section}.{key}"), message))
+        })
+    }
+
+    /// What a data set made with this config says of itself.
+    pub fn description(&self, source: &str) -> Description {
+        let ViewsConfig { count, resolution, high_resolution, layout, .. } = self.views;
+        Description {
+            layout,
+            views: count,
+            resolution,
+            high_resolution,
+            pixel_centre: if layout == Layout::Authors { 0.0 } else { 0.5 },
+            source: source.to_owned(),
+        }
+    }
+
+    /// The cameras of a subject that faces `yaw_degrees` (SNAPSNAP §5.3), straying as `name` decides.
+    pub fn cameras(&self, yaw_degrees: f64, name: &str) -> Vec<Camera> {
+        let mut random = stream(&format!("cameras/{name}"));
+        let mut rig = Orbit { yaw_degrees, ..Orbit::default() };
+        self.jitter.rig.apply(&mut rig, &mut random);
+        (0..self.views.count)
+            .map(|view| {
+                let mut orbit = rig;
+                orbit.yaw_degrees += view as f64 * 360.0 / self.views.count as f64;
+                self.jitter.view.apply(&mut orbit, &mut random);
+                orbit.camera(self.views.resolution)
+            })
+            .collect()
+    }
+
+    /// Draws and adds a subject. `mesh` stands on the floor at the origin; `name` is the subject's name among all data
+    /// sets, which decides what is random about its cameras.
+    ///
+    /// # Errors
+    /// [`DataError`] for a mesh that cannot be drawn and for files that cannot be written.
+    pub fn add(
+        &self,
+        folder: &Folder,
+        split: Split,
+        subject: &str,
+        mesh: &Mesh,
+        yaw_degrees: f64,
+        name: &str,
+    ) -> Result<(), DataError> {
+        let renderer = Renderer::new(mesh).map_err(|e| DataError::unsuitable(folder.root(), e))?;
+        let options = ViewOptions { samples: self.views.samples, lights: Lights::default() };
+        let cameras = self.cameras(yaw_degrees, name);
+        folder.write_subject(split, subject, &cameras, |camera| renderer.draw(camera, &options))
+    }
+}
+
+/// One of several machines that share the work: `i/n`, from 0.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Shard {
+    index: usize,
+    count: usize,
+}
+
+impl Default for Shard {
+    fn default() -> Self {
+        Self { index: 0, count: 1 }
+    }
+}
+
+impl Shard {
+    /// Whether the subject at this place is this machine's.
+    pub fn has(self, place: usize) -> bool {
+        place % self.count == self.index
+    }
+}
+
+impl FromStr for Shard {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let parts = text.split_once('/').and_then(|(i, n)| Some((i.parse().ok()?, n.parse().ok()?)));
+        match parts {
+            Some((index, count)) if index < count => Ok(Self { index, count }),
+            _ => Err(format!("`{text}` is no shard: expected i/n, with i from 0 to n − 1")),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn without_jitter_the_cameras_are_the_published_ones() {
+        let cameras = PrepareConfig::default().cameras(30.0, "a");
+        assert_eq!(cameras.len(), 24);
+        assert_eq!(cameras[0], Camera::orbit_at_yaw_degrees(30.0, 1024));
+        assert_eq!(cameras[12], Camera::orbit_at_yaw_degrees(210.0, 1024));
+    }
+
+    #[test]
+    fn jitter_stays_in_its_ranges_and_follows_the_name() {
+        let jitter = Jitter { yaw: 5.0, pitch: 4.0, roll: 3.0, distance: 0.2, focal: 0.1, look_at: 0.05 };
+        let mut config = PrepareConfig::default();
+        config.jitter.view = jitter;
+        let cameras = |name: &str| config.cameras(0.0, name);
+        assert_eq!(cameras("a"), cameras("a"));
+        assert_ne!(cameras("a"), cameras("b"));
+        let (mut nearest, mut furthest, mut shortest, mut longest) = (9.0_f64, 0.0_f64, 9.0_f64, 0.0_f64);
+        for camera in (0..40).flat_map(|i| cameras(&i.to_string())) {
+            let distance = (camera.centre() - Orbit::default().centre).length();
+            (nearest, furthest) = (nearest.min(distance), furthest.max(distance));
+            let focal = camera.focal.x / 1024.0;
+            (shortest, longest) = (shortest.min(focal), longest.max(focal));
+        }
+        assert!(nearest > 1.7 && furthest < 2.3 && furthest - nearest > 0.4, "{nearest} {furthest}");
+        assert!(shortest >= 0.72 && longest <= 0.88 && longest - shortest > 0.15, "{shortest} {longest}");
+        assert_eq!(config.problem(), None);
+        config.jitter.rig.focal = 0.6;
+        assert_eq!(config.problem(), Some(("jitter.rig.focal".into(), "is 0.6, must be 0 to 0.5".into())));
+    }
+
+    #[test]
+    fn shards_share_the_work() {
+        let shards: Vec<Shard> = ["0/3", "1/3", "2/3"].map(|s| s.parse().expect("a shard")).to_vec();
+        for place in 0..10 {
+            assert_eq!(shards.iter().filter(|shard| shard.has(place)).count(), 1);
+        }
+        for wrong in ["", "1", "3/3", "0/0", "-1/2", "1/2/3"] {
+            assert!(wrong.parse::<Shard>().is_err(), "{wrong}");
+        }
+    }
+}
