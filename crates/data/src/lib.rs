@@ -2,8 +2,10 @@
 
 pub mod dataset;
 mod error;
+pub mod export;
 pub mod import;
 pub mod mesh;
+mod pattern;
 pub mod photo;
 mod picture;
 pub mod prepare;
@@ -11,6 +13,7 @@ pub mod random;
 mod resize;
 pub mod scan;
 pub mod smplx;
+pub mod synth;
 pub mod view;
 
 pub use error::DataError;

@@ -33,7 +33,7 @@ impl Lights {
                 let y = 1.0 - (2 * i + 1) as f32 / count as f32;
                 let (sin, cos) = (golden * i as f32).sin_cos();
                 let r = (1.0 - y * y).sqrt();
-                lights.strength(Vec3::new(r * cos, y, r * sin))
+                lights.sum(Vec3::new(r * cos, y, r * sin))
             })
             .fold(f32::MIN_POSITIVE, f32::max);
         lights.ambient /= brightest;
@@ -43,12 +43,17 @@ impl Lights {
 
     /// Light that a surface with this unit normal reflects, 0 to 1.
     pub fn strength(&self, normal: Vec3) -> f32 {
+        // Between the directions that were looked at a brighter one may hide, by less than a shade of 8 bits.
+        self.sum(normal).min(1.0)
+    }
+
+    fn sum(&self, normal: Vec3) -> f32 {
         let soft = |(direction, strength): &(Vec3, f32)| {
             // Reaches a little beyond the terminator, as light from an area does.
             let cosine = (normal.dot(*direction) + 0.3) / 1.3;
             strength * cosine.max(0.0)
         };
-        (self.ambient + self.directional.iter().map(soft).sum::<f32>()).min(1.0)
+        self.ambient + self.directional.iter().map(soft).sum::<f32>()
     }
 }
 
@@ -66,6 +71,11 @@ impl Default for Lights {
     }
 }
 
+/// Pixels over which the speed of a texture is measured.
+const STEP: f64 = 0.01;
+/// Most samples of a texture for one pixel.
+const MAX_TAPS: f32 = 8.0;
+
 /// A texture and its halvings.
 struct Pyramid {
     levels: Vec<RgbImage>,
@@ -81,11 +91,22 @@ impl Pyramid {
         Self { levels }
     }
 
-    /// Colour at `at`, filtered over `footprint` texture coordinates.
-    fn sample(&self, at: Vec2, footprint: Vec2) -> Vec3 {
-        let [w, h] = [self.levels[0].width() as f32, self.levels[0].height() as f32];
-        let texels = (footprint * Vec2::new(w, h)).max_element().max(1.0);
-        let level = texels.log2().min((self.levels.len() - 1) as f32);
+    /// Colour at `at`, filtered over the pixel, whose columns and rows move the texture by `right` and `down`: where a
+    /// surface is seen aslant, several samples along the longer way, each no wider than the shorter one.
+    fn sample(&self, at: Vec2, right: Vec2, down: Vec2) -> Vec3 {
+        let size = Vec2::new(self.levels[0].width() as f32, self.levels[0].height() as f32);
+        let (a, b) = ((right * size).length(), (down * size).length());
+        let (long, short) = (a.max(b), a.min(b).max(1.0));
+        let taps = (long / short).ceil().clamp(1.0, MAX_TAPS);
+        let level = (long / taps).max(1.0).log2().min((self.levels.len() - 1) as f32);
+        let way = if a > b { right } else { down };
+        let sum: Vec3 = (0..taps as usize)
+            .map(|tap| self.level(at + way * ((tap as f32 + 0.5) / taps - 0.5), level))
+            .sum();
+        sum / taps
+    }
+
+    fn level(&self, at: Vec2, level: f32) -> Vec3 {
         let (low, fraction) = (level.floor() as usize, level.fract());
         let fine = bilinear(&self.levels[low], at);
         match self.levels.get(low + 1).filter(|_| fraction > 0.0) {
@@ -150,7 +171,7 @@ impl Shader<'_> {
     pub fn color(&self, face: usize, at: DVec2, plane: DVec3) -> Vec3 {
         let Surface { mesh, normals, textures } = self.surface;
         let face = &mesh.faces[face];
-        let weights = self.weights(face.positions, at, plane);
+        let weights = self.weights(face.positions, at, plane).as_vec3();
         let mix = |values: [Vec3; 3]| values[0] * weights.x + values[1] * weights.y + values[2] * weights.z;
         let mut normal = mix(face.positions.map(|row| normals[row as usize])).normalize_or_zero();
         // Seen from behind, the other side of the surface is lit.
@@ -165,20 +186,21 @@ impl Shader<'_> {
             color *= mix(face.positions.map(|row| mesh.colors[row as usize]));
         }
         if let Some((texture, rows)) = textures[face.material as usize].as_ref().zip(face.texcoords) {
-            let coordinates = rows.map(|row| mesh.texcoords[row as usize]);
-            let at_weights = |w: Vec3| coordinates[0] * w.x + coordinates[1] * w.y + coordinates[2] * w.z;
-            let here = at_weights(weights);
-            // How far the texture moves over a pixel, either way.
-            let right = at_weights(self.weights(face.positions, at + DVec2::X, plane)) - here;
-            let down = at_weights(self.weights(face.positions, at + DVec2::Y, plane)) - here;
-            color *= texture.sample(here, right.abs().max(down.abs()));
+            let coordinates = rows.map(|row| mesh.texcoords[row as usize].as_dvec2());
+            let coordinate = |at: DVec2| {
+                let w = self.weights(face.positions, at, plane);
+                coordinates[0] * w.x + coordinates[1] * w.y + coordinates[2] * w.z
+            };
+            let here = coordinate(at);
+            // How fast the texture moves, per pixel: over a small step, since a whole one may lead beyond the horizon.
+            let speed = |way: DVec2| ((coordinate(at + STEP * way) - here) / STEP).as_vec2();
+            color *= texture.sample(here.as_vec2(), speed(DVec2::X), speed(DVec2::Y));
         }
         color
     }
 
-    /// Barycentric weights of the point of the triangle's plane that is seen at `at`, clamped to the triangle's
-    /// surroundings so that grazing views do not run away.
-    fn weights(&self, rows: [u32; 3], at: DVec2, plane: DVec3) -> Vec3 {
+    /// Barycentric weights of the point of the triangle's plane that is seen at `at`.
+    fn weights(&self, rows: [u32; 3], at: DVec2, plane: DVec3) -> DVec3 {
         let [a, b, c] = rows.map(|row| self.corners[row as usize]);
         let inverse_depth = plane.dot(DVec3::new(at.x, at.y, 1.0));
         let ray = ((at - self.camera.principal_point) / self.camera.focal).extend(1.0);
@@ -188,7 +210,6 @@ impl Shader<'_> {
         let first = (c - b).cross(p - b).dot(n) / area;
         let second = (a - c).cross(p - c).dot(n) / area;
         let weights = DVec3::new(first, second, 1.0 - first - second);
-        let weights = if weights.is_finite() { weights } else { DVec3::splat(1.0 / 3.0) };
-        weights.clamp(DVec3::splat(-1.0), DVec3::splat(2.0)).as_vec3()
+        if weights.is_finite() { weights } else { DVec3::splat(1.0 / 3.0) }
     }
 }

@@ -3,19 +3,25 @@
 mod check;
 mod preview;
 mod scan;
+mod synth;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand, ValueEnum};
-use snapsnap_data::DataError;
 use snapsnap_data::dataset::{Folder, Split};
 use snapsnap_data::mesh::Mesh;
 use snapsnap_data::prepare::{PrepareConfig, Shard};
+use snapsnap_data::random::stream;
+use snapsnap_data::scan::{Collection, normalise};
+use snapsnap_data::{DataError, export};
 use snapsnap_net::config::parse;
 
 use crate::failure::Failure;
 use crate::progress::Progress;
 use crate::say;
+
+/// Most people of one call: subjects have four digits, or a few more.
+const MAX_SUBJECTS: usize = 1_000_000;
 
 #[derive(Args)]
 pub struct Arguments {
@@ -27,6 +33,8 @@ pub struct Arguments {
 enum Kind {
     /// Render scans, OBJ, PLY or GLB, into a data set.
     Scan(scan::Arguments),
+    /// Make people of simple shapes, with cloth full of detail.
+    Synth(synth::Arguments),
     /// List what is wrong with a data set.
     Check(check::Arguments),
 }
@@ -34,6 +42,7 @@ enum Kind {
 pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     match &arguments.kind {
         Kind::Scan(arguments) => scan::run(arguments, quiet),
+        Kind::Synth(arguments) => synth::run(arguments, quiet),
         Kind::Check(arguments) => check::run(arguments, quiet),
     }
 }
@@ -167,4 +176,58 @@ fn make(
         return Err(Failure::Input(message));
     }
     Ok(())
+}
+
+/// What the makers of people are told beside it.
+#[derive(Args)]
+struct Generate {
+    /// How many people.
+    #[arg(long, value_name = "N", default_value_t = 100)]
+    subjects: usize,
+    /// What they are for; the people of one split are never those of another.
+    #[arg(long, value_enum, default_value = "train")]
+    split: SplitArgument,
+    /// Also keep each person as a scan, OBJ with texture, in scans/SPLIT/ID below the data set.
+    #[arg(long)]
+    save_scans: bool,
+}
+
+/// Makes people by their names.
+fn generate(
+    common: &Common,
+    generate: &Generate,
+    quiet: bool,
+    kind: &str,
+    person: impl Fn(&str) -> Result<Mesh, DataError>,
+) -> Result<(), Failure> {
+    if generate.subjects == 0 || generate.subjects > MAX_SUBJECTS {
+        let message = format!("--subjects is {}, must be 1 to {MAX_SUBJECTS}", generate.subjects);
+        return Err(Failure::Input(message));
+    }
+    let split = Split::from(generate.split);
+    let works: Vec<Work> = (0..generate.subjects)
+        .map(|index| Work {
+            split,
+            subject: format!("{index:04}"),
+            identity: format!("{kind}/{}/{split}/{index}", common.seed),
+        })
+        .collect();
+    let source = format!("{kind}, seed {}", common.seed);
+    make(common, quiet, &source, &works, |_, work| {
+        let mut mesh = person(&work.identity)?;
+        if generate.save_scans {
+            let scan = common.output.join("scans").join(split.name()).join(&work.subject);
+            export::write_obj(&mesh, &scan.join(format!("{}.obj", work.subject)))?;
+        }
+        place(&mut mesh, work, Collection::Other, &common.output)?;
+        Ok(Person { mesh, yaw_degrees: 0.0 })
+    })
+}
+
+/// Stands the mesh up for the cameras; training subjects not quite in the middle, as their names decide.
+fn place(mesh: &mut Mesh, work: &Work, collection: Collection, origin: &Path) -> Result<(), DataError> {
+    let mut random = stream(&format!("place/{}", work.identity));
+    let jitter = (work.split == Split::Train).then_some(&mut random);
+    normalise(mesh, collection, jitter)
+        .map_err(|e| DataError::Unsuitable { path: origin.to_owned(), message: e.to_string() })
 }

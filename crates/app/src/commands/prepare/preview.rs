@@ -43,7 +43,7 @@ fn shrink(color: &RgbImage, mask: &image::GrayImage) -> RgbImage {
         image::Rgb([mix(0), mix(1), mix(2)])
     });
     // With the published cameras people reach from row 124 to 863 of 1024.
-    let side = HEIGHT * 5 / 4;
+    let side = HEIGHT * 7 / 6;
     let small = imageops::resize(&over, side, side, imageops::FilterType::Triangle);
-    imageops::crop_imm(&small, (side - WIDTH) / 2, side * 83 / 1024, WIDTH, HEIGHT).to_image()
+    imageops::crop_imm(&small, (side - WIDTH) / 2, side * 54 / 1024, WIDTH, HEIGHT).to_image()
 }

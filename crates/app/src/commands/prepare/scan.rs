@@ -4,8 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
 use snapsnap_data::dataset::Split;
-use snapsnap_data::random::stream;
-use snapsnap_data::scan::{Collection, find, normalise};
+use snapsnap_data::scan::{Collection, find};
 use snapsnap_data::{DataError, import, smplx};
 
 use super::{Common, Person, SplitArgument, Work, make};
@@ -84,10 +83,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
                 None => 0.0,
             };
         let mut mesh = import::read(path)?;
-        let mut random = stream(&format!("place/{}", work.identity));
-        let jitter = (work.split == Split::Train).then_some(&mut random);
-        normalise(&mut mesh, collection, jitter)
-            .map_err(|e| DataError::Unsuitable { path: path.clone(), message: e.to_string() })?;
+        super::place(&mut mesh, work, collection, path)?;
         Ok(Person { mesh, yaw_degrees })
     })
 }

@@ -1,0 +1,94 @@
+//! Functions whose results are the same on every machine: the standard library's sine differs between systems in its last
+//! digits.
+
+use std::f32::consts::PI;
+
+use glam::{Mat3, Vec2, Vec3};
+
+pub fn sin_cos(angle: f32) -> (f32, f32) {
+    libm::sincosf(angle)
+}
+
+/// Right-handed rotations by degrees.
+pub fn rotate_x(degrees: f32) -> Mat3 {
+    let (s, c) = sin_cos(degrees * PI / 180.0);
+    Mat3::from_cols(Vec3::X, Vec3::new(0.0, c, s), Vec3::new(0.0, -s, c))
+}
+
+pub fn rotate_y(degrees: f32) -> Mat3 {
+    let (s, c) = sin_cos(degrees * PI / 180.0);
+    Mat3::from_cols(Vec3::new(c, 0.0, -s), Vec3::Y, Vec3::new(s, 0.0, c))
+}
+
+pub fn rotate_z(degrees: f32) -> Mat3 {
+    let (s, c) = sin_cos(degrees * PI / 180.0);
+    Mat3::from_cols(Vec3::new(c, s, 0.0), Vec3::new(-s, c, 0.0), Vec3::Z)
+}
+
+/// 0 below `from`, 1 above `to`, smooth in between.
+pub fn smoothstep(from: f32, to: f32, x: f32) -> f32 {
+    let t = ((x - from) / (to - from)).clamp(0.0, 1.0);
+    t * t * (3.0 - 2.0 * t)
+}
+
+/// The smaller of two distances, rounded where they are within `radius` of each other.
+pub fn smooth_min(a: f32, b: f32, radius: f32) -> f32 {
+    let overlap = (radius - (a - b).abs()).max(0.0) / radius;
+    a.min(b) - overlap * overlap * radius / 4.0
+}
+
+/// A number in [0, 1) for a point of a lattice.
+pub fn hash(x: i32, y: i32, z: i32, seed: u32) -> f32 {
+    let mut h = seed.wrapping_mul(0x9e37_79b9);
+    for v in [x, y, z] {
+        h = (h ^ v as u32).wrapping_mul(0x85eb_ca6b);
+        h ^= h >> 13;
+        h = h.wrapping_mul(0xc2b2_ae35);
+        h ^= h >> 16;
+    }
+    (h >> 8) as f32 / (1 << 24) as f32
+}
+
+/// Smooth noise in [0, 1], one bump per unit.
+pub fn noise(p: Vec3, seed: u32) -> f32 {
+    let cell = p.floor();
+    let f = p - cell;
+    let w = f * f * (Vec3::splat(3.0) - 2.0 * f);
+    let (x, y, z) = (cell.x as i32, cell.y as i32, cell.z as i32);
+    let along_x = |dy: i32, dz: i32| {
+        let (a, b) = (hash(x, y + dy, z + dz, seed), hash(x + 1, y + dy, z + dz, seed));
+        a + (b - a) * w.x
+    };
+    let along_y = |dz: i32| {
+        let (a, b) = (along_x(0, dz), along_x(1, dz));
+        a + (b - a) * w.y
+    };
+    let (a, b) = (along_y(0), along_y(1));
+    a + (b - a) * w.z
+}
+
+/// Smooth noise on a plane.
+pub fn noise2(p: Vec2, seed: u32) -> f32 {
+    noise(p.extend(0.5), seed)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rotations_are_right_handed() {
+        let close = |a: Vec3, b: Vec3| (a - b).length() < 1e-6;
+        assert!(close(rotate_x(90.0) * Vec3::Y, Vec3::Z));
+        assert!(close(rotate_y(90.0) * Vec3::Z, Vec3::X));
+        assert!(close(rotate_z(90.0) * Vec3::X, Vec3::Y));
+    }
+
+    #[test]
+    fn noise_is_continuous_and_fills_its_range() {
+        let values: Vec<f32> = (0..4000).map(|i| noise(Vec3::new(i as f32 * 0.05, 1.3, 7.7), 3)).collect();
+        assert!(values.windows(2).all(|w| (w[0] - w[1]).abs() < 0.1));
+        let (low, high) = values.iter().fold((1.0_f32, 0.0_f32), |(l, h), v| (l.min(*v), h.max(*v)));
+        assert!(low < 0.2 && high > 0.8 && low >= 0.0 && high <= 1.0, "{low} {high}");
+    }
+}

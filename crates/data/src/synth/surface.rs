@@ -1,0 +1,117 @@
+//! The surface of a body as triangles.
+
+use fast_surface_nets::{SurfaceNetsBuffer, surface_nets};
+use glam::{IVec3, Vec3};
+use ndshape::RuntimeShape;
+use rayon::prelude::*;
+
+use super::body::Body;
+
+/// Samples along a block's edge; blocks without surface are not sampled.
+const BLOCK: usize = 8;
+/// Distances are lower bounds; where surfaces lean or are crumpled they may be this much too large.
+const SLACK: f32 = 1.4;
+
+/// A closed surface; normals point outwards.
+#[derive(Debug, Clone)]
+pub struct Surface {
+    pub positions: Vec<Vec3>,
+    pub faces: Vec<[u32; 3]>,
+    /// Row of the part that each position lies on.
+    pub parts: Vec<u8>,
+}
+
+/// Meshes `body` with cells of `cell` metres; positions lie on the surface itself.
+pub fn mesh(body: &Body, cell: f32) -> Surface {
+    let (low, high) = body.bounds();
+    let origin = low - Vec3::splat(2.0 * cell);
+    let counts = ((high - origin) / cell).ceil().as_ivec3() + IVec3::splat(3);
+    let [nx, ny, nz] = counts.to_array().map(|n| (n as usize).next_multiple_of(BLOCK));
+    let place = |x: usize, y: usize, z: usize| origin + cell * Vec3::new(x as f32, y as f32, z as f32);
+    let reach = SLACK * cell * (BLOCK as f32 / 2.0) * 1.75;
+
+    let mut values = vec![0.0_f32; nx * ny * nz];
+    values.par_chunks_mut(nx * ny * BLOCK).enumerate().for_each(|(slab, values)| {
+        let z0 = slab * BLOCK;
+        for y0 in (0..ny).step_by(BLOCK) {
+            for x0 in (0..nx).step_by(BLOCK) {
+                let middle = place(x0, y0, z0) + Vec3::splat(cell * (BLOCK - 1) as f32 / 2.0);
+                let far = body.distance(middle, reach).0;
+                for z in 0..BLOCK {
+                    for y in y0..y0 + BLOCK {
+                        let row = (z * ny + y) * nx + x0;
+                        for (x, value) in values[row..row + BLOCK].iter_mut().enumerate() {
+                            *value = if far.abs() > reach {
+                                far
+                            } else {
+                                body.distance(place(x0 + x, y, z0 + z), 2.0 * cell).0
+                            };
+                        }
+                    }
+                }
+            }
+        }
+    });
+
+    let mut buffer = SurfaceNetsBuffer::default();
+    let shape = RuntimeShape::<u32, 3>::new([nx as u32, ny as u32, nz as u32]);
+    surface_nets(&values, &shape, [0; 3], [nx as u32 - 1, ny as u32 - 1, nz as u32 - 1], &mut buffer);
+    drop(values);
+    let positions: Vec<Vec3> =
+        buffer.positions.iter().map(|p| origin + cell * Vec3::from_array(*p)).collect();
+    let faces = buffer.indices.chunks_exact(3).map(|f| [f[0], f[1], f[2]]).collect();
+    let (positions, faces) = largest_piece(positions, faces);
+    let (positions, parts) = positions.into_par_iter().map(|p| settle(body, p, cell)).unzip();
+    Surface { positions, faces, parts }
+}
+
+/// Moves a point of the net onto the surface, by Newton's method, within its cell; and the part it lies on.
+fn settle(body: &Body, start: Vec3, cell: f32) -> (Vec3, u8) {
+    let distance = |p: Vec3| body.distance(p, 4.0 * cell).0;
+    let step = 0.2 * cell;
+    let mut p = start;
+    for _ in 0..2 {
+        let d = distance(p);
+        let slope = |axis: Vec3| (distance(p + step * axis) - distance(p - step * axis)) / (2.0 * step);
+        let gradient = Vec3::new(slope(Vec3::X), slope(Vec3::Y), slope(Vec3::Z));
+        let moved = p - gradient * (d / gradient.length_squared().max(0.1));
+        p = start + (moved - start).clamp_length_max(0.7 * cell);
+    }
+    (p, body.distance(p, 4.0 * cell).1 as u8)
+}
+
+/// The piece with the most triangles: crumbs of cloth are left out.
+fn largest_piece(positions: Vec<Vec3>, faces: Vec<[u32; 3]>) -> (Vec<Vec3>, Vec<[u32; 3]>) {
+    let mut parent: Vec<u32> = (0..positions.len() as u32).collect();
+    fn root(parent: &mut [u32], mut row: u32) -> u32 {
+        while parent[row as usize] != row {
+            parent[row as usize] = parent[parent[row as usize] as usize];
+            row = parent[row as usize];
+        }
+        row
+    }
+    for face in &faces {
+        let first = root(&mut parent, face[0]);
+        for row in &face[1..] {
+            let other = root(&mut parent, *row);
+            parent[other as usize] = first;
+        }
+    }
+    let mut sizes = vec![0_u32; positions.len()];
+    for face in &faces {
+        sizes[root(&mut parent, face[0]) as usize] += 1;
+    }
+    let largest =
+        (0..sizes.len()).max_by_key(|row| (sizes[*row], std::cmp::Reverse(*row))).unwrap_or(0) as u32;
+    let mut rows = vec![u32::MAX; positions.len()];
+    let mut kept = Vec::new();
+    for row in 0..positions.len() as u32 {
+        if root(&mut parent, row) == largest {
+            rows[row as usize] = kept.len() as u32;
+            kept.push(positions[row as usize]);
+        }
+    }
+    let faces =
+        faces.into_iter().map(|f| f.map(|row| rows[row as usize])).filter(|f| f[0] != u32::MAX).collect();
+    (kept, faces)
+}
