@@ -4,6 +4,7 @@ pub mod dataset;
 mod error;
 pub mod export;
 pub mod import;
+pub mod makehuman;
 pub mod mesh;
 mod pattern;
 pub mod photo;

@@ -113,6 +113,24 @@ impl Pose {
 }
 
 impl Pose {
+    /// Axes of the trunk, from the pelvis (0) to the shoulders (1).
+    pub fn trunk_frame(&self, share: f32) -> Mat3 {
+        let [lean, turn, aside] = self.trunk;
+        rotate_y((0.3 + 0.4 * share) * turn) * rotate_x((0.3 + 0.7 * share) * lean) * rotate_z(share * aside)
+    }
+
+    /// Axes of neck and head, from the shoulders (0) to the skull (1).
+    pub fn head_frame(&self, share: f32) -> Mat3 {
+        let [nod, look, tilt] = self.head;
+        let upright = nod - 0.5 * self.trunk[0];
+        self.trunk_frame(1.0) * rotate_y(share * look) * rotate_x(share * upright) * rotate_z(share * tilt)
+    }
+
+    /// By how many degrees an arm is lifted beyond where the collarbone begins to move.
+    pub fn lift(&self, side: usize) -> f32 {
+        (self.arms[side][0] - 35.0).max(0.0)
+    }
+
     /// Moves hanging arms out of the way of clothes that stand out around the hips by this share of them.
     pub fn spread_arms(&mut self, share: f32) {
         for arm in &mut self.arms {
@@ -174,15 +192,12 @@ impl Figure {
     /// Shares of the stature after Drillis and Contini (1966).
     pub fn new(build: Build, pose: &Pose) -> Self {
         let h = build.stature;
-        let [lean, turn, aside] = pose.trunk;
-        let pelvis_frame = rotate_y(0.3 * turn) * rotate_x(0.3 * lean);
-        let chest_frame = rotate_y(0.7 * turn) * rotate_x(lean) * rotate_z(aside);
+        let turn = pose.trunk[1];
+        let (pelvis_frame, chest_frame) = (pose.trunk_frame(0.0), pose.trunk_frame(1.0));
         let pelvis = Bone::stand(Vec3::ZERO, pelvis_frame, 0.095 * h);
         let chest = Bone::stand(pelvis.end, chest_frame, 0.215 * h);
-        let [nod, look, tilt] = pose.head;
-        let neck = Bone::stand(chest.end, chest_frame * rotate_x(0.4 * nod + 8.0), 0.045 * h);
-        let head_frame = chest_frame * rotate_y(look) * rotate_x(nod - 0.5 * lean) * rotate_z(tilt);
-        let head = Bone::stand(neck.end, head_frame, 0.128 * h * build.head);
+        let neck = Bone::stand(chest.end, chest_frame * rotate_x(0.4 * pose.head[0] + 8.0), 0.045 * h);
+        let head = Bone::stand(neck.end, pose.head_frame(1.0), 0.128 * h * build.head);
 
         let breadth = h * build.shoulders * (0.09 + 0.015 * build.sex);
         let sides = [0, 1];

@@ -2,13 +2,13 @@
 //!
 //! Everything about a person follows from a name, the same on every machine.
 
-mod atlas;
-mod body;
-mod figure;
+pub(crate) mod atlas;
+pub(crate) mod body;
+pub(crate) mod figure;
 pub(crate) mod math;
-mod outfit;
-mod paint;
-mod surface;
+pub(crate) mod outfit;
+pub(crate) mod paint;
+pub(crate) mod surface;
 #[cfg(test)]
 mod tests;
 

@@ -9,6 +9,33 @@ use super::figure::Figure;
 use super::math::{noise2, smoothstep};
 use super::outfit::{Cut, Lower, Outfit};
 
+/// Where the features of a face are: angles around the head, and heights in heads above the chin.
+#[derive(Debug, Clone)]
+pub struct Face {
+    pub eye: (f32, f32),
+    pub brow: f32,
+    pub mouth: f32,
+    /// Half width and half height of the lips.
+    pub lips: [f32; 2],
+    /// Height of the nostrils, where they are painted.
+    pub nose: Option<f32>,
+    pub painted_eyes: bool,
+}
+
+impl Default for Face {
+    /// The face of the synthetic people.
+    fn default() -> Self {
+        Self {
+            eye: (0.41, 0.455),
+            brow: 0.545,
+            mouth: 0.19,
+            lips: [0.3, 0.034],
+            nose: Some(0.3),
+            painted_eyes: true,
+        }
+    }
+}
+
 /// A person's colours.
 pub struct Painter<'a> {
     pub outfit: &'a Outfit,
@@ -17,6 +44,7 @@ pub struct Painter<'a> {
     pub head: f32,
     /// Where prints are centred, metres along the trunk.
     pub chest: f32,
+    pub face: Face,
 }
 
 impl<'a> Painter<'a> {
@@ -24,7 +52,7 @@ impl<'a> Painter<'a> {
         let marks = Marks::of(figure, outfit);
         let length = |bone: &super::figure::Bone| (bone.end - bone.start).length();
         let chest = 1.7 * length(&figure.pelvis) + 0.55 * length(&figure.chest);
-        Self { outfit, marks, head: length(&figure.head), chest }
+        Self { outfit, marks, head: length(&figure.head), chest, face: Face::default() }
     }
 
     /// Colour at a place of a part's chart: angle around (0 in front, positive towards +x) and metres along.
@@ -152,6 +180,8 @@ impl<'a> Painter<'a> {
         let Outfit { hair, lips, eyes, cut, .. } = self.outfit;
         let mut color = self.skin(cloth, 5);
         let aside = angle.abs();
+        let face = &self.face;
+        let (eye_angle, eye_up) = face.eye;
         // Red where blood shows.
         let blush = (1.0 - ((aside - 0.75) / 0.4).powi(2) - ((up - 0.36) / 0.12).powi(2)).max(0.0);
         color = color.lerp(Vec3::new(0.8, 0.35, 0.3) * self.outfit.skin.x.max(0.3), 0.18 * blush);
@@ -162,25 +192,29 @@ impl<'a> Painter<'a> {
             let strand = 0.7 + 0.4 * noise2(Vec2::new(angle * 60.0, up * 30.0), 11);
             color = color.lerp(*hair * strand, (chin.max(lip).max(cheeks)) * 0.9);
         }
-        let mouth = Vec2::new(angle / 0.3, (up - 0.19) / 0.034);
+        let mouth = Vec2::new(angle / face.lips[0], (up - face.mouth) / face.lips[1]);
         if mouth.length() < 1.0 {
-            let parted = (up - 0.19).abs() < 0.004;
+            let parted = (up - face.mouth).abs() < 0.004;
             color = if parted { *lips * 0.45 } else { *lips };
         }
-        let nostril = Vec2::new((aside - 0.075) / 0.03, (up - 0.3) / 0.013);
-        if nostril.length() < 1.0 {
-            color *= 0.5;
+        if let Some(nose) = face.nose {
+            let nostril = Vec2::new((aside - 0.075) / 0.03, (up - nose) / 0.013);
+            if nostril.length() < 1.0 {
+                color *= 0.5;
+            }
         }
-        let brow = Vec2::new((aside - 0.42) / 0.22, (up - 0.545 - 0.02 * (aside - 0.42)) / 0.017);
+        let brow =
+            Vec2::new((aside - eye_angle) / 0.22, (up - face.brow - 0.02 * (aside - eye_angle)) / 0.017);
         if brow.length() < 1.0 {
             color = *hair * 0.7;
         }
-        let eye = Vec2::new((aside - 0.41) / 0.135, (up - 0.455) / 0.036);
-        if eye.length() < 1.15 {
+        let from_eye = Vec2::new(aside - eye_angle, up - eye_up);
+        let eye = (from_eye / Vec2::new(0.135, 0.036)).length();
+        if face.painted_eyes && eye < 1.15 {
             color *= 0.45;
         }
-        if eye.length() < 1.0 {
-            let iris = Vec2::new((aside - 0.41) / 0.056, (up - 0.457) / 0.034).length();
+        if face.painted_eyes && eye < 1.0 {
+            let iris = ((from_eye - Vec2::new(0.0, 0.002)) / Vec2::new(0.056, 0.034)).length();
             color = match iris {
                 r if r < 0.42 => Vec3::splat(0.03),
                 r if r < 1.0 => *eyes,

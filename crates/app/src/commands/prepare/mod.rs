@@ -1,6 +1,7 @@
 //! `snapsnap prepare`: people, from files or generated, become data sets.
 
 mod check;
+mod makehuman;
 mod preview;
 mod scan;
 mod synth;
@@ -35,6 +36,8 @@ enum Kind {
     Scan(scan::Arguments),
     /// Make people of simple shapes, with cloth full of detail.
     Synth(synth::Arguments),
+    /// Make people from MakeHuman's free data.
+    Makehuman(makehuman::Arguments),
     /// List what is wrong with a data set.
     Check(check::Arguments),
 }
@@ -43,6 +46,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     match &arguments.kind {
         Kind::Scan(arguments) => scan::run(arguments, quiet),
         Kind::Synth(arguments) => synth::run(arguments, quiet),
+        Kind::Makehuman(arguments) => makehuman::run(arguments, quiet),
         Kind::Check(arguments) => check::run(arguments, quiet),
     }
 }

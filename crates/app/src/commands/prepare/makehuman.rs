@@ -1,0 +1,24 @@
+//! `snapsnap prepare makehuman`.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use snapsnap_data::makehuman::{Library, person};
+
+use super::{Common, Generate, generate};
+use crate::failure::Failure;
+
+#[derive(Args)]
+pub struct Arguments {
+    /// MakeHuman's folder `data`, or a checkout that has it.
+    folder: PathBuf,
+    #[command(flatten)]
+    common: Common,
+    #[command(flatten)]
+    generate: Generate,
+}
+
+pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
+    let library = Library::open(&arguments.folder)?;
+    generate(&arguments.common, &arguments.generate, quiet, "makehuman", |name| person(&library, name))
+}
