@@ -12,9 +12,12 @@ mod picture;
 pub mod prepare;
 pub mod random;
 mod resize;
+pub mod sample;
 pub mod scan;
 pub mod smplx;
 pub mod synth;
+#[cfg(test)]
+mod testing;
 pub mod view;
 
 pub use error::DataError;

@@ -259,20 +259,24 @@ impl Folder {
     /// # Errors
     /// [`DataError`] naming the file that is missing, damaged, or of another size than the set's.
     pub fn view(&self, split: Option<Split>, subject: &str, view: usize) -> Result<StoredView, DataError> {
-        let camera = self.camera(split, subject, view)?;
         let (color, mask) = self.picture(split, subject, view, false)?;
-        let depth = match self.description.layout {
-            Layout::Authors => {
-                files::read_inverse_depth(&self.path(split, "depth", subject).join(format!("{view}.png")))
-            }
-            Layout::Exact => {
-                files::read_depth(&self.path(split, "depth", subject).join(format!("{view}.npz")))
-            }
-        }?;
-        let side = self.description.resolution;
-        let path = self.path(split, "depth", subject);
-        self.check_size(&path, (depth.1[1], depth.1[0]), side)?;
-        Ok(StoredView { color, mask, depth: depth.0, camera })
+        Ok(StoredView { color, mask, ..self.depth(split, subject, view)? })
+    }
+
+    /// Reads one view without its picture: colours and mask are empty.
+    ///
+    /// # Errors
+    /// As [`Self::view`].
+    pub fn depth(&self, split: Option<Split>, subject: &str, view: usize) -> Result<StoredView, DataError> {
+        let camera = self.camera(split, subject, view)?;
+        let folder = self.path(split, "depth", subject);
+        let (path, read): (PathBuf, fn(&Path) -> _) = match self.description.layout {
+            Layout::Authors => (folder.join(format!("{view}.png")), files::read_inverse_depth),
+            Layout::Exact => (folder.join(format!("{view}.npz")), files::read_depth),
+        };
+        let (depth, [height, width]) = read(&path)?;
+        self.check_size(&path, (width, height), self.description.resolution)?;
+        Ok(StoredView { color: RgbImage::default(), mask: GrayImage::default(), depth, camera })
     }
 
     /// Reads the picture of a view, at twice the side if `high_resolution`: colours and coverage.

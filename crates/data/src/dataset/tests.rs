@@ -1,1 +1,147 @@
+use super::*;
+use crate::prepare::PrepareConfig;
+use crate::testing::{data_set, rectangle};
 
+const TRAIN: Option<Split> = Some(Split::Train);
+
+fn small(layout: Layout) -> (tempfile::TempDir, std::sync::Arc<Folder>) {
+    data_set(&rectangle().0, layout, 64, 4, true, 2)
+}
+
+#[test]
+fn what_was_written_is_read_again() {
+    for layout in [Layout::Exact, Layout::Authors] {
+        let (_temporary, written) = small(layout);
+        let folder = Folder::open(written.root()).expect("opens");
+        assert_eq!(folder.description(), written.description());
+        assert_eq!(folder.splits(), [TRAIN]);
+        assert_eq!(folder.subjects(TRAIN).expect("lists"), ["0000", "0001"]);
+        let view = folder.view(TRAIN, "0001", 2).expect("reads");
+        let expected = Camera::orbit_at_yaw_degrees(180.0, 64);
+        let off = (view.camera.world_to_camera.translation - expected.world_to_camera.translation).length();
+        assert!(off < 1e-12 && view.camera.focal == expected.focal, "{layout:?}: {:?}", view.camera);
+        assert_eq!(view.camera.principal_point, expected.principal_point);
+        let middle = 37 * 64 + 32;
+        assert!((view.depth[middle] - 2.0).abs() < 0.15, "{}", view.depth[middle]);
+        assert_eq!(view.mask.as_raw()[middle], 255);
+        let (large, _) = folder.picture(TRAIN, "0001", 2, true).expect("reads");
+        assert_eq!(large.dimensions(), (128, 128));
+        let checked = check(folder.root(), |_, _| {}).expect("checks");
+        assert_eq!((checked.subjects, checked.views, checked.problems), (2, 8, Vec::<String>::new()));
+    }
+}
+
+/// The authors' folders have no description, and test sets no splits.
+#[test]
+fn folders_of_the_authors_tools_are_recognised() {
+    let (_temporary, written) = small(Layout::Authors);
+    let root = written.root();
+    fs::remove_file(root.join(DESCRIPTION)).expect("remove");
+    let folder = Folder::open(root).expect("opens");
+    let Description { layout, views, resolution, high_resolution, pixel_centre, .. } = folder.description();
+    assert_eq!((*layout, *views, *resolution, *high_resolution), (Layout::Authors, 4, 64, true));
+    assert_eq!(*pixel_centre, 0.0);
+    for kind in ["img", "mask", "depth", "parm"] {
+        fs::rename(root.join("train").join(kind), root.join(kind)).expect("rename");
+    }
+    let folder = Folder::open(root).expect("opens");
+    assert_eq!(folder.splits(), [None]);
+    assert_eq!(folder.view(None, "0000", 0).expect("reads").depth.len(), 64 * 64);
+
+    // Matrices in f32, as some of the authors' tools write them.
+    let path = root.join("parm/0000/0_extrinsic.npy");
+    let camera = folder.camera(None, "0000", 0).expect("reads");
+    let rotation = camera.world_to_camera.rotation;
+    let matrix = ndarray::Array2::from_shape_fn((3, 4), |(r, c)| {
+        (if c < 3 { rotation.row(r)[c] } else { camera.world_to_camera.translation[r] }) as f32
+    });
+    ndarray_npy::write_npy(&path, &matrix).expect("writes");
+    let again = folder.camera(None, "0000", 0).expect("reads");
+    assert!((again.world_to_camera.translation - camera.world_to_camera.translation).length() < 1e-6);
+}
+
+#[test]
+fn the_authors_folder_must_be_called_as_their_loader_wants_it() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let mut config = PrepareConfig::default();
+    config.views.layout = Layout::Authors;
+    let create = |name: &str| Folder::create(&temporary.path().join(name), config.description("a test"));
+    assert!(create("people").expect_err("refused").to_string().contains("must end in `_1024_24`"));
+    assert!(create("people_1024_24").is_ok());
+    let other = PrepareConfig::default().description("a test");
+    let error = Folder::create(&temporary.path().join("people_1024_24"), other).expect_err("another");
+    assert!(error.to_string().contains("describes another data set"), "{error}");
+}
+
+#[test]
+fn a_killed_run_leaves_no_half_subject() {
+    let (_temporary, folder) = small(Layout::Exact);
+    let root = folder.root();
+    assert!(!root.join(".unfinished").exists());
+    // As if killed while drawing, and while moving into place.
+    fs::create_dir_all(root.join(".unfinished/train-0002/img")).expect("make");
+    fs::create_dir_all(root.join("train/depth/0002")).expect("make");
+    fs::write(root.join("train/depth/0002/stale.npz"), "").expect("write");
+    assert_eq!(folder.subjects(TRAIN).expect("lists").len(), 2);
+    assert!(!folder.has(Split::Train, "0002"));
+    let problems = check(root, |_, _| {}).expect("checks").problems;
+    assert_eq!(problems.len(), 2, "{problems:?}");
+    let mut config = PrepareConfig::default();
+    config.views =
+        crate::prepare::ViewsConfig { count: 4, resolution: 64, high_resolution: true, ..config.views };
+    config.add(&folder, Split::Train, "0002", &rectangle().0, 0.0, "0002").expect("adds");
+    assert!(folder.has(Split::Train, "0002"));
+    assert!(check(root, |_, _| {}).expect("checks").problems.is_empty());
+}
+
+/// Every fault is found, and none hides another.
+#[test]
+fn a_check_lists_everything_that_is_wrong() {
+    let (_temporary, folder) = small(Layout::Exact);
+    let at = |path: &str| folder.root().join("train").join(path);
+    fs::remove_file(at("img/0000/0.png")).expect("remove");
+    let whole = fs::read(at("img/0000/1.png")).expect("read");
+    fs::write(at("img/0000/1.png"), &whole[..whole.len() / 2]).expect("write");
+    fs::copy(at("img/0000/2_hr.png"), at("img/0000/2.png")).expect("copy");
+    fs::write(at("img/0000/4.png"), &whole).expect("write");
+    let empty = image::RgbaImage::new(64, 64);
+    empty.save(at("img/0001/0.png")).expect("save");
+    let write_depth = |view: usize, change: fn(&mut Vec<f32>)| {
+        let mut depth = folder.depth(TRAIN, "0001", view).expect("reads").depth;
+        change(&mut depth);
+        let view_file = crate::view::View { width: 64, height: 64, color: vec![], alpha: vec![], depth };
+        files::write_depth(&at(&format!("depth/0001/{view}.npz")), &view_file).expect("writes");
+    };
+    write_depth(1, |depth| depth[0] = f32::NAN);
+    write_depth(2, |depth| depth.fill(0.0));
+    fs::write(at("depth/0001/3.npz"), "not a zip").expect("write");
+    let cameras = at("cameras/0000.json");
+    let text = fs::read_to_string(&cameras).expect("read").replacen("64", "65", 1);
+    fs::write(&cameras, text).expect("write");
+    fs::create_dir(at("depth/0009")).expect("make");
+
+    let problems = check(folder.root(), |_, _| {}).expect("checks").problems;
+    let expected = [
+        "0009: its subject has no pictures",
+        "4.png: belongs to none of the 4 views",
+        "0000/0.png: cannot read",
+        "0000/1.png: not a readable image",
+        "0000/2.png: is 128×128, the data set has views of 64×64",
+        "0001/0: its mask is empty",
+        "0001/1: its depth holds NaN",
+        "0001/2: ",
+        "0001/3.npz: is no depth map",
+    ];
+    for words in expected {
+        assert!(problems.iter().any(|problem| problem.contains(words)), "{words}: {problems:#?}");
+    }
+    assert_eq!(problems.len(), expected.len(), "{problems:#?}");
+    // A wrong camera shows once its picture can be read.
+    fs::write(at("img/0000/0.png"), &whole).expect("write");
+    let problems = check(folder.root(), |_, _| {}).expect("checks").problems;
+    assert!(problems.iter().any(|problem| problem.contains("is 65×64")), "{problems:#?}");
+
+    fs::write(folder.root().join(DESCRIPTION), "layout = \"exact\"\nviews = 4\n").expect("write");
+    let error = check(folder.root(), |_, _| {}).expect_err("no description").to_string();
+    assert!(error.contains(DESCRIPTION) && error.contains("resolution"), "{error}");
+}

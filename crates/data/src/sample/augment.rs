@@ -1,0 +1,215 @@
+//! Changes to photographs, so that a network learned from renders meets what cameras and masks do.
+
+use std::io::Cursor;
+
+use glam::Vec3;
+use image::codecs::jpeg::JpegEncoder;
+use image::{GrayImage, Rgb, RgbImage};
+use rand::Rng;
+use serde::{Deserialize, Serialize};
+
+/// Ranges; 0 or false leaves a change out. Front and back are changed each by itself.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Augment {
+    /// Brighter or darker by up to this share.
+    pub exposure: f32,
+    /// Red and blue against green, up to this share.
+    pub white_balance: f32,
+    /// Masks that are too small, by up to so many pixels.
+    pub mask_erosion: f32,
+    /// Masks that are too large, by up to so many pixels.
+    pub mask_dilation: f32,
+    /// Lowest JPEG quality of photographs, 1 to 100; 0: never compressed.
+    pub jpeg_quality: u8,
+    /// Photographs before random backgrounds, which shine through where masks are soft or too large.
+    pub background: bool,
+    /// Stage 2: views are compared over a random colour instead of black.
+    pub background_color: bool,
+}
+
+impl Default for Augment {
+    /// Ours.
+    fn default() -> Self {
+        Self {
+            exposure: 0.15,
+            white_balance: 0.06,
+            mask_erosion: 1.5,
+            mask_dilation: 1.5,
+            jpeg_quality: 70,
+            background: true,
+            background_color: true,
+        }
+    }
+}
+
+impl Augment {
+    /// Nothing is changed.
+    pub fn none() -> Self {
+        Self {
+            exposure: 0.0,
+            white_balance: 0.0,
+            mask_erosion: 0.0,
+            mask_dilation: 0.0,
+            jpeg_quality: 0,
+            background: false,
+            background_color: false,
+        }
+    }
+
+    pub(super) fn problem(&self) -> Option<(&'static str, String)> {
+        let limits = [
+            ("exposure", self.exposure, 0.9),
+            ("white_balance", self.white_balance, 0.9),
+            ("mask_erosion", self.mask_erosion, 16.0),
+            ("mask_dilation", self.mask_dilation, 16.0),
+            ("jpeg_quality", f32::from(self.jpeg_quality), 100.0),
+        ];
+        let (key, value, limit) =
+            limits.into_iter().find(|(_, value, limit)| !(0.0..=*limit).contains(value))?;
+        Some((key, format!("is {value}, must be 0 to {limit}")))
+    }
+
+    /// The changed photograph and its mask.
+    pub(super) fn apply(
+        &self,
+        color: &RgbImage,
+        mask: &GrayImage,
+        random: &mut impl Rng,
+    ) -> (RgbImage, GrayImage) {
+        let mut stray = |range: f32| 1.0 + range * random.random_range(-1.0_f32..1.0);
+        let exposure = stray(self.exposure);
+        let gain = Vec3::new(stray(self.white_balance), 1.0, stray(self.white_balance)) * exposure;
+        let grow = random.random_range(-1.0_f32..1.0);
+        let quality = random.random_range(0.0_f32..1.0);
+        let backdrop = Backdrop::draw(random);
+        let mut picture = color.clone();
+        if self.background || gain != Vec3::ONE {
+            for (x, y, pixel) in picture.enumerate_pixels_mut() {
+                let lit = (Vec3::from(pixel.0.map(f32::from)) * gain).clamp(Vec3::ZERO, Vec3::splat(255.0));
+                let mixed = if self.background {
+                    let share = f32::from(mask.get_pixel(x, y).0[0]) / 255.0;
+                    backdrop
+                        .color(x as f32 / color.width() as f32, y as f32 / color.height() as f32)
+                        .lerp(lit, share)
+                } else {
+                    lit
+                };
+                *pixel = Rgb(mixed.to_array().map(|c| c.round() as u8));
+            }
+        }
+        if self.jpeg_quality > 0 {
+            let lowest = f32::from(self.jpeg_quality);
+            picture = compressed(picture, (lowest + quality * (100.0 - lowest)) as u8);
+        }
+        let reach = if grow < 0.0 { grow * self.mask_erosion } else { grow * self.mask_dilation };
+        let mask = if reach == 0.0 { mask.clone() } else { moved(mask, reach) };
+        (picture, mask)
+    }
+}
+
+/// A smooth background between two colours.
+struct Backdrop {
+    colors: [Vec3; 2],
+    way: [f32; 2],
+}
+
+impl Backdrop {
+    fn draw(random: &mut impl Rng) -> Self {
+        let mut color = || 255.0 * Vec3::new(random.random(), random.random(), random.random());
+        let colors = [color(), color()];
+        Self { colors, way: [random.random_range(-1.0..1.0), random.random_range(-1.0..1.0)] }
+    }
+
+    fn color(&self, x: f32, y: f32) -> Vec3 {
+        let [a, b] = self.colors;
+        a.lerp(b, (0.5 + (x - 0.5) * self.way[0] + (y - 0.5) * self.way[1]).clamp(0.0, 1.0))
+    }
+}
+
+fn compressed(picture: RgbImage, quality: u8) -> RgbImage {
+    let mut bytes = Vec::new();
+    let done = JpegEncoder::new_with_quality(&mut bytes, quality.clamp(1, 100)).encode_image(&picture);
+    let decoded = image::ImageReader::with_format(Cursor::new(&bytes), image::ImageFormat::Jpeg).decode();
+    match (done, decoded) {
+        (Ok(()), Ok(decoded)) => decoded.into_rgb8(),
+        // Only if memory runs out; then the picture stays as it is.
+        _ => picture,
+    }
+}
+
+/// The mask with its outline moved outwards by `reach` pixels, or inwards where that is negative.
+fn moved(mask: &GrayImage, reach: f32) -> GrayImage {
+    let radius = reach.abs();
+    let (width, height) = (i64::from(mask.width()), i64::from(mask.height()));
+    let whole = radius.ceil() as i64;
+    // Pixels of a disc, each with the share of it that the radius reaches.
+    let disc: Vec<(i64, i64, f32)> = (-whole..=whole)
+        .flat_map(|y| (-whole..=whole).map(move |x| (x, y)))
+        .map(|(x, y)| (x, y, (radius + 1.0 - ((x * x + y * y) as f32).sqrt()).clamp(0.0, 1.0)))
+        .filter(|(_, _, share)| *share > 0.0)
+        .collect();
+    let dilate = reach > 0.0;
+    let at = |x: i64, y: i64| {
+        let inside = (0..width).contains(&x) && (0..height).contains(&y);
+        let value = if inside { mask.as_raw()[(y * width + x) as usize] } else { 0 };
+        if dilate { value } else { 255 - value }
+    };
+    GrayImage::from_fn(mask.width(), mask.height(), |x, y| {
+        let (x, y) = (i64::from(x), i64::from(y));
+        let here = at(x, y);
+        // Most of a picture is far from the outline.
+        let near = [(whole, 0), (-whole, 0), (0, whole), (0, -whole)];
+        let flat = here == 255 || (here == 0 && near.iter().all(|(dx, dy)| at(x + dx, y + dy) == 0));
+        let value = if flat && whole <= 1 || here == 255 {
+            here
+        } else {
+            disc.iter().map(|(dx, dy, share)| f32::from(at(x + dx, y + dy)) * share).fold(0.0, f32::max) as u8
+        };
+        image::Luma([if dilate { value } else { 255 - value }])
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::random::stream;
+
+    fn disc(radius: f32) -> GrayImage {
+        GrayImage::from_fn(64, 64, |x, y| {
+            let d = ((x as f32 - 31.5).powi(2) + (y as f32 - 31.5).powi(2)).sqrt();
+            image::Luma([((radius + 0.5 - d).clamp(0.0, 1.0) * 255.0) as u8])
+        })
+    }
+
+    fn area(mask: &GrayImage) -> f32 {
+        mask.as_raw().iter().map(|v| f32::from(*v) / 255.0).sum()
+    }
+
+    #[test]
+    fn outlines_move_by_the_asked_distance() {
+        let radius_of = |mask: &GrayImage| (area(mask) / std::f32::consts::PI).sqrt();
+        let before = radius_of(&disc(16.0));
+        for reach in [-2.5, -1.0, -0.5, 0.5, 1.0, 2.5] {
+            let after = radius_of(&moved(&disc(16.0), reach));
+            assert!((after - before - reach).abs() < 0.35, "{reach}: {before} to {after}");
+        }
+    }
+
+    #[test]
+    fn nothing_is_changed_unless_asked() {
+        let color = RgbImage::from_fn(64, 64, |x, y| Rgb([x as u8, y as u8, 77]));
+        let mask = disc(20.0);
+        let mut random = stream("a");
+        assert_eq!(Augment::none().apply(&color, &mask, &mut random), (color.clone(), mask.clone()));
+        let (changed, moved) = Augment::default().apply(&color, &mask, &mut random);
+        assert_ne!(changed, color);
+        assert_ne!(moved, mask);
+        // What is chosen does not depend on what else is asked for.
+        let only = Augment { exposure: 0.5, ..Augment::none() };
+        let (brighter, same) = only.apply(&color, &mask, &mut stream("b"));
+        assert_eq!(same, mask);
+        let ratio = f32::from(brighter.get_pixel(10, 60).0[1]) / 60.0;
+        assert!((0.5..1.5).contains(&ratio) && (ratio - 1.0).abs() > 0.01, "{ratio}");
+    }
+}

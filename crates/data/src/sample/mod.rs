@@ -1,0 +1,181 @@
+//! Training samples: Burn data sets of stage 1 and stage 2 (SNAPSNAP §5.6, §5.7), their batches, and a loader.
+
+mod augment;
+mod loader;
+mod stage1;
+mod stage2;
+#[cfg(test)]
+mod tests;
+
+use std::sync::Arc;
+
+use glam::DVec3;
+use image::{GrayImage, RgbImage};
+use rand::Rng;
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+use snapsnap_splat::Camera;
+
+use crate::DataError;
+use crate::dataset::{Folder, Split, StoredView};
+use crate::random::stream;
+pub use augment::Augment;
+pub use loader::Loader;
+pub use stage1::{Stage1, Stage1Batch, Stage1Batcher, Stage1Item};
+pub use stage2::{Stage2, Stage2Batch, Stage2Batcher, Stage2Item};
+
+/// Depth that the published code gives the background: 1/(0 + 10⁻⁸).
+const COMPAT_FAR: f32 = 1e8;
+/// Coverage from which a pixel belongs to the person, in 8 bits.
+const INSIDE: u8 = 128;
+
+/// How samples are made: the section `[samples]` of a training config.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SampleConfig {
+    /// Every quirk of the published loader: points half a pixel off in sets whose samples lie at the pixels' corners,
+    /// black background, nothing augmented.
+    pub compat: bool,
+    /// How often each subject comes in an epoch.
+    pub repeat: usize,
+    /// Stage 2: random views to be compared, beside the two side views.
+    pub supervision: usize,
+    /// Stage 2: compare at twice the side, where the data set has it.
+    pub high_resolution: bool,
+    /// Decides everything that is random.
+    pub seed: u64,
+    /// Changes to the two input photographs.
+    pub augment: Augment,
+}
+
+impl Default for SampleConfig {
+    /// Ours.
+    fn default() -> Self {
+        Self {
+            compat: false,
+            repeat: 50,
+            supervision: 3,
+            high_resolution: false,
+            seed: 1,
+            augment: Augment::default(),
+        }
+    }
+}
+
+impl SampleConfig {
+    /// The published loader.
+    pub fn compat() -> Self {
+        Self { compat: true, high_resolution: true, augment: Augment::none(), ..Self::default() }
+    }
+
+    /// The first key that makes no sense, and why.
+    pub fn problem(&self) -> Option<(String, String)> {
+        if self.repeat == 0 || self.repeat > 1_000_000 {
+            return Some(("repeat".into(), format!("is {}, must be 1 to 1000000", self.repeat)));
+        }
+        if self.supervision > 64 {
+            return Some(("supervision".into(), format!("is {}, must be 0 to 64", self.supervision)));
+        }
+        if self.compat && self.augment != Augment::none() {
+            return Some(("augment".into(), "must be off beside `compat = true`".into()));
+        }
+        self.augment.problem().map(|(key, message)| (format!("augment.{key}"), message))
+    }
+}
+
+/// What both stages share: a split of a data set and how to make samples of it.
+#[derive(Debug, Clone)]
+struct Source {
+    folder: Arc<Folder>,
+    split: Option<Split>,
+    subjects: Arc<Vec<String>>,
+    config: SampleConfig,
+    epoch: u64,
+}
+
+impl Source {
+    fn new(folder: Arc<Folder>, split: Option<Split>, config: SampleConfig) -> Result<Self, DataError> {
+        let wrong = |message: String| DataError::unsuitable(folder.root(), message);
+        if let Some((key, message)) = config.problem() {
+            return Err(wrong(format!("samples: `{key}`: {message}")));
+        }
+        let views = folder.description().views;
+        if !views.is_multiple_of(4) {
+            return Err(wrong(format!("has {views} views; front, back and sides need a multiple of 4")));
+        }
+        if config.high_resolution && !folder.description().high_resolution {
+            return Err(wrong("has no views at twice the side, which `high_resolution` asks for".into()));
+        }
+        let subjects = folder.subjects(split)?;
+        if subjects.is_empty() {
+            return Err(wrong("has no subject in this split".into()));
+        }
+        Ok(Self { folder, split, subjects: Arc::new(subjects), config, epoch: 0 })
+    }
+
+    fn len(&self) -> usize {
+        self.subjects.len() * self.config.repeat
+    }
+
+    /// The subject of a sample and what is random about it. Subjects come one after another (SNAPSNAP §5.6).
+    fn subject(&self, stage: u32, index: usize) -> (&str, ChaCha8Rng) {
+        let subject = &self.subjects[index % self.subjects.len()];
+        let random = stream(&format!("sample/{stage}/{}/{}/{index}", self.config.seed, self.epoch));
+        (subject, random)
+    }
+
+    /// A view; without its picture where that is not needed.
+    fn view_for(&self, subject: &str, view: usize, picture: bool) -> Result<StoredView, DataError> {
+        if picture {
+            self.folder.view(self.split, subject, view)
+        } else {
+            self.folder.depth(self.split, subject, view)
+        }
+    }
+
+    /// The camera by which depths become points: the true one, or, with `compat`, the stored one as the published code
+    /// reads it.
+    fn camera(&self, stored: &Camera) -> Camera {
+        if self.config.compat { *stored } else { self.folder.exact_camera(stored) }
+    }
+
+    /// Front and back as the networks see them: `[2,3,H,W]` and their masks `[2,H,W]`.
+    fn photographs(
+        &self,
+        views: [(&RgbImage, &GrayImage); 2],
+        random: &mut impl Rng,
+    ) -> (Vec<f32>, Vec<f32>) {
+        let (mut images, mut masks) = (Vec::new(), Vec::new());
+        for (color, mask) in views {
+            let (color, mask) = self.config.augment.apply(color, mask, random);
+            // Channels first; the background is 0 (SNAPSNAP §5.7).
+            for channel in 0..3 {
+                let pixels = color.pixels().zip(mask.pixels());
+                images.extend(pixels.map(|(c, m)| {
+                    (2.0 * f32::from(c.0[channel]) / 255.0 - 1.0) * (f32::from(m.0[0]) / 255.0)
+                }));
+            }
+            masks.extend(mask.as_raw().iter().map(|m| if *m >= INSIDE { 1.0 } else { 0.0 }));
+        }
+        (images, masks)
+    }
+}
+
+/// Points `[H,W,3]` of a depth map in the frame of `to`, metres: each pixel's centre, at +½ in the coordinates of `camera`,
+/// moved along its ray to the stored depth. Where there is no depth it is taken for `far`.
+pub fn unproject(view: &StoredView, camera: &Camera, to: &Camera, far: f32) -> Vec<f32> {
+    let width = camera.width as usize;
+    // From the camera's frame to the other's.
+    let back = camera.world_to_camera.inverse();
+    let rotation = to.world_to_camera.rotation * back.rotation;
+    let shift = to.world_to_camera.apply(back.translation);
+    let (f, c) = (camera.focal, camera.principal_point);
+    let mut points = Vec::with_capacity(3 * view.depth.len());
+    for (pixel, z) in view.depth.iter().enumerate() {
+        let z = f64::from(if *z > 0.0 { *z } else { far });
+        let (x, y) = ((pixel % width) as f64 + 0.5, (pixel / width) as f64 + 0.5);
+        let point = rotation * (z * DVec3::new((x - c.x) / f.x, (y - c.y) / f.y, 1.0)) + shift;
+        points.extend(point.as_vec3().to_array());
+    }
+    points
+}

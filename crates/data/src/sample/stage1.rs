@@ -1,0 +1,132 @@
+//! Stage 1: two opposite photographs, and the points that four views around see.
+
+use std::sync::Arc;
+
+use burn::data::dataloader::batcher::Batcher;
+use burn::data::dataset::{Dataset, DatasetError};
+use burn::tensor::{Device, Tensor, TensorData};
+use rand::Rng;
+
+use super::{COMPAT_FAR, INSIDE, SampleConfig, Source, unproject};
+use crate::DataError;
+use crate::dataset::{Folder, Split};
+
+/// Samples of stage 1 (SNAPSNAP §5.6): any view is the front, the opposite one the back, those at right angles the sides.
+#[derive(Debug, Clone)]
+pub struct Stage1(Source);
+
+/// One sample; H and W are the side of the data set's views.
+#[derive(Debug, Clone)]
+pub struct Stage1Item {
+    /// H and W.
+    pub side: usize,
+    /// `[2,3,H,W]` front and back in [−1, 1] times the mask.
+    pub images: Vec<f32>,
+    /// `[2,H,W]` 1 where the input masks see the person.
+    pub masks: Vec<f32>,
+    /// `[4,H,W,3]` points that front, back, right and left see, metres in the front camera's frame.
+    pub points: Vec<f32>,
+    /// `[4,H,W]` 1 where a point is one.
+    pub valid: Vec<f32>,
+}
+
+/// A batch of B samples on a device.
+#[derive(Debug, Clone)]
+pub struct Stage1Batch {
+    /// `[B,2,3,H,W]`.
+    pub images: Tensor<5>,
+    /// `[B,2,H,W]`.
+    pub masks: Tensor<4>,
+    /// `[B,4,H,W,3]`.
+    pub points: Tensor<5>,
+    /// `[B,4,H,W]`.
+    pub valid: Tensor<4>,
+}
+
+impl Stage1 {
+    /// The samples of a split.
+    ///
+    /// # Errors
+    /// [`DataError`] if the split has no subject, the number of views is no multiple of 4, or the config contradicts
+    /// itself or the data set.
+    pub fn new(folder: Arc<Folder>, split: Option<Split>, config: SampleConfig) -> Result<Self, DataError> {
+        // High resolution is stage 2's.
+        Source::new(folder, split, SampleConfig { high_resolution: false, ..config }).map(Self)
+    }
+
+    /// The same subjects with other random choices.
+    pub fn with_epoch(&self, epoch: u64) -> Self {
+        Self(Source { epoch, ..self.0.clone() })
+    }
+
+    /// One sample.
+    ///
+    /// # Errors
+    /// [`DataError`] for files that are missing or damaged.
+    pub fn sample(&self, index: usize) -> Result<Stage1Item, DataError> {
+        let source = &self.0;
+        let (subject, mut random) = source.subject(1, index);
+        let count = source.folder.description().views;
+        let first = random.random_range(0..count);
+        // Front, back, and the sides at +90° and +270° (SNAPSNAP §5.6).
+        let order = [0, 2, 1, 3].map(|quarter| (first + quarter * count / 4) % count);
+        let compat = source.config.compat;
+        let side = source.folder.description().resolution as usize;
+        let (mut points, mut valid) =
+            (Vec::with_capacity(12 * side * side), Vec::with_capacity(4 * side * side));
+        let mut pictures = Vec::new();
+        let mut front = None;
+        for (place, view) in order.into_iter().enumerate() {
+            let stored = source.view_for(subject, view, place < 2 || compat)?;
+            let camera = source.camera(&stored.camera);
+            let front = *front.get_or_insert(camera);
+            points.extend(unproject(&stored, &camera, &front, if compat { COMPAT_FAR } else { 0.0 }));
+            valid.extend(stored.depth.iter().enumerate().map(|(pixel, z)| {
+                let there = if compat { stored.mask.as_raw()[pixel] >= INSIDE } else { *z > 0.0 };
+                f32::from(u8::from(there))
+            }));
+            if place < 2 {
+                pictures.push((stored.color, stored.mask));
+            }
+        }
+        let [front, back] = [0, 1].map(|i| (&pictures[i].0, &pictures[i].1));
+        let (images, masks) = source.photographs([front, back], &mut random);
+        Ok(Stage1Item { side, images, masks, points, valid })
+    }
+}
+
+impl Dataset<Stage1Item> for Stage1 {
+    fn get(&self, index: usize) -> Result<Stage1Item, DatasetError> {
+        assert!(index < self.len(), "sample {index} of {}", self.len());
+        self.sample(index).map_err(DatasetError::new)
+    }
+
+    fn len(&self) -> usize {
+        self.0.len()
+    }
+}
+
+/// Puts samples together.
+#[derive(Debug, Clone, Copy)]
+pub struct Stage1Batcher;
+
+impl Batcher<Stage1Item, Stage1Batch> for Stage1Batcher {
+    fn batch(&self, items: Vec<Stage1Item>, device: &Device) -> Stage1Batch {
+        let (b, side) = (items.len(), items.first().map_or(0, |item| item.side));
+        fn together<const D: usize>(
+            items: &[Stage1Item],
+            of: fn(&Stage1Item) -> &Vec<f32>,
+            shape: [usize; D],
+            device: &Device,
+        ) -> Tensor<D> {
+            let values: Vec<f32> = items.iter().flat_map(|item| of(item).iter().copied()).collect();
+            Tensor::from_data(TensorData::new(values, shape), device)
+        }
+        Stage1Batch {
+            images: together(&items, |item| &item.images, [b, 2, 3, side, side], device),
+            masks: together(&items, |item| &item.masks, [b, 2, side, side], device),
+            points: together(&items, |item| &item.points, [b, 4, side, side, 3], device),
+            valid: together(&items, |item| &item.valid, [b, 4, side, side], device),
+        }
+    }
+}

@@ -1,0 +1,164 @@
+//! Stage 2: front and back photographs, and views to compare the rendered Gaussians with.
+
+use std::sync::Arc;
+
+use burn::data::dataloader::batcher::Batcher;
+use burn::data::dataset::{Dataset, DatasetError};
+use burn::tensor::{Device, Tensor, TensorData};
+use image::{GrayImage, RgbImage};
+use rand::Rng;
+use snapsnap_splat::Camera;
+
+use super::{SampleConfig, Source};
+use crate::DataError;
+use crate::dataset::{Folder, Split};
+
+/// Samples of stage 2 (SNAPSNAP §5.6): front and back are the first view and the opposite one; compared are the sides and
+/// random views.
+#[derive(Debug, Clone)]
+pub struct Stage2(Source);
+
+/// One sample; H and W are the side of the data set's views, h and w that of the views to compare.
+#[derive(Debug, Clone)]
+pub struct Stage2Item {
+    /// H and W.
+    pub side: usize,
+    /// `[2,3,H,W]` front and back in [−1, 1] times the mask.
+    pub images: Vec<f32>,
+    /// `[2,H,W]` 1 where the input masks see the person.
+    pub masks: Vec<f32>,
+    /// Cameras of front, back, right and left, side H.
+    pub cameras: [Camera; 4],
+    /// h and w.
+    pub target_side: usize,
+    /// `[V,3,h,w]` views to compare in [0, 1], over `background`: the random ones, then right and left.
+    pub targets: Vec<f32>,
+    /// Their cameras.
+    pub target_cameras: Vec<Camera>,
+    /// Colour behind the person.
+    pub background: [f32; 3],
+}
+
+/// A batch of B samples on a device; cameras stay on the host.
+#[derive(Debug, Clone)]
+pub struct Stage2Batch {
+    /// `[B,2,3,H,W]`.
+    pub images: Tensor<5>,
+    /// `[B,2,H,W]`.
+    pub masks: Tensor<4>,
+    /// Front, back, right and left of each sample.
+    pub cameras: Vec<[Camera; 4]>,
+    /// `[B,V,3,h,w]`.
+    pub targets: Tensor<5>,
+    /// V cameras of each sample.
+    pub target_cameras: Vec<Vec<Camera>>,
+    /// Colour behind each sample.
+    pub backgrounds: Vec<[f32; 3]>,
+}
+
+impl Stage2 {
+    /// The samples of a split.
+    ///
+    /// # Errors
+    /// As [`super::Stage1::new`].
+    pub fn new(folder: Arc<Folder>, split: Option<Split>, config: SampleConfig) -> Result<Self, DataError> {
+        Source::new(folder, split, config).map(Self)
+    }
+
+    /// The same subjects with other random choices.
+    pub fn with_epoch(&self, epoch: u64) -> Self {
+        Self(Source { epoch, ..self.0.clone() })
+    }
+
+    /// One sample.
+    ///
+    /// # Errors
+    /// [`DataError`] for files that are missing or damaged.
+    pub fn sample(&self, index: usize) -> Result<Stage2Item, DataError> {
+        let source = &self.0;
+        let Source { folder, split, config, .. } = source;
+        let (subject, mut random) = source.subject(2, index);
+        let description = folder.description();
+        let count = description.views;
+        let [front, right, back, left] = [0, 1, 2, 3].map(|quarter| quarter * count / 4);
+        let picture = |view: usize| folder.picture(*split, subject, view, false);
+        let (a, b) = (picture(front)?, picture(back)?);
+        let camera = |view: usize| folder.camera(*split, subject, view).map(|stored| source.camera(&stored));
+        let cameras = [camera(front)?, camera(back)?, camera(right)?, camera(left)?];
+
+        let random_views = (0..config.supervision).map(|_| random.random_range(0..count)).collect::<Vec<_>>();
+        let background =
+            if config.augment.background_color { [(); 3].map(|()| random.random()) } else { [0.0; 3] };
+        let scale = if config.high_resolution { 2 } else { 1 };
+        let target_side = description.resolution * scale;
+        let (mut targets, mut target_cameras) = (Vec::new(), Vec::new());
+        for view in random_views.into_iter().chain([right, left]) {
+            let (color, mask) = folder.picture(*split, subject, view, config.high_resolution)?;
+            targets.extend(over(&color, &mask, background));
+            // Sampled where the stored picture is, at its own size.
+            let stored = folder.camera(*split, subject, view)?.resized(target_side, target_side);
+            target_cameras.push(source.camera(&stored));
+        }
+        let (images, masks) = source.photographs([(&a.0, &a.1), (&b.0, &b.1)], &mut random);
+        Ok(Stage2Item {
+            side: description.resolution as usize,
+            images,
+            masks,
+            cameras,
+            target_side: target_side as usize,
+            targets,
+            target_cameras,
+            background,
+        })
+    }
+}
+
+/// `[3,h,w]` in [0, 1], over a colour.
+fn over(color: &RgbImage, mask: &GrayImage, background: [f32; 3]) -> impl Iterator<Item = f32> {
+    (0..3).flat_map(move |channel| {
+        color.pixels().zip(mask.pixels()).map(move |(c, m)| {
+            let a = f32::from(m.0[0]) / 255.0;
+            a * f32::from(c.0[channel]) / 255.0 + (1.0 - a) * background[channel]
+        })
+    })
+}
+
+impl Dataset<Stage2Item> for Stage2 {
+    fn get(&self, index: usize) -> Result<Stage2Item, DatasetError> {
+        assert!(index < self.len(), "sample {index} of {}", self.len());
+        self.sample(index).map_err(DatasetError::new)
+    }
+
+    fn len(&self) -> usize {
+        self.0.len()
+    }
+}
+
+/// Puts samples together.
+#[derive(Debug, Clone, Copy)]
+pub struct Stage2Batcher;
+
+impl Batcher<Stage2Item, Stage2Batch> for Stage2Batcher {
+    fn batch(&self, items: Vec<Stage2Item>, device: &Device) -> Stage2Batch {
+        let b = items.len();
+        let (side, target_side) = items.first().map_or((0, 0), |item| (item.side, item.target_side));
+        let views = items.first().map_or(0, |item| item.target_cameras.len());
+        fn together<const D: usize>(
+            items: &[Stage2Item],
+            of: fn(&Stage2Item) -> &Vec<f32>,
+            shape: [usize; D],
+            device: &Device,
+        ) -> Tensor<D> {
+            let values: Vec<f32> = items.iter().flat_map(|item| of(item).iter().copied()).collect();
+            Tensor::from_data(TensorData::new(values, shape), device)
+        }
+        Stage2Batch {
+            images: together(&items, |item| &item.images, [b, 2, 3, side, side], device),
+            masks: together(&items, |item| &item.masks, [b, 2, side, side], device),
+            targets: together(&items, |item| &item.targets, [b, views, 3, target_side, target_side], device),
+            cameras: items.iter().map(|item| item.cameras).collect(),
+            backgrounds: items.iter().map(|item| item.background).collect(),
+            target_cameras: items.into_iter().map(|item| item.target_cameras).collect(),
+        }
+    }
+}

@@ -1,0 +1,255 @@
+use burn::data::dataloader::DataLoader;
+use burn::data::dataset::Dataset;
+use burn::tensor::Device;
+use glam::{DVec2, Vec3};
+use kiddo::{ImmutableKdTree, SquaredEuclidean};
+
+use super::*;
+use crate::dataset::Layout;
+use crate::testing::{data_set, person, rectangle};
+
+const TRAIN: Option<Split> = Some(Split::Train);
+
+fn points_of(values: &[f32]) -> impl Iterator<Item = Vec3> {
+    values.chunks_exact(3).map(Vec3::from_slice)
+}
+
+/// The world points that a view sees.
+fn world(folder: &Folder, view: usize, compat: bool) -> Vec<Vec3> {
+    let stored = folder.depth(TRAIN, "0000", view).expect("reads");
+    let camera = if compat { stored.camera } else { folder.exact_camera(&stored.camera) };
+    let mut origin = camera;
+    origin.world_to_camera = snapsnap_splat::RigidTransform::IDENTITY;
+    let points = unproject(&stored, &camera, &origin, 0.0);
+    points_of(&points).zip(&stored.depth).filter(|(_, z)| **z > 0.0).map(|(p, _)| p).collect()
+}
+
+fn median(mut values: Vec<f32>) -> f32 {
+    values.sort_unstable_by(f32::total_cmp);
+    values[values.len() / 2]
+}
+
+/// A plane, rendered, stored and read: every point of every view lies on it.
+#[test]
+fn points_lie_on_the_surface_that_was_rendered() {
+    let (mesh, normal) = rectangle();
+    for (layout, compat, bound) in [(Layout::Exact, false, 2e-6), (Layout::Authors, false, 1.5e-4)] {
+        let (_temporary, folder) = data_set(&mesh, layout, 128, 8, false, 1);
+        let mut worst = 0.0_f32;
+        for view in [0, 1, 4, 7] {
+            for p in world(&folder, view, compat) {
+                worst = worst.max((normal.dot(p) - 0.9).abs() / normal.length());
+            }
+        }
+        println!("{layout:?}: {worst:e} m");
+        assert!(worst < bound, "{layout:?}: {worst} m");
+    }
+}
+
+/// Points of one view lie, seen from another, on the surface that that one sees.
+#[test]
+fn depth_of_one_view_projects_into_another() {
+    let (_temporary, folder) = data_set(person(), Layout::Exact, 512, 24, false, 1);
+    let stored = folder.depth(TRAIN, "0000", 2).expect("reads");
+    let mut shifts = Vec::new();
+    for p in world(&folder, 0, false) {
+        let (at, z) = stored.camera.project(p.as_dvec3()).expect("in front");
+        let corner = at - DVec2::splat(0.5);
+        let (x, y) = (corner.x.floor(), corner.y.floor());
+        let depth = |dx: usize, dy: usize| f64::from(stored.depth[(y as usize + dy) * 512 + x as usize + dx]);
+        let around = [depth(0, 0), depth(1, 0), depth(0, 1), depth(1, 1)];
+        // Where the other view sees a single smooth surface, and this one.
+        let (low, high) = around.iter().fold((f64::MAX, 0.0_f64), |(l, h), d| (l.min(*d), h.max(*d)));
+        if low == 0.0 || high - low > 0.01 || (z - around[0]).abs() > 0.02 {
+            continue;
+        }
+        let (fx, fy) = (corner.x - x, corner.y - y);
+        let top = around[0] + (around[1] - around[0]) * fx;
+        let bottom = around[2] + (around[3] - around[2]) * fx;
+        let seen = top + (bottom - top) * fy;
+        // How far the point lies off that surface, in pixels of the first view.
+        shifts.push(((z - seen).abs() * stored.camera.focal.x / z) as f32);
+    }
+    assert!(shifts.len() > 5000, "{} points", shifts.len());
+    shifts.sort_unstable_by(f32::total_cmp);
+    let share = shifts.iter().filter(|s| **s <= 0.5).count() as f32 / shifts.len() as f32;
+    println!(
+        "{} points, median {} px, {:.2} % within half a pixel",
+        shifts.len(),
+        shifts[shifts.len() / 2],
+        100.0 * share
+    );
+    assert!(share > 0.99 && shifts[shifts.len() / 2] < 0.1, "{share}");
+}
+
+/// Distances between the points that two views at right angles both see: the median, metres.
+fn between(folder: &Folder, views: [usize; 2], compat: bool) -> f32 {
+    let [a, b] = views.map(|view| world(folder, view, compat));
+    let points: Vec<[f32; 3]> = b.iter().map(|p| p.to_array()).collect();
+    let tree: ImmutableKdTree<f32, 3> = ImmutableKdTree::new_from_slice(&points).expect("few");
+    let queries: Vec<[f32; 3]> = a.iter().step_by(17).map(|p| p.to_array()).collect();
+    let found = tree.query_batch(&queries).nearest_one::<SquaredEuclidean<f32>>().execute();
+    median(found.iter().map(|f| f.distance.sqrt()).filter(|d| *d < 0.01).collect())
+}
+
+/// Front, back and side clouds agree in the exact layout, as far as their points are dense (1.2 mm apart in views of 2048
+/// pixels); as the published code reads the authors' layout, each is moved by half a pixel along its own camera's axes.
+#[test]
+fn clouds_agree_and_show_the_published_shift() {
+    for (resolution, bound) in [(1024, 1.5e-3), (2048, 1e-3)] {
+        let (_temporary, folder) = data_set(person(), Layout::Exact, resolution, 4, false, 1);
+        for views in [[0, 1], [2, 1], [0, 3]] {
+            let median = between(&folder, views, false);
+            println!("{resolution}, views {views:?}: {:.2} mm", 1000.0 * median);
+            assert!(median <= bound, "{views:?}: {median}");
+        }
+    }
+
+    let (_temporary, folder) = data_set(person(), Layout::Authors, 1024, 4, false, 1);
+    for compat in [false, true] {
+        println!("authors' layout, compat {compat}: {:.2} mm", 1000.0 * between(&folder, [0, 1], compat));
+    }
+    for view in [0, 2] {
+        let rotation = folder.camera(TRAIN, "0000", view).expect("reads").world_to_camera.rotation.as_mat3();
+        let (mut sum, mut expected) = (Vec3::ZERO, Vec3::ZERO);
+        let (exact, published) = (world(&folder, view, false), world(&folder, view, true));
+        let depth = folder.depth(TRAIN, "0000", view).expect("reads").depth;
+        for ((a, b), z) in exact.iter().zip(&published).zip(depth.iter().filter(|z| **z > 0.0)) {
+            sum += rotation * (*b - *a);
+            expected += Vec3::new(0.5, 0.5, 0.0) * *z / 819.2;
+        }
+        let count = exact.len() as f32;
+        println!("view {view}: shift {} mm", 1000.0 * sum / count);
+        assert!((sum - expected).length() / count < 1e-5, "{} {}", sum / count, expected / count);
+        assert!((sum / count).x > 1.1e-3);
+    }
+}
+
+#[test]
+fn stage_one_samples_are_those_of_the_published_loader() {
+    let (_temporary, folder) = data_set(person(), Layout::Authors, 128, 8, true, 2);
+    let stage = Stage1::new(folder.clone(), TRAIN, SampleConfig::compat()).expect("makes samples");
+    assert_eq!(stage.len(), 100);
+    let area = 128 * 128;
+    for index in [0, 1, 7] {
+        let item = stage.sample(index).expect("reads");
+        assert_eq!(item.images.len(), 2 * 3 * area);
+        for i in 0..2 * area {
+            let (view, pixel) = (i / area, i % area);
+            let rgb = [0, 1, 2].map(|c| item.images[(view * 3 + c) * area + pixel]);
+            assert!(rgb.iter().all(|v| (-1.0..=1.0).contains(v)));
+            if item.masks[i] == 0.0 {
+                assert_eq!(rgb, [0.0; 3], "the background is 0");
+            }
+            assert_eq!(item.masks[i], item.valid[i], "front and back see their points");
+        }
+        // Points of the front lie on its own rays, as the published code reads them: through j + ½.
+        let front = folder.camera(TRAIN, "0000", 0).expect("reads");
+        let mut depths = Vec::new();
+        for (pixel, p) in points_of(&item.points[..3 * area]).enumerate() {
+            if item.valid[pixel] == 0.0 {
+                assert!(p.z > 1e7, "the background is far away: {p}");
+                continue;
+            }
+            let at = front.focal * p.as_dvec3().truncate() / f64::from(p.z) + front.principal_point;
+            let centre = DVec2::new((pixel % 128) as f64 + 0.5, (pixel / 128) as f64 + 0.5);
+            assert!((at - centre).length() < 1e-3, "{at} {centre}");
+            depths.push(p.z);
+        }
+        assert!((median(depths) - 2.0).abs() < 0.3);
+        // The back's points lie behind the front's: the person is as deep as people are.
+        let back = points_of(&item.points[3 * area..6 * area]).zip(&item.valid[area..2 * area]);
+        let back = median(back.filter(|(_, v)| **v > 0.0).map(|(p, _)| p.z).collect());
+        assert!((1.7..2.4).contains(&back), "{back}");
+    }
+}
+
+#[test]
+fn our_samples_follow_their_seed_and_are_augmented() {
+    let (_temporary, folder) = data_set(person(), Layout::Exact, 64, 8, false, 3);
+    let make = |config: SampleConfig| Stage1::new(folder.clone(), TRAIN, config).expect("makes samples");
+    let stage = make(SampleConfig::default());
+    let images = |stage: &Stage1, index: usize| stage.sample(index).expect("reads").images;
+    assert_eq!(images(&stage, 4), images(&make(SampleConfig::default()), 4));
+    assert_ne!(images(&stage, 4), images(&stage, 4 + 3));
+    assert_ne!(images(&stage, 4), images(&stage.with_epoch(1), 4));
+    assert_ne!(images(&stage, 4), images(&make(SampleConfig { seed: 2, ..SampleConfig::default() }), 4));
+    // Augmentation changes photographs, never points.
+    let plain = make(SampleConfig { augment: Augment::none(), ..SampleConfig::default() });
+    assert_ne!(images(&stage, 4), images(&plain, 4));
+    assert_eq!(stage.sample(4).expect("reads").points, plain.sample(4).expect("reads").points);
+    // Every view is the front at some time.
+    let firsts: std::collections::HashSet<Vec<u32>> =
+        (0..90).map(|i| images(&plain, i)[..3 * 64 * 64].iter().map(|v| v.to_bits()).collect()).collect();
+    assert_eq!(firsts.len(), 8);
+}
+
+#[test]
+fn stage_two_samples_have_cameras_for_what_they_compare() {
+    for layout in [Layout::Exact, Layout::Authors] {
+        let (_temporary, folder) = data_set(person(), layout, 64, 8, true, 1);
+        let config = SampleConfig { high_resolution: true, ..SampleConfig::default() };
+        let stage = Stage2::new(folder.clone(), TRAIN, config).expect("makes samples");
+        let item = stage.sample(3).expect("reads");
+        assert_eq!((item.target_side, item.target_cameras.len()), (128, 5));
+        assert_eq!(item.targets.len(), 5 * 3 * 128 * 128);
+        // A corner shows the background.
+        let corner = [0, 1, 2].map(|c| item.targets[c * 128 * 128]);
+        assert_eq!(corner, item.background);
+        assert_ne!(item.background, [0.0; 3]);
+        // The person's pixels are where the target's camera sees the person.
+        for (view, camera) in item.target_cameras.iter().enumerate() {
+            assert_eq!((camera.width, camera.height), (128, 128));
+            let target = &item.targets[view * 3 * 128 * 128..][..128 * 128];
+            let (mut rows, mut columns) = ((128, 0), (128, 0));
+            for (pixel, value) in target.iter().enumerate() {
+                if (value - item.background[0]).abs() > 0.1 {
+                    rows = (rows.0.min(pixel / 128), rows.1.max(pixel / 128));
+                    columns = (columns.0.min(pixel % 128), columns.1.max(pixel % 128));
+                }
+            }
+            let mut expected = [f64::MAX, 0.0];
+            for p in &person().positions {
+                let (at, _) = camera.project(p.as_dvec3()).expect("in front");
+                expected = [expected[0].min(at.y), expected[1].max(at.y)];
+            }
+            let found = [rows.0 as f64, rows.1 as f64 + 1.0];
+            let off = (found[0] - expected[0]).abs().max((found[1] - expected[1]).abs());
+            assert!(off < 2.5, "{layout:?} {view}: {found:?} {expected:?}");
+        }
+        let batch = burn::data::dataloader::batcher::Batcher::batch(
+            &Stage2Batcher,
+            vec![item.clone(), item],
+            &Device::flex(),
+        );
+        assert_eq!(batch.targets.dims(), [2, 5, 3, 128, 128]);
+        assert_eq!(batch.images.dims(), [2, 2, 3, 64, 64]);
+    }
+}
+
+#[test]
+fn a_loader_gives_batches_of_stage_one() {
+    let (_temporary, folder) = data_set(person(), Layout::Exact, 64, 8, false, 2);
+    let config = SampleConfig { repeat: 3, ..SampleConfig::default() };
+    let stage = Stage1::new(folder, TRAIN, config).expect("makes samples");
+    let loader = Loader::new(stage, Stage1Batcher, 4, 2, 1, &Device::flex()).shuffled(1);
+    let batches: Vec<Stage1Batch> = loader.iter().map(|b| b.expect("loads")).collect();
+    assert_eq!(loader.num_items(), 6);
+    let shapes: Vec<[usize; 5]> = batches.iter().map(|b| b.points.dims()).collect();
+    assert_eq!(shapes, [[4, 4, 64, 64, 3], [2, 4, 64, 64, 3]]);
+}
+
+#[test]
+fn contradictions_are_refused() {
+    let (_temporary, folder) = data_set(&rectangle().0, Layout::Exact, 16, 6, false, 1);
+    let message = |config: SampleConfig| {
+        Stage1::new(folder.clone(), TRAIN, config).map(drop).expect_err("refused").to_string()
+    };
+    let compat = SampleConfig { compat: true, ..SampleConfig::default() };
+    assert!(message(compat).contains("`augment`: must be off beside `compat = true`"));
+    assert!(message(SampleConfig { repeat: 0, ..SampleConfig::default() }).contains("`repeat`"));
+    assert!(message(SampleConfig::default()).contains("6 views"));
+    let config = SampleConfig { high_resolution: true, ..SampleConfig::default() };
+    let error = Stage2::new(folder.clone(), TRAIN, config).map(drop).expect_err("refused").to_string();
+    assert!(error.contains("multiple of 4") || error.contains("high_resolution"), "{error}");
+}

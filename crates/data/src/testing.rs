@@ -1,0 +1,63 @@
+//! Small data sets for tests.
+
+use std::sync::{Arc, OnceLock};
+
+use glam::Vec3;
+use tempfile::TempDir;
+
+use crate::dataset::{Folder, Layout, Split};
+use crate::mesh::{Face, Material, Mesh};
+use crate::prepare::PrepareConfig;
+use crate::scan::{Collection, normalise};
+use crate::synth;
+
+/// One synthetic person, standing where the cameras look.
+pub fn person() -> &'static Mesh {
+    static PERSON: OnceLock<Mesh> = OnceLock::new();
+    PERSON.get_or_init(|| {
+        let mut mesh = synth::person("test/data");
+        normalise(&mut mesh, Collection::Other, None::<&mut rand_chacha::ChaCha8Rng>).expect("has height");
+        mesh
+    })
+}
+
+/// A rectangle that leans, seen from in front and from behind: its points satisfy `normal · p = 0.9`.
+pub fn rectangle() -> (Mesh, Vec3) {
+    let (right, up) = (Vec3::new(0.8, 0.0, 0.25), Vec3::new(0.1, 0.9, 0.2));
+    let centre = Vec3::new(0.0, 0.9, 0.05);
+    let corners = [(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)];
+    let normal = right.cross(up).normalize();
+    let mesh = Mesh {
+        positions: corners.map(|(a, b)| centre + a * right + b * up).to_vec(),
+        faces: [[0, 1, 2], [0, 2, 3]]
+            .map(|positions| Face { positions, texcoords: None, material: 0 })
+            .to_vec(),
+        materials: vec![Material { color: Vec3::new(0.9, 0.5, 0.2), texture: None }],
+        ..Mesh::default()
+    };
+    (mesh, normal * (0.9 / normal.dot(centre)))
+}
+
+/// A data set of `subjects` times the same mesh, in train.
+pub fn data_set(
+    mesh: &Mesh,
+    layout: Layout,
+    resolution: u32,
+    views: usize,
+    high_resolution: bool,
+    subjects: usize,
+) -> (TempDir, Arc<Folder>) {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let root = temporary.path().join(format!("people_{resolution}_{views}"));
+    let mut config = PrepareConfig::default();
+    config.views.layout = layout;
+    config.views.resolution = resolution;
+    config.views.count = views;
+    config.views.high_resolution = high_resolution;
+    let folder = Folder::create(&root, config.description("a test")).expect("makes the folder");
+    for subject in 0..subjects {
+        let name = format!("{subject:04}");
+        config.add(&folder, Split::Train, &name, mesh, 0.0, &name).expect("adds a subject");
+    }
+    (temporary, Arc::new(folder))
+}
