@@ -92,11 +92,12 @@ fn between(folder: &Folder, views: [usize; 2], compat: bool) -> f32 {
     median(found.iter().map(|f| f.distance.sqrt()).filter(|d| *d < 0.01).collect())
 }
 
-/// Front, back and side clouds agree in the exact layout, as far as their points are dense (1.2 mm apart in views of 2048
-/// pixels); as the published code reads the authors' layout, each is moved by half a pixel along its own camera's axes.
+/// Front, back and side clouds agree in the exact layout, as far as their points are dense (2.4 mm apart in views of 1024
+/// pixels, half of that in views of 2048); as the published code reads the authors' layout, each is moved by half a pixel
+/// along its own camera's axes.
 #[test]
 fn clouds_agree_and_show_the_published_shift() {
-    for (resolution, bound) in [(1024, 1.5e-3), (2048, 1e-3)] {
+    for (resolution, bound) in [(1024, 2e-3), (2048, 1e-3)] {
         let (_temporary, folder) = data_set(person(), Layout::Exact, resolution, 4, false, 1);
         for views in [[0, 1], [2, 1], [0, 3]] {
             let median = between(&folder, views, false);
