@@ -11,16 +11,19 @@ use crate::DataError;
 use crate::dataset::{Description, Folder, Layout, MAX_RESOLUTION, MAX_VIEWS, Split};
 use crate::mesh::Mesh;
 use crate::random::stream;
+use crate::sample::SampleConfig;
 use crate::view::{Lights, Renderer, ViewOptions};
 
-/// How subjects become views: `configs/data/*.toml`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+/// How subjects become views, and views samples: `configs/data/*.toml`.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-pub struct PrepareConfig {
+pub struct DataConfig {
     /// Which views.
     pub views: ViewsConfig,
     /// How cameras stray from the training orbit.
     pub jitter: JitterConfig,
+    /// How training makes samples of the views; nothing to `prepare`.
+    pub samples: SampleConfig,
 }
 
 /// Which views.
@@ -67,14 +70,8 @@ pub struct Jitter {
     pub look_at: f64,
 }
 
-impl Default for PrepareConfig {
-    /// The published cameras in our exact layout.
-    fn default() -> Self {
-        Self { views: ViewsConfig::default(), jitter: JitterConfig::default() }
-    }
-}
-
 impl Default for ViewsConfig {
+    /// The published cameras in our exact layout.
     fn default() -> Self {
         Self { count: 24, resolution: 1024, high_resolution: false, samples: 3, layout: Layout::Exact }
     }
@@ -109,7 +106,7 @@ impl Jitter {
     }
 }
 
-impl PrepareConfig {
+impl DataConfig {
     /// The first key that makes no sense, and why.
     pub fn problem(&self) -> Option<(String, String)> {
         let ViewsConfig { count, resolution, samples, .. } = self.views;
@@ -124,9 +121,10 @@ impl PrepareConfig {
             return Some(("views.samples".into(), format!("is {samples}, must be 1 to 6")));
         }
         let sections = [("jitter.rig", &self.jitter.rig), ("jitter.view", &self.jitter.view)];
-        sections.into_iter().find_map(|(section, jitter)| {
+        let jitter = sections.into_iter().find_map(|(section, jitter)| {
             jitter.problem().map(|(key, message)| (format!("{section}.{key}"), message))
-        })
+        });
+        jitter.or_else(|| self.samples.problem().map(|(key, message)| (format!("samples.{key}"), message)))
     }
 
     /// What a data set made with this config says of itself.
@@ -216,7 +214,7 @@ mod tests {
 
     #[test]
     fn without_jitter_the_cameras_are_the_published_ones() {
-        let cameras = PrepareConfig::default().cameras(30.0, "a");
+        let cameras = DataConfig::default().cameras(30.0, "a");
         assert_eq!(cameras.len(), 24);
         assert_eq!(cameras[0], Camera::orbit_at_yaw_degrees(30.0, 1024));
         assert_eq!(cameras[12], Camera::orbit_at_yaw_degrees(210.0, 1024));
@@ -225,7 +223,7 @@ mod tests {
     #[test]
     fn jitter_stays_in_its_ranges_and_follows_the_name() {
         let jitter = Jitter { yaw: 5.0, pitch: 4.0, roll: 3.0, distance: 0.2, focal: 0.1, look_at: 0.05 };
-        let mut config = PrepareConfig::default();
+        let mut config = DataConfig::default();
         config.jitter.view = jitter;
         let cameras = |name: &str| config.cameras(0.0, name);
         assert_eq!(cameras("a"), cameras("a"));

@@ -7,7 +7,7 @@ use tempfile::TempDir;
 
 use crate::dataset::{Folder, Layout, Split};
 use crate::mesh::{Face, Material, Mesh};
-use crate::prepare::PrepareConfig;
+use crate::prepare::DataConfig;
 use crate::scan::{Collection, normalise};
 use crate::synth;
 
@@ -49,7 +49,7 @@ pub fn data_set(
 ) -> (TempDir, Arc<Folder>) {
     let temporary = tempfile::tempdir().expect("temporary folder");
     let root = temporary.path().join(format!("people_{resolution}_{views}"));
-    let mut config = PrepareConfig::default();
+    let mut config = DataConfig::default();
     config.views.layout = layout;
     config.views.resolution = resolution;
     config.views.count = views;

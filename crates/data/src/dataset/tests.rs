@@ -1,5 +1,5 @@
 use super::*;
-use crate::prepare::PrepareConfig;
+use crate::prepare::DataConfig;
 use crate::testing::{data_set, rectangle};
 
 const TRAIN: Option<Split> = Some(Split::Train);
@@ -63,12 +63,12 @@ fn folders_of_the_authors_tools_are_recognised() {
 #[test]
 fn the_authors_folder_must_be_called_as_their_loader_wants_it() {
     let temporary = tempfile::tempdir().expect("temporary folder");
-    let mut config = PrepareConfig::default();
+    let mut config = DataConfig::default();
     config.views.layout = Layout::Authors;
     let create = |name: &str| Folder::create(&temporary.path().join(name), config.description("a test"));
     assert!(create("people").expect_err("refused").to_string().contains("must end in `_1024_24`"));
     assert!(create("people_1024_24").is_ok());
-    let other = PrepareConfig::default().description("a test");
+    let other = DataConfig::default().description("a test");
     let error = Folder::create(&temporary.path().join("people_1024_24"), other).expect_err("another");
     assert!(error.to_string().contains("describes another data set"), "{error}");
 }
@@ -86,7 +86,7 @@ fn a_killed_run_leaves_no_half_subject() {
     assert!(!folder.has(Split::Train, "0002"));
     let problems = check(root, |_, _| {}).expect("checks").problems;
     assert_eq!(problems.len(), 2, "{problems:?}");
-    let mut config = PrepareConfig::default();
+    let mut config = DataConfig::default();
     config.views =
         crate::prepare::ViewsConfig { count: 4, resolution: 64, high_resolution: true, ..config.views };
     config.add(&folder, Split::Train, "0002", &rectangle().0, 0.0, "0002").expect("adds");

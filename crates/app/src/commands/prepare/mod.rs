@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use clap::{Args, Subcommand, ValueEnum};
 use snapsnap_data::dataset::{Folder, Split};
 use snapsnap_data::mesh::Mesh;
-use snapsnap_data::prepare::{PrepareConfig, Shard};
+use snapsnap_data::prepare::{DataConfig, Shard};
 use snapsnap_data::random::stream;
 use snapsnap_data::scan::{Collection, normalise};
 use snapsnap_data::{DataError, export};
@@ -95,7 +95,7 @@ struct Common {
 }
 
 impl Common {
-    fn config(&self) -> Result<PrepareConfig, Failure> {
+    fn config(&self) -> Result<DataConfig, Failure> {
         let (text, origin) = match &self.config {
             Some(path) => {
                 let text = std::fs::read_to_string(path).map_err(|e| {
@@ -105,7 +105,7 @@ impl Common {
             }
             None => (String::new(), "the built-in config".to_owned()),
         };
-        let (config, origin): (PrepareConfig, String) = parse(&text, &origin, &self.set)?;
+        let (config, origin): (DataConfig, String) = parse(&text, &origin, &self.set)?;
         match config.problem() {
             Some((key, message)) => Err(Failure::Input(format!("{origin}: `{key}`: {message}"))),
             None => Ok(config),

@@ -1,0 +1,87 @@
+//! Samples per second and memory of the loader: `cargo bench --workspace --bench samples -- [--full]`. With `--full`, memory
+//! over 10,000 samples.
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use burn::data::dataloader::DataLoader;
+use burn::tensor::Device;
+use peak_alloc::PeakAlloc;
+use snapsnap_data::dataset::{Folder, Layout, Split};
+use snapsnap_data::prepare::DataConfig;
+use snapsnap_data::sample::{Augment, Loader, SampleConfig, Stage1, Stage1Batcher, Stage2, Stage2Batcher};
+use snapsnap_data::synth;
+
+#[global_allocator]
+static ALLOCATOR: PeakAlloc = PeakAlloc;
+
+const SUBJECTS: usize = 4;
+
+fn data_set(root: &std::path::Path, layout: Layout, resolution: u32) -> Arc<Folder> {
+    let mut config = DataConfig::default();
+    config.views.layout = layout;
+    config.views.resolution = resolution;
+    config.views.samples = 1;
+    let folder =
+        Folder::create(&root.join(format!("{layout:?}_{resolution}_24")), config.description("bench"));
+    let folder = folder.expect("makes the folder");
+    for index in 0..SUBJECTS {
+        let (subject, mesh) = (format!("{index:04}"), synth::person(&format!("bench/{index}")));
+        config.add(&folder, Split::Train, &subject, &mesh, 0.0, &subject).expect("adds a subject");
+    }
+    Arc::new(folder)
+}
+
+/// Loads `count` samples one by one; prints rate and peak memory.
+fn measure<O>(name: &str, loader: &dyn DataLoader<O>, count: usize) {
+    ALLOCATOR.reset_peak_usage();
+    let before = ALLOCATOR.current_usage_as_mb();
+    let start = Instant::now();
+    let mut loaded = 0;
+    'all: loop {
+        for batch in loader.iter() {
+            batch.expect("loads");
+            loaded += 1;
+            if [100, 1000, 10_000].contains(&loaded) || loaded == count {
+                let rate = loaded as f64 / start.elapsed().as_secs_f64();
+                let peak = ALLOCATOR.peak_usage_as_mb() - before;
+                println!("| {name} | {loaded} | {rate:.1} | {peak:.0} MB |");
+            }
+            if loaded == count {
+                break 'all;
+            }
+        }
+    }
+}
+
+fn main() {
+    let full = std::env::args().any(|argument| argument == "--full");
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let device = Device::flex();
+    let ours = SampleConfig::default();
+    let plain = SampleConfig { augment: Augment::none(), ..SampleConfig::default() };
+    let compat = SampleConfig { high_resolution: false, ..SampleConfig::compat() };
+    println!("| samples | loaded | per second | peak memory |\n|---|---:|---:|---:|");
+    for resolution in [512, 1024] {
+        let exact = data_set(temporary.path(), Layout::Exact, resolution);
+        let authors = data_set(temporary.path(), Layout::Authors, resolution);
+        let sets = [
+            ("exact, ours", &exact, &ours),
+            ("exact, not augmented", &exact, &plain),
+            ("authors' layout, compat", &authors, &compat),
+        ];
+        for (name, folder, config) in sets {
+            let stage = Stage1::new(folder.clone(), Some(Split::Train), config.clone()).expect("samples");
+            let loader = Loader::new(stage, Stage1Batcher, 1, 2, 2, &device);
+            measure(&format!("stage 1, {resolution}², {name}"), &loader, 100);
+            let stage = Stage2::new(folder.clone(), Some(Split::Train), config.clone()).expect("samples");
+            let loader = Loader::new(stage, Stage2Batcher, 1, 2, 2, &device);
+            measure(&format!("stage 2, {resolution}², {name}"), &loader, 100);
+        }
+        if full && resolution == 512 {
+            let stage = Stage1::new(exact, Some(Split::Train), ours.clone()).expect("samples");
+            let loader = Loader::new(stage, Stage1Batcher, 1, 2, 2, &device).shuffled(1);
+            measure("stage 1, 512², exact, ours", &loader, 10_000);
+        }
+    }
+}

@@ -1,0 +1,264 @@
+//! `snapsnap prepare` as a user types it: people and scans become data sets, what is broken is named, and what was begun is
+//! finished.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+use snapsnap_tests::{refused, shared, snapsnap, succeed};
+
+/// Small and few views.
+const SMALL: [&str; 4] = ["--set", "views.count=4", "--set", "views.resolution=64"];
+/// Address space that a refusal may take, in kilobytes: a tenth of what the headers below promise.
+const MEMORY: u64 = 3_000_000;
+
+fn prepare(kind: &str) -> Command {
+    let mut command = snapsnap();
+    command.args(["prepare", kind]);
+    command
+}
+
+/// Every file below a folder, by its path, with its content.
+fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+    let mut found = BTreeMap::new();
+    for entry in fs::read_dir(folder).expect("list").map(|entry| entry.expect("entry").path()) {
+        if entry.is_dir() {
+            found.extend(files(&entry).into_iter().map(|(path, content)| (path, content)));
+        } else {
+            found.insert(entry.clone(), fs::read(&entry).expect("read"));
+        }
+    }
+    found
+        .into_iter()
+        .map(|(path, content)| (path.strip_prefix(folder).map(Path::to_owned).unwrap_or(path), content))
+        .collect()
+}
+
+fn synth(folder: &Path, subjects: &str) -> Command {
+    let mut command = prepare("synth");
+    command.args(["--subjects", subjects, "--seed", "3", "-o"]).arg(folder).args(SMALL);
+    command
+}
+
+#[test]
+fn synthetic_people_become_a_data_set_that_has_no_fault() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let (folder, sheet) = (temporary.path().join("people"), temporary.path().join("sheet.png"));
+    succeed(synth(&folder, "3").arg("--save-scans").arg("--preview").arg(&sheet));
+    let report = succeed(prepare("check").arg(&folder));
+    assert!(report.contains("3 subjects, 12 views: no fault"), "{report}");
+    let sheet = image::open(&sheet).expect("a picture").into_rgb8();
+    let colors: std::collections::HashSet<[u8; 3]> = sheet.pixels().map(|p| p.0).collect();
+    assert!(sheet.width() == 9 * 144 && colors.len() > 500, "{:?}", sheet.dimensions());
+
+    // Both roads meet: the scan that was kept gives the same person.
+    let scans = folder.join("scans/train/0001");
+    let again = temporary.path().join("again");
+    succeed(prepare("scan").arg(&scans).arg("-o").arg(&again).args(SMALL).args(["--split", "val"]));
+    let val = temporary.path().join("val");
+    succeed(prepare("scan").arg(&scans).arg("-o").arg(&val).args(SMALL).args(["--split", "val"]));
+    assert_eq!(files(&again), files(&val));
+    assert!(again.join("val/img/0001/3.png").is_file());
+}
+
+#[test]
+fn shards_and_reruns_give_what_one_run_gives() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let (whole, shared) = (temporary.path().join("whole"), temporary.path().join("shared"));
+    succeed(&mut synth(&whole, "4"));
+    succeed(synth(&shared, "4").args(["--shard", "1/2"]));
+    assert!(!shared.join("train/img/0000").exists() && shared.join("train/img/0003").exists());
+    // A finished subject is left alone.
+    let kept = shared.join("train/img/0001/0.png");
+    fs::write(&kept, "kept").expect("write");
+    succeed(synth(&shared, "4").args(["--shard", "0/2"]));
+    assert_eq!(fs::read(&kept).expect("read"), b"kept");
+    fs::remove_dir_all(shared.join("train/img/0001")).expect("remove");
+    succeed(&mut synth(&shared, "4"));
+    assert!(files(&whole) == files(&shared), "the same bytes");
+
+    let message = refused(synth(&shared, "4").args(["--set", "views.resolution=32"]));
+    assert!(message.contains("dataset.toml") && message.contains("another data set"), "{message}");
+}
+
+/// Killed at any moment, a run leaves whole subjects only, and another run does the rest.
+#[test]
+#[cfg(unix)]
+fn a_killed_run_is_finished_by_the_next() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let folder = temporary.path().join("people");
+    for signal in ["-INT", "-KILL"] {
+        let mut child = synth(&folder, "6").stderr(Stdio::null()).spawn().expect("starts");
+        let start = Instant::now();
+        // In the midst of a subject that is not the first of this run.
+        let before = count(&folder);
+        while count(&folder) == before && start.elapsed() < Duration::from_secs(60) {
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        let pid = child.id().to_string();
+        assert!(Command::new("kill").args([signal, &pid]).status().expect("kill").success());
+        child.wait().expect("ends");
+        assert!(count(&folder) > before && count(&folder) < 6, "{} subjects", count(&folder));
+        if signal == "-INT" {
+            assert!(
+                !folder.join(".unfinished").exists()
+                    || folder.join(".unfinished").read_dir().expect("list").count() == 0
+            );
+            let report = succeed(prepare("check").arg(&folder));
+            assert!(report.contains("no fault"), "{report}");
+        }
+    }
+    succeed(&mut synth(&folder, "6"));
+    assert!(succeed(prepare("check").arg(&folder)).contains("6 subjects, 24 views: no fault"));
+}
+
+fn count(folder: &Path) -> usize {
+    fs::read_dir(folder.join("train/img")).map_or(0, Iterator::count)
+}
+
+#[test]
+fn makehuman_people_become_a_data_set() {
+    let data = shared("makehuman");
+    if !data.is_dir() {
+        println!("SKIPPED: {} is not there", data.display());
+        return;
+    }
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let make = |name: &str, split: &str| {
+        let folder = temporary.path().join(name);
+        let mut command = prepare("makehuman");
+        command.arg(&data).args(["--subjects", "2", "--seed", "5", "--split", split, "-o"]).arg(&folder);
+        succeed(command.args(SMALL));
+        folder
+    };
+    let (first, again, val) = (make("a", "train"), make("b", "train"), make("c", "val"));
+    assert!(succeed(prepare("check").arg(&first)).contains("2 subjects, 8 views: no fault"));
+    assert!(files(&first) == files(&again), "the same bytes");
+    let picture =
+        |folder: &Path, split: &str| fs::read(folder.join(split).join("img/0000/0.png")).expect("read");
+    assert_ne!(picture(&first, "train"), picture(&val, "val"), "no one is in two splits");
+}
+
+#[test]
+fn real_scans_with_several_materials_are_imported() {
+    let scans = shared("samples/scans");
+    if !scans.is_dir() {
+        println!("SKIPPED: {} is not there", scans.display());
+        return;
+    }
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let folder = temporary.path().join("scans_128_4");
+    let layout = ["--set", "views.layout=authors", "--set", "views.count=4", "--set", "views.resolution=128"];
+    succeed(
+        prepare("scan").arg(&scans).arg("-o").arg(&folder).args(["--collection", "thuman2.0"]).args(layout),
+    );
+    // Subjects 0 and 1 are on the published list.
+    assert!(folder.join("val/parm/0001/3_extrinsic.npy").is_file());
+    assert!(succeed(prepare("check").arg(&folder)).contains("2 subjects, 8 views: no fault"));
+    let picture = image::open(folder.join("val/img/0000/0.jpg")).expect("a picture").into_rgb8();
+    // Scan 0000 wears a shirt of dark red and teal over a skirt of green and violet.
+    let is_seen = |near: [i32; 3]| {
+        picture.pixels().filter(|p| (0..3).all(|c| (i32::from(p.0[c]) - near[c]).abs() < 40)).count() > 100
+    };
+    assert!(is_seen([55, 45, 140]) && is_seen([45, 75, 25]), "the skirt's colours");
+}
+
+/// Corrupt scans among sound ones: each is named with the reason, the rest is made, memory stays bounded.
+#[test]
+#[cfg(unix)]
+fn broken_scans_are_named_and_skipped() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let scans = temporary.path().join("scäns with spaces 人");
+    let write = |name: &str, content: &[u8]| {
+        let path = scans.join(name).join(name);
+        fs::create_dir_all(path.parent().expect("a folder")).expect("make");
+        fs::write(path, content).expect("write");
+    };
+    let pyramid = "v -0.3 0 -0.3\nv 0.3 0 -0.3\nv 0 0 0.4\nv 0 1.7 0\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n";
+    let billion = "ply\nformat binary_little_endian 1.0\nelement vertex 1000000000\nproperty float x\nproperty float y\n\
+                   property float z\nelement face 1000000000\nproperty list uchar int vertex_indices\nend_header\n1234";
+    write("sound one.obj", pyramid.as_bytes());
+    write("trüncated.obj", pyramid.split_at(pyramid.len() - 8).0.replace("f 1 2 4", "f 1 2 x").as_bytes());
+    write("billion.ply", billion.as_bytes());
+    write("nan.obj", pyramid.replacen("1.7", "nan", 1).as_bytes());
+    write("no triangle.obj", b"v 0 0 0\nv 0 1 0\n");
+    write("flat.obj", b"v 0 0 0\nv 1 0 0\nv 0 0 1\nf 1 2 3\n");
+    write("absent texture.obj", format!("mtllib a.mtl\n{pyramid}").as_bytes());
+    fs::write(scans.join("absent texture.obj/a.mtl"), "newmtl a\nmap_Kd skin.png\n").expect("write");
+    // A bitmap of 100,000 × 100,000 pixels.
+    let mut absurd =
+        b"BM\x36\0\0\0\0\0\0\0\x36\0\0\0\x28\0\0\0\xa0\x86\x01\0\xa0\x86\x01\0\x01\0\x18\0".to_vec();
+    absurd.resize(200, 0);
+    write("absurd texture.obj", format!("mtllib a.mtl\n{pyramid}").as_bytes());
+    fs::write(scans.join("absurd texture.obj/a.mtl"), "newmtl a\nmap_Kd skin.bmp\n").expect("write");
+    fs::write(scans.join("absurd texture.obj/skin.bmp"), absurd).expect("write");
+
+    let program = snapsnap().get_program().to_owned();
+    let out = temporary.path().join("out");
+    let mut command = Command::new("sh");
+    command.arg("-c").arg(format!("ulimit -v {MEMORY}; exec \"$@\"")).arg("sh").arg(program);
+    command.args(["prepare", "scan"]).arg(&scans).arg("-o").arg(&out).args(SMALL);
+    let message = refused(&mut command);
+    let expected = [
+        ("trüncated.obj", "face parse error"),
+        ("billion.ply", "of 1000000000: `y` is missing"),
+        ("nan.obj", "position 3 is not finite"),
+        ("no triangle.obj", "there is no triangle"),
+        ("flat.obj", "the mesh has no height"),
+        ("absent texture.obj", "texture `skin.png` is missing"),
+        ("skin.bmp", "Image too large"),
+        ("", "7 of 8 subjects could not be made; the others are there"),
+    ];
+    for (name, reason) in expected {
+        let found = message.lines().any(|line| line.contains(name) && line.contains(reason));
+        assert!(found, "{name}: {reason}\n{message}");
+    }
+    assert_eq!(count(&out), 1, "the sound one is there");
+    assert!(succeed(prepare("check").arg(&out)).contains("1 subjects, 4 views: no fault"));
+}
+
+#[test]
+fn wrong_arguments_are_refused_before_any_work() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let out = temporary.path().join("out");
+    let refusal = |arguments: &[&str]| {
+        let message = refused(prepare("synth").arg("-o").arg(&out).args(arguments));
+        assert!(!out.exists(), "{arguments:?} wrote something");
+        message
+    };
+    let table: [(&[&str], &str); 9] = [
+        (&["--subjects", "0"], "--subjects is 0, must be 1 to"),
+        (&["--shard", "2/2"], "`2/2` is no shard"),
+        (&["--set", "views.count=0"], "`views.count`: is 0, must be 1 to 4096"),
+        (&["--set", "views.resolution=9000"], "`views.resolution`"),
+        (&["--set", "jitter.view.pitch=-1"], "`jitter.view.pitch`: is -1"),
+        (&["--set", "samples.compat=true"], "`samples.augment`: must be off beside `compat = true`"),
+        (&["--set", "views.colour=1"], "unknown field `colour`"),
+        (&["--config", "/no/such.toml"], "/no/such.toml: cannot read the config"),
+        (&["--set", "views.layout=authors"], "must end in `_1024_24`"),
+    ];
+    for (arguments, expected) in table {
+        let message = refusal(arguments);
+        assert!(message.contains(expected), "{arguments:?}: {message}");
+    }
+    let message = refused(prepare("check").arg(temporary.path()));
+    assert!(message.contains("is no data set"), "{message}");
+    let message = refused(prepare("makehuman").arg(temporary.path()).arg("-o").arg(&out));
+    assert!(message.contains("is no MakeHuman data"), "{message}");
+}
+
+/// The configs that are shipped are understood, and say what their comments say.
+#[test]
+fn shipped_configs_are_understood() {
+    let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/data");
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    for (name, folder) in [("published", "a_64_4"), ("training", "b"), ("evaluation", "c")] {
+        let folder = temporary.path().join(folder);
+        let mut command = prepare("synth");
+        command.args(["--subjects", "1", "--config"]).arg(configs.join(name).with_extension("toml"));
+        succeed(command.arg("-o").arg(&folder).args(SMALL));
+        assert!(succeed(prepare("check").arg(&folder)).contains("no fault"), "{name}");
+    }
+}
