@@ -1,6 +1,15 @@
 //! What can go wrong on this floor.
 
+use std::fs::File;
 use std::path::{Path, PathBuf};
+
+/// Opens a regular file: reading a pipe or a device might never end.
+pub(crate) fn open(path: &Path) -> Result<File, DataError> {
+    if std::fs::metadata(path).is_ok_and(|metadata| !metadata.is_file() && !metadata.is_dir()) {
+        return Err(DataError::unsuitable(path, "is no regular file"));
+    }
+    File::open(path).map_err(DataError::read(path))
+}
 
 /// Errors of photographs, scans and data sets; each names its file.
 #[derive(Debug, thiserror::Error)]
@@ -50,6 +59,9 @@ impl DataError {
 
     /// A camera file's error, which names the file itself.
     pub(crate) fn splat(path: &Path, error: snapsnap_splat::SplatError) -> Self {
+        if let snapsnap_splat::SplatError::Write { source, .. } = error {
+            return Self::Write { path: path.to_owned(), source };
+        }
         let message = error.to_string();
         let message = message.strip_prefix(&format!("{}: ", path.display())).unwrap_or(&message).to_owned();
         Self::Unsuitable { path: path.to_owned(), message }

@@ -116,7 +116,6 @@ pub fn load(
     if canvas.valid.contains(&true) { Ok(canvas) } else { Err(empty()) }
 }
 
-/// Reads an image and turns it as its EXIF orientation says.
 /// A mask picture's brightness, on black where it is transparent.
 fn grey(picture: &DynamicImage) -> GrayImage {
     let pixels = picture.to_luma_alpha8();

@@ -1,20 +1,19 @@
 //! Picture files, photographs and textures alike.
 
-use std::fs::File;
 use std::io::{BufRead, BufReader, Cursor, Seek};
 use std::path::Path;
 
 use image::{DynamicImage, ImageDecoder, ImageReader};
 
 use crate::DataError;
+use crate::error::open;
 
 /// Pictures above this number of pixels are refused before they are decoded: 16 bytes each are needed at least.
 const MAX_PIXELS: u64 = 256_000_000;
 
 /// The picture in `path`, turned upright as its EXIF data say.
 pub fn decode(path: &Path) -> Result<DynamicImage, DataError> {
-    let file = File::open(path).map_err(DataError::read(path))?;
-    decode_from(path, BufReader::new(file))
+    decode_from(path, BufReader::new(open(path)?))
 }
 
 /// The picture in `bytes`, which are a part of `path`.

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use snapsnap_splat::{Camera, Orbit};
 
 use crate::DataError;
-use crate::dataset::{Description, Folder, Layout, MAX_RESOLUTION, MAX_VIEWS, Split};
+use crate::dataset::{Description, Drawn, Folder, Layout, MAX_RESOLUTION, MAX_VIEWS, Made, Split};
 use crate::mesh::Mesh;
 use crate::random::stream;
 use crate::sample::SampleConfig;
@@ -94,6 +94,18 @@ impl Jitter {
         Some((key, format!("is {value}, must be 0 to {limit}")))
     }
 
+    /// How far both can stray together.
+    fn plus(&self, other: &Self) -> Self {
+        Self {
+            yaw: 0.0,
+            pitch: self.pitch + other.pitch,
+            roll: 0.0,
+            distance: self.distance + other.distance,
+            focal: self.focal + other.focal,
+            look_at: self.look_at + other.look_at,
+        }
+    }
+
     fn apply(&self, orbit: &mut Orbit, random: &mut impl Rng) {
         // Drawn even where the range is 0, so that one range does not change what another draws.
         let mut stray = |range: f64| range * random.random_range(-1.0..1.0);
@@ -120,7 +132,9 @@ impl DataConfig {
         if !(1..=6).contains(&samples) {
             return Some(("views.samples".into(), format!("is {samples}, must be 1 to 6")));
         }
-        let sections = [("jitter.rig", &self.jitter.rig), ("jitter.view", &self.jitter.view)];
+        let JitterConfig { rig, view } = &self.jitter;
+        let sections =
+            [("jitter.rig", rig), ("jitter.view", view), ("jitter.rig and jitter.view: ", &rig.plus(view))];
         let jitter = sections.into_iter().find_map(|(section, jitter)| {
             jitter.problem().map(|(key, message)| (format!("{section}.{key}"), message))
         });
@@ -137,6 +151,7 @@ impl DataConfig {
             high_resolution,
             pixel_centre: if layout == Layout::Authors { 0.0 } else { 0.5 },
             source: source.to_owned(),
+            drawn: Some(Drawn { samples: self.views.samples, jitter: self.jitter.clone() }),
         }
     }
 
@@ -159,7 +174,7 @@ impl DataConfig {
     /// sets, which decides what is random about its cameras.
     ///
     /// # Errors
-    /// [`DataError`] for a mesh that cannot be drawn and for files that cannot be written.
+    /// [`DataError`] for a mesh that cannot be drawn or that a camera does not see, and for files that cannot be written.
     pub fn add(
         &self,
         folder: &Folder,
@@ -168,7 +183,7 @@ impl DataConfig {
         mesh: &Mesh,
         yaw_degrees: f64,
         name: &str,
-    ) -> Result<(), DataError> {
+    ) -> Result<Made, DataError> {
         let renderer = Renderer::new(mesh).map_err(|e| DataError::unsuitable(folder.root(), e))?;
         let options = ViewOptions { samples: self.views.samples, lights: Lights::default() };
         let cameras = self.cameras(yaw_degrees, name);

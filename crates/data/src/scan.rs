@@ -1,5 +1,6 @@
 //! Scans of people: where the known sets keep which subject, and how a scan is stood up for the cameras.
 
+use std::collections::HashSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -7,7 +8,7 @@ use glam::{Mat3, Vec3};
 use rand::Rng;
 use serde::{Deserialize, Serialize};
 
-use crate::dataset::{Split, check_subject_name};
+use crate::dataset::Split;
 use crate::mesh::{Mesh, MeshError};
 use crate::{DataError, import};
 
@@ -40,9 +41,11 @@ pub enum Collection {
 }
 
 impl Collection {
-    /// Where a subject belongs: the published lists for THuman; other sets are trained on unless told otherwise.
+    /// Where a subject belongs: the published lists for THuman; 2K2K and 4D-Dress are
+    /// tested on, others trained on (SNAPSNAP §5.1).
     pub fn split(self, subject: &str) -> Split {
-        match (self, subject.parse::<u32>()) {
+        match (self.of(subject), subject.parse::<u32>()) {
+            (Self::TwoK2K | Self::FourDDress, _) => Split::Test,
             (Self::Thuman20, Ok(id)) if VALIDATION.contains(&id) => Split::Val,
             (Self::Thuman21, Ok(id)) if LOOSE.contains(&id) => Split::Test,
             _ => Split::Train,
@@ -116,7 +119,7 @@ pub fn find(root: &Path) -> Result<Vec<Source>, DataError> {
     if root.is_file() {
         paths.push(root.to_owned());
     } else {
-        search(root, 0, &mut paths)?;
+        search(root, 0, &mut HashSet::new(), &mut paths)?;
     }
     if paths.is_empty() {
         let message = format!("holds no scan: no file .{}", import::EXTENSIONS.join(", ."));
@@ -128,8 +131,8 @@ pub fn find(root: &Path) -> Result<Vec<Source>, DataError> {
         let (name, folder) = (stem(path), path.parent().unwrap_or(root));
         let tells = folder == root || root == path || stem(folder) == name || name.parse::<u32>().is_ok();
         let name = if tells { name } else { format!("{}-{name}", stem(folder)) };
-        let subject = name.parse::<u32>().map_or(name, |number| format!("{number:04}"));
-        check_subject_name(&subject).map_err(|e| DataError::unsuitable(path, e))?;
+        let subject =
+            name.parse::<u32>().map_or_else(|_| subject_name(&name), |number| format!("{number:04}"));
         if let Some(other) = sources.iter().find(|other| other.subject == subject) {
             let message = format!("and {} would both be subject {subject}", other.path.display());
             return Err(DataError::unsuitable(path, message));
@@ -139,7 +142,22 @@ pub fn find(root: &Path) -> Result<Vec<Source>, DataError> {
     Ok(sources)
 }
 
-fn search(folder: &Path, depth: usize, found: &mut Vec<PathBuf>) -> Result<(), DataError> {
+/// A name that is one folder on every system.
+fn subject_name(name: &str) -> String {
+    let fine = |c: char| c.is_alphanumeric() || "-_. ".contains(c);
+    name.chars().take(60).map(|c| if fine(c) { c } else { '_' }).collect()
+}
+
+fn search(
+    folder: &Path,
+    depth: usize,
+    visited: &mut HashSet<PathBuf>,
+    found: &mut Vec<PathBuf>,
+) -> Result<(), DataError> {
+    // Links may lead round in circles.
+    if !visited.insert(folder.canonicalize().unwrap_or_else(|_| folder.to_owned())) {
+        return Ok(());
+    }
     let mut entries = Vec::new();
     for entry in fs::read_dir(folder).map_err(DataError::read(folder))? {
         entries.push(entry.map_err(DataError::read(folder))?.path());
@@ -156,18 +174,17 @@ fn search(folder: &Path, depth: usize, found: &mut Vec<PathBuf>) -> Result<(), D
     }
     for path in entries {
         let hidden = path.file_name().is_some_and(|name| name.to_string_lossy().starts_with('.'));
+        // Some systems leave hidden files beside those they copy.
+        if hidden {
+            continue;
+        }
         if is_scan(&path) {
             found.push(path);
-        } else if path.is_dir() && !hidden && depth < MAX_DEPTH {
-            search(&path, depth + 1, found)?;
+        } else if path.is_dir() && depth < MAX_DEPTH {
+            search(&path, depth + 1, visited, found)?;
         }
     }
     Ok(())
-}
-
-/// The training subjects of THuman2.0.
-pub fn training_ids() -> impl Iterator<Item = u32> {
-    (0..526).filter(|id| !VALIDATION.contains(id))
 }
 
 /// Stands a scan up: axes, height, feet on y = 0 (SNAPSNAP §5.4). With `jitter`, as for training: another height, and not
@@ -212,8 +229,6 @@ pub fn normalise(
 
 #[cfg(test)]
 mod tests {
-    use std::collections::HashSet;
-
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
 
@@ -229,7 +244,8 @@ mod tests {
 
     #[test]
     fn the_lists_are_those_of_the_paper() {
-        assert_eq!(training_ids().count(), 426);
+        let train = (0..526).filter(|id| Collection::Thuman20.split(&id.to_string()) == Split::Train);
+        assert_eq!(train.count(), 426);
         assert_eq!(VALIDATION.iter().collect::<HashSet<_>>().len(), 100);
         assert_eq!(LOOSE.iter().collect::<HashSet<_>>().len(), 50);
         assert!(LOOSE.iter().all(|id| (526..2500).contains(id)));
@@ -247,9 +263,16 @@ mod tests {
         let subjects = |below: &str| -> Vec<String> {
             find(&root.join(below)).expect("finds").into_iter().map(|source| source.subject).collect()
         };
-        ["th/0007/0007.obj", "th/0007/other.ply", "th/12/12.OBJ", "th/.x/a.obj", "th/notes.txt"]
-            .into_iter()
-            .for_each(touch);
+        [
+            "th/0007/0007.obj",
+            "th/0007/other.ply",
+            "th/12/12.OBJ",
+            "th/.x/a.obj",
+            "th/notes.txt",
+            "th/._7.obj",
+        ]
+        .into_iter()
+        .for_each(touch);
         assert_eq!(subjects("th"), ["0007", "0012"]);
         ["ch/a/mesh-f00011.obj", "ch/a/mesh-f00021.obj", "ch/b/mesh-f00011.obj"].into_iter().for_each(touch);
         assert_eq!(subjects("ch"), ["a-mesh-f00011", "a-mesh-f00021", "b-mesh-f00011"]);
@@ -270,6 +293,8 @@ mod tests {
         assert_eq!(Collection::Thuman20.split("0006"), Split::Val);
         assert_eq!(Collection::Thuman20.split("0004"), Split::Train);
         assert_eq!(collection.split("0659"), Split::Test);
+        assert_eq!(collection.split("0006"), Split::Val, "THuman2.1 includes THuman2.0");
+        assert_eq!(Collection::TwoK2K.split("0006"), Split::Test);
     }
 
     #[test]

@@ -16,6 +16,8 @@ use crate::DataError;
 const MAX_BYTES: u64 = 16 << 20;
 /// Most operations of a pickle; parameters take a few hundred.
 const MAX_OPERATIONS: usize = 10_000;
+/// Most lists and numbers of a parameter.
+const MAX_NODES: usize = 100;
 /// The parameter that says where the body faces: an axis times an angle in radians.
 const ORIENTATION: &str = "global_orient";
 
@@ -59,7 +61,7 @@ fn from_pickle(bytes: &[u8]) -> Result<Vec<f64>, String> {
     let value =
         entries.chunks_exact(2).find(|pair| matches!(&pair[0], Value::Text(key) if **key == *ORIENTATION));
     let value = &value.ok_or_else(|| format!("`{ORIENTATION}` is missing"))?[1];
-    numbers(value, 0).ok_or_else(|| format!("`{ORIENTATION}` is no array of numbers"))
+    numbers(value, &mut { MAX_NODES }).ok_or_else(|| format!("`{ORIENTATION}` is no array of numbers"))
 }
 
 /// What a pickle builds. Containers are shared, as in Python.
@@ -83,13 +85,14 @@ fn shared(values: Vec<Value>) -> Rc<RefCell<Vec<Value>>> {
 }
 
 /// The numbers of a NumPy array or scalar, or of a list, in order.
-fn numbers(value: &Value, depth: usize) -> Option<Vec<f64>> {
+fn numbers(value: &Value, nodes: &mut usize) -> Option<Vec<f64>> {
+    // Lists that hold one another many times unfold without end.
+    *nodes = nodes.checked_sub(1)?;
     match value {
-        _ if depth > 8 => None,
         Value::Number(number) => Some(vec![*number]),
         Value::List(items) => {
             let items = items.borrow();
-            let nested: Option<Vec<Vec<f64>>> = items.iter().map(|item| numbers(item, depth + 1)).collect();
+            let nested: Option<Vec<Vec<f64>>> = items.iter().map(|item| numbers(item, nodes)).collect();
             Some(nested?.concat())
         }
         Value::Object(parts) => {
@@ -137,6 +140,8 @@ fn numbers(value: &Value, depth: usize) -> Option<Vec<f64>> {
 fn raw(value: &Value) -> Option<Rc<[u8]>> {
     match value {
         Value::Bytes(bytes) => Some(bytes.clone()),
+        // Python 2's strings, where they happen to be text.
+        Value::Text(text) => Some(text.as_bytes().into()),
         Value::Object(parts) => {
             let parts = parts.borrow();
             let [Value::Text(name), Value::List(arguments)] = parts.as_slice() else { return None };

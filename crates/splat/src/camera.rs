@@ -133,8 +133,11 @@ impl Camera {
         -(self.world_to_camera.rotation.inverse() * self.world_to_camera.translation)
     }
 
-    /// Whether an image can be rendered into this camera; if not, what is wrong.
-    pub(crate) fn check(&self) -> Result<(), String> {
+    /// Whether an image can be rendered into this camera.
+    ///
+    /// # Errors
+    /// What is wrong with it.
+    pub fn check(&self) -> Result<(), String> {
         for (field, side) in [("width", self.width), ("height", self.height)] {
             if side == 0 || side > MAX_SIDE {
                 return Err(format!("`{field}` is {side}, expected 1 to {MAX_SIDE} pixels"));

@@ -1,6 +1,5 @@
 //! Single files of data sets.
 
-use std::fs::File;
 use std::io::{BufReader, Cursor, Read, Write};
 use std::path::Path;
 
@@ -16,6 +15,7 @@ use zip::{CompressionMethod, ZipArchive, ZipWriter};
 
 use super::MAX_RESOLUTION;
 use crate::DataError;
+use crate::error::open;
 use crate::picture::decode;
 use crate::view::View;
 
@@ -96,6 +96,29 @@ pub fn write_inverse_depth(path: &Path, view: &View) -> Result<(), DataError> {
     write_png(path, &bytes, (view.width, view.height), ExtendedColorType::L16)
 }
 
+/// Whether an `.npy` is as long as the shape in its header says, at four bytes per number at least: its reader makes room
+/// before it looks.
+fn holds_its_shape(npy: &[u8]) -> bool {
+    let length =
+        |bytes: Option<&[u8]>| Some(bytes?.iter().rev().fold(0, |sum, b| sum << 8 | usize::from(*b)));
+    let header = match npy.get(6) {
+        Some(1) => length(npy.get(8..10)).and_then(|n| npy.get(10..10 + n)),
+        _ => length(npy.get(8..12)).and_then(|n| npy.get(12..12 + n)),
+    };
+    let shape = header.and_then(|header| std::str::from_utf8(header).ok()).and_then(|text| {
+        let (_, rest) = text.split_once("'shape':")?;
+        let (_, rest) = rest.split_once('(')?;
+        rest.split_once(')').map(|(shape, _)| shape)
+    });
+    let numbers = shape.and_then(|shape| {
+        let sides = shape.split(',').map(str::trim).filter(|side| !side.is_empty());
+        sides
+            .map(|side| side.parse::<usize>().ok())
+            .try_fold(1_usize, |product, side| product.checked_mul(side?))
+    });
+    numbers.is_some_and(|numbers| numbers <= npy.len() / 4)
+}
+
 /// Depths in metres and their shape.
 type Depth = (Vec<f32>, [u32; 2]);
 
@@ -130,12 +153,14 @@ pub fn write_depth(path: &Path, view: &View) -> Result<(), DataError> {
 /// Undoes [`write_depth`].
 pub fn read_depth(path: &Path) -> Result<Depth, DataError> {
     let wrong = |e: &dyn std::fmt::Display| DataError::unsuitable(path, format!("is no depth map: {e}"));
-    let file = File::open(path).map_err(DataError::read(path))?;
-    let mut archive = ZipArchive::new(BufReader::new(file)).map_err(|e| wrong(&e))?;
+    let mut archive = ZipArchive::new(BufReader::new(open(path)?)).map_err(|e| wrong(&e))?;
     let entry = archive.by_name(&format!("{DEPTH}.npy")).map_err(|e| wrong(&e))?;
     let mut npy = Vec::new();
     // What is longer than the largest depth map is cut off, and refused for that.
     entry.take(MAX_NPY).read_to_end(&mut npy).map_err(|e| wrong(&e))?;
+    if !holds_its_shape(&npy) {
+        return Err(wrong(&"its header promises more than it holds"));
+    }
     let array = Array2::<f32>::read_npy(npy.as_slice()).map_err(|e| wrong(&e))?;
     let (height, width) = array.dim();
     let array = array.as_standard_layout().into_owned();
@@ -166,8 +191,10 @@ pub fn read_camera(folder: &Path, view: usize, side: u32) -> Result<Camera, Data
     let load = |name: &str, shape: (usize, usize)| {
         let path = folder.join(format!("{view}_{name}.npy"));
         let mut bytes = Vec::new();
-        let file = File::open(&path).map_err(DataError::read(&path))?;
-        file.take(4096).read_to_end(&mut bytes).map_err(DataError::read(&path))?;
+        open(&path)?.take(4096).read_to_end(&mut bytes).map_err(DataError::read(&path))?;
+        if !holds_its_shape(&bytes) {
+            return Err(DataError::unsuitable(&path, "is no matrix: its header promises more than it holds"));
+        }
         let matrix = Array2::<f64>::read_npy(bytes.as_slice())
             .or_else(|e| Array2::<f32>::read_npy(bytes.as_slice()).map(|m| m.mapv(f64::from)).map_err(|_| e));
         let matrix = matrix.map_err(|e| DataError::unsuitable(&path, format!("is no matrix: {e}")))?;

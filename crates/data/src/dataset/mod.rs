@@ -27,10 +27,13 @@ use std::path::{Path, PathBuf};
 use glam::DVec2;
 use image::{GrayImage, RgbImage};
 use serde::{Deserialize, Serialize};
-use snapsnap_splat::{Camera, cameras, file, quoted};
+use snapsnap_splat::{Camera, cameras, file};
 
 use crate::DataError;
+use crate::error::open;
+use crate::prepare::JitterConfig;
 pub use check::{Checked, check};
+pub use write::Made;
 
 /// Name of the file that describes a folder.
 const DESCRIPTION: &str = "dataset.toml";
@@ -100,6 +103,19 @@ pub struct Description {
     pub pixel_centre: f64,
     /// What the subjects are and how they were made.
     pub source: String,
+    /// With which cameras and how finely they were drawn, where that is known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub drawn: Option<Drawn>,
+}
+
+/// How views were drawn.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Drawn {
+    /// Samples per pixel along each axis.
+    pub samples: usize,
+    /// How cameras strayed.
+    pub jitter: JitterConfig,
 }
 
 impl Description {
@@ -164,6 +180,7 @@ impl Folder {
                 high_resolution: false,
                 pixel_centre: 0.0,
                 source: "written by the authors' tools".into(),
+                drawn: None,
             },
         };
         let (split, subject) = folder
@@ -276,6 +293,9 @@ impl Folder {
         };
         let (depth, [height, width]) = read(&path)?;
         self.check_size(&path, (width, height), self.description.resolution)?;
+        if let Some(z) = depth.iter().find(|z| !z.is_finite() || **z < 0.0) {
+            return Err(DataError::unsuitable(&path, format!("holds a depth of {z}")));
+        }
         Ok(StoredView { color: RgbImage::default(), mask: GrayImage::default(), depth, camera })
     }
 
@@ -328,10 +348,14 @@ impl Folder {
         match self.description.layout {
             Layout::Authors => {
                 let folder = self.path(split, "parm", subject);
-                files::read_camera(&folder, view, side)
+                let camera = files::read_camera(&folder, view, side)?;
+                let path = folder.join(format!("{view}_intrinsic.npy"));
+                camera.check().map_err(|problem| DataError::unsuitable(&path, problem))?;
+                Ok(camera)
             }
             Layout::Exact => {
                 let path = self.split_path(split).join("cameras").join(format!("{subject}.json"));
+                drop(open(&path)?);
                 let cameras = cameras::read(&path).map_err(|e| DataError::splat(&path, e))?;
                 let count = cameras.len();
                 let camera = cameras.into_iter().nth(view).ok_or_else(|| {
@@ -370,7 +394,7 @@ impl Folder {
 }
 
 fn read_description(path: &Path) -> Result<Description, DataError> {
-    if fs::metadata(path).map_err(DataError::read(path))?.len() > MAX_DESCRIPTION {
+    if open(path)?.metadata().map_err(DataError::read(path))?.len() > MAX_DESCRIPTION {
         return Err(DataError::unsuitable(path, "is far too long for a description"));
     }
     let text = fs::read_to_string(path).map_err(DataError::read(path))?;
@@ -388,13 +412,4 @@ fn views_in_name(root: &Path) -> Option<usize> {
     let name = name.file_name()?.to_string_lossy().into_owned();
     let (_, views) = name.rsplit_once('_')?;
     views.parse().ok().filter(|views| (1..=MAX_VIEWS).contains(views))
-}
-
-/// Whether a subject may be called so: a name that is one folder everywhere.
-pub fn check_subject_name(name: &str) -> Result<(), String> {
-    let fine = |c: char| c.is_alphanumeric() || "-_. ".contains(c);
-    if name.is_empty() || name.starts_with('.') || name.len() > 128 || !name.chars().all(fine) {
-        return Err(format!("`{}` is no name for a subject", quoted(name)));
-    }
-    Ok(())
 }

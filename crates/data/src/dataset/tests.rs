@@ -77,6 +77,7 @@ fn the_authors_folder_must_be_called_as_their_loader_wants_it() {
 fn a_killed_run_leaves_no_half_subject() {
     let (_temporary, folder) = small(Layout::Exact);
     let root = folder.root();
+    folder.tidy();
     assert!(!root.join(".unfinished").exists());
     // As if killed while drawing, and while moving into place.
     fs::create_dir_all(root.join(".unfinished/train-0002/img")).expect("make");
@@ -91,6 +92,17 @@ fn a_killed_run_leaves_no_half_subject() {
         crate::prepare::ViewsConfig { count: 4, resolution: 64, high_resolution: true, ..config.views };
     config.add(&folder, Split::Train, "0002", &rectangle().0, 0.0, "0002").expect("adds");
     assert!(folder.has(Split::Train, "0002"));
+    // What another run is making at this moment is left to it.
+    fs::remove_dir_all(root.join("train/img/0002")).expect("remove");
+    fs::create_dir_all(root.join(".unfinished")).expect("make");
+    let lock = fs::File::create(root.join(".unfinished/train-0002.lock")).expect("create");
+    lock.try_lock().expect("free");
+    let add = || config.add(&folder, Split::Train, "0002", &rectangle().0, 0.0, "0002").expect("adds");
+    assert_eq!(add(), Made::Elsewhere);
+    drop(lock);
+    assert_eq!(add(), Made::Whole);
+    assert!(folder.has(Split::Train, "0002"));
+    folder.tidy();
     assert!(check(root, |_, _| {}).expect("checks").problems.is_empty());
 }
 
@@ -128,7 +140,7 @@ fn a_check_lists_everything_that_is_wrong() {
         "0000/1.png: not a readable image",
         "0000/2.png: is 128×128, the data set has views of 64×64",
         "0001/0: its mask is empty",
-        "0001/1: its depth holds NaN",
+        "0001/1.npz: holds a depth of NaN",
         "0001/2: ",
         "0001/3.npz: is no depth map",
     ];

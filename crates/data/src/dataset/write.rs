@@ -1,6 +1,6 @@
 //! Writing of subjects.
 
-use std::fs;
+use std::fs::{self, TryLockError};
 use std::io;
 use std::path::{Path, PathBuf};
 
@@ -12,19 +12,40 @@ use crate::DataError;
 use crate::view::View;
 
 /// Subjects in the making, in the data set's root.
-const UNFINISHED: &str = ".unfinished";
+pub(super) const UNFINISHED: &str = ".unfinished";
+
+/// What became of a subject that was to be written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Made {
+    /// It is there now, or another run has made it meanwhile.
+    Whole,
+    /// Another run is making it at this moment.
+    Elsewhere,
+}
 
 impl Folder {
-    /// Whether the subject is there, whole.
+    /// Whether the subject is there, whole: every kind of file, up to the last view.
     pub fn has(&self, split: Split, subject: &str) -> bool {
-        self.path(Some(split), "img", subject).is_dir()
+        let last = self.description.views - 1;
+        self.kinds().into_iter().all(|kind| match kind {
+            "cameras" => self.split_path(Some(split)).join(kind).join(format!("{subject}.json")).is_file(),
+            _ => {
+                let name = match (kind, self.description.layout) {
+                    ("parm", _) => format!("{last}_extrinsic.npy"),
+                    ("depth", Layout::Exact) => format!("{last}.npz"),
+                    ("img", Layout::Authors) => format!("{last}.jpg"),
+                    _ => format!("{last}.png"),
+                };
+                self.path(Some(split), kind, subject).join(name).is_file()
+            }
+        })
     }
 
     /// Adds a subject: `draw` gives what each of `cameras` (pixel centres at +½, side of the set) sees. The subject
-    /// appears when everything is written.
+    /// appears when everything is written; runs that work on one data set leave each other's subjects alone.
     ///
     /// # Errors
-    /// [`DataError::Write`].
+    /// [`DataError::Write`]; [`DataError::Unsuitable`] if a camera sees nothing.
     ///
     /// # Panics
     /// If there are more or fewer cameras than the set has views, or one of another size.
@@ -34,13 +55,25 @@ impl Folder {
         subject: &str,
         cameras: &[Camera],
         draw: impl Fn(&Camera) -> View + Sync,
-    ) -> Result<(), DataError> {
+    ) -> Result<Made, DataError> {
         let description = &self.description;
         assert_eq!(cameras.len(), description.views, "cameras");
         let side = description.resolution;
         assert!(cameras.iter().all(|c| (c.width, c.height) == (side, side)), "a camera of another size");
         let unfinished = self.root.join(UNFINISHED);
+        fs::create_dir_all(&unfinished).map_err(DataError::write(&unfinished))?;
         let temporary = unfinished.join(format!("{split}-{subject}"));
+        // The system frees the lock of a run that was killed.
+        let mark = unfinished.join(format!("{split}-{subject}.lock"));
+        let lock = fs::File::create(&mark).map_err(DataError::write(&mark))?;
+        match lock.try_lock() {
+            Err(TryLockError::WouldBlock) => return Ok(Made::Elsewhere),
+            // Where files cannot be locked, two runs must not share a subject.
+            Err(TryLockError::Error(_)) | Ok(()) => {}
+        }
+        if self.has(split, subject) {
+            return Ok(Made::Whole);
+        }
         // Left by a run that was killed.
         match fs::remove_dir_all(&temporary) {
             Err(e) if e.kind() != io::ErrorKind::NotFound => return Err(DataError::write(&temporary)(e)),
@@ -49,11 +82,17 @@ impl Folder {
         let guard = file::unfinished_folder(&temporary).map_err(DataError::write(&temporary))?;
         let made = self.write_into(&temporary, subject, cameras, &draw);
         let made = made.and_then(|()| self.reveal(&temporary, split, subject));
-        // Whether it went well or not, nothing stays; others may still be at work beside it.
+        // Whether it went well or not, nothing stays. Other runs may be at work beside it: the folder around is theirs too.
         let _ = fs::remove_dir_all(&temporary);
-        let _ = fs::remove_dir(&unfinished);
         drop(guard);
-        made
+        let _ = fs::remove_file(&mark);
+        made.map(|()| Made::Whole)
+    }
+
+    /// Removes what runs leave when they are done.
+    pub fn tidy(&self) {
+        // Not if another run is at work.
+        let _ = fs::remove_dir(self.root.join(UNFINISHED));
     }
 
     /// Draws and writes every view below `folder`.
@@ -70,6 +109,12 @@ impl Folder {
         }
         cameras.par_iter().enumerate().try_for_each(|(view, camera)| {
             let drawn = draw(&self.exact_camera(camera));
+            if drawn.depth.iter().all(|z| *z == 0.0) {
+                return Err(DataError::unsuitable(
+                    &self.root,
+                    format!("view {view} sees nothing of {subject}"),
+                ));
+            }
             let picture = |suffix: &str, drawn: &View| match self.description.layout {
                 Layout::Authors => {
                     files::write_jpeg(&folder.join("img").join(format!("{view}{suffix}.jpg")), drawn)
@@ -116,7 +161,7 @@ impl Folder {
             };
             let parent = to.parent().unwrap_or(&self.root);
             fs::create_dir_all(parent).map_err(DataError::write(parent))?;
-            // A run that was killed in between left it; without `img` nobody has seen it.
+            // A run that was killed in between left it, or a part of it was removed: the subject was not whole.
             if to.is_dir() {
                 fs::remove_dir_all(&to).map_err(DataError::write(&to))?;
             }

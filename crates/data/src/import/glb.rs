@@ -18,6 +18,9 @@ use crate::picture::decode_bytes;
 /// Deepest nesting of nodes.
 const MAX_DEPTH: usize = 256;
 
+/// Most positions and faces: nodes may show one mesh many times.
+const MAX_ELEMENTS: usize = 100_000_000;
+
 /// What an attribute may be stored as.
 struct Kind {
     name: &'static str,
@@ -144,6 +147,13 @@ impl File<'_> {
             }
         }
         let count = wanted[0].0.as_ref().map_or(0, Accessor::count);
+        let indices = wanted[3].0.as_ref().map_or(count, Accessor::count);
+        if self.mesh.positions.len() + count > MAX_ELEMENTS || self.mesh.faces.len() + indices > MAX_ELEMENTS
+        {
+            return Err(
+                self.wrong(format!("its nodes unfold to more than {MAX_ELEMENTS} positions or faces"))
+            );
+        }
         let blob = std::mem::take(&mut self.blob);
         let reader = primitive.reader(|_| Some(&blob));
         let positions: Vec<Vec3> = reader

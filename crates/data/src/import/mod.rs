@@ -50,7 +50,7 @@ pub fn read(path: &Path) -> Result<Mesh, DataError> {
     let mut mesh = reader(path)?;
     mesh.check().map_err(|e| DataError::unsuitable(path, e))?;
     // Files differ in what the brightest value of a colour is.
-    if mesh.colors.iter().any(|c| c.max_element() > 1.0) {
+    if mesh.colors.iter().any(|c| c.max_element() > 2.0) {
         mesh.colors.iter_mut().for_each(|c| *c /= 255.0);
     }
     mesh.colors.iter_mut().for_each(|c| *c = c.clamp(Vec3::ZERO, Vec3::ONE));

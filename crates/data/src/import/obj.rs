@@ -1,8 +1,9 @@
 //! Wavefront OBJ: polygons with several materials and textures, vertex colours.
 
 use std::cell::Cell;
-use std::fs::File;
-use std::io::{self, BufRead, BufReader, Read};
+use std::collections::HashMap;
+use std::fs;
+use std::io::{self, BufRead, Read};
 use std::path::Path;
 
 use glam::{Vec2, Vec3};
@@ -17,33 +18,42 @@ use crate::mesh::{Face, Material, Mesh};
 const MAX_LINE: usize = 1 << 20;
 
 pub fn read(path: &Path) -> Result<Mesh, DataError> {
-    let file = File::open(path).map_err(DataError::read(path))?;
+    let text = read_lossy(path)?;
     let line = Cell::new(0);
-    let mut lines = Lines { source: BufReader::new(file), line: &line, length: 0 };
-    let missing = Cell::new(None);
+    let mut lines = Lines { source: text.as_bytes(), line: &line, length: 0 };
+    let failed = Cell::new(None);
+    let fail = |e: DataError| {
+        failed.set(Some(e));
+        LoadError::MaterialParseError
+    };
     let options =
         LoadOptions { triangulate: true, ignore_points: true, ignore_lines: true, ..Default::default() };
     let loaded = tobj::load_obj_buf(&mut lines, &options, |name| {
-        let Some(file) = beside(path, &name.to_string_lossy()) else {
-            missing.set(Some(format!("its material file `{}` is missing", quoted(&name.to_string_lossy()))));
-            return Err(LoadError::OpenFileFailed);
-        };
-        tobj::load_mtl(&file).map_err(|e| {
-            missing.set(Some(format!("its material file {}: {e}", file.display())));
-            e
-        })
+        let name = name.to_string_lossy();
+        let file = beside(path, &name).ok_or_else(|| {
+            let message = format!("its material file `{}` is missing", quoted(&name));
+            fail(DataError::unsuitable(path, message))
+        })?;
+        read_materials(&file).map_err(fail)
     });
     let (models, materials) = loaded.map_err(|e| {
         // The line is the one that was read last; what is wrong with the whole shows at the end.
         DataError::unsuitable(path, format!("line {}: {e}", line.get().max(1)))
     })?;
-    if let Some(problem) = missing.take() {
-        return Err(DataError::unsuitable(path, problem));
+    if let Some(e) = failed.take() {
+        return Err(e);
+    }
+    let materials = materials.unwrap_or_default();
+    // The parser takes unknown names for no material at all.
+    let used = text.lines().filter_map(|line| line.strip_prefix("usemtl ")).map(str::trim);
+    let known = |name: &&str| materials.is_empty() || materials.iter().any(|m| m.name == **name);
+    if let Some(name) = used.into_iter().find(|name| !known(name)) {
+        return Err(DataError::unsuitable(path, format!("its material `{}` is missing", quoted(name))));
     }
 
     let mut mesh = Mesh { materials: vec![Material::default()], ..Mesh::default() };
     let mut textures = Textures::of(path);
-    for material in materials.unwrap_or_default() {
+    for material in materials {
         let texture = material.diffuse_texture.as_deref().map(|name| textures.load(file_name(name)));
         let color = match (&texture, material.diffuse) {
             // Exporters leave the colour black or grey where a texture replaces it.
@@ -97,9 +107,41 @@ fn file_name(statement: &str) -> &str {
     rest
 }
 
+/// A text file; bytes that are no UTF-8, as in names from elsewhere, are replaced.
+fn read_lossy(path: &Path) -> Result<String, DataError> {
+    let bytes = fs::read(path).map_err(DataError::read(path))?;
+    Ok(String::from_utf8(bytes).unwrap_or_else(|e| String::from_utf8_lossy(e.as_bytes()).into_owned()))
+}
+
+/// Names, colours and textures of materials; the parser of OBJ files stumbles over damaged ones.
+fn read_materials(path: &Path) -> Result<(Vec<tobj::Material>, HashMap<String, usize>), DataError> {
+    let text = read_lossy(path)?;
+    let mut materials: Vec<tobj::Material> = Vec::new();
+    for (number, line) in text.lines().map(str::trim).enumerate() {
+        let (word, rest) = line.split_once(char::is_whitespace).unwrap_or((line, ""));
+        match (word, materials.last_mut()) {
+            ("newmtl", _) => {
+                materials.push(tobj::Material { name: rest.trim().to_owned(), ..Default::default() });
+            }
+            ("Kd", Some(material)) => {
+                let numbers: Vec<f32> = rest.split_whitespace().map_while(|n| n.parse().ok()).collect();
+                let color = numbers.try_into().ok().filter(|c: &[f32; 3]| c.iter().all(|v| v.is_finite()));
+                material.diffuse = Some(color.ok_or_else(|| {
+                    let message = format!("line {}, `{}`: no colour", number + 1, quoted(line));
+                    DataError::unsuitable(path, message)
+                })?);
+            }
+            ("map_Kd", Some(material)) => material.diffuse_texture = Some(rest.trim().to_owned()),
+            _ => {}
+        }
+    }
+    let rows = materials.iter().enumerate().map(|(row, m)| (m.name.clone(), row)).collect();
+    Ok((materials, rows))
+}
+
 /// Counts the lines that were begun, and refuses those that never end.
 struct Lines<'a> {
-    source: BufReader<File>,
+    source: &'a [u8],
     line: &'a Cell<usize>,
     /// Bytes of the line that is being read.
     length: usize,
@@ -116,7 +158,7 @@ impl BufRead for Lines<'_> {
         if self.length > MAX_LINE {
             return Err(io::Error::other("a line without an end"));
         }
-        self.source.fill_buf()
+        Ok(self.source)
     }
 
     fn consume(&mut self, amount: usize) {
@@ -124,7 +166,7 @@ impl BufRead for Lines<'_> {
             self.line.set(self.line.get() + 1);
         }
         // `lines` consumes up to a line's end and no further.
-        let ended = self.source.buffer()[..amount].ends_with(b"\n");
+        let ended = self.source[..amount].ends_with(b"\n");
         self.length = if ended { 0 } else { self.length + amount };
         self.source.consume(amount);
     }

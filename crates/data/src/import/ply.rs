@@ -155,6 +155,10 @@ fn vertices(element: &Element, body: &mut Body, mesh: &mut Mesh) -> Result<(), S
 }
 
 fn faces(element: &Element, body: &mut Body, mesh: &mut Mesh) -> Result<(), String> {
+    let is_corners = |name: &str| matches!(name, "vertex_indices" | "vertex_index");
+    if !element.properties.iter().any(|p| p.list.is_some() && is_corners(&p.name)) {
+        return Err("`face` has no list `vertex_indices`".into());
+    }
     let per_vertex = !mesh.texcoords.is_empty();
     let (mut corners, mut texcoords) = (Vec::new(), Vec::new());
     for row in 0..element.count {

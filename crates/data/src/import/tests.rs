@@ -227,6 +227,8 @@ fn corrupt_scans_are_refused_by_name() {
     let folder = Folder::new();
     folder.file("absurd.png", absurd_png());
     folder.file("absurd.mtl", "newmtl a\nmap_Kd absurd.png\n");
+    folder.file("color.mtl", "newmtl a\nKd 1 1\n");
+    folder.file("known.mtl", "newmtl ä\nKd 1 1 1\n");
     folder.file("absent.mtl", "newmtl a\nmap_Kd absent.png\n");
     let billion = |format: &str| {
         format!(
@@ -245,7 +247,10 @@ fn corrupt_scans_are_refused_by_name() {
         ("huge.obj", triangle.replace("1 0 0", "1 1e39 0").into(), "position 1 is not finite"),
         ("range.obj", triangle.replace("f 1 2 3", "f 1 2 9").into(), "face vertex index out of bounds"),
         ("line.obj", vec![b'v'; 5 << 20], "line 1: read error"),
-        ("bytes.obj", vec![0xff; 1000], "line 1: read error"),
+        ("bytes.obj", vec![0xff; 1000], "there is no triangle"),
+        ("color.obj", format!("mtllib color.mtl\n{triangle}").into(), "color.mtl: line 2, `Kd 1 1`: no colour"),
+        ("unknown.obj", format!("mtllib known.mtl\nusemtl zzz\n{triangle}").into(), "material `zzz` is missing"),
+        ("faces.ply", b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\nproperty float z\nelement face 1000000000000000\nend_header\n".into(), "no list `vertex_indices`"),
         ("mtl.obj", format!("mtllib no.mtl\n{triangle}").into(), "material file `no.mtl` is missing"),
         ("texture.obj", format!("mtllib absent.mtl\n{triangle}").into(), "texture `absent.png` is missing"),
         ("absurd.obj", format!("mtllib absurd.mtl\n{triangle}").into(), "is 100000×100000, more than"),

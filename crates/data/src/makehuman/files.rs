@@ -16,6 +16,14 @@ const METRES: f32 = 0.1;
 /// Largest file that is read; the largest that MakeHuman has takes a few megabytes.
 const MAX_BYTES: u64 = 256 << 20;
 
+/// Largest coordinate, decimetres; a NaN is refused as well.
+const LARGEST: f32 = 1000.0;
+/// What of the base mesh and the rig is used.
+const GROUPS: [&str; 5] = ["body", "helper-tights", "helper-skirt", "helper-l-eye", "helper-r-eye"];
+const BONES: [&str; 5] = ["spine03", "neck01", "head", "jaw", "oris01"];
+const SIDED_BONES: [&str; 9] =
+    ["eye", "upperarm01", "lowerarm01", "wrist", "finger3-3", "upperleg01", "lowerleg01", "foot", "clavicle"];
+
 /// Moves of vertices: row and metres.
 pub type Target = Arc<Vec<(u32, Vec3)>>;
 
@@ -55,7 +63,19 @@ impl Library {
             DataError::unsuitable(folder, message)
         })?;
         let (positions, groups) = read_base(&root.join(base))?;
+        let missing = GROUPS.iter().find(|group| !groups.contains_key(**group));
+        if let Some(group) = missing {
+            return Err(DataError::unsuitable(&root.join(base), format!("has no group `{group}`")));
+        }
         let (bones, weights) = read_rig(&root.join("rigs"), positions.len())?;
+        let sided = SIDED_BONES.iter().flat_map(|name| ["L", "R"].map(|side| format!("{name}.{side}")));
+        let mut needed = BONES.iter().map(|name| (*name).to_owned()).chain(sided);
+        if let Some(bone) = needed.find(|needed| !bones.iter().any(|bone| bone.name == *needed)) {
+            return Err(DataError::unsuitable(
+                &root.join("rigs/default.mhskel"),
+                format!("has no bone `{bone}`"),
+            ));
+        }
         Ok(Self { root, positions, groups, bones, weights, targets: Mutex::default() })
     }
 
@@ -103,7 +123,7 @@ fn wrong(path: &Path, line: usize, text: &str) -> DataError {
 
 /// Three finite numbers.
 fn vector<'a>(mut words: impl Iterator<Item = &'a str>) -> Option<Vec3> {
-    let mut next = || words.next()?.parse().ok().filter(|v: &f32| v.is_finite());
+    let mut next = || words.next()?.parse().ok().filter(|v: &f32| v.abs() < LARGEST);
     Some(METRES * Vec3::new(next()?, next()?, next()?))
 }
 

@@ -253,7 +253,8 @@ impl<'a> Person<'a> {
                 let (kind, _, along, length) = self.place(vertex);
                 let flare = match (kind, self.outfit.lower) {
                     (Kind::Leg, Lower::Trousers { flare, .. }) => {
-                        flare * (along / length).clamp(0.0, 1.0).powi(2)
+                        let down = (along / length).clamp(0.0, 1.0);
+                        flare * down * down
                     }
                     _ => 0.0,
                 };

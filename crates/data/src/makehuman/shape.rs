@@ -50,7 +50,8 @@ impl Mix {
             let old = (age - 0.45).max(0.0) * between(0.4, 1.6);
             [0.0, 1.0 - old.min(1.0), old.min(1.0)]
         };
-        let shares = [(); 3].map(|()| between(0.0, 1.0).powi(3) + 1e-3);
+        // Mostly of one descent.
+        let shares = [(); 3].map(|()| between(0.0, 1.0)).map(|share| share * share * share + 1e-3);
         let sum: f32 = shares.iter().sum();
         Self {
             sex,

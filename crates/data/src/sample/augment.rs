@@ -155,13 +155,30 @@ fn moved(mask: &GrayImage, reach: f32) -> GrayImage {
         let value = if inside { mask.as_raw()[(y * width + x) as usize] } else { 0 };
         if dilate { value } else { 255 - value }
     };
+    // Squares that hold anything at all; a disc reaches into a square or its neighbours.
+    let square = whole.max(8);
+    let squares = [width, height].map(|side| side.div_euclid(square) + 1);
+    let mut filled = vec![false; (squares[0] * squares[1]) as usize];
+    for y in 0..height {
+        for x in 0..width {
+            filled[(y / square * squares[0] + x / square) as usize] |= at(x, y) > 0;
+        }
+    }
+    let near = |x: i64, y: i64| {
+        let (x, y) = (x / square, y / square);
+        (y - 1..=y + 1).any(|y| {
+            (x - 1..=x + 1).any(|x| {
+                // Outside the picture a mask is empty, which is what erosion grows.
+                let inside = (0..squares[0]).contains(&x) && (0..squares[1]).contains(&y);
+                if inside { filled[(y * squares[0] + x) as usize] } else { !dilate }
+            })
+        })
+    };
     GrayImage::from_fn(mask.width(), mask.height(), |x, y| {
         let (x, y) = (i64::from(x), i64::from(y));
         let here = at(x, y);
-        // Most of a picture is far from the outline.
-        let near = [(whole, 0), (-whole, 0), (0, whole), (0, -whole)];
-        let flat = here == 255 || (here == 0 && near.iter().all(|(dx, dy)| at(x + dx, y + dy) == 0));
-        let value = if flat && whole <= 1 || here == 255 {
+        // Most of a picture is far from the outline, and what is whole cannot grow.
+        let value = if here == 255 || !near(x, y) {
             here
         } else {
             disc.iter().map(|(dx, dy, share)| f32::from(at(x + dx, y + dy)) * share).fold(0.0, f32::max) as u8

@@ -32,8 +32,8 @@ pub struct Loader<I, O> {
 }
 
 impl<I: 'static, O: 'static> Loader<I, O> {
-    /// Batches of `batch` items on `device`, made by `workers` threads, at most `prefetch` ready beside those in the
-    /// making. The last batch may be smaller.
+    /// Batches of `batch` items on `device`, made by `workers` threads; ready or in the making are at most
+    /// `workers + prefetch`. The last batch may be smaller.
     ///
     /// # Panics
     /// If `batch` or `workers` is 0.
@@ -66,13 +66,19 @@ impl<I: 'static, O: 'static> Loader<I, O> {
         self
     }
 
+    /// Begins with the order of this pass, as a training that goes on does.
+    pub fn from_pass(self, pass: u64) -> Self {
+        self.passes.store(pass, Ordering::Relaxed);
+        self
+    }
+
     fn with(&self, device: &Device, range: std::ops::Range<usize>) -> Self {
         Self {
             dataset: self.dataset.clone(),
             batcher: self.batcher.clone(),
             device: device.clone(),
             range,
-            passes: AtomicU64::new(0),
+            passes: AtomicU64::new(self.passes.load(Ordering::Relaxed)),
             ..*self
         }
     }
@@ -306,6 +312,8 @@ mod tests {
             [order(&loader), order(&loader)]
         };
         let [first, second] = shuffled(1);
+        let later = loader(50, 2, None).0.shuffled(7).from_pass(1);
+        assert_eq!(order(&later), second);
         assert_eq!([first.clone(), second.clone()], shuffled(3));
         assert_ne!(first, second);
         let mut sorted = first;

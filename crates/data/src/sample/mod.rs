@@ -9,6 +9,7 @@ mod tests;
 
 use std::sync::Arc;
 
+use burn::tensor::{Device, Tensor, TensorData};
 use glam::DVec3;
 use image::{GrayImage, RgbImage};
 use rand::Rng;
@@ -159,6 +160,17 @@ impl Source {
         }
         (images, masks)
     }
+}
+
+/// One field of all items of a batch, as one tensor.
+fn together<I, const D: usize>(
+    items: &[I],
+    of: fn(&I) -> &Vec<f32>,
+    shape: [usize; D],
+    device: &Device,
+) -> Tensor<D> {
+    let values: Vec<f32> = items.iter().flat_map(|item| of(item).iter().copied()).collect();
+    Tensor::from_data(TensorData::new(values, shape), device)
 }
 
 /// Points `[H,W,3]` of a depth map in the frame of `to`, metres: each pixel's centre, at +½ in the coordinates of `camera`,

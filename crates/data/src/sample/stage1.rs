@@ -4,10 +4,10 @@ use std::sync::Arc;
 
 use burn::data::dataloader::batcher::Batcher;
 use burn::data::dataset::{Dataset, DatasetError};
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::{Device, Tensor};
 use rand::Rng;
 
-use super::{COMPAT_FAR, INSIDE, SampleConfig, Source, unproject};
+use super::{COMPAT_FAR, INSIDE, SampleConfig, Source, together, unproject};
 use crate::DataError;
 use crate::dataset::{Folder, Split};
 
@@ -113,15 +113,6 @@ pub struct Stage1Batcher;
 impl Batcher<Stage1Item, Stage1Batch> for Stage1Batcher {
     fn batch(&self, items: Vec<Stage1Item>, device: &Device) -> Stage1Batch {
         let (b, side) = (items.len(), items.first().map_or(0, |item| item.side));
-        fn together<const D: usize>(
-            items: &[Stage1Item],
-            of: fn(&Stage1Item) -> &Vec<f32>,
-            shape: [usize; D],
-            device: &Device,
-        ) -> Tensor<D> {
-            let values: Vec<f32> = items.iter().flat_map(|item| of(item).iter().copied()).collect();
-            Tensor::from_data(TensorData::new(values, shape), device)
-        }
         Stage1Batch {
             images: together(&items, |item| &item.images, [b, 2, 3, side, side], device),
             masks: together(&items, |item| &item.masks, [b, 2, side, side], device),

@@ -4,14 +4,14 @@ use std::sync::Arc;
 
 use burn::data::dataloader::batcher::Batcher;
 use burn::data::dataset::{Dataset, DatasetError};
-use burn::tensor::{Device, Tensor, TensorData};
-use image::{GrayImage, RgbImage};
+use burn::tensor::{Device, Tensor};
+use image::{GrayImage, Luma, RgbImage};
 use rand::Rng;
 use snapsnap_splat::Camera;
 
-use super::{SampleConfig, Source};
+use super::{SampleConfig, Source, together};
 use crate::DataError;
-use crate::dataset::{Folder, Split};
+use crate::dataset::{Folder, Layout, Split};
 
 /// Samples of stage 2 (SNAPSNAP §5.6): front and back are the first view and the opposite one; compared are the sides and
 /// random views.
@@ -62,6 +62,12 @@ impl Stage2 {
     /// # Errors
     /// As [`super::Stage1::new`].
     pub fn new(folder: Arc<Folder>, split: Option<Split>, config: SampleConfig) -> Result<Self, DataError> {
+        let authors = folder.description().layout == Layout::Authors;
+        if authors && config.high_resolution && config.augment.background_color {
+            let message =
+                "has no masks at twice the side, which `background_color` needs beside `high_resolution`";
+            return Err(DataError::unsuitable(folder.root(), message));
+        }
         Source::new(folder, split, config).map(Self)
     }
 
@@ -89,11 +95,18 @@ impl Stage2 {
         let random_views = (0..config.supervision).map(|_| random.random_range(0..count)).collect::<Vec<_>>();
         let background =
             if config.augment.background_color { [(); 3].map(|()| random.random()) } else { [0.0; 3] };
+        let composited = description.layout == Layout::Exact || config.augment.background_color;
         let scale = if config.high_resolution { 2 } else { 1 };
         let target_side = description.resolution * scale;
         let (mut targets, mut target_cameras) = (Vec::new(), Vec::new());
         for view in random_views.into_iter().chain([right, left]) {
             let (color, mask) = folder.picture(*split, subject, view, config.high_resolution)?;
+            // The authors' pictures are over black already, and their masks half as fine as the larger ones.
+            let mask = if composited {
+                mask
+            } else {
+                GrayImage::from_pixel(mask.width(), mask.height(), Luma([255]))
+            };
             targets.extend(over(&color, &mask, background));
             // Sampled where the stored picture is, at its own size.
             let stored = folder.camera(*split, subject, view)?.resized(target_side, target_side);
@@ -143,15 +156,6 @@ impl Batcher<Stage2Item, Stage2Batch> for Stage2Batcher {
         let b = items.len();
         let (side, target_side) = items.first().map_or((0, 0), |item| (item.side, item.target_side));
         let views = items.first().map_or(0, |item| item.target_cameras.len());
-        fn together<const D: usize>(
-            items: &[Stage2Item],
-            of: fn(&Stage2Item) -> &Vec<f32>,
-            shape: [usize; D],
-            device: &Device,
-        ) -> Tensor<D> {
-            let values: Vec<f32> = items.iter().flat_map(|item| of(item).iter().copied()).collect();
-            Tensor::from_data(TensorData::new(values, shape), device)
-        }
         Stage2Batch {
             images: together(&items, |item| &item.images, [b, 2, 3, side, side], device),
             masks: together(&items, |item| &item.masks, [b, 2, side, side], device),

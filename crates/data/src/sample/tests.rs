@@ -189,15 +189,18 @@ fn our_samples_follow_their_seed_and_are_augmented() {
 fn stage_two_samples_have_cameras_for_what_they_compare() {
     for layout in [Layout::Exact, Layout::Authors] {
         let (_temporary, folder) = data_set(person(), layout, 64, 8, true, 1);
-        let config = SampleConfig { high_resolution: true, ..SampleConfig::default() };
-        let stage = Stage2::new(folder.clone(), TRAIN, config).expect("makes samples");
+        let high = layout == Layout::Exact;
+        let compat = SampleConfig { high_resolution: true, ..SampleConfig::compat() };
+        let ours = SampleConfig { high_resolution: true, ..SampleConfig::default() };
+        let stage =
+            Stage2::new(folder.clone(), TRAIN, if high { ours } else { compat }).expect("makes samples");
         let item = stage.sample(3).expect("reads");
         assert_eq!((item.target_side, item.target_cameras.len()), (128, 5));
         assert_eq!(item.targets.len(), 5 * 3 * 128 * 128);
         // A corner shows the background.
         let corner = [0, 1, 2].map(|c| item.targets[c * 128 * 128]);
         assert_eq!(corner, item.background);
-        assert_ne!(item.background, [0.0; 3]);
+        assert_eq!(item.background == [0.0; 3], !high);
         // The person's pixels are where the target's camera sees the person.
         for (view, camera) in item.target_cameras.iter().enumerate() {
             assert_eq!((camera.width, camera.height), (128, 128));
@@ -209,13 +212,14 @@ fn stage_two_samples_have_cameras_for_what_they_compare() {
                     columns = (columns.0.min(pixel % 128), columns.1.max(pixel % 128));
                 }
             }
-            let mut expected = [f64::MAX, 0.0];
+            let mut expected = [f64::MAX, 0.0, f64::MAX, 0.0];
             for p in &person().positions {
                 let (at, _) = camera.project(p.as_dvec3()).expect("in front");
-                expected = [expected[0].min(at.y), expected[1].max(at.y)];
+                let [top, bottom, left, right] = expected;
+                expected = [top.min(at.y), bottom.max(at.y), left.min(at.x), right.max(at.x)];
             }
-            let found = [rows.0 as f64, rows.1 as f64 + 1.0];
-            let off = (found[0] - expected[0]).abs().max((found[1] - expected[1]).abs());
+            let found = [rows.0, rows.1 + 1, columns.0, columns.1 + 1].map(|v| v as f64);
+            let off = found.iter().zip(expected).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
             assert!(off < 2.5, "{layout:?} {view}: {found:?} {expected:?}");
         }
         let batch = burn::data::dataloader::batcher::Batcher::batch(
@@ -250,7 +254,11 @@ fn contradictions_are_refused() {
     assert!(message(compat).contains("`augment`: must be off beside `compat = true`"));
     assert!(message(SampleConfig { repeat: 0, ..SampleConfig::default() }).contains("`repeat`"));
     assert!(message(SampleConfig::default()).contains("6 views"));
-    let config = SampleConfig { high_resolution: true, ..SampleConfig::default() };
-    let error = Stage2::new(folder.clone(), TRAIN, config).map(drop).expect_err("refused").to_string();
-    assert!(error.contains("multiple of 4") || error.contains("high_resolution"), "{error}");
+    let refusal = |layout: Layout, high: bool| {
+        let (_temporary, folder) = data_set(&rectangle().0, layout, 16, 4, high, 1);
+        let config = SampleConfig { high_resolution: true, ..SampleConfig::default() };
+        Stage2::new(folder, TRAIN, config).map(drop).expect_err("refused").to_string()
+    };
+    assert!(refusal(Layout::Exact, false).contains("`high_resolution` asks for"));
+    assert!(refusal(Layout::Authors, true).contains("no masks at twice the side"));
 }

@@ -135,7 +135,9 @@ impl Outfit {
             }
         } else {
             let length = if between(0.0, 1.0) < 0.25 { between(0.3, 0.6) } else { between(0.8, 0.99) };
-            Lower::Trousers { length, flare: between(0.0, 1.0).powi(3) * 0.045 }
+            let wide = between(0.0, 1.0);
+            // Seldom wide.
+            Lower::Trousers { length, flare: wide * wide * wide * 0.045 }
         };
         let style = between(0.0, 1.0);
         let cut = match style {

@@ -183,7 +183,8 @@ impl<'a> Painter<'a> {
         let face = &self.face;
         let (eye_angle, eye_up) = face.eye;
         // Red where blood shows.
-        let blush = (1.0 - ((aside - 0.75) / 0.4).powi(2) - ((up - 0.36) / 0.12).powi(2)).max(0.0);
+        let cheek = Vec2::new((aside - 0.75) / 0.4, (up - 0.36) / 0.12);
+        let blush = (1.0 - cheek.length_squared()).max(0.0);
         color = color.lerp(Vec3::new(0.8, 0.35, 0.3) * self.outfit.skin.x.max(0.3), 0.18 * blush);
         if self.outfit.beard {
             let chin = smoothstep(0.27, 0.2, up) * smoothstep(1.45, 1.25, aside);

@@ -155,7 +155,7 @@ pub fn parse(bytes: &[u8]) -> Result<Header, String> {
         let wrong = |problem: &str| Err(format!("header line {number}, `{}`: {problem}", quoted(&text)));
         match words.as_slice() {
             ["comment", ..] => {
-                comments.push(text.trim_start().trim_start_matches("comment").trim().to_owned())
+                comments.push(text.trim_start().trim_start_matches("comment").trim().to_owned());
             }
             [] | ["obj_info", ..] => {}
             ["format", ..] if format.is_some() => return wrong("a second format"),

@@ -6,10 +6,13 @@ mod preview;
 mod scan;
 mod synth;
 
+use std::fs;
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use clap::{Args, Subcommand, ValueEnum};
-use snapsnap_data::dataset::{Folder, Split};
+use snapsnap_data::dataset::{Folder, Made, Split};
 use snapsnap_data::mesh::Mesh;
 use snapsnap_data::prepare::{DataConfig, Shard};
 use snapsnap_data::random::stream;
@@ -21,6 +24,8 @@ use crate::failure::Failure;
 use crate::progress::Progress;
 use crate::say;
 
+/// Largest config that is read.
+const MAX_CONFIG: u64 = 1 << 20;
 /// Most people of one call: subjects have four digits, or a few more.
 const MAX_SUBJECTS: usize = 1_000_000;
 
@@ -98,10 +103,14 @@ impl Common {
     fn config(&self) -> Result<DataConfig, Failure> {
         let (text, origin) = match &self.config {
             Some(path) => {
-                let text = std::fs::read_to_string(path).map_err(|e| {
+                let wrong = |e: &dyn std::fmt::Display| {
                     Failure::Input(format!("{}: cannot read the config: {e}", path.display()))
-                })?;
-                (text, path.display().to_string())
+                };
+                let metadata = fs::metadata(path).map_err(|e| wrong(&e))?;
+                if !metadata.is_file() || metadata.len() > MAX_CONFIG {
+                    return Err(wrong(&"it is no file, or far too long"));
+                }
+                (fs::read_to_string(path).map_err(|e| wrong(&e))?, path.display().to_string())
             }
             None => (String::new(), "the built-in config".to_owned()),
         };
@@ -111,6 +120,23 @@ impl Common {
             None => Ok(config),
         }
     }
+}
+
+/// Refuses a sheet that is no PNG, or lies where it might replace what is worked on.
+fn check_preview(sheet: &Path, common: &Common, inputs: &[&Path]) -> Result<(), Failure> {
+    let wrong = |problem: &str| Err(Failure::Input(format!("--preview {}: {problem}", sheet.display())));
+    if !sheet.extension().is_some_and(|e| e.eq_ignore_ascii_case("png")) {
+        return wrong("must end in .png");
+    }
+    super::check_outputs(&[sheet], &[])?;
+    let folder = sheet.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let folder = folder.canonicalize().unwrap_or_else(|_| folder.to_owned());
+    for taken in inputs.iter().copied().chain([common.output.as_path()]) {
+        if taken.canonicalize().is_ok_and(|taken| taken.is_dir() && folder.starts_with(taken)) {
+            return wrong("lies inside the data set or its source");
+        }
+    }
+    Ok(())
 }
 
 /// One subject to be made.
@@ -134,12 +160,13 @@ fn make(
     common: &Common,
     quiet: bool,
     source: &str,
+    inputs: &[&Path],
     works: &[Work],
     person: impl Fn(usize, &Work) -> Result<Person, DataError>,
 ) -> Result<(), Failure> {
     let config = common.config()?;
     if let Some(sheet) = &common.preview {
-        super::check_outputs(&[sheet], &[])?;
+        check_preview(sheet, common, inputs)?;
     }
     let folder = Folder::create(&common.output, config.description(source))?;
     let mine: Vec<(usize, &Work)> =
@@ -150,7 +177,7 @@ fn make(
         say::err(&format!("{} of {} subjects are there already", mine.len() - missing.len(), mine.len()));
     }
     let progress = Progress::steps(quiet, missing.len(), "subjects");
-    let mut failed = 0;
+    let (mut failed, mut elsewhere) = (0, 0);
     for (done, (place, work)) in missing.iter().enumerate() {
         progress.step(done, missing.len(), "subjects");
         let Work { split, subject, identity } = work;
@@ -158,7 +185,12 @@ fn make(
             config.add(&folder, *split, subject, &person.mesh, person.yaw_degrees, identity)
         });
         match made {
-            Ok(()) => {}
+            Ok(Made::Whole) => {}
+            Ok(Made::Elsewhere) => elsewhere += 1,
+            // The program is being ended: it stops here, without a word about the subject.
+            Err(DataError::Write { source, .. }) if source.kind() == ErrorKind::Interrupted => {
+                std::thread::sleep(Duration::from_secs(60));
+            }
             // Nothing more can be written: to go on would only repeat it.
             Err(e @ DataError::Write { .. }) => return Err(e.into()),
             Err(e) => {
@@ -169,9 +201,16 @@ fn make(
     }
     progress.step(missing.len(), missing.len(), "subjects");
     drop(progress);
-    if let Some(sheet) = &common.preview {
-        let there: Vec<(Split, &str)> =
-            works.iter().map(|work| (work.split, work.subject.as_str())).collect();
+    folder.tidy();
+    if elsewhere > 0 {
+        say::err(&format!("{elsewhere} subjects are being made by another run"));
+    }
+    let there: Vec<(Split, &str)> = works
+        .iter()
+        .map(|work| (work.split, work.subject.as_str()))
+        .filter(|(split, subject)| folder.has(*split, subject))
+        .collect();
+    if let Some(sheet) = common.preview.as_deref().filter(|_| !there.is_empty()) {
         preview::write(sheet, &folder, &there)?;
     }
     if failed > 0 {
@@ -217,11 +256,15 @@ fn generate(
         })
         .collect();
     let source = format!("{kind}, seed {}", common.seed);
-    make(common, quiet, &source, &works, |_, work| {
+    make(common, quiet, &source, &[], &works, |_, work| {
         let mut mesh = person(&work.identity)?;
         if generate.save_scans {
             let scan = common.output.join("scans").join(split.name()).join(&work.subject);
-            export::write_obj(&mesh, &scan.join(format!("{}.obj", work.subject)))?;
+            let path = scan.join(format!("{}.obj", work.subject));
+            // What is there may have been changed by hand.
+            if !path.exists() {
+                export::write_obj(&mesh, &path)?;
+            }
         }
         place(&mut mesh, work, Collection::Other, &common.output)?;
         Ok(Person { mesh, yaw_degrees: 0.0 })

@@ -18,21 +18,17 @@ const COLUMNS: u32 = 9;
 /// Colour of the background.
 const BACKGROUND: [u8; 3] = [235; 3];
 
-/// Writes the sheet of those `subjects` that are there.
+/// Writes the sheet of the first of these subjects.
 pub fn write(path: &Path, folder: &Folder, subjects: &[(Split, &str)]) -> Result<(), Failure> {
     let views = folder.description().views;
     let mut pictures = Vec::new();
-    for (split, subject) in subjects.iter().filter(|(split, subject)| folder.has(*split, subject)).take(MOST)
-    {
+    for (split, subject) in subjects.iter().take(MOST) {
         for view in [0, views / 2, views / 4] {
             let (color, mask) = folder.picture(Some(*split), subject, view, false)?;
             pictures.push(shrink(&color, &mask));
         }
     }
-    if pictures.is_empty() {
-        return Err(Failure::Input(format!("{}: there is no subject to show", path.display())));
-    }
-    write_png(path, &sheet(&pictures, COLUMNS.min(pictures.len() as u32)))
+    write_png(path, &sheet(&pictures, COLUMNS.min(pictures.len().max(1) as u32)))
 }
 
 /// On the background, smaller, cut to the middle.

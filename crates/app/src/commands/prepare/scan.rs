@@ -1,5 +1,6 @@
 //! `snapsnap prepare scan`.
 
+use std::cell::Cell;
 use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
@@ -9,6 +10,7 @@ use snapsnap_data::{DataError, import, smplx};
 
 use super::{Common, Person, SplitArgument, Work, make};
 use crate::failure::Failure;
+use crate::say;
 
 #[derive(Clone, Copy, ValueEnum)]
 enum CollectionArgument {
@@ -54,7 +56,7 @@ pub struct Arguments {
     /// it they are looked for beside each scan.
     #[arg(long, value_name = "DIR")]
     smplx: Option<PathBuf>,
-    /// Put all subjects there [default: as the set's published lists say, otherwise train].
+    /// Put all subjects there [default: as the set's published lists say; 2K2K and 4D-Dress test, others train].
     #[arg(long, value_enum)]
     split: Option<SplitArgument>,
 }
@@ -72,20 +74,40 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
         })
         .collect();
     let name = arguments.source.file_name().unwrap_or_default().to_string_lossy().into_owned();
-    let description = format!("scans of {name}");
-    make(&arguments.common, quiet, &description, &works, |place, work| {
+    let description = format!("scans of {name}, seed {}", arguments.common.seed);
+    let mut inputs = vec![arguments.source.as_path()];
+    inputs.extend(arguments.smplx.as_deref());
+    let unknown = Cell::new(0);
+    let made = make(&arguments.common, quiet, &description, &inputs, &works, |place, work| {
         let path = &sources[place].path;
+        // A person in two splits would be tested on after having been learned.
+        let img = |split: Split| arguments.common.output.join(split.name()).join("img").join(&work.subject);
+        if let Some(other) = Split::ALL.into_iter().find(|other| *other != work.split && img(*other).exists())
+        {
+            let message = format!("subject {} is in {other} already", work.subject);
+            return Err(DataError::Unsuitable { path: path.clone(), message });
+        }
         let collection = collection.of(&work.subject);
         let parameters = parameters(path, &work.subject, arguments.smplx.as_deref())?;
         let yaw_degrees =
             match parameters.filter(|_| collection.has_orientation() || arguments.smplx.is_some()) {
                 Some(parameters) => smplx::yaw_degrees(&parameters)?,
-                None => 0.0,
+                None => {
+                    unknown.set(unknown.get() + usize::from(collection.has_orientation()));
+                    0.0
+                }
             };
         let mut mesh = import::read(path)?;
         super::place(&mut mesh, work, collection, path)?;
         Ok(Person { mesh, yaw_degrees })
-    })
+    });
+    if unknown.get() > 0 {
+        say::err(&format!(
+            "{} subjects have no SMPL-X parameters (--smplx) and were taken to face +z",
+            unknown.get()
+        ));
+    }
+    made
 }
 
 /// The subject's SMPL-X parameters; an error if a folder of them was named and has none.
