@@ -23,17 +23,18 @@ fn prepare(kind: &str) -> Command {
 /// Every file below a folder, by its path, with its content.
 fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     let mut found = BTreeMap::new();
-    for entry in fs::read_dir(folder).expect("list").map(|entry| entry.expect("entry").path()) {
-        if entry.is_dir() {
-            found.extend(files(&entry).into_iter().map(|(path, content)| (path, content)));
-        } else {
-            found.insert(entry.clone(), fs::read(&entry).expect("read"));
+    let mut folders = vec![folder.to_owned()];
+    while let Some(next) = folders.pop() {
+        for entry in fs::read_dir(&next).expect("list").map(|entry| entry.expect("entry").path()) {
+            if entry.is_dir() {
+                folders.push(entry);
+            } else {
+                let content = fs::read(&entry).expect("read");
+                found.insert(entry.strip_prefix(folder).expect("is below").to_owned(), content);
+            }
         }
     }
     found
-        .into_iter()
-        .map(|(path, content)| (path.strip_prefix(folder).map(Path::to_owned).unwrap_or(path), content))
-        .collect()
 }
 
 fn synth(folder: &Path, subjects: &str) -> Command {

@@ -240,7 +240,7 @@ impl File<'_> {
             .checked_sub(1)
             .and_then(|last| last.checked_mul(stride)?.checked_add(size)?.checked_add(accessor.offset()));
         let inside = view.offset().checked_add(view.length()).is_some_and(|end| end <= self.blob.len());
-        if stride < size || !inside || !end.is_some_and(|end| end <= view.length()) {
+        if stride < size || !inside || end.is_none_or(|end| end > view.length()) {
             let count = accessor.count();
             return Err(self.wrong(format!(
                 "accessor {index} promises {count} entries, more than the file holds; it may be cut off"

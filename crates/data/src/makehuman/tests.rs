@@ -46,7 +46,8 @@ fn skin_does_not_come_through_cloth() {
     for index in 0..10 {
         let check = |person: &Person| {
             let skin = person.skin().net;
-            let garments: [(Net, &dyn Fn(&Vertex) -> f32); 3] = [
+            type Inside<'a> = &'a dyn Fn(&Vertex) -> f32;
+            let garments: [(Net, Inside); 3] = [
                 (person.top().net, &|v| person.in_top(v)),
                 (person.bottom().net, &|v| person.in_bottom(v)),
                 (person.shoes().net, &|v| person.in_shoes(v)),
