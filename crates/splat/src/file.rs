@@ -4,6 +4,11 @@ use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::thread;
+use std::time::Duration;
+
+/// How often the removal of a folder is tried.
+const FOLDER_TRIES: usize = 100;
 
 /// Temporary files that are being written.
 #[derive(Default)]
@@ -25,9 +30,20 @@ pub fn remove_unfinished() {
     let mut unfinished = unfinished();
     unfinished.ending = true;
     for path in unfinished.paths.drain(..) {
-        // Whoever renamed or removed it first has done the work.
-        let _ = if path.is_dir() { fs::remove_dir_all(path) } else { fs::remove_file(path) };
+        // Whoever renamed or removed it first has done the work. Others may still be writing into a folder.
+        for _ in 0..FOLDER_TRIES {
+            let removed = if path.is_dir() { fs::remove_dir_all(&path) } else { fs::remove_file(&path) };
+            if removed.is_ok() || !path.is_dir() {
+                break;
+            }
+            thread::sleep(Duration::from_millis(10));
+        }
     }
+}
+
+/// Whether [`remove_unfinished`] was called, in which case what fails now fails for that.
+pub fn is_ending() -> bool {
+    unfinished().ending
 }
 
 /// Makes the folder `path`, and those around it, for files that are to be moved elsewhere once all of them are written.

@@ -2,6 +2,7 @@
 //!
 //! Everything about a person follows from a name, the same on every machine.
 
+mod anatomy;
 pub(crate) mod atlas;
 pub(crate) mod body;
 pub(crate) mod figure;

@@ -7,7 +7,6 @@ mod scan;
 mod synth;
 
 use std::fs;
-use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -19,6 +18,7 @@ use snapsnap_data::random::stream;
 use snapsnap_data::scan::{Collection, normalise};
 use snapsnap_data::{DataError, export};
 use snapsnap_net::config::parse;
+use snapsnap_splat::file;
 
 use crate::failure::Failure;
 use crate::progress::Progress;
@@ -188,9 +188,7 @@ fn make(
             Ok(Made::Whole) => {}
             Ok(Made::Elsewhere) => elsewhere += 1,
             // The program is being ended: it stops here, without a word about the subject.
-            Err(DataError::Write { source, .. }) if source.kind() == ErrorKind::Interrupted => {
-                std::thread::sleep(Duration::from_secs(60));
-            }
+            Err(_) if file::is_ending() => std::thread::sleep(Duration::from_secs(60)),
             // Nothing more can be written: to go on would only repeat it.
             Err(e @ DataError::Write { .. }) => return Err(e.into()),
             Err(e) => {
