@@ -81,6 +81,8 @@ fn a_killed_run_leaves_no_half_subject() {
     assert!(!root.join(".unfinished").exists());
     // As if killed while drawing, and while moving into place.
     fs::create_dir_all(root.join(".unfinished/train-0002/img")).expect("make");
+    // As if killed between the last move and the end.
+    fs::write(root.join(".unfinished/train-0001.lock"), "").expect("write");
     fs::create_dir_all(root.join("train/depth/0002")).expect("make");
     fs::write(root.join("train/depth/0002/stale.npz"), "").expect("write");
     assert_eq!(folder.subjects(TRAIN).expect("lists").len(), 2);

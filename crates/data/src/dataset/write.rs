@@ -89,10 +89,18 @@ impl Folder {
         made.map(|()| Made::Whole)
     }
 
-    /// Removes what runs leave when they are done.
+    /// Removes what runs leave that were killed; what another run is at work on stays.
     pub fn tidy(&self) {
-        // Not if another run is at work.
-        let _ = fs::remove_dir(self.root.join(UNFINISHED));
+        let unfinished = self.root.join(UNFINISHED);
+        for mark in fs::read_dir(&unfinished).into_iter().flatten().flatten().map(|entry| entry.path()) {
+            let is_mark = mark.extension().is_some_and(|extension| extension == "lock");
+            // Held by whoever is at work; the system frees those of the dead.
+            if is_mark && fs::File::open(&mark).is_ok_and(|lock| lock.try_lock().is_ok()) {
+                let _ = fs::remove_dir_all(mark.with_extension(""));
+                let _ = fs::remove_file(&mark);
+            }
+        }
+        let _ = fs::remove_dir(unfinished);
     }
 
     /// Draws and writes every view below `folder`.
