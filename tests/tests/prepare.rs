@@ -279,5 +279,10 @@ fn shipped_configs_are_understood() {
         command.args(["--subjects", "1", "--config"]).arg(configs.join(name).with_extension("toml"));
         succeed(command.arg("-o").arg(&folder).args(SMALL));
         assert!(succeed(prepare("check").arg(&folder)).contains("no fault"), "{name}");
+        // The config in force lies beside the data, and is a config itself.
+        let resolved = folder.join("prepare.config.toml");
+        let mut again = prepare("synth");
+        again.args(["--subjects", "1", "--config"]).arg(&resolved).arg("-o").arg(&folder);
+        succeed(&mut again);
     }
 }

@@ -141,6 +141,14 @@ impl DataConfig {
         jitter.or_else(|| self.samples.problem().map(|(key, message)| (format!("samples.{key}"), message)))
     }
 
+    /// The config as TOML, every key written out.
+    ///
+    /// # Panics
+    /// Never: every field is representable in TOML.
+    pub fn to_toml(&self) -> String {
+        toml::to_string(self).expect("the config has only TOML types")
+    }
+
     /// What a data set made with this config says of itself.
     pub fn description(&self, source: &str) -> Description {
         let ViewsConfig { count, resolution, high_resolution, layout, .. } = self.views;

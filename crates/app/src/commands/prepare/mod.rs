@@ -7,6 +7,7 @@ mod scan;
 mod synth;
 
 use std::fs;
+use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -24,6 +25,8 @@ use crate::failure::Failure;
 use crate::progress::Progress;
 use crate::say;
 
+/// Name of the config in force, beside the data.
+const CONFIG: &str = "prepare.config.toml";
 /// Largest config that is read.
 const MAX_CONFIG: u64 = 1 << 20;
 /// Most people of one call: subjects have four digits, or a few more.
@@ -169,6 +172,9 @@ fn make(
         check_preview(sheet, common, inputs)?;
     }
     let folder = Folder::create(&common.output, config.description(source))?;
+    let resolved = common.output.join(CONFIG);
+    file::write_whole(&resolved, |out| out.write_all(config.to_toml().as_bytes()))
+        .map_err(|source| DataError::Write { path: resolved.clone(), source })?;
     let mine: Vec<(usize, &Work)> =
         works.iter().enumerate().filter(|(place, _)| common.shard.has(*place)).collect();
     let missing: Vec<&(usize, &Work)> =
