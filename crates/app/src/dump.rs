@@ -1,15 +1,14 @@
 //! `--dump`: every intermediate tensor, named and shaped as in the `pipeline` fixture.
 
-use std::io;
 use std::path::Path;
 
 use burn::tensor::Tensor;
 use safetensors::Dtype;
 use safetensors::tensor::TensorView;
 use snapsnap_net::Reconstruction;
-use snapsnap_splat::file::write_whole;
 
 use crate::failure::Failure;
+use crate::output;
 
 /// Writes `points conf valid side_images means opacity scale rotation rgb`, in the front camera's frame.
 pub fn write(result: &Reconstruction, path: &Path) -> Result<(), Failure> {
@@ -39,8 +38,7 @@ pub fn write(result: &Reconstruction, path: &Path) -> Result<(), Failure> {
         (name.as_str(), view)
     });
     let file = safetensors::serialize(views, None).expect("valid tensors");
-    write_whole(path, |out| io::Write::write_all(out, &file))
-        .map_err(|e| Failure::Input(format!("{}: cannot write: {e}", path.display())))
+    output::write(path, &file)
 }
 
 fn bytes<const D: usize>(tensor: &Tensor<D>) -> Vec<u8> {

@@ -1,6 +1,8 @@
 //! How a command fails: bad input (exit code 2) or everything else (exit code 1).
 
 use std::fmt;
+use std::io;
+use std::path::Path;
 use std::process::ExitCode;
 
 use snapsnap_data::DataError;
@@ -18,6 +20,11 @@ pub enum Failure {
 }
 
 impl Failure {
+    /// The operating system refused to write this file.
+    pub fn cannot_write(path: &Path, e: &io::Error) -> Self {
+        Self::Input(format!("{}: cannot write: {e}", path.display()))
+    }
+
     pub fn exit_code(&self) -> ExitCode {
         match self {
             Self::Input(_) => ExitCode::from(2),

@@ -4,6 +4,7 @@ mod commands;
 mod device;
 mod dump;
 mod failure;
+mod output;
 mod pictures;
 mod progress;
 mod say;

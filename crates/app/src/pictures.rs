@@ -7,9 +7,9 @@ use std::path::Path;
 use burn::tensor::Tensor;
 use image::codecs::gif::{GifEncoder, Repeat};
 use image::{Delay, Frame, ImageFormat, RgbImage, RgbaImage, imageops};
-use snapsnap_splat::file;
 
 use crate::failure::Failure;
+use crate::output::write;
 
 /// Speed of the search for a GIF's colours: 1 is best, 30 fastest.
 const GIF_SPEED: i32 = 10;
@@ -69,11 +69,6 @@ pub fn sheet(pictures: &[RgbImage], columns: u32) -> RgbImage {
 pub fn make_folder(path: &Path) -> Result<(), Failure> {
     fs::create_dir_all(path)
         .map_err(|e| Failure::Input(format!("{}: cannot make this folder: {e}", path.display())))
-}
-
-fn write(path: &Path, bytes: &[u8]) -> Result<(), Failure> {
-    file::write_whole(path, |out| std::io::Write::write_all(out, bytes))
-        .map_err(|e| Failure::Input(format!("{}: cannot write: {e}", path.display())))
 }
 
 fn failed(path: &Path, e: &image::ImageError) -> Failure {

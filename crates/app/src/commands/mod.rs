@@ -44,8 +44,7 @@ impl ConfigArguments {
 /// Refuses output paths that could not be written in the end, that are one another, or that are an input.
 pub fn check_outputs(outputs: &[&Path], inputs: &[&Path]) -> Result<(), Failure> {
     for (i, output) in outputs.iter().enumerate() {
-        file::check_writable(output)
-            .map_err(|e| Failure::Input(format!("{}: cannot write: {e}", output.display())))?;
+        file::check_writable(output).map_err(|e| Failure::cannot_write(output, &e))?;
         if inputs.iter().any(|input| is_same_file(output, input)) {
             let message = "is an input of this command and would be overwritten";
             return Err(Failure::Input(format!("{}: {message}", output.display())));

@@ -1,6 +1,5 @@
 //! `snapsnap reconstruct`.
 
-use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
@@ -14,7 +13,7 @@ use super::{ConfigArguments, check_outputs, is_same_file};
 use crate::failure::Failure;
 use crate::progress::Progress;
 use crate::turntable::{self, Turntable};
-use crate::{device, dump, say, weights};
+use crate::{device, dump, output, say, weights};
 
 #[derive(Args)]
 pub struct Arguments {
@@ -103,7 +102,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let world = result.in_world(&config);
     ply::write(&world, &arguments.output)?;
     if let Some(path) = &config_path {
-        write_text(path, &config.resolved().to_toml())?;
+        output::write(path, config.resolved().to_toml().as_bytes())?;
     }
     if let Some(path) = &arguments.dump {
         dump::write(&result, path)?;
@@ -144,11 +143,6 @@ fn check_paths(arguments: &Arguments, weights: &Path) -> Result<Option<PathBuf>,
     let outputs: Vec<&Path> = outputs.into_iter().flatten().map(PathBuf::as_path).collect();
     check_outputs(&outputs, &inputs)?;
     Ok(config_path)
-}
-
-fn write_text(path: &Path, text: &str) -> Result<(), Failure> {
-    file::write_whole(path, |out| out.write_all(text.as_bytes()))
-        .map_err(|e| Failure::Input(format!("{}: cannot write: {e}", path.display())))
 }
 
 fn report(say: fn(&str), plan: &[String], times: &[(&str, Duration)], total: Duration) {

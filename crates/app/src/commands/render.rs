@@ -277,11 +277,7 @@ impl Raw {
         };
         let part = |name| io::Result::Ok((name, BufWriter::new(tempfile::tempfile_in(&folder)?)));
         let parts = || -> io::Result<_> { Ok([part("color")?, part("alpha")?, part("depth")?]) };
-        Ok(Self { path: path.to_owned(), parts: parts().map_err(|e| Self::failed(path, &e))? })
-    }
-
-    fn failed(path: &Path, e: &io::Error) -> Failure {
-        Failure::Input(format!("{}: cannot write: {e}", path.display()))
+        Ok(Self { path: path.to_owned(), parts: parts().map_err(|e| Failure::cannot_write(path, &e))? })
     }
 
     fn add(&mut self, rendered: Rendered) -> Result<(), Failure> {
@@ -289,7 +285,7 @@ impl Raw {
         let tensors = [rendered.color.reshape([-1]), rendered.alpha.reshape([-1]), depth.reshape([-1])];
         for ((_, file), tensor) in self.parts.iter_mut().zip(tensors) {
             let bytes: Vec<u8> = read_back(tensor)?.iter().flat_map(|v| v.to_le_bytes()).collect();
-            file.write_all(&bytes).map_err(|e| Self::failed(&self.path, &e))?;
+            file.write_all(&bytes).map_err(|e| Failure::cannot_write(&self.path, &e))?;
         }
         Ok(())
     }
@@ -321,7 +317,7 @@ impl Raw {
             }
             Ok(())
         })
-        .map_err(|e| Self::failed(&path, &e))
+        .map_err(|e| Failure::cannot_write(&path, &e))
     }
 }
 

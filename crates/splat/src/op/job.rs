@@ -107,6 +107,42 @@ pub struct Wanted {
     pub background: bool,
 }
 
+/// Which sums over pixels the backward pass keeps of one intersection, in this order: colour (3), opacity (1),
+/// geometry (5), depth (1); what is not wanted has no place.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub(super) struct Record {
+    pub colors: bool,
+    pub opacities: bool,
+    pub geometry: bool,
+    pub depth: bool,
+}
+
+impl Record {
+    pub fn new(wanted: Wanted, job: &Job) -> Self {
+        let Wanted { colors, geometry, .. } = wanted;
+        // The compensation of antialiasing carries the opacity's gradient on to the geometry.
+        let opacities = wanted.opacities || (geometry && job.antialiased);
+        Self { colors, opacities, geometry, depth: geometry && job.depth }
+    }
+
+    /// f32 per intersection.
+    pub fn len(self) -> usize {
+        self.depth_at() + usize::from(self.depth)
+    }
+
+    pub fn opacity_at(self) -> usize {
+        3 * usize::from(self.colors)
+    }
+
+    pub fn geometry_at(self) -> usize {
+        self.opacity_at() + usize::from(self.opacities)
+    }
+
+    pub fn depth_at(self) -> usize {
+        self.geometry_at() + 5 * usize::from(self.geometry)
+    }
+}
+
 fn view(camera: &Camera) -> View {
     let r = camera.world_to_camera.rotation;
     let row = |i: usize| {

@@ -7,7 +7,6 @@ mod scan;
 mod synth;
 
 use std::fs;
-use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -23,7 +22,7 @@ use snapsnap_splat::file;
 
 use crate::failure::Failure;
 use crate::progress::Progress;
-use crate::say;
+use crate::{output, say};
 
 /// Name of the config in force, beside the data.
 const CONFIG: &str = "prepare.config.toml";
@@ -172,9 +171,7 @@ fn make(
         check_preview(sheet, common, inputs)?;
     }
     let folder = Folder::create(&common.output, config.description(source))?;
-    let resolved = common.output.join(CONFIG);
-    file::write_whole(&resolved, |out| out.write_all(config.to_toml().as_bytes()))
-        .map_err(|source| DataError::Write { path: resolved.clone(), source })?;
+    output::write(&common.output.join(CONFIG), config.to_toml().as_bytes())?;
     let mine: Vec<(usize, &Work)> =
         works.iter().enumerate().filter(|(place, _)| common.shard.has(*place)).collect();
     let missing: Vec<&(usize, &Work)> =

@@ -3,7 +3,7 @@
 use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
 
-use super::super::job::{Job, Wanted};
+use super::super::job::{Job, Record, Wanted};
 use super::lanes::{BATCH, Lanes, fetch, row, rows};
 use super::splats::{Splat, parameters, projection};
 use super::{Scene, State, ViewState};
@@ -22,39 +22,6 @@ pub struct Gradients {
     pub opacities: Vec<f32>,
     pub colors: Vec<f32>,
     pub background: Vec<f32>,
-}
-
-/// Where the sums of one entry lie in its record; what is not wanted has no place.
-#[derive(Clone, Copy)]
-struct Record {
-    wanted: Wanted,
-    depth: bool,
-    len: usize,
-}
-
-impl Record {
-    fn new(wanted: Wanted, job: &Job) -> Self {
-        // The compensation of antialiasing carries the opacity's gradient on to the geometry.
-        let wanted = Wanted { opacities: wanted.opacities || (wanted.geometry && job.antialiased), ..wanted };
-        let depth = wanted.geometry && job.depth;
-        let len = 3 * usize::from(wanted.colors)
-            + usize::from(wanted.opacities)
-            + 5 * usize::from(wanted.geometry)
-            + usize::from(depth);
-        Self { wanted, depth, len }
-    }
-
-    fn opacity(&self) -> usize {
-        3 * usize::from(self.wanted.colors)
-    }
-
-    fn geometry(&self) -> usize {
-        self.opacity() + usize::from(self.wanted.opacities)
-    }
-
-    fn depth(&self) -> usize {
-        self.geometry() + 5
-    }
 }
 
 /// Gradients of the inputs that `wanted` names, from `upstream`, ∂L/∂image `[V,H,W,C]`.
@@ -77,7 +44,7 @@ pub fn backward(scene: Scene, job: &Job, state: &State, upstream: &[f32], wanted
             let sums = background(view, job, upstream);
             gradients.background.iter_mut().zip(sums).for_each(|(g, s)| *g += s);
         }
-        if record.len > 0 {
+        if record.len() > 0 {
             let records = pixels(scene, job, view, upstream, record);
             gather(scene, job, index, view, &records, record, &mut gradients);
         }
@@ -106,13 +73,13 @@ fn background(view: &ViewState, job: &Job, upstream: &[f32]) -> [f32; 3] {
 
 /// One record of sums over pixels per entry of the tiles' lists, in the lists' order.
 fn pixels(scene: Scene, job: &Job, view: &ViewState, upstream: &[f32], record: Record) -> Vec<f32> {
-    let mut records = vec![0.0_f32; view.lists.len() * record.len];
+    let mut records = vec![0.0_f32; view.lists.len() * record.len()];
     let mut rest = records.as_mut_slice();
     let mut bands = Vec::with_capacity(job.tiles_y());
     for y in 0..job.tiles_y() {
         let tiles = y * job.tiles_x()..(y + 1) * job.tiles_x();
         let entries = view.lists.starts[tiles.end] - view.lists.starts[tiles.start];
-        let (records, others) = rest.split_at_mut(entries as usize * record.len);
+        let (records, others) = rest.split_at_mut(entries as usize * record.len());
         rest = others;
         bands.push(Band { job, view, upstream, background: scene.background(), y, records, record });
     }
@@ -159,7 +126,7 @@ impl WithSimd for Band<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(mut self, _simd: S) {
-        let colors_only = !self.record.wanted.geometry && !self.record.wanted.opacities;
+        let colors_only = !self.record.geometry && !self.record.opacities;
         for x in 0..self.job.tiles_x() {
             match (colors_only, self.job.depth) {
                 (true, _) => self.tile::<false, false>(x),
@@ -207,8 +174,8 @@ impl Band<'_> {
                         self.job.max_alpha,
                     );
                 }
-                let at = (first + n) * self.record.len;
-                write(&sums, splat, self.record, &mut self.records[at..at + self.record.len]);
+                let at = (first + n) * self.record.len();
+                write(&sums, splat, self.record, &mut self.records[at..at + self.record.len()]);
             }
         }
     }
@@ -311,15 +278,15 @@ fn write(sums: &Sums, splat: &Splat, record: Record, out: &mut [f32]) {
         }
         lanes[0]
     };
-    if record.wanted.colors {
+    if record.colors {
         out[..3].copy_from_slice(&[sum(&sums.color[0]), sum(&sums.color[1]), sum(&sums.color[2])]);
     }
-    if record.wanted.opacities {
-        out[record.opacity()] = sum(&sums.alpha) / splat.opacity;
+    if record.opacities {
+        out[record.opacity_at()] = sum(&sums.alpha) / splat.opacity;
     }
-    if record.wanted.geometry {
+    if record.geometry {
         let [a, b, c] = &sums.second;
-        out[record.geometry()..record.geometry() + 5].copy_from_slice(&[
+        out[record.geometry_at()..record.geometry_at() + 5].copy_from_slice(&[
             sum(&sums.first[0]),
             sum(&sums.first[1]),
             sum(a),
@@ -328,7 +295,7 @@ fn write(sums: &Sums, splat: &Splat, record: Record, out: &mut [f32]) {
         ]);
     }
     if record.depth {
-        out[record.depth()] = sum(&sums.depth);
+        out[record.depth_at()] = sum(&sums.depth);
     }
 }
 
@@ -362,7 +329,7 @@ fn gather(
             (splats, geometry, opacities.next().unwrap_or_default(), colors.next().unwrap_or_default())
         })
         .collect();
-    let (wanted, camera) = (record.wanted, &job.views[index]);
+    let camera = &job.views[index];
     tasks.into_par_iter().for_each(|(splats, [means, rotations, scales], opacities, colors)| {
         for (i, &at) in splats.iter().enumerate() {
             if at == u32::MAX {
@@ -373,26 +340,26 @@ fn gather(
                 ..view.lists.first_place[at as usize + 1] as usize;
             let mut sum = [0.0_f32; 10];
             for &place in &view.lists.places[places] {
-                let at = place as usize * record.len;
-                sum.iter_mut().zip(&records[at..at + record.len]).for_each(|(s, r)| *s += r);
+                let at = place as usize * record.len();
+                sum.iter_mut().zip(&records[at..at + record.len()]).for_each(|(s, r)| *s += r);
             }
-            if wanted.colors {
+            if record.colors {
                 add(colors, 3 * i, &sum[..3]);
             }
-            let v_opacity = if wanted.opacities { sum[record.opacity()] } else { 0.0 };
+            let v_opacity = if record.opacities { sum[record.opacity_at()] } else { 0.0 };
             if !opacities.is_empty() {
                 opacities[i] += v_opacity * splat.compensation;
             }
-            if wanted.geometry {
+            if record.geometry {
                 let g = splat.gaussian as usize;
-                let at = record.geometry();
+                let at = record.geometry_at();
                 let gradient = FootprintGradient {
                     r0: sum[at],
                     r1: sum[at + 1],
                     s00: sum[at + 2],
                     s01: sum[at + 3],
                     s11: sum[at + 4],
-                    depth: if record.depth { sum[record.depth()] } else { 0.0 },
+                    depth: if record.depth { sum[record.depth_at()] } else { 0.0 },
                     compensation: if job.antialiased { v_opacity * scene.opacities[g] } else { 0.0 },
                 };
                 let p = projection(&scene, g, camera, job);

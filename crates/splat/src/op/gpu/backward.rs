@@ -7,6 +7,7 @@ use cubecl::prelude::*;
 use super::blend::UNITS;
 use super::channels;
 use super::project::{REACH, SPLAT, load_quat, load_view, load3};
+use crate::op::job::Record;
 use crate::options::{MIN_ALPHA, TILE};
 use crate::vjp::{FootprintGradient, project, project_vjp, to_camera};
 
@@ -15,34 +16,6 @@ const ROUND: usize = 8;
 /// Units that share the sums of one splat, and pixels of each.
 const SHARERS: usize = UNITS / ROUND;
 const SHARE: usize = UNITS / SHARERS;
-
-/// Which sums an intersection's record holds, in this order: colour (3), opacity (1), geometry (5), depth (1).
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub struct Record {
-    pub colors: bool,
-    pub opacities: bool,
-    pub geometry: bool,
-    pub depth: bool,
-}
-
-impl Record {
-    /// f32 per intersection.
-    pub fn len(self) -> usize {
-        self.depth_at() + usize::from(self.depth)
-    }
-
-    fn opacity_at(self) -> usize {
-        3 * usize::from(self.colors)
-    }
-
-    fn geometry_at(self) -> usize {
-        self.opacity_at() + usize::from(self.opacities)
-    }
-
-    fn depth_at(self) -> usize {
-        self.geometry_at() + 5 * usize::from(self.geometry)
-    }
-}
 
 /// Fills `records` `[intersections, record.len()]` from `upstream` `[V,H,W,C]`.
 #[cube(launch)]

@@ -26,10 +26,9 @@ use burn_cubecl::ops::into_data_sync;
 use burn_cubecl::tensor::CubeTensor;
 use cubecl::prelude::*;
 
-use super::job::{Counts, Job, Wanted};
+use super::job::{Counts, Job, Record, Wanted};
 use super::{Forward, SplatBackend, SplatInputs, SplatKernels, SplatOutput, splat_untracked};
 use crate::SplatError;
-use backward::Record;
 use buffers::Buffers;
 use project::{REACH, SPLAT, STATISTICS};
 
@@ -133,13 +132,7 @@ impl SplatKernels for CubeBackend {
         let colors = room([n, 3], wanted.colors);
         let opacities = wanted.opacities.then(|| gradient(&buffers, [n]));
         let background = wanted.background.then(|| background(&buffers, job, state, &upstream));
-        let record = Record {
-            colors: wanted.colors,
-            // The compensation of antialiasing carries the opacity's gradient on to the geometry.
-            opacities: wanted.opacities || (wanted.geometry && job.antialiased),
-            geometry: wanted.geometry,
-            depth: wanted.geometry && job.depth,
-        };
+        let record = Record::new(wanted, job);
         if record.len() > 0 && n > 0 {
             let records = records(&buffers, &inputs, job, state, upstream, record);
             let unused = |tensor: &Option<CubeTensor>| {
