@@ -178,20 +178,16 @@ fn broken_scans_are_named_and_skipped() {
     let billion = "ply\nformat binary_little_endian 1.0\nelement vertex 1000000000\nproperty float x\nproperty float y\n\
                    property float z\nelement face 1000000000\nproperty list uchar int vertex_indices\nend_header\n1234";
     write("sound one.obj", pyramid.as_bytes());
-    write("trüncated.obj", pyramid.split_at(pyramid.len() - 8).0.replace("f 1 2 4", "f 1 2 x").as_bytes());
+    write("trüncated.obj", &pyramid.as_bytes()[..pyramid.len() - 3]);
+    write("half.obj", format!("{}{pyramid}", "v 0 0 0\n".repeat(3)).as_bytes());
+    write("no number.obj", pyramid.replace("f 1 2 4", "f 1 2 x").as_bytes());
+    write("billion text.ply", billion.replace("binary_little_endian", "ascii").as_bytes());
     write("billion.ply", billion.as_bytes());
     write("nan.obj", pyramid.replacen("1.7", "nan", 1).as_bytes());
     write("no triangle.obj", b"v 0 0 0\nv 0 1 0\n");
     write("bad colour.obj", format!("mtllib a.mtl\n{pyramid}").as_bytes());
     fs::write(scans.join("bad colour.obj/a.mtl"), "newmtl a\nKd 1 1\n").expect("write");
-    write(
-        "far away.obj",
-        b"v 900 0 0
-v 901 0 0
-v 900 1.7 0
-f 1 2 3
-",
-    );
+    write("far away.obj", b"v 900 0 0\nv 901 0 0\nv 900 1.7 0\nf 1 2 3\n");
     write("flat.obj", b"v 0 0 0\nv 1 0 0\nv 0 0 1\nf 1 2 3\n");
     write("absent texture.obj", format!("mtllib a.mtl\n{pyramid}").as_bytes());
     fs::write(scans.join("absent texture.obj/a.mtl"), "newmtl a\nmap_Kd skin.png\n").expect("write");
@@ -210,7 +206,10 @@ f 1 2 3
     command.args(["prepare", "scan"]).arg(&scans).arg("-o").arg(&out).args(SMALL);
     let message = refused(&mut command);
     let expected = [
-        ("trüncated.obj", "face parse error"),
+        ("trüncated.obj", "line 8, `f 3 1`: a face needs three corners"),
+        ("half.obj", "3 of 7 vertices belong to no face"),
+        ("no number.obj", "face parse error"),
+        ("billion text.ply", "of 1000000000"),
         ("billion.ply", "of 1000000000: `y` is missing"),
         ("nan.obj", "position 3 is not finite"),
         ("no triangle.obj", "there is no triangle"),
@@ -219,7 +218,7 @@ f 1 2 3
         ("skin.bmp", "Image too large"),
         ("bad colour.obj/a.mtl", "line 2, `Kd 1 1`: no colour"),
         ("far away", "sees nothing of far away"),
-        ("", "9 of 10 subjects could not be made; the others are there"),
+        ("", "12 of 13 subjects could not be made; the others are there"),
     ];
     for (name, reason) in expected {
         let found = message.lines().any(|line| line.contains(name) && line.contains(reason));

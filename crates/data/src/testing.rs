@@ -38,6 +38,30 @@ pub fn rectangle() -> (Mesh, Vec3) {
     (mesh, normal * (0.9 / normal.dot(centre)))
 }
 
+/// Middle and half the size of [`block`]: no turn of the camera makes another of its views.
+pub const BLOCK: (Vec3, Vec3) = (Vec3::new(0.06, 0.9, 0.03), Vec3::new(0.3, 0.8, 0.17));
+
+/// A block whose six sides face along the axes.
+pub fn block() -> Mesh {
+    let (middle, half) = BLOCK;
+    let corner = |i: u32| Vec3::new((i & 1) as f32, (i >> 1 & 1) as f32, (i >> 2) as f32) * 2.0 - 1.0;
+    let sides = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]];
+    let faces = sides.iter().flat_map(|[a, b, c, d]| [[*a, *b, *c], [*a, *c, *d]]);
+    Mesh {
+        positions: (0..8).map(|i| middle + half * corner(i)).collect(),
+        faces: faces.map(|positions| Face { positions, texcoords: None, material: 0 }).collect(),
+        materials: vec![Material { color: Vec3::new(0.3, 0.6, 0.8), texture: None }],
+        ..Mesh::default()
+    }
+}
+
+/// How far a point lies from the surface of [`block`].
+pub fn off_block(p: Vec3) -> f32 {
+    let (middle, half) = BLOCK;
+    let out = (p - middle).abs() - half;
+    (out.max(Vec3::ZERO).length() + out.max_element().min(0.0)).abs()
+}
+
 /// A data set of `subjects` times the same mesh, in train.
 pub fn data_set(
     mesh: &Mesh,

@@ -1,13 +1,14 @@
 //! What is wrong with a data set.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeSet, HashSet};
 use std::fs;
 use std::path::Path;
 
 use rayon::prelude::*;
 
+use super::agree::{Seen, disagreements};
 use super::write::UNFINISHED;
-use super::{Folder, Split};
+use super::{Description, Folder, Layout, Split, split_alpha};
 use crate::DataError;
 
 /// Share of the person that may have no depth: scans have gaps that are narrower than a pixel.
@@ -49,11 +50,16 @@ pub fn check(root: &Path, mut progress: impl FnMut(usize, usize)) -> Result<Chec
         checked.subjects += 1;
         checked.views += folder.description().views;
         checked.problems.extend(unexpected(&folder, *split, subject));
-        let found: Vec<Vec<String>> = (0..folder.description().views)
+        let found: Vec<(Vec<String>, Option<Seen>)> = (0..folder.description().views)
             .into_par_iter()
             .map(|view| faults(&folder, *split, subject, view))
             .collect();
-        checked.problems.extend(found.into_iter().flatten());
+        let (problems, seen): (Vec<_>, Vec<_>) = found.into_iter().unzip();
+        // What is wrong with a file of all views shows with each of them.
+        let mut said = HashSet::new();
+        checked.problems.extend(problems.into_iter().flatten().filter(|p| said.insert(p.clone())));
+        let at = folder.path(*split, "img", subject);
+        checked.problems.extend(disagreements(&seen).map(|p| format!("{}: {p}", at.display())));
     }
     progress(all.len(), all.len());
     Ok(checked)
@@ -94,42 +100,43 @@ fn unexpected(folder: &Folder, split: Option<Split>, subject: &str) -> Vec<Strin
     extra.into_iter().collect()
 }
 
-/// What is wrong with one view.
-fn faults(folder: &Folder, split: Option<Split>, subject: &str, view: usize) -> Vec<String> {
+/// What is wrong with one view, each of its files apart; and what it sees, if all of them can be read.
+fn faults(folder: &Folder, split: Option<Split>, subject: &str, view: usize) -> (Vec<String>, Option<Seen>) {
     let mut problems = Vec::new();
-    // Missing and damaged files, sizes: the error names the file.
-    if folder.description().high_resolution
-        && let Err(e) = folder.picture(split, subject, view, true)
-    {
-        problems.push(e.to_string());
+    let mut keep = |e: DataError| problems.push(e.to_string());
+    let Description { layout, high_resolution, .. } = *folder.description();
+    if high_resolution {
+        folder.file(split, subject, view, true).map_err(&mut keep).ok();
     }
-    match folder.view(split, subject, view) {
-        Err(e) => problems.push(e.to_string()),
-        Ok(stored) => {
-            let at = folder.path(split, "img", subject).join(view.to_string());
-            let mut report = |problem: String| problems.push(format!("{}: {problem}", at.display()));
-            let seen = |v: u8| v >= 128;
-            let mask = stored.mask.as_raw();
-            if !mask.iter().any(|v| seen(*v)) {
-                report("its mask is empty".into());
-            }
-            // At the outline coverage and sample may part by a pixel; inside they agree.
-            let (width, height) = stored.mask.dimensions();
-            let inside = |x: u32, y: u32| {
-                (x.saturating_sub(1)..=(x + 1).min(width - 1)).all(|x| {
-                    (y.saturating_sub(1)..=(y + 1).min(height - 1))
-                        .all(|y| seen(stored.mask.get_pixel(x, y).0[0]))
-                })
-            };
-            let missing = (0..height)
-                .flat_map(|y| (0..width).map(move |x| (x, y)))
-                .filter(|&(x, y)| stored.depth[(y * width + x) as usize] <= 0.0 && inside(x, y));
-            let missing = missing.count();
-            let person = mask.iter().filter(|v| seen(**v)).count();
-            if missing as f64 > HOLES * person as f64 {
-                report(format!("{missing} pixels of the person have no depth"));
-            }
-        }
+    let picture = folder.file(split, subject, view, false).map_err(&mut keep).ok();
+    let mask = match layout {
+        Layout::Exact => picture.map(|picture| split_alpha(picture).1),
+        Layout::Authors => folder.mask(split, subject, view).map_err(&mut keep).ok(),
+    };
+    let depth = folder.depth_map(split, subject, view).map_err(&mut keep).ok();
+    let camera = folder.camera(split, subject, view).map_err(&mut keep).ok();
+
+    let at = folder.path(split, "img", subject).join(view.to_string());
+    let mut report = |problem: String| problems.push(format!("{}: {problem}", at.display()));
+    let seen = |v: u8| v >= 128;
+    let person = mask.as_ref().map(|mask| mask.as_raw().iter().filter(|v| seen(**v)).count());
+    if person == Some(0) {
+        report("its mask is empty".into());
     }
-    problems
+    let (Some(mask), Some(depth)) = (mask, depth) else { return (problems, None) };
+    // At the outline coverage and sample may part by a pixel; inside they agree.
+    let (width, height) = mask.dimensions();
+    let inside = |x: u32, y: u32| {
+        (x.saturating_sub(1)..=(x + 1).min(width - 1))
+            .all(|x| (y.saturating_sub(1)..=(y + 1).min(height - 1)).all(|y| seen(mask.get_pixel(x, y).0[0])))
+    };
+    let missing = (0..height)
+        .flat_map(|y| (0..width).map(move |x| (x, y)))
+        .filter(|&(x, y)| depth[(y * width + x) as usize] <= 0.0 && inside(x, y))
+        .count();
+    if missing as f64 > HOLES * person.unwrap_or(0) as f64 {
+        report(format!("{missing} pixels of the person have no depth"));
+    }
+    let seen = camera.map(|camera| Seen::new(&folder.exact_camera(&camera), &mask, depth));
+    (problems, seen)
 }

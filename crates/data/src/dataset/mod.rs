@@ -14,6 +14,7 @@
 //! A subject appears whole or not at all: it is written under another name and its `img` folder, which says that the
 //! subject is there, is renamed last.
 
+mod agree;
 mod check;
 mod files;
 #[cfg(test)]
@@ -25,7 +26,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use glam::DVec2;
-use image::{GrayImage, RgbImage};
+use image::{DynamicImage, GrayImage, RgbImage};
 use serde::{Deserialize, Serialize};
 use snapsnap_splat::{Camera, cameras, file};
 
@@ -286,6 +287,11 @@ impl Folder {
     /// As [`Self::view`].
     pub fn depth(&self, split: Option<Split>, subject: &str, view: usize) -> Result<StoredView, DataError> {
         let camera = self.camera(split, subject, view)?;
+        let depth = self.depth_map(split, subject, view)?;
+        Ok(StoredView { color: RgbImage::default(), mask: GrayImage::default(), depth, camera })
+    }
+
+    fn depth_map(&self, split: Option<Split>, subject: &str, view: usize) -> Result<Vec<f32>, DataError> {
         let folder = self.path(split, "depth", subject);
         let (path, read): (PathBuf, fn(&Path) -> _) = match self.description.layout {
             Layout::Authors => (folder.join(format!("{view}.png")), files::read_inverse_depth),
@@ -296,7 +302,7 @@ impl Folder {
         if let Some(z) = depth.iter().find(|z| !z.is_finite() || **z < 0.0) {
             return Err(DataError::unsuitable(&path, format!("holds a depth of {z}")));
         }
-        Ok(StoredView { color: RgbImage::default(), mask: GrayImage::default(), depth, camera })
+        Ok(depth)
     }
 
     /// Reads the picture of a view, at twice the side if `high_resolution`: colours and coverage.
@@ -310,33 +316,45 @@ impl Folder {
         view: usize,
         high_resolution: bool,
     ) -> Result<(RgbImage, GrayImage), DataError> {
-        let folder = self.path(split, "img", subject);
-        let suffix = if high_resolution { "_hr" } else { "" };
-        let side = self.description.resolution * if high_resolution { 2 } else { 1 };
-        match self.description.layout {
-            Layout::Exact => {
-                let path = folder.join(format!("{view}{suffix}.png"));
-                let picture = crate::picture::decode(&path)?;
-                self.check_size(&path, (picture.width(), picture.height()), side)?;
-                let rgba = picture.into_rgba8();
-                let mask = GrayImage::from_fn(side, side, |x, y| image::Luma([rgba.get_pixel(x, y).0[3]]));
-                Ok((image::DynamicImage::ImageRgba8(rgba).into_rgb8(), mask))
-            }
-            Layout::Authors => {
-                let path = folder.join(format!("{view}{suffix}.jpg"));
-                let color = crate::picture::decode(&path)?;
-                self.check_size(&path, (color.width(), color.height()), side)?;
-                let path = self.path(split, "mask", subject).join(format!("{view}.png"));
-                let mask = crate::picture::decode(&path)?.into_luma8();
-                self.check_size(&path, mask.dimensions(), self.description.resolution)?;
-                let mask = if high_resolution {
-                    image::imageops::resize(&mask, side, side, image::imageops::FilterType::Nearest)
-                } else {
-                    mask
-                };
-                Ok((color.into_rgb8(), mask))
-            }
+        let picture = self.file(split, subject, view, high_resolution)?;
+        if self.description.layout == Layout::Exact {
+            return Ok(split_alpha(picture));
         }
+        let mask = self.mask(split, subject, view)?;
+        let (width, height) = (picture.width(), picture.height());
+        let mask = if high_resolution {
+            image::imageops::resize(&mask, width, height, image::imageops::FilterType::Nearest)
+        } else {
+            mask
+        };
+        Ok((picture.into_rgb8(), mask))
+    }
+
+    /// The picture file of a view; in the exact layout it holds the mask as well.
+    fn file(
+        &self,
+        split: Option<Split>,
+        subject: &str,
+        view: usize,
+        high_resolution: bool,
+    ) -> Result<DynamicImage, DataError> {
+        let (suffix, times) = if high_resolution { ("_hr", 2) } else { ("", 1) };
+        let ending = match self.description.layout {
+            Layout::Authors => "jpg",
+            Layout::Exact => "png",
+        };
+        let path = self.path(split, "img", subject).join(format!("{view}{suffix}.{ending}"));
+        let picture = crate::picture::decode(&path)?;
+        self.check_size(&path, (picture.width(), picture.height()), times * self.description.resolution)?;
+        Ok(picture)
+    }
+
+    /// The mask file of a view in the authors' layout.
+    fn mask(&self, split: Option<Split>, subject: &str, view: usize) -> Result<GrayImage, DataError> {
+        let path = self.path(split, "mask", subject).join(format!("{view}.png"));
+        let mask = crate::picture::decode(&path)?.into_luma8();
+        self.check_size(&path, mask.dimensions(), self.description.resolution)?;
+        Ok(mask)
     }
 
     /// Reads the camera of a view, in the pixel coordinates that [`Description::pixel_centre`] says.
@@ -357,9 +375,13 @@ impl Folder {
                 let path = self.split_path(split).join("cameras").join(format!("{subject}.json"));
                 drop(open(&path)?);
                 let cameras = cameras::read(&path).map_err(|e| DataError::splat(&path, e))?;
-                let count = cameras.len();
-                let camera = cameras.into_iter().nth(view).ok_or_else(|| {
-                    DataError::unsuitable(&path, format!("holds {count} cameras, view {view} has none"))
+                let views = self.description.views;
+                if cameras.len() != views {
+                    let message = format!("holds {} cameras, the data set has {views} views", cameras.len());
+                    return Err(DataError::unsuitable(&path, message));
+                }
+                let camera = cameras.get(view).copied().ok_or_else(|| {
+                    DataError::unsuitable(&path, format!("has no camera for view {view}, of {views}"))
                 })?;
                 self.check_size(&path, (camera.width, camera.height), side)?;
                 Ok(camera)
@@ -391,6 +413,14 @@ impl Folder {
     fn path(&self, split: Option<Split>, kind: &str, subject: &str) -> PathBuf {
         self.split_path(split).join(kind).join(subject)
     }
+}
+
+/// Colours and coverage of a picture that holds both.
+fn split_alpha(picture: DynamicImage) -> (RgbImage, GrayImage) {
+    let rgba = picture.into_rgba8();
+    let mask =
+        GrayImage::from_fn(rgba.width(), rgba.height(), |x, y| image::Luma([rgba.get_pixel(x, y).0[3]]));
+    (DynamicImage::ImageRgba8(rgba).into_rgb8(), mask)
 }
 
 fn read_description(path: &Path) -> Result<Description, DataError> {

@@ -132,6 +132,10 @@ fn a_check_lists_everything_that_is_wrong() {
     let cameras = at("cameras/0000.json");
     let text = fs::read_to_string(&cameras).expect("read").replacen("64", "65", 1);
     fs::write(&cameras, text).expect("write");
+    // A view of which nothing is left.
+    fs::remove_file(at("img/0000/3.png")).expect("remove");
+    fs::remove_file(at("img/0000/3_hr.png")).expect("remove");
+    fs::remove_file(at("depth/0000/3.npz")).expect("remove");
     fs::create_dir(at("depth/0009")).expect("make");
 
     let problems = check(folder.root(), |_, _| {}).expect("checks").problems;
@@ -141,6 +145,10 @@ fn a_check_lists_everything_that_is_wrong() {
         "0000/0.png: cannot read",
         "0000/1.png: not a readable image",
         "0000/2.png: is 128×128, the data set has views of 64×64",
+        "0000/3.png: cannot read",
+        "0000/3_hr.png: cannot read",
+        "0000/3.npz: cannot read",
+        "0000.json: is 65×64",
         "0001/0: its mask is empty",
         "0001/1.npz: holds a depth of NaN",
         "0001/2: ",
@@ -150,12 +158,77 @@ fn a_check_lists_everything_that_is_wrong() {
         assert!(problems.iter().any(|problem| problem.contains(words)), "{words}: {problems:#?}");
     }
     assert_eq!(problems.len(), expected.len(), "{problems:#?}");
-    // A wrong camera shows once its picture can be read.
-    fs::write(at("img/0000/0.png"), &whole).expect("write");
+    // Too many cameras: said once, not with each view.
+    let text = fs::read_to_string(at("cameras/0001.json")).expect("read");
+    let mut all: Vec<serde_json::Value> = serde_json::from_str(&text).expect("a list");
+    all.push(all[0].clone());
+    fs::write(at("cameras/0001.json"), serde_json::to_string(&all).expect("JSON")).expect("write");
     let problems = check(folder.root(), |_, _| {}).expect("checks").problems;
-    assert!(problems.iter().any(|problem| problem.contains("is 65×64")), "{problems:#?}");
+    let said = problems.iter().filter(|p| p.contains("holds 5 cameras, the data set has 4 views")).count();
+    assert_eq!(said, 1, "{problems:#?}");
 
     fs::write(folder.root().join(DESCRIPTION), "layout = \"exact\"\nviews = 4\n").expect("write");
     let error = check(folder.root(), |_, _| {}).expect_err("no description").to_string();
     assert!(error.contains(DESCRIPTION) && error.contains("resolution"), "{error}");
+}
+
+/// Each file of the authors' layout is looked at, whatever is wrong with the others.
+#[test]
+fn a_check_looks_at_every_file_of_the_authors_layout() {
+    let (_temporary, folder) = small(Layout::Authors);
+    let at = |path: &str| folder.root().join("train").join(path);
+    let files = [
+        "img/0000/1.jpg",
+        "img/0000/1_hr.jpg",
+        "mask/0000/1.png",
+        "depth/0000/1.png",
+        "parm/0000/1_extrinsic.npy",
+        "parm/0000/2_intrinsic.npy",
+        "mask/0001/3.png",
+    ];
+    for file in files {
+        fs::write(at(file), "nothing").expect("write");
+    }
+    let problems = check(folder.root(), |_, _| {}).expect("checks").problems;
+    for file in files {
+        assert!(problems.iter().any(|problem| problem.contains(file)), "{file}: {problems:#?}");
+    }
+    assert_eq!(problems.len(), files.len(), "{problems:#?}");
+}
+
+/// A camera that is sound by itself but not the one that drew the view.
+#[test]
+fn a_check_sees_cameras_that_do_not_fit_their_views() {
+    let changes: [(&str, fn(&mut Camera)); 4] = [
+        ("of a picture four times the size", |camera| {
+            camera.focal *= 4.0;
+            camera.principal_point *= 4.0;
+        }),
+        ("displaced by 10 cm", |camera| camera.world_to_camera.translation.x += 0.1),
+        ("10 cm nearer", |camera| camera.world_to_camera.translation.z -= 0.1),
+        ("of another view", |camera| *camera = Camera::orbit_at_yaw_degrees(45.0, 256)),
+    ];
+    for layout in [Layout::Exact, Layout::Authors] {
+        let (_temporary, folder) = data_set(crate::testing::person(), layout, 256, 8, false, 1);
+        assert!(check(folder.root(), |_, _| {}).expect("checks").problems.is_empty());
+        let cameras: Vec<Camera> =
+            (0..8).map(|view| folder.camera(TRAIN, "0000", view).expect("reads")).collect();
+        for (name, change) in changes {
+            let mut cameras = cameras.clone();
+            change(&mut cameras[3]);
+            let train = folder.root().join("train");
+            match layout {
+                Layout::Exact => cameras::write(&cameras, &train.join("cameras/0000.json")).expect("writes"),
+                Layout::Authors => {
+                    files::write_camera(&train.join("parm/0000"), 3, &cameras[3]).expect("writes");
+                }
+            }
+            let problems = check(folder.root(), |_, _| {}).expect("checks").problems;
+            let fit = |pair: &str| {
+                problems.iter().any(|p| p.contains(pair) && p.contains("do not fit one another"))
+            };
+            assert!(fit("views 1 and 3") && fit("views 3 and 5"), "{layout:?}, {name}: {problems:#?}");
+            assert_eq!(problems.len(), 2, "{problems:#?}");
+        }
+    }
 }

@@ -16,6 +16,8 @@ use crate::mesh::{Face, Material, Mesh};
 
 /// Longest line; a face of a scan has a handful of corners.
 const MAX_LINE: usize = 1 << 20;
+/// Share of the vertices that may belong to no face: scans have strays, files that were cut short have many.
+const UNUSED: f64 = 0.05;
 
 pub fn read(path: &Path) -> Result<Mesh, DataError> {
     let text = read_lossy(path)?;
@@ -42,6 +44,15 @@ pub fn read(path: &Path) -> Result<Mesh, DataError> {
     })?;
     if let Some(e) = failed.take() {
         return Err(e);
+    }
+    let vertices = check_faces(path, &text)?;
+    let used: usize = models.iter().map(|model| model.mesh.positions.len() / 3).sum();
+    if (vertices.saturating_sub(used)) as f64 > UNUSED * vertices as f64 && used > 0 {
+        let message = format!(
+            "{} of {vertices} vertices belong to no face: the file seems to be cut short",
+            vertices - used
+        );
+        return Err(DataError::unsuitable(path, message));
     }
     let materials = materials.unwrap_or_default();
     // The parser takes unknown names for no material at all.
@@ -85,6 +96,23 @@ pub fn read(path: &Path) -> Result<Mesh, DataError> {
         }
     }
     Ok(mesh)
+}
+
+/// How many vertices there are; refuses faces of fewer than three corners, which the parser takes for lines.
+fn check_faces(path: &Path, text: &str) -> Result<usize, DataError> {
+    let mut vertices = 0;
+    for (number, line) in text.lines().enumerate() {
+        let mut words = line.split_ascii_whitespace();
+        match words.next() {
+            Some("v") => vertices += 1,
+            Some("f") if words.take_while(|word| !word.starts_with('#')).count() < 3 => {
+                let message = format!("line {}, `{}`: a face needs three corners", number + 1, quoted(line));
+                return Err(DataError::unsuitable(path, message));
+            }
+            _ => {}
+        }
+    }
+    Ok(vertices)
 }
 
 /// The file in a `map_Kd` statement, behind its options (`-s 1 1 1 skin.png`).

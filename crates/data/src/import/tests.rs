@@ -288,3 +288,23 @@ fn corrupt_scans_are_refused_by_name() {
     }
     assert!(read(Path::new("/no/such.obj")).expect_err("missing").to_string().contains("cannot read"));
 }
+
+/// Wherever the file of a person is cut, but for its very end, that is noticed.
+#[test]
+fn a_scan_that_is_cut_short_is_refused() {
+    let folder = tempfile::tempdir().expect("temporary folder");
+    let whole = folder.path().join("whole.obj");
+    crate::export::write_obj(crate::testing::person(), &whole).expect("writes");
+    let bytes = fs::read(&whole).expect("reads");
+    let path = folder.path().join("cut.obj");
+    for percent in [1, 20, 40, 50, 60, 70, 80, 90, 95] {
+        // At the end of a line: nothing else tells that more should come.
+        let end = bytes.len() * percent / 100;
+        let end = bytes[..end].iter().rposition(|b| *b == b'\n').map_or(0, |at| at + 1);
+        fs::write(&path, &bytes[..end]).expect("writes");
+        let refused = read(&path).map(|_| ()).expect_err("cut").to_string();
+        let expected = ["there is no triangle", "the file seems to be cut short", "refers to"];
+        assert!(expected.iter().any(|words| refused.contains(words)), "{percent} %: {refused}");
+    }
+    assert!(read(&whole).is_ok());
+}

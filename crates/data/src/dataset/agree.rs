@@ -1,0 +1,104 @@
+//! Whether the views of a subject fit one another: what one sees must lie within the person's outline in the others.
+
+use glam::{DVec2, DVec3};
+use image::GrayImage;
+use snapsnap_splat::{Camera, RigidTransform};
+
+use super::StoredView;
+use crate::sample::unproject;
+
+/// Side of an outline in cells, at most: what is compared is coarser than the pictures.
+const CELLS: u32 = 256;
+/// Most points of a view that are tried.
+const POINTS: usize = 2000;
+/// Share of them that may lie outside: single pixels of one view may be too thin for another.
+const OUTSIDE: f64 = 0.05;
+
+/// What one view says of its subject.
+pub struct Seen {
+    camera: Camera,
+    /// World points, metres.
+    points: Vec<DVec3>,
+    /// `[side,side]` where the person is, one cell wider all around than it is.
+    outline: Vec<bool>,
+    side: u32,
+    /// Whether the picture cuts the person off.
+    is_cut: bool,
+}
+
+impl Seen {
+    /// `camera` has the first pixel's sample at (½, ½); `depth` is `[H,W]` in metres.
+    pub fn new(camera: &Camera, mask: &GrayImage, depth: Vec<f32>) -> Self {
+        let width = camera.width;
+        let side = width.min(CELLS);
+        let mut outline = vec![false; (side * side) as usize];
+        let mut is_cut = false;
+        let stored =
+            StoredView { color: Default::default(), mask: Default::default(), depth, camera: *camera };
+        for (x, y, pixel) in mask.enumerate_pixels() {
+            if pixel.0[0] < 128 && stored.depth[(y * width + x) as usize] <= 0.0 {
+                continue;
+            }
+            is_cut |= x == 0 || y == 0 || x + 1 == width || y + 1 == width;
+            let cell = |v: u32| (u64::from(v) * u64::from(side) / u64::from(width)) as u32;
+            for y in cell(y).saturating_sub(1)..=(cell(y) + 1).min(side - 1) {
+                for x in cell(x).saturating_sub(1)..=(cell(x) + 1).min(side - 1) {
+                    outline[(y * side + x) as usize] = true;
+                }
+            }
+        }
+        let mut world = *camera;
+        world.world_to_camera = RigidTransform::IDENTITY;
+        let points = unproject(&stored, camera, &world, 0.0);
+        let points: Vec<DVec3> = points
+            .chunks_exact(3)
+            .zip(&stored.depth)
+            .filter(|(_, z)| **z > 0.0)
+            .map(|(p, _)| DVec3::new(p[0].into(), p[1].into(), p[2].into()))
+            .collect();
+        let points = points.iter().step_by(points.len().div_ceil(POINTS).max(1)).copied().collect();
+        Self { camera: *camera, points, outline, side, is_cut }
+    }
+
+    /// Share of the points of `other` that lie outside the person here.
+    fn outside(&self, other: &Self) -> f64 {
+        let (mut tried, mut outside) = (0, 0);
+        for point in &other.points {
+            let cell = self
+                .camera
+                .project(*point)
+                .map(|(at, _)| (at * f64::from(self.side) / f64::from(self.camera.width)).floor());
+            let size = f64::from(self.side);
+            let cell = cell.filter(|c| c.cmpge(DVec2::ZERO).all() && c.max_element() < size);
+            match cell {
+                None if self.is_cut => continue,
+                None => outside += 1,
+                Some(c) => {
+                    let row = c.y as usize * self.side as usize;
+                    outside += usize::from(!self.outline[row + c.x as usize]);
+                }
+            }
+            tried += 1;
+        }
+        if tried == 0 { 0.0 } else { outside as f64 / f64::from(tried) }
+    }
+}
+
+/// Pairs of views, a quarter turn apart, that do not fit one another: a camera or a depth map of theirs is wrong.
+pub fn disagreements(views: &[Option<Seen>]) -> impl Iterator<Item = String> {
+    let count = views.len();
+    let step = (count / 4).max(1);
+    let pairs = if count > 2 { count } else { count.saturating_sub(1) };
+    (0..pairs).filter_map(move |a| {
+        let b = (a + step) % count;
+        let (one, other) = (views[a].as_ref()?, views[b].as_ref()?);
+        let share = one.outside(other).max(other.outside(one));
+        (share > OUTSIDE).then(|| {
+            let percent = 100.0 * share;
+            format!(
+                "views {a} and {b} do not fit one another: {percent:.0} % of what one sees lies outside the person in \
+                 the other; a camera or a depth map is wrong"
+            )
+        })
+    })
+}
