@@ -41,11 +41,12 @@ pub enum Collection {
 }
 
 impl Collection {
-    /// Where a subject belongs: the published lists for THuman; 2K2K and 4D-Dress are
-    /// tested on, others trained on (SNAPSNAP §5.1).
-    pub fn split(self, subject: &str) -> Split {
+    /// Where a subject belongs, the `place`-th of its set: the published lists for THuman; the first 100 of 2K2K and all
+    /// of 4D-Dress are tested on, others trained on (SNAPSNAP §5.1).
+    pub fn split(self, subject: &str, place: usize) -> Split {
         match (self.of(subject), subject.parse::<u32>()) {
-            (Self::TwoK2K | Self::FourDDress, _) => Split::Test,
+            (Self::FourDDress, _) => Split::Test,
+            (Self::TwoK2K, _) if place < TESTED_2K2K => Split::Test,
             (Self::Thuman20, Ok(id)) if VALIDATION.contains(&id) => Split::Val,
             (Self::Thuman21, Ok(id)) if LOOSE.contains(&id) => Split::Test,
             _ => Split::Train,
@@ -95,6 +96,9 @@ pub const LOOSE: [u32; 50] = [
     2264, 1350, 1982, 1981, 1122, 2413, 1819, 1043, 1267, 2186, 865, 2148, 1392, 2092, 2198, 2409, 839, 2250,
     1681, 837, 2109, 1398, 1115, 659, 1123, 1816, 2230, 1693, 1367, 713, 2258, 1124,
 ];
+
+/// How many subjects of 2K2K's training set are tested on: the first.
+const TESTED_2K2K: usize = 100;
 
 /// A scan's file and the subject that it becomes.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -244,7 +248,7 @@ mod tests {
 
     #[test]
     fn the_lists_are_those_of_the_paper() {
-        let train = (0..526).filter(|id| Collection::Thuman20.split(&id.to_string()) == Split::Train);
+        let train = (0..526).filter(|id| Collection::Thuman20.split(&id.to_string(), 0) == Split::Train);
         assert_eq!(train.count(), 426);
         assert_eq!(VALIDATION.iter().collect::<HashSet<_>>().len(), 100);
         assert_eq!(LOOSE.iter().collect::<HashSet<_>>().len(), 50);
@@ -290,11 +294,13 @@ mod tests {
     fn subjects_go_where_the_published_lists_say() {
         let collection = Collection::Thuman21;
         assert_eq!((collection.of("0525"), collection.of("0526")), (Collection::Thuman20, collection));
-        assert_eq!(Collection::Thuman20.split("0006"), Split::Val);
-        assert_eq!(Collection::Thuman20.split("0004"), Split::Train);
-        assert_eq!(collection.split("0659"), Split::Test);
-        assert_eq!(collection.split("0006"), Split::Val, "THuman2.1 includes THuman2.0");
-        assert_eq!(Collection::TwoK2K.split("0006"), Split::Test);
+        assert_eq!(Collection::Thuman20.split("0006", 7), Split::Val);
+        assert_eq!(Collection::Thuman20.split("0004", 7), Split::Train);
+        assert_eq!(collection.split("0659", 7), Split::Test);
+        assert_eq!(collection.split("0006", 7), Split::Val, "THuman2.1 includes THuman2.0");
+        assert_eq!(Collection::TwoK2K.split("0100", 99), Split::Test);
+        assert_eq!(Collection::TwoK2K.split("0101", 100), Split::Train);
+        assert_eq!(Collection::FourDDress.split("00185-f00021", 700), Split::Test);
     }
 
     #[test]

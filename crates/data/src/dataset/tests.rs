@@ -199,7 +199,8 @@ fn a_check_looks_at_every_file_of_the_authors_layout() {
 /// A camera that is sound by itself but not the one that drew the view.
 #[test]
 fn a_check_sees_cameras_that_do_not_fit_their_views() {
-    let changes: [(&str, fn(&mut Camera)); 4] = [
+    type Change = fn(&mut Camera);
+    let changes: [(&str, Change); 4] = [
         ("of a picture four times the size", |camera| {
             camera.focal *= 4.0;
             camera.principal_point *= 4.0;

@@ -4,6 +4,7 @@ mod augment;
 mod loader;
 mod stage1;
 mod stage2;
+mod test_set;
 #[cfg(test)]
 mod tests;
 
@@ -18,12 +19,13 @@ use serde::{Deserialize, Serialize};
 use snapsnap_splat::Camera;
 
 use crate::DataError;
-use crate::dataset::{Folder, Split, StoredView};
+use crate::dataset::{Folder, Layout, Split, StoredView};
 use crate::random::stream;
 pub use augment::Augment;
 pub use loader::Loader;
 pub use stage1::{Stage1, Stage1Batch, Stage1Batcher, Stage1Item};
 pub use stage2::{Stage2, Stage2Batch, Stage2Batcher, Stage2Item};
+pub use test_set::{Test, TestItem};
 
 /// Depth that the published code gives the background: 1/(0 + 10⁻⁸).
 const COMPAT_FAR: f32 = 1e8;
@@ -95,14 +97,21 @@ struct Source {
 }
 
 impl Source {
-    fn new(folder: Arc<Folder>, split: Option<Split>, config: SampleConfig) -> Result<Self, DataError> {
+    /// `parts`: into how many equal parts views are taken from the circle.
+    fn new(
+        folder: Arc<Folder>,
+        split: Option<Split>,
+        config: SampleConfig,
+        parts: usize,
+    ) -> Result<Self, DataError> {
         let wrong = |message: String| DataError::unsuitable(folder.root(), message);
         if let Some((key, message)) = config.problem() {
             return Err(wrong(format!("samples: `{key}`: {message}")));
         }
         let views = folder.description().views;
-        if !views.is_multiple_of(4) {
-            return Err(wrong(format!("has {views} views; front, back and sides need a multiple of 4")));
+        if !views.is_multiple_of(parts) {
+            let who = if parts == 4 { "front, back and sides" } else { "front and back" };
+            return Err(wrong(format!("has {views} views; {who} need a multiple of {parts}")));
         }
         if config.high_resolution && !folder.description().high_resolution {
             return Err(wrong("has no views at twice the side, which `high_resolution` asks for".into()));
@@ -138,6 +147,28 @@ impl Source {
     /// reads it.
     fn camera(&self, stored: &Camera) -> Camera {
         if self.config.compat { *stored } else { self.folder.exact_camera(stored) }
+    }
+
+    /// What a view sees, to be compared with: `[3,h,w]` in [0, 1], over a colour.
+    fn target(
+        &self,
+        subject: &str,
+        view: usize,
+        high_resolution: bool,
+        background: [f32; 3],
+    ) -> Result<Vec<f32>, DataError> {
+        let (color, mask) = self.folder.picture(self.split, subject, view, high_resolution)?;
+        // The authors' pictures are over black already, and their masks half as fine as the larger ones.
+        let is_done = self.folder.description().layout == Layout::Authors && background == [0.0; 3];
+        let value = |c: u8, a: u8, behind: f32| {
+            let a = if is_done { 1.0 } else { f32::from(a) / 255.0 };
+            a * f32::from(c) / 255.0 + (1.0 - a) * behind
+        };
+        let pixels = |channel: usize| {
+            let pixels = color.pixels().zip(mask.pixels());
+            pixels.map(move |(c, a)| value(c.0[channel], a.0[0], background[channel]))
+        };
+        Ok((0..3).flat_map(pixels).collect())
     }
 
     /// Front and back as the networks see them: `[2,3,H,W]` and their masks `[2,H,W]`.

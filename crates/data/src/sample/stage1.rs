@@ -51,7 +51,7 @@ impl Stage1 {
     /// itself or the data set.
     pub fn new(folder: Arc<Folder>, split: Option<Split>, config: SampleConfig) -> Result<Self, DataError> {
         // High resolution is stage 2's.
-        Source::new(folder, split, SampleConfig { high_resolution: false, ..config }).map(Self)
+        Source::new(folder, split, SampleConfig { high_resolution: false, ..config }, 4).map(Self)
     }
 
     /// The same subjects with other random choices.

@@ -5,7 +5,6 @@ use std::sync::Arc;
 use burn::data::dataloader::batcher::Batcher;
 use burn::data::dataset::{Dataset, DatasetError};
 use burn::tensor::{Device, Tensor};
-use image::{GrayImage, Luma, RgbImage};
 use rand::Rng;
 use snapsnap_splat::Camera;
 
@@ -68,7 +67,7 @@ impl Stage2 {
                 "has no masks at twice the side, which `background_color` needs beside `high_resolution`";
             return Err(DataError::unsuitable(folder.root(), message));
         }
-        Source::new(folder, split, config).map(Self)
+        Source::new(folder, split, config, 4).map(Self)
     }
 
     /// The same subjects with other random choices.
@@ -95,19 +94,11 @@ impl Stage2 {
         let random_views = (0..config.supervision).map(|_| random.random_range(0..count)).collect::<Vec<_>>();
         let background =
             if config.augment.background_color { [(); 3].map(|()| random.random()) } else { [0.0; 3] };
-        let composited = description.layout == Layout::Exact || config.augment.background_color;
         let scale = if config.high_resolution { 2 } else { 1 };
         let target_side = description.resolution * scale;
         let (mut targets, mut target_cameras) = (Vec::new(), Vec::new());
         for view in random_views.into_iter().chain([right, left]) {
-            let (color, mask) = folder.picture(*split, subject, view, config.high_resolution)?;
-            // The authors' pictures are over black already, and their masks half as fine as the larger ones.
-            let mask = if composited {
-                mask
-            } else {
-                GrayImage::from_pixel(mask.width(), mask.height(), Luma([255]))
-            };
-            targets.extend(over(&color, &mask, background));
+            targets.extend(source.target(subject, view, config.high_resolution, background)?);
             // Sampled where the stored picture is, at its own size.
             let stored = folder.camera(*split, subject, view)?.resized(target_side, target_side);
             target_cameras.push(source.camera(&stored));
@@ -124,16 +115,6 @@ impl Stage2 {
             background,
         })
     }
-}
-
-/// `[3,h,w]` in [0, 1], over a colour.
-fn over(color: &RgbImage, mask: &GrayImage, background: [f32; 3]) -> impl Iterator<Item = f32> {
-    (0..3).flat_map(move |channel| {
-        color.pixels().zip(mask.pixels()).map(move |(c, m)| {
-            let a = f32::from(m.0[0]) / 255.0;
-            a * f32::from(c.0[channel]) / 255.0 + (1.0 - a) * background[channel]
-        })
-    })
 }
 
 impl Dataset<Stage2Item> for Stage2 {

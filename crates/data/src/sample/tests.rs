@@ -290,6 +290,43 @@ fn stage_two_samples_have_cameras_for_what_they_compare() {
     }
 }
 
+/// Thirty views, of which 0 and 15 go in, as in the published test.
+#[test]
+fn test_samples_are_the_first_view_and_the_opposite_one() {
+    for layout in [Layout::Exact, Layout::Authors] {
+        let (_temporary, folder) = data_set(&block(), layout, 64, 30, false, 2);
+        let refusal = Stage1::new(folder.clone(), TRAIN, SampleConfig::default()).map(drop).expect_err("30");
+        assert!(refusal.to_string().contains("has 30 views; front, back and sides need a multiple of 4"));
+        let test = Test::new(folder.clone(), TRAIN, SampleConfig::default()).expect("makes samples");
+        assert_eq!(test.len(), 2);
+        let item = test.sample(1).expect("reads");
+        assert_eq!((item.subject.as_str(), item.side, item.cameras.len()), ("0001", 64, 30));
+        for (view, yaw) in [(0, 0.0), (7, 84.0), (15, 180.0)] {
+            let expected = Camera::orbit_at_yaw_degrees(yaw, 64).centre();
+            assert!((item.cameras[view].centre() - expected).length() < 1e-9, "{view}");
+        }
+        // What goes in is what is to be compared, but for the range of values.
+        let area = 64 * 64;
+        for (place, view) in [(0, 0), (1, 15)] {
+            let target = test.target(1, view, [0.25, 0.5, 0.75]).expect("reads");
+            let image = &item.images[place * 3 * area..][..3 * area];
+            let mask = &item.masks[place * area..][..area];
+            let stored = folder.view(TRAIN, "0001", view).expect("reads");
+            let mut inside = 0;
+            for i in 0..3 * area {
+                let full = image[i] != 0.0 && mask[i % area] == 1.0;
+                if full && stored.mask.as_raw()[i % area] == 255 {
+                    assert!((target[i] - (image[i] + 1.0) / 2.0).abs() < 1e-6, "{layout:?} {view}");
+                    inside += 1;
+                }
+            }
+            assert!(inside > 500, "{inside}");
+            assert_eq!([0, 1, 2].map(|c| target[c * area]), [0.25, 0.5, 0.75], "a corner");
+        }
+        assert_eq!(test.target(0, 3, [0.0; 3]).expect("reads").len(), 3 * area);
+    }
+}
+
 #[test]
 fn a_loader_gives_batches_of_stage_one() {
     let (_temporary, folder) = data_set(person(), Layout::Exact, 64, 8, false, 2);

@@ -257,19 +257,33 @@ fn generate(
         })
         .collect();
     let source = format!("{kind}, seed {}", common.seed);
+    let scan = |work: &Work| {
+        let Work { split, subject, .. } = work;
+        common.output.join("scans").join(split.name()).join(subject).join(format!("{subject}.obj"))
+    };
+    // What is there may have been changed by hand.
+    let is_due = |work: &Work| generate.save_scans && !scan(work).exists();
     make(common, quiet, &source, &[], &works, |_, work| {
         let mut mesh = person(&work.identity)?;
-        if generate.save_scans {
-            let scan = common.output.join("scans").join(split.name()).join(&work.subject);
-            let path = scan.join(format!("{}.obj", work.subject));
-            // What is there may have been changed by hand.
-            if !path.exists() {
-                export::write_obj(&mesh, &path)?;
-            }
+        if is_due(work) {
+            export::write_obj(&mesh, &scan(work))?;
         }
         place(&mut mesh, work, Collection::Other, &common.output)?;
         Ok(Person { mesh, yaw_degrees: 0.0 })
-    })
+    })?;
+    // Subjects that were there before, without their scans.
+    let mine = works.iter().enumerate().filter(|(place, work)| common.shard.has(*place) && is_due(work));
+    let due: Vec<&Work> = mine.map(|(_, work)| work).collect();
+    if due.is_empty() {
+        return Ok(());
+    }
+    let progress = Progress::steps(quiet, due.len(), "scans");
+    for (done, work) in due.iter().enumerate() {
+        progress.step(done, due.len(), "scans");
+        export::write_obj(&person(&work.identity)?, &scan(work))?;
+    }
+    progress.step(due.len(), due.len(), "scans");
+    Ok(())
 }
 
 /// Stands the mesh up for the cameras; training subjects not quite in the middle, as their names decide.

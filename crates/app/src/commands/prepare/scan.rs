@@ -56,7 +56,7 @@ pub struct Arguments {
     /// it they are looked for beside each scan.
     #[arg(long, value_name = "DIR")]
     smplx: Option<PathBuf>,
-    /// Put all subjects there [default: as the set's published lists say; 2K2K and 4D-Dress test, others train].
+    /// Put all subjects there [default: as the set's published lists say; the first 100 of 2K2K and all of 4D-Dress test, others train].
     #[arg(long, value_enum)]
     split: Option<SplitArgument>,
 }
@@ -66,9 +66,10 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let sources = find(&arguments.source)?;
     let works: Vec<Work> = sources
         .iter()
-        .map(|source| {
+        .enumerate()
+        .map(|(place, source)| {
             let subject = source.subject.clone();
-            let split = arguments.split.map_or_else(|| collection.split(&subject), Split::from);
+            let split = arguments.split.map_or_else(|| collection.split(&subject, place), Split::from);
             let identity = format!("scan/{}/{split}/{subject}", arguments.common.seed);
             Work { split, subject, identity }
         })
