@@ -52,7 +52,7 @@ fn synthetic_people_become_a_data_set_that_has_no_fault() {
     assert!(report.contains("3 subjects, 12 views: no fault"), "{report}");
     let sheet = image::open(&sheet).expect("a picture").into_rgb8();
     let colors: std::collections::HashSet<[u8; 3]> = sheet.pixels().map(|p| p.0).collect();
-    assert!(sheet.width() == 9 * 144 && colors.len() > 500, "{:?}", sheet.dimensions());
+    assert!(sheet.width() == 9 * 192 && colors.len() > 500, "{:?}", sheet.dimensions());
 }
 
 /// Both roads meet: people that were kept as scans, read again, give the same views.

@@ -43,7 +43,10 @@ pub fn check(root: &Path, mut progress: impl FnMut(usize, usize)) -> Result<Chec
     }
     let path = root.join(UNFINISHED);
     if fs::read_dir(&path).is_ok_and(|mut entries| entries.next().is_some()) {
-        checked.problems.push(format!("{}: a run was killed, or is at work", path.display()));
+        checked.problems.push(format!(
+            "{}: a run is at work, or was killed: the next one clears this away",
+            path.display()
+        ));
     }
     for (done, (split, subject)) in all.iter().enumerate() {
         progress(done, all.len());

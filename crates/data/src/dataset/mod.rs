@@ -21,6 +21,7 @@ mod files;
 mod tests;
 mod write;
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -210,7 +211,8 @@ impl Folder {
             return Err(DataError::unsuitable(root, problem));
         }
         let Description { layout, views, resolution, .. } = description;
-        if layout == Layout::Authors && views_in_name(root) != Some(views) {
+        let name = full_name(root);
+        if layout == Layout::Authors && !name.ends_with(&format!("_{resolution}_{views}")) {
             let message = format!(
                 "the authors' loader reads the number of views from the folder's name: it must end in `_{resolution}_{views}`"
             );
@@ -221,11 +223,9 @@ impl Folder {
         if path.exists() {
             let there = read_description(&path)?;
             if there != description {
-                let text = |d: &Description| toml::to_string(d).unwrap_or_default().replace('\n', ", ");
                 let message = format!(
-                    "describes another data set than the one to be written: {}instead of {}give another folder",
-                    text(&there),
-                    text(&description)
+                    "describes another data set than the one to be written: {}; give another folder",
+                    differences(&there, &description)
                 );
                 return Err(DataError::unsuitable(&path, message));
             }
@@ -436,10 +436,41 @@ fn read_description(path: &Path) -> Result<Description, DataError> {
     }
 }
 
+/// What the one description says and the other does not, key by key.
+fn differences(there: &Description, wanted: &Description) -> String {
+    let keys = |d: &Description| {
+        let table = toml::Table::try_from(d).expect("the description has only TOML types");
+        let mut keys = BTreeMap::new();
+        flatten("", &table, &mut keys);
+        keys
+    };
+    let (there, wanted) = (keys(there), keys(wanted));
+    let all: BTreeSet<&String> = there.keys().chain(wanted.keys()).collect();
+    let value = |of: &BTreeMap<String, String>, key: &str| of.get(key).map_or("unset".into(), String::clone);
+    let differing = all.into_iter().filter(|key| there.get(*key) != wanted.get(*key));
+    let said =
+        differing.map(|key| format!("`{key}` is {} there, not {}", value(&there, key), value(&wanted, key)));
+    said.collect::<Vec<_>>().join(", ")
+}
+
+fn flatten(before: &str, table: &toml::Table, keys: &mut BTreeMap<String, String>) {
+    for (key, value) in table {
+        match value {
+            toml::Value::Table(table) => flatten(&format!("{before}{key}."), table, keys),
+            value => drop(keys.insert(format!("{before}{key}"), value.to_string())),
+        }
+    }
+}
+
+/// The name of a folder, however its path is written.
+fn full_name(root: &Path) -> String {
+    let name = root.canonicalize().unwrap_or_else(|_| root.to_owned());
+    name.file_name().unwrap_or_default().to_string_lossy().into_owned()
+}
+
 /// The number behind the last underscore of the folder's name.
 fn views_in_name(root: &Path) -> Option<usize> {
-    let name = root.canonicalize().unwrap_or_else(|_| root.to_owned());
-    let name = name.file_name()?.to_string_lossy().into_owned();
+    let name = full_name(root);
     let (_, views) = name.rsplit_once('_')?;
     views.parse().ok().filter(|views| (1..=MAX_VIEWS).contains(views))
 }

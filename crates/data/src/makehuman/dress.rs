@@ -1,6 +1,6 @@
 //! The layers of a MakeHuman person: skin, clothes cut from the base mesh's helper surfaces, hair.
 
-use glam::Vec3;
+use glam::{Vec2, Vec3};
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 
 use super::net::{Net, PARTS, Vertex};
@@ -10,52 +10,61 @@ use crate::synth::math::{noise, smoothstep};
 use crate::synth::outfit::Lower;
 use crate::synth::surface::{self, Surface};
 
-/// Skin this deep under a hem, in metres, is left out.
-const HIDDEN: f32 = 0.03;
+/// Metres that skin stays below cloth.
+const GAP: f32 = 0.004;
 /// Beyond this, how far inside a garment a place is does not matter.
 const FAR: f32 = 0.08;
 /// Side of the cells that hair is meshed with, metres.
 const HAIR_CELL: f32 = 0.006;
 
 impl Person<'_> {
+    /// The mean over the parts that a vertex belongs to of what `depth` says of its place on each chart, by kind, angle,
+    /// metres along, and the chart's length: so that edges run smoothly from part to part.
+    fn blend(&self, vertex: &Vertex, depth: impl Fn(Kind, f32, f32, f32) -> f32) -> f32 {
+        let (mut sum, mut shares) = (0.0, 0.0);
+        for (part, share) in vertex.parts.iter().enumerate().filter(|(_, share)| **share > 0.0) {
+            let chart = &self.body.parts[self.rows[part]];
+            let (angle, along) = chart.chart(vertex.rest);
+            sum += share * depth(ORDER[part].0, angle, along, chart.length).clamp(-FAR, FAR);
+            shares += share;
+        }
+        if shares > 0.0 { sum / shares } else { -FAR }
+    }
+
     /// Metres inside the top's edges; negative outside.
     pub fn in_top(&self, vertex: &Vertex) -> f32 {
-        let (kind, angle, along, length) = self.place(vertex);
-        let depth = match kind {
+        self.blend(vertex, |kind, angle, along, length| match kind {
             Kind::Trunk => {
                 let collar = self.marks.collar - neckline(self.marks.neckline, angle);
                 (along - self.marks.hem).min(collar - along)
             }
             Kind::Arm => self.outfit.sleeve * length - along,
             _ => -FAR,
-        };
-        depth.clamp(-FAR, FAR)
+        })
     }
 
     /// Metres inside the edges of trousers, or of a skirt's lining on the trunk.
     pub fn in_bottom(&self, vertex: &Vertex) -> f32 {
-        let (kind, _, along, length) = self.place(vertex);
         // Under a top only as far as it may ride up.
         let band = self.marks.waistband.min(self.marks.hem + 0.06);
-        let depth = match (kind, self.outfit.lower) {
+        self.blend(vertex, |kind, _, along, length| match (kind, self.outfit.lower) {
             (Kind::Trunk, _) => band - along,
             (Kind::Leg, Lower::Trousers { length: share, .. }) => share * length - along,
             // Shorts under a skirt.
             (Kind::Leg, Lower::Skirt { .. }) => 0.05 - along,
             _ => -FAR,
-        };
-        depth.clamp(-FAR, FAR)
+        })
     }
 
     pub fn in_shoes(&self, vertex: &Vertex) -> f32 {
-        let (kind, _, along, length) = self.place(vertex);
-        let shaft = (self.outfit.boots * length).max(0.025);
-        let depth = match kind {
-            Kind::Foot => FAR,
-            Kind::Leg => along - (length - shaft),
-            _ => -FAR,
-        };
-        depth.clamp(-FAR, FAR)
+        self.blend(vertex, |kind, _, along, length| {
+            let shaft = (self.outfit.boots * length).max(0.025);
+            match kind {
+                Kind::Foot => FAR,
+                Kind::Leg => along - (length - shaft),
+                _ => -FAR,
+            }
+        })
     }
 
     /// A piece of the base mesh, whose vertices lie on their own parts.
@@ -65,25 +74,38 @@ impl Person<'_> {
     }
 
     pub fn skin(&self) -> Piece {
-        let mut net = self.group("body").subdivide();
-        let depth = |vertex: &Vertex| {
-            let depth = self.in_top(vertex).max(self.in_bottom(vertex)).max(self.in_shoes(vertex));
-            depth.max(self.under_skirt(vertex))
-        };
-        let hidden: Vec<bool> = net.vertices.iter().map(|vertex| depth(vertex) > HIDDEN).collect();
-        net.faces.retain(|face| !face.iter().all(|row| hidden[*row as usize]));
-        // Only vertices that are still used.
-        let mut net = net.cut(|_| 1.0);
-        // Cloth presses on what is left under it.
-        net.inflate(|vertex| -0.007 * smoothstep(0.0, 0.015, depth(vertex)));
-        self.own(net)
+        self.own(self.group("body").subdivide())
+    }
+
+    /// Skin as cloth leaves it: what is under a garment lies on its inner side.
+    pub fn pressed_skin(&self, mut skin: Piece, garments: &[Piece]) -> Piece {
+        let depth =
+            |vertex: &Vertex| self.in_top(vertex).max(self.in_bottom(vertex)).max(self.in_shoes(vertex));
+        let depths: Vec<f32> = skin.net.vertices.iter().map(depth).collect();
+        for garment in garments {
+            press_in(&mut skin.net, &depths, &garment.net, GAP);
+        }
+        skin
     }
 
     /// A layer of cloth over the body: the part of the tights that is `inside`, `thick` metres off.
-    fn layer(&self, inside: impl Fn(&Vertex) -> f32, thick: impl Fn(&Vertex) -> f32) -> Piece {
+    /// Its cloth lies on the charts of `kinds`, also where it reaches a little beyond them.
+    fn layer(
+        &self,
+        kinds: &[Kind],
+        inside: impl Fn(&Vertex) -> f32,
+        thick: impl Fn(&Vertex) -> f32,
+    ) -> Piece {
         let mut net = self.group("helper-tights").subdivide().subdivide();
         net.inflate(thick);
-        self.own(net.cut(inside))
+        let net = net.cut(inside);
+        let own = |vertex: &Vertex| {
+            let parts = (0..PARTS).filter(|part| kinds.contains(&ORDER[*part].0));
+            let most = parts.max_by(|a, b| vertex.parts[*a].total_cmp(&vertex.parts[*b]));
+            self.rows[most.unwrap_or(0)] as u8
+        };
+        let parts = net.vertices.iter().map(own).collect();
+        Piece { net, parts }
     }
 
     fn folds(&self, vertex: &Vertex) -> f32 {
@@ -91,43 +113,54 @@ impl Person<'_> {
         self.outfit.folds * noise(Vec3::new(p.x * 24.0, p.y * 30.0, p.z * 24.0), self.outfit.seed)
     }
 
+    /// Metres that trousers stand off the body.
+    fn off_bottom(&self, vertex: &Vertex) -> f32 {
+        let (kind, _, along, length) = self.place(vertex);
+        let flare = match (kind, self.outfit.lower) {
+            (Kind::Leg, Lower::Trousers { flare, .. }) => {
+                let down = (along / length).clamp(0.0, 1.0);
+                flare * down * down
+            }
+            _ => 0.0,
+        };
+        0.001 + 0.5 * self.outfit.lower_thickness + flare + self.folds(vertex)
+    }
+
     pub fn top(&self) -> Piece {
         self.layer(
+            &[Kind::Trunk, Kind::Arm],
             |vertex| self.in_top(vertex),
             |vertex| {
-                let (kind, _, along, length) = self.place(vertex);
+                let (kind, angle, along, length) = self.place(vertex);
                 let share = (along / (self.outfit.sleeve * length).max(0.05)).clamp(0.0, 1.0);
                 let flare = if kind == Kind::Arm { self.outfit.sleeve_flare * share * share } else { 0.0 };
                 // Collars lie close to the neck.
                 let loose = if kind == Kind::Trunk {
-                    1.0 - smoothstep(self.marks.collar - 0.09, self.marks.collar - 0.02, along)
+                    let collar = self.marks.collar - neckline(self.marks.neckline, angle);
+                    1.0 - smoothstep(collar - 0.09, collar - 0.02, along)
                 } else {
                     1.0
                 };
-                0.006 + loose * (0.8 * self.outfit.top_thickness + flare + 1.5 * self.folds(vertex))
+                let off =
+                    0.006 + loose * (0.8 * self.outfit.top_thickness + flare + 1.5 * self.folds(vertex));
+                // It hangs over the trousers.
+                let over = smoothstep(-0.03, 0.0, self.in_bottom(vertex));
+                off.max(over * (self.off_bottom(vertex) + GAP))
             },
         )
     }
 
     pub fn bottom(&self) -> Piece {
         self.layer(
+            &[Kind::Trunk, Kind::Leg],
             |vertex| self.in_bottom(vertex),
-            |vertex| {
-                let (kind, _, along, length) = self.place(vertex);
-                let flare = match (kind, self.outfit.lower) {
-                    (Kind::Leg, Lower::Trousers { flare, .. }) => {
-                        let down = (along / length).clamp(0.0, 1.0);
-                        flare * down * down
-                    }
-                    _ => 0.0,
-                };
-                0.001 + 0.5 * self.outfit.lower_thickness + flare + self.folds(vertex)
-            },
+            |vertex| self.off_bottom(vertex),
         )
     }
 
     pub fn shoes(&self) -> Piece {
         self.layer(
+            &[Kind::Leg, Kind::Foot],
             |vertex| self.in_shoes(vertex),
             |vertex| {
                 let (kind, angle, ..) = self.place(vertex);
@@ -143,14 +176,6 @@ impl Person<'_> {
         (0..self.body.parts.len()).filter(|row| self.body.parts[*row].kind == Kind::Skirt)
     }
 
-    /// Metres above the longest skirt's hem, for skin that it hides.
-    fn under_skirt(&self, vertex: &Vertex) -> f32 {
-        if !matches!(ORDER[vertex.part()].0, Kind::Leg | Kind::Trunk) {
-            return -FAR;
-        }
-        self.drapes().map(|row| self.in_drape(row, vertex) - 0.06).fold(-FAR, f32::max)
-    }
-
     fn in_drape(&self, row: usize, vertex: &Vertex) -> f32 {
         let part = &self.body.parts[row];
         let along = part.chart(vertex.rest).1;
@@ -158,19 +183,24 @@ impl Person<'_> {
         (part.length - along).min(along - band).clamp(-FAR, FAR)
     }
 
-    pub fn skirt(&self, row: usize, skin: &Piece) -> Piece {
+    /// `under`: what it hangs over, from the inside out.
+    pub fn skirt(&self, row: usize, under: &[&Piece]) -> Piece {
         let is_coat = self.body.parts[row].side == 1;
         let mut net = self.group("helper-skirt").subdivide().subdivide();
         let off = if is_coat { 0.012 } else { 0.004 } + self.outfit.lower_thickness;
+        // Close at the waist, where it is sewn on.
+        let loose = |vertex: &Vertex| smoothstep(0.0, 0.08, self.body.parts[row].chart(vertex.rest).1);
         let folds = |vertex: &Vertex| {
             let p = vertex.rest - self.figure.pelvis.start;
             let angle = libm::atan2f(p.x, p.z);
             let down = smoothstep(0.0, 0.5, -p.y);
             0.012 * down * noise(Vec3::new(2.2 * angle, 1.5 * p.y, 0.0), self.outfit.seed)
         };
-        net.inflate(|vertex| off + folds(vertex));
+        net.inflate(|vertex| loose(vertex) * off + folds(vertex));
         let mut net = net.cut(|vertex| self.in_drape(row, vertex));
-        push_out(&mut net, &skin.net, 0.008);
+        for piece in under {
+            push_out(&mut net, &piece.net, true, |vertex| GAP * (0.5 + 1.5 * loose(vertex)));
+        }
         let parts = vec![row as u8; net.vertices.len()];
         Piece { net, parts }
     }
@@ -184,14 +214,24 @@ impl Person<'_> {
         let vertex = |p: &Vec3| Vertex { rest: *p, posed: turn * *p + shift, parts: [0.0; PARTS] };
         let vertices: Vec<Vertex> = positions.iter().map(vertex).collect();
         let mut net = Net { vertices, faces: faces.into_iter().map(|f| f.to_vec()).collect() };
-        push_out(&mut net, &skin.net, 0.006);
+        push_out(&mut net, &skin.net, false, |_| 0.006);
+        // The face stays free: an ellipse around the mouth, up to above the brows.
+        let face = self.landmarks();
+        let head = &self.body.parts[self.rows[1]];
+        let height = (self.figure.head.end - self.figure.head.start).length();
+        let net = net.cut(|vertex| {
+            let (angle, along) = head.chart(vertex.rest);
+            let up = (along / height - face.mouth) / (face.brow + 0.07 - face.mouth);
+            Vec2::new(angle / 1.05, up).length() - 1.0
+        });
         let parts = vec![row as u8; net.vertices.len()];
         Some(Piece { net, parts })
     }
 }
 
-/// Moves vertices that lie inside `solid`, or nearer to it than `gap` metres, out to that distance.
-fn push_out(net: &mut Net, solid: &Net, gap: f32) {
+/// Moves vertices that lie inside `solid`, or nearer to it than `gap` metres, out to that distance. With `spans` they move
+/// along their own normals: where what lies below has a fold, cloth goes over it.
+fn push_out(net: &mut Net, solid: &Net, spans: bool, gap: impl Fn(&Vertex) -> f32) {
     let normals = solid.normals();
     let points: Vec<[f32; 3]> = solid.vertices.iter().map(|vertex| vertex.posed.to_array()).collect();
     if points.is_empty() {
@@ -203,12 +243,40 @@ fn push_out(net: &mut Net, solid: &Net, gap: f32) {
     let found = tree.query_batch(&places).nearest_one::<SquaredEuclidean<f32>>().execute();
     // Further inside than this the nearest skin is that of the other side.
     let deepest = 0.05;
-    for (vertex, found) in net.vertices.iter_mut().zip(&found) {
+    let own = net.normals();
+    for ((vertex, found), own) in net.vertices.iter_mut().zip(&found).zip(own) {
         let nearest = found.item as usize;
         let (skin, normal) = (Vec3::from_array(points[nearest]), normals[nearest]);
         let out = (vertex.posed - skin).dot(normal);
-        if out < gap && out > -deepest && (vertex.posed - skin).length() < deepest {
-            vertex.posed += normal * (gap - out);
+        let along = if spans { own } else { normal };
+        let (gap, facing) = (gap(vertex), along.dot(normal));
+        if facing > 0.3 && out < gap && out > -deepest && (vertex.posed - skin).length() < deepest {
+            vertex.posed += along * ((gap - out) / facing).min(deepest);
         }
+    }
+}
+
+/// Moves skin in until it lies `gap` metres below the cloth that is its nearest in the resting pose, where limbs are apart.
+/// `depths`: how deep inside a garment each vertex is.
+fn press_in(skin: &mut Net, depths: &[f32], cloth: &Net, gap: f32) {
+    let normals = cloth.normals();
+    let points: Vec<[f32; 3]> = cloth.vertices.iter().map(|vertex| vertex.rest.to_array()).collect();
+    if points.is_empty() {
+        return;
+    }
+    let tree: ImmutableKdTree<f32, 3> =
+        ImmutableKdTree::new_from_slice(&points).expect("fewer points than u32 can number");
+    let places: Vec<[f32; 3]> = skin.vertices.iter().map(|vertex| vertex.rest.to_array()).collect();
+    let found = tree.query_batch(&places).nearest_one::<SquaredEuclidean<f32>>().execute();
+    for ((vertex, depth), found) in skin.vertices.iter_mut().zip(depths).zip(&found) {
+        // Beyond this there is none of this garment.
+        if *depth <= 0.0 || found.distance > 0.03 * 0.03 {
+            continue;
+        }
+        let nearest = found.item as usize;
+        let out = (vertex.posed - cloth.vertices[nearest].posed).dot(normals[nearest]);
+        // At hems skin goes over into what is bare.
+        let gap = gap * smoothstep(0.0, 0.015, *depth);
+        vertex.posed -= normals[nearest] * (out + gap).clamp(0.0, 0.05);
     }
 }

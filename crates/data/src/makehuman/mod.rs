@@ -2,10 +2,11 @@
 //! helper surfaces, in the clothes and colours of the synthetic people.
 //!
 //! Colour follows from the place on the resting body alone, so that whatever layer is seen somewhere has the right one;
-//! skin that is deep under cloth is left out, so that it cannot come through.
+//! skin under cloth is pressed in, so that it cannot come through.
 
 mod dress;
 mod files;
+mod hands;
 mod net;
 mod rig;
 mod shape;
@@ -17,6 +18,7 @@ use glam::Vec3;
 use crate::DataError;
 use crate::mesh::{Face, Material, Mesh};
 use crate::random::stream;
+use crate::synth::MOVES;
 use crate::synth::atlas;
 use crate::synth::body::{Body, Kind, Marks};
 use crate::synth::figure::{Build, Figure, Pose};
@@ -63,14 +65,30 @@ fn with_person<T>(library: &Library, name: &str, then: impl FnOnce(&Person) -> T
     build.girth = 0.8 + 0.4 * mix.weight;
     let mut outfit = Outfit::draw(&mut random, &build);
     outfit.glasses = false;
+    // Cut through the shoulder joint, armholes would gape.
+    outfit.sleeve = outfit.sleeve.max(0.14);
     if matches!(outfit.lower, Lower::Skirt { .. }) {
         // The base mesh's skirt begins below the waist.
         outfit.top_length = outfit.top_length.max(0.5);
     }
     pose.spread_arms(0.5 * outfit.breadth());
     let joints = Joints::of(library, &rest);
-    let figure = joints.figure(build, high.y);
-    let posed = joints.pose(&rest, &figure, &pose);
+    let middle = |height: f32| {
+        let rows = group("body").iter().flatten().map(|row| rest[*row as usize]);
+        let (low, high) = bounds(rows.filter(|p| p.x.abs() < 0.1 && (p.y - height).abs() < 0.03));
+        if low.is_finite() { (low.z + high.z) / 2.0 } else { 0.0 }
+    };
+    let figure = joints.figure(build, high.y, middle);
+    let cloth = 0.01 + outfit.top_thickness + if outfit.breadth() > 0.0 { 0.03 } else { 0.0 };
+    let mut posed = joints.pose(&rest, &figure, &pose);
+    for _ in 0..MOVES {
+        let sunk = hands::sunk(library, &posed.positions, cloth);
+        if sunk == [false; 2] {
+            break;
+        }
+        (0..2).filter(|side| sunk[*side]).for_each(|side| pose.ease_arm(side));
+        posed = joints.pose(&rest, &figure, &pose);
+    }
     Ok(then(&Person::new(library, &rest, &posed, &figure, &outfit, &joints)))
 }
 
@@ -150,13 +168,20 @@ impl<'a> Person<'a> {
 
     fn mesh(&self) -> Mesh {
         let skin = self.skin();
-        let mut pieces = Vec::new();
-        pieces.extend(self.hair(&skin));
-        pieces.push(self.bottom());
-        pieces.push(self.top());
-        pieces.push(self.shoes());
-        pieces.extend(self.drapes().map(|row| self.skirt(row, &skin)));
-        pieces.insert(0, skin);
+        let hair = self.hair(&skin);
+        let garments = vec![self.bottom(), self.top(), self.shoes()];
+        let skirts: Vec<Piece> = self
+            .drapes()
+            .map(|row| {
+                // Tails belong to the top; skirts begin under it.
+                let is_tail = self.body.parts[row].side == 1;
+                self.skirt(row, &[&skin, &garments[0], &garments[1]][..if is_tail { 3 } else { 2 }])
+            })
+            .collect();
+        let mut pieces = vec![self.pressed_skin(skin, &garments)];
+        pieces.extend(hair);
+        pieces.extend(garments);
+        pieces.extend(skirts);
 
         let mut surface = Surface { positions: Vec::new(), faces: Vec::new(), parts: Vec::new() };
         let mut positions = Vec::new();
@@ -197,7 +222,7 @@ impl<'a> Person<'a> {
             eye,
             brow: eye.1 + 0.075,
             mouth: mouth.1,
-            lips: [corner.0 * 0.95, (high.y - low.y) / size * 0.3],
+            lips: [corner.0 * 1.15, (high.y - low.y) / size * 0.3],
             nose: None,
             painted_eyes: false,
         }

@@ -49,17 +49,21 @@ impl<'a> Joints<'a> {
         if low.is_finite() { (low, high) } else { (Vec3::ZERO, Vec3::ZERO) }
     }
 
-    /// The body as the synthetic people's figures are described. `crown` is the height of the top of the head.
-    pub fn figure(&self, build: Build, crown: f32) -> Figure {
+    /// The body as the synthetic people's figures are described. `crown` is the height of the top of the head; `middle`
+    /// says halfway between belly and back at a height, for the spine lies close under the back.
+    pub fn figure(&self, build: Build, crown: f32, middle: impl Fn(f32) -> f32) -> Figure {
         let straight = |start: Vec3, end: Vec3| Bone { start, end, frame: Mat3::IDENTITY };
         let sides = [0, 1];
         let hips = sides.map(|side| self.head(&sided("upperleg01", side)));
-        let middle = (hips[0] + hips[1]) / 2.0;
-        let waist = (self.head("spine03") + self.tail("spine03")) / 2.0;
-        let base = self.head("neck01");
+        let inside = |joint: Vec3, share: f32| {
+            Vec3::new(joint.x, joint.y, joint.z + share * (middle(joint.y) - joint.z))
+        };
+        let crotch = inside((hips[0] + hips[1]) / 2.0, 1.0);
+        let waist = inside((self.head("spine03") + self.tail("spine03")) / 2.0, 1.0);
+        let base = inside(self.head("neck01"), 0.5);
         let skull = self.head("head");
         let chin = Vec3::new(skull.x, self.tail("jaw").y, skull.z);
-        let pelvis = straight(middle, waist);
+        let pelvis = straight(crotch, waist);
         let limb = |first: &str, last: &str, side: usize, hinge: Vec3| {
             let (start, end) = (self.head(&sided(first, side)), self.head(&sided(last, side)));
             Bone { start, end, frame: hanging(end - start, hinge) }

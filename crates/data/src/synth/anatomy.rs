@@ -336,7 +336,7 @@ pub fn drapes(figure: &Figure, outfit: &Outfit) -> Vec<Part> {
         // The hips must fit as well, though the cone is straight from waist to hem.
         let down = (waist.y - pelvis.start.y) / (waist.y - bottom);
         let needed =
-            (Vec2::new(0.116, 0.103) * h * girth + Vec2::splat(thickness) - (1.0 - down) * top_radii) / down;
+            (Vec2::new(0.12, 0.116) * h * girth + Vec2::splat(thickness) - (1.0 - down) * top_radii) / down;
         let drape = Drape {
             top,
             bottom,

@@ -238,24 +238,55 @@ pub struct Body {
     pub parts: Vec<Part>,
 }
 
+/// Below the top's hem the trunk's chart goes on for so many metres, lest the hem be cut off by the legs' charts.
+const HEM_REACH: f32 = 0.04;
 /// Cloth is at most this thick, with everything that folds and flares add.
 const THICKEST: f32 = 0.08;
 
 impl Body {
+    /// The part whose chart is laid over a place on the surface of part `nearest`: hips that fill a skirt show the skirt's
+    /// cloth, and thighs that lie higher than the top's hem show the trunk's.
+    fn laid_over(&self, p: Vec3, nearest: usize) -> usize {
+        let kind = self.parts[nearest].kind;
+        if !matches!(kind, Kind::Trunk | Kind::Leg) {
+            return nearest;
+        }
+        // The outer one is the last.
+        let hangs = |part: &Part| part.drape.is_some_and(|drape| p.y > drape.bottom && p.y < drape.top);
+        if let Some(row) = self.parts.iter().rposition(hangs) {
+            return row;
+        }
+        let trunk = &self.parts[0];
+        let is_high = |hem: f32| trunk.chart(p).1 > hem - HEM_REACH;
+        if kind == Kind::Leg && trunk.layers.first().is_some_and(|top| is_high(top.from)) {
+            0
+        } else {
+            nearest
+        }
+    }
+
     /// Signed distance and the part that is nearest. Where all of the body is further than `enough`, any number between
     /// `enough` and the distance.
     pub fn distance(&self, p: Vec3, enough: f32) -> (f32, usize) {
         let mut union = f32::INFINITY;
         let mut nearest = (f32::INFINITY, 0);
+        // What skirts hang over.
+        let mut hips = f32::INFINITY;
         for (index, part) in self.parts.iter().enumerate() {
             let outside = (p - part.bound.0).length() - part.bound.1 - THICKEST;
             if part.drape.is_none() && outside > enough.max(0.0) + 0.06 && outside > 0.06 {
                 union = union.min(outside);
                 continue;
             }
-            let d = part.distance(p);
+            let mut d = part.distance(p);
             if d < nearest.0 {
                 nearest = (d, index);
+            }
+            match part.kind {
+                Kind::Trunk | Kind::Leg => hips = hips.min(d),
+                // Cloth does not show every edge of what fills it.
+                Kind::Skirt if hips.is_finite() => d = smooth_min(d, hips, 0.05),
+                _ => {}
             }
             let joint = if part.joint > 0.0 {
                 // Limbs flow into the trunk where they begin and pass it freely further on.
@@ -267,6 +298,18 @@ impl Body {
             union = if union.is_finite() { smooth_min(union, d, joint) } else { d };
         }
         (union, nearest.1)
+    }
+
+    /// The part whose chart is laid over a place on the surface.
+    pub fn owner(&self, p: Vec3, cell: f32) -> usize {
+        self.laid_over(p, self.distance(p, 4.0 * cell).1)
+    }
+
+    /// Distance to what hands must not sink into: trunk, legs and what hangs over them.
+    pub fn trunk_distance(&self, p: Vec3) -> f32 {
+        let solid =
+            self.parts.iter().filter(|part| matches!(part.kind, Kind::Trunk | Kind::Leg | Kind::Skirt));
+        solid.map(|part| part.distance(p)).fold(f32::INFINITY, f32::min)
     }
 
     /// A box around everything.

@@ -139,6 +139,14 @@ impl Pose {
     }
 }
 
+impl Pose {
+    /// Moves an arm a little away from the body: one that is bent is stretched, another one lifted.
+    pub fn ease_arm(&mut self, side: usize) {
+        let [aside, _, _, bend] = &mut self.arms[side];
+        if *bend > 45.0 { *bend -= 4.0 } else { *aside += 4.0 }
+    }
+}
+
 /// A straight piece of the body: its start, its end, and its axes (right, up, front when it hangs or stands straight).
 #[derive(Debug, Clone, Copy)]
 pub struct Bone {

@@ -13,6 +13,8 @@ pub(crate) mod surface;
 #[cfg(test)]
 mod tests;
 
+use glam::Vec3;
+
 use crate::mesh::Mesh;
 use crate::random::stream;
 use body::Body;
@@ -23,6 +25,9 @@ use paint::Painter;
 /// Side of the cells that bodies are meshed with, metres.
 pub const CELL: f32 = 0.005;
 
+/// Most small moves that take an arm out of the trunk.
+pub(crate) const MOVES: usize = 24;
+
 /// The person of this name: life-size in metres, standing on y = 0 and facing +z.
 pub fn person(name: &str) -> Mesh {
     let mut random = stream(&format!("synth/{name}"));
@@ -30,8 +35,7 @@ pub fn person(name: &str) -> Mesh {
     let mut pose = Pose::draw(&mut random);
     let outfit = Outfit::draw(&mut random, &build);
     pose.spread_arms(outfit.breadth());
-    let figure = Figure::new(build, &pose);
-    let body = Body::new(&figure, &outfit);
+    let (figure, body) = pose_freely(&build, &mut pose, &outfit);
     let mut surface = surface::mesh(&body, CELL);
     let mut mesh = atlas::paint(&body, &surface, &Painter::new(&figure, &outfit));
     let floor = surface.positions.iter().map(|p| p.y).fold(f32::INFINITY, f32::min);
@@ -40,4 +44,25 @@ pub fn person(name: &str) -> Mesh {
     }
     mesh.positions = surface.positions;
     mesh
+}
+
+/// The body in this pose, its arms moved away from the trunk as far as is needed for hands to lie on it, not in it.
+fn pose_freely(build: &Build, pose: &mut Pose, outfit: &Outfit) -> (Figure, Body) {
+    for _ in 0..MOVES {
+        let figure = Figure::new(build.clone(), pose);
+        let body = Body::new(&figure, outfit);
+        let thick = 0.014 * build.stature;
+        let sunk = [0, 1].map(|side| {
+            let (hand, fore) = (&figure.hands[side], &figure.forearms[side]);
+            let points = [fore.at(0.75, Vec3::ZERO), hand.start, hand.at(0.5, Vec3::ZERO), hand.end];
+            points.iter().any(|p| body.trunk_distance(*p) < thick)
+        });
+        if sunk == [false; 2] {
+            break;
+        }
+        (0..2).filter(|side| sunk[*side]).for_each(|side| pose.ease_arm(side));
+    }
+    let figure = Figure::new(build.clone(), pose);
+    let body = Body::new(&figure, outfit);
+    (figure, body)
 }

@@ -187,11 +187,15 @@ impl<'a> Painter<'a> {
         let blush = (1.0 - cheek.length_squared()).max(0.0);
         color = color.lerp(Vec3::new(0.8, 0.35, 0.3) * self.outfit.skin.x.max(0.3), 0.18 * blush);
         if self.outfit.beard {
-            let chin = smoothstep(0.27, 0.2, up) * smoothstep(1.45, 1.25, aside);
-            let lip = smoothstep(0.05, 0.03, (up - 0.255).abs()) * smoothstep(0.36, 0.3, aside);
-            let cheeks = smoothstep(0.16, 0.1, (aside - 1.2).abs()) * smoothstep(0.5, 0.42, up);
+            // Higher towards the ears, where it goes over into the hair.
+            let above = up - face.mouth;
+            let edge = 0.08 + 0.4 * smoothstep(1.0, 1.5, aside);
+            let chin = smoothstep(edge, edge - 0.06, above) * smoothstep(1.75, 1.6, aside);
+            // Over the lip, falling towards its corners.
+            let lip = Vec2::new(aside / 0.4, (above - 0.07 + 0.2 * aside * aside) / 0.035).length();
+            let lip = smoothstep(1.0, 0.7, lip);
             let strand = 0.7 + 0.4 * noise2(Vec2::new(angle * 60.0, up * 30.0), 11);
-            color = color.lerp(*hair * strand, (chin.max(lip).max(cheeks)) * 0.9);
+            color = color.lerp(*hair * strand, chin.max(lip) * 0.9);
         }
         let mouth = Vec2::new(angle / face.lips[0], (up - face.mouth) / face.lips[1]);
         if mouth.length() < 1.0 {

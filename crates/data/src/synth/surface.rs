@@ -77,7 +77,7 @@ fn settle(body: &Body, start: Vec3, cell: f32) -> (Vec3, u8) {
         let moved = p - gradient * (d / gradient.length_squared().max(0.1));
         p = start + (moved - start).clamp_length_max(0.7 * cell);
     }
-    (p, body.distance(p, 4.0 * cell).1 as u8)
+    (p, body.owner(p, cell) as u8)
 }
 
 /// The piece with the most triangles: crumbs of cloth are left out.

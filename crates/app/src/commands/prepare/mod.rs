@@ -171,7 +171,10 @@ fn make(
         check_preview(sheet, common, inputs)?;
     }
     let folder = Folder::create(&common.output, config.description(source))?;
-    output::write(&common.output.join(CONFIG), config.to_toml().as_bytes())?;
+    let (path, resolved) = (common.output.join(CONFIG), config.to_toml());
+    if fs::read(&path).ok().as_deref() != Some(resolved.as_bytes()) {
+        output::write(&path, resolved.as_bytes())?;
+    }
     let mine: Vec<(usize, &Work)> =
         works.iter().enumerate().filter(|(place, _)| common.shard.has(*place)).collect();
     let missing: Vec<&(usize, &Work)> =

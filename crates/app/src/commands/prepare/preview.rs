@@ -8,9 +8,8 @@ use snapsnap_data::dataset::{Folder, Split};
 use crate::failure::Failure;
 use crate::pictures::{sheet, write_png};
 
-/// Height of a subject's picture in pixels, and its width: few people spread their arms.
-const HEIGHT: u32 = 192;
-const WIDTH: u32 = 144;
+/// Side of a subject's picture in pixels.
+const SIDE: u32 = 192;
 /// Most subjects on a sheet.
 const MOST: usize = 48;
 /// Pictures in a row: three subjects.
@@ -31,15 +30,15 @@ pub fn write(path: &Path, folder: &Folder, subjects: &[(Split, &str)]) -> Result
     write_png(path, &sheet(&pictures, COLUMNS.min(pictures.len().max(1) as u32)))
 }
 
-/// On the background, smaller, cut to the middle.
+/// On the background, smaller, without the margin around.
 fn shrink(color: &RgbImage, mask: &image::GrayImage) -> RgbImage {
     let over = RgbImage::from_fn(color.width(), color.height(), |x, y| {
         let (c, a) = (color.get_pixel(x, y).0, u32::from(mask.get_pixel(x, y).0[0]));
         let mix = |i: usize| (u32::from(c[i]) * a + u32::from(BACKGROUND[i]) * (255 - a)).div_ceil(255) as u8;
         image::Rgb([mix(0), mix(1), mix(2)])
     });
-    // With the published cameras people reach from row 124 to 863 of 1024.
-    let side = HEIGHT * 7 / 6;
+    // With the published cameras people reach from row 124 to 863 of 1024, and as far aside with their arms.
+    let side = SIDE * 16 / 14;
     let small = imageops::resize(&over, side, side, imageops::FilterType::Triangle);
-    imageops::crop_imm(&small, (side - WIDTH) / 2, side * 54 / 1024, WIDTH, HEIGHT).to_image()
+    imageops::crop_imm(&small, (side - SIDE) / 2, (side - SIDE) / 2, SIDE, SIDE).to_image()
 }

@@ -74,8 +74,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
             Work { split, subject, identity }
         })
         .collect();
-    let name = arguments.source.file_name().unwrap_or_default().to_string_lossy().into_owned();
-    let description = format!("scans of {name}, seed {}", arguments.common.seed);
+    let description = describe(arguments);
     let mut inputs = vec![arguments.source.as_path()];
     inputs.extend(arguments.smplx.as_deref());
     let unknown = Cell::new(0);
@@ -104,11 +103,23 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     });
     if unknown.get() > 0 {
         say::err(&format!(
-            "{} subjects have no SMPL-X parameters (--smplx) and were taken to face +z",
+            "{} subjects have no SMPL-X parameters and were taken to face +z; with --smplx make them anew, in another folder",
             unknown.get()
         ));
     }
     made
+}
+
+/// What the data set's description says of its source: all that decides what the subjects are.
+fn describe(arguments: &Arguments) -> String {
+    // Many folders are called `scans`; where on which machine they lie is nobody's business.
+    let path = arguments.source.canonicalize().unwrap_or_else(|_| arguments.source.clone());
+    let mut names: Vec<_> = path.iter().rev().take(2).map(|name| name.to_string_lossy()).collect();
+    names.reverse();
+    let collection =
+        arguments.collection.to_possible_value().map_or(String::new(), |v| v.get_name().to_owned());
+    let smplx = if arguments.smplx.is_some() { ", with SMPL-X parameters" } else { "" };
+    format!("scans of {} ({collection}{smplx}), seed {}", names.join("/"), arguments.common.seed)
 }
 
 /// The subject's SMPL-X parameters; an error if a folder of them was named and has none.
