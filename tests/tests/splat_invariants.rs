@@ -221,7 +221,34 @@ fn inputs_that_nobody_tracks_get_no_gradient() {
     assert!(expected.iter().any(|g| *g != 0.0));
 }
 
-/// Whatever one Gaussian holds, pixels stay finite and the others' gradients do not change when it is not seen.
+/// A Gaussian with a number that is none is as if it were not there: to the last bit, for pixels and the others' gradients.
+#[test]
+fn a_poisoned_gaussian_is_left_out() {
+    let Some(device) = device() else { return };
+    let camera = [forward_camera(31, 23)];
+    let clean = random_scene(30, 13);
+    let mut without = clean.clone();
+    without.gaussians[7][10] = 0.0;
+    for antialiased in [false, true] {
+        let options = RenderOptions { antialiased, ..RenderOptions::inria() };
+        let expected = pass(&without, &camera, &options, &device);
+        assert!(expected.image != pass(&clean, &camera, &options, &device).image, "it is seen when sound");
+        for place in 0..14 {
+            for value in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+                let mut host = clean.clone();
+                host.gaussians[7][place] = value;
+                let found = pass(&host, &camera, &options, &device);
+                let what = format!("{value} at {place}");
+                assert_eq!(found.counts.invalid, 1, "{what}");
+                assert!(found.image == expected.image, "{what}: pixels");
+                assert!(found.gradient == expected.gradient, "{what}: gradients");
+                assert!(found.background == expected.background, "{what}: background");
+            }
+        }
+    }
+}
+
+/// Whatever Gaussians hold, pixels and gradients stay finite, and everyone is counted.
 #[test]
 fn poison_stays_where_it_is() {
     let Some(device) = device() else { return };

@@ -78,12 +78,11 @@ pub fn render(
     };
     let output = <Dispatch as SplatBackend>::splat(inputs, Arc::new(job));
     let counts = output.counts?;
-    let image = Tensor::<4>::from_dispatch(output.image);
-    let channel = |index: usize| image.clone().narrow(3, index, 1).squeeze_dim::<3>(3);
+    let flat = |image| Tensor::<4>::from_dispatch(image).squeeze_dim::<3>(3);
     Ok(Rendered {
-        color: image.clone().narrow(3, 0, 3),
-        alpha: channel(3),
-        depth: options.depth.then(|| channel(4)),
+        color: Tensor::from_dispatch(output.color),
+        alpha: flat(output.alpha),
+        depth: options.depth.then(|| flat(output.depth)),
         counts,
     })
 }

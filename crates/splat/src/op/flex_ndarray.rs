@@ -12,7 +12,7 @@ use burn::tensor::{TensorData, read_sync};
 
 use super::cpu::{self, Scene, State};
 use super::job::{Job, Wanted};
-use super::{Forward, SplatBackend, SplatInputs, SplatKernels, SplatOutput, splat_untracked};
+use super::{Forward, SplatBackend, SplatInputs, SplatKernels, SplatOutput, Upstream, splat_untracked};
 
 impl SplatBackend for Flex {
     fn splat(inputs: SplatInputs<Self>, job: Arc<Job>) -> SplatOutput<Self> {
@@ -40,13 +40,13 @@ impl SplatKernels for Flex {
         inputs: &SplatInputs<Self>,
         job: &Job,
         state: &Self::State,
-        upstream: FloatTensor<Self>,
+        upstream: Upstream<FloatTensor<Self>>,
         wanted: Wanted,
     ) -> [Option<FloatTensor<Self>>; 6] {
         let fields = fields(inputs).map(FlexTensor::to_contiguous);
-        let upstream = upstream.to_contiguous();
+        let upstream = upstream.map(|tensor| tensor.to_contiguous());
         let scene = scene(fields.each_ref().map(slice));
-        let gradients = cpu::backward(scene, job, state, slice(&upstream), wanted);
+        let gradients = cpu::backward(scene, job, state, &upstream.as_ref().map(slice), wanted);
         gradient_data(gradients, scene.opacities.len()).map(|data| data.map(FlexTensor::from_data))
     }
 }
@@ -67,12 +67,13 @@ impl SplatKernels for NdArray {
         inputs: &SplatInputs<Self>,
         job: &Job,
         state: &Self::State,
-        upstream: FloatTensor<Self>,
+        upstream: Upstream<FloatTensor<Self>>,
         wanted: Wanted,
     ) -> [Option<FloatTensor<Self>>; 6] {
         let fields = fields(inputs).map(read::<Self>);
         let scene = scene(fields.each_ref().map(Vec::as_slice));
-        let gradients = cpu::backward(scene, job, state, &read::<Self>(&upstream), wanted);
+        let upstream = upstream.map(|tensor| read::<Self>(&tensor));
+        let gradients = cpu::backward(scene, job, state, &upstream.as_ref().map(Vec::as_slice), wanted);
         gradient_data(gradients, scene.opacities.len())
             .map(|data| data.map(|data| Self::float_from_data(data, &Default::default())))
     }

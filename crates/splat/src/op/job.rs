@@ -95,16 +95,21 @@ impl Job {
 }
 
 /// Which tracked inputs need gradients.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub struct Wanted {
-    /// Means, rotations or scales.
-    pub geometry: bool,
-    /// Opacities.
+    pub means: bool,
+    pub rotations: bool,
+    pub scales: bool,
     pub opacities: bool,
-    /// Colours.
     pub colors: bool,
-    /// Background.
     pub background: bool,
+}
+
+impl Wanted {
+    /// Whether any of those is wanted that the shape of a splat depends on: they share their sums over pixels.
+    pub fn geometry(self) -> bool {
+        self.means || self.rotations || self.scales
+    }
 }
 
 /// Which sums over pixels the backward pass keeps of one intersection, in this order: colour (3), opacity (1),
@@ -119,7 +124,7 @@ pub(super) struct Record {
 
 impl Record {
     pub fn new(wanted: Wanted, job: &Job) -> Self {
-        let Wanted { colors, geometry, .. } = wanted;
+        let (colors, geometry) = (wanted.colors, wanted.geometry());
         // The compensation of antialiasing carries the opacity's gradient on to the geometry.
         let opacities = wanted.opacities || (geometry && job.antialiased);
         Self { colors, opacities, geometry, depth: geometry && job.depth }

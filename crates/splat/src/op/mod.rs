@@ -9,14 +9,16 @@ mod gpu;
 mod job;
 
 use std::fmt::Debug;
-use std::sync::Arc;
+use std::ops::Range;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use burn::backend::autodiff::Autodiff;
 use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::CheckpointStrategy};
 use burn::backend::autodiff::grads::Gradients;
 use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
 use burn::backend::tensor::FloatTensor;
-use burn::backend::{Backend, ExtensionType, backend_extension};
+use burn::backend::{AutodiffBackend, Backend, ExtensionType, TensorMetadata, backend_extension};
+use burn::tensor::{FloatDType, Shape, Slice};
 
 use crate::SplatError;
 pub use job::{Counts, Job, MAX_SIDE, Wanted};
@@ -33,11 +35,46 @@ pub struct SplatInputs<B: Backend> {
     pub(crate) background: FloatTensor<B>,
 }
 
-/// Image `[V,H,W,C]` with C = red, green, blue, alpha and, if asked for, depth. On an error the image means nothing.
+/// Colours `[V,H,W,3]`, alphas `[V,H,W,1]` and depths `[V,H,W,1]`; where no depth was asked for, alphas stand in for it. On
+/// an error they mean nothing.
 #[derive(ExtensionType)]
 pub struct SplatOutput<B: Backend> {
-    pub(crate) image: FloatTensor<B>,
+    pub(crate) color: FloatTensor<B>,
+    pub(crate) alpha: FloatTensor<B>,
+    pub(crate) depth: FloatTensor<B>,
     pub(crate) counts: Result<Counts, SplatError>,
+}
+
+/// Where in an image `[V,H,W,C]` colours, alphas and depths lie.
+const CHANNELS: [Range<usize>; 3] = [0..3, 3..4, 4..5];
+
+fn channels<B: Backend>(image: FloatTensor<B>, range: Range<usize>) -> FloatTensor<B> {
+    let full = Slice::from(..);
+    B::float_slice(image, &[full, full, full, Slice::from(range)])
+}
+
+/// ∂L/∂ of the outputs of a call, those that have none `None`: kept apart, for they are as large as pictures, and putting
+/// them together would cost several times that.
+#[derive(Debug, Clone, Copy)]
+pub struct Upstream<T> {
+    /// Colours `[V,H,W,3]`.
+    pub color: Option<T>,
+    /// Alphas `[V,H,W,1]`.
+    pub alpha: Option<T>,
+    /// Depths `[V,H,W,1]`.
+    pub depth: Option<T>,
+}
+
+impl<T> Upstream<T> {
+    fn as_ref(&self) -> Upstream<&T> {
+        let Self { color, alpha, depth } = self;
+        Upstream { color: color.as_ref(), alpha: alpha.as_ref(), depth: depth.as_ref() }
+    }
+
+    fn map<U>(self, f: impl Fn(T) -> U) -> Upstream<U> {
+        let Self { color, alpha, depth } = self;
+        Upstream { color: color.map(&f), alpha: alpha.map(&f), depth: depth.map(&f) }
+    }
 }
 
 /// Backends that can splat. Users call [`render`](crate::render()).
@@ -61,13 +98,12 @@ pub trait SplatKernels: Backend {
     /// [`SplatError::TooManyIntersections`].
     fn forward(inputs: &SplatInputs<Self>, job: &Job, keep: bool) -> Forward<Self>;
 
-    /// Gradients in the order of the fields of [`SplatInputs`], those that are not wanted `None`. `upstream` is
-    /// ∂L/∂image.
+    /// Gradients in the order of the fields of [`SplatInputs`], those that are not wanted `None`.
     fn backward(
         inputs: &SplatInputs<Self>,
         job: &Job,
         state: &Self::State,
-        upstream: FloatTensor<Self>,
+        upstream: Upstream<FloatTensor<Self>>,
         wanted: Wanted,
     ) -> [Option<FloatTensor<Self>>; 6];
 }
@@ -75,10 +111,27 @@ pub trait SplatKernels: Backend {
 /// The untracked operation on a concrete backend.
 fn splat_untracked<B: SplatKernels>(inputs: SplatInputs<B>, job: &Job) -> SplatOutput<B> {
     match B::forward(&inputs, job, false) {
-        Ok((image, _, counts)) => SplatOutput { image, counts: Ok(counts) },
-        Err(error) => SplatOutput { image: inputs.background, counts: Err(error) },
+        Ok((image, _, counts)) => {
+            let [color, alpha, depth] = CHANNELS;
+            let depth = if job.depth { depth } else { alpha.clone() };
+            SplatOutput {
+                color: channels::<B>(image.clone(), color),
+                alpha: channels::<B>(image.clone(), alpha),
+                depth: channels::<B>(image, depth),
+                counts: Ok(counts),
+            }
+        }
+        Err(error) => failed(inputs.background, error),
     }
 }
+
+fn failed<B: Backend>(anything: FloatTensor<B>, error: SplatError) -> SplatOutput<B> {
+    let [color, alpha, depth] = [anything.clone(), anything.clone(), anything];
+    SplatOutput { color, alpha, depth, counts: Err(error) }
+}
+
+/// What arrives at the outputs, until the backward pass fetches it.
+type Arrived<B> = Arc<Mutex<[Option<FloatTensor<B>>; 3]>>;
 
 #[derive(Debug)]
 struct SplatBackward;
@@ -89,25 +142,50 @@ struct Kept<B: SplatKernels> {
     inputs: SplatInputs<B>,
     job: Arc<Job>,
     state: Option<B::State>,
+    arrived: Arrived<B>,
 }
 
 impl<B: SplatKernels> Backward<B, 6> for SplatBackward {
     type State = Kept<B>;
 
     fn backward(self, ops: Ops<Self::State, 6>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
-        let upstream = grads.consume::<B>(&ops.node);
-        let Kept { inputs, job, state } = ops.state;
+        // Only says that something arrived.
+        drop(grads.consume::<B>(&ops.node));
+        let Kept { inputs, job, state, arrived } = ops.state;
+        let [color, alpha, depth] = std::mem::take(&mut *lock(&arrived));
         let [means, rotations, scales, opacities, colors, background] =
             ops.parents.each_ref().map(Option::is_some);
-        let wanted = Wanted { geometry: means || rotations || scales, opacities, colors, background };
+        let wanted = Wanted { means, rotations, scales, opacities, colors, background };
         let state = state.expect("kept by the forward pass, which tracks only what succeeded");
-        let gradients = B::backward(&inputs, &job, &state, upstream, wanted);
+        let gradients = B::backward(&inputs, &job, &state, Upstream { color, alpha, depth }, wanted);
         for (parent, gradient) in ops.parents.into_iter().zip(gradients) {
             if let Some((parent, gradient)) = parent.zip(gradient) {
                 grads.register::<B>(parent.id, gradient);
             }
         }
     }
+}
+
+/// Takes what arrives at one of the outputs to the operation, without the detour over an image of zeros.
+#[derive(Debug)]
+struct ChannelsBackward;
+
+impl<B: SplatKernels> Backward<B, 1> for ChannelsBackward {
+    type State = (usize, Arrived<B>);
+
+    fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
+        let upstream = grads.consume::<B>(&ops.node);
+        let (output, arrived) = ops.state;
+        let token = B::float_zeros(Shape::new([1]), &upstream.device(), FloatDType::F32);
+        lock(&arrived)[output] = Some(upstream);
+        let [image] = ops.parents;
+        grads.register::<B>(image.expect("tracked, or this would not run").id, token);
+    }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    // Nothing is half done where it is held.
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl<B: SplatKernels, C: CheckpointStrategy> SplatBackend for Autodiff<B, C> {
@@ -131,15 +209,28 @@ impl<B: SplatKernels, C: CheckpointStrategy> SplatBackend for Autodiff<B, C> {
         match SplatBackward.prepare::<C>(nodes).compute_bound().stateful() {
             OpsKind::Tracked(prepared) => {
                 let (image, state, counts) = match B::forward(&inputs, &job, true) {
-                    Ok((image, state, counts)) => (image, state, Ok(counts)),
-                    Err(error) => (inputs.background.clone(), None, Err(error)),
+                    Ok((image, state, counts)) => (image, state, counts),
+                    Err(error) => return failed(Self::from_inner(inputs.background), error),
                 };
-                let kept = Kept { inputs, job, state };
-                SplatOutput { image: prepared.finish(kept, image), counts }
+                let arrived = Arrived::<B>::default();
+                let has_depth = job.depth;
+                let kept = Kept { inputs, job, state, arrived: arrived.clone() };
+                let whole = prepared.finish(kept, image.clone());
+                let part = |output: usize| {
+                    let part = channels::<B>(image.clone(), CHANNELS[output].clone());
+                    match ChannelsBackward.prepare::<C>([whole.node()]).compute_bound().stateful() {
+                        OpsKind::Tracked(prepared) => prepared.finish((output, arrived.clone()), part),
+                        OpsKind::UnTracked(prepared) => prepared.finish(part),
+                    }
+                };
+                let (color, alpha) = (part(0), part(1));
+                let depth = if has_depth { part(2) } else { alpha.clone() };
+                SplatOutput { color, alpha, depth, counts: Ok(counts) }
             }
-            OpsKind::UnTracked(prepared) => {
-                let SplatOutput { image, counts } = splat_untracked(inputs, &job);
-                SplatOutput { image: prepared.finish(image), counts }
+            OpsKind::UnTracked(_) => {
+                let SplatOutput { color, alpha, depth, counts } = splat_untracked(inputs, &job);
+                let [color, alpha, depth] = [color, alpha, depth].map(Self::from_inner);
+                SplatOutput { color, alpha, depth, counts }
             }
         }
     }

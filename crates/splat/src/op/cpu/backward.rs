@@ -3,6 +3,7 @@
 use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
 
+use super::super::Upstream;
 use super::super::job::{Job, Record, Wanted};
 use super::lanes::{BATCH, Lanes, fetch, row, rows};
 use super::splats::{Splat, parameters, projection};
@@ -24,24 +25,35 @@ pub struct Gradients {
     pub background: Vec<f32>,
 }
 
-/// Gradients of the inputs that `wanted` names, from `upstream`, ∂L/∂image `[V,H,W,C]`.
-pub fn backward(scene: Scene, job: &Job, state: &State, upstream: &[f32], wanted: Wanted) -> Gradients {
+/// Gradients of the inputs that `wanted` names.
+pub fn backward(
+    scene: Scene,
+    job: &Job,
+    state: &State,
+    upstream: &Upstream<&[f32]>,
+    wanted: Wanted,
+) -> Gradients {
     let n = scene.len();
     let room = |columns: usize, wanted: bool| vec![0.0_f32; if wanted { n * columns } else { 0 }];
     let mut gradients = Gradients {
-        means: room(3, wanted.geometry),
-        rotations: room(4, wanted.geometry),
-        scales: room(3, wanted.geometry),
+        means: room(3, wanted.means),
+        rotations: room(4, wanted.rotations),
+        scales: room(3, wanted.scales),
         opacities: room(1, wanted.opacities),
         colors: room(3, wanted.colors),
         background: vec![0.0; if wanted.background { 3 } else { 0 }],
     };
     let record = Record::new(wanted, job);
-    let image = job.width * job.height * job.channels();
+    let count = job.width * job.height;
     for (index, view) in state.views.iter().enumerate() {
-        let upstream = &upstream[index * image..][..image];
-        if wanted.background {
-            let sums = background(view, job, upstream);
+        let Upstream { color, alpha, depth } = *upstream;
+        let upstream = Upstream {
+            color: color.map(|values| &values[3 * index * count..][..3 * count]),
+            alpha: alpha.map(|values| &values[index * count..][..count]),
+            depth: depth.map(|values| &values[index * count..][..count]),
+        };
+        if let Some(color) = upstream.color.filter(|_| wanted.background) {
+            let sums = background(view, job, color);
             gradients.background.iter_mut().zip(sums).for_each(|(g, s)| *g += s);
         }
         if record.len() > 0 {
@@ -53,14 +65,14 @@ pub fn backward(scene: Scene, job: &Job, state: &State, upstream: &[f32], wanted
 }
 
 /// ∂L/∂background = Σ T_final·v_colour, image row by image row in f64.
-fn background(view: &ViewState, job: &Job, upstream: &[f32]) -> [f32; 3] {
+fn background(view: &ViewState, job: &Job, color: &[f32]) -> [f32; 3] {
     let rows: Vec<[f64; 3]> = view
         .transmittance
         .par_chunks(job.width)
-        .zip(upstream.par_chunks(job.width * job.channels()))
-        .map(|(transmittance, upstream)| {
+        .zip(color.par_chunks(3 * job.width))
+        .map(|(transmittance, color)| {
             let mut sum = [0.0; 3];
-            for (t, v) in transmittance.iter().zip(upstream.chunks_exact(job.channels())) {
+            for (t, v) in transmittance.iter().zip(color.chunks_exact(3)) {
                 for c in 0..3 {
                     sum[c] += f64::from(t * v[c]);
                 }
@@ -72,7 +84,7 @@ fn background(view: &ViewState, job: &Job, upstream: &[f32]) -> [f32; 3] {
 }
 
 /// One record of sums over pixels per entry of the tiles' lists, in the lists' order.
-fn pixels(scene: Scene, job: &Job, view: &ViewState, upstream: &[f32], record: Record) -> Vec<f32> {
+fn pixels(scene: Scene, job: &Job, view: &ViewState, upstream: Upstream<&[f32]>, record: Record) -> Vec<f32> {
     let mut records = vec![0.0_f32; view.lists.len() * record.len()];
     let mut rest = records.as_mut_slice();
     let mut bands = Vec::with_capacity(job.tiles_y());
@@ -92,7 +104,7 @@ fn pixels(scene: Scene, job: &Job, view: &ViewState, upstream: &[f32], record: R
 struct Band<'a> {
     job: &'a Job,
     view: &'a ViewState,
-    upstream: &'a [f32],
+    upstream: Upstream<&'a [f32]>,
     background: [f32; 3],
     y: usize,
     records: &'a mut [f32],
@@ -188,25 +200,29 @@ impl Band<'_> {
             last: [[0; TILE]; TILE],
             upstream: [[[0.0; TILE]; TILE]; 5],
         };
-        let (width, channels) = (self.job.width, self.job.channels());
+        let width = self.job.width;
         let columns = TILE.min(width - x * TILE);
         for y in 0..TILE.min(self.job.height - self.y * TILE) {
             let first = (self.y * TILE + y) * width + x * TILE;
             p.transmittance[y][..columns].copy_from_slice(&self.view.transmittance[first..first + columns]);
             p.last[y][..columns].copy_from_slice(&self.view.last[first..first + columns]);
-            let upstream = &self.upstream[first * channels..(first + columns) * channels];
-            for (i, v) in upstream.chunks_exact(channels).enumerate() {
-                for c in 0..3 {
-                    p.upstream[c][y][i] = v[c];
-                }
-                if SHAPE {
-                    p.upstream[3][y][i] = v[3];
-                    if DEPTH {
-                        p.upstream[4][y][i] = v[4];
+            if let Some(color) = self.upstream.color {
+                let color = &color[3 * first..3 * (first + columns)];
+                for (i, v) in color.chunks_exact(3).enumerate() {
+                    for c in 0..3 {
+                        p.upstream[c][y][i] = v[c];
                     }
-                    let b = self.background;
-                    p.behind[y][i] = p.transmittance[y][i] * (b[0] * v[0] + b[1] * v[1] + b[2] * v[2]);
+                    if SHAPE {
+                        let b = self.background;
+                        p.behind[y][i] = p.transmittance[y][i] * (b[0] * v[0] + b[1] * v[1] + b[2] * v[2]);
+                    }
                 }
+            }
+            if SHAPE && let Some(alpha) = self.upstream.alpha {
+                p.upstream[3][y][..columns].copy_from_slice(&alpha[first..first + columns]);
+            }
+            if DEPTH && let Some(depth) = self.upstream.depth {
+                p.upstream[4][y][..columns].copy_from_slice(&depth[first..first + columns]);
             }
         }
         p
@@ -364,9 +380,15 @@ fn gather(
                 };
                 let p = projection(&scene, g, camera, job);
                 let v = project_vjp(camera, &p, &parameters(&scene, g).2, &gradient);
-                add(means, 3 * i, &[v.mean.x, v.mean.y, v.mean.z]);
-                add(rotations, 4 * i, &[v.rotation.w, v.rotation.x, v.rotation.y, v.rotation.z]);
-                add(scales, 3 * i, &[v.scale.x, v.scale.y, v.scale.z]);
+                if !means.is_empty() {
+                    add(means, 3 * i, &[v.mean.x, v.mean.y, v.mean.z]);
+                }
+                if !rotations.is_empty() {
+                    add(rotations, 4 * i, &[v.rotation.w, v.rotation.x, v.rotation.y, v.rotation.z]);
+                }
+                if !scales.is_empty() {
+                    add(scales, 3 * i, &[v.scale.x, v.scale.y, v.scale.z]);
+                }
             }
         }
     });

@@ -97,3 +97,90 @@ fn zeros(what: &'static str, n: usize) -> Result<Vec<f32>, SplatError> {
     drop(probe);
     Ok(vec![0.0; n])
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::Upstream;
+    use super::super::job::Wanted;
+    use super::*;
+    use crate::{Camera, RenderOptions};
+
+    const N: usize = 6000;
+    const EVERYTHING: Wanted = Wanted {
+        means: true,
+        rotations: true,
+        scales: true,
+        opacities: true,
+        colors: true,
+        background: true,
+    };
+
+    /// Values in [0, 1).
+    fn noise(n: usize, seed: u64) -> Vec<f32> {
+        (0..n as u64).map(|i| ((i * 7919 + seed * 104_729 + 13) % 1009) as f32 / 1009.0).collect()
+    }
+
+    /// Image and gradients of 6,000 Gaussians in two views.
+    fn pass(wanted: Wanted) -> (Vec<f32>, Gradients) {
+        let means: Vec<f32> = noise(3 * N, 1).iter().map(|v| 1.2 * v - 0.2).collect();
+        let scales: Vec<f32> = noise(3 * N, 2).iter().map(|v| 0.002 + 0.02 * v).collect();
+        let (rotations, opacities, colors) = (noise(4 * N, 3), noise(N, 4), noise(3 * N, 5));
+        let scene = Scene {
+            means: &means,
+            rotations: &rotations,
+            scales: &scales,
+            opacities: &opacities,
+            colors: &colors,
+            background: &[0.2, 0.4, 0.6],
+        };
+        let options = RenderOptions { antialiased: true, depth: true, ..RenderOptions::inria() };
+        let job = Job::new(&Camera::orbit(2, 150, 130), &options).expect("sound cameras");
+        let (image, state, _) = forward(scene, &job, true).expect("renders");
+        let pixels = 2 * 150 * 130;
+        let (color, alpha, depth) = (noise(3 * pixels, 6), noise(pixels, 7), noise(pixels, 8));
+        let upstream = Upstream { color: Some(&color[..]), alpha: Some(&alpha[..]), depth: Some(&depth[..]) };
+        let gradients = backward(scene, &job, &state, &upstream, wanted);
+        (image, gradients)
+    }
+
+    fn fields(g: &Gradients) -> [&Vec<f32>; 6] {
+        [&g.means, &g.rotations, &g.scales, &g.opacities, &g.colors, &g.background]
+    }
+
+    #[test]
+    fn results_do_not_depend_on_the_number_of_threads() {
+        let with = |threads: usize| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads");
+            pool.install(|| pass(EVERYTHING))
+        };
+        let (image, gradients) = with(1);
+        assert!(fields(&gradients).iter().all(|g| g.iter().any(|v| *v != 0.0)));
+        for threads in [2, 5] {
+            let (other_image, other) = with(threads);
+            assert!(image == other_image, "{threads} threads: image");
+            assert!(fields(&gradients) == fields(&other), "{threads} threads: gradients");
+        }
+    }
+
+    /// What is not wanted takes no room, and what is wanted is the same by itself.
+    #[test]
+    fn only_what_is_wanted_is_made() {
+        let full = pass(EVERYTHING).1;
+        for index in 0..6 {
+            let is = |place: usize| place == index;
+            let wanted = Wanted {
+                means: is(0),
+                rotations: is(1),
+                scales: is(2),
+                opacities: is(3),
+                colors: is(4),
+                background: is(5),
+            };
+            let part = pass(wanted).1;
+            for (place, (found, expected)) in fields(&part).into_iter().zip(fields(&full)).enumerate() {
+                let expected: &[f32] = if is(place) { expected } else { &[] };
+                assert!(found == expected, "{index}: field {place}");
+            }
+        }
+    }
+}

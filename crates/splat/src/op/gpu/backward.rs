@@ -7,7 +7,7 @@ use cubecl::prelude::*;
 use super::blend::UNITS;
 use super::channels;
 use super::project::{REACH, SPLAT, load_quat, load_view, load3};
-use crate::op::job::Record;
+use crate::op::job::{Record, Wanted};
 use crate::options::{MIN_ALPHA, TILE};
 use crate::vjp::{FootprintGradient, project, project_vjp, to_camera};
 
@@ -269,7 +269,7 @@ pub fn gather(
     blur: f32,
     #[comptime] antialiased: bool,
     #[comptime] record: Record,
-    #[comptime] opacities_wanted: bool,
+    #[comptime] wanted: Wanted,
 ) {
     let g = ABSOLUTE_POS;
     if g >= n {
@@ -357,17 +357,21 @@ pub fn gather(
         v_colors[3 * g + 1] = green;
         v_colors[3 * g + 2] = blue;
     }
-    if comptime!(opacities_wanted) {
+    if comptime!(wanted.opacities) {
         v_opacities[g] = v_opacity;
     }
-    if comptime!(record.geometry) {
+    if comptime!(wanted.means) {
         v_means[3 * g] = mean_x;
         v_means[3 * g + 1] = mean_y;
         v_means[3 * g + 2] = mean_z;
+    }
+    if comptime!(wanted.rotations) {
         v_rotations[4 * g] = rotation_w;
         v_rotations[4 * g + 1] = rotation_x;
         v_rotations[4 * g + 2] = rotation_y;
         v_rotations[4 * g + 3] = rotation_z;
+    }
+    if comptime!(wanted.scales) {
         v_scales[3 * g] = scale_x;
         v_scales[3 * g + 1] = scale_y;
         v_scales[3 * g + 2] = scale_z;

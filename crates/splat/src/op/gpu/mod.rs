@@ -18,8 +18,9 @@ mod sort;
 
 use std::sync::Arc;
 
-use burn::backend::tensor::FloatTensor;
-use burn::tensor::{DType, Shape};
+use burn::backend::ops::FloatTensorOps;
+use burn::backend::tensor::{Device, FloatTensor};
+use burn::tensor::{DType, FloatDType, Shape, Slice};
 use burn_cubecl::CubeBackend;
 use burn_cubecl::kernel::into_contiguous;
 use burn_cubecl::ops::into_data_sync;
@@ -27,7 +28,9 @@ use burn_cubecl::tensor::CubeTensor;
 use cubecl::prelude::*;
 
 use super::job::{Counts, Job, Record, Wanted};
-use super::{Forward, SplatBackend, SplatInputs, SplatKernels, SplatOutput, splat_untracked};
+use super::{
+    CHANNELS, Forward, SplatBackend, SplatInputs, SplatKernels, SplatOutput, Upstream, splat_untracked,
+};
 use crate::SplatError;
 use buffers::Buffers;
 use project::{REACH, SPLAT, STATISTICS};
@@ -118,17 +121,17 @@ impl SplatKernels for CubeBackend {
         inputs: &SplatInputs<Self>,
         job: &Job,
         state: &State,
-        upstream: FloatTensor<Self>,
+        upstream: Upstream<FloatTensor<Self>>,
         wanted: Wanted,
     ) -> [Option<FloatTensor<Self>>; 6] {
         let inputs = contiguous(inputs);
-        let upstream = into_contiguous(upstream);
+        let upstream = whole(upstream, job, &inputs.means.device);
         let buffers = Buffers::of(&inputs.means);
         let n = inputs.len;
         let room = |shape: [usize; 2], wanted: bool| wanted.then(|| gradient(&buffers, shape));
-        let means = room([n, 3], wanted.geometry);
-        let rotations = room([n, 4], wanted.geometry);
-        let scales = room([n, 3], wanted.geometry);
+        let means = room([n, 3], wanted.means);
+        let rotations = room([n, 4], wanted.rotations);
+        let scales = room([n, 3], wanted.scales);
         let colors = room([n, 3], wanted.colors);
         let opacities = wanted.opacities.then(|| gradient(&buffers, [n]));
         let background = wanted.background.then(|| background(&buffers, job, state, &upstream));
@@ -159,11 +162,26 @@ impl SplatKernels for CubeBackend {
                 job.blur,
                 job.antialiased,
                 record,
-                wanted.opacities,
+                wanted,
             );
         }
         [means, rotations, scales, opacities, colors, background]
     }
+}
+
+/// ∂L/∂image `[V,H,W,C]` for kernels: nothing arrived where nobody looked.
+fn whole(upstream: Upstream<CubeTensor>, job: &Job, device: &Device<CubeBackend>) -> CubeTensor {
+    let shape = Shape::new([job.views.len(), job.height, job.width, job.channels()]);
+    let Upstream { color, alpha, depth } = upstream;
+    let mut image = CubeBackend::float_zeros(shape, device, FloatDType::F32);
+    for (part, range) in [color, alpha, depth].into_iter().zip(CHANNELS) {
+        if let Some(part) = part {
+            let full = Slice::from(..);
+            let place = [full, full, full, Slice::from(range)];
+            image = CubeBackend::float_slice_assign(image, &place, part);
+        }
+    }
+    into_contiguous(image)
 }
 
 /// Room for a gradient. Where there is nothing, its shape says so, though the kernels need at least one number.
