@@ -65,8 +65,6 @@ fn with_person<T>(library: &Library, name: &str, then: impl FnOnce(&Person) -> T
     build.girth = 0.8 + 0.4 * mix.weight;
     let mut outfit = Outfit::draw(&mut random, &build);
     outfit.glasses = false;
-    // Cut through the shoulder joint, armholes would gape.
-    outfit.sleeve = outfit.sleeve.max(0.14);
     if matches!(outfit.lower, Lower::Skirt { .. }) {
         // The base mesh's skirt begins below the waist.
         outfit.top_length = outfit.top_length.max(0.5);

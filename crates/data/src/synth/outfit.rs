@@ -116,7 +116,8 @@ impl Outfit {
         let kind = between(0.0, 1.0);
         let sleeve = match kind {
             _ if coat => between(0.9, 0.98),
-            k if k < 0.12 => between(0.02, 0.08),
+            // Not shorter: an edge through the shoulder joint would be ragged.
+            k if k < 0.12 => between(0.14, 0.2),
             k if k < 0.5 => between(0.25, 0.45),
             k if k < 0.6 => between(0.55, 0.75),
             _ => between(0.88, 0.98),

@@ -242,10 +242,12 @@ impl<'a> Painter<'a> {
     }
 
     fn hair(&self, part: &Part, angle: f32, along: f32, cloth: Vec2) -> Vec3 {
-        if self.outfit.cut == Cut::Cap {
+        // A cap's rim; below it hair shows.
+        let rim = 0.6 * part.length;
+        if self.outfit.cut == Cut::Cap && along > rim {
             let seam = (angle * 3.0 / PI).fract().abs() < 0.02;
             let color = self.outfit.shoes.color(cloth);
-            return if seam || along < 0.6 * part.length { color * 0.7 } else { color };
+            return if seam || along < rim + 0.012 { color * 0.7 } else { color };
         }
         let strand = noise2(Vec2::new(angle * 38.0, along * 12.0), self.outfit.seed ^ 21);
         let fine = noise2(Vec2::new(angle * 160.0, along * 40.0), self.outfit.seed ^ 22);
