@@ -166,6 +166,13 @@ fn real_scans_with_several_materials_are_imported() {
     );
     // Subjects 0 and 1 are on the published list.
     assert!(folder.join("val/parm/0001/3_extrinsic.npy").is_file());
+    let mut only = prepare("scan");
+    only.arg(&scans).arg("-o").arg(temporary.path().join("none")).args([
+        "--collection",
+        "thuman2.0",
+        "--only",
+    ]);
+    assert!(refused(only.arg("train")).contains("none of its scans is in the split"));
     assert!(succeed(prepare("check").arg(&folder)).contains("2 subjects, 8 views: no fault"));
     let picture = image::open(folder.join("val/img/0000/0.jpg")).expect("a picture").into_rgb8();
     // Scan 0000 wears a shirt of dark red and teal over a skirt of green and violet.
@@ -191,7 +198,7 @@ fn broken_scans_are_named_and_skipped() {
                    property float z\nelement face 1000000000\nproperty list uchar int vertex_indices\nend_header\n1234";
     write("sound one.obj", pyramid.as_bytes());
     write("trüncated.obj", &pyramid.as_bytes()[..pyramid.len() - 3]);
-    write("half.obj", format!("{}{pyramid}", "v 0 0 0\n".repeat(3)).as_bytes());
+    write("half.obj", pyramid.replace("f 1 3", &format!("{}f 1 3", "v 0 0 0\n".repeat(3))).as_bytes());
     write("no number.obj", pyramid.replace("f 1 2 4", "f 1 2 x").as_bytes());
     write("billion text.ply", billion.replace("binary_little_endian", "ascii").as_bytes());
     write("billion.ply", billion.as_bytes());
@@ -219,7 +226,7 @@ fn broken_scans_are_named_and_skipped() {
     let message = refused(&mut command);
     let expected = [
         ("trüncated.obj", "line 8, `f 3 1`: a face needs three corners"),
-        ("half.obj", "3 of 7 vertices belong to no face"),
+        ("half.obj", "its last 3 of 7 vertices belong to no face"),
         ("no number.obj", "face parse error"),
         ("billion text.ply", "of 1000000000"),
         ("billion.ply", "of 1000000000: `y` is missing"),

@@ -134,7 +134,7 @@ impl DataConfig {
         }
         let JitterConfig { rig, view } = &self.jitter;
         let sections =
-            [("jitter.rig", rig), ("jitter.view", view), ("jitter.rig and jitter.view: ", &rig.plus(view))];
+            [("jitter.rig", rig), ("jitter.view", view), ("jitter.rig + jitter.view", &rig.plus(view))];
         let jitter = sections.into_iter().find_map(|(section, jitter)| {
             jitter.problem().map(|(key, message)| (format!("{section}.{key}"), message))
         });

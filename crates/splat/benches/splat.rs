@@ -174,6 +174,7 @@ fn run(case: &Case, tracked: Tracked, device: &Device, on_host: bool) {
         |figure: Figure| if on_host { format!("{:.1}", figure.bytes as f64 / 1e6) } else { "–".into() };
     // The image comes out, its gradient comes in, the inputs' gradients come out: they are not scratch memory.
     let (image, upstream) = (16 * pixels, 12 * pixels);
+    let gradients = case.n * if tracked == Tracked::Everything { 56 } else { 12 };
     let budget = (400 * case.n + 40 * pixels) as f64;
     let share = |figure: Figure, outputs: usize| match on_host {
         true => format!("{:.0} %", 100.0 * figure.bytes.saturating_sub(outputs) as f64 / budget),
@@ -196,7 +197,7 @@ fn run(case: &Case, tracked: Tracked, device: &Device, on_host: bool) {
         share(forward, image),
         backward.map_or("–".into(), ms),
         backward.map_or("–".into(), mb),
-        backward.map_or("–".into(), |figure| share(figure, image + upstream + 56 * case.n)),
+        backward.map_or("–".into(), |figure| share(figure, image + upstream + gradients)),
     );
 }
 

@@ -9,10 +9,12 @@ use crate::sample::unproject;
 
 /// Side of an outline in cells, at most: what is compared is coarser than the pictures.
 const CELLS: u32 = 256;
+/// Pictures with a shorter side are too coarse to compare.
+pub const LEAST_SIDE: u32 = 64;
 /// Most points of a view that are tried.
 const POINTS: usize = 2000;
 /// Share of them that may lie outside: single pixels of one view may be too thin for another.
-const OUTSIDE: f64 = 0.05;
+const OUTSIDE: f64 = 0.08;
 
 /// What one view says of its subject.
 pub struct Seen {
@@ -84,7 +86,7 @@ impl Seen {
     }
 }
 
-/// Pairs of views, a quarter turn apart, that do not fit one another: a camera or a depth map of theirs is wrong.
+/// Pairs of views, a quarter turn or more apart, that do not fit one another: a camera or a depth map of theirs is wrong.
 pub fn disagreements(views: &[Option<Seen>]) -> impl Iterator<Item = String> {
     let count = views.len();
     let step = (count / 4).max(1);

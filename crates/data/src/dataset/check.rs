@@ -6,7 +6,7 @@ use std::path::Path;
 
 use rayon::prelude::*;
 
-use super::agree::{Seen, disagreements};
+use super::agree::{LEAST_SIDE, Seen, disagreements};
 use super::write::UNFINISHED;
 use super::{Description, Folder, Layout, Split, split_alpha};
 use crate::DataError;
@@ -137,9 +137,11 @@ fn faults(folder: &Folder, split: Option<Split>, subject: &str, view: usize) -> 
         .flat_map(|y| (0..width).map(move |x| (x, y)))
         .filter(|&(x, y)| depth[(y * width + x) as usize] <= 0.0 && inside(x, y))
         .count();
-    if missing as f64 > HOLES * person.unwrap_or(0) as f64 {
+    if missing > 4 && missing as f64 > HOLES * person.unwrap_or(0) as f64 {
         report(format!("{missing} pixels of the person have no depth"));
     }
+    // Nothing can be said of an empty view, and little of a tiny one.
+    let camera = camera.filter(|_| person != Some(0) && width >= LEAST_SIDE);
     let seen = camera.map(|camera| Seen::new(&folder.exact_camera(&camera), &mask, depth));
     (problems, seen)
 }

@@ -211,8 +211,7 @@ impl Folder {
             return Err(DataError::unsuitable(root, problem));
         }
         let Description { layout, views, resolution, .. } = description;
-        let name = full_name(root);
-        if layout == Layout::Authors && !name.ends_with(&format!("_{resolution}_{views}")) {
+        if layout == Layout::Authors && views_in_name(root) != Some(views) {
             let message = format!(
                 "the authors' loader reads the number of views from the folder's name: it must end in `_{resolution}_{views}`"
             );
@@ -462,15 +461,10 @@ fn flatten(before: &str, table: &toml::Table, keys: &mut BTreeMap<String, String
     }
 }
 
-/// The name of a folder, however its path is written.
-fn full_name(root: &Path) -> String {
-    let name = root.canonicalize().unwrap_or_else(|_| root.to_owned());
-    name.file_name().unwrap_or_default().to_string_lossy().into_owned()
-}
-
 /// The number behind the last underscore of the folder's name.
 fn views_in_name(root: &Path) -> Option<usize> {
-    let name = full_name(root);
+    let name = root.canonicalize().unwrap_or_else(|_| root.to_owned());
+    let name = name.file_name()?.to_string_lossy().into_owned();
     let (_, views) = name.rsplit_once('_')?;
     views.parse().ok().filter(|views| (1..=MAX_VIEWS).contains(views))
 }

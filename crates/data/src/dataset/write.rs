@@ -45,7 +45,8 @@ impl Folder {
     /// appears when everything is written; runs that work on one data set leave each other's subjects alone.
     ///
     /// # Errors
-    /// [`DataError::Write`]; [`DataError::Unsuitable`] if a camera sees nothing.
+    /// [`DataError::Write`]; [`DataError::Unsuitable`] if a camera sees nothing, or, in the authors' layout,
+    /// something within half a metre.
     ///
     /// # Panics
     /// If there are more or fewer cameras than the set has views, or one of another size.
@@ -122,6 +123,12 @@ impl Folder {
                     &self.root,
                     format!("view {view} sees nothing of {subject}"),
                 ));
+            }
+            if self.description.layout == Layout::Authors && drawn.depth.iter().any(|z| *z > 0.0 && *z <= 0.5) {
+                let message = format!(
+                    "view {view} sees {subject} within half a metre, for which the authors' layout has no number"
+                );
+                return Err(DataError::unsuitable(&self.root, message));
             }
             let picture = |suffix: &str, drawn: &View| match self.description.layout {
                 Layout::Authors => {

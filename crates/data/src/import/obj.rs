@@ -16,7 +16,7 @@ use crate::mesh::{Face, Material, Mesh};
 
 /// Longest line; a face of a scan has a handful of corners.
 const MAX_LINE: usize = 1 << 20;
-/// Share of the vertices that may belong to no face: scans have strays, files that were cut short have many.
+/// Share of the vertices, the last ones, that may belong to no face: files that were cut short have many.
 const UNUSED: f64 = 0.05;
 
 pub fn read(path: &Path) -> Result<Mesh, DataError> {
@@ -45,15 +45,7 @@ pub fn read(path: &Path) -> Result<Mesh, DataError> {
     if let Some(e) = failed.take() {
         return Err(e);
     }
-    let vertices = check_faces(path, &text)?;
-    let used: usize = models.iter().map(|model| model.mesh.positions.len() / 3).sum();
-    if (vertices.saturating_sub(used)) as f64 > UNUSED * vertices as f64 && used > 0 {
-        let message = format!(
-            "{} of {vertices} vertices belong to no face: the file seems to be cut short",
-            vertices - used
-        );
-        return Err(DataError::unsuitable(path, message));
-    }
+    check_faces(path, &text)?;
     let materials = materials.unwrap_or_default();
     // The parser takes unknown names for no material at all.
     let used = text.lines().filter_map(|line| line.strip_prefix("usemtl ")).map(str::trim);
@@ -98,21 +90,39 @@ pub fn read(path: &Path) -> Result<Mesh, DataError> {
     Ok(mesh)
 }
 
-/// How many vertices there are; refuses faces of fewer than three corners, which the parser takes for lines.
-fn check_faces(path: &Path, text: &str) -> Result<usize, DataError> {
-    let mut vertices = 0;
+/// Refuses what is left of a file that was cut: a face of fewer than three corners, which the parser takes for a line, and
+/// vertices at the end that no face refers to any more.
+fn check_faces(path: &Path, text: &str) -> Result<(), DataError> {
+    let (mut vertices, mut last) = (0_i64, 0_i64);
     for (number, line) in text.lines().enumerate() {
-        let mut words = line.split_ascii_whitespace();
+        let mut words = line.split_ascii_whitespace().take_while(|word| !word.starts_with('#'));
         match words.next() {
             Some("v") => vertices += 1,
-            Some("f") if words.take_while(|word| !word.starts_with('#')).count() < 3 => {
-                let message = format!("line {}, `{}`: a face needs three corners", number + 1, quoted(line));
-                return Err(DataError::unsuitable(path, message));
+            Some(kind @ ("f" | "l" | "p")) => {
+                let mut corners = 0;
+                for word in words {
+                    corners += 1;
+                    let row: i64 = word.split('/').next().and_then(|row| row.parse().ok()).unwrap_or(0);
+                    // Negative numbers count from the end.
+                    last = last.max(if row < 0 { vertices + row + 1 } else { row });
+                }
+                if kind == "f" && corners < 3 {
+                    let message =
+                        format!("line {}, `{}`: a face needs three corners", number + 1, quoted(line));
+                    return Err(DataError::unsuitable(path, message));
+                }
             }
             _ => {}
         }
     }
-    Ok(vertices)
+    let unused = vertices - last;
+    if last > 0 && unused > 2 && unused as f64 > UNUSED * vertices as f64 {
+        let message = format!(
+            "its last {unused} of {vertices} vertices belong to no face: the file seems to be cut short"
+        );
+        return Err(DataError::unsuitable(path, message));
+    }
+    Ok(())
 }
 
 /// The file in a `map_Kd` statement, behind its options (`-s 1 1 1 skin.png`).

@@ -1,5 +1,7 @@
 //! The layers of a MakeHuman person: skin, clothes cut from the base mesh's helper surfaces, hair.
 
+use std::num::NonZeroUsize;
+
 use glam::{Vec2, Vec3};
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 
@@ -16,6 +18,10 @@ const GAP: f32 = 0.004;
 const FAR: f32 = 0.08;
 /// Side of the cells that hair is meshed with, metres.
 const HAIR_CELL: f32 = 0.006;
+/// Cloth within so many metres of a place in the resting pose is what lies over it.
+const OVER: f32 = 0.02;
+/// Vertices of cloth around a place among which one of those is looked for.
+const AROUND: NonZeroUsize = NonZeroUsize::new(16).expect("not zero");
 
 impl Person<'_> {
     /// The mean over the parts that a vertex belongs to of what `depth` says of its place on each chart, by kind, angle,
@@ -256,27 +262,44 @@ fn push_out(net: &mut Net, solid: &Net, spans: bool, gap: impl Fn(&Vertex) -> f3
     }
 }
 
-/// Moves skin in until it lies `gap` metres below the cloth that is its nearest in the resting pose, where limbs are apart.
-/// `depths`: how deep inside a garment each vertex is.
+/// Moves skin in until it lies `gap` metres below the cloth over it: in the pose cloth of another limb may be nearer, in
+/// the resting pose limbs are apart. `depths`: how deep inside a garment each vertex is.
 fn press_in(skin: &mut Net, depths: &[f32], cloth: &Net, gap: f32) {
     let normals = cloth.normals();
-    let points: Vec<[f32; 3]> = cloth.vertices.iter().map(|vertex| vertex.rest.to_array()).collect();
-    if points.is_empty() {
+    let rest: Vec<[f32; 3]> = cloth.vertices.iter().map(|vertex| vertex.rest.to_array()).collect();
+    let posed: Vec<[f32; 3]> = cloth.vertices.iter().map(|vertex| vertex.posed.to_array()).collect();
+    if rest.is_empty() {
         return;
     }
-    let tree: ImmutableKdTree<f32, 3> =
-        ImmutableKdTree::new_from_slice(&points).expect("fewer points than u32 can number");
-    let places: Vec<[f32; 3]> = skin.vertices.iter().map(|vertex| vertex.rest.to_array()).collect();
-    let found = tree.query_batch(&places).nearest_one::<SquaredEuclidean<f32>>().execute();
-    for ((vertex, depth), found) in skin.vertices.iter_mut().zip(depths).zip(&found) {
-        // Beyond this there is none of this garment.
-        if *depth <= 0.0 || found.distance > 0.03 * 0.03 {
-            continue;
-        }
-        let nearest = found.item as usize;
-        let out = (vertex.posed - cloth.vertices[nearest].posed).dot(normals[nearest]);
+    let tree = |points: &[[f32; 3]]| -> ImmutableKdTree<f32, 3> {
+        ImmutableKdTree::new_from_slice(points).expect("fewer points than u32 can number")
+    };
+    let press = |vertex: &mut Vertex, depth: f32, cloth_row: usize| {
+        let out = (vertex.posed - cloth.vertices[cloth_row].posed).dot(normals[cloth_row]);
         // At hems skin goes over into what is bare.
-        let gap = gap * smoothstep(0.0, 0.015, *depth);
-        vertex.posed -= normals[nearest] * (out + gap).clamp(0.0, 0.05);
+        let gap = gap * smoothstep(0.0, 0.015, depth);
+        vertex.posed -= normals[cloth_row] * (out + gap).clamp(0.0, 0.05);
+    };
+    let covered: Vec<usize> = (0..depths.len()).filter(|row| depths[*row] > 0.0).collect();
+    // First what lies over it in the resting pose, however far away it is now …
+    let places: Vec<[f32; 3]> = covered.iter().map(|row| skin.vertices[*row].rest.to_array()).collect();
+    let found = tree(&rest).query_batch(&places).nearest_one::<SquaredEuclidean<f32>>().execute();
+    for (row, found) in covered.iter().zip(&found).filter(|(_, found)| found.distance < OVER * OVER) {
+        press(&mut skin.vertices[*row], depths[*row], found.item as usize);
+    }
+    // … then what of that is nearest now.
+    let tree = tree(&posed);
+    for _ in 0..2 {
+        let places: Vec<[f32; 3]> = covered.iter().map(|row| skin.vertices[*row].posed.to_array()).collect();
+        let found = tree.query_batch(&places).nearest_n::<SquaredEuclidean<f32>>(AROUND).execute();
+        for (row, found) in covered.iter().zip(&found) {
+            let vertex = &mut skin.vertices[*row];
+            let over = found.iter().find(|found| {
+                (cloth.vertices[found.item as usize].rest - vertex.rest).length_squared() < OVER * OVER
+            });
+            if let Some(over) = over {
+                press(vertex, depths[*row], over.item as usize);
+            }
+        }
     }
 }

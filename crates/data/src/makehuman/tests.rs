@@ -35,26 +35,27 @@ fn people_stand_upright_and_follow_their_names() {
     let (one, again) = (mesh("test/1"), mesh("test/1"));
     assert_eq!(one.positions, again.positions);
     assert_eq!(one.faces, again.faces);
-    // The same on every machine: the numbers were written down on one.
-    let sum = one.positions.iter().map(|p| p.as_dvec3()).sum::<glam::DVec3>();
+    // The same on every machine: the numbers were written down on one. Where two places of cloth are equally near, machines
+    // may press skin against one or the other, by a hair.
     let texture = one.materials[0].texture.as_ref().expect("has a texture");
     let light: u64 = texture.as_raw().iter().map(|b| u64::from(*b)).sum();
-    let sum = sum.to_array().map(|v| (v * 1e6).round() as i64);
-    assert_eq!(
-        (one.positions.len(), one.faces.len(), light, sum),
-        (100_479, 199_159, 316_772_622, [-6_188_267_462, 96_874_516_900, 5_890_165_724])
-    );
+    assert_eq!((one.positions.len(), one.faces.len(), light), (100_479, 199_159, 316_772_622));
+    let mean = one.positions.iter().map(|p| p.as_dvec3()).sum::<glam::DVec3>() / one.positions.len() as f64;
+    let expected = glam::DVec3::new(-0.061_584, 0.964_124, 0.058_625);
+    assert!((mean - expected).length() < 1e-5, "{mean}");
 }
 
-/// How many vertices of `inner` lie outside of the cloth over them; of how many that have some. What lies over what is
-/// told by the resting pose, where limbs are apart.
+/// How many vertices of `inner` lie outside of the cloth over them, by more than 1 mm; of how many that have some. Cloth
+/// over a vertex is that within 2 cm in the resting pose, where limbs are apart; the nearest of it in the pose counts.
 fn through(inner: &Net, cloth: &Net, inside: impl Fn(&Vertex) -> f32) -> (usize, usize) {
     let normals = cloth.normals();
     let (mut under, mut through) = (0, 0);
     for vertex in inner.vertices.iter().filter(|v| inside(v) > 0.01) {
-        let distance = |i: &usize| (cloth.vertices[*i].rest - vertex.rest).length_squared();
-        let nearest = (0..cloth.vertices.len()).min_by(|a, b| distance(a).total_cmp(&distance(b)));
-        let nearest = nearest.expect("the garment is there");
+        let over = |i: &usize| (cloth.vertices[*i].rest - vertex.rest).length_squared() < 0.02 * 0.02;
+        let distance = |i: &usize| (cloth.vertices[*i].posed - vertex.posed).length_squared();
+        let nearest =
+            (0..cloth.vertices.len()).filter(over).min_by(|a, b| distance(a).total_cmp(&distance(b)));
+        let Some(nearest) = nearest else { continue };
         under += 1;
         let out = (vertex.posed - cloth.vertices[nearest].posed).dot(normals[nearest]);
         through += usize::from(out > 0.001);

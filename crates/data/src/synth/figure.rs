@@ -137,9 +137,7 @@ impl Pose {
             arm[0] = arm[0].max((10.0 + 32.0 * share).min(30.0));
         }
     }
-}
 
-impl Pose {
     /// Moves an arm a little away from the body: one that is bent is stretched, another one lifted.
     pub fn ease_arm(&mut self, side: usize) {
         let [aside, _, _, bend] = &mut self.arms[side];

@@ -266,19 +266,23 @@ fn generate(
     };
     // What is there may have been changed by hand.
     let is_due = |work: &Work| generate.save_scans && !scan(work).exists();
-    make(common, quiet, &source, &[], &works, |_, work| {
+    let made = make(common, quiet, &source, &[], &works, |_, work| {
         let mut mesh = person(&work.identity)?;
         if is_due(work) {
             export::write_obj(&mesh, &scan(work))?;
         }
         place(&mut mesh, work, Collection::Other, &common.output)?;
         Ok(Person { mesh, yaw_degrees: 0.0 })
-    })?;
+    });
     // Subjects that were there before, without their scans.
-    let mine = works.iter().enumerate().filter(|(place, work)| common.shard.has(*place) && is_due(work));
+    let there = |work: &Work| common.output.join(split.name()).join("img").join(&work.subject).is_dir();
+    let mine = works
+        .iter()
+        .enumerate()
+        .filter(|(place, work)| common.shard.has(*place) && is_due(work) && there(work));
     let due: Vec<&Work> = mine.map(|(_, work)| work).collect();
     if due.is_empty() {
-        return Ok(());
+        return made;
     }
     let progress = Progress::steps(quiet, due.len(), "scans");
     for (done, work) in due.iter().enumerate() {
@@ -286,7 +290,7 @@ fn generate(
         export::write_obj(&person(&work.identity)?, &scan(work))?;
     }
     progress.step(due.len(), due.len(), "scans");
-    Ok(())
+    made
 }
 
 /// Stands the mesh up for the cameras; training subjects not quite in the middle, as their names decide.

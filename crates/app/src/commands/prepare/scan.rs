@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
 use snapsnap_data::dataset::Split;
-use snapsnap_data::scan::{Collection, find};
+use snapsnap_data::scan::{Collection, Source, find};
 use snapsnap_data::{DataError, import, smplx};
 
 use super::{Common, Person, SplitArgument, Work, make};
@@ -59,21 +59,30 @@ pub struct Arguments {
     /// Put all subjects there [default: as the set's published lists say; the first 100 of 2K2K and all of 4D-Dress test, others train].
     #[arg(long, value_enum)]
     split: Option<SplitArgument>,
+    /// Leave out the subjects of the other splits.
+    #[arg(long, value_enum, value_name = "SPLIT", conflicts_with = "split")]
+    only: Option<SplitArgument>,
 }
 
 pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let collection = Collection::from(arguments.collection);
     let sources = find(&arguments.source)?;
-    let works: Vec<Work> = sources
-        .iter()
+    let only = arguments.only.map(Split::from);
+    let (sources, works): (Vec<Source>, Vec<Work>) = sources
+        .into_iter()
         .enumerate()
         .map(|(place, source)| {
             let subject = source.subject.clone();
             let split = arguments.split.map_or_else(|| collection.split(&subject, place), Split::from);
             let identity = format!("scan/{}/{split}/{subject}", arguments.common.seed);
-            Work { split, subject, identity }
+            (source, Work { split, subject, identity })
         })
-        .collect();
+        .filter(|(_, work)| only.is_none_or(|only| work.split == only))
+        .unzip();
+    if works.is_empty() {
+        let message = "none of its scans is in the split that --only names".to_owned();
+        return Err(DataError::Unsuitable { path: arguments.source.clone(), message }.into());
+    }
     let description = describe(arguments);
     let mut inputs = vec![arguments.source.as_path()];
     inputs.extend(arguments.smplx.as_deref());
@@ -112,14 +121,13 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
 
 /// What the data set's description says of its source: all that decides what the subjects are.
 fn describe(arguments: &Arguments) -> String {
-    // Many folders are called `scans`; where on which machine they lie is nobody's business.
+    // Where the folder lies differs from machine to machine.
     let path = arguments.source.canonicalize().unwrap_or_else(|_| arguments.source.clone());
-    let mut names: Vec<_> = path.iter().rev().take(2).map(|name| name.to_string_lossy()).collect();
-    names.reverse();
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
     let collection =
         arguments.collection.to_possible_value().map_or(String::new(), |v| v.get_name().to_owned());
     let smplx = if arguments.smplx.is_some() { ", with SMPL-X parameters" } else { "" };
-    format!("scans of {} ({collection}{smplx}), seed {}", names.join("/"), arguments.common.seed)
+    format!("scans of {name} ({collection}{smplx}), seed {}", arguments.common.seed)
 }
 
 /// The subject's SMPL-X parameters; an error if a folder of them was named and has none.
