@@ -16,124 +16,25 @@
 
 mod agree;
 mod check;
+mod description;
 mod files;
 #[cfg(test)]
 mod tests;
 mod write;
 
-use std::collections::{BTreeMap, BTreeSet};
-use std::fmt;
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use glam::DVec2;
 use image::{DynamicImage, GrayImage, RgbImage};
-use serde::{Deserialize, Serialize};
 use snapsnap_splat::{Camera, cameras, file};
 
 use crate::DataError;
 use crate::error::open;
-use crate::prepare::JitterConfig;
 pub use check::{Checked, check};
+use description::DESCRIPTION;
+pub use description::{Description, Drawn, Layout, MAX_RESOLUTION, MAX_VIEWS, Split};
 pub use write::Made;
-
-/// Name of the file that describes a folder.
-const DESCRIPTION: &str = "dataset.toml";
-/// Largest description that is read.
-const MAX_DESCRIPTION: u64 = 1 << 20;
-/// Most views of a subject.
-pub const MAX_VIEWS: usize = 4096;
-/// Largest side of a view.
-pub const MAX_RESOLUTION: u32 = 8192;
-
-/// How views are stored.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Layout {
-    /// JPEG, depth in 16 bits, sampled at the pixels' corners: what the authors' tools write and read.
-    Authors,
-    /// Lossless, depth in f32, sampled at the pixels' centres.
-    Exact,
-}
-
-/// What a data set is kept for. Subjects of different splits are different people.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Split {
-    /// To learn from.
-    Train,
-    /// To choose among what was learned.
-    Val,
-    /// To report on.
-    Test,
-}
-
-impl Split {
-    /// Every split.
-    pub const ALL: [Self; 3] = [Self::Train, Self::Val, Self::Test];
-
-    /// Name of the split's folder.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Train => "train",
-            Self::Val => "val",
-            Self::Test => "test",
-        }
-    }
-}
-
-impl fmt::Display for Split {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.name())
-    }
-}
-
-/// What `dataset.toml` says.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Description {
-    /// How views are stored.
-    pub layout: Layout,
-    /// Views of each subject, evenly around it.
-    pub views: usize,
-    /// Side of a view in pixels.
-    pub resolution: u32,
-    /// Whether each view is there at twice the side as well.
-    pub high_resolution: bool,
-    /// Where in the first pixel the camera's coordinates (0, 0) and (½, ½) put its sample: 0 in the authors' sets, ½ in
-    /// ours. Points from depth are half a pixel off where this is not heeded.
-    pub pixel_centre: f64,
-    /// What the subjects are and how they were made.
-    pub source: String,
-    /// With which cameras and how finely they were drawn, where that is known.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub drawn: Option<Drawn>,
-}
-
-/// How views were drawn.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Drawn {
-    /// Samples per pixel along each axis.
-    pub samples: usize,
-    /// How cameras strayed.
-    pub jitter: JitterConfig,
-}
-
-impl Description {
-    fn problem(&self) -> Option<String> {
-        if self.views == 0 || self.views > MAX_VIEWS {
-            return Some(format!("`views` is {}, must be 1 to {MAX_VIEWS}", self.views));
-        }
-        if self.resolution == 0 || self.resolution > MAX_RESOLUTION {
-            return Some(format!("`resolution` is {}, must be 1 to {MAX_RESOLUTION}", self.resolution));
-        }
-        if self.pixel_centre != 0.0 && self.pixel_centre != 0.5 {
-            return Some(format!("`pixel_centre` is {}, must be 0 or 0.5", self.pixel_centre));
-        }
-        None
-    }
-}
 
 /// One stored view.
 #[derive(Debug, Clone)]
@@ -163,7 +64,7 @@ impl Folder {
     pub fn open(root: &Path) -> Result<Self, DataError> {
         let path = root.join(DESCRIPTION);
         if path.is_file() {
-            let description = read_description(&path)?;
+            let description = description::read(&path)?;
             return Ok(Self { root: root.to_owned(), description });
         }
         let entries = fs::read_dir(root).map_err(DataError::read(root))?;
@@ -220,11 +121,11 @@ impl Folder {
         fs::create_dir_all(root).map_err(DataError::write(root))?;
         let path = root.join(DESCRIPTION);
         if path.exists() {
-            let there = read_description(&path)?;
+            let there = description::read(&path)?;
             if there != description {
                 let message = format!(
                     "describes another data set than the one to be written: {}; give another folder",
-                    differences(&there, &description)
+                    description::differences(&there, &description)
                 );
                 return Err(DataError::unsuitable(&path, message));
             }
@@ -420,45 +321,6 @@ fn split_alpha(picture: DynamicImage) -> (RgbImage, GrayImage) {
     let mask =
         GrayImage::from_fn(rgba.width(), rgba.height(), |x, y| image::Luma([rgba.get_pixel(x, y).0[3]]));
     (DynamicImage::ImageRgba8(rgba).into_rgb8(), mask)
-}
-
-fn read_description(path: &Path) -> Result<Description, DataError> {
-    if open(path)?.metadata().map_err(DataError::read(path))?.len() > MAX_DESCRIPTION {
-        return Err(DataError::unsuitable(path, "is far too long for a description"));
-    }
-    let text = fs::read_to_string(path).map_err(DataError::read(path))?;
-    let description: Description =
-        toml::from_str(&text).map_err(|e| DataError::unsuitable(path, e.to_string().trim_end()))?;
-    match description.problem() {
-        Some(problem) => Err(DataError::unsuitable(path, problem)),
-        None => Ok(description),
-    }
-}
-
-/// What the one description says and the other does not, key by key.
-fn differences(there: &Description, wanted: &Description) -> String {
-    let keys = |d: &Description| {
-        let table = toml::Table::try_from(d).expect("the description has only TOML types");
-        let mut keys = BTreeMap::new();
-        flatten("", &table, &mut keys);
-        keys
-    };
-    let (there, wanted) = (keys(there), keys(wanted));
-    let all: BTreeSet<&String> = there.keys().chain(wanted.keys()).collect();
-    let value = |of: &BTreeMap<String, String>, key: &str| of.get(key).map_or("unset".into(), String::clone);
-    let differing = all.into_iter().filter(|key| there.get(*key) != wanted.get(*key));
-    let said =
-        differing.map(|key| format!("`{key}` is {} there, not {}", value(&there, key), value(&wanted, key)));
-    said.collect::<Vec<_>>().join(", ")
-}
-
-fn flatten(before: &str, table: &toml::Table, keys: &mut BTreeMap<String, String>) {
-    for (key, value) in table {
-        match value {
-            toml::Value::Table(table) => flatten(&format!("{before}{key}."), table, keys),
-            value => drop(keys.insert(format!("{before}{key}"), value.to_string())),
-        }
-    }
 }
 
 /// The number behind the last underscore of the folder's name.

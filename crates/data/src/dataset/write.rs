@@ -69,7 +69,7 @@ impl Folder {
         let lock = fs::File::create(&mark).map_err(DataError::write(&mark))?;
         match lock.try_lock() {
             Err(TryLockError::WouldBlock) => return Ok(Made::Elsewhere),
-            // Where files cannot be locked, two runs must not share a subject.
+            // Some file systems know no locks: nothing keeps two runs apart there.
             Err(TryLockError::Error(_)) | Ok(()) => {}
         }
         if self.has(split, subject) {

@@ -48,9 +48,9 @@ pub fn read(path: &Path) -> Result<Mesh, DataError> {
     check_faces(path, &text)?;
     let materials = materials.unwrap_or_default();
     // The parser takes unknown names for no material at all.
-    let used = text.lines().filter_map(|line| line.strip_prefix("usemtl ")).map(str::trim);
+    let mut used = text.lines().filter_map(|line| line.strip_prefix("usemtl ")).map(str::trim);
     let known = |name: &&str| materials.is_empty() || materials.iter().any(|m| m.name == **name);
-    if let Some(name) = used.into_iter().find(|name| !known(name)) {
+    if let Some(name) = used.find(|name| !known(name)) {
         return Err(DataError::unsuitable(path, format!("its material `{}` is missing", quoted(name))));
     }
 

@@ -303,7 +303,7 @@ fn a_scan_that_is_cut_short_is_refused() {
         let end = bytes[..end].iter().rposition(|b| *b == b'\n').map_or(0, |at| at + 1);
         fs::write(&path, &bytes[..end]).expect("writes");
         let refused = read(&path).map(|_| ()).expect_err("cut").to_string();
-        let expected = ["there is no triangle", "the file seems to be cut short", "refers to"];
+        let expected = ["there is no triangle", "the file seems to be cut short"];
         assert!(expected.iter().any(|words| refused.contains(words)), "{percent} %: {refused}");
     }
     assert!(read(&whole).is_ok());

@@ -3,9 +3,9 @@
 use std::num::NonZeroUsize;
 
 use glam::{Vec2, Vec3};
-use kiddo::{ImmutableKdTree, SquaredEuclidean};
+use kiddo::SquaredEuclidean;
 
-use super::net::{Net, PARTS, Vertex};
+use super::net::{Net, PARTS, Vertex, coordinates, tree};
 use super::{ORDER, Person, Piece};
 use crate::synth::body::{Body, Kind, neckline};
 use crate::synth::math::{noise, smoothstep};
@@ -94,15 +94,15 @@ impl Person<'_> {
         skin
     }
 
-    /// A layer of cloth over the body: the part of the tights that is `inside`, `thick` metres off.
-    /// Its cloth lies on the charts of `kinds`, also where it reaches a little beyond them.
+    /// A layer of cloth over the body: the part of the tights that is `inside`, `thick` metres off. Its cloth lies on the
+    /// charts of `kinds`, also where it reaches a little beyond them.
     fn layer(
         &self,
         kinds: &[Kind],
         inside: impl Fn(&Vertex) -> f32,
         thick: impl Fn(&Vertex) -> f32,
     ) -> Piece {
-        let mut net = self.group("helper-tights").subdivide().subdivide();
+        let mut net = self.tights.clone();
         net.inflate(thick);
         let net = net.cut(inside);
         let own = |vertex: &Vertex| {
@@ -216,7 +216,7 @@ impl Person<'_> {
         let row = self.body.parts.iter().position(|part| part.kind == Kind::Hair)?;
         let hair = Body { parts: vec![self.body.parts[row].clone()] };
         let Surface { positions, faces, .. } = surface::mesh(&hair, HAIR_CELL);
-        let (turn, shift) = self.posed.head;
+        let (turn, shift) = self.head;
         let vertex = |p: &Vec3| Vertex { rest: *p, posed: turn * *p + shift, parts: [0.0; PARTS] };
         let vertices: Vec<Vertex> = positions.iter().map(vertex).collect();
         let mut net = Net { vertices, faces: faces.into_iter().map(|f| f.to_vec()).collect() };
@@ -239,20 +239,18 @@ impl Person<'_> {
 /// along their own normals: where what lies below has a fold, cloth goes over it.
 fn push_out(net: &mut Net, solid: &Net, spans: bool, gap: impl Fn(&Vertex) -> f32) {
     let normals = solid.normals();
-    let points: Vec<[f32; 3]> = solid.vertices.iter().map(|vertex| vertex.posed.to_array()).collect();
-    if points.is_empty() {
+    if solid.vertices.is_empty() {
         return;
     }
-    let tree: ImmutableKdTree<f32, 3> =
-        ImmutableKdTree::new_from_slice(&points).expect("fewer points than u32 can number");
-    let places: Vec<[f32; 3]> = net.vertices.iter().map(|vertex| vertex.posed.to_array()).collect();
+    let places = coordinates(net.vertices.iter().map(|vertex| vertex.posed));
+    let tree = tree(solid.vertices.iter().map(|vertex| vertex.posed));
     let found = tree.query_batch(&places).nearest_one::<SquaredEuclidean<f32>>().execute();
     // Further inside than this the nearest skin is that of the other side.
     let deepest = 0.05;
     let own = net.normals();
     for ((vertex, found), own) in net.vertices.iter_mut().zip(&found).zip(own) {
         let nearest = found.item as usize;
-        let (skin, normal) = (Vec3::from_array(points[nearest]), normals[nearest]);
+        let (skin, normal) = (solid.vertices[nearest].posed, normals[nearest]);
         let out = (vertex.posed - skin).dot(normal);
         let along = if spans { own } else { normal };
         let (gap, facing) = (gap(vertex), along.dot(normal));
@@ -266,14 +264,9 @@ fn push_out(net: &mut Net, solid: &Net, spans: bool, gap: impl Fn(&Vertex) -> f3
 /// the resting pose limbs are apart. `depths`: how deep inside a garment each vertex is.
 fn press_in(skin: &mut Net, depths: &[f32], cloth: &Net, gap: f32) {
     let normals = cloth.normals();
-    let rest: Vec<[f32; 3]> = cloth.vertices.iter().map(|vertex| vertex.rest.to_array()).collect();
-    let posed: Vec<[f32; 3]> = cloth.vertices.iter().map(|vertex| vertex.posed.to_array()).collect();
-    if rest.is_empty() {
+    if cloth.vertices.is_empty() {
         return;
     }
-    let tree = |points: &[[f32; 3]]| -> ImmutableKdTree<f32, 3> {
-        ImmutableKdTree::new_from_slice(points).expect("fewer points than u32 can number")
-    };
     let press = |vertex: &mut Vertex, depth: f32, cloth_row: usize| {
         let out = (vertex.posed - cloth.vertices[cloth_row].posed).dot(normals[cloth_row]);
         // At hems skin goes over into what is bare.
@@ -282,16 +275,17 @@ fn press_in(skin: &mut Net, depths: &[f32], cloth: &Net, gap: f32) {
     };
     let covered: Vec<usize> = (0..depths.len()).filter(|row| depths[*row] > 0.0).collect();
     // First what lies over it in the resting pose, however far away it is now …
-    let places: Vec<[f32; 3]> = covered.iter().map(|row| skin.vertices[*row].rest.to_array()).collect();
-    let found = tree(&rest).query_batch(&places).nearest_one::<SquaredEuclidean<f32>>().execute();
+    let places = coordinates(covered.iter().map(|row| skin.vertices[*row].rest));
+    let rest = tree(cloth.vertices.iter().map(|vertex| vertex.rest));
+    let found = rest.query_batch(&places).nearest_one::<SquaredEuclidean<f32>>().execute();
     for (row, found) in covered.iter().zip(&found).filter(|(_, found)| found.distance < OVER * OVER) {
         press(&mut skin.vertices[*row], depths[*row], found.item as usize);
     }
     // … then what of that is nearest now.
-    let tree = tree(&posed);
+    let posed = tree(cloth.vertices.iter().map(|vertex| vertex.posed));
     for _ in 0..2 {
-        let places: Vec<[f32; 3]> = covered.iter().map(|row| skin.vertices[*row].posed.to_array()).collect();
-        let found = tree.query_batch(&places).nearest_n::<SquaredEuclidean<f32>>(AROUND).execute();
+        let places = coordinates(covered.iter().map(|row| skin.vertices[*row].posed));
+        let found = posed.query_batch(&places).nearest_n::<SquaredEuclidean<f32>>(AROUND).execute();
         for (row, found) in covered.iter().zip(&found) {
             let vertex = &mut skin.vertices[*row];
             let over = found.iter().find(|found| {

@@ -13,7 +13,7 @@ mod shape;
 #[cfg(test)]
 mod tests;
 
-use glam::Vec3;
+use glam::{Mat3, Vec3};
 
 use crate::DataError;
 use crate::mesh::{Face, Material, Mesh};
@@ -59,8 +59,8 @@ fn with_person<T>(library: &Library, name: &str, then: impl FnOnce(&Person) -> T
     let mut build = Build::draw(&mut random);
     let mut pose = Pose::draw(&mut random);
     let rest = morph(library, &mix, &mut random)?;
-    let group = |name: &str| library.groups.get(name).map_or(&[][..], Vec::as_slice);
-    let (low, high) = bounds(group("body").iter().flatten().map(|row| rest[*row as usize]));
+    let body = || library.groups.get("body").into_iter().flatten().flatten().map(|row| rest[*row as usize]);
+    let (low, high) = bounds(body());
     (build.sex, build.stature) = (mix.sex, (high.y - low.y).max(0.5));
     build.girth = 0.8 + 0.4 * mix.weight;
     let mut outfit = Outfit::draw(&mut random, &build);
@@ -72,22 +72,27 @@ fn with_person<T>(library: &Library, name: &str, then: impl FnOnce(&Person) -> T
     pose.spread_arms(0.5 * outfit.breadth());
     let joints = Joints::of(library, &rest);
     let middle = |height: f32| {
-        let rows = group("body").iter().flatten().map(|row| rest[*row as usize]);
-        let (low, high) = bounds(rows.filter(|p| p.x.abs() < 0.1 && (p.y - height).abs() < 0.03));
+        let (low, high) = bounds(body().filter(|p| p.x.abs() < 0.1 && (p.y - height).abs() < 0.03));
         if low.is_finite() { (low.z + high.z) / 2.0 } else { 0.0 }
     };
     let figure = joints.figure(build, high.y, middle);
     let cloth = 0.01 + outfit.top_thickness + if outfit.breadth() > 0.0 { 0.03 } else { 0.0 };
+    let shares = shares(library);
+    let vertices = |posed: &Posed| -> Vec<Vertex> {
+        let places = rest.iter().zip(&posed.positions).zip(&shares);
+        places.map(|((rest, posed), parts)| Vertex { rest: *rest, posed: *posed, parts: *parts }).collect()
+    };
     let mut posed = joints.pose(&rest, &figure, &pose);
     for _ in 0..MOVES {
-        let sunk = hands::sunk(library, &posed.positions, cloth);
+        let vertices = vertices(&posed);
+        let sunk = hands::sunk(&group(library, &vertices, "body"), cloth);
         if sunk == [false; 2] {
             break;
         }
         (0..2).filter(|side| sunk[*side]).for_each(|side| pose.ease_arm(side));
         posed = joints.pose(&rest, &figure, &pose);
     }
-    Ok(then(&Person::new(library, &rest, &posed, &figure, &outfit, &joints)))
+    Ok(then(&Person::new(library, vertices(&posed), posed.head, &figure, &outfit, &joints)))
 }
 
 fn bounds(points: impl Iterator<Item = Vec3>) -> (Vec3, Vec3) {
@@ -103,7 +108,10 @@ struct Person<'a> {
     /// Rows of `body` of the parts of [`ORDER`].
     rows: [usize; PARTS],
     vertices: Vec<Vertex>,
-    posed: &'a Posed,
+    /// The surface that clothes are cut from.
+    tights: Net,
+    /// How the head moved: turn, then shift.
+    head: (Mat3, Vec3),
     eyes: [Vec3; 2],
     mouth: (Vec3, Vec3),
 }
@@ -117,8 +125,8 @@ struct Piece {
 impl<'a> Person<'a> {
     fn new(
         library: &'a Library,
-        rest: &[Vec3],
-        posed: &'a Posed,
+        vertices: Vec<Vertex>,
+        head: (Mat3, Vec3),
         figure: &'a Figure,
         outfit: &'a Outfit,
         joints: &Joints,
@@ -127,16 +135,7 @@ impl<'a> Person<'a> {
         let row = |kind: Kind, side: usize| {
             body.parts.iter().position(|part| part.kind == kind && part.side == side).unwrap_or(0)
         };
-        let kinds: Vec<usize> = library.bones.iter().map(|bone| part_of(&bone.name)).collect();
-        let vertices = (0..rest.len())
-            .map(|i| {
-                let mut parts = [0.0; PARTS];
-                for (bone, share) in &library.weights[i] {
-                    parts[kinds[*bone as usize]] += share;
-                }
-                Vertex { rest: rest[i], posed: posed.positions[i], parts }
-            })
-            .collect();
+        let tights = group(library, &vertices, "helper-tights").subdivide().subdivide();
         Self {
             library,
             figure,
@@ -145,15 +144,15 @@ impl<'a> Person<'a> {
             rows: ORDER.map(|(kind, side)| row(kind, side)),
             body,
             vertices,
-            posed,
+            tights,
+            head,
             eyes: [joints.eye(0), joints.eye(1)],
             mouth: joints.mouth(),
         }
     }
 
     fn group(&self, name: &str) -> Net {
-        let faces = self.library.groups.get(name).map_or(&[][..], Vec::as_slice);
-        Net::of(|row| self.vertices[row as usize], faces)
+        group(self.library, &self.vertices, name)
     }
 
     /// Kind of part, and place on its chart.
@@ -252,6 +251,23 @@ impl<'a> Person<'a> {
             }
         }
     }
+}
+
+/// A group of the base mesh.
+fn group(library: &Library, vertices: &[Vertex], name: &str) -> Net {
+    let faces = library.groups.get(name).map_or(&[][..], Vec::as_slice);
+    Net::of(|row| vertices[row as usize], faces)
+}
+
+/// How much each vertex belongs to each part of the body.
+fn shares(library: &Library) -> Vec<[f32; PARTS]> {
+    let kinds: Vec<usize> = library.bones.iter().map(|bone| part_of(&bone.name)).collect();
+    let shares = library.weights.iter().map(|weights| {
+        let mut parts = [0.0; PARTS];
+        weights.iter().for_each(|(bone, share)| parts[kinds[*bone as usize]] += share);
+        parts
+    });
+    shares.collect()
 }
 
 /// The part of the body that a bone belongs to.

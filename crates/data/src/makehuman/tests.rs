@@ -103,7 +103,7 @@ fn hands_do_not_sink_into_the_body() {
     let Some(folder) = data() else { return };
     let library = Library::open(&folder).expect("opens");
     for index in 0..30 {
-        let check = |person: &Person| hands::sunk(&library, &person.posed.positions, 0.005);
+        let check = |person: &Person| hands::sunk(&person.group("body"), 0.005);
         let sunk = with_person(&library, &format!("test/hands/{index}"), check).expect("made");
         assert_eq!(sunk, [false; 2], "person {index}");
     }

@@ -30,12 +30,7 @@ pub(crate) const MOVES: usize = 24;
 
 /// The person of this name: life-size in metres, standing on y = 0 and facing +z.
 pub fn person(name: &str) -> Mesh {
-    let mut random = stream(&format!("synth/{name}"));
-    let build = Build::draw(&mut random);
-    let mut pose = Pose::draw(&mut random);
-    let outfit = Outfit::draw(&mut random, &build);
-    pose.spread_arms(outfit.breadth());
-    let (figure, body) = pose_freely(&build, &mut pose, &outfit);
+    let (figure, outfit, body) = dressed(name);
     let mut surface = surface::mesh(&body, CELL);
     let mut mesh = atlas::paint(&body, &surface, &Painter::new(&figure, &outfit));
     let floor = surface.positions.iter().map(|p| p.y).fold(f32::INFINITY, f32::min);
@@ -46,23 +41,30 @@ pub fn person(name: &str) -> Mesh {
     mesh
 }
 
-/// The body in this pose, its arms moved away from the trunk as far as is needed for hands to lie on it, not in it.
-fn pose_freely(build: &Build, pose: &mut Pose, outfit: &Outfit) -> (Figure, Body) {
-    for _ in 0..MOVES {
+/// The person in a pose, its arms moved away from the trunk as far as is needed for hands to lie on it, not in it.
+fn dressed(name: &str) -> (Figure, Outfit, Body) {
+    let mut random = stream(&format!("synth/{name}"));
+    let build = Build::draw(&mut random);
+    let mut pose = Pose::draw(&mut random);
+    let outfit = Outfit::draw(&mut random, &build);
+    pose.spread_arms(outfit.breadth());
+    let posed = |pose: &Pose| {
         let figure = Figure::new(build.clone(), pose);
-        let body = Body::new(&figure, outfit);
-        let thick = 0.014 * build.stature;
+        let body = Body::new(&figure, &outfit);
+        (figure, body)
+    };
+    let (mut figure, mut body) = posed(&pose);
+    for _ in 0..MOVES {
         let sunk = [0, 1].map(|side| {
             let (hand, fore) = (&figure.hands[side], &figure.forearms[side]);
             let points = [fore.at(0.75, Vec3::ZERO), hand.start, hand.at(0.5, Vec3::ZERO), hand.end];
-            points.iter().any(|p| body.trunk_distance(*p) < thick)
+            points.iter().any(|p| body.trunk_distance(*p) < 0.014 * build.stature)
         });
         if sunk == [false; 2] {
             break;
         }
         (0..2).filter(|side| sunk[*side]).for_each(|side| pose.ease_arm(side));
+        (figure, body) = posed(&pose);
     }
-    let figure = Figure::new(build.clone(), pose);
-    let body = Body::new(&figure, outfit);
-    (figure, body)
+    (figure, outfit, body)
 }

@@ -44,12 +44,7 @@ fn people_are_closed_and_of_one_piece() {
 fn hands_and_hips_stay_where_they_belong() {
     let (mut skirts, mut filled) = (0, 0);
     for index in 0..60 {
-        let mut random = stream(&format!("synth/test/hands/{index}"));
-        let build = Build::draw(&mut random);
-        let mut pose = Pose::draw(&mut random);
-        let outfit = Outfit::draw(&mut random, &build);
-        pose.spread_arms(outfit.breadth());
-        let (figure, body) = pose_freely(&build, &mut pose, &outfit);
+        let (figure, _, body) = dressed(&format!("test/hands/{index}"));
         for hand in &figure.hands {
             for share in [0.0, 0.5, 1.0] {
                 let depth = body.trunk_distance(hand.at(share, Vec3::ZERO));

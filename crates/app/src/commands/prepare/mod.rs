@@ -102,6 +102,11 @@ struct Common {
 }
 
 impl Common {
+    /// Where a subject's pictures are, or would be.
+    fn pictures(&self, split: Split, subject: &str) -> PathBuf {
+        self.output.join(split.name()).join("img").join(subject)
+    }
+
     fn config(&self) -> Result<DataConfig, Failure> {
         let (text, origin) = match &self.config {
             Some(path) => {
@@ -275,7 +280,7 @@ fn generate(
         Ok(Person { mesh, yaw_degrees: 0.0 })
     });
     // Subjects that were there before, without their scans.
-    let there = |work: &Work| common.output.join(split.name()).join("img").join(&work.subject).is_dir();
+    let there = |work: &Work| common.pictures(work.split, &work.subject).is_dir();
     let mine = works
         .iter()
         .enumerate()

@@ -90,9 +90,8 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let made = make(&arguments.common, quiet, &description, &inputs, &works, |place, work| {
         let path = &sources[place].path;
         // A person in two splits would be tested on after having been learned.
-        let img = |split: Split| arguments.common.output.join(split.name()).join("img").join(&work.subject);
-        if let Some(other) = Split::ALL.into_iter().find(|other| *other != work.split && img(*other).exists())
-        {
+        let is_in = |split: Split| arguments.common.pictures(split, &work.subject).exists();
+        if let Some(other) = Split::ALL.into_iter().find(|other| *other != work.split && is_in(*other)) {
             let message = format!("subject {} is in {other} already", work.subject);
             return Err(DataError::Unsuitable { path: path.clone(), message });
         }
