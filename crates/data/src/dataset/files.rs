@@ -21,6 +21,8 @@ use crate::view::View;
 
 /// Stored depths of the authors' layout are ⌊2¹⁵/z⌋ (SNAPSNAP §5.2).
 const INVERSE_DEPTH_UNIT: f64 = 32_768.0;
+/// What is not further than this, in metres, has no number there.
+pub const NEAREST: f32 = 0.5;
 /// Quality of JPEGs in the authors' layout.
 const JPEG_QUALITY: u8 = 95;
 /// Name of the array in a depth file.
@@ -88,10 +90,8 @@ pub fn write_mask(path: &Path, view: &View) -> Result<(), DataError> {
 
 /// ⌊2¹⁵/z⌋ in 16 bits, 0 for the background.
 pub fn write_inverse_depth(path: &Path, view: &View) -> Result<(), DataError> {
-    // Nearer than half a metre the format has no number; the largest stands for all of it.
-    let stored = |z: f32| {
-        if z > 0.0 { (INVERSE_DEPTH_UNIT / f64::from(z)).floor().min(65_535.0) as u16 } else { 0 }
-    };
+    // What is nearer than `NEAREST` saturates; data sets refuse it.
+    let stored = |z: f32| if z > 0.0 { (INVERSE_DEPTH_UNIT / f64::from(z)).floor() as u16 } else { 0 };
     let bytes: Vec<u8> = view.depth.iter().flat_map(|z| stored(*z).to_ne_bytes()).collect();
     write_png(path, &bytes, (view.width, view.height), ExtendedColorType::L16)
 }

@@ -22,6 +22,7 @@ mod files;
 mod tests;
 mod write;
 
+use std::fmt::Display;
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -192,10 +193,10 @@ impl Folder {
     }
 
     fn depth_map(&self, split: Option<Split>, subject: &str, view: usize) -> Result<Vec<f32>, DataError> {
-        let folder = self.path(split, "depth", subject);
-        let (path, read): (PathBuf, fn(&Path) -> _) = match self.description.layout {
-            Layout::Authors => (folder.join(format!("{view}.png")), files::read_inverse_depth),
-            Layout::Exact => (folder.join(format!("{view}.npz")), files::read_depth),
+        let path = self.path(split, "depth", subject).join(self.file_name("depth", view));
+        let read = match self.description.layout {
+            Layout::Authors => files::read_inverse_depth,
+            Layout::Exact => files::read_depth,
         };
         let (depth, [height, width]) = read(&path)?;
         self.check_size(&path, (width, height), self.description.resolution)?;
@@ -239,11 +240,8 @@ impl Folder {
         high_resolution: bool,
     ) -> Result<DynamicImage, DataError> {
         let (suffix, times) = if high_resolution { ("_hr", 2) } else { ("", 1) };
-        let ending = match self.description.layout {
-            Layout::Authors => "jpg",
-            Layout::Exact => "png",
-        };
-        let path = self.path(split, "img", subject).join(format!("{view}{suffix}.{ending}"));
+        let name = self.file_name("img", format_args!("{view}{suffix}"));
+        let path = self.path(split, "img", subject).join(name);
         let picture = crate::picture::decode(&path)?;
         self.check_size(&path, (picture.width(), picture.height()), times * self.description.resolution)?;
         Ok(picture)
@@ -251,7 +249,7 @@ impl Folder {
 
     /// The mask file of a view in the authors' layout.
     fn mask(&self, split: Option<Split>, subject: &str, view: usize) -> Result<GrayImage, DataError> {
-        let path = self.path(split, "mask", subject).join(format!("{view}.png"));
+        let path = self.path(split, "mask", subject).join(self.file_name("mask", view));
         let mask = crate::picture::decode(&path)?.into_luma8();
         self.check_size(&path, mask.dimensions(), self.description.resolution)?;
         Ok(mask)
@@ -301,6 +299,16 @@ impl Folder {
         }
         let message = format!("is {}×{}, the data set has views of {side}×{side}", found.0, found.1);
         Err(DataError::unsuitable(path, message))
+    }
+
+    /// Name of a view's picture, mask or depth, by the folder that it lies in.
+    fn file_name(&self, kind: &str, view: impl Display) -> String {
+        let ending = match (kind, self.description.layout) {
+            ("depth", Layout::Exact) => "npz",
+            ("img", Layout::Authors) => "jpg",
+            _ => "png",
+        };
+        format!("{view}.{ending}")
     }
 
     fn split_path(&self, split: Option<Split>) -> PathBuf {

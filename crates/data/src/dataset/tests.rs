@@ -172,6 +172,29 @@ fn a_check_lists_everything_that_is_wrong() {
     assert!(error.contains(DESCRIPTION) && error.contains("resolution"), "{error}");
 }
 
+/// What is too near for 16 bits of inverse depth is refused, not stored as something else.
+#[test]
+fn nearer_than_the_authors_layout_can_say_is_refused() {
+    let mut wall = crate::testing::block();
+    // Every camera, 2 m from the middle, stands before a wall 40 cm away.
+    wall.positions.iter_mut().for_each(|p| {
+        p.x = 1.6 * p.x.signum();
+        p.z = 1.6 * p.z.signum();
+    });
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let mut config = DataConfig::default();
+    config.views =
+        crate::prepare::ViewsConfig { count: 4, resolution: 64, layout: Layout::Authors, ..config.views };
+    let folder =
+        Folder::create(&temporary.path().join("a_64_4"), config.description("walls")).expect("makes");
+    let refused = config.add(&folder, Split::Train, "0000", &wall, 0.0, "0000").expect_err("too near");
+    assert!(refused.to_string().contains("within half a metre"), "{refused}");
+    assert!(!folder.has(Split::Train, "0000"));
+    config.views.layout = Layout::Exact;
+    let folder = Folder::create(&temporary.path().join("b"), config.description("walls")).expect("makes");
+    config.add(&folder, Split::Train, "0000", &wall, 0.0, "0000").expect("f32 can say it");
+}
+
 /// Each file of the authors' layout is looked at, whatever is wrong with the others.
 #[test]
 fn a_check_looks_at_every_file_of_the_authors_layout() {

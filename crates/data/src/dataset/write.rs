@@ -29,15 +29,8 @@ impl Folder {
         let last = self.description.views - 1;
         self.kinds().into_iter().all(|kind| match kind {
             "cameras" => self.split_path(Some(split)).join(kind).join(format!("{subject}.json")).is_file(),
-            _ => {
-                let name = match (kind, self.description.layout) {
-                    ("parm", _) => format!("{last}_extrinsic.npy"),
-                    ("depth", Layout::Exact) => format!("{last}.npz"),
-                    ("img", Layout::Authors) => format!("{last}.jpg"),
-                    _ => format!("{last}.png"),
-                };
-                self.path(Some(split), kind, subject).join(name).is_file()
-            }
+            "parm" => self.path(Some(split), kind, subject).join(format!("{last}_extrinsic.npy")).is_file(),
+            _ => self.path(Some(split), kind, subject).join(self.file_name(kind, last)).is_file(),
         })
     }
 
@@ -124,35 +117,30 @@ impl Folder {
                     format!("view {view} sees nothing of {subject}"),
                 ));
             }
-            if self.description.layout == Layout::Authors && drawn.depth.iter().any(|z| *z > 0.0 && *z <= 0.5) {
+            if self.description.layout == Layout::Authors && drawn.depth.iter().any(|z| *z > 0.0 && *z <= files::NEAREST)
+            {
                 let message = format!(
                     "view {view} sees {subject} within half a metre, for which the authors' layout has no number"
                 );
                 return Err(DataError::unsuitable(&self.root, message));
             }
-            let picture = |suffix: &str, drawn: &View| match self.description.layout {
-                Layout::Authors => {
-                    files::write_jpeg(&folder.join("img").join(format!("{view}{suffix}.jpg")), drawn)
-                }
-                Layout::Exact => {
-                    files::write_rgba(&folder.join("img").join(format!("{view}{suffix}.png")), drawn)
-                }
+            let at = |kind: &str| folder.join(kind).join(self.file_name(kind, view));
+            let picture = match self.description.layout {
+                Layout::Authors => files::write_jpeg,
+                Layout::Exact => files::write_rgba,
             };
-            picture("", &drawn)?;
+            picture(&at("img"), &drawn)?;
             if self.description.high_resolution {
-                picture(
-                    "_hr",
-                    &draw(&self.exact_camera(&camera.resized(2 * camera.width, 2 * camera.height))),
-                )?;
+                let large = draw(&self.exact_camera(&camera.resized(2 * camera.width, 2 * camera.height)));
+                picture(&folder.join("img").join(self.file_name("img", format_args!("{view}_hr"))), &large)?;
             }
-            let depth = folder.join("depth");
             match self.description.layout {
                 Layout::Authors => {
-                    files::write_mask(&folder.join("mask").join(format!("{view}.png")), &drawn)?;
-                    files::write_inverse_depth(&depth.join(format!("{view}.png")), &drawn)?;
+                    files::write_mask(&at("mask"), &drawn)?;
+                    files::write_inverse_depth(&at("depth"), &drawn)?;
                     files::write_camera(&folder.join("parm"), view, camera)
                 }
-                Layout::Exact => files::write_depth(&depth.join(format!("{view}.npz")), &drawn),
+                Layout::Exact => files::write_depth(&at("depth"), &drawn),
             }
         })?;
         if self.description.layout == Layout::Exact {

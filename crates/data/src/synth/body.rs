@@ -244,27 +244,6 @@ const HEM_REACH: f32 = 0.04;
 const THICKEST: f32 = 0.08;
 
 impl Body {
-    /// The part whose chart is laid over a place on the surface of part `nearest`: hips that fill a skirt show the skirt's
-    /// cloth, and thighs that lie higher than the top's hem show the trunk's.
-    fn laid_over(&self, p: Vec3, nearest: usize) -> usize {
-        let kind = self.parts[nearest].kind;
-        if !matches!(kind, Kind::Trunk | Kind::Leg) {
-            return nearest;
-        }
-        // The outer one is the last.
-        let hangs = |part: &Part| part.drape.is_some_and(|drape| p.y > drape.bottom && p.y < drape.top);
-        if let Some(row) = self.parts.iter().rposition(hangs) {
-            return row;
-        }
-        let trunk = &self.parts[0];
-        let is_high = |hem: f32| trunk.chart(p).1 > hem - HEM_REACH;
-        if kind == Kind::Leg && trunk.layers.first().is_some_and(|top| is_high(top.from)) {
-            0
-        } else {
-            nearest
-        }
-    }
-
     /// Signed distance and the part that is nearest. Where all of the body is further than `enough`, any number between
     /// `enough` and the distance.
     pub fn distance(&self, p: Vec3, enough: f32) -> (f32, usize) {
@@ -300,9 +279,22 @@ impl Body {
         (union, nearest.1)
     }
 
-    /// The part whose chart is laid over a place on the surface.
+    /// The part whose chart is laid over a place on the surface: mostly the nearest, but hips that fill a skirt show the
+    /// skirt's cloth, and thighs that lie higher than the top's hem show the trunk's.
     pub fn owner(&self, p: Vec3, cell: f32) -> usize {
-        self.laid_over(p, self.distance(p, 4.0 * cell).1)
+        let nearest = self.distance(p, 4.0 * cell).1;
+        let kind = self.parts[nearest].kind;
+        if !matches!(kind, Kind::Trunk | Kind::Leg) {
+            return nearest;
+        }
+        // The outer one is the last.
+        let hangs = |part: &Part| part.drape.is_some_and(|drape| p.y > drape.bottom && p.y < drape.top);
+        if let Some(row) = self.parts.iter().rposition(hangs) {
+            return row;
+        }
+        let trunk = &self.parts[0];
+        let is_high = |top: &Layer| trunk.chart(p).1 > top.from - HEM_REACH;
+        if kind == Kind::Leg && trunk.layers.first().is_some_and(is_high) { 0 } else { nearest }
     }
 
     /// Distance to what hands must not sink into: trunk, legs and what hangs over them.

@@ -17,7 +17,7 @@ const COLUMNS: u32 = 9;
 /// Colour of the background.
 const BACKGROUND: [u8; 3] = [235; 3];
 
-/// Writes the sheet of the first of these subjects.
+/// Writes the sheet of the first of these subjects, of which there is one at least.
 pub fn write(path: &Path, folder: &Folder, subjects: &[(Split, &str)]) -> Result<(), Failure> {
     let views = folder.description().views;
     let mut pictures = Vec::new();
@@ -27,7 +27,7 @@ pub fn write(path: &Path, folder: &Folder, subjects: &[(Split, &str)]) -> Result
             pictures.push(shrink(&color, &mask));
         }
     }
-    write_png(path, &sheet(&pictures, COLUMNS.min(pictures.len().max(1) as u32)))
+    write_png(path, &sheet(&pictures, COLUMNS.min(pictures.len() as u32)))
 }
 
 /// On the background, smaller, without the margin around.
