@@ -4,11 +4,12 @@ use std::path::Path;
 
 use burn::tensor::{Device, Tensor, TensorData};
 use snapsnap_net::config::{Config, Downsample, NetworkConfig, Upsample};
-use snapsnap_net::network::{PointMap, PointPredictor, Rope, View, activate};
+use snapsnap_net::network::{PointMap, PointPredictor, View, activate};
 use snapsnap_net::regressor::{RECEPTIVE_RADIUS, Statistics};
-use snapsnap_net::resample::{bilinear, shrink};
+use snapsnap_net::resample::shrink;
 use snapsnap_net::weights::{WeightFile, init};
 use snapsnap_net::{Photograph, Reconstruction, Reconstructor, Window};
+use snapsnap_ops::{Rope, bilinear};
 use snapsnap_tests::{device, relative_error, values};
 
 fn config(overrides: &[&str]) -> Config {

@@ -5,7 +5,7 @@ use std::io;
 use std::path::Path;
 use std::process::ExitCode;
 
-use snapsnap_data::DataError;
+use snapsnap_mesh::FileError;
 use snapsnap_net::config::ConfigError;
 use snapsnap_net::weights::WeightsError;
 use snapsnap_splat::SplatError;
@@ -51,7 +51,7 @@ macro_rules! input_error {
     };
 }
 
-input_error!(DataError, ConfigError, WeightsError);
+input_error!(FileError, ConfigError, WeightsError);
 
 impl From<SplatError> for Failure {
     fn from(e: SplatError) -> Self {

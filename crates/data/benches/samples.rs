@@ -10,7 +10,7 @@ use peak_alloc::PeakAlloc;
 use snapsnap_data::dataset::{Folder, Layout, Split};
 use snapsnap_data::prepare::DataConfig;
 use snapsnap_data::sample::{Augment, Loader, SampleConfig, Stage1, Stage1Batcher, Stage2, Stage2Batcher};
-use snapsnap_data::synth;
+use snapsnap_people::synth;
 
 #[global_allocator]
 static ALLOCATOR: PeakAlloc = PeakAlloc;

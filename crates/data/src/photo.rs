@@ -7,9 +7,9 @@ use std::path::Path;
 
 use image::{DynamicImage, GrayImage, RgbImage};
 
-use crate::DataError;
-use crate::picture::decode;
 use crate::resize::{Filter, resize};
+use snapsnap_mesh::FileError;
+use snapsnap_mesh::picture::decode;
 
 /// Photographs below this side are refused: nothing of a person is left.
 const MIN_SIDE: u32 = 64;
@@ -55,16 +55,16 @@ pub struct Canvas {
 /// or, without one, by the picture's alpha channel.
 ///
 /// # Errors
-/// [`DataError`]: unreadable files, a mask of another size, an empty mask, no mask at all, a picture below 64 pixels
+/// [`FileError`]: unreadable files, a mask of another size, an empty mask, no mask at all, a picture below 64 pixels
 /// or of a single colour, or, with [`Placement::AsIs`], of another size than the canvas.
 pub fn load(
     path: &Path,
     mask: Option<&Path>,
     side: usize,
     placement: Placement,
-) -> Result<Canvas, DataError> {
+) -> Result<Canvas, FileError> {
     let picture = decode(path)?;
-    let refuse = |message: String| DataError::Unsuitable { path: path.to_owned(), message };
+    let refuse = |message: String| FileError::Unsuitable { path: path.to_owned(), message };
     let (width, height) = (picture.width(), picture.height());
     if placement == Placement::AsIs {
         if (width as usize, height as usize) != (side, side) {
@@ -85,7 +85,7 @@ pub fn load(
                     mask.height(),
                     path.display()
                 );
-                return Err(DataError::Unsuitable { path: mask_path.to_owned(), message });
+                return Err(FileError::Unsuitable { path: mask_path.to_owned(), message });
             }
             (mask, mask_path)
         }
@@ -96,7 +96,7 @@ pub fn load(
         let least =
             if matches!(placement, Placement::Demo { .. }) { "255, as `mode.compat` asks" } else { "128" };
         let message = format!("the mask is empty: no pixel of the person reaches {least}");
-        DataError::Unsuitable { path: mask_path.to_owned(), message }
+        FileError::Unsuitable { path: mask_path.to_owned(), message }
     };
     // The demo takes whatever the mask touches; a lossy mask touches much that is not the person.
     let least = if matches!(placement, Placement::Demo { .. }) { 1 } else { u8::MAX.div_ceil(2) };

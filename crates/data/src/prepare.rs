@@ -2,17 +2,16 @@
 
 use std::str::FromStr;
 
-use glam::DVec3;
-use rand::Rng;
 use serde::{Deserialize, Serialize};
 use snapsnap_splat::{Camera, Orbit};
 
-use crate::DataError;
+use crate::JitterConfig;
 use crate::dataset::{Description, Drawn, Folder, Layout, MAX_RESOLUTION, MAX_VIEWS, Made, Split};
-use crate::mesh::Mesh;
-use crate::random::stream;
 use crate::sample::SampleConfig;
-use crate::view::{Lights, Renderer, ViewOptions};
+use snapsnap_mesh::FileError;
+use snapsnap_mesh::mesh::Mesh;
+use snapsnap_mesh::view::{Lights, Renderer, ViewOptions};
+use snapsnap_people::random::stream;
 
 /// How subjects become views, and views samples: `configs/data/*.toml`.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -42,79 +41,10 @@ pub struct ViewsConfig {
     pub layout: Layout,
 }
 
-/// How cameras stray, evenly within ± each value: all views of a subject together (`rig`), and each by itself (`view`).
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct JitterConfig {
-    /// All views of a subject together.
-    pub rig: Jitter,
-    /// Each view by itself.
-    pub view: Jitter,
-}
-
-/// Ranges, each ±.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Jitter {
-    /// Around the subject, degrees.
-    pub yaw: f64,
-    /// Up and down, degrees.
-    pub pitch: f64,
-    /// Around the optical axis, degrees.
-    pub roll: f64,
-    /// Metres.
-    pub distance: f64,
-    /// Share of the focal length.
-    pub focal: f64,
-    /// Of the point looked at, metres per axis.
-    pub look_at: f64,
-}
-
 impl Default for ViewsConfig {
     /// The published cameras in our exact layout.
     fn default() -> Self {
         Self { count: 24, resolution: 1024, high_resolution: false, samples: 3, layout: Layout::Exact }
-    }
-}
-
-impl Jitter {
-    fn problem(&self) -> Option<(&'static str, String)> {
-        let Self { yaw, pitch, roll, distance, focal, look_at } = *self;
-        let limits = [
-            ("yaw", yaw, 180.0),
-            ("pitch", pitch, 80.0),
-            ("roll", roll, 180.0),
-            // Beyond these the camera would stand in the subject, or see nothing of it.
-            ("distance", distance, 0.7),
-            ("focal", focal, 0.5),
-            ("look_at", look_at, 0.5),
-        ];
-        let (key, value, limit) =
-            limits.into_iter().find(|(_, value, limit)| !(0.0..=*limit).contains(value))?;
-        Some((key, format!("is {value}, must be 0 to {limit}")))
-    }
-
-    /// How far both can stray together.
-    fn plus(&self, other: &Self) -> Self {
-        Self {
-            yaw: 0.0,
-            pitch: self.pitch + other.pitch,
-            roll: 0.0,
-            distance: self.distance + other.distance,
-            focal: self.focal + other.focal,
-            look_at: self.look_at + other.look_at,
-        }
-    }
-
-    fn apply(&self, orbit: &mut Orbit, random: &mut impl Rng) {
-        // Drawn even where the range is 0, so that one range does not change what another draws.
-        let mut stray = |range: f64| range * random.random_range(-1.0..1.0);
-        orbit.yaw_degrees += stray(self.yaw);
-        orbit.pitch_degrees += stray(self.pitch);
-        orbit.roll_degrees += stray(self.roll);
-        orbit.radius += stray(self.distance);
-        orbit.focal *= 1.0 + stray(self.focal);
-        orbit.centre += DVec3::new(stray(self.look_at), stray(self.look_at), stray(self.look_at));
     }
 }
 
@@ -132,12 +62,7 @@ impl DataConfig {
         if !(1..=6).contains(&samples) {
             return Some(("views.samples".into(), format!("is {samples}, must be 1 to 6")));
         }
-        let JitterConfig { rig, view } = &self.jitter;
-        let sections =
-            [("jitter.rig", rig), ("jitter.view", view), ("jitter.rig + jitter.view", &rig.plus(view))];
-        let jitter = sections.into_iter().find_map(|(section, jitter)| {
-            jitter.problem().map(|(key, message)| (format!("{section}.{key}"), message))
-        });
+        let jitter = self.jitter.problem().map(|(key, message)| (format!("jitter.{key}"), message));
         jitter.or_else(|| self.samples.problem().map(|(key, message)| (format!("samples.{key}"), message)))
     }
 
@@ -182,7 +107,7 @@ impl DataConfig {
     /// sets, which decides what is random about its cameras.
     ///
     /// # Errors
-    /// [`DataError`] for a mesh that cannot be drawn or that a camera does not see, and for files that cannot be written.
+    /// [`FileError`] for a mesh that cannot be drawn or that a camera does not see, and for files that cannot be written.
     pub fn add(
         &self,
         folder: &Folder,
@@ -191,8 +116,8 @@ impl DataConfig {
         mesh: &Mesh,
         yaw_degrees: f64,
         name: &str,
-    ) -> Result<Made, DataError> {
-        let renderer = Renderer::new(mesh).map_err(|e| DataError::unsuitable(folder.root(), e))?;
+    ) -> Result<Made, FileError> {
+        let renderer = Renderer::new(mesh).map_err(|e| FileError::unsuitable(folder.root(), e))?;
         let options = ViewOptions { samples: self.views.samples, lights: Lights::default() };
         let cameras = self.cameras(yaw_degrees, name);
         folder.write_subject(split, subject, &cameras, |camera| renderer.draw(camera, &options))
@@ -234,6 +159,7 @@ impl FromStr for Shard {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Jitter;
 
     #[test]
     fn without_jitter_the_cameras_are_the_published_ones() {

@@ -9,8 +9,8 @@ use rand::Rng;
 use serde::{Deserialize, Serialize};
 
 use crate::dataset::Split;
-use crate::mesh::{Mesh, MeshError};
-use crate::{DataError, import};
+use snapsnap_mesh::mesh::{Mesh, MeshError};
+use snapsnap_mesh::{FileError, import};
 
 /// Height of a normalised subject in metres (SNAPSNAP §5.4). Real stature is lost on purpose: two photographs do not show it.
 pub const HEIGHT: f32 = 1.8;
@@ -117,8 +117,8 @@ const MAX_DEPTH: usize = 4;
 /// number, or else as its folder and its file; numbers get four digits, as the authors' loader wants them.
 ///
 /// # Errors
-/// [`DataError`] if `root` cannot be read, holds no scan, or two scans would be the same subject.
-pub fn find(root: &Path) -> Result<Vec<Source>, DataError> {
+/// [`FileError`] if `root` cannot be read, holds no scan, or two scans would be the same subject.
+pub fn find(root: &Path) -> Result<Vec<Source>, FileError> {
     let mut paths = Vec::new();
     if root.is_file() {
         paths.push(root.to_owned());
@@ -127,7 +127,7 @@ pub fn find(root: &Path) -> Result<Vec<Source>, DataError> {
     }
     if paths.is_empty() {
         let message = format!("holds no scan: no file .{}", import::EXTENSIONS.join(", ."));
-        return Err(DataError::unsuitable(root, message));
+        return Err(FileError::unsuitable(root, message));
     }
     let stem = |path: &Path| path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     let mut sources: Vec<Source> = Vec::new();
@@ -139,7 +139,7 @@ pub fn find(root: &Path) -> Result<Vec<Source>, DataError> {
             name.parse::<u32>().map_or_else(|_| subject_name(&name), |number| format!("{number:04}"));
         if let Some(other) = sources.iter().find(|other| other.subject == subject) {
             let message = format!("and {} would both be subject {subject}", other.path.display());
-            return Err(DataError::unsuitable(path, message));
+            return Err(FileError::unsuitable(path, message));
         }
         sources.push(Source { subject, path: path.clone() });
     }
@@ -157,14 +157,14 @@ fn search(
     depth: usize,
     visited: &mut HashSet<PathBuf>,
     found: &mut Vec<PathBuf>,
-) -> Result<(), DataError> {
+) -> Result<(), FileError> {
     // Links may lead round in circles.
     if !visited.insert(folder.canonicalize().unwrap_or_else(|_| folder.to_owned())) {
         return Ok(());
     }
     let mut entries = Vec::new();
-    for entry in fs::read_dir(folder).map_err(DataError::read(folder))? {
-        entries.push(entry.map_err(DataError::read(folder))?.path());
+    for entry in fs::read_dir(folder).map_err(FileError::read(folder))? {
+        entries.push(entry.map_err(FileError::read(folder))?.path());
     }
     entries.sort_unstable();
     let is_scan = |path: &Path| {
@@ -359,5 +359,25 @@ mod tests {
         }
         assert!((1.75..1.76).contains(&lowest) && (1.84..1.85).contains(&highest), "{lowest} {highest}");
         assert!(furthest > 0.09);
+    }
+
+    /// Wherever the file of a person is cut, but for its very end, that is noticed.
+    #[test]
+    fn a_scan_that_is_cut_short_is_refused() {
+        let folder = tempfile::tempdir().expect("temporary folder");
+        let whole = folder.path().join("whole.obj");
+        snapsnap_mesh::export::write_obj(crate::testing::person(), &whole).expect("writes");
+        let bytes = fs::read(&whole).expect("reads");
+        let path = folder.path().join("cut.obj");
+        for percent in [1, 20, 40, 50, 60, 70, 80, 90, 95] {
+            // At the end of a line: nothing else tells that more should come.
+            let end = bytes.len() * percent / 100;
+            let end = bytes[..end].iter().rposition(|b| *b == b'\n').map_or(0, |at| at + 1);
+            fs::write(&path, &bytes[..end]).expect("writes");
+            let refused = import::read(&path).map(|_| ()).expect_err("cut").to_string();
+            let expected = ["there is no triangle", "the file seems to be cut short"];
+            assert!(expected.iter().any(|words| refused.contains(words)), "{percent} %: {refused}");
+        }
+        assert!(import::read(&whole).is_ok());
     }
 }

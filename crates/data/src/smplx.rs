@@ -10,7 +10,7 @@ use std::rc::Rc;
 
 use serde_json::Value as Json;
 
-use crate::DataError;
+use snapsnap_mesh::FileError;
 
 /// Largest file that is read; parameters take a few kilobytes.
 const MAX_BYTES: u64 = 16 << 20;
@@ -25,21 +25,21 @@ const ORIENTATION: &str = "global_orient";
 /// for a pure rotation around y as the authors do (SNAPSNAP §5.3).
 ///
 /// # Errors
-/// [`DataError`] for files that are no such parameters.
-pub fn yaw_degrees(path: &Path) -> Result<f64, DataError> {
-    if fs::metadata(path).map_err(DataError::read(path))?.len() > MAX_BYTES {
-        return Err(DataError::unsuitable(path, "is far too long for SMPL-X parameters"));
+/// [`FileError`] for files that are no such parameters.
+pub fn yaw_degrees(path: &Path) -> Result<f64, FileError> {
+    if fs::metadata(path).map_err(FileError::read(path))?.len() > MAX_BYTES {
+        return Err(FileError::unsuitable(path, "is far too long for SMPL-X parameters"));
     }
-    let bytes = fs::read(path).map_err(DataError::read(path))?;
+    let bytes = fs::read(path).map_err(FileError::read(path))?;
     let is_json = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("json"));
     let orientation = if is_json { from_json(&bytes) } else { from_pickle(&bytes) };
     let orientation = orientation
-        .map_err(|e| DataError::unsuitable(path, format!("is no file of SMPL-X parameters: {e}")))?;
+        .map_err(|e| FileError::unsuitable(path, format!("is no file of SMPL-X parameters: {e}")))?;
     match orientation[..] {
         [x, y, z] if [x, y, z].iter().all(|v| v.is_finite()) => Ok(y.to_degrees()),
         _ => {
             let message = format!("`{ORIENTATION}` is {orientation:?}, expected three numbers");
-            Err(DataError::unsuitable(path, message))
+            Err(FileError::unsuitable(path, message))
         }
     }
 }

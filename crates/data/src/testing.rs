@@ -6,10 +6,10 @@ use glam::Vec3;
 use tempfile::TempDir;
 
 use crate::dataset::{Folder, Layout, Split};
-use crate::mesh::{Face, Material, Mesh};
 use crate::prepare::DataConfig;
 use crate::scan::{Collection, normalise};
-use crate::synth;
+use snapsnap_mesh::mesh::{Face, Material, Mesh};
+use snapsnap_people::synth;
 
 /// One synthetic person, standing where the cameras look.
 pub fn person() -> &'static Mesh {

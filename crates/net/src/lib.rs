@@ -1,7 +1,6 @@
 //! The networks of snapsnap: two photographs → point maps → Gaussians, and the files their weights come from.
 
 pub mod config;
-mod cpu;
 mod crop;
 pub mod network;
 mod reconstruct;

@@ -4,8 +4,7 @@ use glam::{DVec2, DVec3};
 use image::GrayImage;
 use snapsnap_splat::{Camera, RigidTransform};
 
-use super::StoredView;
-use crate::sample::unproject;
+use super::stored::{StoredView, unproject};
 
 /// Side of an outline in cells, at most: what is compared is coarser than the pictures.
 const CELLS: u32 = 256;

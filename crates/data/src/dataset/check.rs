@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use super::agree::{LEAST_SIDE, Seen, disagreements};
 use super::write::UNFINISHED;
 use super::{Description, Folder, Layout, Split, split_alpha};
-use crate::DataError;
+use snapsnap_mesh::FileError;
 
 /// Share of the person that may have no depth: scans have gaps that are narrower than a pixel.
 const HOLES: f64 = 0.01;
@@ -28,8 +28,8 @@ pub struct Checked {
 /// Reads everything in a data set; `progress` is told how many of how many subjects are done.
 ///
 /// # Errors
-/// [`DataError`] if `root` is no data set at all; every other fault is a line of the result.
-pub fn check(root: &Path, mut progress: impl FnMut(usize, usize)) -> Result<Checked, DataError> {
+/// [`FileError`] if `root` is no data set at all; every other fault is a line of the result.
+pub fn check(root: &Path, mut progress: impl FnMut(usize, usize)) -> Result<Checked, FileError> {
     let folder = Folder::open(root)?;
     let mut checked = Checked::default();
     let mut all: Vec<(Option<Split>, String)> = Vec::new();
@@ -106,7 +106,7 @@ fn unexpected(folder: &Folder, split: Option<Split>, subject: &str) -> Vec<Strin
 /// What is wrong with one view, each of its files apart; and what it sees, if all of them can be read.
 fn faults(folder: &Folder, split: Option<Split>, subject: &str, view: usize) -> (Vec<String>, Option<Seen>) {
     let mut problems = Vec::new();
-    let mut keep = |e: DataError| problems.push(e.to_string());
+    let mut keep = |e: FileError| problems.push(e.to_string());
     let Description { layout, high_resolution, .. } = *folder.description();
     if high_resolution {
         folder.file(split, subject, view, true).map_err(&mut keep).ok();

@@ -7,9 +7,9 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use crate::DataError;
-use crate::error::open;
-use crate::prepare::JitterConfig;
+use crate::JitterConfig;
+use snapsnap_mesh::FileError;
+use snapsnap_mesh::open;
 
 /// Name of the file that describes a folder.
 pub const DESCRIPTION: &str = "dataset.toml";
@@ -110,15 +110,15 @@ impl Description {
 }
 
 /// Reads a description.
-pub fn read(path: &Path) -> Result<Description, DataError> {
-    if open(path)?.metadata().map_err(DataError::read(path))?.len() > MAX_DESCRIPTION {
-        return Err(DataError::unsuitable(path, "is far too long for a description"));
+pub fn read(path: &Path) -> Result<Description, FileError> {
+    if open(path)?.metadata().map_err(FileError::read(path))?.len() > MAX_DESCRIPTION {
+        return Err(FileError::unsuitable(path, "is far too long for a description"));
     }
-    let text = fs::read_to_string(path).map_err(DataError::read(path))?;
+    let text = fs::read_to_string(path).map_err(FileError::read(path))?;
     let description: Description =
-        toml::from_str(&text).map_err(|e| DataError::unsuitable(path, e.to_string().trim_end()))?;
+        toml::from_str(&text).map_err(|e| FileError::unsuitable(path, e.to_string().trim_end()))?;
     match description.problem() {
-        Some(problem) => Err(DataError::unsuitable(path, problem)),
+        Some(problem) => Err(FileError::unsuitable(path, problem)),
         None => Ok(description),
     }
 }

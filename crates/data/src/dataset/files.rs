@@ -14,10 +14,10 @@ use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipArchive, ZipWriter};
 
 use super::MAX_RESOLUTION;
-use crate::DataError;
-use crate::error::open;
-use crate::picture::decode;
-use crate::view::View;
+use snapsnap_mesh::FileError;
+use snapsnap_mesh::open;
+use snapsnap_mesh::picture::decode;
+use snapsnap_mesh::view::View;
 
 /// Stored depths of the authors' layout are ⌊2¹⁵/z⌋ (SNAPSNAP §5.2).
 const INVERSE_DEPTH_UNIT: f64 = 32_768.0;
@@ -30,9 +30,9 @@ const DEPTH: &str = "depth";
 /// Largest `.npy` that is read: a depth map of the largest view.
 const MAX_NPY: u64 = MAX_RESOLUTION as u64 * MAX_RESOLUTION as u64 * 4 + 4096;
 
-fn write(path: &Path, bytes: &[u8]) -> Result<(), DataError> {
+fn write(path: &Path, bytes: &[u8]) -> Result<(), FileError> {
     // Inside a subject's temporary folder: what is half-written is never seen.
-    std::fs::write(path, bytes).map_err(DataError::write(path))
+    std::fs::write(path, bytes).map_err(FileError::write(path))
 }
 
 fn write_png(
@@ -40,11 +40,11 @@ fn write_png(
     bytes: &[u8],
     side: (usize, usize),
     kind: ExtendedColorType,
-) -> Result<(), DataError> {
+) -> Result<(), FileError> {
     let mut out = Vec::new();
     PngEncoder::new_with_quality(&mut out, CompressionType::Fast, FilterType::Adaptive)
         .write_image(bytes, side.0 as u32, side.1 as u32, kind)
-        .map_err(|source| DataError::Decode { path: path.to_owned(), source })?;
+        .map_err(|source| FileError::Decode { path: path.to_owned(), source })?;
     write(path, &out)
 }
 
@@ -59,7 +59,7 @@ fn straight(view: &View, pixel: usize) -> [u8; 3] {
 }
 
 /// Straight colours and coverage.
-pub fn write_rgba(path: &Path, view: &View) -> Result<(), DataError> {
+pub fn write_rgba(path: &Path, view: &View) -> Result<(), FileError> {
     let bytes: Vec<u8> = (0..view.alpha.len())
         .flat_map(|pixel| {
             let [r, g, b] = straight(view, pixel);
@@ -70,7 +70,7 @@ pub fn write_rgba(path: &Path, view: &View) -> Result<(), DataError> {
 }
 
 /// Straight colours where the pixel's sample sees something, black elsewhere.
-pub fn write_jpeg(path: &Path, view: &View) -> Result<(), DataError> {
+pub fn write_jpeg(path: &Path, view: &View) -> Result<(), FileError> {
     let picture = RgbImage::from_fn(view.width as u32, view.height as u32, |x, y| {
         let pixel = y as usize * view.width + x as usize;
         image::Rgb(if view.depth[pixel] > 0.0 { straight(view, pixel) } else { [0; 3] })
@@ -78,18 +78,18 @@ pub fn write_jpeg(path: &Path, view: &View) -> Result<(), DataError> {
     let mut out = Vec::new();
     JpegEncoder::new_with_quality(&mut out, JPEG_QUALITY)
         .encode_image(&picture)
-        .map_err(|source| DataError::Decode { path: path.to_owned(), source })?;
+        .map_err(|source| FileError::Decode { path: path.to_owned(), source })?;
     write(path, &out)
 }
 
 /// White in three channels where the pixel's sample sees something.
-pub fn write_mask(path: &Path, view: &View) -> Result<(), DataError> {
+pub fn write_mask(path: &Path, view: &View) -> Result<(), FileError> {
     let bytes: Vec<u8> = view.depth.iter().flat_map(|z| [if *z > 0.0 { 255 } else { 0 }; 3]).collect();
     write_png(path, &bytes, (view.width, view.height), ExtendedColorType::Rgb8)
 }
 
 /// ⌊2¹⁵/z⌋ in 16 bits, 0 for the background.
-pub fn write_inverse_depth(path: &Path, view: &View) -> Result<(), DataError> {
+pub fn write_inverse_depth(path: &Path, view: &View) -> Result<(), FileError> {
     // What is nearer than `NEAREST` saturates; data sets refuse it.
     let stored = |z: f32| if z > 0.0 { (INVERSE_DEPTH_UNIT / f64::from(z)).floor() as u16 } else { 0 };
     let bytes: Vec<u8> = view.depth.iter().flat_map(|z| stored(*z).to_ne_bytes()).collect();
@@ -123,11 +123,11 @@ fn holds_its_shape(npy: &[u8]) -> bool {
 type Depth = (Vec<f32>, [u32; 2]);
 
 /// Undoes [`write_inverse_depth`].
-pub fn read_inverse_depth(path: &Path) -> Result<Depth, DataError> {
+pub fn read_inverse_depth(path: &Path) -> Result<Depth, FileError> {
     let picture = decode(path)?;
     if picture.color() != image::ColorType::L16 {
         let message = format!("is {:?}, expected 16-bit grey: inverse depth", picture.color());
-        return Err(DataError::unsuitable(path, message));
+        return Err(FileError::unsuitable(path, message));
     }
     let stored: ImageBuffer<Luma<u16>, Vec<u16>> = picture.into_luma16();
     let shape = [stored.height(), stored.width()];
@@ -136,10 +136,10 @@ pub fn read_inverse_depth(path: &Path) -> Result<Depth, DataError> {
 }
 
 /// f32 metres, compressed without loss; NumPy's `load` reads it.
-pub fn write_depth(path: &Path, view: &View) -> Result<(), DataError> {
+pub fn write_depth(path: &Path, view: &View) -> Result<(), FileError> {
     let array = ArrayView2::from_shape((view.height, view.width), &view.depth).expect("one depth per pixel");
     let mut npy = Vec::new();
-    array.write_npy(&mut npy).map_err(|e| DataError::unsuitable(path, e))?;
+    array.write_npy(&mut npy).map_err(|e| FileError::unsuitable(path, e))?;
     let mut archive = ZipWriter::new(Cursor::new(Vec::new()));
     let options = SimpleFileOptions::default()
         .compression_method(CompressionMethod::Deflated)
@@ -147,12 +147,12 @@ pub fn write_depth(path: &Path, view: &View) -> Result<(), DataError> {
     let packed = archive.start_file(format!("{DEPTH}.npy"), options).map_err(|e| e.to_string());
     let packed = packed.and_then(|()| archive.write_all(&npy).map_err(|e| e.to_string()));
     let packed = packed.and_then(|()| archive.finish().map_err(|e| e.to_string()));
-    write(path, packed.map_err(|e| DataError::unsuitable(path, e))?.get_ref())
+    write(path, packed.map_err(|e| FileError::unsuitable(path, e))?.get_ref())
 }
 
 /// Undoes [`write_depth`].
-pub fn read_depth(path: &Path) -> Result<Depth, DataError> {
-    let wrong = |e: &dyn std::fmt::Display| DataError::unsuitable(path, format!("is no depth map: {e}"));
+pub fn read_depth(path: &Path) -> Result<Depth, FileError> {
+    let wrong = |e: &dyn std::fmt::Display| FileError::unsuitable(path, format!("is no depth map: {e}"));
     let mut archive = ZipArchive::new(BufReader::new(open(path)?)).map_err(|e| wrong(&e))?;
     let entry = archive.by_name(&format!("{DEPTH}.npy")).map_err(|e| wrong(&e))?;
     let mut npy = Vec::new();
@@ -168,7 +168,7 @@ pub fn read_depth(path: &Path) -> Result<Depth, DataError> {
 }
 
 /// Intrinsic 3×3 and extrinsic 3×4 matrix (world → camera), as stored.
-pub fn write_camera(folder: &Path, view: usize, camera: &Camera) -> Result<(), DataError> {
+pub fn write_camera(folder: &Path, view: usize, camera: &Camera) -> Result<(), FileError> {
     let Camera { focal: f, principal_point: c, world_to_camera, .. } = *camera;
     let intrinsic = [[f.x, 0.0, c.x], [0.0, f.y, c.y], [0.0, 0.0, 1.0]];
     let RigidTransform { rotation, translation } = world_to_camera;
@@ -179,7 +179,7 @@ pub fn write_camera(folder: &Path, view: usize, camera: &Camera) -> Result<(), D
     let save = |name: &str, matrix: Array2<f64>| {
         let path = folder.join(format!("{view}_{name}.npy"));
         let mut bytes = Vec::new();
-        matrix.write_npy(&mut bytes).map_err(|e| DataError::unsuitable(&path, e))?;
+        matrix.write_npy(&mut bytes).map_err(|e| FileError::unsuitable(&path, e))?;
         write(&path, &bytes)
     };
     save("intrinsic", ndarray::arr2(&intrinsic))?;
@@ -187,24 +187,24 @@ pub fn write_camera(folder: &Path, view: usize, camera: &Camera) -> Result<(), D
 }
 
 /// Undoes [`write_camera`]; the authors' tools store some matrices in f32.
-pub fn read_camera(folder: &Path, view: usize, side: u32) -> Result<Camera, DataError> {
+pub fn read_camera(folder: &Path, view: usize, side: u32) -> Result<Camera, FileError> {
     let load = |name: &str, shape: (usize, usize)| {
         let path = folder.join(format!("{view}_{name}.npy"));
         let mut bytes = Vec::new();
-        open(&path)?.take(4096).read_to_end(&mut bytes).map_err(DataError::read(&path))?;
+        open(&path)?.take(4096).read_to_end(&mut bytes).map_err(FileError::read(&path))?;
         if !holds_its_shape(&bytes) {
-            return Err(DataError::unsuitable(&path, "is no matrix: its header promises more than it holds"));
+            return Err(FileError::unsuitable(&path, "is no matrix: its header promises more than it holds"));
         }
         let matrix = Array2::<f64>::read_npy(bytes.as_slice())
             .or_else(|e| Array2::<f32>::read_npy(bytes.as_slice()).map(|m| m.mapv(f64::from)).map_err(|_| e));
-        let matrix = matrix.map_err(|e| DataError::unsuitable(&path, format!("is no matrix: {e}")))?;
+        let matrix = matrix.map_err(|e| FileError::unsuitable(&path, format!("is no matrix: {e}")))?;
         if matrix.dim() != shape {
             let (rows, columns) = matrix.dim();
             let message = format!("is {rows}×{columns}, expected {}×{}", shape.0, shape.1);
-            return Err(DataError::unsuitable(&path, message));
+            return Err(FileError::unsuitable(&path, message));
         }
         if let Some(value) = matrix.iter().find(|v| !v.is_finite()) {
-            return Err(DataError::unsuitable(&path, format!("holds {value}")));
+            return Err(FileError::unsuitable(&path, format!("holds {value}")));
         }
         Ok(matrix)
     };

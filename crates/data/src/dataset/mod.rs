@@ -18,6 +18,7 @@ mod agree;
 mod check;
 mod description;
 mod files;
+mod stored;
 #[cfg(test)]
 mod tests;
 mod write;
@@ -30,25 +31,13 @@ use glam::DVec2;
 use image::{DynamicImage, GrayImage, RgbImage};
 use snapsnap_splat::{Camera, cameras, file};
 
-use crate::DataError;
-use crate::error::open;
 pub use check::{Checked, check};
 use description::DESCRIPTION;
 pub use description::{Description, Drawn, Layout, MAX_RESOLUTION, MAX_VIEWS, Split};
+use snapsnap_mesh::FileError;
+use snapsnap_mesh::open;
+pub use stored::{StoredView, unproject};
 pub use write::Made;
-
-/// One stored view.
-#[derive(Debug, Clone)]
-pub struct StoredView {
-    /// `[H,W]` colours; meaningless where the mask is 0.
-    pub color: RgbImage,
-    /// `[H,W]` coverage.
-    pub mask: GrayImage,
-    /// `[H,W]` metres along the optical axis; 0 where nothing was seen.
-    pub depth: Vec<f32>,
-    /// As stored: pixel coordinates follow [`Description::pixel_centre`].
-    pub camera: Camera,
-}
 
 /// A data-set folder.
 #[derive(Debug, Clone)]
@@ -61,17 +50,17 @@ impl Folder {
     /// Opens a data set. Without a `dataset.toml` it is taken for one that the authors' tools wrote.
     ///
     /// # Errors
-    /// [`DataError`]: no folder, a `dataset.toml` that is wrong, or neither one nor the authors' layout.
-    pub fn open(root: &Path) -> Result<Self, DataError> {
+    /// [`FileError`]: no folder, a `dataset.toml` that is wrong, or neither one nor the authors' layout.
+    pub fn open(root: &Path) -> Result<Self, FileError> {
         let path = root.join(DESCRIPTION);
         if path.is_file() {
             let description = description::read(&path)?;
             return Ok(Self { root: root.to_owned(), description });
         }
-        let entries = fs::read_dir(root).map_err(DataError::read(root))?;
+        let entries = fs::read_dir(root).map_err(FileError::read(root))?;
         drop(entries);
         let foreign = |message: &str| {
-            DataError::unsuitable(root, format!("is no data set: it has no {DESCRIPTION}, and {message}"))
+            FileError::unsuitable(root, format!("is no data set: it has no {DESCRIPTION}, and {message}"))
         };
         let views = views_in_name(root)
             .ok_or_else(|| foreign("its name does not end in the number of views, as `_1024_24`"))?;
@@ -94,11 +83,11 @@ impl Folder {
             .ok_or_else(|| foreign("no subject lies in img, train/img, val/img or test/img"))?;
         let first = folder.path(split, "img", &subject).join("0.jpg");
         let size = image::image_dimensions(&first)
-            .map_err(|source| DataError::Decode { path: first.clone(), source })?;
+            .map_err(|source| FileError::Decode { path: first.clone(), source })?;
         folder.description.resolution = size.0;
         folder.description.high_resolution = first.with_file_name("0_hr.jpg").is_file();
         if let Some(problem) = folder.description.problem() {
-            return Err(DataError::unsuitable(&first, problem));
+            return Err(FileError::unsuitable(&first, problem));
         }
         Ok(folder)
     }
@@ -106,20 +95,20 @@ impl Folder {
     /// Opens the folder `root` for writing subjects into it, making it if it is not there.
     ///
     /// # Errors
-    /// [`DataError`] if it cannot be made, holds a data set of another kind, or, in the authors' layout, if its name does
+    /// [`FileError`] if it cannot be made, holds a data set of another kind, or, in the authors' layout, if its name does
     /// not say how many views there are: the authors' loader reads the number there.
-    pub fn create(root: &Path, description: Description) -> Result<Self, DataError> {
+    pub fn create(root: &Path, description: Description) -> Result<Self, FileError> {
         if let Some(problem) = description.problem() {
-            return Err(DataError::unsuitable(root, problem));
+            return Err(FileError::unsuitable(root, problem));
         }
         let Description { layout, views, resolution, .. } = description;
         if layout == Layout::Authors && views_in_name(root) != Some(views) {
             let message = format!(
                 "the authors' loader reads the number of views from the folder's name: it must end in `_{resolution}_{views}`"
             );
-            return Err(DataError::unsuitable(root, message));
+            return Err(FileError::unsuitable(root, message));
         }
-        fs::create_dir_all(root).map_err(DataError::write(root))?;
+        fs::create_dir_all(root).map_err(FileError::write(root))?;
         let path = root.join(DESCRIPTION);
         if path.exists() {
             let there = description::read(&path)?;
@@ -128,13 +117,13 @@ impl Folder {
                     "describes another data set than the one to be written: {}; give another folder",
                     description::differences(&there, &description)
                 );
-                return Err(DataError::unsuitable(&path, message));
+                return Err(FileError::unsuitable(&path, message));
             }
         } else {
             let text = toml::to_string(&description).expect("the description has only TOML types");
             let text = format!("# Written by `snapsnap prepare`.\n{text}");
             file::write_whole(&path, |out| std::io::Write::write_all(out, text.as_bytes()))
-                .map_err(DataError::write(&path))?;
+                .map_err(FileError::write(&path))?;
         }
         Ok(Self { root: root.to_owned(), description })
     }
@@ -158,12 +147,12 @@ impl Folder {
     /// Names of the subjects of a split, in order.
     ///
     /// # Errors
-    /// [`DataError::Read`] if the split is not there.
-    pub fn subjects(&self, split: Option<Split>) -> Result<Vec<String>, DataError> {
+    /// [`FileError::Read`] if the split is not there.
+    pub fn subjects(&self, split: Option<Split>) -> Result<Vec<String>, FileError> {
         let folder = self.split_path(split).join("img");
         let mut subjects = Vec::new();
-        for entry in fs::read_dir(&folder).map_err(DataError::read(&folder))? {
-            let entry = entry.map_err(DataError::read(&folder))?;
+        for entry in fs::read_dir(&folder).map_err(FileError::read(&folder))? {
+            let entry = entry.map_err(FileError::read(&folder))?;
             let name = entry.file_name().to_string_lossy().into_owned();
             if !name.starts_with('.') && entry.path().is_dir() {
                 subjects.push(name);
@@ -176,8 +165,8 @@ impl Folder {
     /// Reads one view.
     ///
     /// # Errors
-    /// [`DataError`] naming the file that is missing, damaged, or of another size than the set's.
-    pub fn view(&self, split: Option<Split>, subject: &str, view: usize) -> Result<StoredView, DataError> {
+    /// [`FileError`] naming the file that is missing, damaged, or of another size than the set's.
+    pub fn view(&self, split: Option<Split>, subject: &str, view: usize) -> Result<StoredView, FileError> {
         let (color, mask) = self.picture(split, subject, view, false)?;
         Ok(StoredView { color, mask, ..self.depth(split, subject, view)? })
     }
@@ -186,13 +175,13 @@ impl Folder {
     ///
     /// # Errors
     /// As [`Self::view`].
-    pub fn depth(&self, split: Option<Split>, subject: &str, view: usize) -> Result<StoredView, DataError> {
+    pub fn depth(&self, split: Option<Split>, subject: &str, view: usize) -> Result<StoredView, FileError> {
         let camera = self.camera(split, subject, view)?;
         let depth = self.depth_map(split, subject, view)?;
         Ok(StoredView { color: RgbImage::default(), mask: GrayImage::default(), depth, camera })
     }
 
-    fn depth_map(&self, split: Option<Split>, subject: &str, view: usize) -> Result<Vec<f32>, DataError> {
+    fn depth_map(&self, split: Option<Split>, subject: &str, view: usize) -> Result<Vec<f32>, FileError> {
         let path = self.path(split, "depth", subject).join(self.file_name("depth", view));
         let read = match self.description.layout {
             Layout::Authors => files::read_inverse_depth,
@@ -201,7 +190,7 @@ impl Folder {
         let (depth, [height, width]) = read(&path)?;
         self.check_size(&path, (width, height), self.description.resolution)?;
         if let Some(z) = depth.iter().find(|z| !z.is_finite() || **z < 0.0) {
-            return Err(DataError::unsuitable(&path, format!("holds a depth of {z}")));
+            return Err(FileError::unsuitable(&path, format!("holds a depth of {z}")));
         }
         Ok(depth)
     }
@@ -216,7 +205,7 @@ impl Folder {
         subject: &str,
         view: usize,
         high_resolution: bool,
-    ) -> Result<(RgbImage, GrayImage), DataError> {
+    ) -> Result<(RgbImage, GrayImage), FileError> {
         let picture = self.file(split, subject, view, high_resolution)?;
         if self.description.layout == Layout::Exact {
             return Ok(split_alpha(picture));
@@ -238,19 +227,19 @@ impl Folder {
         subject: &str,
         view: usize,
         high_resolution: bool,
-    ) -> Result<DynamicImage, DataError> {
+    ) -> Result<DynamicImage, FileError> {
         let (suffix, times) = if high_resolution { ("_hr", 2) } else { ("", 1) };
         let name = self.file_name("img", format_args!("{view}{suffix}"));
         let path = self.path(split, "img", subject).join(name);
-        let picture = crate::picture::decode(&path)?;
+        let picture = snapsnap_mesh::picture::decode(&path)?;
         self.check_size(&path, (picture.width(), picture.height()), times * self.description.resolution)?;
         Ok(picture)
     }
 
     /// The mask file of a view in the authors' layout.
-    fn mask(&self, split: Option<Split>, subject: &str, view: usize) -> Result<GrayImage, DataError> {
+    fn mask(&self, split: Option<Split>, subject: &str, view: usize) -> Result<GrayImage, FileError> {
         let path = self.path(split, "mask", subject).join(self.file_name("mask", view));
-        let mask = crate::picture::decode(&path)?.into_luma8();
+        let mask = snapsnap_mesh::picture::decode(&path)?.into_luma8();
         self.check_size(&path, mask.dimensions(), self.description.resolution)?;
         Ok(mask)
     }
@@ -259,27 +248,27 @@ impl Folder {
     ///
     /// # Errors
     /// As [`Self::view`].
-    pub fn camera(&self, split: Option<Split>, subject: &str, view: usize) -> Result<Camera, DataError> {
+    pub fn camera(&self, split: Option<Split>, subject: &str, view: usize) -> Result<Camera, FileError> {
         let side = self.description.resolution;
         match self.description.layout {
             Layout::Authors => {
                 let folder = self.path(split, "parm", subject);
                 let camera = files::read_camera(&folder, view, side)?;
                 let path = folder.join(format!("{view}_intrinsic.npy"));
-                camera.check().map_err(|problem| DataError::unsuitable(&path, problem))?;
+                camera.check().map_err(|problem| FileError::unsuitable(&path, problem))?;
                 Ok(camera)
             }
             Layout::Exact => {
                 let path = self.split_path(split).join("cameras").join(format!("{subject}.json"));
                 drop(open(&path)?);
-                let cameras = cameras::read(&path).map_err(|e| DataError::splat(&path, e))?;
+                let cameras = cameras::read(&path).map_err(|e| FileError::splat(&path, e))?;
                 let views = self.description.views;
                 if cameras.len() != views {
                     let message = format!("holds {} cameras, the data set has {views} views", cameras.len());
-                    return Err(DataError::unsuitable(&path, message));
+                    return Err(FileError::unsuitable(&path, message));
                 }
                 let camera = cameras.get(view).copied().ok_or_else(|| {
-                    DataError::unsuitable(&path, format!("has no camera for view {view}, of {views}"))
+                    FileError::unsuitable(&path, format!("has no camera for view {view}, of {views}"))
                 })?;
                 self.check_size(&path, (camera.width, camera.height), side)?;
                 Ok(camera)
@@ -293,12 +282,12 @@ impl Folder {
         Camera { principal_point: stored.principal_point + shift, ..*stored }
     }
 
-    fn check_size(&self, path: &Path, found: (u32, u32), side: u32) -> Result<(), DataError> {
+    fn check_size(&self, path: &Path, found: (u32, u32), side: u32) -> Result<(), FileError> {
         if found == (side, side) {
             return Ok(());
         }
         let message = format!("is {}×{}, the data set has views of {side}×{side}", found.0, found.1);
-        Err(DataError::unsuitable(path, message))
+        Err(FileError::unsuitable(path, message))
     }
 
     /// Name of a view's picture, mask or depth, by the folder that it lies in.

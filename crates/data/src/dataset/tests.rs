@@ -123,7 +123,8 @@ fn a_check_lists_everything_that_is_wrong() {
     let write_depth = |view: usize, change: fn(&mut Vec<f32>)| {
         let mut depth = folder.depth(TRAIN, "0001", view).expect("reads").depth;
         change(&mut depth);
-        let view_file = crate::view::View { width: 64, height: 64, color: vec![], alpha: vec![], depth };
+        let view_file =
+            snapsnap_mesh::view::View { width: 64, height: 64, color: vec![], alpha: vec![], depth };
         files::write_depth(&at(&format!("depth/0001/{view}.npz")), &view_file).expect("writes");
     };
     write_depth(1, |depth| depth[0] = f32::NAN);

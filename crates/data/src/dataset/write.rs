@@ -8,8 +8,8 @@ use rayon::prelude::*;
 use snapsnap_splat::{Camera, cameras, file};
 
 use super::{Folder, Layout, Split, files};
-use crate::DataError;
-use crate::view::View;
+use snapsnap_mesh::FileError;
+use snapsnap_mesh::view::View;
 
 /// Subjects in the making, in the data set's root.
 pub(super) const UNFINISHED: &str = ".unfinished";
@@ -38,7 +38,7 @@ impl Folder {
     /// appears when everything is written; runs that work on one data set leave each other's subjects alone.
     ///
     /// # Errors
-    /// [`DataError::Write`]; [`DataError::Unsuitable`] if a camera sees nothing, or, in the authors' layout,
+    /// [`FileError::Write`]; [`FileError::Unsuitable`] if a camera sees nothing, or, in the authors' layout,
     /// something within half a metre.
     ///
     /// # Panics
@@ -49,17 +49,17 @@ impl Folder {
         subject: &str,
         cameras: &[Camera],
         draw: impl Fn(&Camera) -> View + Sync,
-    ) -> Result<Made, DataError> {
+    ) -> Result<Made, FileError> {
         let description = &self.description;
         assert_eq!(cameras.len(), description.views, "cameras");
         let side = description.resolution;
         assert!(cameras.iter().all(|c| (c.width, c.height) == (side, side)), "a camera of another size");
         let unfinished = self.root.join(UNFINISHED);
-        fs::create_dir_all(&unfinished).map_err(DataError::write(&unfinished))?;
+        fs::create_dir_all(&unfinished).map_err(FileError::write(&unfinished))?;
         let temporary = unfinished.join(format!("{split}-{subject}"));
         // The system frees the lock of a run that was killed.
         let mark = unfinished.join(format!("{split}-{subject}.lock"));
-        let lock = fs::File::create(&mark).map_err(DataError::write(&mark))?;
+        let lock = fs::File::create(&mark).map_err(FileError::write(&mark))?;
         match lock.try_lock() {
             Err(TryLockError::WouldBlock) => return Ok(Made::Elsewhere),
             // Some file systems know no locks: nothing keeps two runs apart there.
@@ -70,10 +70,10 @@ impl Folder {
         }
         // Left by a run that was killed.
         match fs::remove_dir_all(&temporary) {
-            Err(e) if e.kind() != io::ErrorKind::NotFound => return Err(DataError::write(&temporary)(e)),
+            Err(e) if e.kind() != io::ErrorKind::NotFound => return Err(FileError::write(&temporary)(e)),
             _ => {}
         }
-        let guard = file::unfinished_folder(&temporary).map_err(DataError::write(&temporary))?;
+        let guard = file::unfinished_folder(&temporary).map_err(FileError::write(&temporary))?;
         let made = self.write_into(&temporary, subject, cameras, &draw);
         let made = made.and_then(|()| self.reveal(&temporary, split, subject));
         // Whether it went well or not, nothing stays. Other runs may be at work beside it: the folder around is theirs too.
@@ -104,15 +104,15 @@ impl Folder {
         subject: &str,
         cameras: &[Camera],
         draw: &(impl Fn(&Camera) -> View + Sync),
-    ) -> Result<(), DataError> {
+    ) -> Result<(), FileError> {
         for kind in self.kinds() {
             let path = folder.join(kind);
-            fs::create_dir_all(&path).map_err(DataError::write(&path))?;
+            fs::create_dir_all(&path).map_err(FileError::write(&path))?;
         }
         cameras.par_iter().enumerate().try_for_each(|(view, camera)| {
             let drawn = draw(&self.exact_camera(camera));
             if drawn.depth.iter().all(|z| *z == 0.0) {
-                return Err(DataError::unsuitable(
+                return Err(FileError::unsuitable(
                     &self.root,
                     format!("view {view} sees nothing of {subject}"),
                 ));
@@ -122,7 +122,7 @@ impl Folder {
                 let message = format!(
                     "view {view} sees {subject} within half a metre, for which the authors' layout has no number"
                 );
-                return Err(DataError::unsuitable(&self.root, message));
+                return Err(FileError::unsuitable(&self.root, message));
             }
             let at = |kind: &str| folder.join(kind).join(self.file_name(kind, view));
             let picture = match self.description.layout {
@@ -145,13 +145,13 @@ impl Folder {
         })?;
         if self.description.layout == Layout::Exact {
             let path = folder.join("cameras").join(format!("{subject}.json"));
-            cameras::write(cameras, &path).map_err(|e| DataError::splat(&path, e))?;
+            cameras::write(cameras, &path).map_err(|e| FileError::splat(&path, e))?;
         }
         Ok(())
     }
 
     /// Moves a finished subject to its place, `img` last.
-    fn reveal(&self, temporary: &Path, split: Split, subject: &str) -> Result<(), DataError> {
+    fn reveal(&self, temporary: &Path, split: Split, subject: &str) -> Result<(), FileError> {
         let mut kinds = self.kinds();
         kinds.reverse();
         for kind in kinds {
@@ -163,12 +163,12 @@ impl Folder {
                 _ => (temporary.join(kind), self.path(Some(split), kind, subject)),
             };
             let parent = to.parent().unwrap_or(&self.root);
-            fs::create_dir_all(parent).map_err(DataError::write(parent))?;
+            fs::create_dir_all(parent).map_err(FileError::write(parent))?;
             // A run that was killed in between left it, or a part of it was removed: the subject was not whole.
             if to.is_dir() {
-                fs::remove_dir_all(&to).map_err(DataError::write(&to))?;
+                fs::remove_dir_all(&to).map_err(FileError::write(&to))?;
             }
-            fs::rename(&from, &to).map_err(DataError::write(&to))?;
+            fs::rename(&from, &to).map_err(FileError::write(&to))?;
         }
         Ok(())
     }

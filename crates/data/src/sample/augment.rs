@@ -190,7 +190,7 @@ fn moved(mask: &GrayImage, reach: f32) -> GrayImage {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::random::stream;
+    use snapsnap_people::random::stream;
 
     fn disc(radius: f32) -> GrayImage {
         GrayImage::from_fn(64, 64, |x, y| {

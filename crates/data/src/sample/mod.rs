@@ -11,18 +11,17 @@ mod tests;
 use std::sync::Arc;
 
 use burn::tensor::{Device, Tensor, TensorData};
-use glam::DVec3;
 use image::{GrayImage, RgbImage};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use snapsnap_splat::Camera;
 
-use crate::DataError;
 use crate::dataset::{Folder, Layout, Split, StoredView};
-use crate::random::stream;
 pub use augment::Augment;
 pub use loader::Loader;
+use snapsnap_mesh::FileError;
+use snapsnap_people::random::stream;
 pub use stage1::{Stage1, Stage1Batch, Stage1Batcher, Stage1Item};
 pub use stage2::{Stage2, Stage2Batch, Stage2Batcher, Stage2Item};
 pub use test_set::{Test, TestItem};
@@ -103,8 +102,8 @@ impl Source {
         split: Option<Split>,
         config: SampleConfig,
         parts: usize,
-    ) -> Result<Self, DataError> {
-        let wrong = |message: String| DataError::unsuitable(folder.root(), message);
+    ) -> Result<Self, FileError> {
+        let wrong = |message: String| FileError::unsuitable(folder.root(), message);
         if let Some((key, message)) = config.problem() {
             return Err(wrong(format!("samples: `{key}`: {message}")));
         }
@@ -135,7 +134,7 @@ impl Source {
     }
 
     /// A view; without its picture where that is not needed.
-    fn view_for(&self, subject: &str, view: usize, picture: bool) -> Result<StoredView, DataError> {
+    fn view_for(&self, subject: &str, view: usize, picture: bool) -> Result<StoredView, FileError> {
         if picture {
             self.folder.view(self.split, subject, view)
         } else {
@@ -156,7 +155,7 @@ impl Source {
         view: usize,
         high_resolution: bool,
         background: [f32; 3],
-    ) -> Result<Vec<f32>, DataError> {
+    ) -> Result<Vec<f32>, FileError> {
         let (color, mask) = self.folder.picture(self.split, subject, view, high_resolution)?;
         // The authors' pictures are over black already, and their masks half as fine as the larger ones.
         let is_done = self.folder.description().layout == Layout::Authors && background == [0.0; 3];
@@ -202,23 +201,4 @@ fn together<I, const D: usize>(
 ) -> Tensor<D> {
     let values: Vec<f32> = items.iter().flat_map(|item| of(item).iter().copied()).collect();
     Tensor::from_data(TensorData::new(values, shape), device)
-}
-
-/// Points `[H,W,3]` of a depth map in the frame of `to`, metres: each pixel's centre, at +½ in the coordinates of `camera`,
-/// moved along its ray to the stored depth. Where there is no depth it is taken for `far`.
-pub fn unproject(view: &StoredView, camera: &Camera, to: &Camera, far: f32) -> Vec<f32> {
-    let width = camera.width as usize;
-    // From the camera's frame to the other's.
-    let back = camera.world_to_camera.inverse();
-    let rotation = to.world_to_camera.rotation * back.rotation;
-    let shift = to.world_to_camera.apply(back.translation);
-    let (f, c) = (camera.focal, camera.principal_point);
-    let mut points = Vec::with_capacity(3 * view.depth.len());
-    for (pixel, z) in view.depth.iter().enumerate() {
-        let z = f64::from(if *z > 0.0 { *z } else { far });
-        let (x, y) = ((pixel % width) as f64 + 0.5, (pixel / width) as f64 + 0.5);
-        let point = rotation * (z * DVec3::new((x - c.x) / f.x, (y - c.y) / f.y, 1.0)) + shift;
-        points.extend(point.as_vec3().to_array());
-    }
-    points
 }

@@ -7,9 +7,9 @@ use burn::data::dataset::{Dataset, DatasetError};
 use burn::tensor::{Device, Tensor};
 use rand::Rng;
 
-use super::{COMPAT_FAR, INSIDE, SampleConfig, Source, together, unproject};
-use crate::DataError;
-use crate::dataset::{Folder, Split};
+use super::{COMPAT_FAR, INSIDE, SampleConfig, Source, together};
+use crate::dataset::{Folder, Split, unproject};
+use snapsnap_mesh::FileError;
 
 /// Samples of stage 1 (SNAPSNAP §5.6): any view is the front, the opposite one the back, those at right angles the sides.
 #[derive(Debug, Clone)]
@@ -47,9 +47,9 @@ impl Stage1 {
     /// The samples of a split.
     ///
     /// # Errors
-    /// [`DataError`] if the split has no subject, the number of views is no multiple of 4, or the config contradicts
+    /// [`FileError`] if the split has no subject, the number of views is no multiple of 4, or the config contradicts
     /// itself or the data set.
-    pub fn new(folder: Arc<Folder>, split: Option<Split>, config: SampleConfig) -> Result<Self, DataError> {
+    pub fn new(folder: Arc<Folder>, split: Option<Split>, config: SampleConfig) -> Result<Self, FileError> {
         // High resolution is stage 2's.
         Source::new(folder, split, SampleConfig { high_resolution: false, ..config }, 4).map(Self)
     }
@@ -62,8 +62,8 @@ impl Stage1 {
     /// One sample.
     ///
     /// # Errors
-    /// [`DataError`] for files that are missing or damaged.
-    pub fn sample(&self, index: usize) -> Result<Stage1Item, DataError> {
+    /// [`FileError`] for files that are missing or damaged.
+    pub fn sample(&self, index: usize) -> Result<Stage1Item, FileError> {
         let source = &self.0;
         let (subject, mut random) = source.subject(1, index);
         let count = source.folder.description().views;

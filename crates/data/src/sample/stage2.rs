@@ -9,8 +9,8 @@ use rand::Rng;
 use snapsnap_splat::Camera;
 
 use super::{SampleConfig, Source, together};
-use crate::DataError;
 use crate::dataset::{Folder, Layout, Split};
+use snapsnap_mesh::FileError;
 
 /// Samples of stage 2 (SNAPSNAP §5.6): front and back are the first view and the opposite one; compared are the sides and
 /// random views.
@@ -60,12 +60,12 @@ impl Stage2 {
     ///
     /// # Errors
     /// As [`super::Stage1::new`].
-    pub fn new(folder: Arc<Folder>, split: Option<Split>, config: SampleConfig) -> Result<Self, DataError> {
+    pub fn new(folder: Arc<Folder>, split: Option<Split>, config: SampleConfig) -> Result<Self, FileError> {
         let authors = folder.description().layout == Layout::Authors;
         if authors && config.high_resolution && config.augment.background_color {
             let message =
                 "has no masks at twice the side, which `background_color` needs beside `high_resolution`";
-            return Err(DataError::unsuitable(folder.root(), message));
+            return Err(FileError::unsuitable(folder.root(), message));
         }
         Source::new(folder, split, config, 4).map(Self)
     }
@@ -78,8 +78,8 @@ impl Stage2 {
     /// One sample.
     ///
     /// # Errors
-    /// [`DataError`] for files that are missing or damaged.
-    pub fn sample(&self, index: usize) -> Result<Stage2Item, DataError> {
+    /// [`FileError`] for files that are missing or damaged.
+    pub fn sample(&self, index: usize) -> Result<Stage2Item, FileError> {
         let source = &self.0;
         let Source { folder, split, config, .. } = source;
         let (subject, mut random) = source.subject(2, index);

@@ -6,8 +6,8 @@ use burn::data::dataset::{Dataset, DatasetError};
 use snapsnap_splat::Camera;
 
 use super::{Augment, SampleConfig, Source};
-use crate::DataError;
 use crate::dataset::{Folder, Split};
+use snapsnap_mesh::FileError;
 
 /// Subjects of a test set (SNAPSNAP §5.6): the first view and the opposite one go in, 0 and 15 of the published 30; all
 /// are compared. Each subject comes once, and nothing about it is random.
@@ -33,8 +33,8 @@ impl Test {
     /// The subjects of a split; `None` where they lie in the root itself, as in the authors' test sets.
     ///
     /// # Errors
-    /// [`DataError`] if the split has no subject, the number of views is odd, or the config contradicts itself.
-    pub fn new(folder: Arc<Folder>, split: Option<Split>, config: SampleConfig) -> Result<Self, DataError> {
+    /// [`FileError`] if the split has no subject, the number of views is odd, or the config contradicts itself.
+    pub fn new(folder: Arc<Folder>, split: Option<Split>, config: SampleConfig) -> Result<Self, FileError> {
         let config = SampleConfig { repeat: 1, high_resolution: false, augment: Augment::none(), ..config };
         Source::new(folder, split, config, 2).map(Self)
     }
@@ -42,8 +42,8 @@ impl Test {
     /// One subject.
     ///
     /// # Errors
-    /// [`DataError`] for files that are missing or damaged.
-    pub fn sample(&self, index: usize) -> Result<TestItem, DataError> {
+    /// [`FileError`] for files that are missing or damaged.
+    pub fn sample(&self, index: usize) -> Result<TestItem, FileError> {
         let source = &self.0;
         let (subject, mut random) = source.subject(3, index);
         let description = source.folder.description();
@@ -66,7 +66,7 @@ impl Test {
     ///
     /// # Errors
     /// As [`Self::sample`].
-    pub fn target(&self, index: usize, view: usize, background: [f32; 3]) -> Result<Vec<f32>, DataError> {
+    pub fn target(&self, index: usize, view: usize, background: [f32; 3]) -> Result<Vec<f32>, FileError> {
         self.0.target(self.0.subject(3, index).0, view, false, background)
     }
 }

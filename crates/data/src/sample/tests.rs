@@ -5,7 +5,7 @@ use glam::{DVec2, Vec3};
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 
 use super::*;
-use crate::dataset::Layout;
+use crate::dataset::{Layout, unproject};
 use crate::testing::{BLOCK, block, data_set, off_block, person, rectangle};
 
 const TRAIN: Option<Split> = Some(Split::Train);

@@ -3,11 +3,9 @@
 
 use burn::module::Module;
 use burn::nn::{Linear, LinearConfig};
-use burn::tensor::module::attention;
 use burn::tensor::{Device, Tensor};
 
-use super::rope::Rope;
-use crate::cpu;
+use snapsnap_ops::{Rope, rotary_attention};
 
 /// Self-attention; `qkv`'s output rows are all queries, all keys, all values.
 #[derive(Module, Debug)]
@@ -56,20 +54,4 @@ impl CrossAttention {
         let (q, k, v) = (self.projq.forward(x), self.projk.forward(y.clone()), self.projv.forward(y));
         self.proj.forward(rotary_attention(q, k, v, rope, self.heads))
     }
-}
-
-/// softmax(rope(q) · rope(k)ᵀ / √head_dim) · v, heads side by side in the channels: `[B, N, dim]`, `[B, M, dim]`
-/// twice → `[B, N, dim]`.
-fn rotary_attention(q: Tensor<3>, k: Tensor<3>, v: Tensor<3>, rope: &Rope, heads: usize) -> Tensor<3> {
-    if cpu::is_fast(&q) {
-        return cpu::rotary_attention(q, k, v, rope, heads);
-    }
-    let [b, n, dim] = q.dims();
-    let split = |x: Tensor<3>| {
-        let m = x.dims()[1];
-        x.reshape([b, m, heads, dim / heads]).swap_dims(1, 2)
-    };
-    let (q, k) = (rope.apply(split(q)), rope.apply(split(k)));
-    let out = attention(q, k, split(v), None, None, Default::default());
-    out.swap_dims(1, 2).reshape([b, n, dim])
 }

@@ -2,12 +2,10 @@
 
 use burn::module::Module;
 use burn::nn::{LayerNorm, LayerNormConfig, Linear, LinearConfig};
-use burn::tensor::activation::gelu;
 use burn::tensor::{Device, Tensor};
 
 use super::attention::{CrossAttention, SelfAttention};
-use super::rope::Rope;
-use crate::cpu;
+use snapsnap_ops::{Rope, linear_gelu};
 
 /// Epsilon of every layer normalisation (SNAPSNAP §1.1).
 const NORM_EPSILON: f64 = 1e-6;
@@ -32,9 +30,7 @@ impl Mlp {
     }
 
     fn forward(&self, x: Tensor<3>) -> Tensor<3> {
-        let hidden =
-            if cpu::is_fast(&x) { cpu::linear_gelu(&self.fc1, x) } else { gelu(self.fc1.forward(x)) };
-        self.fc2.forward(hidden)
+        self.fc2.forward(linear_gelu(&self.fc1, x))
     }
 }
 

@@ -11,8 +11,8 @@ use burn::tensor::activation::relu;
 use burn::tensor::{Device, Tensor};
 
 use crate::config::NetworkConfig;
-use crate::cpu;
-use crate::resample::bilinear;
+use snapsnap_ops as ops;
+use snapsnap_ops::bilinear;
 
 fn conv3x3(from: usize, to: usize, stride: usize, bias: bool, device: &Device) -> Conv2d {
     Conv2dConfig::new([from, to], [3, 3])
@@ -81,8 +81,8 @@ impl ResidualConvUnit {
     }
 
     fn forward(&self, x: Tensor<4>) -> Tensor<4> {
-        let h = cpu::conv3x3(&self.conv1, x.clone(), true);
-        x + cpu::conv3x3(&self.conv2, h, true)
+        let h = ops::conv3x3(&self.conv1, x.clone(), true);
+        x + ops::conv3x3(&self.conv2, h, true)
     }
 }
 
@@ -185,17 +185,17 @@ impl DptHead {
         let [m0, m1, m2, m3] = maps;
         let (branches, s) = (&self.act_postprocess, &self.scratch);
         let l3 = branches.at_3.at_1.forward(branches.at_3.at_0.forward(m3));
-        let path = s.refinenet4.forward(cpu::conv3x3(&s.layer4_rn, l3, false), None);
+        let path = s.refinenet4.forward(ops::conv3x3(&s.layer4_rn, l3, false), None);
         let path = s
             .refinenet3
-            .forward(path, Some(cpu::conv3x3(&s.layer3_rn, branches.at_2.at_0.forward(m2), false)));
+            .forward(path, Some(ops::conv3x3(&s.layer3_rn, branches.at_2.at_0.forward(m2), false)));
         let path =
-            s.refinenet2.forward(path, Some(cpu::conv3x3(&s.layer2_rn, branches.at_1.forward(m1), false)));
+            s.refinenet2.forward(path, Some(ops::conv3x3(&s.layer2_rn, branches.at_1.forward(m1), false)));
         let path =
-            s.refinenet1.forward(path, Some(cpu::conv3x3(&s.layer1_rn, branches.at_0.forward(m0), false)));
-        let x = cpu::conv3x3(&self.head.at_0, path, false);
+            s.refinenet1.forward(path, Some(ops::conv3x3(&s.layer1_rn, branches.at_0.forward(m0), false)));
+        let x = ops::conv3x3(&self.head.at_0, path, false);
         let [_, _, h, w] = x.dims();
-        let x = cpu::conv3x3(&self.head.at_2, bilinear(x, [2 * h, 2 * w], true), false);
+        let x = ops::conv3x3(&self.head.at_2, bilinear(x, [2 * h, 2 * w], true), false);
         self.head.at_4.forward(relu(x))
     }
 }

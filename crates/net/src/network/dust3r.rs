@@ -10,8 +10,8 @@ use burn::tensor::{Device, Tensor};
 use super::block::{DecoderBlock, EncoderBlock, layer_norm};
 use super::dpt::DptHead;
 use super::linear::LinearHead;
-use super::rope::Rope;
 use crate::config::{Fusion, HeadKind, NetworkConfig};
+use snapsnap_ops::Rope;
 
 /// One side of the person. The sides are named as seen in the front picture.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -6,8 +6,6 @@ mod dpt;
 mod dust3r;
 mod linear;
 mod predictor;
-mod rope;
 
 pub use dust3r::{Dust3r, TokenMaps, View};
 pub use predictor::{PointMap, PointPredictor, activate};
-pub use rope::Rope;

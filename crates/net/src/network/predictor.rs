@@ -6,7 +6,7 @@ use burn::tensor::{Device, Tensor};
 
 use super::dust3r::{Dust3r, View};
 use crate::config::{ConfMode, NetworkConfig, Upsample};
-use crate::resample::bilinear;
+use snapsnap_ops::bilinear;
 
 /// Points and confidences on one view's pixel grid.
 #[derive(Debug, Clone)]

@@ -1,7 +1,10 @@
 //! The Gaussian regressor: colours and points of one view → one Gaussian per pixel (SNAPSNAP §8).
 
 mod attributes;
+mod fused;
 mod statistics;
+#[cfg(test)]
+mod tests;
 mod unet;
 
 use burn::module::Module;
@@ -11,11 +14,9 @@ use burn::tensor::{Device, Tensor};
 
 pub use attributes::Attributes;
 pub use statistics::Statistics;
-pub(crate) use unet::{BRANCH_SCALE, ResBlock};
 pub use unet::{RECEPTIVE_RADIUS, UNet};
 
 use crate::config::RegressorConfig;
-use crate::cpu;
 
 /// Channels in: red, green, blue in [−1, 1], then x, y, z in metres (front camera's frame).
 pub const INPUT_CHANNELS: usize = 6;
@@ -47,8 +48,8 @@ impl Regressor {
         let [_, channels, h, w] = input.dims();
         assert_eq!(channels, INPUT_CHANNELS, "regressor input must be [B, {INPUT_CHANNELS}, H, W]");
         assert!(h % 4 == 0 && w % 4 == 0, "regressor input {h}×{w}: both sides must be multiples of 4");
-        if cpu::is_fast(&input) && self.pred_unet.suits_cpu_kernel() {
-            return cpu::regress(self, input, statistics);
+        if snapsnap_ops::is_fast(&input) && self.pred_unet.suits_cpu_kernel() {
+            return fused::regress(&self.pred_unet, &self.gs_conv, input, statistics);
         }
         self.gs_conv.forward(self.pred_unet.forward(input, statistics)).permute([0, 2, 3, 1])
     }

@@ -11,7 +11,6 @@ use burn::tensor::{Device, Tensor};
 use super::statistics::{Statistics, normalise};
 use super::{FEATURES, INPUT_CHANNELS};
 use crate::config::RegressorConfig;
-use crate::cpu;
 
 /// Every sum of two branches is scaled by this, so that its variance stays put.
 pub(crate) const BRANCH_SCALE: f64 = std::f64::consts::FRAC_1_SQRT_2;
@@ -119,7 +118,7 @@ impl UNet {
 
     /// Whether the fused CPU kernel has this width.
     pub(crate) fn suits_cpu_kernel(&self) -> bool {
-        self.norm_out.num_channels == cpu::UNET_CHANNELS
+        self.norm_out.num_channels == snapsnap_ops::conv::CHANNELS
     }
 
     /// `[B, 6, H, W]`, H and W multiples of 4 → `[B, 14, H, W]`.

@@ -1,4 +1,4 @@
-//! Our weight file: writing it tensor by tensor, opening it, and turning it back into the authors' layout.
+//! Our weight file: writing it tensor by tensor, and opening it.
 
 use std::collections::{BTreeSet, HashMap};
 use std::io::{self, Write};
@@ -8,9 +8,9 @@ use safetensors::Dtype;
 use safetensors::tensor::{Metadata, TensorInfo};
 use snapsnap_splat::file::write_whole;
 
+use super::WeightsError;
 use super::schema::{self, Part, TensorSpec};
-use super::source::Source;
-use super::{WeightsError, import};
+use super::source::{Entry, Source, is_readable};
 use crate::config::Config;
 
 /// Metadata key under which the config (TOML) is stored.
@@ -36,7 +36,7 @@ pub(super) fn write(
     write_tensors(path, metadata, infos.collect(), |i| values(&tensors[i]), progress)
 }
 
-fn write_tensors(
+pub(super) fn write_tensors(
     path: &Path,
     metadata: HashMap<String, String>,
     tensors: Vec<(String, Vec<usize>)>,
@@ -110,7 +110,7 @@ impl WeightFile {
         for spec in &expected {
             match source.tensors().get(&spec.name) {
                 None => problems.push(format!("missing: {} {:?}", spec.name, spec.shape)),
-                Some(entry) => problems.extend(import::mismatch(spec, entry, path)),
+                Some(entry) => problems.extend(mismatch(spec, entry, path)),
             }
         }
         let names: BTreeSet<_> = expected.iter().map(|t| t.name.as_str()).collect();
@@ -186,21 +186,18 @@ pub(super) fn parts_of<'a>(keys: impl Iterator<Item = &'a String>) -> Parts {
     parts
 }
 
-/// Writes `from` (our file) to `to` with every name the authors' state dicts have, aliases included, and without our
-/// metadata, so that a strict `load_state_dict` accepts each part. Returns the number of tensors written.
-///
-/// # Errors
-/// [`WeightsError`].
-pub fn export(from: &Path, to: &Path, progress: Progress) -> Result<usize, WeightsError> {
-    let file = WeightFile::open(from, None)?;
-    let mut entries: Vec<(String, &str)> = Vec::new();
-    for name in file.source.tensors().keys() {
-        entries.push((name.clone(), name));
-        entries.extend(import::alias_of(name).map(|alias| (alias, name.as_str())));
+/// A line for a tensor of the wrong shape or type.
+pub(super) fn mismatch(spec: &TensorSpec, entry: &Entry, path: &Path) -> Option<String> {
+    if !is_readable(&entry.dtype) {
+        return Some(format!(
+            "wrong type: {} is {} in {}, must be f32, f16 or bf16",
+            spec.name,
+            entry.dtype,
+            path.display()
+        ));
     }
-    let shapes =
-        entries.iter().map(|(alias, name)| (alias.clone(), file.source.tensors()[*name].shape.clone()));
-    let metadata = HashMap::from([("format".to_owned(), "pt".to_owned())]);
-    write_tensors(to, metadata, shapes.collect(), |i| file.source.read_f32(entries[i].1), progress)?;
-    Ok(entries.len())
+    (entry.shape != spec.shape).then(|| {
+        let (name, file, found) = (&spec.name, path.display(), &entry.shape);
+        format!("wrong shape: {name} is {found:?} in {file}, the config asks for {:?}", spec.shape)
+    })
 }

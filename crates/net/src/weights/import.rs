@@ -4,10 +4,10 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use super::WeightsError;
-use super::file::{Progress, parts_of, write};
+use super::file::{Progress, mismatch, parts_of, write};
 use super::init::{SideHeads, draw};
 use super::schema::{self, DUST3R, SCALE, SIDE, TensorSpec};
-use super::source::{Entry, Source, is_readable};
+use super::source::{Source, is_readable};
 use crate::config::Config;
 
 /// Choices an import leaves to the user.
@@ -62,22 +62,6 @@ fn canonical(key: &str) -> String {
         return format!("{DUST3R}{head}scratch.layer{}_rn.weight", n + 1);
     }
     format!("{DUST3R}{bare}")
-}
-
-/// A line for a tensor of the wrong shape or type.
-pub(super) fn mismatch(spec: &TensorSpec, entry: &Entry, path: &Path) -> Option<String> {
-    if !is_readable(&entry.dtype) {
-        return Some(format!(
-            "wrong type: {} is {} in {}, must be f32, f16 or bf16",
-            spec.name,
-            entry.dtype,
-            path.display()
-        ));
-    }
-    (entry.shape != spec.shape).then(|| {
-        let (name, file, found) = (&spec.name, path.display(), &entry.shape);
-        format!("wrong shape: {name} is {found:?} in {file}, the config asks for {:?}", spec.shape)
-    })
 }
 
 /// Reads checkpoints of the authors, DUSt3R or CroCo, checks every tensor against `config` and writes one file of ours.

@@ -3,6 +3,7 @@
 //! Our file is one `.safetensors` with the authors' keys (`scale`, `dust3r.*`, `pred_unet.*`, `gs_conv.*`), all f32, and
 //! the config as TOML in its metadata.
 
+mod export;
 mod file;
 mod import;
 mod init;
@@ -12,7 +13,8 @@ mod source;
 
 use std::path::{Path, PathBuf};
 
-pub use file::{CONFIG_KEY, Progress, WeightFile, export};
+pub use export::export;
+pub use file::{CONFIG_KEY, Progress, WeightFile};
 pub use import::{ImportOptions, ImportReport, import};
 pub use init::{SideHeads, init};
 pub use source::{Entry, Source};

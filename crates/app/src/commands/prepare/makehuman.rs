@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use snapsnap_data::makehuman::{Library, person};
+use snapsnap_people::makehuman::{Library, person};
 
 use super::{Common, Generate, generate};
 use crate::failure::Failure;

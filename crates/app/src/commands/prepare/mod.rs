@@ -12,12 +12,12 @@ use std::time::Duration;
 
 use clap::{Args, Subcommand, ValueEnum};
 use snapsnap_data::dataset::{Folder, Made, Split};
-use snapsnap_data::mesh::Mesh;
 use snapsnap_data::prepare::{DataConfig, Shard};
-use snapsnap_data::random::stream;
 use snapsnap_data::scan::{Collection, normalise};
-use snapsnap_data::{DataError, export};
+use snapsnap_mesh::mesh::Mesh;
+use snapsnap_mesh::{FileError, export};
 use snapsnap_net::config::parse;
+use snapsnap_people::random::stream;
 use snapsnap_splat::file;
 
 use crate::failure::Failure;
@@ -169,7 +169,7 @@ fn make(
     source: &str,
     inputs: &[&Path],
     works: &[Work],
-    person: impl Fn(usize, &Work) -> Result<Person, DataError>,
+    person: impl Fn(usize, &Work) -> Result<Person, FileError>,
 ) -> Result<(), Failure> {
     let config = common.config()?;
     if let Some(sheet) = &common.preview {
@@ -201,7 +201,7 @@ fn make(
             // The program is being ended: it stops here, without a word about the subject.
             Err(_) if file::is_ending() => std::thread::sleep(Duration::from_secs(60)),
             // Nothing more can be written: to go on would only repeat it.
-            Err(e @ DataError::Write { .. }) => return Err(e.into()),
+            Err(e @ FileError::Write { .. }) => return Err(e.into()),
             Err(e) => {
                 failed += 1;
                 say::err(&format!("skipped {subject}: {e}"));
@@ -250,7 +250,7 @@ fn generate(
     generate: &Generate,
     quiet: bool,
     kind: &str,
-    person: impl Fn(&str) -> Result<Mesh, DataError>,
+    person: impl Fn(&str) -> Result<Mesh, FileError>,
 ) -> Result<(), Failure> {
     if generate.subjects == 0 || generate.subjects > MAX_SUBJECTS {
         let message = format!("--subjects is {}, must be 1 to {MAX_SUBJECTS}", generate.subjects);
@@ -299,9 +299,9 @@ fn generate(
 }
 
 /// Stands the mesh up for the cameras; training subjects not quite in the middle, as their names decide.
-fn place(mesh: &mut Mesh, work: &Work, collection: Collection, origin: &Path) -> Result<(), DataError> {
+fn place(mesh: &mut Mesh, work: &Work, collection: Collection, origin: &Path) -> Result<(), FileError> {
     let mut random = stream(&format!("place/{}", work.identity));
     let jitter = (work.split == Split::Train).then_some(&mut random);
     normalise(mesh, collection, jitter)
-        .map_err(|e| DataError::Unsuitable { path: origin.to_owned(), message: e.to_string() })
+        .map_err(|e| FileError::Unsuitable { path: origin.to_owned(), message: e.to_string() })
 }

@@ -6,7 +6,8 @@ use std::path::{Path, PathBuf};
 use clap::{Args, ValueEnum};
 use snapsnap_data::dataset::Split;
 use snapsnap_data::scan::{Collection, Source, find};
-use snapsnap_data::{DataError, import, smplx};
+use snapsnap_data::smplx;
+use snapsnap_mesh::{FileError, import};
 
 use super::{Common, Person, SplitArgument, Work, make};
 use crate::failure::Failure;
@@ -81,7 +82,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
         .unzip();
     if works.is_empty() {
         let message = "none of its scans is in the split that --only names".to_owned();
-        return Err(DataError::Unsuitable { path: arguments.source.clone(), message }.into());
+        return Err(FileError::Unsuitable { path: arguments.source.clone(), message }.into());
     }
     let description = describe(arguments);
     let mut inputs = vec![arguments.source.as_path()];
@@ -93,7 +94,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
         let is_in = |split: Split| arguments.common.pictures(split, &work.subject).exists();
         if let Some(other) = Split::ALL.into_iter().find(|other| *other != work.split && is_in(*other)) {
             let message = format!("subject {} is in {other} already", work.subject);
-            return Err(DataError::Unsuitable { path: path.clone(), message });
+            return Err(FileError::Unsuitable { path: path.clone(), message });
         }
         let collection = collection.of(&work.subject);
         let parameters = parameters(path, &work.subject, arguments.smplx.as_deref())?;
@@ -130,7 +131,7 @@ fn describe(arguments: &Arguments) -> String {
 }
 
 /// The subject's SMPL-X parameters; an error if a folder of them was named and has none.
-fn parameters(scan: &Path, subject: &str, folder: Option<&Path>) -> Result<Option<PathBuf>, DataError> {
+fn parameters(scan: &Path, subject: &str, folder: Option<&Path>) -> Result<Option<PathBuf>, FileError> {
     let stem = scan.file_stem().unwrap_or_default();
     let names = [stem.to_string_lossy().into_owned(), subject.to_owned()];
     let beside = scan.parent().unwrap_or(Path::new("."));
@@ -147,7 +148,7 @@ fn parameters(scan: &Path, subject: &str, folder: Option<&Path>) -> Result<Optio
     }
     let found = candidates.into_iter().find(|path| path.is_file());
     match (folder, &found) {
-        (Some(folder), None) => Err(DataError::Unsuitable {
+        (Some(folder), None) => Err(FileError::Unsuitable {
             path: folder.to_owned(),
             message: format!("has no SMPL-X parameters of subject {subject}"),
         }),

@@ -1,7 +1,7 @@
 //! `snapsnap prepare synth`.
 
 use clap::Args;
-use snapsnap_data::synth;
+use snapsnap_people::synth;
 
 use super::{Common, Generate, generate};
 use crate::failure::Failure;

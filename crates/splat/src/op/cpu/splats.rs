@@ -1,11 +1,13 @@
 //! Projection of all Gaussians into one view, culling, and depth order.
 
+use std::ops::RangeInclusive;
+
 use rayon::prelude::*;
 
 use super::super::job::{Counts, Job, MAX_MAGNITUDE, MIN_QUATERNION, RADIUS_MARGIN};
 use super::Scene;
-use crate::options::MIN_ALPHA;
-use crate::vjp::{Projection, Quat, Vec3, View, footprint, project, to_camera};
+use crate::options::{MIN_ALPHA, TILE};
+use crate::vjp::{Projection, Quat, Vec3, View, footprint, project, span, to_camera};
 
 /// Gaussians per task.
 const CHUNK: usize = 4096;
@@ -36,6 +38,31 @@ pub struct Splat {
     pub gaussian: u32,
     /// √(det Σ'_raw / det Σ') with antialiasing, else 1.
     pub compensation: f32,
+}
+
+impl Splat {
+    /// The rows of tiles that it reaches.
+    #[inline]
+    pub fn tile_rows(&self) -> RangeInclusive<usize> {
+        usize::from(self.rows[0]) / TILE..=usize::from(self.rows[1]) / TILE
+    }
+
+    /// The tiles of one row that it reaches: first and last, over the columns of pixel centres that its ellipse holds
+    /// within that row.
+    #[inline]
+    pub fn tiles_in_row(&self, y: usize, job: &Job) -> Option<RangeInclusive<usize>> {
+        let first = (y * TILE) as f32 + 0.5 - self.v;
+        let last = (y * TILE + TILE - 1).min(job.height - 1) as f32 + 0.5 - self.v;
+        let span = span(self.l0, self.k, self.l1, self.radius_squared, first, last);
+        let left = (self.u + span.left - 0.5).max(0.0).ceil();
+        let right = (self.u + span.right - 0.5).min((job.width - 1) as f32).floor();
+        (left <= right).then_some(left as usize / TILE..=right as usize / TILE)
+    }
+
+    fn count_tiles(&self, job: &Job) -> u32 {
+        let rows = self.tile_rows().filter_map(|y| self.tiles_in_row(y, job));
+        rows.map(|tiles| (tiles.end() - tiles.start() + 1) as u32).sum()
+    }
 }
 
 enum Cull {
@@ -158,7 +185,7 @@ fn splat(scene: Scene, g: usize, view: &View, job: &Job) -> Result<Splat, Cull> 
         gaussian: g as u32,
         compensation,
     };
-    splat.tiles = super::tiles::count(&splat, job);
+    splat.tiles = splat.count_tiles(job);
     if splat.tiles > 0 { Ok(splat) } else { Err(Cull::Outside) }
 }
 

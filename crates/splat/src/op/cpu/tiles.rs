@@ -1,14 +1,10 @@
 //! Which splats each tile must look at, front to back.
 
-use std::ops::RangeInclusive;
-
 use rayon::prelude::*;
 
 use super::super::job::Job;
 use super::splats::Splat;
 use crate::SplatError;
-use crate::options::TILE;
-use crate::vjp::span;
 
 /// Splats per task.
 const CHUNK: usize = 4096;
@@ -43,30 +39,6 @@ impl Lists {
     }
 }
 
-/// The tiles of one row that the splat reaches: first and last, over the columns of pixel centres that its ellipse holds
-/// within that row.
-#[inline]
-fn tiles_in_row(splat: &Splat, y: usize, job: &Job) -> Option<RangeInclusive<usize>> {
-    let first = (y * TILE) as f32 + 0.5 - splat.v;
-    let last = (y * TILE + TILE - 1).min(job.height - 1) as f32 + 0.5 - splat.v;
-    let span = span(splat.l0, splat.k, splat.l1, splat.radius_squared, first, last);
-    let left = (splat.u + span.left - 0.5).max(0.0).ceil();
-    let right = (splat.u + span.right - 0.5).min((job.width - 1) as f32).floor();
-    (left <= right).then_some(left as usize / TILE..=right as usize / TILE)
-}
-
-/// The rows of tiles that the splat reaches.
-#[inline]
-fn tile_rows(splat: &Splat) -> RangeInclusive<usize> {
-    usize::from(splat.rows[0]) / TILE..=usize::from(splat.rows[1]) / TILE
-}
-
-/// How many tiles the splat reaches.
-pub fn count(splat: &Splat, job: &Job) -> u32 {
-    let rows = tile_rows(splat).filter_map(|y| tiles_in_row(splat, y, job));
-    rows.map(|tiles| (tiles.end() - tiles.start() + 1) as u32).sum()
-}
-
 /// The lists of all tiles for `splats`, which are ordered front to back.
 ///
 /// # Errors
@@ -83,9 +55,9 @@ pub fn lists(splats: &[Splat], job: &Job, keep_places: bool) -> Result<Lists, Sp
         .map(|splats| {
             let mut tiles = Vec::with_capacity(splats.iter().map(|splat| splat.tiles as usize).sum());
             for splat in splats {
-                for y in tile_rows(splat) {
+                for y in splat.tile_rows() {
                     let row = (y * job.tiles_x()) as u32;
-                    tiles.extend(tiles_in_row(splat, y, job).into_iter().flatten().map(|x| row + x as u32));
+                    tiles.extend(splat.tiles_in_row(y, job).into_iter().flatten().map(|x| row + x as u32));
                 }
             }
             tiles

@@ -1,0 +1,37 @@
+//! A view as it is stored, and the points that its depths are.
+
+use glam::DVec3;
+use image::{GrayImage, RgbImage};
+use snapsnap_splat::Camera;
+
+/// One stored view.
+#[derive(Debug, Clone)]
+pub struct StoredView {
+    /// `[H,W]` colours; meaningless where the mask is 0.
+    pub color: RgbImage,
+    /// `[H,W]` coverage.
+    pub mask: GrayImage,
+    /// `[H,W]` metres along the optical axis; 0 where nothing was seen.
+    pub depth: Vec<f32>,
+    /// As stored: pixel coordinates follow [`super::Description::pixel_centre`].
+    pub camera: Camera,
+}
+
+/// Points `[H,W,3]` of a depth map in the frame of `to`, metres: each pixel's centre, at +½ in the coordinates of `camera`,
+/// moved along its ray to the stored depth. Where there is no depth it is taken for `far`.
+pub fn unproject(view: &StoredView, camera: &Camera, to: &Camera, far: f32) -> Vec<f32> {
+    let width = camera.width as usize;
+    // From the camera's frame to the other's.
+    let back = camera.world_to_camera.inverse();
+    let rotation = to.world_to_camera.rotation * back.rotation;
+    let shift = to.world_to_camera.apply(back.translation);
+    let (f, c) = (camera.focal, camera.principal_point);
+    let mut points = Vec::with_capacity(3 * view.depth.len());
+    for (pixel, z) in view.depth.iter().enumerate() {
+        let z = f64::from(if *z > 0.0 { *z } else { far });
+        let (x, y) = ((pixel % width) as f64 + 0.5, (pixel / width) as f64 + 0.5);
+        let point = rotation * (z * DVec3::new((x - c.x) / f.x, (y - c.y) / f.y, 1.0)) + shift;
+        points.extend(point.as_vec3().to_array());
+    }
+    points
+}

@@ -1,0 +1,68 @@
+//! Meshes as scans: OBJ with materials and textures.
+
+use std::collections::HashMap;
+use std::fs;
+use std::io::{self, Cursor, Write};
+use std::path::Path;
+use std::sync::Arc;
+
+use image::ImageFormat;
+use snapsnap_splat::file::write_whole;
+
+use crate::FileError;
+use crate::mesh::Mesh;
+
+/// Writes `mesh` to `path`, with its materials and textures beside it under the same name; the OBJ is written last.
+///
+/// # Errors
+/// [`FileError::Write`].
+pub fn write_obj(mesh: &Mesh, path: &Path) -> Result<(), FileError> {
+    let folder = path.parent().unwrap_or(Path::new("."));
+    fs::create_dir_all(folder).map_err(FileError::write(folder))?;
+    let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+    let mut materials = String::new();
+    let mut textures = HashMap::new();
+    for (row, material) in mesh.materials.iter().enumerate() {
+        let [r, g, b] = material.color.to_array();
+        materials += &format!("newmtl m{row}\nKd {r} {g} {b}\n");
+        if let Some(texture) = &material.texture {
+            let count = textures.len();
+            let name = textures.entry(Arc::as_ptr(texture)).or_insert_with(|| format!("{stem}_{count}.png"));
+            materials += &format!("map_Kd {name}\n");
+            let file = folder.join(&*name);
+            let mut bytes = Cursor::new(Vec::new());
+            texture
+                .write_to(&mut bytes, ImageFormat::Png)
+                .map_err(|e| FileError::write(&file)(io::Error::other(e)))?;
+            write_whole(&file, |out| out.write_all(bytes.get_ref())).map_err(FileError::write(&file))?;
+        }
+    }
+    let file = folder.join(format!("{stem}.mtl"));
+    write_whole(&file, |out| out.write_all(materials.as_bytes())).map_err(FileError::write(&file))?;
+    write_whole(path, |out| {
+        writeln!(out, "mtllib {stem}.mtl")?;
+        for (row, p) in mesh.positions.iter().enumerate() {
+            match mesh.colors.get(row) {
+                Some(c) => writeln!(out, "v {} {} {} {} {} {}", p.x, p.y, p.z, c.x, c.y, c.z)?,
+                None => writeln!(out, "v {} {} {}", p.x, p.y, p.z)?,
+            }
+        }
+        for t in &mesh.texcoords {
+            writeln!(out, "vt {} {}", t.x, t.y)?;
+        }
+        let mut material = u32::MAX;
+        for face in &mesh.faces {
+            if face.material != material {
+                material = face.material;
+                writeln!(out, "usemtl m{material}")?;
+            }
+            let [a, b, c] = face.positions.map(|row| row + 1);
+            match face.texcoords.map(|t| t.map(|row| row + 1)) {
+                Some([s, t, u]) => writeln!(out, "f {a}/{s} {b}/{t} {c}/{u}")?,
+                None => writeln!(out, "f {a} {b} {c}")?,
+            }
+        }
+        Ok(())
+    })
+    .map_err(FileError::write(path))
+}

@@ -1,0 +1,290 @@
+use std::fs;
+use std::io::Cursor;
+use std::path::{Path, PathBuf};
+
+use glam::{Vec2, Vec3};
+use image::{ImageFormat, Rgb, RgbImage};
+
+use super::read;
+use crate::mesh::Mesh;
+
+/// A picture with one pixel of each of four colours, as PNG.
+fn png() -> Vec<u8> {
+    let mut picture = RgbImage::new(2, 2);
+    for (x, y, color) in [(0, 0, [255, 0, 0]), (1, 0, [0, 255, 0]), (0, 1, [0, 0, 255]), (1, 1, [9, 9, 9])] {
+        picture.put_pixel(x, y, Rgb(color));
+    }
+    let mut bytes = Cursor::new(Vec::new());
+    picture.write_to(&mut bytes, ImageFormat::Png).expect("encodes");
+    bytes.into_inner()
+}
+
+struct Folder(tempfile::TempDir);
+
+impl Folder {
+    fn new() -> Self {
+        // A space and letters beyond ASCII in every path.
+        Self(tempfile::Builder::new().prefix("scän 人 ").tempdir().expect("temporary folder"))
+    }
+
+    fn file(&self, name: &str, content: impl AsRef<[u8]>) -> PathBuf {
+        let path = self.0.path().join(name);
+        fs::write(&path, content).expect("write");
+        path
+    }
+}
+
+fn corners(mesh: &Mesh) -> Vec<[Vec3; 3]> {
+    mesh.faces.iter().map(|f| f.positions.map(|row| mesh.positions[row as usize])).collect()
+}
+
+fn texcoords(mesh: &Mesh, face: usize) -> Option<[Vec2; 3]> {
+    mesh.faces[face].texcoords.map(|rows| rows.map(|row| mesh.texcoords[row as usize]))
+}
+
+const OBJ: &str = "mtllib my materials.mtl\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 0 0 1\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n\
+                   usemtl cloth\nf 1/1 2/2 3/3 4/4\nusemtl skin\nf -5//  -4// -1//\n";
+
+#[test]
+fn obj_with_several_materials_polygons_and_a_texture_in_a_travelled_path() {
+    let folder = Folder::new();
+    folder.file("cloth 1.png", png());
+    folder.file(
+        "my materials.mtl",
+        "newmtl skin\nKd 0.5 0.25 1\nnewmtl cloth\nKd 0 0 0\nmap_Kd -s 1 1 1 C:\\scans\\cloth 1.png\n",
+    );
+    let obj = OBJ.replace("f -5//  -4// -1//", "f -5 -4 -1");
+    let mesh = read(&folder.file("a b.obj", obj)).expect("reads");
+    let [o, x, xy, y, z] = [Vec3::ZERO, Vec3::X, Vec3::new(1.0, 1.0, 0.0), Vec3::Y, Vec3::Z];
+    assert_eq!(corners(&mesh), [[o, x, xy], [o, xy, y], [o, x, z]]);
+    assert_eq!(mesh.positions.len(), 5, "positions shared by two materials stay one");
+    assert_eq!(texcoords(&mesh, 1), Some([Vec2::ZERO, Vec2::ONE, Vec2::Y]));
+    let material = |face: usize| &mesh.materials[mesh.faces[face].material as usize];
+    let texture = material(0).texture.as_ref().expect("has a texture");
+    assert_eq!((texture.dimensions(), texture.get_pixel(0, 1).0), ((2, 2), [0, 0, 255]));
+    assert_eq!(material(0).color, Vec3::ONE, "a texture replaces the colour");
+    assert_eq!(material(2).color, Vec3::new(0.5, 0.25, 1.0));
+    assert!(material(2).texture.is_none());
+}
+
+#[test]
+fn obj_with_vertex_colours() {
+    let folder = Folder::new();
+    let mesh = read(&folder.file("a.obj", "v 0 0 0 255 0 0\nv 1 0 0 0 255 0\nv 0 1 0 0 0 51\nf 1 2 3\n"));
+    assert_eq!(mesh.expect("reads").colors, [Vec3::X, Vec3::Y, 0.2 * Vec3::Z]);
+}
+
+/// A triangle and a quadrilateral, with colours.
+fn ply(format: &str) -> Vec<u8> {
+    let header = format!(
+        "ply\nformat {format} 1.0\ncomment made by hand\nelement vertex 4\nproperty float x\nproperty float y\n\
+         property double z\nproperty uchar red\nproperty uchar green\nproperty uchar blue\nproperty uchar alpha\n\
+         element edge 1\nproperty list uchar int16 ends\nelement face 2\nproperty uchar flags\n\
+         property list uchar int vertex_indices\nend_header\n"
+    );
+    let vertices = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0_f32]];
+    let mut out = header.into_bytes();
+    let big = format.contains("big");
+    let mut push = |bytes: &[u8]| {
+        let mut bytes = bytes.to_vec();
+        if big {
+            bytes.reverse();
+        }
+        out.extend(bytes);
+    };
+    if format == "ascii" {
+        push(b"0 0 0 255 0 0 255\n1 0 0 0 255 0 255\n1 1 0 0 0 255 255\n0 1 0 51 51 51 255\n");
+        push(b"2 0 3\n7 3 0 1 2\n7 4 0 1 2 3\n");
+        return out;
+    }
+    for (i, [x, y, z]) in vertices.into_iter().enumerate() {
+        push(&x.to_le_bytes());
+        push(&y.to_le_bytes());
+        push(&f64::from(z).to_le_bytes());
+        for c in 0..3 {
+            push(&[if i == 3 { 51 } else { 255 * u8::from(c == i) }]);
+        }
+        push(&[255]);
+    }
+    push(&[2]);
+    push(&0_i16.to_le_bytes());
+    push(&3_i16.to_le_bytes());
+    for face in [&[0, 1, 2][..], &[0, 1, 2, 3]] {
+        push(&[7]);
+        push(&[face.len() as u8]);
+        for row in face {
+            push(&i32::to_le_bytes(*row));
+        }
+    }
+    out
+}
+
+#[test]
+fn ply_in_every_format() {
+    let folder = Folder::new();
+    for format in ["ascii", "binary_little_endian", "binary_big_endian"] {
+        let mesh = read(&folder.file("a.ply", ply(format))).unwrap_or_else(|e| panic!("{format}: {e}"));
+        let [o, x, xy, y] = [Vec3::ZERO, Vec3::X, Vec3::new(1.0, 1.0, 0.0), Vec3::Y];
+        assert_eq!(corners(&mesh), [[o, x, xy], [o, x, xy], [o, xy, y]], "{format}");
+        assert_eq!(mesh.colors, [Vec3::X, Vec3::Y, Vec3::Z, Vec3::splat(0.2)], "{format}");
+    }
+}
+
+#[test]
+fn ply_with_a_texture_per_corner_and_per_vertex() {
+    let folder = Folder::new();
+    folder.file("skin.png", png());
+    let start = "ply\nformat ascii 1.0\ncomment TextureFile skin.png\nelement vertex 3\nproperty float x\n\
+                 property float y\nproperty float z\n";
+    let faces = "element face 1\nproperty list uchar uint vertex_index\n";
+    let per_corner = format!(
+        "{start}{faces}property list uchar float texcoord\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2 6 0 0 1 0 0 1\n"
+    );
+    let per_vertex = format!(
+        "{start}property float s\nproperty float t\n{faces}end_header\n0 0 0 0 0\n1 0 0 1 0\n0 1 0 0 1\n3 0 1 2\n"
+    );
+    for text in [per_corner, per_vertex] {
+        let mesh = read(&folder.file("a.ply", text)).expect("reads");
+        assert_eq!(texcoords(&mesh, 0), Some([Vec2::ZERO, Vec2::X, Vec2::Y]));
+        assert!(mesh.materials[0].texture.is_some());
+    }
+}
+
+/// A GLB with one textured triangle in a node that is moved by (0, 0, 5); `change` edits the JSON.
+fn glb(change: impl FnOnce(String) -> String) -> Vec<u8> {
+    let mut binary = Vec::new();
+    for value in [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0, 0.0_f32] {
+        binary.extend(value.to_le_bytes());
+    }
+    for row in [0_u16, 1, 2, 0] {
+        binary.extend(row.to_le_bytes());
+    }
+    let picture = png();
+    let (at, length) = (binary.len(), picture.len());
+    binary.extend(picture);
+    binary.resize(binary.len().next_multiple_of(4), 0);
+    let json = format!(
+        r#"{{"asset":{{"version":"2.0"}},"scene":0,"scenes":[{{"nodes":[0]}}],
+        "nodes":[{{"children":[1],"translation":[0,0,4]}},{{"mesh":0,"translation":[0,0,1]}}],
+        "meshes":[{{"primitives":[{{"attributes":{{"POSITION":0,"TEXCOORD_0":1}},"indices":2,"material":0}}]}}],
+        "materials":[{{"pbrMetallicRoughness":{{"baseColorTexture":{{"index":0}}}}}}],
+        "textures":[{{"source":0}}],"images":[{{"bufferView":3,"mimeType":"image/png"}}],
+        "accessors":[{{"bufferView":0,"componentType":5126,"count":3,"type":"VEC3","min":[0,0,0],"max":[1,1,0]}},
+        {{"bufferView":1,"componentType":5126,"count":3,"type":"VEC2"}},
+        {{"bufferView":2,"componentType":5123,"count":3,"type":"SCALAR"}}],
+        "bufferViews":[{{"buffer":0,"byteOffset":0,"byteLength":36}},{{"buffer":0,"byteOffset":36,"byteLength":24}},
+        {{"buffer":0,"byteOffset":60,"byteLength":6}},{{"buffer":0,"byteOffset":{at},"byteLength":{length}}}],
+        "buffers":[{{"byteLength":{}}}]}}"#,
+        binary.len()
+    );
+    let mut json = change(json).into_bytes();
+    json.resize(json.len().next_multiple_of(4), b' ');
+    let mut out = b"glTF".to_vec();
+    out.extend(2_u32.to_le_bytes());
+    out.extend((28 + json.len() as u32 + binary.len() as u32).to_le_bytes());
+    for (kind, chunk) in [(b"JSON", &json), (b"BIN\0", &binary)] {
+        out.extend((chunk.len() as u32).to_le_bytes());
+        out.extend(kind);
+        out.extend(chunk);
+    }
+    out
+}
+
+#[test]
+fn glb_with_nested_nodes_and_a_texture() {
+    let folder = Folder::new();
+    let mesh = read(&folder.file("a.GLB", glb(|json| json))).expect("reads");
+    assert_eq!(corners(&mesh), [[Vec3::ZERO, Vec3::X, Vec3::Y].map(|p| p + 5.0 * Vec3::Z)]);
+    // glTF counts texture rows from the top: (0, 1), (1, 1), (0, 0) are our (0, 0), (1, 0), (0, 1).
+    assert_eq!(texcoords(&mesh, 0), Some([Vec2::ZERO, Vec2::X, Vec2::Y]));
+    assert!(mesh.materials[mesh.faces[0].material as usize].texture.is_some());
+    let mirrored = glb(|json| json.replace("\"translation\":[0,0,4]", "\"scale\":[-1,1,1]"));
+    let mesh = read(&folder.file("b.glb", mirrored)).expect("reads");
+    assert!(mesh.normals()[0].z > 0.9, "a mirrored node keeps its outside out: {:?}", mesh.normals());
+}
+
+/// The head of a PNG that promises 100,000 × 100,000 pixels.
+fn absurd_png() -> Vec<u8> {
+    let mut bytes = png();
+    bytes[16..20].copy_from_slice(&100_000_u32.to_be_bytes());
+    bytes[20..24].copy_from_slice(&100_000_u32.to_be_bytes());
+    // CRC-32 of the header chunk.
+    let mut crc = !0_u32;
+    for byte in &bytes[12..29] {
+        crc ^= u32::from(*byte);
+        for _ in 0..8 {
+            crc = if crc & 1 == 1 { (crc >> 1) ^ 0xedb8_8320 } else { crc >> 1 };
+        }
+    }
+    bytes[29..33].copy_from_slice(&(!crc).to_be_bytes());
+    bytes
+}
+
+/// Corrupt scans, each with the words that its error must hold. The memory that they cost is measured by the suite of the
+/// command line.
+#[test]
+fn corrupt_scans_are_refused_by_name() {
+    let folder = Folder::new();
+    folder.file("absurd.png", absurd_png());
+    folder.file("absurd.mtl", "newmtl a\nmap_Kd absurd.png\n");
+    folder.file("color.mtl", "newmtl a\nKd 1 1\n");
+    folder.file("known.mtl", "newmtl ä\nKd 1 1 1\n");
+    folder.file("absent.mtl", "newmtl a\nmap_Kd absent.png\n");
+    let billion = |format: &str| {
+        format!(
+            "ply\nformat {format} 1.0\nelement vertex 1000000000\nproperty float x\nproperty float y\nproperty float z\n\
+             element face 1000000000\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n"
+        )
+    };
+    let triangle = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n";
+    let binary = ply("binary_little_endian");
+    let table: Vec<(&str, Vec<u8>, &str)> = vec![
+        ("empty.obj", b"".into(), "there is no triangle"),
+        ("truncated.obj", b"v 0 0 0\nv 1 0 0\nv 0 1".into(), "line 3: position parse error"),
+        ("truncated-face.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 -".into(), "line 4: face parse error"),
+        ("points.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n".into(), "there is no triangle"),
+        ("nan.obj", triangle.replace("1 0 0", "1 nan 0").into(), "position 1 is not finite"),
+        ("huge.obj", triangle.replace("1 0 0", "1 1e39 0").into(), "position 1 is not finite"),
+        ("range.obj", triangle.replace("f 1 2 3", "f 1 2 9").into(), "face vertex index out of bounds"),
+        ("line.obj", vec![b'v'; 5 << 20], "line 1: read error"),
+        ("bytes.obj", vec![0xff; 1000], "there is no triangle"),
+        ("color.obj", format!("mtllib color.mtl\n{triangle}").into(), "color.mtl: line 2, `Kd 1 1`: no colour"),
+        ("unknown.obj", format!("mtllib known.mtl\nusemtl zzz\n{triangle}").into(), "material `zzz` is missing"),
+        ("faces.ply", b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\nproperty float z\nelement face 1000000000000000\nend_header\n".into(), "no list `vertex_indices`"),
+        ("mtl.obj", format!("mtllib no.mtl\n{triangle}").into(), "material file `no.mtl` is missing"),
+        ("texture.obj", format!("mtllib absent.mtl\n{triangle}").into(), "texture `absent.png` is missing"),
+        ("absurd.obj", format!("mtllib absurd.mtl\n{triangle}").into(), "is 100000×100000, more than"),
+        ("ascii.ply", billion("ascii").into(), "vertex 1 of 1000000000: `x` is missing"),
+        ("binary.ply", billion("binary_big_endian").into(), "of 1000000000: `y` is missing"),
+        ("cut.ply", binary[..binary.len() - 3].into(), "face 1 of 2: `vertex_indices` is missing"),
+        ("foreign.ply", b"plyx".into(), "not a PLY file"),
+        (
+            "gaussians.ply",
+            b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n".into(),
+            "no properties `x`, `y`, `z`",
+        ),
+        ("cut.glb", glb(|json| json)[..600].into(), "is no valid GLB"),
+        ("text.glb", b"not a GLB".into(), "is no valid GLB"),
+        (
+            "accessor.glb",
+            glb(|json| json.replacen("\"count\":3", "\"count\":1000000000", 1)),
+            "promises 1000000000 entries",
+        ),
+        ("zero.glb", glb(|json| json.replacen("\"count\":3", "\"count\":0", 1)), "accessor 0"),
+        ("indices.glb", glb(|json| json.replace("5123", "5126")), "accessor 2"),
+        ("loop.glb", glb(|json| json.replace("\"mesh\":0,", "\"mesh\":0,\"children\":[0],")), "loop"),
+        (
+            "picture.glb",
+            glb(|json| json.replace("\"bufferView\":3", "\"bufferView\":0")),
+            "not a readable image",
+        ),
+        ("scan.stl", b"solid".into(), "expected a file .obj, .ply or .glb"),
+    ];
+    for (name, content, expected) in table {
+        let path = folder.file(name, content);
+        let error = read(&path).map(|mesh| mesh.faces.len()).expect_err(name).to_string();
+        assert!(error.contains(expected), "{name}: {error}");
+        assert!(error.starts_with(&folder.0.path().display().to_string()), "{name}: {error}");
+    }
+    assert!(read(Path::new("/no/such.obj")).expect_err("missing").to_string().contains("cannot read"));
+}

@@ -1,0 +1,155 @@
+//! Operators that Burn's CPU backends do slowly. Each is one function with two roads: kernels of our own on Burn's `flex`
+//! device where nothing is tracked for gradients, and plain tensor code on every other device and in training. Tests hold
+//! the two together.
+
+mod attention;
+pub mod conv;
+mod gelu;
+mod math;
+mod resize;
+mod rope;
+mod winograd;
+
+#[cfg(test)]
+mod tests;
+
+use burn::nn::Linear;
+use burn::nn::conv::Conv2d;
+use burn::tensor::activation::{gelu, relu};
+use burn::tensor::module::{attention, interpolate};
+use burn::tensor::ops::{InterpolateMode, InterpolateOptions};
+use burn::tensor::{Device, Tensor, TensorData};
+
+pub use rope::Rope;
+
+/// Whether `x` lives where this crate's own kernels apply: on `flex`, with nothing tracked for gradients.
+pub fn is_fast<const D: usize>(x: &Tensor<D>) -> bool {
+    let device = x.device();
+    !device.is_autodiff() && device == Device::flex()
+}
+
+/// softmax(rope(q) · rope(k)ᵀ / √head_dim) · v, heads side by side in the channels: `q` `[B, N, C]`, `k` and `v`
+/// `[B, M, C]` → `[B, N, C]`; both sides share one grid, hence one table.
+pub fn rotary_attention(q: Tensor<3>, k: Tensor<3>, v: Tensor<3>, rope: &Rope, heads: usize) -> Tensor<3> {
+    if !is_fast(&q) {
+        return plain_attention(q, k, v, rope, heads);
+    }
+    let ([b, n, c], m, device) = (q.dims(), k.dims()[1], q.device());
+    let (cos, sin) = (host(rope.cos.clone()), host(rope.sin.clone()));
+    let shape = attention::Shape { batch: b, queries: n, keys: m, heads, head_dim: c / heads };
+    let out = attention::attend(&shape, &host(q), &host(k), &host(v), [&cos, &sin]);
+    Tensor::from_data(TensorData::new(out, [b, n, c]), &device)
+}
+
+fn plain_attention(q: Tensor<3>, k: Tensor<3>, v: Tensor<3>, rope: &Rope, heads: usize) -> Tensor<3> {
+    let [b, n, c] = q.dims();
+    let split = |x: Tensor<3>| {
+        let tokens = x.dims()[1];
+        x.reshape([b, tokens, heads, c / heads]).swap_dims(1, 2)
+    };
+    let (q, k) = (rope.apply(split(q)), rope.apply(split(k)));
+    let out = attention(q, k, split(v), None, None, Default::default());
+    out.swap_dims(1, 2).reshape([b, n, c])
+}
+
+/// GELU (erf form) of a linear layer: `[B, N, C]` → `[B, N, D]`.
+pub fn linear_gelu(layer: &Linear, x: Tensor<3>) -> Tensor<3> {
+    if !is_fast(&x) {
+        return gelu(layer.forward(x));
+    }
+    let ([b, n, c], device) = (x.dims(), x.device());
+    let weight = layer.weight.val();
+    let width = weight.dims()[1];
+    let mut values = host(x.reshape([b * n, c]).matmul(weight));
+    let bias = layer.bias.as_ref().map_or_else(|| vec![0.0; width], |bias| host(bias.val()));
+    gelu::bias_gelu(&mut values, &bias);
+    Tensor::from_data(TensorData::new(values, [b, n, width]), &device)
+}
+
+/// Bilinear resize of `[B, C, H, W]` to `size` (rows, columns).
+///
+/// `align_corners`: the outermost samples coincide (inside the DPT head); otherwise pixel areas do (everything else).
+/// Check values (SNAPSNAP §13.4): [0, 1] → [0, ⅓, ⅔, 1] and [0, ¼, ¾, 1].
+pub fn bilinear(x: Tensor<4>, size: [usize; 2], align_corners: bool) -> Tensor<4> {
+    let ([b, c, h, w], device) = (x.dims(), x.device());
+    let [down, across] = [(h, size[0]), (w, size[1])].map(|(from, to)| resize::taps(from, to, align_corners));
+    if device.is_autodiff() {
+        // Burn's own operator has no backward pass on GPUs; products with constant matrices have.
+        let matrix = |taps: &[resize::Tap], from: usize| {
+            let data = TensorData::new(resize::matrix(taps, from), [taps.len(), from]);
+            Tensor::<2>::from_data(data, &device)
+        };
+        return matrix(&down, h).unsqueeze().matmul(x).matmul(matrix(&across, w).transpose().unsqueeze());
+    }
+    if is_fast(&x) {
+        let out = resize::resize(&host(x), [h, w], &down, &across);
+        return Tensor::from_data(TensorData::new(out, [b, c, size[0], size[1]]), &device);
+    }
+    let options = InterpolateOptions::new(InterpolateMode::Bilinear).with_align_corners(align_corners);
+    interpolate(x, options.with_output_size(size))
+}
+
+/// A 3×3 convolution with stride 1 and padding 1 of `[B, C, H, W]`, or of its positive part; on `flex` with even sides
+/// by Winograd's method, elsewhere by Burn's.
+pub fn conv3x3(conv: &Conv2d, x: Tensor<4>, rectified: bool) -> Tensor<4> {
+    let [batch, inputs, height, width] = x.dims();
+    if !is_fast(&x) || height % 2 != 0 || width % 2 != 0 {
+        return conv.forward(if rectified { relu(x) } else { x });
+    }
+    let device = x.device();
+    let weight = conv.weight.val();
+    let outputs = weight.dims()[0];
+    let bias = conv.bias.as_ref().map_or_else(|| vec![0.0; outputs], |bias| host(bias.val()));
+    let shape = winograd::Shape { batch, inputs, outputs, height, width };
+    let out = winograd::conv3x3(shape, &host(x), &host(weight), &bias, rectified);
+    Tensor::from_data(TensorData::new(out, [batch, outputs, height, width]), &device)
+}
+
+/// Values on the host; without a copy if the tensor is contiguous and nobody else holds it.
+///
+/// # Panics
+/// If the values are not f32.
+pub fn host<const D: usize>(x: Tensor<D>) -> Vec<f32> {
+    x.into_data().try_into_vec().expect("all tensors here are f32")
+}
+
+/// out `[m, n]` row-major = lhs `[m, k]` · rhs `[k, n]`; strides are (column, row) in elements.
+fn multiply(
+    [m, n, k]: [usize; 3],
+    lhs: &[f32],
+    ls: [usize; 2],
+    rhs: &[f32],
+    rs: [usize; 2],
+    out: &mut [f32],
+) {
+    let last =
+        |rows: usize, columns: usize, [column, row]: [usize; 2]| (rows - 1) * row + (columns - 1) * column;
+    assert!(m > 0 && n > 0 && k > 0);
+    assert!(last(m, k, ls) < lhs.len() && last(k, n, rs) < rhs.len() && m * n <= out.len());
+    let s = |x: usize| x as isize;
+    // SAFETY: the assertions above bound every element that the strides reach; `out` is borrowed mutably.
+    #[allow(unsafe_code, reason = "the matrix product of the gemm crate takes pointers")]
+    unsafe {
+        gemm::gemm(
+            m,
+            n,
+            k,
+            out.as_mut_ptr(),
+            1,
+            s(n),
+            false,
+            lhs.as_ptr(),
+            s(ls[0]),
+            s(ls[1]),
+            rhs.as_ptr(),
+            s(rs[0]),
+            s(rs[1]),
+            0.0,
+            1.0,
+            false,
+            false,
+            false,
+            gemm::Parallelism::None,
+        );
+    }
+}

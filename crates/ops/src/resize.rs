@@ -1,0 +1,63 @@
+//! Bilinear resize of planes: every input row is stretched once, every output row blends two stretched ones.
+
+use rayon::prelude::*;
+
+/// Where the samples of one target position are: lower index, upper index, weight of the upper.
+pub type Tap = (usize, usize, f32);
+
+/// Samples and weights of every target position along one axis.
+pub fn taps(from: usize, to: usize, align_corners: bool) -> Vec<Tap> {
+    let position = |i: usize| match align_corners {
+        true if to > 1 => i as f64 * (from - 1) as f64 / (to - 1) as f64,
+        true => 0.0,
+        false => ((i as f64 + 0.5) * from as f64 / to as f64 - 0.5).clamp(0.0, (from - 1) as f64),
+    };
+    let tap = |at: f64| {
+        let low = (at as usize).min(from - 1);
+        (low, (low + 1).min(from - 1), (at - low as f64) as f32)
+    };
+    (0..to).map(position).map(tap).collect()
+}
+
+/// The same as a matrix `[taps.len(), from]`, row-major.
+pub fn matrix(taps: &[Tap], from: usize) -> Vec<f32> {
+    let mut values = vec![0.0_f32; taps.len() * from];
+    for (row, &(low, high, weight)) in values.chunks_exact_mut(from).zip(taps) {
+        row[low] += 1.0 - weight;
+        row[high] += weight;
+    }
+    values
+}
+
+/// Planes `[count, rows, columns]` → `[count, down.len(), across.len()]`.
+pub fn resize(planes: &[f32], [rows, columns]: [usize; 2], down: &[Tap], across: &[Tap]) -> Vec<f32> {
+    let count = planes.len() / (rows * columns);
+    let mut out = vec![0.0_f32; count * down.len() * across.len()];
+    out.par_chunks_mut(down.len() * across.len()).zip(planes.par_chunks(rows * columns)).for_each(
+        |(out, plane)| {
+            // The two stretched rows in use, and which they are.
+            let mut held = [usize::MAX; 2];
+            let mut stretched = [vec![0.0; across.len()], vec![0.0; across.len()]];
+            for (out, &(low, high, weight)) in out.chunks_exact_mut(across.len()).zip(down) {
+                for row in [low, high] {
+                    // Neighbouring rows differ in parity, so they never share a slot.
+                    if held[row % 2] != row {
+                        held[row % 2] = row;
+                        stretch(&plane[row * columns..(row + 1) * columns], across, &mut stretched[row % 2]);
+                    }
+                }
+                let (a, b) = (&stretched[low % 2], &stretched[high % 2]);
+                for ((out, a), b) in out.iter_mut().zip(a).zip(b) {
+                    *out = a + (b - a) * weight;
+                }
+            }
+        },
+    );
+    out
+}
+
+fn stretch(row: &[f32], across: &[Tap], out: &mut [f32]) {
+    for (out, &(low, high, weight)) in out.iter_mut().zip(across) {
+        *out = row[low] + (row[high] - row[low]) * weight;
+    }
+}

@@ -1,0 +1,56 @@
+//! Rotary position embedding in two dimensions (SNAPSNAP §1.3): the first half of a head's channels is turned by the
+//! token's row, the second half by its column.
+
+use burn::tensor::{Device, Tensor, TensorData};
+
+/// Cosines and sines of every token's rotation angles, for one grid and one head size.
+#[derive(Debug, Clone)]
+pub struct Rope {
+    /// `[N, head_dim]`: cos θ for both members of each rotated pair.
+    pub cos: Tensor<2>,
+    /// `[N, head_dim]`: −sin θ for the first member of each pair, +sin θ for the second.
+    pub sin: Tensor<2>,
+}
+
+impl Rope {
+    /// Tables for a grid of `rows` × `columns` tokens, row-major, with `head_dim` channels per head (a multiple of 4).
+    ///
+    /// The angles are computed in f64: token positions reach the hundreds on large canvases.
+    pub fn new(rows: usize, columns: usize, head_dim: usize, base: f64, device: &Device) -> Self {
+        Self::with_origin([0, 0], rows, columns, head_dim, base, device)
+    }
+
+    /// As [`Rope::new`], with the first token at `origin` (row, column) instead of (0, 0).
+    pub fn with_origin(
+        origin: [usize; 2],
+        rows: usize,
+        columns: usize,
+        head_dim: usize,
+        base: f64,
+        device: &Device,
+    ) -> Self {
+        assert_eq!(head_dim % 4, 0, "head_dim {head_dim} must be a multiple of 4");
+        let pairs = head_dim / 4;
+        let (mut cos, mut sin) = (Vec::new(), Vec::new());
+        for token in 0..rows * columns {
+            for position in [origin[0] + token / columns, origin[1] + token % columns] {
+                let angles = (0..pairs).map(|k| position as f64 * base.powf(-(k as f64) / pairs as f64));
+                let (s, c): (Vec<f32>, Vec<f32>) =
+                    angles.map(f64::sin_cos).map(|(s, c)| (s as f32, c as f32)).unzip();
+                cos.extend(c.iter().chain(&c));
+                sin.extend(s.iter().map(|v| -v));
+                sin.extend(s);
+            }
+        }
+        let tensor = |values| Tensor::from_data(TensorData::new(values, [rows * columns, head_dim]), device);
+        Self { cos: tensor(cos), sin: tensor(sin) }
+    }
+
+    /// Rotates queries or keys `[B, heads, N, head_dim]`.
+    pub fn apply(&self, x: Tensor<4>) -> Tensor<4> {
+        let [b, h, n, d] = x.dims();
+        // Each half (row, column) holds pairs k and k + d/4; swapping the members gives the sine's factor.
+        let swapped = x.clone().reshape([b * h * n, 2, 2, d / 4]).flip([2]).reshape([b, h, n, d]);
+        x * self.cos.clone().unsqueeze() + swapped * self.sin.clone().unsqueeze()
+    }
+}

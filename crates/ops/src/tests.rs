@@ -1,0 +1,68 @@
+//! The fast roads against the plain tensor code, at sizes that reach their corners: blocks that do not divide, widths
+//! below a register block, strides, groups of several channels.
+
+use burn::module::Param;
+use burn::nn::conv::Conv2dConfig;
+use burn::nn::{LinearConfig, PaddingConfig2d};
+use burn::tensor::activation::{gelu, relu};
+use burn::tensor::{Device, Tensor, TensorData};
+use rand::{RngCore, SeedableRng};
+
+use super::Rope;
+
+/// Uniform in ±1; the same numbers on every run.
+fn random<const D: usize>(shape: [usize; D], seed: u64) -> Tensor<D> {
+    let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
+    let values = (0..shape.iter().product()).map(|_| random.next_u32() as f32 / u32::MAX as f32 * 2.0 - 1.0);
+    Tensor::from_data(TensorData::new(values.collect::<Vec<f32>>(), shape), &Device::flex())
+}
+
+/// Relative L2 error; both roads are f32, whose rounding over some hundred terms stays below a few 1e-6.
+fn assert_equal<const D: usize>(what: &str, got: Tensor<D>, expected: Tensor<D>) {
+    assert_eq!(got.dims(), expected.dims(), "{what}");
+    let norm = |x: Tensor<D>| x.square().sum().sqrt().into_scalar::<f32>();
+    let error = norm(got - expected.clone()) / norm(expected);
+    println!("{what}: {error:e}");
+    assert!(error < 5e-6, "{what}: {error:e}");
+}
+
+#[test]
+fn winograd_equals_direct_convolution() {
+    for [batch, inputs, outputs, height, width] in
+        [[2, 5, 7, 2, 2], [1, 3, 4, 10, 34], [3, 16, 16, 6, 8], [1, 200, 70, 6, 300], [1, 64, 96, 64, 20]]
+    {
+        let mut conv = Conv2dConfig::new([inputs, outputs], [3, 3])
+            .with_padding(PaddingConfig2d::Explicit(1, 1, 1, 1))
+            .init(&Device::flex());
+        conv.weight = Param::from_tensor(random([outputs, inputs, 3, 3], 1));
+        conv.bias = Some(Param::from_tensor(random([outputs], 2)));
+        let x = random([batch, inputs, height, width], 3);
+        let what = format!("{batch}×{inputs}→{outputs} at {height}×{width}");
+        assert_equal(&what, super::conv3x3(&conv, x.clone(), false), conv.forward(x.clone()));
+        assert_equal(
+            &format!("{what}, rectified"),
+            super::conv3x3(&conv, x.clone(), true),
+            conv.forward(relu(x)),
+        );
+    }
+}
+
+#[test]
+fn rotary_attention_equals_its_composition() {
+    for (rows, columns, heads, head_dim) in [(2, 3, 2, 4), (13, 11, 3, 16), (16, 17, 1, 64)] {
+        let (n, dim) = (rows * columns, heads * head_dim);
+        let rope = Rope::new(rows, columns, head_dim, 100.0, &Device::flex());
+        let [q, k, v] = [1, 2, 3].map(|seed| random([2, n, dim], seed));
+        let expected = super::plain_attention(q.clone(), k.clone(), v.clone(), &rope, heads);
+        assert_equal(&format!("{n} tokens"), super::rotary_attention(q, k, v, &rope, heads), expected);
+    }
+}
+
+#[test]
+fn linear_gelu_equals_its_composition() {
+    let mut layer = LinearConfig::new(20, 37).init(&Device::flex());
+    layer.weight = Param::from_tensor(random([20, 37], 1));
+    layer.bias = Some(Param::from_tensor(random([37], 2)));
+    let x = random([2, 19, 20], 3);
+    assert_equal("gelu", super::linear_gelu(&layer, x.clone()), gelu(layer.forward(x)));
+}

@@ -1,0 +1,7 @@
+//! Makes people to train on: of simple shapes ([`synth`]), and of MakeHuman's data ([`makehuman`]).
+
+pub mod makehuman;
+mod math;
+mod pattern;
+pub mod random;
+pub mod synth;

@@ -1,0 +1,300 @@
+//! The layers of a MakeHuman person: skin, clothes cut from the base mesh's helper surfaces, hair.
+
+use std::num::NonZeroUsize;
+
+use glam::{Vec2, Vec3};
+use kiddo::SquaredEuclidean;
+
+use super::net::{Net, PARTS, Vertex, coordinates, tree};
+use super::{ORDER, Person, Piece};
+use crate::math::{noise, smoothstep};
+use crate::synth::body::Body;
+use crate::synth::outfit::Lower;
+use crate::synth::part::{Kind, neckline};
+use crate::synth::surface::{self, Surface};
+
+/// Metres that skin stays below cloth.
+const GAP: f32 = 0.004;
+/// Beyond this, how far inside a garment a place is does not matter.
+const FAR: f32 = 0.08;
+/// Side of the cells that hair is meshed with, metres.
+const HAIR_CELL: f32 = 0.006;
+/// Cloth within so many metres of a place in the resting pose is what lies over it.
+const OVER: f32 = 0.02;
+/// Vertices of cloth around a place among which one of those is looked for.
+const AROUND: NonZeroUsize = NonZeroUsize::new(16).expect("not zero");
+
+impl Person<'_> {
+    /// The mean over the parts that a vertex belongs to of what `depth` says of its place on each chart, by kind, angle,
+    /// metres along, and the chart's length: so that edges run smoothly from part to part.
+    fn blend(&self, vertex: &Vertex, depth: impl Fn(Kind, f32, f32, f32) -> f32) -> f32 {
+        let (mut sum, mut shares) = (0.0, 0.0);
+        for (part, share) in vertex.parts.iter().enumerate().filter(|(_, share)| **share > 0.0) {
+            let chart = &self.body.parts[self.rows[part]];
+            let (angle, along) = chart.chart(vertex.rest);
+            sum += share * depth(ORDER[part].0, angle, along, chart.length).clamp(-FAR, FAR);
+            shares += share;
+        }
+        if shares > 0.0 { sum / shares } else { -FAR }
+    }
+
+    /// Metres inside the top's edges; negative outside.
+    pub fn in_top(&self, vertex: &Vertex) -> f32 {
+        self.blend(vertex, |kind, angle, along, length| match kind {
+            Kind::Trunk => {
+                let collar = self.marks.collar - neckline(self.marks.neckline, angle);
+                (along - self.marks.hem).min(collar - along)
+            }
+            Kind::Arm => self.outfit.sleeve * length - along,
+            _ => -FAR,
+        })
+    }
+
+    /// Metres inside the edges of trousers, or of a skirt's lining on the trunk.
+    pub fn in_bottom(&self, vertex: &Vertex) -> f32 {
+        // Under a top only as far as it may ride up.
+        let band = self.marks.waistband.min(self.marks.hem + 0.06);
+        self.blend(vertex, |kind, _, along, length| match (kind, self.outfit.lower) {
+            (Kind::Trunk, _) => band - along,
+            (Kind::Leg, Lower::Trousers { length: share, .. }) => share * length - along,
+            // Shorts under a skirt.
+            (Kind::Leg, Lower::Skirt { .. }) => 0.05 - along,
+            _ => -FAR,
+        })
+    }
+
+    pub fn in_shoes(&self, vertex: &Vertex) -> f32 {
+        self.blend(vertex, |kind, _, along, length| {
+            let shaft = (self.outfit.boots * length).max(0.025);
+            match kind {
+                Kind::Foot => FAR,
+                Kind::Leg => along - (length - shaft),
+                _ => -FAR,
+            }
+        })
+    }
+
+    /// A piece of the base mesh, whose vertices lie on their own parts.
+    fn own(&self, net: Net) -> Piece {
+        let parts = net.vertices.iter().map(|vertex| self.rows[vertex.part()] as u8).collect();
+        Piece { net, parts }
+    }
+
+    pub fn skin(&self) -> Piece {
+        self.own(self.group("body").subdivide())
+    }
+
+    /// Skin as cloth leaves it: what is under a garment lies on its inner side.
+    pub fn pressed_skin(&self, mut skin: Piece, garments: &[Piece]) -> Piece {
+        let depth =
+            |vertex: &Vertex| self.in_top(vertex).max(self.in_bottom(vertex)).max(self.in_shoes(vertex));
+        let depths: Vec<f32> = skin.net.vertices.iter().map(depth).collect();
+        for garment in garments {
+            press_in(&mut skin.net, &depths, &garment.net, GAP);
+        }
+        skin
+    }
+
+    /// A layer of cloth over the body: the part of the tights that is `inside`, `thick` metres off. Its cloth lies on the
+    /// charts of `kinds`, also where it reaches a little beyond them.
+    fn layer(
+        &self,
+        kinds: &[Kind],
+        inside: impl Fn(&Vertex) -> f32,
+        thick: impl Fn(&Vertex) -> f32,
+    ) -> Piece {
+        let mut net = self.tights.clone();
+        net.inflate(thick);
+        let net = net.cut(inside);
+        let own = |vertex: &Vertex| {
+            let parts = (0..PARTS).filter(|part| kinds.contains(&ORDER[*part].0));
+            let most = parts.max_by(|a, b| vertex.parts[*a].total_cmp(&vertex.parts[*b]));
+            self.rows[most.unwrap_or(0)] as u8
+        };
+        let parts = net.vertices.iter().map(own).collect();
+        Piece { net, parts }
+    }
+
+    fn folds(&self, vertex: &Vertex) -> f32 {
+        let p = vertex.rest;
+        self.outfit.folds * noise(Vec3::new(p.x * 24.0, p.y * 30.0, p.z * 24.0), self.outfit.seed)
+    }
+
+    /// Metres that trousers stand off the body.
+    fn off_bottom(&self, vertex: &Vertex) -> f32 {
+        let (kind, _, along, length) = self.place(vertex);
+        let flare = match (kind, self.outfit.lower) {
+            (Kind::Leg, Lower::Trousers { flare, .. }) => {
+                let down = (along / length).clamp(0.0, 1.0);
+                flare * down * down
+            }
+            _ => 0.0,
+        };
+        0.001 + 0.5 * self.outfit.lower_thickness + flare + self.folds(vertex)
+    }
+
+    pub fn top(&self) -> Piece {
+        self.layer(
+            &[Kind::Trunk, Kind::Arm],
+            |vertex| self.in_top(vertex),
+            |vertex| {
+                let (kind, angle, along, length) = self.place(vertex);
+                let share = (along / (self.outfit.sleeve * length).max(0.05)).clamp(0.0, 1.0);
+                let flare = if kind == Kind::Arm { self.outfit.sleeve_flare * share * share } else { 0.0 };
+                // Collars lie close to the neck.
+                let loose = if kind == Kind::Trunk {
+                    let collar = self.marks.collar - neckline(self.marks.neckline, angle);
+                    1.0 - smoothstep(collar - 0.09, collar - 0.02, along)
+                } else {
+                    1.0
+                };
+                let off =
+                    0.006 + loose * (0.8 * self.outfit.top_thickness + flare + 1.5 * self.folds(vertex));
+                // It hangs over the trousers.
+                let over = smoothstep(-0.03, 0.0, self.in_bottom(vertex));
+                off.max(over * (self.off_bottom(vertex) + GAP))
+            },
+        )
+    }
+
+    pub fn bottom(&self) -> Piece {
+        self.layer(
+            &[Kind::Trunk, Kind::Leg],
+            |vertex| self.in_bottom(vertex),
+            |vertex| self.off_bottom(vertex),
+        )
+    }
+
+    pub fn shoes(&self) -> Piece {
+        self.layer(
+            &[Kind::Leg, Kind::Foot],
+            |vertex| self.in_shoes(vertex),
+            |vertex| {
+                let (kind, angle, ..) = self.place(vertex);
+                // Soles are thicker.
+                let sole = if kind == Kind::Foot && angle.abs() > 2.2 { 0.008 } else { 0.0 };
+                0.004 + 0.6 * self.outfit.shoe_thickness + sole
+            },
+        )
+    }
+
+    /// Skirts and the tails of coats: row of the part.
+    pub fn drapes(&self) -> impl Iterator<Item = usize> {
+        (0..self.body.parts.len()).filter(|row| self.body.parts[*row].kind == Kind::Skirt)
+    }
+
+    fn in_drape(&self, row: usize, vertex: &Vertex) -> f32 {
+        let part = &self.body.parts[row];
+        let along = part.chart(vertex.rest).1;
+        let band = if part.side == 1 { -1.0 } else { 0.0 };
+        (part.length - along).min(along - band).clamp(-FAR, FAR)
+    }
+
+    /// `under`: what it hangs over, from the inside out.
+    pub fn skirt(&self, row: usize, under: &[&Piece]) -> Piece {
+        let is_coat = self.body.parts[row].side == 1;
+        let mut net = self.group("helper-skirt").subdivide().subdivide();
+        let off = if is_coat { 0.012 } else { 0.004 } + self.outfit.lower_thickness;
+        // Close at the waist, where it is sewn on.
+        let loose = |vertex: &Vertex| smoothstep(0.0, 0.08, self.body.parts[row].chart(vertex.rest).1);
+        let folds = |vertex: &Vertex| {
+            let p = vertex.rest - self.figure.pelvis.start;
+            let angle = libm::atan2f(p.x, p.z);
+            let down = smoothstep(0.0, 0.5, -p.y);
+            0.012 * down * noise(Vec3::new(2.2 * angle, 1.5 * p.y, 0.0), self.outfit.seed)
+        };
+        net.inflate(|vertex| loose(vertex) * off + folds(vertex));
+        let mut net = net.cut(|vertex| self.in_drape(row, vertex));
+        for piece in under {
+            push_out(&mut net, &piece.net, true, |vertex| GAP * (0.5 + 1.5 * loose(vertex)));
+        }
+        let parts = vec![row as u8; net.vertices.len()];
+        Piece { net, parts }
+    }
+
+    /// Hair, meshed around the resting head and carried along by it.
+    pub fn hair(&self, skin: &Piece) -> Option<Piece> {
+        let row = self.body.parts.iter().position(|part| part.kind == Kind::Hair)?;
+        let hair = Body { parts: vec![self.body.parts[row].clone()] };
+        let Surface { positions, faces, .. } = surface::mesh(&hair, HAIR_CELL);
+        let (turn, shift) = self.head;
+        let vertex = |p: &Vec3| Vertex { rest: *p, posed: turn * *p + shift, parts: [0.0; PARTS] };
+        let vertices: Vec<Vertex> = positions.iter().map(vertex).collect();
+        let mut net = Net { vertices, faces: faces.into_iter().map(|f| f.to_vec()).collect() };
+        push_out(&mut net, &skin.net, false, |_| 0.006);
+        // The face stays free: an ellipse around the mouth, up to above the brows.
+        let face = self.landmarks();
+        let head = &self.body.parts[self.rows[1]];
+        let height = (self.figure.head.end - self.figure.head.start).length();
+        let net = net.cut(|vertex| {
+            let (angle, along) = head.chart(vertex.rest);
+            let up = (along / height - face.mouth) / (face.brow + 0.07 - face.mouth);
+            Vec2::new(angle / 1.05, up).length() - 1.0
+        });
+        let parts = vec![row as u8; net.vertices.len()];
+        Some(Piece { net, parts })
+    }
+}
+
+/// Moves vertices that lie inside `solid`, or nearer to it than `gap` metres, out to that distance. With `spans` they move
+/// along their own normals: where what lies below has a fold, cloth goes over it.
+fn push_out(net: &mut Net, solid: &Net, spans: bool, gap: impl Fn(&Vertex) -> f32) {
+    let normals = solid.normals();
+    if solid.vertices.is_empty() {
+        return;
+    }
+    let places = coordinates(net.vertices.iter().map(|vertex| vertex.posed));
+    let tree = tree(solid.vertices.iter().map(|vertex| vertex.posed));
+    let found = tree.query_batch(&places).nearest_one::<SquaredEuclidean<f32>>().execute();
+    // Further inside than this the nearest skin is that of the other side.
+    let deepest = 0.05;
+    let own = net.normals();
+    for ((vertex, found), own) in net.vertices.iter_mut().zip(&found).zip(own) {
+        let nearest = found.item as usize;
+        let (skin, normal) = (solid.vertices[nearest].posed, normals[nearest]);
+        let out = (vertex.posed - skin).dot(normal);
+        let along = if spans { own } else { normal };
+        let (gap, facing) = (gap(vertex), along.dot(normal));
+        if facing > 0.3 && out < gap && out > -deepest && (vertex.posed - skin).length() < deepest {
+            vertex.posed += along * ((gap - out) / facing).min(deepest);
+        }
+    }
+}
+
+/// Moves skin in until it lies `gap` metres below the cloth over it: in the pose cloth of another limb may be nearer, in
+/// the resting pose limbs are apart. `depths`: how deep inside a garment each vertex is.
+fn press_in(skin: &mut Net, depths: &[f32], cloth: &Net, gap: f32) {
+    let normals = cloth.normals();
+    if cloth.vertices.is_empty() {
+        return;
+    }
+    let press = |vertex: &mut Vertex, depth: f32, cloth_row: usize| {
+        let out = (vertex.posed - cloth.vertices[cloth_row].posed).dot(normals[cloth_row]);
+        // At hems skin goes over into what is bare.
+        let gap = gap * smoothstep(0.0, 0.015, depth);
+        vertex.posed -= normals[cloth_row] * (out + gap).clamp(0.0, 0.05);
+    };
+    let covered: Vec<usize> = (0..depths.len()).filter(|row| depths[*row] > 0.0).collect();
+    // First what lies over it in the resting pose, however far away it is now …
+    let places = coordinates(covered.iter().map(|row| skin.vertices[*row].rest));
+    let rest = tree(cloth.vertices.iter().map(|vertex| vertex.rest));
+    let found = rest.query_batch(&places).nearest_one::<SquaredEuclidean<f32>>().execute();
+    for (row, found) in covered.iter().zip(&found).filter(|(_, found)| found.distance < OVER * OVER) {
+        press(&mut skin.vertices[*row], depths[*row], found.item as usize);
+    }
+    // … then what of that is nearest now.
+    let posed = tree(cloth.vertices.iter().map(|vertex| vertex.posed));
+    for _ in 0..2 {
+        let places = coordinates(covered.iter().map(|row| skin.vertices[*row].posed));
+        let found = posed.query_batch(&places).nearest_n::<SquaredEuclidean<f32>>(AROUND).execute();
+        for (row, found) in covered.iter().zip(&found) {
+            let vertex = &mut skin.vertices[*row];
+            let over = found.iter().find(|found| {
+                (cloth.vertices[found.item as usize].rest - vertex.rest).length_squared() < OVER * OVER
+            });
+            if let Some(over) = over {
+                press(vertex, depths[*row], over.item as usize);
+            }
+        }
+    }
+}

@@ -1,0 +1,249 @@
+//! MakeHuman's own files: base mesh, morph targets, rig and skin weights.
+
+use std::collections::HashMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+
+use glam::Vec3;
+use serde::Deserialize;
+use snapsnap_mesh::quoted;
+
+use snapsnap_mesh::FileError;
+
+/// MakeHuman counts in decimetres.
+const METRES: f32 = 0.1;
+/// Largest file that is read; the largest that MakeHuman has takes a few megabytes.
+const MAX_BYTES: u64 = 256 << 20;
+
+/// Largest coordinate, decimetres; a NaN is refused as well.
+const LARGEST: f32 = 1000.0;
+/// What of the base mesh and the rig is used.
+const GROUPS: [&str; 5] = ["body", "helper-tights", "helper-skirt", "helper-l-eye", "helper-r-eye"];
+const BONES: [&str; 5] = ["spine03", "neck01", "head", "jaw", "oris01"];
+const SIDED_BONES: [&str; 9] =
+    ["eye", "upperarm01", "lowerarm01", "wrist", "finger3-3", "upperleg01", "lowerleg01", "foot", "clavicle"];
+
+/// Moves of vertices: row and metres.
+pub type Target = Arc<Vec<(u32, Vec3)>>;
+
+/// A bone: its name, its parent's row, and the vertices whose mean is its head and its tail.
+#[derive(Debug, Clone)]
+pub struct RigBone {
+    pub name: String,
+    pub parent: Option<usize>,
+    pub head: Vec<u32>,
+    pub tail: Vec<u32>,
+}
+
+/// The data of a MakeHuman installation.
+pub struct Library {
+    root: PathBuf,
+    /// Metres.
+    pub positions: Vec<Vec3>,
+    /// Faces of each group; triangles repeat their last corner.
+    pub groups: HashMap<String, Vec<[u32; 4]>>,
+    /// Parents before children.
+    pub bones: Vec<RigBone>,
+    /// Bones that move each vertex, with shares that add up to 1.
+    pub weights: Vec<Vec<(u32, f32)>>,
+    targets: Mutex<HashMap<PathBuf, Target>>,
+}
+
+impl Library {
+    /// Opens `folder`: MakeHuman's `data`, or a checkout that has it.
+    ///
+    /// # Errors
+    /// [`FileError`] naming the file that is missing or damaged.
+    pub fn open(folder: &Path) -> Result<Self, FileError> {
+        let candidates = [folder.to_owned(), folder.join("data"), folder.join("makehuman/data")];
+        let base = Path::new("3dobjs/base.obj");
+        let root = candidates.into_iter().find(|root| root.join(base).is_file()).ok_or_else(|| {
+            let message = "is no MakeHuman data: neither it nor its folder `data` has 3dobjs/base.obj";
+            FileError::unsuitable(folder, message)
+        })?;
+        let (positions, groups) = read_base(&root.join(base))?;
+        let missing = GROUPS.iter().find(|group| !groups.contains_key(**group));
+        if let Some(group) = missing {
+            return Err(FileError::unsuitable(&root.join(base), format!("has no group `{group}`")));
+        }
+        let (bones, weights) = read_rig(&root.join("rigs"), positions.len())?;
+        let sided = SIDED_BONES.iter().flat_map(|name| ["L", "R"].map(|side| format!("{name}.{side}")));
+        let mut needed = BONES.iter().map(|name| (*name).to_owned()).chain(sided);
+        if let Some(bone) = needed.find(|needed| !bones.iter().any(|bone| bone.name == *needed)) {
+            return Err(FileError::unsuitable(
+                &root.join("rigs/default.mhskel"),
+                format!("has no bone `{bone}`"),
+            ));
+        }
+        Ok(Self { root, positions, groups, bones, weights, targets: Mutex::default() })
+    }
+
+    /// The morph target at this path below `targets`, without its ending. Read once.
+    ///
+    /// # Errors
+    /// [`FileError`] if it is missing or damaged.
+    pub fn target(&self, name: &str) -> Result<Target, FileError> {
+        let path = self.root.join("targets").join(format!("{name}.target"));
+        let locked = || self.targets.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(target) = locked().get(&path) {
+            return Ok(target.clone());
+        }
+        let target = Arc::new(read_target(&path, self.positions.len())?);
+        locked().insert(path, target.clone());
+        Ok(target)
+    }
+
+    /// Names of the targets in a folder below `targets`, in order.
+    ///
+    /// # Errors
+    /// [`FileError::Read`] if it is missing.
+    pub fn targets_in(&self, folder: &str) -> Result<Vec<String>, FileError> {
+        let path = self.root.join("targets").join(folder);
+        let mut names = Vec::new();
+        for entry in fs::read_dir(&path).map_err(FileError::read(&path))? {
+            let name = entry.map_err(FileError::read(&path))?.file_name().to_string_lossy().into_owned();
+            names.extend(name.strip_suffix(".target").map(str::to_owned));
+        }
+        names.sort_unstable();
+        Ok(names)
+    }
+}
+
+fn read_text(path: &Path) -> Result<String, FileError> {
+    if fs::metadata(path).map_err(FileError::read(path))?.len() > MAX_BYTES {
+        return Err(FileError::unsuitable(path, "is far too long"));
+    }
+    fs::read_to_string(path).map_err(FileError::read(path))
+}
+
+fn wrong(path: &Path, line: usize, text: &str) -> FileError {
+    FileError::unsuitable(path, format!("line {}, `{}`: not understood", line + 1, quoted(text)))
+}
+
+/// Three finite numbers.
+fn vector<'a>(mut words: impl Iterator<Item = &'a str>) -> Option<Vec3> {
+    let mut next = || words.next()?.parse().ok().filter(|v: &f32| v.abs() < LARGEST);
+    Some(METRES * Vec3::new(next()?, next()?, next()?))
+}
+
+type Base = (Vec<Vec3>, HashMap<String, Vec<[u32; 4]>>);
+
+/// The general importer does not keep the rows of vertices, which targets and weights refer to.
+fn read_base(path: &Path) -> Result<Base, FileError> {
+    let text = read_text(path)?;
+    let mut positions = Vec::new();
+    let mut groups: HashMap<String, Vec<[u32; 4]>> = HashMap::new();
+    let mut group = String::new();
+    for (number, line) in text.lines().enumerate() {
+        let mut words = line.split_ascii_whitespace();
+        match words.next() {
+            Some("v") => positions.push(vector(words).ok_or_else(|| wrong(path, number, line))?),
+            Some("g") => group = words.next().unwrap_or_default().to_owned(),
+            Some("f") => {
+                let row = |word: &str| {
+                    let row: usize = word.split('/').next()?.parse().ok()?;
+                    (1..=positions.len()).contains(&row).then(|| row as u32 - 1)
+                };
+                let rows: Option<Vec<u32>> = words.map(row).collect();
+                let face = match rows.as_deref() {
+                    Some([a, b, c, d]) => [*a, *b, *c, *d],
+                    Some([a, b, c]) => [*a, *b, *c, *c],
+                    _ => return Err(wrong(path, number, line)),
+                };
+                groups.entry(group.clone()).or_default().push(face);
+            }
+            _ => {}
+        }
+    }
+    Ok((positions, groups))
+}
+
+fn read_target(path: &Path, vertices: usize) -> Result<Vec<(u32, Vec3)>, FileError> {
+    let text = read_text(path)?;
+    let mut moves = Vec::new();
+    for (number, line) in text.lines().enumerate() {
+        let mut words = line.split_ascii_whitespace();
+        let Some(first) = words.next().filter(|word| !word.starts_with('#')) else { continue };
+        let row = first.parse().ok().filter(|row: &u32| (*row as usize) < vertices);
+        moves.push(row.zip(vector(words)).ok_or_else(|| wrong(path, number, line))?);
+    }
+    Ok(moves)
+}
+
+#[derive(Deserialize)]
+struct RigFile {
+    bones: HashMap<String, BoneFile>,
+    joints: HashMap<String, Vec<u32>>,
+}
+
+#[derive(Deserialize)]
+struct BoneFile {
+    parent: Option<String>,
+    head: String,
+    tail: String,
+}
+
+#[derive(Deserialize)]
+struct WeightsFile {
+    weights: HashMap<String, Vec<(u32, f32)>>,
+}
+
+type Rig = (Vec<RigBone>, Vec<Vec<(u32, f32)>>);
+
+fn read_rig(folder: &Path, vertices: usize) -> Result<Rig, FileError> {
+    let path = folder.join("default.mhskel");
+    let file: RigFile =
+        serde_json::from_str(&read_text(&path)?).map_err(|e| FileError::unsuitable(&path, e))?;
+    let mut names: Vec<&String> = file.bones.keys().collect();
+    names.sort_unstable();
+    let mut bones: Vec<RigBone> = Vec::new();
+    let mut rows: HashMap<&str, usize> = HashMap::new();
+    // Parents first: each round takes those whose parent was taken.
+    while bones.len() < names.len() {
+        let before = bones.len();
+        for name in &names {
+            let bone = &file.bones[*name];
+            let parent = bone.parent.as_deref().map(|parent| rows.get(parent).copied());
+            if rows.contains_key(name.as_str()) || parent == Some(None) {
+                continue;
+            }
+            let joint = |joint: &String| {
+                let rows = file.joints.get(joint).filter(|rows| !rows.is_empty());
+                rows.filter(|rows| rows.iter().all(|row| (*row as usize) < vertices)).cloned().ok_or_else(
+                    || FileError::unsuitable(&path, format!("joint `{}` is missing or wrong", quoted(joint))),
+                )
+            };
+            rows.insert(name, bones.len());
+            let (head, tail) = (joint(&bone.head)?, joint(&bone.tail)?);
+            bones.push(RigBone { name: (*name).clone(), parent: parent.flatten(), head, tail });
+        }
+        if bones.len() == before {
+            return Err(FileError::unsuitable(&path, "a bone's parent is missing, or bones form a loop"));
+        }
+    }
+
+    let path = folder.join("default_weights.mhw");
+    let file: WeightsFile =
+        serde_json::from_str(&read_text(&path)?).map_err(|e| FileError::unsuitable(&path, e))?;
+    let mut weights: Vec<Vec<(u32, f32)>> = vec![Vec::new(); vertices];
+    let mut names: Vec<&String> = file.weights.keys().collect();
+    names.sort_unstable();
+    for name in names {
+        let unknown = || FileError::unsuitable(&path, format!("bone `{}` is not in the rig", quoted(name)));
+        let bone = *rows.get(name.as_str()).ok_or_else(unknown)? as u32;
+        for (row, weight) in &file.weights[name] {
+            let vertex = weights.get_mut(*row as usize).filter(|_| *weight >= 0.0 && weight.is_finite());
+            let message = || format!("bone `{}` has a wrong weight for vertex {row}", quoted(name));
+            vertex.ok_or_else(|| FileError::unsuitable(&path, message()))?.push((bone, *weight));
+        }
+    }
+    for (row, shares) in weights.iter_mut().enumerate() {
+        let sum: f32 = shares.iter().map(|(_, weight)| weight).sum();
+        if sum <= 0.0 {
+            return Err(FileError::unsuitable(&path, format!("vertex {row} has no weight")));
+        }
+        shares.iter_mut().for_each(|(_, weight)| *weight /= sum);
+    }
+    Ok((bones, weights))
+}

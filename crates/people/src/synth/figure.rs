@@ -1,0 +1,250 @@
+//! Proportions and pose: where the joints of a person are.
+
+use glam::{Mat3, Vec3};
+use rand::Rng;
+
+use crate::math::{rotate_x, rotate_y, rotate_z};
+
+/// Proportions of a body.
+#[derive(Debug, Clone)]
+pub struct Build {
+    /// Stature in metres.
+    pub stature: f32,
+    /// 0: as most women, 1: as most men.
+    pub sex: f32,
+    /// Girth of limbs and trunk, 1 on average.
+    pub girth: f32,
+    /// How far the belly stands out, 0 to 1.
+    pub belly: f32,
+    /// Lengths of legs and arms and breadth of the shoulders, 1 on average.
+    pub legs: f32,
+    pub arms: f32,
+    pub shoulders: f32,
+    /// Size of the head, 1 on average.
+    pub head: f32,
+}
+
+impl Build {
+    pub fn draw(random: &mut impl Rng) -> Self {
+        let sex: f32 = random.random_range(0.0..1.0);
+        let stature = random.random_range(1.52..1.78) + 0.14 * sex;
+        let girth = random.random_range(0.86..1.2);
+        Self {
+            stature,
+            sex,
+            girth,
+            belly: if girth > 1.0 { random.random_range(0.0..1.0) } else { 0.0 },
+            legs: random.random_range(0.95..1.05),
+            arms: random.random_range(0.95..1.05),
+            shoulders: random.random_range(0.94..1.06),
+            head: random.random_range(1.02..1.14),
+        }
+    }
+}
+
+/// Angles in degrees. Arrays hold the left side (towards +x) and the right.
+#[derive(Debug, Clone, Default)]
+pub struct Pose {
+    /// Lean forward, turn and lean aside of the trunk.
+    trunk: [f32; 3],
+    /// Nod, turn and tilt of the head.
+    head: [f32; 3],
+    /// Raised aside, raised forward, turned inwards; bend of the elbow.
+    arms: [[f32; 4]; 2],
+    /// Forward and aside; bend of the knee.
+    legs: [[f32; 3]; 2],
+    /// Curl of the fingers.
+    pub fingers: f32,
+}
+
+impl Pose {
+    pub fn draw(random: &mut impl Rng) -> Self {
+        let mut between = |low: f32, high: f32| random.random_range(low..high);
+        let mut pose = Self {
+            trunk: [between(-4.0, 8.0), between(-10.0, 10.0), between(-4.0, 4.0)],
+            head: [between(-8.0, 14.0), between(-30.0, 30.0), between(-8.0, 8.0)],
+            fingers: between(5.0, 35.0),
+            ..Self::default()
+        };
+        let stance = between(2.0, 10.0);
+        for leg in &mut pose.legs {
+            *leg = [between(-3.0, 6.0), stance + between(-1.0, 1.0), between(0.0, 8.0)];
+        }
+        let kind = between(0.0, 1.0);
+        // Arms down, a little away, up to horizontal; walking; hands on the hips; anything.
+        let swing = if between(0.0, 1.0) < 0.5 { 1.0 } else { -1.0 };
+        for side in 0..2 {
+            let across = if side == 0 { swing } else { -swing };
+            pose.arms[side] = match kind {
+                k if k < 0.3 => {
+                    [between(9.0, 22.0), between(-8.0, 12.0), between(-5.0, 25.0), between(3.0, 25.0)]
+                }
+                k if k < 0.45 => {
+                    [between(25.0, 50.0), between(-8.0, 8.0), between(-10.0, 20.0), between(2.0, 20.0)]
+                }
+                k if k < 0.55 => {
+                    [between(75.0, 92.0), between(-8.0, 8.0), between(-10.0, 20.0), between(0.0, 12.0)]
+                }
+                k if k < 0.75 => {
+                    let stride = between(14.0, 28.0);
+                    pose.legs[side] = if across > 0.0 {
+                        [stride, between(1.0, 4.0), between(2.0, 12.0)]
+                    } else {
+                        [-stride * 0.7, between(1.0, 4.0), between(10.0, 28.0)]
+                    };
+                    [
+                        between(9.0, 14.0),
+                        -across * between(15.0, 32.0),
+                        between(0.0, 15.0),
+                        between(10.0, 40.0),
+                    ]
+                }
+                k if k < 0.88 && (side == 0 || k < 0.82) => {
+                    [between(42.0, 52.0), between(-22.0, -12.0), between(78.0, 95.0), between(88.0, 102.0)]
+                }
+                k if k < 0.88 => {
+                    [between(10.0, 20.0), between(-5.0, 10.0), between(0.0, 20.0), between(5.0, 20.0)]
+                }
+                _ => [between(12.0, 110.0), between(-15.0, 60.0), between(-10.0, 60.0), between(5.0, 95.0)],
+            };
+        }
+        pose
+    }
+}
+
+impl Pose {
+    /// Axes of the trunk, from the pelvis (0) to the shoulders (1).
+    pub fn trunk_frame(&self, share: f32) -> Mat3 {
+        let [lean, turn, aside] = self.trunk;
+        rotate_y((0.3 + 0.4 * share) * turn) * rotate_x((0.3 + 0.7 * share) * lean) * rotate_z(share * aside)
+    }
+
+    /// Axes of neck and head, from the shoulders (0) to the skull (1).
+    pub fn head_frame(&self, share: f32) -> Mat3 {
+        let [nod, look, tilt] = self.head;
+        let upright = nod - 0.5 * self.trunk[0];
+        self.trunk_frame(1.0) * rotate_y(share * look) * rotate_x(share * upright) * rotate_z(share * tilt)
+    }
+
+    /// By how many degrees an arm is lifted beyond where the collarbone begins to move.
+    pub fn lift(&self, side: usize) -> f32 {
+        (self.arms[side][0] - 35.0).max(0.0)
+    }
+
+    /// Moves hanging arms out of the way of clothes that stand out around the hips by this share of them.
+    pub fn spread_arms(&mut self, share: f32) {
+        for arm in &mut self.arms {
+            arm[0] = arm[0].max((10.0 + 32.0 * share).min(30.0));
+        }
+    }
+
+    /// Moves an arm a little away from the body: one that is bent is stretched, another one lifted.
+    pub fn ease_arm(&mut self, side: usize) {
+        let [aside, _, _, bend] = &mut self.arms[side];
+        if *bend > 45.0 { *bend -= 4.0 } else { *aside += 4.0 }
+    }
+}
+
+/// A straight piece of the body: its start, its end, and its axes (right, up, front when it hangs or stands straight).
+#[derive(Debug, Clone, Copy)]
+pub struct Bone {
+    pub start: Vec3,
+    pub end: Vec3,
+    pub frame: Mat3,
+}
+
+impl Bone {
+    fn hang(start: Vec3, frame: Mat3, length: f32) -> Self {
+        Self { start, end: start - frame.y_axis * length, frame }
+    }
+
+    fn stand(start: Vec3, frame: Mat3, length: f32) -> Self {
+        Self { start, end: start + frame.y_axis * length, frame }
+    }
+
+    /// The point at `along` of the bone, moved by `offset` along its axes.
+    pub fn at(&self, along: f32, offset: Vec3) -> Vec3 {
+        self.start.lerp(self.end, along) + self.frame * offset
+    }
+}
+
+/// A posed body. Arrays hold the left side (towards +x) and the right. The pelvis is at the origin.
+#[derive(Debug, Clone)]
+pub struct Figure {
+    pub build: Build,
+    pub fingers: f32,
+    /// From between the hips to the waist.
+    pub pelvis: Bone,
+    /// From the waist to the base of the neck.
+    pub chest: Bone,
+    pub neck: Bone,
+    /// From the top of the neck to the crown.
+    pub head: Bone,
+    pub upper_arms: [Bone; 2],
+    pub forearms: [Bone; 2],
+    pub hands: [Bone; 2],
+    pub thighs: [Bone; 2],
+    pub calves: [Bone; 2],
+    /// From the ankle to the ball of the foot's height above the ground, pointing down; front is where the toes are.
+    pub feet: [Bone; 2],
+}
+
+/// +1 for the left side, −1 for the right.
+pub fn sign(side: usize) -> f32 {
+    if side == 0 { 1.0 } else { -1.0 }
+}
+
+impl Figure {
+    /// Shares of the stature after Drillis and Contini (1966).
+    pub fn new(build: Build, pose: &Pose) -> Self {
+        let h = build.stature;
+        let turn = pose.trunk[1];
+        let (pelvis_frame, chest_frame) = (pose.trunk_frame(0.0), pose.trunk_frame(1.0));
+        let pelvis = Bone::stand(Vec3::ZERO, pelvis_frame, 0.095 * h);
+        let chest = Bone::stand(pelvis.end, chest_frame, 0.215 * h);
+        let neck = Bone::stand(chest.end, chest_frame * rotate_x(0.4 * pose.head[0] + 8.0), 0.045 * h);
+        let head = Bone::stand(neck.end, pose.head_frame(1.0), 0.128 * h * build.head);
+
+        let breadth = h * build.shoulders * (0.09 + 0.015 * build.sex);
+        let sides = [0, 1];
+        let upper_arms = sides.map(|side| {
+            let [abduct, raise, inwards, _] = pose.arms[side];
+            let start = chest.at(0.85, Vec3::new(sign(side) * breadth, -0.005 * h, 0.0));
+            let frame = chest_frame
+                * rotate_x(-raise)
+                * rotate_z(sign(side) * abduct)
+                * rotate_y(-sign(side) * inwards);
+            Bone::hang(start, frame, 0.172 * h * build.arms)
+        });
+        let forearms = sides.map(|side| {
+            let frame = upper_arms[side].frame * rotate_x(-pose.arms[side][3]);
+            Bone::hang(upper_arms[side].end, frame, 0.146 * h * build.arms)
+        });
+        let hands = sides.map(|side| {
+            // Palms towards the thighs.
+            let frame = forearms[side].frame * rotate_y(-sign(side) * 70.0) * rotate_x(-8.0);
+            Bone::hang(forearms[side].end, frame, 0.1 * h)
+        });
+
+        let thighs = sides.map(|side| {
+            let [forward, apart, _] = pose.legs[side];
+            let start = pelvis.at(0.0, Vec3::new(sign(side) * 0.051 * h, -0.005 * h, 0.0));
+            let frame = pelvis_frame * rotate_x(-forward) * rotate_z(sign(side) * apart);
+            Bone::hang(start, frame, 0.245 * h * build.legs)
+        });
+        let calves = sides.map(|side| {
+            let frame = thighs[side].frame * rotate_x(pose.legs[side][2]);
+            Bone::hang(thighs[side].end, frame, 0.246 * h * build.legs)
+        });
+        let feet = sides.map(|side| {
+            // Feet stay flat, unless the calf leans far forward: then the heel lifts.
+            let calf = calves[side].frame;
+            let lifted = (calf.y_axis.z.clamp(-1.0, 1.0) * 45.0 - 6.0).max(0.0);
+            let out = sign(side) * 9.0;
+            let frame = rotate_y(0.3 * turn + out) * rotate_x(lifted);
+            Bone::hang(calves[side].end, frame, 0.039 * h)
+        });
+        let fingers = pose.fingers;
+        Self { build, fingers, pelvis, chest, neck, head, upper_arms, forearms, hands, thighs, calves, feet }
+    }
+}

@@ -1,0 +1,259 @@
+//! What a body is made of: parts, each of a few tapered capsules and ellipsoids that flow into one another.
+//!
+//! A part has an axis, along and around which cloth and skin are laid; a layer of cloth moves the part's surface outwards.
+//! Distances are lower bounds close to the truth (they are exact for round shapes), which is all that meshing needs.
+
+use std::ops::Range;
+
+use glam::{Mat3, Vec2, Vec3};
+
+use super::figure::{Bone, Figure};
+use super::outfit::Outfit;
+use crate::math::{noise, sin_cos, smooth_min, smoothstep};
+
+/// A shape in a frame of its own.
+#[derive(Debug, Clone, Copy)]
+pub struct Shape {
+    /// Start and end in the frame; equal for an ellipsoid.
+    start: Vec3,
+    axis: Vec3,
+    /// World → frame, where the shape is round.
+    turn: Mat3,
+    squeeze: Vec3,
+    radii: [f32; 2],
+    /// Smallest of the squeezes: distances in the frame times this are lower bounds outside.
+    scale: f32,
+    pub bound: (Vec3, f32),
+}
+
+impl Shape {
+    /// From `a` to `b` with radii there, flattened to `flat` (shares of the radius along right, up, front).
+    pub fn capsule(a: Vec3, b: Vec3, radii: [f32; 2], frame: Mat3, flat: Vec3) -> Self {
+        let turn = frame.transpose();
+        let reach = (b - a).length() / 2.0 + radii[0].max(radii[1]) * flat.max_element();
+        Self {
+            start: turn * a / flat,
+            axis: turn * (b - a) / flat,
+            turn,
+            squeeze: flat,
+            radii,
+            scale: flat.min_element(),
+            bound: ((a + b) / 2.0, reach),
+        }
+    }
+
+    pub fn ellipsoid(centre: Vec3, radii: Vec3, frame: Mat3) -> Self {
+        let radius = radii.max_element();
+        Self::capsule(centre, centre, [radius; 2], frame, radii / radius)
+    }
+
+    fn distance(&self, p: Vec3) -> f32 {
+        let q = self.turn * p / self.squeeze - self.start;
+        let length = self.axis.length_squared();
+        let along = if length > 0.0 { (q.dot(self.axis) / length).clamp(0.0, 1.0) } else { 0.0 };
+        let radius = self.radii[0] + (self.radii[1] - self.radii[0]) * along;
+        ((q - along * self.axis).length() - radius) * self.scale
+    }
+}
+
+/// What a part is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Kind {
+    Trunk,
+    Arm,
+    Hand,
+    Leg,
+    Foot,
+    Head,
+    Hair,
+    Skirt,
+}
+
+/// Cloth over a part of its axis.
+#[derive(Debug, Clone, Copy)]
+pub struct Layer {
+    pub from: f32,
+    to: f32,
+    thickness: f32,
+    /// More thickness towards `to`.
+    flare: f32,
+    folds: f32,
+    /// How much earlier it ends in front and behind.
+    pub drop: [f32; 2],
+}
+
+impl Layer {
+    pub fn new(span: Range<f32>, thickness: f32, flare: f32, folds: f32) -> Self {
+        Self { from: span.start, to: span.end, thickness, flare, folds, drop: [0.0; 2] }
+    }
+}
+
+/// How much lower a neckline hangs at this angle, by its depth in front and behind.
+pub fn neckline([front, behind]: [f32; 2], angle: f32) -> f32 {
+    let cosine = sin_cos(angle).1;
+    let depth = if cosine > 0.0 { front } else { behind };
+    depth * cosine * cosine
+}
+
+/// A piece of the body with its clothes.
+#[derive(Debug, Clone)]
+pub struct Part {
+    pub kind: Kind,
+    /// 0: left, 1: right; 0 for the middle.
+    pub side: usize,
+    pub shapes: Vec<Shape>,
+    /// Radius of the curves between the shapes.
+    blend: f32,
+    /// Radius of the curve towards the trunk, at the start of the axis; it vanishes along the first bone.
+    pub joint: f32,
+    axis: Vec<Bone>,
+    /// Metres of cloth around it, over 2π.
+    pub radius: f32,
+    pub length: f32,
+    pub layers: Vec<Layer>,
+    pub bound: (Vec3, f32),
+    pub seed: u32,
+    pub drape: Option<Drape>,
+}
+
+/// Cloth that hangs from the waist: a cone around a vertical axis, with folds.
+#[derive(Debug, Clone, Copy)]
+pub struct Drape {
+    pub top: f32,
+    pub bottom: f32,
+    /// Middle and half axes of the ellipse at the top and at the bottom.
+    pub ends: [(Vec2, Vec2); 2],
+    pub folds: f32,
+    pub depth: f32,
+    pub seed: u32,
+}
+
+impl Drape {
+    fn distance(&self, p: Vec3) -> f32 {
+        let t = ((self.top - p.y) / (self.top - self.bottom)).clamp(0.0, 1.0);
+        let [(c0, r0), (c1, r1)] = self.ends;
+        let (centre, radii) = (c0.lerp(c1, t), r0.lerp(r1, t));
+        let q = Vec2::new(p.x, p.z) - centre;
+        let angle = libm::atan2f(q.x, q.y);
+        let sway = 1.3 * (noise(Vec3::new(3.0 * t, 0.0, 0.0), self.seed) - 0.5);
+        let fold = 1.0 + self.depth * smoothstep(0.05, 1.0, t) * sin_cos(self.folds * angle + sway).0;
+        let scale = radii.min_element();
+        // The surface leans, so the distance to it is shorter than the one sideways.
+        let aside = ((q / radii).length() - fold) * scale * 0.9;
+        aside.max(self.bottom - p.y).max(p.y - self.top)
+    }
+}
+
+impl Part {
+    pub fn new(
+        kind: Kind,
+        side: usize,
+        shapes: Vec<Shape>,
+        blend: f32,
+        axis: Vec<Bone>,
+        radius: f32,
+    ) -> Self {
+        let length = axis.iter().map(|bone| (bone.end - bone.start).length()).sum();
+        let centre = shapes.iter().map(|s| s.bound.0).sum::<Vec3>() / shapes.len().max(1) as f32;
+        let reach = shapes.iter().map(|s| (s.bound.0 - centre).length() + s.bound.1).fold(0.0, f32::max);
+        Self {
+            kind,
+            side,
+            shapes,
+            blend,
+            joint: 0.0,
+            axis,
+            radius,
+            length,
+            layers: Vec::new(),
+            bound: (centre, reach),
+            seed: 0,
+            drape: None,
+        }
+    }
+
+    /// Where on the part's chart a point lies: angle around the axis (0 in front, towards +x up to π) and metres along it.
+    pub fn chart(&self, p: Vec3) -> (f32, f32) {
+        let mut best = (f32::INFINITY, 0.0, 0.0);
+        let mut before = 0.0;
+        for (i, bone) in self.axis.iter().enumerate() {
+            let axis = bone.end - bone.start;
+            let length = axis.length();
+            let mut t = (p - bone.start).dot(axis) / (length * length);
+            // Caps continue the first and the last bone.
+            if i > 0 {
+                t = t.max(0.0);
+            }
+            if i + 1 < self.axis.len() {
+                t = t.min(1.0);
+            }
+            let d = p - bone.start - t * axis;
+            if d.length() < best.0 {
+                let local = bone.frame.transpose() * d;
+                best = (d.length(), libm::atan2f(local.x, local.z), before + t * length);
+            }
+            before += length;
+        }
+        (best.1, best.2)
+    }
+
+    /// How far cloth lies over the skin at a place of the chart.
+    fn thickness(&self, p: Vec3, (angle, along): (f32, f32)) -> f32 {
+        let mut thickest = 0.0_f32;
+        for layer in &self.layers {
+            // A hem is as steep as cloth is thick.
+            let to = layer.to - neckline(layer.drop, angle);
+            let there = smoothstep(layer.from - 0.004, layer.from + 0.004, along)
+                * (1.0 - smoothstep(to - 0.004, to + 0.004, along));
+            if there > 0.0 {
+                let share = ((along - layer.from) / (layer.to - layer.from)).clamp(0.0, 1.0);
+                let crumple = Vec3::new(p.x * 22.0, p.y * 30.0, p.z * 22.0);
+                let fold = layer.folds * (2.0 * noise(crumple, self.seed) - 1.0);
+                thickest = thickest.max(there * (layer.thickness + layer.flare * share * share + fold));
+            }
+        }
+        thickest
+    }
+
+    /// Distance to the part's surface, clothes included.
+    pub fn distance(&self, p: Vec3) -> f32 {
+        if let Some(drape) = &self.drape {
+            return drape.distance(p);
+        }
+        let mut skin = f32::INFINITY;
+        for shape in &self.shapes {
+            let d = shape.distance(p);
+            skin = if skin.is_finite() { smooth_min(skin, d, self.blend) } else { d };
+        }
+        if self.layers.is_empty() { skin } else { skin - self.thickness(p, self.chart(p)) }
+    }
+}
+
+/// Places along the trunk's axis, metres from its start.
+#[derive(Debug, Clone, Copy)]
+pub struct Marks {
+    pub hem: f32,
+    pub waistband: f32,
+    pub collar: f32,
+    /// How much lower the neckline is in front and behind.
+    pub neckline: [f32; 2],
+}
+
+impl Marks {
+    pub fn of(figure: &Figure, outfit: &Outfit) -> Self {
+        let length = |bone: &Bone| (bone.end - bone.start).length();
+        let crotch = 0.7 * length(&figure.pelvis);
+        let waist = crotch + length(&figure.pelvis);
+        let base = waist + length(&figure.chest);
+        Self {
+            hem: waist - outfit.top_length.min(1.0) * length(&figure.pelvis),
+            waistband: waist - 0.06 * length(&figure.pelvis),
+            // The slope from the shoulders to the neck stays covered, however low the neckline.
+            collar: base + outfit.collar.max(0.45) * length(&figure.neck),
+            neckline: [
+                (0.45 - outfit.collar).max(0.1) * 1.3 * length(&figure.neck),
+                (0.45 - outfit.collar).max(0.1) * 0.4 * length(&figure.neck),
+            ],
+        }
+    }
+}

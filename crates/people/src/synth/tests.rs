@@ -1,0 +1,105 @@
+use std::collections::{HashMap, HashSet};
+
+use super::*;
+
+/// Every edge belongs to two triangles that run along it in opposite ways (or to two such pairs, where the surface touches
+/// itself), and all triangles hang together: no holes, no floating parts.
+#[test]
+fn people_are_closed_and_of_one_piece() {
+    for index in 0..6 {
+        let mesh = person(&format!("test/{index}"));
+        assert_eq!(mesh.check(), Ok(()));
+        let mut edges: HashMap<(u32, u32), i32> = HashMap::new();
+        let mut neighbours: HashMap<u32, Vec<u32>> = HashMap::new();
+        for face in &mesh.faces {
+            let [a, b, c] = face.positions;
+            for (from, to) in [(a, b), (b, c), (c, a)] {
+                *edges.entry((from.min(to), from.max(to))).or_default() += if from < to { 1 } else { -1 };
+                neighbours.entry(from).or_default().push(to);
+            }
+        }
+        let open = edges.values().filter(|balance| **balance != 0).count();
+        assert_eq!(open, 0, "person {index}: {open} of {} edges are open", edges.len());
+        let mut reached = HashSet::from([mesh.faces[0].positions[0]]);
+        let mut next: Vec<u32> = reached.iter().copied().collect();
+        while let Some(row) = next.pop() {
+            next.extend(neighbours[&row].iter().filter(|other| reached.insert(**other)));
+        }
+        assert_eq!(reached.len(), neighbours.len(), "person {index}");
+        // Outside is out: the volume that the triangles enclose is that of a person.
+        let volume: f32 = mesh
+            .faces
+            .iter()
+            .map(|f| f.positions.map(|row| mesh.positions[row as usize]))
+            .map(|[a, b, c]| a.dot(b.cross(c)) / 6.0)
+            .sum();
+        let (low, high) = mesh.bounds();
+        assert!((0.03..0.4).contains(&volume), "person {index}: {volume} m³");
+        assert!(low.y == 0.0 && (1.4..2.2).contains(&high.y), "person {index}: {low} to {high}");
+    }
+}
+
+/// No pose leaves a hand in the trunk or in a skirt, and hips that fill a skirt show its cloth.
+#[test]
+fn hands_and_hips_stay_where_they_belong() {
+    let (mut skirts, mut filled) = (0, 0);
+    for index in 0..60 {
+        let (figure, _, body) = dressed(&format!("test/hands/{index}"));
+        for hand in &figure.hands {
+            for share in [0.0, 0.5, 1.0] {
+                let depth = body.trunk_distance(hand.at(share, Vec3::ZERO));
+                assert!(depth > 0.01, "person {index}: {depth} m");
+            }
+        }
+        let Some(drape) = body.parts.iter().find_map(|part| part.drape) else { continue };
+        skirts += 1;
+        // Out from the middle of the hips until the surface is reached.
+        for step in 0..24 {
+            let (sin, cos) = crate::math::sin_cos(step as f32 * std::f32::consts::PI / 12.0);
+            let mut p = Vec3::new(0.0, figure.pelvis.start.y - 0.02, 0.0);
+            while body.distance(p, 0.02).0 < 0.0 {
+                p += 0.002 * Vec3::new(sin, 0.0, cos);
+            }
+            let kind = body.parts[body.owner(p, CELL)].kind;
+            assert!(p.y < drape.bottom || !matches!(kind, part::Kind::Trunk | part::Kind::Leg), "{kind:?}");
+            filled += usize::from(kind == part::Kind::Skirt);
+        }
+    }
+    assert!(skirts > 10 && filled > 10 * skirts, "{skirts} {filled}");
+}
+
+/// Cells are at most 5 mm, and triangles about as small.
+#[test]
+fn triangles_are_small_and_the_texture_covers_them() {
+    let mesh = person("test/0");
+    let longest = mesh.faces.iter().map(|f| {
+        let [a, b, c] = f.positions.map(|row| mesh.positions[row as usize]);
+        (b - a).length().max((c - b).length()).max((a - c).length())
+    });
+    let longest: Vec<f32> = longest.collect();
+    let mean = longest.iter().sum::<f32>() / longest.len() as f32;
+    let worst = longest.iter().copied().fold(0.0, f32::max);
+    assert!(CELL <= 0.005 && mean < 1.5 * CELL && worst < 5.0 * CELL, "{mean} m, {worst} m");
+    assert!(mesh.texcoords.iter().all(|t| (0.0..=1.0).contains(&t.x) && (0.0..=1.0).contains(&t.y)));
+    // Detail: no photograph can be guessed from a few colours.
+    let texture = mesh.materials[0].texture.as_ref().expect("has a texture");
+    let colors: HashSet<[u8; 3]> = texture.pixels().map(|p| p.0).collect();
+    assert!(colors.len() > 500, "{} colours", colors.len());
+}
+
+/// The same person on every machine: the numbers were written down on one and hold on all.
+#[test]
+fn a_name_decides_everything() {
+    let mesh = person("train/1/0");
+    let again = person("train/1/0");
+    assert_eq!(mesh.positions, again.positions);
+    assert_eq!(mesh.faces, again.faces);
+    let other = person("val/1/0");
+    assert_ne!(mesh.positions.len(), other.positions.len());
+    let sum = mesh.positions.iter().map(|p| p.as_dvec3()).sum::<glam::DVec3>();
+    let texture = mesh.materials[0].texture.as_ref().expect("has a texture");
+    let light: u64 = texture.as_raw().iter().map(|b| u64::from(*b)).sum();
+    let found =
+        (mesh.positions.len(), mesh.faces.len(), light, sum.to_array().map(|v| (v * 1e6).round() as i64));
+    assert_eq!(found, (131_052, 262_112, 319_996_657, [83_215_149, 121_905_689_262, 769_614_736]));
+}
