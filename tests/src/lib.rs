@@ -9,33 +9,43 @@ use std::sync::OnceLock;
 use burn::tensor::{Device, DeviceKind, DeviceType, Tensor, TensorData};
 use safetensors::SafeTensors;
 
-/// Name of the device that tests run on: `SNAPSNAP_TEST_DEVICE` = `flex` (default), `ndarray` or `wgpu`.
+/// Name of the device that tests run on: `SNAPSNAP_TEST_DEVICE` = `flex` (default), `ndarray`, `wgpu`, or, where it is
+/// compiled in, `vulkan`.
 pub fn device_name() -> String {
     std::env::var("SNAPSNAP_TEST_DEVICE").unwrap_or_else(|_| "flex".into())
 }
 
-/// The device that tests run on, or `None`, said aloud, where the machine has no adapter for `wgpu`.
+/// The device that tests run on, or `None`, said aloud, where the machine has no adapter for it.
 ///
 /// `wgpu` takes whatever adapter there is, a software one included; `cargo xtask test` runs the suite on each device.
 pub fn device() -> Option<Device> {
     match device_name().as_str() {
         "flex" => Some(Device::flex()),
         "ndarray" => Some(ndarray()),
-        "wgpu" => {
-            let found =
-                std::panic::catch_unwind(|| !Device::enumerate(DeviceType::Wgpu).into_vec().is_empty());
-            if !found.unwrap_or(false) {
-                assert!(
-                    std::env::var_os("SNAPSNAP_REQUIRE_WGPU").is_none(),
-                    "no wgpu adapter, but one is required"
-                );
-                println!("SKIPPED: no wgpu adapter on this machine");
-                return None;
-            }
-            Some(Device::wgpu(DeviceKind::DefaultDevice))
+        "wgpu" => adapter(DeviceType::Wgpu).then(|| Device::wgpu(DeviceKind::DefaultDevice)),
+        #[cfg(feature = "vulkan")]
+        "vulkan" => adapter(DeviceType::Vulkan).then(|| Device::vulkan(DeviceKind::DefaultDevice)),
+        other => {
+            panic!(
+                "SNAPSNAP_TEST_DEVICE = {other}: allowed are flex, ndarray, wgpu, and vulkan if compiled in"
+            )
         }
-        other => panic!("SNAPSNAP_TEST_DEVICE = {other}: allowed are flex, ndarray, wgpu"),
     }
+}
+
+/// Whether an adapter answers; one that does not is an error where `SNAPSNAP_REQUIRE_WGPU` is set.
+fn adapter(kind: DeviceType) -> bool {
+    let found = std::panic::catch_unwind(|| !Device::enumerate(kind).into_vec().is_empty());
+    let found = found.unwrap_or(false);
+    if !found {
+        let name = device_name();
+        assert!(
+            std::env::var_os("SNAPSNAP_REQUIRE_WGPU").is_none(),
+            "no {name} adapter, but one is required"
+        );
+        println!("SKIPPED: no {name} adapter on this machine");
+    }
+    found
 }
 
 #[allow(deprecated, reason = "still the second CPU implementation that results are checked on")]
@@ -43,10 +53,13 @@ fn ndarray() -> Device {
     Device::ndarray()
 }
 
-/// The program as a user starts it, built if it is not.
+/// The program as a user starts it, built if it is not; `SNAPSNAP_PROGRAM` names one that is there.
 pub fn snapsnap() -> Command {
     static PROGRAM: OnceLock<PathBuf> = OnceLock::new();
     let program = PROGRAM.get_or_init(|| {
+        if let Some(program) = std::env::var_os("SNAPSNAP_PROGRAM") {
+            return program.into();
+        }
         let test = std::env::current_exe().expect("the test's own path");
         let release = test.ancestors().nth(2).expect("target/release/deps/test");
         let target = release.parent().expect("target/release");
@@ -87,9 +100,15 @@ pub fn refused(command: &mut Command) -> String {
     err
 }
 
+/// The repository, or the folder with its `configs` and `tests/data` that `SNAPSNAP_ROOT` names.
+pub fn root() -> PathBuf {
+    let built = || Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("the workspace root").to_owned();
+    std::env::var_os("SNAPSNAP_ROOT").map_or_else(built, PathBuf::from)
+}
+
 /// Test data of this repository.
 pub fn data(name: &str) -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("data").join(name)
+    root().join("tests/data").join(name)
 }
 
 /// Path of a reference fixture: in this repository, or in the folder of all of them beside the checkout; `None`, said
@@ -105,8 +124,7 @@ pub fn fixture(name: &str) -> Option<PathBuf> {
 
 /// A folder beside the checkout.
 pub fn shared(name: &str) -> PathBuf {
-    let root = Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("the workspace root");
-    root.parent().expect("a folder around the workspace").join("shared").join(name)
+    root().join("../shared").join(name)
 }
 
 /// A `.safetensors` file read whole.

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use image::{DynamicImage, GrayImage, Luma, Rgb, RgbImage, Rgba, RgbaImage};
-use snapsnap_tests::{Numbers, refused, shared, snapsnap, succeed};
+use snapsnap_tests::{Numbers, refused, root, shared, snapsnap, succeed};
 
 /// A temporary folder with tiny random weights and two pictures.
 struct Workplace(tempfile::TempDir);
@@ -62,7 +62,7 @@ impl Workplace {
 }
 
 fn tiny() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/tiny.toml")
+    root().join("configs/tiny.toml")
 }
 
 /// An ellipse of coloured stripes; `background` goes into the colours of fully transparent pixels.
@@ -155,7 +155,7 @@ fn unsuitable_turntables_are_refused_before_any_work() {
         ("file", "exists and is no folder"),
         ("no/turn.gif", "cannot write"),
         ("front.png", "would be overwritten"),
-        ("human.ply", "two outputs"),
+        ("human.ply", "is a .gif, a .png or a folder"),
     ] {
         let message = place.refusal(place.reconstruct("front.png", "back.png").args(["--turntable", name]));
         assert!(message.contains(expected), "{name}: {message}");

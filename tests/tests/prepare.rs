@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use snapsnap_tests::{refused, shared, snapsnap, succeed};
+use snapsnap_tests::{refused, root, shared, snapsnap, succeed};
 
 /// Small and few views.
 const SMALL: [&str; 4] = ["--set", "views.count=4", "--set", "views.resolution=64"];
@@ -289,7 +289,7 @@ fn wrong_arguments_are_refused_before_any_work() {
 /// The configs that are shipped are understood, and say what their comments say.
 #[test]
 fn shipped_configs_are_understood() {
-    let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/data");
+    let configs = root().join("configs/data");
     let temporary = tempfile::tempdir().expect("temporary folder");
     for (name, folder) in [("published", "a_64_4"), ("training", "b"), ("evaluation", "c")] {
         let folder = temporary.path().join(folder);

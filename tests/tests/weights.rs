@@ -9,13 +9,12 @@ use snapsnap_net::config::Config;
 use snapsnap_net::weights::{
     ImportOptions, SideHeads, Source, WeightFile, WeightsError, export, import, init, schema,
 };
-use snapsnap_tests::{data, fixture};
+use snapsnap_tests::{data, fixture, root};
 
 const OPTIONS: ImportOptions = ImportOptions { side_heads: SideHeads::Seed, seed: 3 };
 
 fn tiny() -> Config {
-    Config::from_file(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/tiny.toml"), &[])
-        .expect("tiny.toml")
+    Config::from_file(&root().join("configs/tiny.toml"), &[]).expect("tiny.toml")
 }
 
 type Tensors = BTreeMap<String, (Dtype, Vec<usize>, Vec<u8>)>;

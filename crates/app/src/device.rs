@@ -20,21 +20,36 @@ pub fn choose(name: &str) -> Result<Device, Failure> {
         return Err(unknown(name, "this device has no index"));
     }
     match kind {
-        "auto" => Ok(real_gpu().unwrap_or_else(Device::flex)),
-        "cpu" | "flex" => Ok(Device::flex()),
-        "ndarray" => Ok(ndarray()),
-        "wgpu" => nth(name, DeviceType::Wgpu, index),
-        #[cfg(feature = "vulkan")]
-        "vulkan" => nth(name, DeviceType::Vulkan, index),
-        #[cfg(feature = "cuda")]
-        "cuda" => nth(name, DeviceType::Cuda, index),
-        #[cfg(feature = "metal")]
-        "metal" => nth(name, DeviceType::Metal, index),
-        "vulkan" | "cuda" | "metal" => {
+        "auto" => return Ok(real_gpu().unwrap_or_else(Device::flex)),
+        "cpu" | "flex" => return Ok(Device::flex()),
+        "ndarray" => return Ok(ndarray()),
+        _ => {}
+    }
+    match gpus().into_iter().find(|(compiled, _)| *compiled == kind) {
+        Some((_, kind)) => nth(name, kind, index),
+        None if ["vulkan", "cuda", "metal"].contains(&kind) => {
             Err(unknown(name, &format!("not compiled in: build with --features {kind}")))
         }
-        _ => Err(unknown(name, "no such kind of device")),
+        None => Err(unknown(name, "no such kind of device")),
     }
+}
+
+/// Kinds of GPU devices that are compiled in, best first.
+fn gpus() -> Vec<(&'static str, DeviceType)> {
+    vec![
+        #[cfg(feature = "cuda")]
+        ("cuda", DeviceType::Cuda),
+        #[cfg(feature = "metal")]
+        ("metal", DeviceType::Metal),
+        #[cfg(feature = "vulkan")]
+        ("vulkan", DeviceType::Vulkan),
+        ("wgpu", DeviceType::Wgpu),
+    ]
+}
+
+/// Whether the device is the processor, whose memory is the machine's.
+pub fn is_cpu(device: &Device) -> bool {
+    device.identity().is_none()
 }
 
 /// A device in words.
@@ -51,18 +66,14 @@ fn ndarray() -> Device {
     Device::ndarray()
 }
 
-/// A device that is a card, not a software adapter; CUDA before wgpu where it is compiled in.
+/// A device that is a card, not a software adapter.
 fn real_gpu() -> Option<Device> {
-    #[cfg(feature = "cuda")]
-    let cuda = quietly(|| Device::enumerate(DeviceType::Cuda).into_vec());
-    #[cfg(not(feature = "cuda"))]
-    let cuda: Vec<Device> = Vec::new();
     let is_card = |d: &Device| d.identity().is_some_and(|i| i.physical.is_some());
-    cuda.into_iter().chain(wgpu_devices()).find(is_card)
+    gpus().into_iter().flat_map(|(_, kind)| devices(kind)).find(is_card)
 }
 
-fn wgpu_devices() -> Vec<Device> {
-    quietly(|| Device::enumerate(DeviceType::Wgpu).into_vec())
+fn devices(kind: DeviceType) -> Vec<Device> {
+    quietly(|| Device::enumerate(kind).into_vec())
 }
 
 /// Runs `look`, taking a panic for "nothing there": the graphics layer panics where no driver answers.
@@ -75,10 +86,12 @@ fn quietly(look: impl FnOnce() -> Vec<Device> + std::panic::UnwindSafe) -> Vec<D
 }
 
 fn nth(name: &str, kind: DeviceType, index: Option<usize>) -> Result<Device, Failure> {
-    let devices = quietly(|| Device::enumerate(kind).into_vec());
+    let devices = devices(kind);
     let found = devices.len();
     match index {
-        _ if found == 0 => Err(unknown(name, "no adapter answers")),
+        _ if found == 0 => {
+            Err(unknown(name, "no adapter answers; is there a card, and is its driver installed?"))
+        }
         // Without an index the runtime's own choice: the fastest card.
         None if name == "wgpu" => Ok(Device::wgpu(DeviceKind::DefaultDevice)),
         _ => {
@@ -90,8 +103,9 @@ fn nth(name: &str, kind: DeviceType, index: Option<usize>) -> Result<Device, Fai
 
 fn unknown(name: &str, why: &str) -> Failure {
     let mut there = vec!["auto".to_owned(), "cpu (= flex)".into(), "ndarray".into()];
-    for (i, device) in wgpu_devices().iter().enumerate() {
-        there.push(format!("wgpu:{i} ({})", describe(device)));
+    for (kind, devices) in gpus().into_iter().map(|(name, kind)| (name, devices(kind))) {
+        let listed = devices.iter().enumerate().map(|(i, d)| format!("{kind}:{i} ({})", describe(d)));
+        there.extend(listed);
     }
     Failure::Input(format!("--device {name}: {why}. Here there are: {}", there.join(", ")))
 }

@@ -4,11 +4,13 @@ mod commands;
 mod device;
 mod dump;
 mod failure;
+mod memory;
 mod output;
 mod pictures;
 mod progress;
 mod say;
 mod turntable;
+mod view_folder;
 mod weights;
 
 use std::process::ExitCode;
@@ -47,6 +49,13 @@ enum Command {
 }
 
 fn main() -> ExitCode {
+    // A library that panics on a damaged file is an error of that file's, which is reported as such.
+    let hook = std::panic::take_hook();
+    std::panic::set_hook(Box::new(move |panic| {
+        if !snapsnap_mesh::is_guarded() {
+            hook(panic);
+        }
+    }));
     // Ctrl-C: 130 as shells expect, and no temporary file stays behind.
     let handler = ctrlc::set_handler(|| {
         snapsnap_splat::file::remove_unfinished();
@@ -57,8 +66,15 @@ fn main() -> ExitCode {
     }
     let Arguments { quiet, command } = match Arguments::try_parse() {
         Ok(arguments) => arguments,
-        // clap prints usage errors and help itself, with exit codes 2 and 0.
-        Err(e) => e.exit(),
+        // clap prints usage errors and help itself, with exit codes 2 and 0, but arguments as they are.
+        Err(e) => {
+            let mut arguments = std::env::args_os().map(|argument| argument.to_string_lossy().into_owned());
+            if arguments.all(|argument| say::printable(&argument) == argument) {
+                e.exit();
+            }
+            say::err(e.to_string().trim_end());
+            return ExitCode::from(2);
+        }
     };
     let result = match command {
         Command::Reconstruct(arguments) => commands::reconstruct::run(&arguments, quiet),

@@ -2,11 +2,12 @@
 
 use std::path::{Path, PathBuf};
 
-use snapsnap_splat::{Camera, Gaussians, RenderOptions, cameras, render};
+use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
 
 use crate::failure::Failure;
-use crate::pictures::{make_folder, picture, sheet, write_gif, write_png};
+use crate::pictures::{picture, sheet, write_gif, write_png};
 use crate::progress::Progress;
+use crate::view_folder::ViewFolder;
 
 /// Side of the pictures.
 const SIZE: u32 = 512;
@@ -17,45 +18,48 @@ const FRAMES_PER_SECOND: u32 = 20;
 const SHEET: usize = 8;
 const SHEET_COLUMNS: u32 = 4;
 
-enum Form {
-    Gif,
-    Sheet,
-    Folder,
-}
-
 /// Where and in what form.
-pub struct Turntable {
-    path: PathBuf,
-    form: Form,
-}
-
-/// Whether `path` names a picture file rather than a folder.
-pub fn is_file(path: &Path) -> bool {
-    path.extension().is_some() && !path.is_dir()
+pub enum Turntable {
+    /// An animation.
+    Gif(PathBuf),
+    /// Views side by side.
+    Sheet(PathBuf),
+    /// A picture of each view.
+    Folder(ViewFolder),
 }
 
 impl Turntable {
     /// The form that the path's ending asks for.
     pub fn new(path: &Path) -> Result<Self, Failure> {
         let ending = path.extension().map(|e| e.to_string_lossy().to_lowercase());
-        let form = match ending.as_deref() {
-            _ if !is_file(path) => Form::Folder,
-            Some("gif") => Form::Gif,
-            Some("png") => Form::Sheet,
-            _ => {
+        match ending.as_deref() {
+            None => Ok(Self::Folder(ViewFolder::new(path, FRAMES, None)?)),
+            Some(_) if path.is_dir() => Ok(Self::Folder(ViewFolder::new(path, FRAMES, None)?)),
+            Some("gif") => Ok(Self::Gif(path.to_owned())),
+            Some("png") => Ok(Self::Sheet(path.to_owned())),
+            Some(_) => {
                 let message = "a turntable is a .gif, a .png or a folder (a name without an ending)";
-                return Err(Failure::Input(format!("--turntable {}: {message}", path.display())));
+                Err(Failure::Input(format!("--turntable {}: {message}", path.display())))
             }
-        };
-        if matches!(form, Form::Folder) && path.exists() && !path.is_dir() {
-            return Err(Failure::Input(format!("--turntable {}: exists and is no folder", path.display())));
         }
-        Ok(Self { path: path.to_owned(), form })
+    }
+
+    /// Files that it will write or replace, as far as they can be in the way of something.
+    pub fn outputs(&self) -> Vec<PathBuf> {
+        match self {
+            Self::Gif(path) | Self::Sheet(path) => vec![path.clone()],
+            Self::Folder(folder) => folder.replaced(),
+        }
+    }
+
+    /// Refuses another output that would be one of its files.
+    pub fn check_apart(&self, other: &Path) -> Result<(), Failure> {
+        if let Self::Folder(folder) = self { folder.check_apart(other) } else { Ok(()) }
     }
 
     /// Renders `gaussians` (world frame) and writes the pictures.
     pub fn write(&self, gaussians: &Gaussians, quiet: bool) -> Result<(), Failure> {
-        let count = if matches!(self.form, Form::Sheet) { SHEET } else { FRAMES };
+        let count = if matches!(self, Self::Sheet(_)) { SHEET } else { FRAMES };
         let orbit = Camera::orbit(count, SIZE, SIZE);
         let options = RenderOptions::inria();
         let progress = Progress::steps(quiet, count, "views");
@@ -65,15 +69,15 @@ impl Turntable {
             pictures.push(picture(&rendered.color)?);
             progress.step(i + 1, count, "views");
         }
-        match self.form {
-            Form::Gif => write_gif(&self.path, &pictures, FRAMES_PER_SECOND),
-            Form::Sheet => write_png(&self.path, &sheet(&pictures, SHEET_COLUMNS)),
-            Form::Folder => {
-                make_folder(&self.path)?;
+        match self {
+            Self::Gif(path) => write_gif(path, &pictures, FRAMES_PER_SECOND),
+            Self::Sheet(path) => write_png(path, &sheet(&pictures, SHEET_COLUMNS)),
+            Self::Folder(folder) => {
+                folder.begin()?;
                 for (i, picture) in pictures.iter().enumerate() {
-                    write_png(&self.path.join(format!("{i:03}.png")), picture)?;
+                    folder.write(i, picture)?;
                 }
-                Ok(cameras::write(&orbit, &self.path.join("cameras.json"))?)
+                folder.finish(&orbit)
             }
         }
     }

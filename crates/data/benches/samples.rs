@@ -8,7 +8,7 @@ use burn::data::dataloader::DataLoader;
 use burn::tensor::Device;
 use peak_alloc::PeakAlloc;
 use snapsnap_data::dataset::{Folder, Layout, Split};
-use snapsnap_data::prepare::DataConfig;
+use snapsnap_data::prepare::{DataConfig, Subject};
 use snapsnap_data::sample::{Augment, Loader, SampleConfig, Stage1, Stage1Batcher, Stage2, Stage2Batcher};
 use snapsnap_people::synth;
 
@@ -27,7 +27,7 @@ fn data_set(root: &std::path::Path, layout: Layout, resolution: u32) -> Arc<Fold
     let folder = folder.expect("makes the folder");
     for index in 0..SUBJECTS {
         let (subject, mesh) = (format!("{index:04}"), synth::person(&format!("bench/{index}")));
-        config.add(&folder, Split::Train, &subject, &mesh, 0.0, &subject).expect("adds a subject");
+        config.add(&folder, &Subject::plain(Split::Train, &subject), &mesh).expect("adds a subject");
     }
     Arc::new(folder)
 }

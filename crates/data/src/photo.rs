@@ -9,7 +9,7 @@ use image::{DynamicImage, GrayImage, RgbImage};
 
 use crate::resize::{Filter, resize};
 use snapsnap_mesh::FileError;
-use snapsnap_mesh::picture::decode;
+use snapsnap_mesh::picture::{self, MAX_BYTES};
 
 /// Photographs below this side are refused: nothing of a person is left.
 const MIN_SIDE: u32 = 64;
@@ -63,7 +63,7 @@ pub fn load(
     side: usize,
     placement: Placement,
 ) -> Result<Canvas, FileError> {
-    let picture = decode(path)?;
+    let picture = picture::decode(path, MAX_BYTES)?;
     let refuse = |message: String| FileError::Unsuitable { path: path.to_owned(), message };
     let (width, height) = (picture.width(), picture.height());
     if placement == Placement::AsIs {
@@ -77,7 +77,7 @@ pub fn load(
     }
     let (mask, mask_path) = match mask {
         Some(mask_path) => {
-            let mask = grey(&decode(mask_path)?);
+            let mask = grey(&picture::decode(mask_path, MAX_BYTES)?);
             if mask.dimensions() != (width, height) {
                 let message = format!(
                     "the mask is {}×{}, its picture {} is {width}×{height}",
@@ -133,7 +133,15 @@ fn alpha(picture: &DynamicImage) -> Result<GrayImage, String> {
                 .into(),
         );
     }
-    let rgba = picture.to_rgba8();
+    // As it mostly is: without a copy.
+    let converted;
+    let rgba = match picture {
+        DynamicImage::ImageRgba8(rgba) => rgba,
+        other => {
+            converted = other.to_rgba8();
+            &converted
+        }
+    };
     let mask = GrayImage::from_fn(rgba.width(), rgba.height(), |x, y| image::Luma([rgba.get_pixel(x, y)[3]]));
     if mask.pixels().all(|p| p[0] == u8::MAX) {
         let message = "is opaque everywhere, so its alpha channel does not show the person: cut the person out, or \
@@ -224,9 +232,8 @@ fn placed(
     let y0 = top as i64 - ((person.y - touched.y) as f32 * sy).round() as i64;
 
     // Colours travel multiplied by the mask, so that what lies behind the person never bleeds in.
-    let premultiplied = crop_planes(rgb, mask, touched, |color, m| unit(color) * unit(m));
-    let from = [touched.height as usize, touched.width as usize];
-    let [r, g, b, m] = premultiplied.map(|plane| resize(&plane, from, [high, wide], Filter::Lanczos3));
+    let premultiplied = |color, m| unit(color) * unit(m);
+    let [r, g, b, m] = planes(rgb, mask, touched, premultiplied, [high, wide], Filter::Lanczos3);
     let area = side * side;
     let (mut values, mut on_canvas) = (vec![0.0; 3 * area], vec![0.0; area]);
     for y in (0..high).filter(|y| (0..side as i64).contains(&(y0 + *y as i64))) {
@@ -266,9 +273,7 @@ fn placed_as_demo(
         if scaled > side { (person.height as usize * side / person.width as usize).max(1) } else { height };
     let width = (scaled / 2 * 2).clamp(2.min(side), side / 2 * 2);
     let (left, top) = ((side - width) / 2, (side - height) / 2);
-    let from = [person.height as usize, person.width as usize];
-    let [r, g, b, m] = crop_planes(rgb, mask, person, |color, _| unit(color))
-        .map(|plane| resize(&plane, from, [height, width], Filter::Bilinear));
+    let [r, g, b, m] = planes(rgb, mask, person, |color, _| unit(color), [height, width], Filter::Bilinear);
     let area = side * side;
     let (mut values, mut on_canvas) = (vec![0.0; 3 * area], vec![0.0; area]);
     for y in 0..height {
@@ -288,24 +293,25 @@ fn placed_as_demo(
     Canvas { rgb: values, mask: on_canvas, valid, report }
 }
 
-/// Red, green, blue (through `color`, which also gets the mask's value) and mask of the person's box.
-fn crop_planes(
+/// Red, green, blue (through `color`, which also gets the mask's value) and mask of the person's box, resized to `size`
+/// (rows, columns). One after the other: a plane in f32 is as large as the whole picture in bytes.
+fn planes(
     rgb: &RgbImage,
     mask: &GrayImage,
     person: Rect,
     color: impl Fn(u8, u8) -> f32,
+    size: [usize; 2],
+    filter: Filter,
 ) -> [Vec<f32>; 4] {
-    let mut planes: [Vec<f32>; 4] = Default::default();
-    for y in person.y..person.y + person.height {
-        for x in person.x..person.x + person.width {
+    std::array::from_fn(|channel| {
+        let rows = person.y..person.y + person.height;
+        let places = rows.flat_map(|y| (person.x..person.x + person.width).map(move |x| (x, y)));
+        let value = |(x, y)| {
             let m = mask.get_pixel(x, y)[0];
-            for (c, plane) in planes.iter_mut().take(3).enumerate() {
-                plane.push(color(rgb.get_pixel(x, y)[c], m));
-            }
-            planes[3].push(unit(m));
-        }
-    }
-    planes
+            if channel == 3 { unit(m) } else { color(rgb.get_pixel(x, y)[channel], m) }
+        };
+        resize(places.map(value).collect(), [person.height as usize, person.width as usize], size, filter)
+    })
 }
 
 fn unit(value: u8) -> f32 {

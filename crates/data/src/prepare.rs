@@ -1,5 +1,6 @@
 //! From a mesh to a subject of a data set: which cameras, which names, which machine.
 
+use std::path::Path;
 use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
@@ -103,24 +104,39 @@ impl DataConfig {
             .collect()
     }
 
-    /// Draws and adds a subject. `mesh` stands on the floor at the origin; `name` is the subject's name among all data
-    /// sets, which decides what is random about its cameras.
+    /// Draws and adds a subject. `mesh` stands on the floor at the origin.
     ///
     /// # Errors
-    /// [`FileError`] for a mesh that cannot be drawn or that a camera does not see, and for files that cannot be written.
-    pub fn add(
-        &self,
-        folder: &Folder,
-        split: Split,
-        subject: &str,
-        mesh: &Mesh,
-        yaw_degrees: f64,
-        name: &str,
-    ) -> Result<Made, FileError> {
-        let renderer = Renderer::new(mesh).map_err(|e| FileError::unsuitable(folder.root(), e))?;
+    /// [`FileError`] for a mesh that cannot be drawn or that a camera does not see, naming its origin, and for files that
+    /// cannot be written.
+    pub fn add(&self, folder: &Folder, subject: &Subject, mesh: &Mesh) -> Result<Made, FileError> {
+        let Subject { split, name, identity, yaw_degrees, origin } = *subject;
+        let renderer = Renderer::new(mesh).map_err(|e| FileError::unsuitable(origin, e))?;
         let options = ViewOptions { samples: self.views.samples, lights: Lights::default() };
-        let cameras = self.cameras(yaw_degrees, name);
-        folder.write_subject(split, subject, &cameras, |camera| renderer.draw(camera, &options))
+        let cameras = self.cameras(yaw_degrees, identity);
+        folder.write_subject(split, name, origin, &cameras, |camera| renderer.draw(camera, &options))
+    }
+}
+
+/// A subject to be added.
+#[derive(Debug, Clone, Copy)]
+pub struct Subject<'a> {
+    /// Where it belongs.
+    pub split: Split,
+    /// Its name in the data set.
+    pub name: &'a str,
+    /// Its name among all data sets, which decides what is random about its cameras.
+    pub identity: &'a str,
+    /// Where it faces, around y.
+    pub yaw_degrees: f64,
+    /// What it was made of: the file that errors name.
+    pub origin: &'a Path,
+}
+
+impl<'a> Subject<'a> {
+    /// A subject that faces +z, of no file.
+    pub fn plain(split: Split, name: &'a str) -> Self {
+        Self { split, name, identity: name, yaw_degrees: 0.0, origin: Path::new(name) }
     }
 }
 

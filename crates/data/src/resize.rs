@@ -13,13 +13,12 @@ pub enum Filter {
 }
 
 /// Resizes `values` of `from` (rows, columns) to `to`; values lie in [0, 1] before and after.
-pub fn resize(values: &[f32], from: [usize; 2], to: [usize; 2], filter: Filter) -> Vec<f32> {
+pub fn resize(values: Vec<f32>, from: [usize; 2], to: [usize; 2], filter: Filter) -> Vec<f32> {
     match filter {
-        Filter::Bilinear => bilinear(values, from, to),
+        Filter::Bilinear => bilinear(&values, from, to),
         Filter::Lanczos3 => {
-            let plane =
-                ImageBuffer::<Luma<f32>, _>::from_raw(from[1] as u32, from[0] as u32, values.to_vec())
-                    .expect("as many values as pixels");
+            let plane = ImageBuffer::<Luma<f32>, _>::from_raw(from[1] as u32, from[0] as u32, values)
+                .expect("as many values as pixels");
             imageops::resize(&plane, to[1] as u32, to[0] as u32, FilterType::Lanczos3).into_raw()
         }
     }
@@ -52,15 +51,15 @@ mod tests {
     /// Check value of SNAPSNAP §13.4: [0, 1] → [0, ¼, ¾, 1].
     #[test]
     fn bilinear_has_its_published_check_value() {
-        assert_eq!(resize(&[0.0, 1.0], [1, 2], [1, 4], Filter::Bilinear), [0.0, 0.25, 0.75, 1.0]);
+        assert_eq!(resize(vec![0.0, 1.0], [1, 2], [1, 4], Filter::Bilinear), [0.0, 0.25, 0.75, 1.0]);
     }
 
     #[test]
     fn lanczos_keeps_constants_and_averages_fine_detail_away() {
-        let flat = resize(&[0.25; 48], [6, 8], [3, 5], Filter::Lanczos3);
+        let flat = resize(vec![0.25; 48], [6, 8], [3, 5], Filter::Lanczos3);
         assert!(flat.iter().all(|v| (v - 0.25).abs() < 1e-6), "{flat:?}");
         let stripes: Vec<f32> = (0..64 * 64).map(|i| (i % 2) as f32).collect();
-        let small = resize(&stripes, [64, 64], [8, 8], Filter::Lanczos3);
+        let small = resize(stripes, [64, 64], [8, 8], Filter::Lanczos3);
         assert!(small.iter().all(|v| (v - 0.5).abs() < 0.05), "{small:?}");
     }
 }

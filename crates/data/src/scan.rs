@@ -146,10 +146,13 @@ pub fn find(root: &Path) -> Result<Vec<Source>, FileError> {
     Ok(sources)
 }
 
-/// A name that is one folder on every system.
+/// A name that is one folder on every system, and one that is not hidden.
 fn subject_name(name: &str) -> String {
     let fine = |c: char| c.is_alphanumeric() || "-_. ".contains(c);
-    name.chars().take(60).map(|c| if fine(c) { c } else { '_' }).collect()
+    let name: String = name.chars().take(60).map(|c| if fine(c) { c } else { '_' }).collect();
+    let rest = name.trim_start_matches('.');
+    let start = "_".repeat(name.len() - rest.len());
+    if name.is_empty() { "_".into() } else { start + rest }
 }
 
 fn search(
@@ -288,6 +291,19 @@ mod tests {
         fs::create_dir(root.join("empty")).expect("make");
         assert!(find(&root.join("empty")).expect_err("empty").to_string().contains("holds no scan"));
         assert!(find(&root.join("absent")).is_err());
+    }
+
+    #[test]
+    fn subjects_are_called_what_a_folder_can_be_called() {
+        let names = ["a.b", ".hid", ".", "..", "...", "", "a/b", "ä 人-1", "\u{1b}[31m"];
+        let expected = ["a.b", "_hid", "_", "__", "___", "_", "a_b", "ä 人-1", "__31m"];
+        assert_eq!(names.map(subject_name), expected);
+        let folder = tempfile::tempdir().expect("temporary folder");
+        for (file, expected) in [(".hid.obj", "_hid"), ("..obj", "_"), ("...obj", "__")] {
+            let path = folder.path().join(file);
+            fs::write(&path, "").expect("write");
+            assert_eq!(find(&path).expect("finds")[0].subject, expected);
+        }
     }
 
     #[test]

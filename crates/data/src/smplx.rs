@@ -4,13 +4,13 @@
 //! as data, and NumPy's arrays are recognised among them.
 
 use std::cell::RefCell;
-use std::fs;
 use std::path::Path;
 use std::rc::Rc;
 
 use serde_json::Value as Json;
 
 use snapsnap_mesh::FileError;
+use snapsnap_splat::file;
 
 /// Largest file that is read; parameters take a few kilobytes.
 const MAX_BYTES: u64 = 16 << 20;
@@ -27,10 +27,7 @@ const ORIENTATION: &str = "global_orient";
 /// # Errors
 /// [`FileError`] for files that are no such parameters.
 pub fn yaw_degrees(path: &Path) -> Result<f64, FileError> {
-    if fs::metadata(path).map_err(FileError::read(path))?.len() > MAX_BYTES {
-        return Err(FileError::unsuitable(path, "is far too long for SMPL-X parameters"));
-    }
-    let bytes = fs::read(path).map_err(FileError::read(path))?;
+    let bytes = file::read(path, MAX_BYTES).map_err(FileError::read(path))?;
     let is_json = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("json"));
     let orientation = if is_json { from_json(&bytes) } else { from_pickle(&bytes) };
     let orientation = orientation
@@ -353,7 +350,7 @@ mod tests {
     fn yaw(name: &str, content: &[u8]) -> Result<f64, String> {
         let folder = tempfile::tempdir().expect("temporary folder");
         let path = folder.path().join(name);
-        fs::write(&path, content).expect("write");
+        std::fs::write(&path, content).expect("write");
         yaw_degrees(&path).map_err(|e| e.to_string())
     }
 

@@ -6,7 +6,7 @@ use glam::Vec3;
 use tempfile::TempDir;
 
 use crate::dataset::{Folder, Layout, Split};
-use crate::prepare::DataConfig;
+use crate::prepare::{DataConfig, Subject};
 use crate::scan::{Collection, normalise};
 use snapsnap_mesh::mesh::{Face, Material, Mesh};
 use snapsnap_people::synth;
@@ -81,7 +81,7 @@ pub fn data_set(
     let folder = Folder::create(&root, config.description("a test")).expect("makes the folder");
     for subject in 0..subjects {
         let name = format!("{subject:04}");
-        config.add(&folder, Split::Train, &name, mesh, 0.0, &name).expect("adds a subject");
+        config.add(&folder, &Subject::plain(Split::Train, &name), mesh).expect("adds a subject");
     }
     (temporary, Arc::new(folder))
 }

@@ -1,17 +1,43 @@
 //! What can go wrong on this floor.
 
+use std::cell::Cell;
 use std::fs::File;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
+
+use snapsnap_splat::{file, quoted};
 
 /// Opens a regular file: reading a pipe or a device might never end.
 ///
 /// # Errors
 /// [`FileError`] if it is something else, or cannot be opened.
 pub fn open(path: &Path) -> Result<File, FileError> {
-    if std::fs::metadata(path).is_ok_and(|metadata| !metadata.is_file() && !metadata.is_dir()) {
-        return Err(FileError::unsuitable(path, "is no regular file"));
-    }
-    File::open(path).map_err(FileError::read(path))
+    file::open(path).map_err(FileError::read(path))
+}
+
+thread_local! {
+    static GUARDED: Cell<bool> = const { Cell::new(false) };
+}
+
+/// Whether this thread is inside [`guarded`]: what panics there becomes an error, and a panic hook need not report it.
+pub fn is_guarded() -> bool {
+    GUARDED.get()
+}
+
+/// Reads a file with libraries that may panic on damaged ones, and turns a panic into an error.
+///
+/// # Errors
+/// What `read` returns, or [`FileError::Unsuitable`] with the panic's message.
+pub fn guarded<T>(path: &Path, read: impl FnOnce() -> Result<T, FileError>) -> Result<T, FileError> {
+    let outer = GUARDED.replace(true);
+    // What `read` may have left half-changed is dropped with it.
+    let result = catch_unwind(AssertUnwindSafe(read));
+    GUARDED.set(outer);
+    result.unwrap_or_else(|panic| {
+        let message = panic.downcast_ref::<&str>().map(|text| (*text).to_owned());
+        let message = message.or_else(|| panic.downcast_ref::<String>().cloned()).unwrap_or_default();
+        Err(FileError::unsuitable(path, format!("is damaged: the reader failed ({})", quoted(&message))))
+    })
 }
 
 /// Errors of photographs, scans, data of people and data sets; each names its file.

@@ -7,5 +7,5 @@ pub mod mesh;
 pub mod picture;
 pub mod view;
 
-pub use error::{FileError, open};
-pub use snapsnap_splat::quoted;
+pub use error::{FileError, guarded, is_guarded, open};
+pub use snapsnap_splat::{file, quoted};

@@ -1,42 +1,69 @@
 //! Picture files, photographs and textures alike.
 
-use std::io::{BufRead, BufReader, Cursor, Seek};
+mod jpeg;
+#[cfg(test)]
+mod tests;
+
+use std::io::{BufRead, BufReader, Cursor, Read, Seek};
 use std::path::Path;
 
-use image::{DynamicImage, ImageDecoder, ImageReader};
+use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader};
 
 use crate::FileError;
-use crate::error::open;
+use crate::error::{guarded, open};
 
-/// Pictures above this number of pixels are refused before they are decoded: 16 bytes each are needed at least.
-const MAX_PIXELS: u64 = 256_000_000;
+/// Bytes that a decoded photograph, mask or view may take: 134 million pixels of red, green, blue and alpha. What comes
+/// after decoding needs about three times as much.
+pub const MAX_BYTES: u64 = 512 << 20;
+/// Largest picture file that is read into memory before it is decoded.
+const MAX_FILE: u64 = 1 << 30;
 
 /// The picture in `path`, turned upright as its EXIF data say.
-pub fn decode(path: &Path) -> Result<DynamicImage, FileError> {
-    decode_from(path, BufReader::new(open(path)?))
+///
+/// # Errors
+/// [`FileError`] for a file that cannot be read, is no picture, is damaged or cut short, or would take more than `most`
+/// bytes in memory; the last is known before it is decoded.
+pub fn decode(path: &Path, most: u64) -> Result<DynamicImage, FileError> {
+    let file = BufReader::new(open(path)?);
+    guarded(path, || decode_from(path, file, most))
 }
 
 /// The picture in `bytes`, which are a part of `path`.
-pub fn decode_bytes(path: &Path, bytes: &[u8]) -> Result<DynamicImage, FileError> {
-    decode_from(path, Cursor::new(bytes))
+///
+/// # Errors
+/// As [`decode`].
+pub fn decode_bytes(path: &Path, bytes: &[u8], most: u64) -> Result<DynamicImage, FileError> {
+    guarded(path, || decode_from(path, Cursor::new(bytes), most))
 }
 
-fn decode_from(path: &Path, source: impl BufRead + Seek) -> Result<DynamicImage, FileError> {
-    let failed = |source| match source {
-        image::ImageError::IoError(source) if source.kind() == std::io::ErrorKind::IsADirectory => {
-            FileError::Read { path: path.to_owned(), source }
-        }
-        source => FileError::Decode { path: path.to_owned(), source },
+fn decode_from(path: &Path, source: impl BufRead + Seek, most: u64) -> Result<DynamicImage, FileError> {
+    let failed = |source| FileError::Decode { path: path.to_owned(), source };
+    let large = |[width, height]: [u32; 2], bytes: u64| {
+        let (mega, most) = (bytes.div_ceil(1 << 20), most >> 20);
+        let message =
+            format!("is {width}×{height}, {mega} MiB in memory, more than {most}: make the picture smaller");
+        Err(FileError::unsuitable(path, message))
     };
     let reader = ImageReader::new(source).with_guessed_format().map_err(FileError::read(path))?;
-    let mut decoder = reader.into_decoder().map_err(failed)?;
-    let (width, height) = decoder.dimensions();
-    if u64::from(width) * u64::from(height) > MAX_PIXELS {
-        let message = format!("is {width}×{height}, more than {} million pixels", MAX_PIXELS / 1_000_000);
-        return Err(FileError::unsuitable(path, message));
-    }
-    let orientation = decoder.orientation().map_err(failed)?;
-    let mut picture = DynamicImage::from_decoder(decoder).map_err(failed)?;
+    let (mut picture, orientation) = if reader.format() == Some(ImageFormat::Jpeg) {
+        let mut bytes = Vec::new();
+        reader.into_inner().take(MAX_FILE).read_to_end(&mut bytes).map_err(FileError::read(path))?;
+        let jpeg = jpeg::Jpeg::open(&bytes).map_err(failed)?;
+        if jpeg.bytes_decoded() > most {
+            return large(jpeg.size, jpeg.bytes_decoded());
+        }
+        jpeg.decode().map_err(failed)?
+    } else {
+        let mut decoder = reader.into_decoder().map_err(failed)?;
+        let (width, height) = decoder.dimensions();
+        // Whatever it is stored as, red, green and blue are made of it.
+        let bytes = decoder.total_bytes().max(3 * u64::from(width) * u64::from(height));
+        if bytes > most {
+            return large([width, height], bytes);
+        }
+        let orientation = decoder.orientation().map_err(failed)?;
+        (DynamicImage::from_decoder(decoder).map_err(failed)?, orientation)
+    };
     picture.apply_orientation(orientation);
     Ok(picture)
 }

@@ -8,6 +8,10 @@ use std::path::{Path, PathBuf};
 
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
+use snapsnap_splat::file;
+
+/// Longest config that is read.
+const MAX_BYTES: u64 = 1 << 20;
 
 /// Everything that decides what the networks compute.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
@@ -263,7 +267,7 @@ impl Config {
     /// # Errors
     /// [`ConfigError`], naming file, key and allowed values.
     pub fn from_file(path: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
-        let text = std::fs::read_to_string(path)
+        let text = file::read_text(path, MAX_BYTES)
             .map_err(|source| ConfigError::Read { path: path.to_owned(), source })?;
         Self::from_toml(&text, &path.display().to_string(), overrides)
     }

@@ -2,6 +2,8 @@
 
 pub mod config;
 mod crop;
+mod memory;
+mod neighbours;
 pub mod network;
 mod reconstruct;
 pub mod regressor;

@@ -8,14 +8,13 @@ mod gelu;
 mod math;
 mod resize;
 mod rope;
-mod winograd;
+pub mod wide;
 
 #[cfg(test)]
 mod tests;
 
 use burn::nn::Linear;
-use burn::nn::conv::Conv2d;
-use burn::tensor::activation::{gelu, relu};
+use burn::tensor::activation::gelu;
 use burn::tensor::module::{attention, interpolate};
 use burn::tensor::ops::{InterpolateMode, InterpolateOptions};
 use burn::tensor::{Device, Tensor, TensorData};
@@ -87,22 +86,6 @@ pub fn bilinear(x: Tensor<4>, size: [usize; 2], align_corners: bool) -> Tensor<4
     }
     let options = InterpolateOptions::new(InterpolateMode::Bilinear).with_align_corners(align_corners);
     interpolate(x, options.with_output_size(size))
-}
-
-/// A 3×3 convolution with stride 1 and padding 1 of `[B, C, H, W]`, or of its positive part; on `flex` with even sides
-/// by Winograd's method, elsewhere by Burn's.
-pub fn conv3x3(conv: &Conv2d, x: Tensor<4>, rectified: bool) -> Tensor<4> {
-    let [batch, inputs, height, width] = x.dims();
-    if !is_fast(&x) || height % 2 != 0 || width % 2 != 0 {
-        return conv.forward(if rectified { relu(x) } else { x });
-    }
-    let device = x.device();
-    let weight = conv.weight.val();
-    let outputs = weight.dims()[0];
-    let bias = conv.bias.as_ref().map_or_else(|| vec![0.0; outputs], |bias| host(bias.val()));
-    let shape = winograd::Shape { batch, inputs, outputs, height, width };
-    let out = winograd::conv3x3(shape, &host(x), &host(weight), &bias, rectified);
-    Tensor::from_data(TensorData::new(out, [batch, outputs, height, width]), &device)
 }
 
 /// Values on the host; without a copy if the tensor is contiguous and nobody else holds it.

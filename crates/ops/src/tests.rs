@@ -1,50 +1,27 @@
-//! The fast roads against the plain tensor code, at sizes that reach their corners: blocks that do not divide, widths
-//! below a register block, strides, groups of several channels.
+//! The fast roads against the plain tensor code, at sizes that reach their corners.
 
 use burn::module::Param;
-use burn::nn::conv::Conv2dConfig;
-use burn::nn::{LinearConfig, PaddingConfig2d};
-use burn::tensor::activation::{gelu, relu};
+use burn::nn::LinearConfig;
+use burn::tensor::activation::gelu;
 use burn::tensor::{Device, Tensor, TensorData};
 use rand::{RngCore, SeedableRng};
 
 use super::Rope;
 
 /// Uniform in ±1; the same numbers on every run.
-fn random<const D: usize>(shape: [usize; D], seed: u64) -> Tensor<D> {
+pub(crate) fn random<const D: usize>(shape: [usize; D], seed: u64) -> Tensor<D> {
     let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
     let values = (0..shape.iter().product()).map(|_| random.next_u32() as f32 / u32::MAX as f32 * 2.0 - 1.0);
     Tensor::from_data(TensorData::new(values.collect::<Vec<f32>>(), shape), &Device::flex())
 }
 
 /// Relative L2 error; both roads are f32, whose rounding over some hundred terms stays below a few 1e-6.
-fn assert_equal<const D: usize>(what: &str, got: Tensor<D>, expected: Tensor<D>) {
+pub(crate) fn assert_equal<const D: usize>(what: &str, got: Tensor<D>, expected: Tensor<D>) {
     assert_eq!(got.dims(), expected.dims(), "{what}");
     let norm = |x: Tensor<D>| x.square().sum().sqrt().into_scalar::<f32>();
     let error = norm(got - expected.clone()) / norm(expected);
     println!("{what}: {error:e}");
     assert!(error < 5e-6, "{what}: {error:e}");
-}
-
-#[test]
-fn winograd_equals_direct_convolution() {
-    for [batch, inputs, outputs, height, width] in
-        [[2, 5, 7, 2, 2], [1, 3, 4, 10, 34], [3, 16, 16, 6, 8], [1, 200, 70, 6, 300], [1, 64, 96, 64, 20]]
-    {
-        let mut conv = Conv2dConfig::new([inputs, outputs], [3, 3])
-            .with_padding(PaddingConfig2d::Explicit(1, 1, 1, 1))
-            .init(&Device::flex());
-        conv.weight = Param::from_tensor(random([outputs, inputs, 3, 3], 1));
-        conv.bias = Some(Param::from_tensor(random([outputs], 2)));
-        let x = random([batch, inputs, height, width], 3);
-        let what = format!("{batch}×{inputs}→{outputs} at {height}×{width}");
-        assert_equal(&what, super::conv3x3(&conv, x.clone(), false), conv.forward(x.clone()));
-        assert_equal(
-            &format!("{what}, rectified"),
-            super::conv3x3(&conv, x.clone(), true),
-            conv.forward(relu(x)),
-        );
-    }
 }
 
 #[test]

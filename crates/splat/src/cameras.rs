@@ -1,7 +1,6 @@
 //! `cameras.json`: a list of pinhole cameras.
 
-use std::fs::File;
-use std::io::{Read, Write};
+use std::io::Write;
 use std::path::Path;
 
 use glam::{DMat3, DVec2, DVec3};
@@ -9,7 +8,7 @@ use serde::Serialize;
 use serde_json::Value;
 
 use crate::error::quoted;
-use crate::file::write_whole;
+use crate::file::{self, write_whole};
 use crate::{Camera, RigidTransform, SplatError};
 
 /// Largest file that is read; a camera takes about 400 bytes.
@@ -74,13 +73,8 @@ impl Entry {
 /// and the field, or if a camera in it cannot be rendered into.
 pub fn read(path: &Path) -> Result<Vec<Camera>, SplatError> {
     let wrong = |problem: String| SplatError::Cameras { path: path.to_owned(), problem };
-    let mut text = String::new();
-    File::open(path)
-        .and_then(|file| file.take(MAX_BYTES + 1).read_to_string(&mut text))
+    let text = file::read_text(path, MAX_BYTES)
         .map_err(|source| SplatError::Read { path: path.to_owned(), source })?;
-    if text.len() as u64 > MAX_BYTES {
-        return Err(wrong(format!("more than {MAX_BYTES} bytes")));
-    }
     // In two steps, so that an error can name the camera.
     let text = text.trim_start_matches('\u{feff}');
     let entries: Vec<Value> = serde_json::from_str(text).map_err(|e| wrong(quoted(&e.to_string())))?;

@@ -1,12 +1,15 @@
-//! Files that appear whole or not at all.
+//! Files that appear whole or not at all, and files that are read to an end.
 
+use std::collections::HashSet;
 use std::fs::{self, File};
-use std::io::{self, BufWriter, Write};
+use std::io::{self, BufWriter, Read, Write};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::thread;
 use std::time::Duration;
 
+/// How the names of temporary files begin.
+const PREFIX: &str = ".snapsnap-";
 /// How often the removal of a folder is tried.
 const FOLDER_TRIES: usize = 100;
 
@@ -51,24 +54,38 @@ pub fn is_ending() -> bool {
 ///
 /// # Errors
 /// The operating system's refusal, or that the program is being ended.
-pub fn unfinished_folder(path: &Path) -> io::Result<UnfinishedFolder> {
+pub fn unfinished_folder(path: &Path) -> io::Result<Watch> {
     let mut unfinished = unfinished();
     if unfinished.ending {
         return Err(io::Error::new(io::ErrorKind::Interrupted, "the program is being ended"));
     }
     fs::create_dir_all(path)?;
     unfinished.paths.push(path.to_owned());
-    Ok(UnfinishedFolder(path.to_owned()))
+    Ok(Watch(path.to_owned()))
 }
 
-/// Ends the watch over a folder of [`unfinished_folder`]; the folder itself stays.
+/// Ends the watch over a folder or file of [`unfinished_folder`] or [`unfinished_file`]; they themselves stay.
 #[derive(Debug)]
-pub struct UnfinishedFolder(PathBuf);
+pub struct Watch(PathBuf);
 
-impl Drop for UnfinishedFolder {
+impl Watch {
+    /// Removes the file and ends the watch.
+    pub fn remove(self) {
+        let _ = fs::remove_file(&self.0);
+    }
+}
+
+impl Drop for Watch {
     fn drop(&mut self) {
         unfinished().paths.retain(|path| *path != self.0);
     }
+}
+
+/// Notes a file that the run removes when it ends, as [`remove_unfinished`] does with those that it is writing.
+#[must_use = "the file is forgotten when the guard is dropped"]
+pub fn unfinished_file(path: &Path) -> Watch {
+    unfinished().paths.push(path.to_owned());
+    Watch(path.to_owned())
 }
 
 /// Creates a temporary file and notes it, in one step as seen from [`remove_unfinished`].
@@ -80,13 +97,36 @@ fn create(path: &Path) -> io::Result<File> {
     let mut options = File::options();
     options.read(true).write(true).create_new(true);
     let file = options.open(path)?;
+    // Tells a file in the making from one that a killed run has left. Some file systems know no locks.
+    let _ = file.lock();
+    // Another run may have taken it for left in between.
+    if !path.exists() {
+        return Err(io::ErrorKind::AlreadyExists.into());
+    }
     unfinished.paths.push(path.to_owned());
     Ok(file)
 }
 
+/// Removes the temporary files that killed runs have left in `folder`; once for each folder of a run.
+pub fn tidy(folder: &Path) {
+    static DONE: Mutex<Option<HashSet<PathBuf>>> = Mutex::new(None);
+    let mut done = DONE.lock().unwrap_or_else(PoisonError::into_inner);
+    if !done.get_or_insert_default().insert(folder.to_owned()) {
+        return;
+    }
+    for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
+        let is_ours = entry.file_name().to_string_lossy().starts_with(PREFIX);
+        let is_file = || entry.file_type().is_ok_and(|kind| kind.is_file());
+        if is_ours && is_file() && File::open(entry.path()).is_ok_and(|file| file.try_lock().is_ok()) {
+            let _ = fs::remove_file(entry.path());
+        }
+    }
+}
+
 /// Writes `path` through `fill`: into a temporary file beside it, which is renamed when `fill` has succeeded, so that
-/// a failure leaves whatever was there before. A symbolic link keeps pointing at the file, which is replaced; a path
-/// that exists and is no regular file (a pipe, a device) is written in place: renaming would replace the device itself.
+/// a failure leaves whatever was there before. A file that is replaced hands its permissions on, and one that is
+/// write-protected is refused. A symbolic link keeps pointing at the file, which is replaced; a path that exists and is no
+/// regular file (a pipe, a device) is written in place: renaming would replace the device itself.
 ///
 /// # Errors
 /// What `fill` returns, or the operating system's refusal to create, write or rename the file.
@@ -101,15 +141,20 @@ pub fn write_whole<E: From<io::Error>>(
         return Ok(out.flush()?);
     }
     let path = &target_of(path);
+    let permissions = permissions_of(path)?;
     // Created with the mode of an ordinary new file (the umask applies), not the private one of temporary files.
     let mut file = tempfile::Builder::new()
-        .prefix(".snapsnap-")
+        .prefix(PREFIX)
         .make_in(folder_of(path), create)
         .map_err(|e| io::Error::from(e.kind()))?;
     let temporary = file.path().to_owned();
     let mut out = BufWriter::with_capacity(1 << 20, file.as_file_mut());
     let filled = fill(&mut out).and_then(|()| Ok(out.flush()?));
     drop(out);
+    let filled = filled.and_then(|()| match permissions {
+        Some(permissions) => Ok(file.as_file().set_permissions(permissions)?),
+        None => Ok(()),
+    });
     let written = filled.and_then(|()| file.persist(path).map(drop).map_err(|e| e.error.into()));
     unfinished().paths.retain(|p| *p != temporary);
     written
@@ -120,13 +165,24 @@ pub fn is_special(path: &Path) -> bool {
     fs::metadata(path).is_ok_and(|m| !m.is_file() && !m.is_dir())
 }
 
+/// Permissions of the file that is to be replaced, if there is one.
+fn permissions_of(path: &Path) -> io::Result<Option<fs::Permissions>> {
+    match fs::metadata(path) {
+        Ok(there) if there.permissions().readonly() => {
+            Err(io::Error::new(io::ErrorKind::PermissionDenied, "is write-protected"))
+        }
+        Ok(there) => Ok(Some(there.permissions())),
+        Err(_) => Ok(None),
+    }
+}
+
 /// The file behind a symbolic link.
 fn target_of(path: &Path) -> PathBuf {
     if path.is_symlink() { path.canonicalize().unwrap_or_else(|_| path.to_owned()) } else { path.to_owned() }
 }
 
-/// Checks, before any work, that `path` can be written: its folder exists and lets us create a file. A pipe or a device
-/// is not touched: opening it is already an event for whoever reads it.
+/// Checks, before any work, that `path` can be written: its folder exists and lets us create a file, and what is there is
+/// not write-protected. A pipe or a device is not touched: opening it is already an event for whoever reads it.
 ///
 /// # Errors
 /// The operating system's reason.
@@ -137,7 +193,47 @@ pub fn check_writable(path: &Path) -> io::Result<()> {
     if is_special(path) {
         return Ok(());
     }
-    tempfile::tempfile_in(folder_of(&target_of(path))).map(drop)
+    let path = &target_of(path);
+    permissions_of(path)?;
+    tidy(folder_of(path));
+    tempfile::tempfile_in(folder_of(path)).map(drop)
+}
+
+/// Opens a regular file for reading: a pipe or a device might never answer, or never end.
+///
+/// # Errors
+/// The operating system's refusal, or that it is no regular file.
+pub fn open(path: &Path) -> io::Result<File> {
+    let metadata = fs::metadata(path)?;
+    if metadata.is_dir() {
+        return Err(io::Error::new(io::ErrorKind::IsADirectory, "is a directory"));
+    }
+    if !metadata.is_file() {
+        return Err(io::Error::new(io::ErrorKind::InvalidInput, "is no regular file"));
+    }
+    File::open(path)
+}
+
+/// The whole of a regular file of at most `limit` bytes.
+///
+/// # Errors
+/// As [`open`], or that it is longer.
+pub fn read(path: &Path, limit: u64) -> io::Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    open(path)?.take(limit.saturating_add(1)).read_to_end(&mut bytes)?;
+    if bytes.len() as u64 > limit {
+        return Err(io::Error::new(io::ErrorKind::FileTooLarge, format!("has more than {limit} bytes")));
+    }
+    Ok(bytes)
+}
+
+/// The whole of a regular text file of at most `limit` bytes.
+///
+/// # Errors
+/// As [`read`], or that it is not UTF-8.
+pub fn read_text(path: &Path, limit: u64) -> io::Result<String> {
+    let text = String::from_utf8(read(path, limit)?);
+    text.map_err(|_| io::Error::new(io::ErrorKind::InvalidData, "is no text (UTF-8)"))
 }
 
 fn folder_of(path: &Path) -> &Path {
@@ -160,6 +256,51 @@ mod tests {
         assert_eq!(failed.expect_err("fails").to_string(), "stop");
         assert_eq!(fs::read_to_string(&path).expect("read"), "old");
         assert_eq!(fs::read_dir(folder.path()).expect("list").count(), 1);
+    }
+
+    #[test]
+    #[cfg(unix)]
+    fn permissions_are_handed_on_and_respected() {
+        use std::os::unix::fs::PermissionsExt;
+        let folder = tempfile::tempdir().expect("temporary folder");
+        let path = folder.path().join("a.txt");
+        let mode = |mode: u32| fs::set_permissions(&path, fs::Permissions::from_mode(mode)).expect("chmod");
+        let new = || write_whole::<io::Error>(&path, |out| out.write_all(b"new"));
+        fs::write(&path, "old").expect("write");
+        mode(0o600);
+        new().expect("writes");
+        assert_eq!(fs::metadata(&path).expect("there").permissions().mode() & 0o777, 0o600);
+        fs::write(&path, "old").expect("write");
+        mode(0o444);
+        assert!(check_writable(&path).expect_err("refuses").to_string().contains("write-protected"));
+        assert!(new().expect_err("refuses").to_string().contains("write-protected"));
+        assert_eq!(fs::read_to_string(&path).expect("read"), "old");
+    }
+
+    #[test]
+    fn what_a_killed_run_left_is_removed_and_what_is_being_written_is_not() {
+        let folder = tempfile::tempdir().expect("temporary folder");
+        let (path, left) = (folder.path().join("a.txt"), folder.path().join(".snapsnap-left"));
+        fs::write(&left, "half").expect("write");
+        write_whole::<io::Error>(&path, |out| {
+            tidy(folder.path());
+            out.write_all(b"whole")
+        })
+        .expect("writes");
+        assert!(!left.exists());
+        assert_eq!(fs::read_to_string(&path).expect("read"), "whole");
+    }
+
+    #[test]
+    fn only_regular_files_of_a_sensible_length_are_read() {
+        let folder = tempfile::tempdir().expect("temporary folder");
+        let path = folder.path().join("a.txt");
+        fs::write(&path, "12345").expect("write");
+        assert_eq!(read_text(&path, 5).expect("reads"), "12345");
+        assert_eq!(read(&path, 4).expect_err("refuses").to_string(), "has more than 4 bytes");
+        assert_eq!(open(folder.path()).expect_err("refuses").kind(), io::ErrorKind::IsADirectory);
+        #[cfg(unix)]
+        assert_eq!(read(Path::new("/dev/zero"), 4).expect_err("refuses").to_string(), "is no regular file");
     }
 
     #[test]

@@ -12,8 +12,8 @@ use snapsnap_splat::{file, ply};
 use super::{ConfigArguments, check_outputs, is_same_file};
 use crate::failure::Failure;
 use crate::progress::Progress;
-use crate::turntable::{self, Turntable};
-use crate::{device, dump, output, say, weights};
+use crate::turntable::Turntable;
+use crate::{device, dump, memory, output, say, weights};
 
 #[derive(Args)]
 pub struct Arguments {
@@ -55,25 +55,30 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     weights.require(Part::PointPredictor)?;
     weights.require(Part::Regressor)?;
     let config = weights.config.clone();
-    let config_path = check_paths(arguments, weights.path())?;
+    let mut times = vec![("opening weights", start.elapsed())];
+    let mut timed = |name: &'static str, since: Instant| times.push((name, since.elapsed()));
     let turntable = arguments.turntable.as_deref().map(Turntable::new).transpose()?;
+    let config_path = check_paths(arguments, weights.path(), turntable.as_ref())?;
+    let since = Instant::now();
+    let device = device::choose(&arguments.device)?;
+    timed("finding the device", since);
+    if device::is_cpu(&device) {
+        let what = format!("a canvas of {0}×{0} pixels", config.network.resolution);
+        let mend = "choose a smaller `network.resolution`";
+        memory::check(&what, config.memory_needed(weights.parameters()), mend)?;
+    }
     let placement = match (arguments.as_is, config.mode.compat) {
         (true, _) => Placement::AsIs,
         (false, true) => Placement::Demo { height: config.person_height() },
         (false, false) => Placement::Training { height: config.person_height() },
     };
     let masks = arguments.masks.as_deref().unwrap_or_default();
-    let mut times = vec![("opening weights", start.elapsed())];
-    let mut timed = |name: &'static str, since: Instant| times.push((name, since.elapsed()));
     let since = Instant::now();
     let load = |path: &Path, mask: Option<&PathBuf>| {
         photo::load(path, mask.map(PathBuf::as_path), config.network.resolution, placement)
     };
     let canvases = [load(&arguments.front, masks.first())?, load(&arguments.back, masks.get(1))?];
     timed("photographs", since);
-    let since = Instant::now();
-    let device = device::choose(&arguments.device)?;
-    timed("finding the device", since);
 
     let progress = Progress::stages(quiet);
     progress.stage("loading weights");
@@ -127,7 +132,11 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
 
 /// Refuses outputs that cannot be written or would destroy an input; returns where the config goes. Beside a pipe or a
 /// device there is no place for it, and a config that was given is not overwritten by itself.
-fn check_paths(arguments: &Arguments, weights: &Path) -> Result<Option<PathBuf>, Failure> {
+fn check_paths(
+    arguments: &Arguments,
+    weights: &Path,
+    turntable: Option<&Turntable>,
+) -> Result<Option<PathBuf>, Failure> {
     let mut inputs: Vec<&Path> = vec![&arguments.front, &arguments.back, weights];
     inputs.extend(arguments.masks.iter().flatten().map(PathBuf::as_path));
     let mut config_path = arguments.output.clone().into_os_string();
@@ -137,10 +146,13 @@ fn check_paths(arguments: &Arguments, weights: &Path) -> Result<Option<PathBuf>,
     let itself = given.is_some_and(|given| is_same_file(given, &config_path));
     let config_path = (!itself && !file::is_special(&arguments.output)).then_some(config_path);
     inputs.extend(given);
-    // A turntable's folder is made when it is needed; only a file can be in the way.
-    let turntable = arguments.turntable.as_ref().filter(|path| turntable::is_file(path));
-    let outputs = [Some(&arguments.output), arguments.dump.as_ref(), config_path.as_ref(), turntable];
-    let outputs: Vec<&Path> = outputs.into_iter().flatten().map(PathBuf::as_path).collect();
+    let outputs = [Some(&arguments.output), arguments.dump.as_ref(), config_path.as_ref()];
+    let mut outputs: Vec<&Path> = outputs.into_iter().flatten().map(PathBuf::as_path).collect();
+    for output in &outputs {
+        turntable.map_or(Ok(()), |turntable| turntable.check_apart(output))?;
+    }
+    let pictures = turntable.map(Turntable::outputs).unwrap_or_default();
+    outputs.extend(pictures.iter().map(PathBuf::as_path));
     check_outputs(&outputs, &inputs)?;
     Ok(config_path)
 }

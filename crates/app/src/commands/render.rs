@@ -14,16 +14,15 @@ use snapsnap_splat::{
 
 use super::check_outputs;
 use crate::failure::Failure;
-use crate::pictures::{make_folder, picture, read_back, write_png};
+use crate::pictures::{picture, read_back};
 use crate::progress::Progress;
+use crate::view_folder::ViewFolder;
 use crate::{device, say};
 
 /// Side of an orbit's pictures.
 const DEFAULT_SIDE: u32 = 1024;
 /// Largest picture, in pixels.
 const MAX_PIXELS: u64 = 1 << 26;
-/// Name of the cameras beside the pictures.
-const CAMERAS: &str = "cameras.json";
 /// Where pictures go if no output is named.
 const DEFAULT_FOLDER: &str = "renders";
 
@@ -81,7 +80,9 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     if arguments.raw.is_some() {
         check_raw(&views)?;
     }
-    check_paths(arguments, folder.as_deref(), views.len())?;
+    let folder =
+        folder.map(|path| ViewFolder::new(&path, views.len(), arguments.cameras.as_deref())).transpose()?;
+    check_paths(arguments, folder.as_ref())?;
     let device = device::choose(&arguments.device)?;
     let start = Instant::now();
     let loaded = ply::read(&arguments.ply, &device)?;
@@ -101,7 +102,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     };
 
     if let Some(folder) = &folder {
-        make_folder(folder)?;
+        folder.begin()?;
     }
     let progress = Progress::steps(quiet, views.len(), "views");
     let start = Instant::now();
@@ -111,7 +112,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
         let rendered = view(&loaded, camera, &options)?;
         counts.push(rendered.counts);
         if let Some(folder) = &folder {
-            write_png(&folder.join(picture_name(i)), &picture(&rendered.color)?)?;
+            folder.write(i, &picture(&rendered.color)?)?;
         }
         if let Some(raw) = &mut raw {
             raw.add(rendered)?;
@@ -121,12 +122,8 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     if let Some(raw) = raw {
         raw.write(&views)?;
     }
-    // Last: where there are cameras, there are all of their pictures.
-    let path = folder.as_ref().map(|folder| folder.join(CAMERAS));
-    let given =
-        |path: &Path| arguments.cameras.as_ref().is_some_and(|given| super::is_same_file(given, path));
-    if let Some(path) = path.filter(|path| !given(path)) {
-        cameras::write(&views, &path)?;
+    if let Some(folder) = &folder {
+        folder.finish(&views)?;
     }
     drop(progress);
     let rendering = start.elapsed();
@@ -144,8 +141,9 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
         say::err(&format!("warning: {empty} of {} views show no Gaussian (see --verbose)", counts.len()));
     }
     if !quiet {
-        let outputs: Vec<String> =
-            folder.iter().chain(&arguments.raw).map(|path| path.display().to_string()).collect();
+        let folder = folder.as_ref().map(ViewFolder::path);
+        let outputs = folder.into_iter().chain(arguments.raw.as_deref());
+        let outputs: Vec<String> = outputs.map(|path| path.display().to_string()).collect();
         say(&format!("{}: {} views of {n} Gaussians", outputs.join(", "), views.len()));
     }
     Ok(())
@@ -207,45 +205,16 @@ fn unchecked_views(arguments: &Arguments) -> Result<Vec<Camera>, Failure> {
 }
 
 /// Refuses outputs that cannot be written, that are one another or that are an input.
-fn check_paths(arguments: &Arguments, folder: Option<&Path>, views: usize) -> Result<(), Failure> {
-    let mut inputs = vec![arguments.ply.as_path()];
-    let mut outputs: Vec<PathBuf> = Vec::new();
-    if let Some(folder) = folder {
-        if folder.exists() && !folder.is_dir() {
-            return Err(Failure::Input(format!("{}: exists and is no folder", folder.display())));
-        }
-        // What is there already is overwritten; a folder that is yet to be made holds nothing to lose.
-        let pictures = (0..views).map(|i| folder.join(picture_name(i)));
-        outputs.extend(pictures.filter(|path| path.symlink_metadata().is_ok()));
-        let path = folder.join(CAMERAS);
-        let own = arguments.cameras.as_ref().is_some_and(|given| super::is_same_file(given, &path));
-        if !own && path.symlink_metadata().is_ok() {
-            outputs.push(path);
-        }
-    }
+fn check_paths(arguments: &Arguments, folder: Option<&ViewFolder>) -> Result<(), Failure> {
+    let mut outputs = folder.map(ViewFolder::replaced).unwrap_or_default();
     if let Some(raw) = &arguments.raw {
-        let inside = raw.parent().is_some_and(|parent| folder.is_some_and(|f| same_folder(parent, f)));
-        let name = raw.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
-        if inside && (name == CAMERAS || (0..views).any(|i| picture_name(i) == name)) {
-            return Err(Failure::Input(format!("{}: is given for two outputs", raw.display())));
-        }
+        folder.map_or(Ok(()), |folder| folder.check_apart(raw))?;
         outputs.push(raw.clone());
     }
+    let mut inputs = vec![arguments.ply.as_path()];
     inputs.extend(arguments.cameras.as_deref());
     let outputs: Vec<&Path> = outputs.iter().map(PathBuf::as_path).collect();
     check_outputs(&outputs, &inputs)
-}
-
-fn picture_name(view: usize) -> String {
-    format!("{view:03}.png")
-}
-
-/// Whether two paths lead to one folder, which need not be there yet.
-fn same_folder(a: &Path, b: &Path) -> bool {
-    match (a.canonicalize(), b.canonicalize()) {
-        (Ok(a), Ok(b)) => a == b,
-        _ => a.components().eq(b.components()),
-    }
 }
 
 /// A tensor has one shape: all views must have one size.

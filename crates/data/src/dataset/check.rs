@@ -42,7 +42,8 @@ pub fn check(root: &Path, mut progress: impl FnMut(usize, usize)) -> Result<Chec
         checked.problems.push(format!("{}: there is no subject", root.display()));
     }
     let path = root.join(UNFINISHED);
-    if fs::read_dir(&path).is_ok_and(|mut entries| entries.next().is_some()) {
+    // The mark of a killed run alone is no fault: the next run takes it over.
+    if fs::read_dir(&path).is_ok_and(|entries| entries.flatten().any(|entry| entry.path().is_dir())) {
         checked.problems.push(format!(
             "{}: a run is at work, or was killed: the next one clears this away",
             path.display()

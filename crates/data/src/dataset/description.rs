@@ -2,14 +2,13 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
-use std::fs;
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
 use crate::JitterConfig;
 use snapsnap_mesh::FileError;
-use snapsnap_mesh::open;
+use snapsnap_splat::file;
 
 /// Name of the file that describes a folder.
 pub const DESCRIPTION: &str = "dataset.toml";
@@ -111,10 +110,7 @@ impl Description {
 
 /// Reads a description.
 pub fn read(path: &Path) -> Result<Description, FileError> {
-    if open(path)?.metadata().map_err(FileError::read(path))?.len() > MAX_DESCRIPTION {
-        return Err(FileError::unsuitable(path, "is far too long for a description"));
-    }
-    let text = fs::read_to_string(path).map_err(FileError::read(path))?;
+    let text = file::read_text(path, MAX_DESCRIPTION).map_err(FileError::read(path))?;
     let description: Description =
         toml::from_str(&text).map_err(|e| FileError::unsuitable(path, e.to_string().trim_end()))?;
     match description.problem() {

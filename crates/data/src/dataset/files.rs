@@ -16,7 +16,7 @@ use zip::{CompressionMethod, ZipArchive, ZipWriter};
 use super::MAX_RESOLUTION;
 use snapsnap_mesh::FileError;
 use snapsnap_mesh::open;
-use snapsnap_mesh::picture::decode;
+use snapsnap_mesh::picture::{MAX_BYTES, decode};
 use snapsnap_mesh::view::View;
 
 /// Stored depths of the authors' layout are ⌊2¹⁵/z⌋ (SNAPSNAP §5.2).
@@ -124,7 +124,7 @@ type Depth = (Vec<f32>, [u32; 2]);
 
 /// Undoes [`write_inverse_depth`].
 pub fn read_inverse_depth(path: &Path) -> Result<Depth, FileError> {
-    let picture = decode(path)?;
+    let picture = decode(path, MAX_BYTES)?;
     if picture.color() != image::ColorType::L16 {
         let message = format!("is {:?}, expected 16-bit grey: inverse depth", picture.color());
         return Err(FileError::unsuitable(path, message));

@@ -36,6 +36,7 @@ use description::DESCRIPTION;
 pub use description::{Description, Drawn, Layout, MAX_RESOLUTION, MAX_VIEWS, Split};
 use snapsnap_mesh::FileError;
 use snapsnap_mesh::open;
+use snapsnap_mesh::picture::{MAX_BYTES, decode};
 pub use stored::{StoredView, unproject};
 pub use write::Made;
 
@@ -82,6 +83,7 @@ impl Folder {
             .find_map(|split| Some((split, folder.subjects(split).ok()?.into_iter().next()?)))
             .ok_or_else(|| foreign("no subject lies in img, train/img, val/img or test/img"))?;
         let first = folder.path(split, "img", &subject).join("0.jpg");
+        drop(open(&first)?);
         let size = image::image_dimensions(&first)
             .map_err(|source| FileError::Decode { path: first.clone(), source })?;
         folder.description.resolution = size.0;
@@ -231,7 +233,7 @@ impl Folder {
         let (suffix, times) = if high_resolution { ("_hr", 2) } else { ("", 1) };
         let name = self.file_name("img", format_args!("{view}{suffix}"));
         let path = self.path(split, "img", subject).join(name);
-        let picture = snapsnap_mesh::picture::decode(&path)?;
+        let picture = decode(&path, MAX_BYTES)?;
         self.check_size(&path, (picture.width(), picture.height()), times * self.description.resolution)?;
         Ok(picture)
     }
@@ -239,7 +241,7 @@ impl Folder {
     /// The mask file of a view in the authors' layout.
     fn mask(&self, split: Option<Split>, subject: &str, view: usize) -> Result<GrayImage, FileError> {
         let path = self.path(split, "mask", subject).join(self.file_name("mask", view));
-        let mask = snapsnap_mesh::picture::decode(&path)?.into_luma8();
+        let mask = decode(&path, MAX_BYTES)?.into_luma8();
         self.check_size(&path, mask.dimensions(), self.description.resolution)?;
         Ok(mask)
     }

@@ -1,5 +1,5 @@
 use super::*;
-use crate::prepare::DataConfig;
+use crate::prepare::{DataConfig, Subject};
 use crate::testing::{data_set, rectangle};
 
 const TRAIN: Option<Split> = Some(Split::Train);
@@ -92,14 +92,14 @@ fn a_killed_run_leaves_no_half_subject() {
     let mut config = DataConfig::default();
     config.views =
         crate::prepare::ViewsConfig { count: 4, resolution: 64, high_resolution: true, ..config.views };
-    config.add(&folder, Split::Train, "0002", &rectangle().0, 0.0, "0002").expect("adds");
+    config.add(&folder, &Subject::plain(Split::Train, "0002"), &rectangle().0).expect("adds");
     assert!(folder.has(Split::Train, "0002"));
     // What another run is making at this moment is left to it.
     fs::remove_dir_all(root.join("train/img/0002")).expect("remove");
     fs::create_dir_all(root.join(".unfinished")).expect("make");
     let lock = fs::File::create(root.join(".unfinished/train-0002.lock")).expect("create");
     lock.try_lock().expect("free");
-    let add = || config.add(&folder, Split::Train, "0002", &rectangle().0, 0.0, "0002").expect("adds");
+    let add = || config.add(&folder, &Subject::plain(Split::Train, "0002"), &rectangle().0).expect("adds");
     assert_eq!(add(), Made::Elsewhere);
     drop(lock);
     assert_eq!(add(), Made::Whole);
@@ -188,12 +188,12 @@ fn nearer_than_the_authors_layout_can_say_is_refused() {
         crate::prepare::ViewsConfig { count: 4, resolution: 64, layout: Layout::Authors, ..config.views };
     let folder =
         Folder::create(&temporary.path().join("a_64_4"), config.description("walls")).expect("makes");
-    let refused = config.add(&folder, Split::Train, "0000", &wall, 0.0, "0000").expect_err("too near");
+    let refused = config.add(&folder, &Subject::plain(Split::Train, "0000"), &wall).expect_err("too near");
     assert!(refused.to_string().contains("within half a metre"), "{refused}");
     assert!(!folder.has(Split::Train, "0000"));
     config.views.layout = Layout::Exact;
     let folder = Folder::create(&temporary.path().join("b"), config.description("walls")).expect("makes");
-    config.add(&folder, Split::Train, "0000", &wall, 0.0, "0000").expect("f32 can say it");
+    config.add(&folder, &Subject::plain(Split::Train, "0000"), &wall).expect("f32 can say it");
 }
 
 /// Each file of the authors' layout is looked at, whatever is wrong with the others.
@@ -256,4 +256,33 @@ fn a_check_sees_cameras_that_do_not_fit_their_views() {
             assert_eq!(problems.len(), 2, "{problems:#?}");
         }
     }
+}
+
+/// A killed run's mark alone is no fault, its unfinished subject is; and no name leads out of the data set.
+#[test]
+fn what_a_killed_run_leaves_and_what_subjects_are_called() {
+    let (_temporary, folder) = small(Layout::Exact);
+    let unfinished = folder.root().join(".unfinished");
+    fs::create_dir_all(&unfinished).expect("makes");
+    fs::write(unfinished.join("train-0009.lock"), "").expect("writes");
+    assert_eq!(check(folder.root(), |_, _| {}).expect("checks").problems, [""; 0]);
+    fs::create_dir(unfinished.join("train-0009")).expect("makes");
+    let problems = check(folder.root(), |_, _| {}).expect("checks").problems;
+    assert!(problems.len() == 1 && problems[0].contains("was killed"), "{problems:?}");
+
+    let mut config = DataConfig::default();
+    (config.views.count, config.views.resolution) = (4, 64);
+    for name in ["", ".", "..", ".hid", "a/b", "../train"] {
+        let subject = Subject::plain(Split::Train, name);
+        let error = config.add(&folder, &subject, &rectangle().0).expect_err(name).to_string();
+        assert!(error.contains("is no name of a subject"), "{name}: {error}");
+    }
+    let all = folder.subjects(TRAIN).expect("lists");
+    assert!(all.iter().all(|subject| folder.has(Split::Train, subject)), "{all:?}");
+    // Errors name what the subject was made of.
+    let mut away = rectangle().0;
+    away.positions.iter_mut().for_each(|p| p.x += 50.0);
+    let subject = Subject { origin: Path::new("scans/p.obj"), ..Subject::plain(Split::Train, "p") };
+    let error = config.add(&folder, &subject, &away).expect_err("is not seen").to_string();
+    assert_eq!(error, "scans/p.obj: view 0 sees nothing of p");
 }

@@ -5,11 +5,19 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
-use snapsnap_splat::{Camera, cameras, file};
+use snapsnap_splat::{Camera, cameras, file, quoted};
 
 use super::{Folder, Layout, Split, files};
 use snapsnap_mesh::FileError;
 use snapsnap_mesh::view::View;
+
+/// Refuses names that lead elsewhere than to a subject's own folders, or to hidden ones.
+fn check_name(subject: &str) -> Result<(), String> {
+    if subject.is_empty() || subject.starts_with('.') || subject.contains(['/', '\\']) {
+        return Err(format!("`{}` is no name of a subject", quoted(subject)));
+    }
+    Ok(())
+}
 
 /// Subjects in the making, in the data set's root.
 pub(super) const UNFINISHED: &str = ".unfinished";
@@ -34,7 +42,7 @@ impl Folder {
         })
     }
 
-    /// Adds a subject: `draw` gives what each of `cameras` (pixel centres at +½, side of the set) sees. The subject
+    /// Adds a subject, made of the file `origin`: `draw` gives what each of `cameras` (pixel centres at +½, side of the set) sees. The subject
     /// appears when everything is written; runs that work on one data set leave each other's subjects alone.
     ///
     /// # Errors
@@ -47,6 +55,7 @@ impl Folder {
         &self,
         split: Split,
         subject: &str,
+        origin: &Path,
         cameras: &[Camera],
         draw: impl Fn(&Camera) -> View + Sync,
     ) -> Result<Made, FileError> {
@@ -54,6 +63,7 @@ impl Folder {
         assert_eq!(cameras.len(), description.views, "cameras");
         let side = description.resolution;
         assert!(cameras.iter().all(|c| (c.width, c.height) == (side, side)), "a camera of another size");
+        check_name(subject).map_err(|problem| FileError::unsuitable(origin, problem))?;
         let unfinished = self.root.join(UNFINISHED);
         fs::create_dir_all(&unfinished).map_err(FileError::write(&unfinished))?;
         let temporary = unfinished.join(format!("{split}-{subject}"));
@@ -65,7 +75,9 @@ impl Folder {
             // Some file systems know no locks: nothing keeps two runs apart there.
             Err(TryLockError::Error(_)) | Ok(()) => {}
         }
+        let mark = file::unfinished_file(&mark);
         if self.has(split, subject) {
+            mark.remove();
             return Ok(Made::Whole);
         }
         // Left by a run that was killed.
@@ -74,12 +86,12 @@ impl Folder {
             _ => {}
         }
         let guard = file::unfinished_folder(&temporary).map_err(FileError::write(&temporary))?;
-        let made = self.write_into(&temporary, subject, cameras, &draw);
+        let made = self.write_into(&temporary, subject, origin, cameras, &draw);
         let made = made.and_then(|()| self.reveal(&temporary, split, subject));
         // Whether it went well or not, nothing stays. Other runs may be at work beside it: the folder around is theirs too.
         let _ = fs::remove_dir_all(&temporary);
         drop(guard);
-        let _ = fs::remove_file(&mark);
+        mark.remove();
         made.map(|()| Made::Whole)
     }
 
@@ -102,6 +114,7 @@ impl Folder {
         &self,
         folder: &Path,
         subject: &str,
+        origin: &Path,
         cameras: &[Camera],
         draw: &(impl Fn(&Camera) -> View + Sync),
     ) -> Result<(), FileError> {
@@ -112,17 +125,14 @@ impl Folder {
         cameras.par_iter().enumerate().try_for_each(|(view, camera)| {
             let drawn = draw(&self.exact_camera(camera));
             if drawn.depth.iter().all(|z| *z == 0.0) {
-                return Err(FileError::unsuitable(
-                    &self.root,
-                    format!("view {view} sees nothing of {subject}"),
-                ));
+                return Err(FileError::unsuitable(origin, format!("view {view} sees nothing of {subject}")));
             }
             if self.description.layout == Layout::Authors && drawn.depth.iter().any(|z| *z > 0.0 && *z <= files::NEAREST)
             {
                 let message = format!(
                     "view {view} sees {subject} within half a metre, for which the authors' layout has no number"
                 );
-                return Err(FileError::unsuitable(&self.root, message));
+                return Err(FileError::unsuitable(origin, message));
             }
             let at = |kind: &str| folder.join(kind).join(self.file_name(kind, view));
             let picture = match self.description.layout {

@@ -1,7 +1,7 @@
 //! Binary glTF 2.0: every triangle of the default scene, in its node's place, with its base colour.
 
 use std::collections::HashMap;
-use std::fs;
+use std::fmt::Display;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -10,6 +10,10 @@ use gltf::accessor::{DataType, Dimensions};
 use gltf::mesh::Mode;
 use gltf::{Accessor, Document, Node, Primitive, image::Source};
 use image::RgbImage;
+use serde_json::Value;
+use snapsnap_splat::file;
+
+use super::{MAX_BYTES, Room};
 
 use crate::FileError;
 use crate::mesh::{Face, Material, Mesh};
@@ -18,8 +22,8 @@ use crate::picture::decode_bytes;
 /// Deepest nesting of nodes.
 const MAX_DEPTH: usize = 256;
 
-/// Most positions and faces: nodes may show one mesh many times.
-const MAX_ELEMENTS: usize = 100_000_000;
+/// Most positions and corners of faces: nodes may show one mesh many times. Ten times what scans of people have.
+const MAX_ELEMENTS: usize = 10_000_000;
 
 /// What an attribute may be stored as.
 struct Kind {
@@ -40,19 +44,56 @@ const INDICES: Kind = Kind {
 };
 
 pub fn read(path: &Path) -> Result<Mesh, FileError> {
-    let bytes = fs::read(path).map_err(FileError::read(path))?;
-    let gltf::Gltf { document, blob } = gltf::Gltf::from_slice(&bytes)
-        .map_err(|e| FileError::unsuitable(path, format!("is no valid GLB: {e}")))?;
+    let bytes = file::read(path, MAX_BYTES).map_err(FileError::read(path))?;
+    let invalid = |e: &dyn Display| FileError::unsuitable(path, format!("is no valid GLB: {e}"));
+    check_references(&bytes).map_err(|e| invalid(&e))?;
+    let gltf::Gltf { document, blob } = gltf::Gltf::from_slice(&bytes).map_err(|e| invalid(&e))?;
     drop(bytes);
     let mut file = File {
         path,
         blob: blob.unwrap_or_default(),
         mesh: Mesh::default(),
         textures: HashMap::new(),
+        room: Room::new(),
         nodes_left: document.nodes().len(),
+        places: Vec::new(),
+        elements: 0,
     };
     file.add(&document)?;
     Ok(file.mesh)
+}
+
+/// Refuses references to nothing that the parser follows before it looks.
+fn check_references(bytes: &[u8]) -> Result<(), String> {
+    let glb;
+    let json = if bytes.starts_with(b"glTF") {
+        glb = gltf::Glb::from_slice(bytes).map_err(|e| e.to_string())?;
+        &glb.json[..]
+    } else {
+        bytes
+    };
+    let json: Value = serde_json::from_slice(json).map_err(|e| e.to_string())?;
+    let accessors = list(&json, "accessors").len() as u64;
+    for (mesh, value) in list(&json, "meshes").iter().enumerate() {
+        for primitive in list(value, "primitives") {
+            let attributes = primitive["attributes"].as_object().into_iter().flatten().map(|(_, row)| row);
+            let rows = attributes.chain(primitive.get("indices")).filter_map(Value::as_u64);
+            if let Some(row) = rows.into_iter().find(|row| *row >= accessors) {
+                return Err(format!("mesh {mesh} refers to accessor {row}, there are {accessors}"));
+            }
+        }
+    }
+    for (index, image) in list(&json, "images").iter().enumerate() {
+        let is_inside = image.get("bufferView").is_some() && image.get("mimeType").is_some();
+        if image.get("uri").is_none() && !is_inside {
+            return Err(format!("image {index} has neither `uri` nor `bufferView` and `mimeType`"));
+        }
+    }
+    Ok(())
+}
+
+fn list<'a>(of: &'a Value, key: &str) -> &'a [Value] {
+    of[key].as_array().map_or(&[], Vec::as_slice)
 }
 
 struct File<'a> {
@@ -62,8 +103,13 @@ struct File<'a> {
     mesh: Mesh,
     /// By the row of the image.
     textures: HashMap<usize, Arc<RgbImage>>,
+    room: Room,
     /// Nodes that may still be visited: in a tree each comes once, in a damaged file there may be loops.
     nodes_left: usize,
+    /// Where primitives stand: mesh, primitive and the node's place.
+    places: Vec<(usize, usize, Mat4)>,
+    /// Positions and corners of all of them.
+    elements: usize,
 }
 
 impl File<'_> {
@@ -82,6 +128,12 @@ impl File<'_> {
         let scene = scene.ok_or_else(|| self.wrong("it has no scene"))?;
         for node in scene.nodes() {
             self.node(&node, Mat4::IDENTITY, 0)?;
+        }
+        // Only now: how much it is altogether is known.
+        let meshes: Vec<gltf::Mesh> = document.meshes().collect();
+        let primitives: Vec<Vec<Primitive>> = meshes.iter().map(|mesh| mesh.primitives().collect()).collect();
+        for (mesh, primitive, to_world) in std::mem::take(&mut self.places) {
+            self.primitive(&primitives[mesh][primitive], to_world)?;
         }
         Ok(())
     }
@@ -108,7 +160,7 @@ impl File<'_> {
         let bytes =
             view.offset().checked_add(view.length()).and_then(|end| self.blob.get(view.offset()..end));
         let bytes = bytes.ok_or_else(|| self.wrong(format!("texture {} is cut off", image.index())))?;
-        let texture = Arc::new(decode_bytes(self.path, bytes)?.into_rgb8());
+        let texture = self.room.fill(|most| decode_bytes(self.path, bytes, most))?;
         self.textures.insert(image.index(), texture.clone());
         Ok(texture)
     }
@@ -119,8 +171,16 @@ impl File<'_> {
         }
         self.nodes_left -= 1;
         let to_world = parent * Mat4::from_cols_array_2d(&node.transform().matrix());
-        for primitive in node.mesh().iter().flat_map(gltf::Mesh::primitives) {
-            self.primitive(&primitive, to_world)?;
+        if let Some(mesh) = node.mesh() {
+            for (row, primitive) in mesh.primitives().enumerate() {
+                self.elements = self.elements.saturating_add(self.checked_size(&primitive)?);
+                if self.elements > MAX_ELEMENTS {
+                    let message =
+                        format!("its nodes unfold to more than {MAX_ELEMENTS} positions and corners");
+                    return Err(self.wrong(message));
+                }
+                self.places.push((mesh.index(), row, to_world));
+            }
         }
         for child in node.children() {
             self.node(&child, to_world, depth + 1)?;
@@ -133,27 +193,8 @@ impl File<'_> {
         if !matches!(mode, Mode::Triangles | Mode::TriangleStrip | Mode::TriangleFan) {
             return Ok(());
         }
-        let base = primitive.material().pbr_metallic_roughness();
-        let set = base.base_color_texture().map_or(0, |texture| texture.tex_coord());
-        let wanted = [
-            (primitive.get(&gltf::Semantic::Positions), &POSITIONS),
-            (primitive.get(&gltf::Semantic::TexCoords(set)), &TEXCOORDS),
-            (primitive.get(&gltf::Semantic::Colors(0)), &COLORS),
-            (primitive.indices(), &INDICES),
-        ];
-        for (accessor, kind) in &wanted {
-            if let Some(accessor) = accessor {
-                self.check(accessor, kind)?;
-            }
-        }
-        let count = wanted[0].0.as_ref().map_or(0, Accessor::count);
-        let indices = wanted[3].0.as_ref().map_or(count, Accessor::count);
-        if self.mesh.positions.len() + count > MAX_ELEMENTS || self.mesh.faces.len() + indices > MAX_ELEMENTS
-        {
-            return Err(
-                self.wrong(format!("its nodes unfold to more than {MAX_ELEMENTS} positions or faces"))
-            );
-        }
+        let set = texture_set(primitive);
+        let count = primitive.get(&gltf::Semantic::Positions).as_ref().map_or(0, Accessor::count);
         let blob = std::mem::take(&mut self.blob);
         let reader = primitive.reader(|_| Some(&blob));
         let positions: Vec<Vec3> = reader
@@ -222,6 +263,22 @@ impl File<'_> {
         Ok(())
     }
 
+    /// Positions and corners of a primitive, one at least, all of whose accessors lie inside the file.
+    fn checked_size(&self, primitive: &Primitive) -> Result<usize, FileError> {
+        let wanted = [
+            (primitive.get(&gltf::Semantic::Positions), &POSITIONS),
+            (primitive.get(&gltf::Semantic::TexCoords(texture_set(primitive))), &TEXCOORDS),
+            (primitive.get(&gltf::Semantic::Colors(0)), &COLORS),
+            (primitive.indices(), &INDICES),
+        ];
+        for (accessor, kind) in &wanted {
+            accessor.as_ref().map_or(Ok(()), |accessor| self.check(accessor, kind))?;
+        }
+        let [positions, _, _, corners] = wanted.map(|(accessor, _)| accessor.as_ref().map(Accessor::count));
+        let positions = positions.unwrap_or(0);
+        Ok(positions.saturating_add(corners.unwrap_or(positions)).max(1))
+    }
+
     /// Whether the accessor lies inside the file: the reader trusts it.
     fn check(&self, accessor: &Accessor, kind: &Kind) -> Result<(), FileError> {
         let index = accessor.index();
@@ -251,6 +308,12 @@ impl File<'_> {
         }
         Ok(())
     }
+}
+
+/// Which texture coordinates the primitive's texture is laid by.
+fn texture_set(primitive: &Primitive) -> u32 {
+    let base = primitive.material().pbr_metallic_roughness();
+    base.base_color_texture().map_or(0, |texture| texture.tex_coord())
 }
 
 /// Linear light as a screen shows it (sRGB).

@@ -7,15 +7,15 @@ mod ply;
 mod tests;
 
 use std::collections::HashMap;
-use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use glam::Vec3;
-use image::RgbImage;
+use image::{DynamicImage, RgbImage};
 use snapsnap_splat::quoted;
 
 use crate::FileError;
+use crate::error::guarded;
 use crate::mesh::Mesh;
 use crate::picture::decode;
 
@@ -24,6 +24,11 @@ pub const EXTENSIONS: [&str; 3] = ["obj", "ply", "glb"];
 
 /// Largest file that is read; the largest published scans take a few hundred megabytes.
 const MAX_BYTES: u64 = 4 << 30;
+
+/// Bytes that a texture may take once it is decoded: 8192×8192 pixels of red, green, blue and alpha.
+const MAX_TEXTURE: u64 = 256 << 20;
+/// The same for all textures of a scan, as red, green and blue.
+const MAX_TEXTURES: u64 = 512 << 20;
 
 /// Reads a scan. Positions are as in the file; positions that several vertices share are made one, so that shading is
 /// smooth across the seams of textures.
@@ -39,15 +44,7 @@ pub fn read(path: &Path) -> Result<Mesh, FileError> {
         "glb" => glb::read,
         _ => return Err(FileError::unsuitable(path, "is no scan: expected a file .obj, .ply or .glb")),
     };
-    let metadata = fs::metadata(path).map_err(FileError::read(path))?;
-    if !metadata.is_file() {
-        return Err(FileError::unsuitable(path, "is no regular file"));
-    }
-    if metadata.len() > MAX_BYTES {
-        let message = format!("has {} bytes, more than {MAX_BYTES}", metadata.len());
-        return Err(FileError::unsuitable(path, message));
-    }
-    let mut mesh = reader(path)?;
+    let mut mesh = guarded(path, || reader(path))?;
     mesh.check().map_err(|e| FileError::unsuitable(path, e))?;
     // Files differ in what the brightest value of a colour is.
     if mesh.colors.iter().any(|c| c.max_element() > 2.0) {
@@ -63,11 +60,31 @@ struct Textures<'a> {
     /// The file that names them.
     owner: &'a Path,
     loaded: HashMap<PathBuf, Arc<RgbImage>>,
+    room: Room,
+}
+
+/// Bytes that are left for textures.
+struct Room(u64);
+
+impl Room {
+    fn new() -> Self {
+        Self(MAX_TEXTURES)
+    }
+
+    /// Decodes a texture with `decode`, which is told how many bytes it may take.
+    fn fill(
+        &mut self,
+        decode: impl FnOnce(u64) -> Result<DynamicImage, FileError>,
+    ) -> Result<Arc<RgbImage>, FileError> {
+        let texture = decode(MAX_TEXTURE.min(self.0))?.into_rgb8();
+        self.0 = self.0.saturating_sub(texture.len() as u64);
+        Ok(Arc::new(texture))
+    }
 }
 
 impl<'a> Textures<'a> {
     fn of(owner: &'a Path) -> Self {
-        Self { owner, loaded: HashMap::new() }
+        Self { owner, loaded: HashMap::new(), room: Room::new() }
     }
 
     /// The texture that the scan calls `name`. Scans travel: a path of another machine is looked for beside the scan.
@@ -79,7 +96,7 @@ impl<'a> Textures<'a> {
         if let Some(texture) = self.loaded.get(&path) {
             return Ok(texture.clone());
         }
-        let texture = Arc::new(decode(&path)?.into_rgb8());
+        let texture = self.room.fill(|most| decode(&path, most))?;
         self.loaded.insert(path, texture.clone());
         Ok(texture)
     }

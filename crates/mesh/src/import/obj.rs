@@ -2,15 +2,14 @@
 
 use std::cell::Cell;
 use std::collections::HashMap;
-use std::fs;
 use std::io::{self, BufRead, Read};
 use std::path::Path;
 
 use glam::{Vec2, Vec3};
-use snapsnap_splat::quoted;
+use snapsnap_splat::{file, quoted};
 use tobj::{LoadError, LoadOptions};
 
-use super::{Textures, beside};
+use super::{MAX_BYTES, Textures, beside};
 use crate::FileError;
 use crate::mesh::{Face, Material, Mesh};
 
@@ -45,7 +44,7 @@ pub fn read(path: &Path) -> Result<Mesh, FileError> {
     if let Some(e) = failed.take() {
         return Err(e);
     }
-    check_faces(path, &text)?;
+    check_whole(path, &text)?;
     let materials = materials.unwrap_or_default();
     // The parser takes unknown names for no material at all.
     let mut used = text.lines().filter_map(|line| line.strip_prefix("usemtl ")).map(str::trim);
@@ -90,39 +89,111 @@ pub fn read(path: &Path) -> Result<Mesh, FileError> {
     Ok(mesh)
 }
 
-/// Refuses what is left of a file that was cut: a face of fewer than three corners, which the parser takes for a line, and
-/// vertices at the end that no face refers to any more.
-fn check_faces(path: &Path, text: &str) -> Result<(), FileError> {
-    let (mut vertices, mut last) = (0_i64, 0_i64);
+/// Refuses what is left of a file that was cut: a last line without an end; a face of fewer than three corners, which the
+/// parser takes for a line; vertices at the end that no face refers to any more; fewer vertices or faces than a comment
+/// says.
+fn check_whole(path: &Path, text: &str) -> Result<(), FileError> {
+    let wrong = |message: String| FileError::unsuitable(path, message);
+    let mut counts = Counts::default();
+    let mut last = 0_i64;
     for (number, line) in text.lines().enumerate() {
+        counts.comment(line);
         let mut words = line.split_ascii_whitespace().take_while(|word| !word.starts_with('#'));
         match words.next() {
-            Some("v") => vertices += 1,
+            Some("v") => counts.vertices += 1,
             Some(kind @ ("f" | "l" | "p")) => {
                 let mut corners = 0;
                 for word in words {
                     corners += 1;
                     let row: i64 = word.split('/').next().and_then(|row| row.parse().ok()).unwrap_or(0);
                     // Negative numbers count from the end.
-                    last = last.max(if row < 0 { vertices + row + 1 } else { row });
+                    last = last.max(if row < 0 { counts.vertices + row + 1 } else { row });
                 }
                 if kind == "f" && corners < 3 {
                     let message =
                         format!("line {}, `{}`: a face needs three corners", number + 1, quoted(line));
-                    return Err(FileError::unsuitable(path, message));
+                    return Err(wrong(message));
+                }
+                if kind == "f" {
+                    counts.faces += 1;
+                    counts.triangles += corners - 2;
                 }
             }
             _ => {}
         }
     }
-    let unused = vertices - last;
+    let end = text.lines().last().unwrap_or_default();
+    if counts.vertices > 0
+        && !text.ends_with('\n')
+        && !end.trim().is_empty()
+        && !end.trim_start().starts_with('#')
+    {
+        let message = format!(
+            "its last line, `{}`, has no end: the file seems to be cut short (if it is whole, end it with a line break)",
+            quoted(end)
+        );
+        return Err(wrong(message));
+    }
+    if let Some(message) = counts.missing() {
+        return Err(wrong(message));
+    }
+    let (vertices, unused) = (counts.vertices, counts.vertices - last);
     if last > 0 && unused > 2 && unused as f64 > UNUSED * vertices as f64 {
         let message = format!(
             "its last {unused} of {vertices} vertices belong to no face: the file seems to be cut short"
         );
-        return Err(FileError::unsuitable(path, message));
+        return Err(wrong(message));
     }
     Ok(())
+}
+
+/// What an OBJ holds, and what its own comments say that it holds.
+#[derive(Default)]
+struct Counts {
+    vertices: i64,
+    faces: i64,
+    triangles: i64,
+    /// What comments before the first vertex and the first face say: number and noun.
+    promised: Vec<(i64, &'static str)>,
+}
+
+impl Counts {
+    /// Takes note of comments that count, as exporters write them: `# Vertices: 8`, `# number of triangles: 12`,
+    /// `#Vertex Count 8`. Behind the first vertex or face they count what stands before them, which is there.
+    fn comment(&mut self, line: &str) {
+        let Some(comment) = line.trim_start().strip_prefix('#') else { return };
+        if self.vertices + self.faces > 0 || comment.len() > 80 {
+            return;
+        }
+        let comment = comment.to_ascii_lowercase();
+        let words: Vec<&str> = comment.split(|c: char| !c.is_ascii_alphanumeric()).collect();
+        let noun = match () {
+            // Coordinates and normals are others' numbers.
+            () if ["normals", "normal", "texture", "coordinates"].iter().any(|w| words.contains(w)) => return,
+            () if words.contains(&"vertices") || comment.trim().starts_with("vertex count") => "vertices",
+            () if words.contains(&"triangles") => "triangles",
+            () if words.contains(&"faces") || comment.trim().starts_with("face count") => "faces",
+            () => return,
+        };
+        let mut numbers = words.iter().filter_map(|word| word.parse::<i64>().ok());
+        if let (Some(number), None) = (numbers.next(), numbers.next()) {
+            self.promised.push((number, noun));
+        }
+    }
+
+    /// The first comment that counts more than there is.
+    fn missing(&self) -> Option<String> {
+        let found = |noun: &str| match noun {
+            "vertices" => self.vertices,
+            // Some count polygons as triangles.
+            _ => self.faces.max(self.triangles),
+        };
+        let (promised, noun) = self.promised.iter().find(|(number, noun)| *number > found(noun))?;
+        let found = if *noun == "vertices" { self.vertices } else { self.faces };
+        Some(format!(
+            "a comment promises {promised} {noun}, there are {found}: the file seems to be cut short"
+        ))
+    }
 }
 
 /// The file in a `map_Kd` statement, behind its options (`-s 1 1 1 skin.png`).
@@ -147,7 +218,7 @@ fn file_name(statement: &str) -> &str {
 
 /// A text file; bytes that are no UTF-8, as in names from elsewhere, are replaced.
 fn read_lossy(path: &Path) -> Result<String, FileError> {
-    let bytes = fs::read(path).map_err(FileError::read(path))?;
+    let bytes = file::read(path, MAX_BYTES).map_err(FileError::read(path))?;
     Ok(String::from_utf8(bytes).unwrap_or_else(|e| String::from_utf8_lossy(e.as_bytes()).into_owned()))
 }
 

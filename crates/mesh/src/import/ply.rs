@@ -1,15 +1,15 @@
 //! PLY meshes, ASCII and binary of either endianness: vertex colours, or a texture with coordinates per vertex or per
 //! corner.
 
-use std::fs;
 use std::path::Path;
 use std::str::SplitAsciiWhitespace;
 
 use glam::{Vec2, Vec3};
+use snapsnap_splat::file;
 use snapsnap_splat::ply::header::{Element, Format, Scalar, parse};
 use snapsnap_splat::quoted;
 
-use super::Textures;
+use super::{MAX_BYTES, Textures};
 use crate::FileError;
 use crate::mesh::{Face, Material, Mesh};
 
@@ -17,7 +17,7 @@ use crate::mesh::{Face, Material, Mesh};
 const MAX_CORNERS: usize = 1 << 16;
 
 pub fn read(path: &Path) -> Result<Mesh, FileError> {
-    let bytes = fs::read(path).map_err(FileError::read(path))?;
+    let bytes = file::read(path, MAX_BYTES).map_err(FileError::read(path))?;
     let wrong = |problem: String| FileError::unsuitable(path, problem);
     let header = parse(&bytes).map_err(wrong)?;
     let body = &bytes[header.len..];

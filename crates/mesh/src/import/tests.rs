@@ -253,7 +253,7 @@ fn corrupt_scans_are_refused_by_name() {
         ("faces.ply", b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\nproperty float z\nelement face 1000000000000000\nend_header\n".into(), "no list `vertex_indices`"),
         ("mtl.obj", format!("mtllib no.mtl\n{triangle}").into(), "material file `no.mtl` is missing"),
         ("texture.obj", format!("mtllib absent.mtl\n{triangle}").into(), "texture `absent.png` is missing"),
-        ("absurd.obj", format!("mtllib absurd.mtl\n{triangle}").into(), "is 100000×100000, more than"),
+        ("absurd.obj", format!("mtllib absurd.mtl\n{triangle}").into(), "is 100000×100000, 28611 MiB in memory, more than 256"),
         ("ascii.ply", billion("ascii").into(), "vertex 1 of 1000000000: `x` is missing"),
         ("binary.ply", billion("binary_big_endian").into(), "of 1000000000: `y` is missing"),
         ("cut.ply", binary[..binary.len() - 3].into(), "face 1 of 2: `vertex_indices` is missing"),
@@ -287,4 +287,69 @@ fn corrupt_scans_are_refused_by_name() {
         assert!(error.starts_with(&folder.0.path().display().to_string()), "{name}: {error}");
     }
     assert!(read(Path::new("/no/such.obj")).expect_err("missing").to_string().contains("cannot read"));
+}
+
+/// Documents that once made the parser panic, which ended a whole batch.
+#[test]
+fn glb_with_references_to_nothing() {
+    let folder = Folder::new();
+    let bare = r#"{"asset":{"version":"2.0"},"meshes":[{"primitives":[{"attributes":{"POSITION":0}}]}]}"#;
+    let image = |image: &str| {
+        let image = format!("\"images\":[{image}]");
+        glb(|json| json.replace(r#""images":[{"bufferView":3,"mimeType":"image/png"}]"#, &image))
+    };
+    let cases = [
+        ("accessor", bare.as_bytes().to_vec(), "mesh 0 refers to accessor 0, there are 0"),
+        ("indices", glb(|json| json.replace("\"indices\":2", "\"indices\":9")), "refers to accessor 9"),
+        ("no source", image("{}"), "image 0 has neither `uri` nor `bufferView` and `mimeType`"),
+        ("no type", image(r#"{"bufferView":3}"#), "image 0 has neither"),
+    ];
+    for (name, bytes, expected) in cases {
+        let error = read(&folder.file("a.glb", bytes)).map(|_| ()).expect_err(name).to_string();
+        assert!(error.contains("is no valid GLB") && error.contains(expected), "{name}: {error}");
+    }
+}
+
+/// One mesh in very many nodes: counted before anything is made of it.
+#[test]
+fn glb_that_unfolds_without_measure_is_refused() {
+    // So many nodes show a mesh of so many primitives.
+    let nodes = |count: usize| {
+        glb(|json| {
+            let primitive = r#"{"attributes":{"POSITION":0,"TEXCOORD_0":1},"indices":2,"material":0}"#;
+            let json = json.replace(primitive, &vec![primitive; count].join(","));
+            let places = vec![r#"{"mesh":0}"#; count].join(",");
+            let children: Vec<String> = (2..count + 2).map(|node| node.to_string()).collect();
+            json.replace("\"children\":[1]", &format!("\"children\":[{}]", children.join(",")))
+                .replace("\"mesh\":0,\"translation\":[0,0,1]}", &format!("\"mesh\":0}},{places}"))
+        })
+    };
+    let folder = Folder::new();
+    assert_eq!(read(&folder.file("a.glb", nodes(30))).expect("reads").faces.len(), 900);
+    // Three positions and three corners each.
+    let error = read(&folder.file("a.glb", nodes(1300))).map(|_| ()).expect_err("refuses").to_string();
+    assert!(error.contains("its nodes unfold to more than 10000000 positions and corners"), "{error}");
+}
+
+#[test]
+fn obj_that_is_cut_short_is_refused() {
+    let folder = Folder::new();
+    let start = "v 0 0 0\nv 1 0 0\nv 0 1 0\n";
+    let outcome = |text: &str| read(&folder.file("a.obj", text)).map(|_| ()).map_err(|e| e.to_string());
+    let error = outcome(&format!("{start}f 1 2 3\nf 1 3 2")).expect_err("a line without an end");
+    assert!(error.contains("its last line, `f 1 3 2`, has no end"), "{error}");
+    assert_eq!(outcome(&format!("{start}f 1 2 3\nf 1 3 2\n")), Ok(()));
+    assert_eq!(outcome(&format!("{start}f 1 2 3\n# End of File")), Ok(()));
+    for comment in
+        ["# Faces: 2", "# number of triangles: 2", "#Face count 2", "# Vertices: 4", "# 4 vertices"]
+    {
+        let error = outcome(&format!("{comment}\n{start}f 1 2 3\n")).expect_err(comment);
+        assert!(error.contains("a comment promises"), "{comment}: {error}");
+        assert_eq!(outcome(&format!("{comment}\n{start}v 1 1 0\nf 1 2 3\nf 2 4 3\n")), Ok(()), "{comment}");
+    }
+    // Behind them they count what was before; and normals are no faces.
+    for comment in ["# 9 vertex normals", "# made of 9 vertices and 3 faces", "# Texture vertices: 9"] {
+        assert_eq!(outcome(&format!("{comment}\n{start}f 1 2 3\n")), Ok(()), "{comment}");
+    }
+    assert_eq!(outcome(&format!("{start}# 3 vertices\ng a\nf 1 2 3\n# 1 faces\n")), Ok(()));
 }

@@ -78,15 +78,15 @@ const MAX_TAPS: f32 = 8.0;
 
 /// A texture and its halvings.
 struct Pyramid {
-    levels: Vec<RgbImage>,
+    levels: Vec<Arc<RgbImage>>,
 }
 
 impl Pyramid {
-    fn new(texture: &RgbImage) -> Self {
+    fn new(texture: &Arc<RgbImage>) -> Self {
         let mut levels = vec![texture.clone()];
         while let Some(last) = levels.last().filter(|l| l.width() > 1 || l.height() > 1) {
             let (w, h) = ((last.width() / 2).max(1), (last.height() / 2).max(1));
-            levels.push(image::imageops::thumbnail(last, w, h));
+            levels.push(Arc::new(image::imageops::thumbnail(last.as_ref(), w, h)));
         }
         Self { levels }
     }

@@ -171,11 +171,7 @@ impl Dust3r {
         };
         match head {
             Head::Linear(head) => head.forward(tokens(self.config.dec_depth), grid),
-            Head::Dpt(head) => head.forward(self.config.hooks.map(|i| {
-                let x = tokens(i);
-                let [b, _, c] = x.dims();
-                x.swap_dims(1, 2).reshape([b, c, grid[0], grid[1]])
-            })),
+            Head::Dpt(head) => head.forward(self.config.hooks.map(tokens), grid),
         }
     }
 

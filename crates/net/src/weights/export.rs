@@ -8,7 +8,8 @@ use super::file::{Progress, WeightFile, write_tensors};
 use super::import::alias_of;
 
 /// Writes `from` (our file) to `to` with every name the authors' state dicts have, aliases included, and without our
-/// metadata, so that a strict `load_state_dict` accepts each part. Returns the number of tensors written.
+/// metadata, so that a strict `load_state_dict` accepts each part. Values that are not finite are refused, as in an import.
+/// Returns the number of tensors written.
 ///
 /// # Errors
 /// [`WeightsError`].
@@ -22,6 +23,7 @@ pub fn export(from: &Path, to: &Path, progress: Progress) -> Result<usize, Weigh
     let shapes =
         entries.iter().map(|(alias, name)| (alias.clone(), file.source.tensors()[*name].shape.clone()));
     let metadata = HashMap::from([("format".to_owned(), "pt".to_owned())]);
-    write_tensors(to, metadata, shapes.collect(), |i| file.source.read_f32(entries[i].1), progress)?;
+    let values = |i: usize| file.source.read_f32(entries[i].1);
+    write_tensors(to, &from.display().to_string(), metadata, shapes.collect(), values, progress)?;
     Ok(entries.len())
 }

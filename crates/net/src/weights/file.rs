@@ -4,6 +4,7 @@ use std::collections::{BTreeSet, HashMap};
 use std::io::{self, Write};
 use std::path::Path;
 
+use rayon::prelude::*;
 use safetensors::Dtype;
 use safetensors::tensor::{Metadata, TensorInfo};
 use snapsnap_splat::file::write_whole;
@@ -19,12 +20,16 @@ pub const CONFIG_KEY: &str = "snapsnap.config";
 /// Hears how many bytes of how many have been written.
 pub type Progress<'a> = &'a dyn Fn(u64, u64);
 
+/// Values per task: a second-level cache holds them.
+const CHUNK: usize = 1 << 16;
 /// Bytes of an f32.
 const F32: usize = 4;
 
-/// Writes `tensors` in order, asking `values` for one at a time, so that never more than one is in memory.
+/// Writes `tensors` in order, asking `values` for one at a time, so that never more than one is in memory. All that are not
+/// finite are named at the end, as `origin`'s, and nothing is written.
 pub(super) fn write(
     path: &Path,
+    origin: &str,
     config: &Config,
     tensors: &[TensorSpec],
     mut values: impl FnMut(&TensorSpec) -> Result<Vec<f32>, WeightsError>,
@@ -33,17 +38,18 @@ pub(super) fn write(
     let infos = tensors.iter().map(|t| (t.name.clone(), t.shape.clone()));
     // One entry only: the header lists metadata in no fixed order, and the same seed must give the same bytes.
     let metadata = HashMap::from([(CONFIG_KEY.into(), config.to_toml())]);
-    write_tensors(path, metadata, infos.collect(), |i| values(&tensors[i]), progress)
+    write_tensors(path, origin, metadata, infos.collect(), |i| values(&tensors[i]), progress)
 }
 
 pub(super) fn write_tensors(
     path: &Path,
+    origin: &str,
     metadata: HashMap<String, String>,
     tensors: Vec<(String, Vec<usize>)>,
     mut values: impl FnMut(usize) -> Result<Vec<f32>, WeightsError>,
     progress: Progress,
 ) -> Result<(), WeightsError> {
-    let count = tensors.len();
+    let names: Vec<String> = tensors.iter().map(|(name, _)| name.clone()).collect();
     let mut at = 0;
     let infos = tensors.into_iter().map(|(name, shape)| {
         let from = at;
@@ -69,19 +75,31 @@ pub(super) fn write_tensors(
         out.write_all(&(header.len() as u64).to_le_bytes())?;
         out.write_all(&header)?;
         let mut written = 0;
-        for i in 0..count {
+        let mut problems = Vec::new();
+        for (i, name) in names.iter().enumerate() {
             let values = values(i).map_err(Failure::Weights)?;
+            problems.extend(not_finite(name, &values));
             let bytes: Vec<u8> = values.iter().flat_map(|v| v.to_le_bytes()).collect();
             out.write_all(&bytes)?;
             written += bytes.len();
             progress(written as u64, at as u64);
         }
-        Ok(())
+        if problems.is_empty() {
+            return Ok(());
+        }
+        Err(Failure::Weights(WeightsError::Tensors { origin: origin.to_owned(), problems }))
     })
     .map_err(|e| match e {
         Failure::Io(source) => WeightsError::Write { path: path.to_owned(), source },
         Failure::Weights(e) => e,
     })
+}
+
+/// A line for a tensor with values that are not finite.
+pub(super) fn not_finite(name: &str, values: &[f32]) -> Option<String> {
+    let bad =
+        values.par_chunks(CHUNK).map(|part| part.iter().filter(|v| !v.is_finite()).count()).sum::<usize>();
+    (bad > 0).then(|| format!("not finite: {name} ({bad} of {} values)", values.len()))
 }
 
 /// An opened weight file whose tensors fit its config.
@@ -125,6 +143,12 @@ impl WeightFile {
     /// The file.
     pub fn path(&self) -> &Path {
         self.source.path()
+    }
+
+    /// Number of parameters.
+    pub fn parameters(&self) -> u64 {
+        let elements = |entry: &Entry| entry.shape.iter().map(|side| *side as u64).product::<u64>();
+        self.source.tensors().values().map(elements).sum()
     }
 
     /// Refuses a file that lacks one of the parts.

@@ -95,26 +95,11 @@ pub fn import(
     }
 
     let mut next = plan.iter();
-    let mut broken = Vec::new();
-    let values = |spec: &TensorSpec| {
-        let values = match next.next().expect("one origin per tensor") {
-            Origin::Drawn => draw(spec, options.seed),
-            Origin::File(source, key) => source.read_f32(key)?,
-        };
-        let bad = values.iter().filter(|v| !v.is_finite()).count();
-        if bad > 0 {
-            broken.push(format!("not finite: {} ({bad} of {} values)", spec.name, values.len()));
-        }
-        // Only the last tensor refuses, so that all broken ones are named; the temporary file is then discarded.
-        if next.len() == 0 && !broken.is_empty() {
-            return Err(WeightsError::Tensors {
-                origin: origin.clone(),
-                problems: std::mem::take(&mut broken),
-            });
-        }
-        Ok(values)
+    let values = |spec: &TensorSpec| match next.next().expect("one origin per tensor") {
+        Origin::Drawn => Ok(draw(spec, options.seed)),
+        Origin::File(source, key) => source.read_f32(key),
     };
-    write(to, config, &specs, values, progress)?;
+    write(to, &origin, config, &specs, values, progress)?;
     report.tensors = specs.len();
     report.parameters = specs.iter().map(TensorSpec::elements).sum();
     Ok(report)

@@ -47,7 +47,7 @@ fn fnv1a(text: &str) -> u64 {
 /// [`WeightsError::Write`].
 pub fn init(config: &Config, seed: u64, path: &Path, progress: Progress) -> Result<usize, WeightsError> {
     let tensors = schema::tensors(config);
-    write(path, config, &tensors, |spec| Ok(draw(spec, seed)), progress)?;
+    write(path, "random weights", config, &tensors, |spec| Ok(draw(spec, seed)), progress)?;
     Ok(tensors.iter().map(TensorSpec::elements).sum())
 }
 

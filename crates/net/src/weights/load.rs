@@ -3,7 +3,7 @@
 use burn::module::{Module, ModuleMapper, Param};
 use burn::tensor::{Device, Tensor, TensorData};
 
-use super::file::WeightFile;
+use super::file::{WeightFile, not_finite};
 use super::schema::{Part, SIDE};
 use super::{Source, WeightsError};
 use crate::network::PointPredictor;
@@ -92,9 +92,8 @@ impl Loader<'_> {
                 return None;
             }
         };
-        let bad = values.iter().filter(|v| !v.is_finite()).count();
-        if bad > 0 {
-            self.problems.push(format!("not finite: {name} ({bad} of {} values)", values.len()));
+        if let Some(problem) = not_finite(&name, &values) {
+            self.problems.push(problem);
             return None;
         }
         let mut shape = self.source.tensors()[&name].shape.clone();

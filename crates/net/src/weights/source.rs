@@ -5,8 +5,11 @@ use std::fs::File;
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
+use burn::tensor::{bf16, f16};
 use pytorch_reader::PytorchReader;
+use rayon::prelude::*;
 use safetensors::tensor::Metadata;
+use snapsnap_splat::file;
 
 use super::WeightsError;
 
@@ -47,7 +50,7 @@ impl Source {
     /// [`WeightsError`] for a file that is missing, truncated, or neither of the two formats.
     pub fn open(path: &Path) -> Result<Self, WeightsError> {
         let read = |source| WeightsError::Read { path: path.to_owned(), source };
-        let mut file = File::open(path).map_err(read)?;
+        let mut file = file::open(path).map_err(read)?;
         let mut start = [0_u8; 9];
         let filled = read_up_to(&mut file, &mut start).map_err(read)?;
         // A safetensors file starts with a little-endian header length and then JSON; every PyTorch container starts
@@ -136,33 +139,85 @@ impl Source {
             .tensors
             .get(name)
             .ok_or_else(|| WeightsError::format(&self.path, &format!("has no tensor `{name}`")))?;
-        let bytes = match &self.reader {
-            Reader::Safetensors(file) => {
-                let mut bytes = vec![0; entry.len];
-                read_at(file, &mut bytes, entry.start).map(|()| bytes)
-            }
-            Reader::Pytorch(tensors) => tensors[name].read(),
-        };
-        let bytes = bytes.map_err(|source| WeightsError::Read { path: self.path.clone(), source })?;
-        widen(&bytes, &entry.dtype).ok_or_else(|| {
+        let kind = Float::called(&entry.dtype).ok_or_else(|| {
             WeightsError::format(&self.path, &format!("`{name}` is {}, not f32, f16 or bf16", entry.dtype))
-        })
+        })?;
+        let values = match &self.reader {
+            Reader::Safetensors(file) => read_values(file, entry, kind),
+            Reader::Pytorch(tensors) => tensors[name].read().map(|bytes| {
+                let mut values = vec![0.0; bytes.len() / kind.size()];
+                kind.widen(&bytes, &mut values);
+                values
+            }),
+        };
+        values.map_err(|source| WeightsError::Read { path: self.path.clone(), source })
     }
 }
 
 /// Whether tensors of this type can become f32 without loss.
 pub fn is_readable(dtype: &str) -> bool {
-    matches!(dtype, "f32" | "f16" | "bf16")
+    Float::called(dtype).is_some()
 }
 
-fn widen(bytes: &[u8], dtype: &str) -> Option<Vec<f32>> {
-    let two = |widen: fn([u8; 2]) -> f32| bytes.chunks_exact(2).map(|b| widen([b[0], b[1]])).collect();
-    match dtype {
-        "f32" => Some(bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect()),
-        "f16" => Some(two(|b| burn::tensor::f16::from_le_bytes(b).to_f32())),
-        "bf16" => Some(two(|b| burn::tensor::bf16::from_le_bytes(b).to_f32())),
-        _ => None,
+/// Types of numbers that f32 holds without loss.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Float {
+    F32,
+    F16,
+    Bf16,
+}
+
+impl Float {
+    fn called(dtype: &str) -> Option<Self> {
+        match dtype {
+            "f32" => Some(Self::F32),
+            "f16" => Some(Self::F16),
+            "bf16" => Some(Self::Bf16),
+            _ => None,
+        }
     }
+
+    /// Bytes of a number.
+    fn size(self) -> usize {
+        if self == Self::F32 { 4 } else { 2 }
+    }
+
+    fn widen(self, bytes: &[u8], values: &mut [f32]) {
+        let halves = || bytes.as_chunks::<2>().0.iter();
+        match self {
+            Self::F32 => {
+                let words = bytes.as_chunks::<4>().0;
+                values.iter_mut().zip(words).for_each(|(v, b)| *v = f32::from_le_bytes(*b));
+            }
+            Self::F16 => {
+                values.iter_mut().zip(halves()).for_each(|(v, b)| *v = f16::from_le_bytes(*b).to_f32());
+            }
+            Self::Bf16 => {
+                values.iter_mut().zip(halves()).for_each(|(v, b)| *v = bf16::from_le_bytes(*b).to_f32());
+            }
+        }
+    }
+}
+
+/// Values that are read and widened at a time: small enough to stay in the second-level cache on the way.
+const CHUNK: usize = 1 << 16;
+
+/// The values of one tensor, read by all cores. Most of the time goes into the first touch of fresh memory, so each page
+/// of the result is touched once, by the core that fills it.
+fn read_values(file: &File, entry: &Entry, kind: Float) -> io::Result<Vec<f32>> {
+    let count = entry.len / kind.size();
+    let mut values = vec![0.0_f32; count];
+    values
+        .par_chunks_mut(CHUNK)
+        .enumerate()
+        .map_init(Vec::new, |bytes, (chunk, values)| {
+            bytes.resize(values.len() * kind.size(), 0);
+            read_at(file, bytes, entry.start + (chunk * CHUNK * kind.size()) as u64)?;
+            kind.widen(bytes, values);
+            Ok(())
+        })
+        .collect::<io::Result<()>>()?;
+    Ok(values)
 }
 
 #[cfg(unix)]

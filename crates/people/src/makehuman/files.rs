@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use glam::Vec3;
 use serde::Deserialize;
-use snapsnap_mesh::quoted;
+use snapsnap_mesh::{file, quoted};
 
 use snapsnap_mesh::FileError;
 
@@ -111,10 +111,7 @@ impl Library {
 }
 
 fn read_text(path: &Path) -> Result<String, FileError> {
-    if fs::metadata(path).map_err(FileError::read(path))?.len() > MAX_BYTES {
-        return Err(FileError::unsuitable(path, "is far too long"));
-    }
-    fs::read_to_string(path).map_err(FileError::read(path))
+    file::read_text(path, MAX_BYTES).map_err(FileError::read(path))
 }
 
 fn wrong(path: &Path, line: usize, text: &str) -> FileError {

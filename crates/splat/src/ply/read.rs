@@ -1,14 +1,14 @@
 //! Reading of Gaussian PLY files: ASCII and binary of either endianness, SH degree 0 to 3, properties in any order,
 //! further properties and elements ignored.
 
-use std::fs::File;
-use std::io::Read;
+use std::io::{self, BufRead, BufReader, Cursor, Read};
 use std::path::Path;
 
 use burn::tensor::{Device, Tensor, TensorData};
 
 use super::header::{Element, Format, Header, MAX_HEADER, Property, parse};
 use crate::error::quoted;
+use crate::file;
 use crate::{Gaussians, SplatError, sh};
 
 /// Every property that must be there, in the order in which they are gathered.
@@ -16,6 +16,27 @@ const REQUIRED: [&str; 14] = [
     "x", "y", "z", "rot_0", "rot_1", "rot_2", "rot_3", "scale_0", "scale_1", "scale_2", "opacity", "f_dc_0",
     "f_dc_1", "f_dc_2",
 ];
+
+/// Longest line of a body in text.
+const MAX_LINE: u64 = 1 << 20;
+
+/// What keeps a file from being read.
+enum Problem {
+    Io(io::Error),
+    Ply(String),
+}
+
+impl From<io::Error> for Problem {
+    fn from(e: io::Error) -> Self {
+        Self::Io(e)
+    }
+}
+
+impl From<String> for Problem {
+    fn from(problem: String) -> Self {
+        Self::Ply(problem)
+    }
+}
 
 /// A file's Gaussians.
 #[derive(Debug, Clone)]
@@ -33,16 +54,18 @@ pub struct Loaded {
 /// [`SplatError::Read`] if the file cannot be read, [`SplatError::Ply`] if it is no PLY, is shorter than its header
 /// says, or lacks a property.
 pub fn read(path: &Path, device: &Device) -> Result<Loaded, SplatError> {
-    let wrong = |problem| SplatError::Ply { path: path.to_owned(), problem };
     let cannot = |source| SplatError::Read { path: path.to_owned(), source };
-    let mut file = File::open(path).map_err(cannot)?;
-    let mut bytes = Vec::new();
-    (&mut file).take(MAX_HEADER as u64 + 1).read_to_end(&mut bytes).map_err(cannot)?;
-    // Before the rest of a file that may be anything.
-    let header = parse(&bytes).map_err(wrong)?;
-    file.read_to_end(&mut bytes).map_err(cannot)?;
-    let table = table(&header, &mut bytes).map_err(wrong)?;
-    drop(bytes);
+    let failed = |problem| match problem {
+        Problem::Io(source) => cannot(source),
+        Problem::Ply(problem) => SplatError::Ply { path: path.to_owned(), problem },
+    };
+    let mut file = file::open(path).map_err(cannot)?;
+    let mut start = Vec::new();
+    (&mut file).take(MAX_HEADER as u64 + 1).read_to_end(&mut start).map_err(cannot)?;
+    let header = parse(&start).map_err(|problem| failed(Problem::Ply(problem)))?;
+    // Only what the header promises is read of a file that may go on for ever.
+    let mut body = BufReader::new(Cursor::new(start.split_off(header.len)).chain(file));
+    let table = table(&header, &mut body).map_err(failed)?;
     let Table { n, coefficients: k, columns } = table;
     let rows = |names: usize, first: usize, f: fn(f32) -> f32| {
         let values: Vec<f32> = (0..n)
@@ -85,11 +108,16 @@ struct Table {
     columns: Vec<Vec<f32>>,
 }
 
-fn table(header: &Header, bytes: &mut [u8]) -> Result<Table, String> {
-    let at = header.elements.iter().position(|e| e.name == "vertex").ok_or("it has no element `vertex`")?;
+fn table(header: &Header, body: &mut impl BufRead) -> Result<Table, Problem> {
+    let at = header
+        .elements
+        .iter()
+        .position(|e| e.name == "vertex")
+        .ok_or_else(|| "it has no element `vertex`".to_owned())?;
     let vertex = &header.elements[at];
     if let Some(list) = vertex.properties.iter().find(|p| p.list.is_some()) {
-        return Err(format!("`vertex` has a list, `{}`; Gaussians are single values", quoted(&list.name)));
+        let list = quoted(&list.name);
+        return Err(format!("`vertex` has a list, `{list}`; Gaussians are single values").into());
     }
     let position = |name: &str| vertex.properties.iter().position(|p| p.name == name);
     let mut wanted = Vec::new();
@@ -108,13 +136,15 @@ fn table(header: &Header, bytes: &mut [u8]) -> Result<Table, String> {
         9 => 4,
         24 => 9,
         45 => 16,
-        _ => return Err(format!("{rest} properties `f_rest_*`; SH of degree 0 to 3 have 0, 9, 24 or 45")),
+        _ => {
+            let message = format!("{rest} properties `f_rest_*`; SH of degree 0 to 3 have 0, 9, 24 or 45");
+            return Err(message.into());
+        }
     };
     for index in 0..rest {
         let name = format!("f_rest_{index}");
         wanted.push(position(&name).ok_or_else(|| format!("`vertex` has no property `{name}`"))?);
     }
-    let body = &mut bytes[header.len..];
     let columns = match header.format {
         Format::Ascii => ascii(header, at, body, &wanted)?,
         Format::LittleEndian | Format::BigEndian => binary(header, at, body, &wanted)?,
@@ -122,30 +152,38 @@ fn table(header: &Header, bytes: &mut [u8]) -> Result<Table, String> {
     Ok(Table { n: vertex.count, coefficients, columns })
 }
 
-/// Where row `row` of `vertex` cannot be read to its end.
-fn truncated(vertex: &Element, detail: &str) -> String {
-    format!("the file ends too early: the header promises {} vertices, {detail}", vertex.count)
+/// Where `vertex` cannot be read to its end.
+fn truncated(vertex: &Element, detail: &str) -> Problem {
+    let count = vertex.count;
+    format!("the file ends too early: the header promises {count} vertices, {detail}").into()
 }
 
-fn ascii(header: &Header, at: usize, body: &[u8], wanted: &[usize]) -> Result<Vec<Vec<f32>>, String> {
-    let text = std::str::from_utf8(body).map_err(|_| "the body is not text, though the format is ascii")?;
+fn ascii(
+    header: &Header,
+    at: usize,
+    body: &mut impl BufRead,
+    wanted: &[usize],
+) -> Result<Vec<Vec<f32>>, Problem> {
     // One row per line, as the format demands; elements before the vertices are skipped.
-    let before: usize = header.elements[..at].iter().fold(0, |sum, e| sum.saturating_add(e.count));
+    let before = header.elements[..at].iter().fold(0_usize, |sum, e| sum.saturating_add(e.count));
     let vertex = &header.elements[at];
-    // A value and its separator take two bytes: never reserve more than the file can hold.
-    if vertex.count > body.len() / (2 * vertex.properties.len()) + 1 {
-        return Err(truncated(vertex, &format!("{} bytes follow it", body.len())));
+    let mut columns: Vec<Vec<f32>> = wanted.iter().map(|_| Vec::new()).collect();
+    let mut line = Vec::new();
+    for _ in 0..before {
+        if !next_line(body, &mut line)? {
+            return Err(truncated(vertex, "0 are there"));
+        }
     }
-    let mut columns: Vec<Vec<f32>> = wanted.iter().map(|_| Vec::with_capacity(vertex.count)).collect();
-    let mut lines = text.lines().filter(|line| !line.trim().is_empty()).skip(before);
-    let mut values = Vec::with_capacity(vertex.properties.len());
     for row in 0..vertex.count {
-        let line = lines.next().ok_or_else(|| truncated(vertex, &format!("{row} are there")))?;
-        values.clear();
-        values.extend(line.split_ascii_whitespace());
+        if !next_line(body, &mut line)? {
+            return Err(truncated(vertex, &format!("{row} are there")));
+        }
+        let text = std::str::from_utf8(&line)
+            .map_err(|_| "the body is not text, though the format is ascii".to_owned())?;
+        let values: Vec<&str> = text.split_ascii_whitespace().collect();
         if values.len() != vertex.properties.len() {
             let (found, expected) = (values.len(), vertex.properties.len());
-            return Err(format!("vertex {row}: {found} values, expected {expected}"));
+            return Err(format!("vertex {row}: {found} values, expected {expected}").into());
         }
         for (column, &index) in columns.iter_mut().zip(wanted) {
             let name = &vertex.properties[index].name;
@@ -160,21 +198,44 @@ fn ascii(header: &Header, at: usize, body: &[u8], wanted: &[usize]) -> Result<Ve
     Ok(columns)
 }
 
-fn binary(header: &Header, at: usize, body: &mut [u8], wanted: &[usize]) -> Result<Vec<Vec<f32>>, String> {
+/// The next line that is not blank; `false` at the end of the file.
+fn next_line(body: &mut impl BufRead, line: &mut Vec<u8>) -> Result<bool, Problem> {
+    loop {
+        line.clear();
+        if body.take(MAX_LINE).read_until(b'\n', line)? == 0 {
+            return Ok(false);
+        }
+        if line.len() as u64 == MAX_LINE && !line.ends_with(b"\n") {
+            return Err(format!("a line of the body is longer than {MAX_LINE} bytes").into());
+        }
+        if !line.trim_ascii().is_empty() {
+            return Ok(true);
+        }
+    }
+}
+
+fn binary(
+    header: &Header,
+    at: usize,
+    body: &mut impl BufRead,
+    wanted: &[usize],
+) -> Result<Vec<Vec<f32>>, Problem> {
     let big = header.format == Format::BigEndian;
-    let mut start = 0;
     for element in &header.elements[..at] {
-        start = skip(element, body, start, big)
-            .ok_or_else(|| format!("the file ends too early: in element `{}`", quoted(&element.name)))?;
+        if !skip(element, body, big)? {
+            let name = quoted(&element.name);
+            return Err(format!("the file ends too early: in element `{name}`").into());
+        }
     }
     let vertex = &header.elements[at];
     let stride: usize = vertex.properties.iter().map(|p| p.kind.size()).sum();
-    let available = body.len() - start;
-    let needed =
-        vertex.count.checked_mul(stride).filter(|needed| *needed <= available).ok_or_else(|| {
-            truncated(vertex, &format!("{stride} bytes each, but {available} bytes are left"))
-        })?;
-    let rows = &mut body[start..start + needed];
+    let needed = (vertex.count as u64).saturating_mul(stride as u64);
+    let mut rows = Vec::new();
+    body.take(needed).read_to_end(&mut rows)?;
+    if (rows.len() as u64) < needed {
+        let detail = format!("{stride} bytes each, but {} bytes are left", rows.len());
+        return Err(truncated(vertex, &detail));
+    }
     let offset = |index: usize| vertex.properties[..index].iter().map(|p| p.kind.size()).sum::<usize>();
     let column = |&index: &usize| {
         let (kind, offset) = (vertex.properties[index].kind, offset(index));
@@ -191,28 +252,34 @@ fn binary(header: &Header, at: usize, body: &mut [u8], wanted: &[usize]) -> Resu
     Ok(wanted.iter().map(column).collect())
 }
 
-/// Where the body goes on after `element`, which starts at `start`; `None` if the file is too short.
-fn skip(element: &Element, body: &[u8], start: usize, big: bool) -> Option<usize> {
+/// Leaves an element out; `false` if the file is too short for it.
+fn skip(element: &Element, body: &mut impl BufRead, big: bool) -> io::Result<bool> {
+    let pass = |body: &mut dyn BufRead, bytes: Option<u64>| -> io::Result<bool> {
+        let Some(bytes) = bytes else { return Ok(false) };
+        Ok(io::copy(&mut body.take(bytes), &mut io::sink())? == bytes)
+    };
     let fixed: usize = element.properties.iter().map(|p| p.kind.size()).sum();
     if element.properties.iter().all(|p| p.list.is_none()) {
-        return start.checked_add(element.count.checked_mul(fixed)?).filter(|end| *end <= body.len());
+        return pass(body, (element.count as u64).checked_mul(fixed as u64));
     }
-    let mut at = start;
     for _ in 0..element.count {
         for Property { kind, list, .. } in &element.properties {
-            let items = match list {
-                None => 1,
-                Some(length) => {
-                    let mut bytes = body.get(at..at.checked_add(length.size())?)?.to_vec();
-                    if big {
-                        bytes.reverse();
-                    }
-                    at += length.size();
-                    length.read_count(&bytes)?
+            let mut items = Some(1);
+            if let Some(length) = list {
+                let mut bytes = Vec::new();
+                body.take(length.size() as u64).read_to_end(&mut bytes)?;
+                if bytes.len() < length.size() {
+                    return Ok(false);
                 }
-            };
-            at = at.checked_add(items.checked_mul(kind.size())?).filter(|end| *end <= body.len())?;
+                if big {
+                    bytes.reverse();
+                }
+                items = length.read_count(&bytes);
+            }
+            if !pass(body, items.and_then(|n| (n as u64).checked_mul(kind.size() as u64)))? {
+                return Ok(false);
+            }
         }
     }
-    Some(at)
+    Ok(true)
 }

@@ -12,7 +12,7 @@ use std::time::Duration;
 
 use clap::{Args, Subcommand, ValueEnum};
 use snapsnap_data::dataset::{Folder, Made, Split};
-use snapsnap_data::prepare::{DataConfig, Shard};
+use snapsnap_data::prepare::{DataConfig, Shard, Subject};
 use snapsnap_data::scan::{Collection, normalise};
 use snapsnap_mesh::mesh::Mesh;
 use snapsnap_mesh::{FileError, export};
@@ -113,11 +113,8 @@ impl Common {
                 let wrong = |e: &dyn std::fmt::Display| {
                     Failure::Input(format!("{}: cannot read the config: {e}", path.display()))
                 };
-                let metadata = fs::metadata(path).map_err(|e| wrong(&e))?;
-                if !metadata.is_file() || metadata.len() > MAX_CONFIG {
-                    return Err(wrong(&"it is no file, or far too long"));
-                }
-                (fs::read_to_string(path).map_err(|e| wrong(&e))?, path.display().to_string())
+                let text = file::read_text(path, MAX_CONFIG).map_err(|e| wrong(&e))?;
+                (text, path.display().to_string())
             }
             None => (String::new(), "the built-in config".to_owned()),
         };
@@ -160,6 +157,8 @@ struct Person {
     mesh: Mesh,
     /// Where it faces, degrees around y.
     yaw_degrees: f64,
+    /// What it was made of.
+    origin: PathBuf,
 }
 
 /// Makes this shard's subjects, those that are not there yet. What cannot be made is reported and left out.
@@ -192,8 +191,9 @@ fn make(
     for (done, (place, work)) in missing.iter().enumerate() {
         progress.step(done, missing.len(), "subjects");
         let Work { split, subject, identity } = work;
-        let made = person(*place, work).and_then(|person| {
-            config.add(&folder, *split, subject, &person.mesh, person.yaw_degrees, identity)
+        let made = person(*place, work).and_then(|Person { mesh, yaw_degrees, origin }| {
+            let subject = Subject { split: *split, name: subject, identity, yaw_degrees, origin: &origin };
+            config.add(&folder, &subject, &mesh)
         });
         match made {
             Ok(Made::Whole) => {}
@@ -277,7 +277,7 @@ fn generate(
             export::write_obj(&mesh, &scan(work))?;
         }
         place(&mut mesh, work, Collection::Other, &common.output)?;
-        Ok(Person { mesh, yaw_degrees: 0.0 })
+        Ok(Person { mesh, yaw_degrees: 0.0, origin: common.output.clone() })
     });
     // Subjects that were there before, without their scans.
     let there = |work: &Work| common.pictures(work.split, &work.subject).is_dir();

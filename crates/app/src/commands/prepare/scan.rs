@@ -108,7 +108,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
             };
         let mut mesh = import::read(path)?;
         super::place(&mut mesh, work, collection, path)?;
-        Ok(Person { mesh, yaw_degrees })
+        Ok(Person { mesh, yaw_degrees, origin: path.clone() })
     });
     if unknown.get() > 0 {
         say::err(&format!(

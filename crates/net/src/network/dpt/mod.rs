@@ -1,8 +1,13 @@
-//! The DPT head: four token maps → one raw point map (SNAPSNAP §2.1).
+//! The DPT head: the tokens of four layers → one raw point map (SNAPSNAP §2.1).
 //!
 //! Field names are the checkpoint's, with `at_N` for entry N of a PyTorch `Sequential`.
 
 #![allow(non_snake_case, reason = "the checkpoint's names")]
+
+mod fused;
+
+#[cfg(test)]
+mod tests;
 
 use burn::module::Module;
 use burn::nn::PaddingConfig2d::{Explicit, Valid};
@@ -11,8 +16,7 @@ use burn::tensor::activation::relu;
 use burn::tensor::{Device, Tensor};
 
 use crate::config::NetworkConfig;
-use snapsnap_ops as ops;
-use snapsnap_ops::bilinear;
+use snapsnap_ops::{bilinear, is_fast};
 
 fn conv3x3(from: usize, to: usize, stride: usize, bias: bool, device: &Device) -> Conv2d {
     Conv2dConfig::new([from, to], [3, 3])
@@ -81,8 +85,8 @@ impl ResidualConvUnit {
     }
 
     fn forward(&self, x: Tensor<4>) -> Tensor<4> {
-        let h = ops::conv3x3(&self.conv1, x.clone(), true);
-        x + ops::conv3x3(&self.conv2, h, true)
+        let h = self.conv1.forward(relu(x.clone()));
+        x + self.conv2.forward(relu(h))
     }
 }
 
@@ -180,22 +184,28 @@ impl DptHead {
         }
     }
 
-    /// Four token maps `[B, C, rows, columns]` → raw x, y, z, confidence `[B, 4, 16·rows, 16·columns]`.
-    pub(crate) fn forward(&self, maps: [Tensor<4>; 4]) -> Tensor<4> {
-        let [m0, m1, m2, m3] = maps;
+    /// Tokens `[B, N, C]` of the four hooked layers on a `grid` (rows, columns) → raw x, y, z, confidence
+    /// `[B, 4, 16·rows, 16·columns]`.
+    pub(crate) fn forward(&self, tokens: [Tensor<3>; 4], grid: [usize; 2]) -> Tensor<4> {
+        if is_fast(&tokens[0]) { fused::forward(self, tokens, grid) } else { self.compose(tokens, grid) }
+    }
+
+    /// The same of Burn's operators, on every device and in training.
+    fn compose(&self, tokens: [Tensor<3>; 4], [rows, columns]: [usize; 2]) -> Tensor<4> {
+        let [m0, m1, m2, m3] = tokens.map(|x| {
+            let [b, _, c] = x.dims();
+            x.swap_dims(1, 2).reshape([b, c, rows, columns])
+        });
         let (branches, s) = (&self.act_postprocess, &self.scratch);
         let l3 = branches.at_3.at_1.forward(branches.at_3.at_0.forward(m3));
-        let path = s.refinenet4.forward(ops::conv3x3(&s.layer4_rn, l3, false), None);
-        let path = s
-            .refinenet3
-            .forward(path, Some(ops::conv3x3(&s.layer3_rn, branches.at_2.at_0.forward(m2), false)));
-        let path =
-            s.refinenet2.forward(path, Some(ops::conv3x3(&s.layer2_rn, branches.at_1.forward(m1), false)));
-        let path =
-            s.refinenet1.forward(path, Some(ops::conv3x3(&s.layer1_rn, branches.at_0.forward(m0), false)));
-        let x = ops::conv3x3(&self.head.at_0, path, false);
+        let path = s.refinenet4.forward(s.layer4_rn.forward(l3), None);
+        let l2 = s.layer3_rn.forward(branches.at_2.at_0.forward(m2));
+        let path = s.refinenet3.forward(path, Some(l2));
+        let path = s.refinenet2.forward(path, Some(s.layer2_rn.forward(branches.at_1.forward(m1))));
+        let path = s.refinenet1.forward(path, Some(s.layer1_rn.forward(branches.at_0.forward(m0))));
+        let x = self.head.at_0.forward(path);
         let [_, _, h, w] = x.dims();
-        let x = ops::conv3x3(&self.head.at_2, bilinear(x, [2 * h, 2 * w], true), false);
+        let x = self.head.at_2.forward(bilinear(x, [2 * h, 2 * w], true));
         self.head.at_4.forward(relu(x))
     }
 }

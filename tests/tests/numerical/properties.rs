@@ -1,7 +1,5 @@
 //! What must hold whatever the weights: symmetries of the networks, and indifference to what is not the person.
 
-use std::path::Path;
-
 use burn::tensor::{Device, Tensor, TensorData};
 use snapsnap_net::config::{Config, Downsample, NetworkConfig, Upsample};
 use snapsnap_net::network::{PointMap, PointPredictor, View, activate};
@@ -10,10 +8,10 @@ use snapsnap_net::resample::shrink;
 use snapsnap_net::weights::{WeightFile, init};
 use snapsnap_net::{Photograph, Reconstruction, Reconstructor, Window};
 use snapsnap_ops::{Rope, bilinear};
-use snapsnap_tests::{device, relative_error, values};
+use snapsnap_tests::{device, relative_error, root, values};
 
 fn config(overrides: &[&str]) -> Config {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/tiny.toml");
+    let path = root().join("configs/tiny.toml");
     let overrides: Vec<String> = overrides.iter().map(|s| (*s).to_owned()).collect();
     Config::from_file(&path, &overrides).expect("tiny.toml")
 }

@@ -1,0 +1,40 @@
+//! How much memory there is, so that what cannot fit is refused before any work instead of ending in an abort.
+
+use std::fs;
+
+use sysinfo::{MemoryRefreshKind, RefreshKind, System};
+
+use crate::failure::Failure;
+
+/// Refuses work on the CPU that may need more bytes than this process can ever get; `what` and `mend` say what it is and
+/// how it needs less.
+pub fn check(what: &str, needed: u64, mend: &str) -> Result<(), Failure> {
+    let there = there();
+    if needed <= there {
+        return Ok(());
+    }
+    let gigabytes = |bytes: u64| bytes as f64 / 1e9;
+    let message = format!(
+        "{what} needs up to {:.1} GB of memory, this machine has {:.1} GB: {mend}",
+        gigabytes(needed),
+        gigabytes(there)
+    );
+    Err(Failure::Input(message))
+}
+
+/// Bytes that the machine has, or, where that is less, that this process is allowed.
+fn there() -> u64 {
+    let memory = RefreshKind::nothing().with_memory(MemoryRefreshKind::nothing().with_ram());
+    let system = System::new_with_specifics(memory);
+    // 0 where the system is not known.
+    let total = Some(system.total_memory()).filter(|bytes| *bytes > 0).unwrap_or(u64::MAX);
+    let group = system.cgroup_limits().map_or(u64::MAX, |limits| limits.total_memory);
+    total.min(group).min(address_space().unwrap_or(u64::MAX))
+}
+
+/// The limit that `ulimit -v` sets, in bytes.
+fn address_space() -> Option<u64> {
+    let limits = fs::read_to_string("/proc/self/limits").ok()?;
+    let line = limits.lines().find_map(|line| line.strip_prefix("Max address space"))?;
+    line.split_whitespace().next()?.parse().ok()
+}

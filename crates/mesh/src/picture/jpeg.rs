@@ -1,0 +1,96 @@
+//! JPEG files, strictly: the decoder of the image crate fills with grey what a file that was cut short no longer has.
+
+use image::error::{DecodingError, ImageFormatHint};
+use image::metadata::Orientation;
+use image::{DynamicImage, GrayImage, ImageError, ImageFormat, RgbImage};
+use zune_jpeg::JpegDecoder;
+use zune_jpeg::zune_core::bytestream::ZCursor;
+use zune_jpeg::zune_core::colorspace::ColorSpace;
+use zune_jpeg::zune_core::options::DecoderOptions;
+
+/// Pixels per byte that no JPEG exceeds: each block of 8×8 takes one bit at least.
+const MAX_PIXELS_PER_BYTE: u64 = 512;
+
+/// A JPEG whose header has been read.
+pub struct Jpeg<'a> {
+    decoder: JpegDecoder<ZCursor<&'a [u8]>>,
+    /// Width and height as stored.
+    pub size: [u32; 2],
+    is_grey: bool,
+}
+
+fn damaged(message: impl ToString) -> ImageError {
+    let message = message.to_string();
+    ImageError::Decoding(DecodingError::new(ImageFormatHint::Exact(ImageFormat::Jpeg), message))
+}
+
+impl<'a> Jpeg<'a> {
+    /// Reads the header, and looks whether the file goes on to the end of the image.
+    pub fn open(bytes: &'a [u8]) -> Result<Self, ImageError> {
+        let options = DecoderOptions::default()
+            .set_strict_mode(true)
+            .set_max_width(usize::MAX)
+            .set_max_height(usize::MAX);
+        let mut decoder = JpegDecoder::new_with_options(ZCursor::new(bytes), options);
+        decoder.decode_headers().map_err(|e| damaged(format!("{e:?}")))?;
+        let (width, height) = decoder.dimensions().ok_or_else(|| damaged("its size is missing"))?;
+        // Otherwise a few bytes could ask for gigabytes.
+        if (width * height) as u64 > MAX_PIXELS_PER_BYTE * bytes.len() as u64 || !is_whole(bytes) {
+            return Err(damaged("the file ends before the picture does"));
+        }
+        let is_grey = matches!(decoder.input_colorspace(), Some(ColorSpace::Luma | ColorSpace::LumaA));
+        let color = if is_grey { ColorSpace::Luma } else { ColorSpace::RGB };
+        decoder.set_options(options.jpeg_set_out_colorspace(color));
+        Ok(Self { decoder, size: [width as u32, height as u32], is_grey })
+    }
+
+    /// Bytes of the picture as red, green and blue.
+    pub fn bytes_decoded(&self) -> u64 {
+        let [width, height] = self.size.map(u64::from);
+        3 * width * height
+    }
+
+    /// The picture as it is stored, and how it wants to be turned.
+    pub fn decode(mut self) -> Result<(DynamicImage, Orientation), ImageError> {
+        let pixels = self.decoder.decode().map_err(|e| damaged(format!("{e:?}")))?;
+        let exif = self.decoder.exif();
+        let orientation = exif.and_then(|exif| Orientation::from_exif_chunk(exif));
+        let [width, height] = self.size;
+        let picture = if self.is_grey {
+            GrayImage::from_raw(width, height, pixels).map(DynamicImage::ImageLuma8)
+        } else {
+            RgbImage::from_raw(width, height, pixels).map(DynamicImage::ImageRgb8)
+        };
+        let picture = picture.ok_or_else(|| damaged("it holds fewer pixels than it promises"))?;
+        Ok((picture, orientation.unwrap_or(Orientation::NoTransforms)))
+    }
+}
+
+/// Whether the segments of a JPEG lead to an end-of-image marker (ITU T.81, B.1.1). Pictures within segments, as
+/// thumbnails are, do not count.
+fn is_whole(bytes: &[u8]) -> bool {
+    let mut at = 0;
+    // Behind the next 0xFF come the marker, which padding may precede, and, with most markers, the segment's length.
+    while let Some(found) = bytes[at..].windows(2).position(|pair| pair[0] == 0xff && is_marker(pair[1])) {
+        let marker = bytes[at + found + 1];
+        at += found + 2;
+        match marker {
+            0xd9 => return true,
+            // Start of image, restarts and TEM stand alone.
+            0xd8 | 0xd0..=0xd7 | 0x01 => {}
+            _ => {
+                let Some(length) = bytes.get(at..at + 2) else { return false };
+                at += usize::from(u16::from_be_bytes([length[0], length[1]]));
+            }
+        }
+        if at > bytes.len() {
+            return false;
+        }
+    }
+    false
+}
+
+/// Not a byte of coded data, in which 0 follows every 0xFF, nor padding.
+fn is_marker(byte: u8) -> bool {
+    byte != 0 && byte != 0xff
+}

@@ -1,0 +1,86 @@
+use std::fs;
+
+use image::codecs::jpeg::JpegEncoder;
+use image::{Rgb, RgbImage};
+
+use super::*;
+
+/// A picture with detail everywhere.
+fn picture() -> RgbImage {
+    RgbImage::from_fn(120, 90, |x, y| {
+        let v = (x * 7919 + y * 104_729) % 251;
+        Rgb([v as u8, (x * 2) as u8, (y * 2) as u8])
+    })
+}
+
+fn encoded(format: ImageFormat) -> Vec<u8> {
+    let mut bytes = Cursor::new(Vec::new());
+    picture().write_to(&mut bytes, format).expect("encodes");
+    bytes.into_inner()
+}
+
+/// 64×64 progressive, made with another encoder.
+const PROGRESSIVE: &[u8] = include_bytes!("../../tests/progressive.jpg");
+
+#[test]
+fn pictures_that_are_cut_short_are_refused() {
+    let folder = tempfile::tempdir().expect("temporary folder");
+    let path = folder.path().join("picture");
+    let jpeg = encoded(ImageFormat::Jpeg);
+    let mut thumbnail = vec![0xff, 0xd8, 0xff, 0xe1];
+    // A whole picture inside a segment does not end the one around it.
+    let small = PROGRESSIVE;
+    thumbnail.extend((small.len() as u16 + 2).to_be_bytes());
+    thumbnail.extend(small);
+    thumbnail.extend(&jpeg[2..]);
+    let pictures = [
+        ("baseline JPEG", jpeg),
+        ("progressive JPEG", PROGRESSIVE.to_vec()),
+        ("JPEG with a thumbnail", thumbnail),
+        ("PNG", encoded(ImageFormat::Png)),
+        ("WebP", encoded(ImageFormat::WebP)),
+        ("BMP", encoded(ImageFormat::Bmp)),
+        ("TIFF", encoded(ImageFormat::Tiff)),
+        ("GIF", encoded(ImageFormat::Gif)),
+    ];
+    for (name, bytes) in pictures {
+        fs::write(&path, &bytes).expect("writes");
+        decode(&path, MAX_BYTES).unwrap_or_else(|e| panic!("{name}: {e}"));
+        for percent in (5..=95).step_by(3) {
+            fs::write(&path, &bytes[..bytes.len() * percent / 100]).expect("writes");
+            let error = decode(&path, MAX_BYTES).map(|_| ()).expect_err(name).to_string();
+            assert!(error.contains("not a readable image"), "{name} at {percent} %: {error}");
+        }
+    }
+}
+
+#[test]
+fn jpegs_are_decoded_as_by_the_image_crate() {
+    for bytes in [encoded(ImageFormat::Jpeg), PROGRESSIVE.to_vec()] {
+        let expected = image::load_from_memory(&bytes).expect("decodes");
+        assert_eq!(decode_bytes(Path::new("a.jpg"), &bytes, MAX_BYTES).expect("decodes"), expected);
+    }
+    let mut grey = Vec::new();
+    let pixels = DynamicImage::from(picture()).into_luma8();
+    JpegEncoder::new(&mut grey).encode_image(&pixels).expect("encodes");
+    let expected = image::load_from_memory(&grey).expect("decodes");
+    assert_eq!(decode_bytes(Path::new("a.jpg"), &grey, MAX_BYTES).expect("decodes"), expected);
+}
+
+#[test]
+fn sizes_are_looked_at_before_pixels() {
+    let error = |bytes: &[u8], most| {
+        decode_bytes(Path::new("a"), bytes, most).map(|_| ()).expect_err("refuses").to_string()
+    };
+    let refused = error(&encoded(ImageFormat::Png), 32_399);
+    assert!(refused.starts_with("a: is 120×90, 1 MiB in memory, more than 0"), "{refused}");
+    assert!(decode_bytes(Path::new("a"), &encoded(ImageFormat::Png), 32_400).is_ok());
+    assert!(error(&encoded(ImageFormat::Jpeg), 32_399).contains("is 120×90"));
+
+    // A header that promises 16000×15999 pixels, and a few kilobytes.
+    let mut jpeg = encoded(ImageFormat::Jpeg);
+    let frame = jpeg.windows(2).position(|pair| pair == [0xff, 0xc0]).expect("a frame header");
+    jpeg[frame + 5..frame + 9].copy_from_slice(&[0x3e, 0x7f, 0x3e, 0x80]);
+    let refused = error(&jpeg, u64::MAX);
+    assert!(refused.contains("the file ends before the picture does"), "{refused}");
+}

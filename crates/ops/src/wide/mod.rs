@@ -1,0 +1,61 @@
+//! Convolutions of hundreds of channels, as the DPT heads have them: 3×3 by Winograd's method, and everything that is a
+//! matrix product per pixel.
+//!
+//! Channels stand in groups of 16, one vector of the widest kind. So an image is at once the left factor of a matrix
+//! product as the kernel in `product` reads it, and every step between products works on whole vectors.
+
+mod convolution;
+mod image;
+mod pointwise;
+mod product;
+mod transforms;
+
+#[cfg(test)]
+mod tests;
+
+use std::sync::{Mutex, PoisonError};
+
+pub use convolution::Conv3x3;
+pub use image::{Image, Source};
+pub use pointwise::Pointwise;
+
+/// Channels that stand together.
+pub const GROUP: usize = 16;
+
+/// Memory to use again. The system clears every fresh page, which for images of this size takes about as long as their
+/// arithmetic.
+#[derive(Debug, Default)]
+pub struct Buffers {
+    free: Mutex<Vec<Vec<f32>>>,
+}
+
+impl Buffers {
+    /// `len` floats of any value.
+    pub fn take(&self, len: usize) -> Vec<f32> {
+        let mut free = self.free.lock().unwrap_or_else(PoisonError::into_inner);
+        // Much larger ones are left for those who need them.
+        let fitting = (0..free.len()).filter(|&i| (len..=2 * len).contains(&free[i].capacity()));
+        let best = fitting.min_by_key(|&i| free[i].capacity()).map(|i| free.swap_remove(i));
+        drop(free);
+        let Some(mut buffer) = best else { return vec![0.0; len] };
+        buffer.resize(len, 0.0);
+        buffer
+    }
+
+    /// Takes back what nobody needs any more.
+    pub fn give(&self, buffer: Vec<f32>) {
+        self.free.lock().unwrap_or_else(PoisonError::into_inner).push(buffer);
+    }
+}
+
+/// Cuts every plane of `plane` floats into pieces of `piece` (the last may be shorter): piece after piece, the slices of
+/// all planes. So tasks that each own some rows of all channels can write side by side.
+fn pieces(data: &mut [f32], plane: usize, piece: usize) -> Vec<Vec<&mut [f32]>> {
+    let mut pieces: Vec<Vec<&mut [f32]>> = (0..plane.div_ceil(piece)).map(|_| Vec::new()).collect();
+    for plane in data.chunks_exact_mut(plane) {
+        for (slices, slice) in pieces.iter_mut().zip(plane.chunks_mut(piece)) {
+            slices.push(slice);
+        }
+    }
+    pieces
+}

@@ -1,0 +1,161 @@
+//! Matrix products whose factors are stored as the kernel reads them, so that nothing is packed for a product.
+//!
+//! The kernel keeps a block of the result in registers (12 rows of 32 columns with AVX-512), sums over the whole inner
+//! dimension and writes the block once. Every element is one sum in one order, whatever the split among threads.
+
+use pulp::{Simd, WithSimd};
+use rayon::prelude::*;
+
+use super::GROUP;
+
+/// Columns of the right factor that stand together.
+pub const PANEL: usize = 2 * GROUP;
+
+/// Left factor `[rows, 16·groups]`: one `[rows][16]` per group, `stride` floats from one to the next.
+#[derive(Clone, Copy)]
+pub struct Left<'a> {
+    pub values: &'a [f32],
+    pub stride: usize,
+    pub groups: usize,
+    pub rows: usize,
+}
+
+/// Right factor `[16·groups, columns]`: one `[16·groups][32]` per panel, `stride` floats from one to the next.
+#[derive(Clone, Copy)]
+pub struct Right<'a> {
+    pub values: &'a [f32],
+    pub stride: usize,
+}
+
+/// out = left · right + bias.
+pub struct Product<'a, 'b> {
+    pub left: Left<'a>,
+    pub right: Right<'a>,
+    /// One value per column, in whole panels.
+    pub bias: Option<&'a [f32]>,
+    /// One `[rows][16]` per group of columns.
+    pub out: &'a mut [&'b mut [f32]],
+}
+
+impl WithSimd for Product<'_, '_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        // Vectors per row of a block of 32 columns and of one of 16, and rows per block: as many as there are registers
+        // for, less those of the factors. Sixteen registers hold no block of 32 columns.
+        match S::F32_LANES {
+            16 => panels::<S, 2, 1, 12>(simd, self),
+            8 => panels::<S, 2, 2, 6>(simd, self),
+            4 => panels::<S, 4, 4, 6>(simd, self),
+            _ => panels::<S, 16, 16, 1>(simd, self),
+        }
+    }
+}
+
+#[inline(always)]
+fn panels<S: Simd, const WIDE: usize, const NARROW: usize, const ROWS: usize>(simd: S, product: Product) {
+    let Product { left, right, bias, out } = product;
+    for (p, out) in out.chunks_mut(PANEL / GROUP).enumerate() {
+        let panel = &right.values[p * right.stride..][..left.groups * GROUP * PANEL];
+        let bias = bias.map_or(&[0.0; PANEL][..], |bias| &bias[p * PANEL..][..PANEL]);
+        if out.len() == 2 && WIDE * S::F32_LANES == PANEL {
+            rows::<S, WIDE, ROWS>(simd, left, panel, bias, out);
+        } else {
+            for (i, out) in out.chunks_mut(1).enumerate() {
+                // The panel's second half begins 16 floats later and ends as much earlier.
+                rows::<S, NARROW, ROWS>(simd, left, &panel[i * GROUP..], &bias[i * GROUP..], out);
+            }
+        }
+    }
+}
+
+/// All rows of VECTORS vectors of columns.
+#[inline(always)]
+fn rows<S: Simd, const VECTORS: usize, const ROWS: usize>(
+    simd: S,
+    left: Left,
+    panel: &[f32],
+    bias: &[f32],
+    out: &mut [&mut [f32]],
+) {
+    /// Rows of the smaller block for what the larger leaves over.
+    const FEW: usize = 4;
+    let mut row = 0;
+    while row < left.rows {
+        // The last block begins earlier instead of being smaller: what it computes twice is the same twice.
+        if left.rows >= ROWS && left.rows - row > FEW {
+            row = row.min(left.rows - ROWS);
+            block::<S, VECTORS, ROWS>(simd, left, row, panel, bias, out);
+            row += ROWS;
+        } else if left.rows >= FEW {
+            row = row.min(left.rows - FEW);
+            block::<S, VECTORS, FEW>(simd, left, row, panel, bias, out);
+            row += FEW;
+        } else {
+            block::<S, VECTORS, 1>(simd, left, row, panel, bias, out);
+            row += 1;
+        }
+    }
+}
+
+/// Rows from `row` on.
+#[inline(always)]
+fn block<S: Simd, const VECTORS: usize, const ROWS: usize>(
+    simd: S,
+    left: Left,
+    row: usize,
+    panel: &[f32],
+    bias: &[f32],
+    out: &mut [&mut [f32]],
+) {
+    let mut sums = [load::<S, VECTORS>(simd, bias); ROWS];
+    for group in 0..left.groups {
+        let (values, _) = left.values[group * left.stride + row * GROUP..].as_chunks::<GROUP>();
+        let values: &[[f32; GROUP]; ROWS] = values.first_chunk().expect("the block lies inside");
+        let weights = &panel[group * GROUP * PANEL..];
+        let weights = &weights[..(GROUP - 1) * PANEL + VECTORS * S::F32_LANES];
+        for k in 0..GROUP {
+            let weights = load::<S, VECTORS>(simd, &weights[k * PANEL..]);
+            for (sums, values) in sums.iter_mut().zip(values) {
+                let value = simd.splat_f32s(values[k]);
+                for v in 0..VECTORS {
+                    sums[v] = simd.mul_add_e_f32s(value, weights[v], sums[v]);
+                }
+            }
+        }
+    }
+    let vectors = GROUP / S::F32_LANES;
+    for (o, out) in out.iter_mut().enumerate() {
+        let (out, _) = S::as_mut_simd_f32s(&mut out[row * GROUP..][..ROWS * GROUP]);
+        for (r, sums) in sums.iter().enumerate() {
+            for v in 0..vectors {
+                out[r * vectors + v] = sums[o * vectors + v];
+            }
+        }
+    }
+}
+
+#[inline(always)]
+fn load<S: Simd, const VECTORS: usize>(simd: S, values: &[f32]) -> [S::f32s; VECTORS] {
+    let (values, _) = S::as_simd_f32s(values);
+    let mut vectors = [simd.splat_f32s(0.0); VECTORS];
+    vectors.copy_from_slice(&values[..VECTORS]);
+    vectors
+}
+
+/// A right factor's panels. Element (row, column) is `weights[rows[row] + columns[column]]`, or 0 where either has no
+/// place; `rows` are whole groups.
+pub fn pack(weights: &[f32], rows: &[Option<usize>], columns: &[Option<usize>], out: &mut [f32]) {
+    assert_eq!(out.len(), columns.len().div_ceil(PANEL) * rows.len() * PANEL);
+    out.par_chunks_mut(rows.len() * PANEL).zip(columns.par_chunks(PANEL)).for_each(|(out, columns)| {
+        for (out, row) in out.as_chunks_mut::<PANEL>().0.iter_mut().zip(rows) {
+            out.fill(0.0);
+            for (out, column) in out.iter_mut().zip(columns) {
+                if let (Some(row), Some(column)) = (row, column) {
+                    *out = weights[row + column];
+                }
+            }
+        }
+    });
+}

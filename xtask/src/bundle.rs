@@ -1,0 +1,150 @@
+//! `cargo xtask bundle`: everything that another machine needs to test and measure the project, without cargo.
+
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+use crate::cargo;
+
+/// The script that runs everything.
+const RUN: &str = include_str!("run.sh");
+/// Files and folders that the programs read.
+const DATA: [&str; 4] = ["configs", "tests/data", "README.md", "LICENSE"];
+
+/// What `bundle` was told.
+pub struct Options {
+    /// Features of the program, comma-separated.
+    pub features: Option<String>,
+    /// The archive.
+    pub output: PathBuf,
+}
+
+impl Options {
+    /// Parses `[--features LIST] [-o FILE]`.
+    pub fn parse(arguments: &[String]) -> Result<Self, String> {
+        let mut options = Self { features: None, output: "target/snapsnap-bundle.tar.xz".into() };
+        let mut arguments = arguments.iter();
+        while let Some(argument) = arguments.next() {
+            let mut value = || arguments.next().cloned().ok_or_else(|| format!("{argument} needs a value"));
+            match argument.as_str() {
+                "--features" => options.features = Some(value()?),
+                "-o" | "--output" => options.output = value()?.into(),
+                other => return Err(format!("bundle: `{other}` is not understood")),
+            }
+        }
+        Ok(options)
+    }
+}
+
+/// Builds and packs.
+pub fn bundle(options: &Options) -> Result<(), String> {
+    let programs = [
+        ("snapsnap", build(options, &["build", "--bin", "snapsnap"])?),
+        ("numerical", build(options, &["test", "--no-run", "--test", "numerical"])?),
+        ("splat", build(options, &["bench", "--no-run", "--bench", "splat"])?),
+    ];
+    let parent = options.output.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let folder = parent.join("snapsnap-bundle");
+    if folder.exists() {
+        fs::remove_dir_all(&folder).map_err(failed(&folder))?;
+    }
+    for (name, program) in programs {
+        copy(&program, &folder.join("bin").join(name))?;
+    }
+    for path in DATA {
+        copy(Path::new(path), &folder.join(path))?;
+    }
+    let script = folder.join("run.sh");
+    let device = match options.features.as_deref() {
+        Some(features) => features.split(',').next().unwrap_or("wgpu"),
+        None => "wgpu",
+    };
+    let text = RUN
+        .replace("@DEVICE@", device)
+        .replace("@FEATURES@", options.features.as_deref().unwrap_or("none"))
+        .replace("@COMMIT@", &commit());
+    fs::write(&script, text).map_err(failed(&script))?;
+    executable(&script).map_err(failed(&script))?;
+    pack(&folder, &options.output)?;
+    let size = fs::metadata(&options.output).map_err(failed(&options.output))?.len();
+    println!(
+        "{}: {:.1} MB; unpack it anywhere and start run.sh",
+        options.output.display(),
+        size as f64 / 1e6
+    );
+    Ok(())
+}
+
+/// Builds one program of the workspace and returns where it is. Other features have a target folder of their own, since
+/// they would otherwise take turns with the plain build.
+fn build(options: &Options, command: &[&str]) -> Result<PathBuf, String> {
+    let mut build = cargo(&command[..1]);
+    // `cargo bench` takes the release profile by itself.
+    build.args((command[0] != "bench").then_some("--release"));
+    build.args(["--workspace", "--message-format=json-render-diagnostics"]).args(&command[1..]);
+    if let Some(features) = &options.features {
+        build.args(["--features", features]).args(["--target-dir", "target-gpu"]);
+    }
+    let output = build.stderr(Stdio::inherit()).output().map_err(|e| format!("cannot run cargo: {e}"))?;
+    if !output.status.success() {
+        return Err(format!("cargo {}: {}", command.join(" "), output.status));
+    }
+    let name = command.last().expect("a command names its target");
+    let messages = String::from_utf8_lossy(&output.stdout);
+    let message = |line: &str| -> Option<PathBuf> {
+        let message: serde_json::Value = serde_json::from_str(line).ok()?;
+        (message["target"]["name"] == *name).then(|| message["executable"].as_str().map(PathBuf::from))?
+    };
+    messages.lines().rev().find_map(message).ok_or_else(|| format!("cargo made no program `{name}`"))
+}
+
+fn failed(what: &Path) -> impl Fn(io::Error) -> String {
+    move |e| format!("{}: {e}", what.display())
+}
+
+/// Copies a file, or a folder with all that is in it.
+fn copy(from: &Path, to: &Path) -> Result<(), String> {
+    if !from.is_dir() {
+        fs::create_dir_all(to.parent().unwrap_or(Path::new("."))).map_err(failed(to))?;
+        return fs::copy(from, to).map(drop).map_err(failed(from));
+    }
+    for entry in fs::read_dir(from).map_err(failed(from))? {
+        let name = entry.map_err(failed(from))?.file_name();
+        copy(&from.join(&name), &to.join(&name))?;
+    }
+    Ok(())
+}
+
+/// An archive of the folder, compressed as its name says.
+fn pack(folder: &Path, output: &Path) -> Result<(), String> {
+    let parent = folder.parent().unwrap_or(Path::new("."));
+    let name = folder.file_name().unwrap_or_default();
+    let mut tar = Command::new("tar");
+    // The programs hold much of the same code: a window that spans them all finds it.
+    tar.env("XZ_OPT", "-6 --lzma2=preset=6,dict=256MiB -T1");
+    let status = tar.arg("-caf").arg(output).arg("-C").arg(parent).arg(name).status();
+    match status {
+        Ok(status) if status.success() => Ok(()),
+        Ok(status) => Err(format!("tar: {status}; are tar and xz installed?")),
+        Err(e) => Err(format!("cannot run tar: {e}")),
+    }
+}
+
+/// The commit that is built, marked where files differ from it.
+fn commit() -> String {
+    let git = Command::new("git").args(["describe", "--always", "--dirty"]).output();
+    let text = git.ok().filter(|output| output.status.success()).map(|output| output.stdout);
+    text.map_or_else(|| "unknown".into(), |text| String::from_utf8_lossy(&text).trim().to_owned())
+}
+
+#[cfg(unix)]
+fn executable(path: &Path) -> io::Result<()> {
+    use std::os::unix::fs::PermissionsExt;
+    fs::set_permissions(path, fs::Permissions::from_mode(0o755))
+}
+
+#[cfg(not(unix))]
+fn executable(_path: &Path) -> io::Result<()> {
+    Ok(())
+}
