@@ -4,6 +4,8 @@ use std::env;
 use std::process::{Command, ExitCode};
 
 mod bundle;
+#[cfg(test)]
+mod house;
 
 const USAGE: &str = "usage: cargo xtask test [FILTER…] | lint | bundle … | COMMAND…
 

@@ -68,7 +68,6 @@ fn ndarray() -> Device {
 
 /// A device that is a card, not a software adapter.
 fn real_gpu() -> Option<Device> {
-    let is_card = |d: &Device| d.identity().is_some_and(|i| i.physical.is_some());
     gpus().into_iter().flat_map(|(_, kind)| devices(kind)).find(is_card)
 }
 
@@ -96,9 +95,20 @@ fn nth(name: &str, kind: DeviceType, index: Option<usize>) -> Result<Device, Fai
         None if name == "wgpu" => Ok(Device::wgpu(DeviceKind::DefaultDevice)),
         _ => {
             let message = format!("there are {found}, numbered from 0");
-            devices.into_iter().nth(index.unwrap_or(0)).ok_or_else(|| unknown(name, &message))
+            let device =
+                devices.into_iter().nth(index.unwrap_or(0)).ok_or_else(|| unknown(name, &message))?;
+            if name.starts_with("vulkan") && !is_card(&device) {
+                // Mesa's ends the program on the first kernel.
+                let message = format!("{} does not bear SPIR-V kernels: use wgpu", describe(&device));
+                return Err(unknown(name, &message));
+            }
+            Ok(device)
         }
     }
+}
+
+fn is_card(device: &Device) -> bool {
+    device.identity().is_some_and(|identity| identity.physical.is_some())
 }
 
 fn unknown(name: &str, why: &str) -> Failure {

@@ -8,3 +8,4 @@ mod splat_fit;
 mod splat_fixtures;
 mod splat_invariants;
 mod splat_oracle;
+mod training;

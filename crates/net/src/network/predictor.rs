@@ -23,7 +23,9 @@ pub fn activate(raw: Tensor<4>, conf_mode: ConfMode) -> PointMap {
     const MIN_NORM: f64 = 1e-8;
     let [b, _, h, w] = raw.dims();
     let xyz = raw.clone().narrow(1, 0, 3).permute([0, 2, 3, 1]);
-    let norm = xyz.clone().square().sum_dim(3).sqrt();
+    // The square root has no gradient at 0; below f32's reach of 1 nothing changes.
+    const MIN_SQUARE: f64 = 1e-30;
+    let norm = xyz.clone().square().sum_dim(3).clamp_min(MIN_SQUARE).sqrt();
     let points = xyz / norm.clone().clamp_min(MIN_NORM) * expm1(norm);
     let conf = raw.narrow(1, 3, 1).reshape([b, h, w]);
     let conf = match conf_mode {

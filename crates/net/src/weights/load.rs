@@ -4,6 +4,7 @@ use burn::module::{Module, ModuleMapper, Param};
 use burn::tensor::{Device, Tensor, TensorData};
 
 use super::file::{WeightFile, not_finite};
+use super::names::Path;
 use super::schema::{Part, SIDE};
 use super::{Source, WeightsError};
 use crate::network::PointPredictor;
@@ -34,9 +35,8 @@ impl WeightFile {
     fn fill<M: Module>(&self, module: M, prefix: &str, device: &Device) -> Result<M, WeightsError> {
         let mut loader = Loader {
             source: &self.source,
-            prefix,
             device,
-            path: Vec::new(),
+            path: Path::new(prefix),
             problems: Vec::new(),
             failure: None,
         };
@@ -53,38 +53,16 @@ impl WeightFile {
 
 struct Loader<'a> {
     source: &'a Source,
-    prefix: &'a str,
     device: &'a Device,
-    /// Component of the checkpoint's key and container type, per open module.
-    path: Vec<(String, String)>,
+    path: Path<'a>,
     problems: Vec<String>,
     failure: Option<WeightsError>,
 }
 
-/// Burn's path component → the checkpoint's, empty if it has none.
-fn component(name: &str, container: &str) -> String {
-    match name {
-        // Burn's normalisation layers.
-        "gamma" => "weight".into(),
-        "beta" => "bias".into(),
-        // Variants of the head.
-        "Dpt" if container.starts_with("Enum:") => "dpt".into(),
-        "Linear" if container.starts_with("Enum:") => String::new(),
-        // Entries of a PyTorch `Sequential`.
-        _ => name.strip_prefix("at_").unwrap_or(name).to_owned(),
-    }
-}
-
 impl Loader<'_> {
-    fn name(&self) -> String {
-        let parts: Vec<&str> =
-            self.path.iter().map(|(part, _)| part.as_str()).filter(|p| !p.is_empty()).collect();
-        format!("{}{}", self.prefix, parts.join("."))
-    }
-
     /// Values and PyTorch shape of the tensor at the current path.
     fn read<const D: usize>(&mut self) -> Option<Tensor<D>> {
-        let name = self.name();
+        let name = self.path.name();
         let values = match self.source.read_f32(&name) {
             Ok(values) => values,
             Err(e) => {
@@ -102,30 +80,25 @@ impl Loader<'_> {
         }
         Some(Tensor::from_data(TensorData::new(values, shape), self.device))
     }
-
-    /// Whether the current parameter is the weight of a Burn `Linear`, which is the transpose of PyTorch's.
-    fn is_linear_weight(&self) -> bool {
-        self.path.last().is_some_and(|(name, container)| name == "weight" && container == "Struct:Linear")
-    }
 }
 
 impl ModuleMapper for Loader<'_> {
     fn enter_module(&mut self, name: &str, container_type: &str) {
-        self.path.push((component(name, container_type), container_type.to_owned()));
+        self.path.enter(name, container_type);
     }
 
     fn exit_module(&mut self, _name: &str, _container_type: &str) {
-        self.path.pop();
+        self.path.leave();
     }
 
     fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
         let expected = param.lazy_shape();
-        let linear = self.is_linear_weight();
+        let transposed = self.path.is_transposed();
         let Some(tensor) = self.read::<D>() else {
             return param;
         };
-        let tensor = if linear { tensor.swap_dims(0, 1) } else { tensor };
-        assert_eq!(tensor.shape(), expected, "{}: schema and network disagree", self.name());
+        let tensor = if transposed { tensor.swap_dims(0, 1) } else { tensor };
+        assert_eq!(tensor.shape(), expected, "{}: schema and network disagree", self.path.name());
         let id = param.id;
         param.transform_for_load(tensor, id)
     }

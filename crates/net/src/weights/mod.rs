@@ -8,6 +8,7 @@ mod file;
 mod import;
 mod init;
 mod load;
+mod names;
 pub mod schema;
 mod source;
 
@@ -17,6 +18,7 @@ pub use export::export;
 pub use file::{CONFIG_KEY, Progress, WeightFile};
 pub use import::{ImportOptions, ImportReport, import};
 pub use init::{SideHeads, init};
+pub use names::{NamedVisitor, names, visit_named};
 pub use source::{Entry, Source};
 
 /// What can be wrong with weights.

@@ -1,0 +1,93 @@
+//! Parameters of the networks by the names that checkpoints give them.
+
+use std::collections::HashMap;
+
+use burn::module::{Module, ModuleVisitor, Param, ParamId};
+use burn::tensor::Tensor;
+
+/// Where in a module a traversal is, as the checkpoint's key.
+pub(super) struct Path<'a> {
+    prefix: &'a str,
+    /// Component of the key and container type, per open module.
+    open: Vec<(String, String)>,
+}
+
+/// Burn's path component → the checkpoint's, empty if it has none.
+fn component(name: &str, container: &str) -> String {
+    match name {
+        // Burn's normalisation layers.
+        "gamma" => "weight".into(),
+        "beta" => "bias".into(),
+        // Variants of the head.
+        "Dpt" if container.starts_with("Enum:") => "dpt".into(),
+        "Linear" if container.starts_with("Enum:") => String::new(),
+        // Entries of a PyTorch `Sequential`.
+        _ => name.strip_prefix("at_").unwrap_or(name).to_owned(),
+    }
+}
+
+impl<'a> Path<'a> {
+    pub(super) fn new(prefix: &'a str) -> Self {
+        Self { prefix, open: Vec::new() }
+    }
+
+    pub(super) fn enter(&mut self, name: &str, container: &str) {
+        self.open.push((component(name, container), container.to_owned()));
+    }
+
+    pub(super) fn leave(&mut self) {
+        self.open.pop();
+    }
+
+    pub(super) fn name(&self) -> String {
+        let parts: Vec<&str> =
+            self.open.iter().map(|(part, _)| part.as_str()).filter(|p| !p.is_empty()).collect();
+        format!("{}{}", self.prefix, parts.join("."))
+    }
+
+    /// Whether the current parameter is the weight of a Burn `Linear`, which is the transpose of PyTorch's.
+    pub(super) fn is_transposed(&self) -> bool {
+        self.open.last().is_some_and(|(name, container)| name == "weight" && container == "Struct:Linear")
+    }
+}
+
+/// What visits the parameters of a module by name.
+pub trait NamedVisitor {
+    /// One parameter. `is_transposed`: the checkpoint has the transpose of this matrix.
+    fn visit<const D: usize>(&mut self, name: &str, is_transposed: bool, parameter: &Param<Tensor<D>>);
+}
+
+/// Visits every parameter of `module`, whose names begin with `prefix`, in a fixed order.
+pub fn visit_named<M: Module>(module: &M, prefix: &str, visitor: &mut impl NamedVisitor) {
+    struct Adapter<'a, V> {
+        path: Path<'a>,
+        visitor: &'a mut V,
+    }
+    impl<V: NamedVisitor> ModuleVisitor for Adapter<'_, V> {
+        fn enter_module(&mut self, name: &str, container_type: &str) {
+            self.path.enter(name, container_type);
+        }
+
+        fn exit_module(&mut self, _name: &str, _container_type: &str) {
+            self.path.leave();
+        }
+
+        fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+            self.visitor.visit(&self.path.name(), self.path.is_transposed(), param);
+        }
+    }
+    module.visit(&mut Adapter { path: Path::new(prefix), visitor });
+}
+
+/// Names of the parameters of `module` by their ids, which are others in every run.
+pub fn names<M: Module>(module: &M, prefix: &str) -> HashMap<ParamId, String> {
+    struct Collect(HashMap<ParamId, String>);
+    impl NamedVisitor for Collect {
+        fn visit<const D: usize>(&mut self, name: &str, _: bool, parameter: &Param<Tensor<D>>) {
+            self.0.insert(parameter.id, name.to_owned());
+        }
+    }
+    let mut collect = Collect(HashMap::new());
+    visit_named(module, prefix, &mut collect);
+    collect.0
+}
