@@ -1,5 +1,8 @@
 //! Helpers of the parity and end-to-end tests: devices, fixtures, error norms.
 
+// What it measures and limits, it asks of Linux.
+#[cfg(target_os = "linux")]
+pub mod fuzz;
 pub mod scenes;
 
 use std::path::{Path, PathBuf};

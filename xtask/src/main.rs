@@ -4,13 +4,15 @@ use std::env;
 use std::process::{Command, ExitCode};
 
 mod bundle;
+mod fuzz;
 #[cfg(test)]
 mod house;
 
-const USAGE: &str = "usage: cargo xtask test [FILTER…] | lint | bundle … | COMMAND…
+const USAGE: &str = "usage: cargo xtask test [FILTER…] | lint | fuzz [OPTION…] | bundle … | COMMAND…
 
   test     the whole suite on flex, then the numerical tests on ndarray and wgpu
   lint     formatting, clippy and documentation, warnings refused
+  fuzz     damaged files of every format that the program reads; see cargo xtask fuzz --help
   bundle   [--features vulkan] [-o FILE.tar.xz]: program, tests, benchmark and a script that runs them and writes a
            report, for a machine without cargo
   COMMAND  a snapsnap command with its arguments, for example: cargo xtask reconstruct --help";
@@ -28,6 +30,7 @@ fn main() -> ExitCode {
         }
         Some("test") => test(rest),
         Some("lint") => lint(),
+        Some("fuzz") => fuzz::run(rest),
         Some("bundle") => match bundle::Options::parse(rest) {
             Ok(options) => bundle::bundle(&options).map_err(|e| eprintln!("error: {e}")).is_ok(),
             Err(e) => {

@@ -1,0 +1,47 @@
+//! Data sets in both layouts.
+
+use std::path::Path;
+
+use snapsnap_data::dataset::{Folder, Layout, Split};
+use snapsnap_data::prepare::{DataConfig, Subject, ViewsConfig};
+
+use super::super::Format;
+use super::{nothing, scans};
+
+/// What both have in common.
+const CHECK: Format = Format {
+    name: "",
+    sample: |_| (),
+    changed: &[],
+    command: "",
+    file: None,
+    kept: &[],
+    whole: nothing,
+    share: 56,
+};
+
+pub const FORMATS: &[Format] = &[
+    Format {
+        name: "data-set",
+        sample: |folder| write(&folder.join("set"), Layout::Exact),
+        changed: &["dataset.toml", ".png", ".npz", ".json"],
+        command: "prepare check in/set",
+        ..CHECK
+    },
+    Format {
+        name: "data-set-authors",
+        sample: |folder| write(&folder.join("set_16_2"), Layout::Authors),
+        changed: &["dataset.toml", ".jpg", ".png", ".npy"],
+        command: "prepare check in/set_16_2",
+        ..CHECK
+    },
+];
+
+/// One subject of two views.
+fn write(root: &Path, layout: Layout) {
+    let views = ViewsConfig { count: 2, resolution: 16, high_resolution: false, samples: 1, layout };
+    let config = DataConfig { views, ..DataConfig::default() };
+    let folder = Folder::create(root, config.description("for tests")).expect("created");
+    config.add(&folder, &Subject::plain(Split::Train, "0000"), &scans::person()).expect("written");
+    folder.tidy();
+}
