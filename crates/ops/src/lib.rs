@@ -6,7 +6,6 @@ mod attention;
 pub mod conv;
 mod gelu;
 mod math;
-mod op;
 mod resize;
 mod rope;
 pub mod wide;
