@@ -117,7 +117,7 @@ impl Sample {
             fs::write(work.join(output), "precious\n").expect("a file");
         }
         let mut changes = Vec::new();
-        let (mut cut, mut instead) = (false, None);
+        let (mut cut, mut instead, mut longer) = (false, None, 0);
         if case.changes > 0 {
             let dice: f64 = random.random();
             if dice < 0.12 {
@@ -140,6 +140,7 @@ impl Sample {
                     changes.push("in a folder whose name is no text".into());
                 }
                 let (bytes, said) = self.damage(case, target, &mut random);
+                longer = (bytes.len() as u64).saturating_sub(self.length(target));
                 fs::write(inputs.join(target), bytes).expect("a file");
                 changes.extend(said);
             }
@@ -148,12 +149,20 @@ impl Sample {
         let before = tree::read(&work);
         let arguments = arguments(case.format, inputs.file_name().expect("a name"));
         let ran = child::run(program, &arguments, &work, place);
-        let most = if self.memory == 0 { u64::MAX } else { self.memory + judge::MORE_MEMORY };
+        let most = if self.memory == 0 {
+            u64::MAX
+        } else {
+            self.memory + judge::MORE_MEMORY + judge::MEMORY_PER_BYTE * longer
+        };
         let mut problems = judge::problems(case.format, &ran, &before, &tree::read(&work), &work, most);
         if cut && ran.ended == Ended::Code(0) {
             problems.push("takes a file that was cut short for whole".into());
         }
         Outcome { ran, changes, instead, problems }
+    }
+
+    fn length(&self, file: &Path) -> u64 {
+        if let Some(Entry::File(bytes)) = self.files.get(file) { bytes.len() as u64 } else { 0 }
     }
 
     /// A file with the case's changes.

@@ -10,6 +10,8 @@ use super::{Format, INPUTS, ODD_INPUTS};
 
 /// Memory that a changed sample may take beyond the sound one.
 pub const MORE_MEMORY: u64 = 300 << 20;
+/// And for each byte that it is longer: numbers and lists take more room in memory than in text.
+pub const MEMORY_PER_BYTE: u64 = 50;
 /// Names of what is being written and not yet whole.
 const UNFINISHED: [&str; 2] = [".snapsnap-", ".unfinished"];
 /// Longest quotation in a problem.

@@ -9,6 +9,16 @@ use std::time::{Duration, Instant};
 use super::case::{Case, Outcome};
 use super::child::Ended;
 
+/// What the numbers of a report mean.
+const MEANING: &str = "\
+Each is a sound sample, changed at random, read as a user would. It must end with exit code 0 and whole output or with 2 and
+none, within 20 s and with at most 300 MB, and 50 bytes for each byte that it became longer, beyond what the sound sample
+takes; without a panic, without control characters on the terminal, and with its inputs as they were.
+";
+/// What the columns of its table are called.
+const HEADER: &str =
+    "| format | cases | mean | exit 0 | exit 2 | otherwise | failed | longest, seed | most memory, seed |";
+
 /// Counts of one format.
 #[derive(Debug, Default)]
 struct Row {
@@ -108,13 +118,9 @@ impl Tally {
         line(format!("`{command}`, {}, {cores} cores of {}.\n", commit(), processor()));
         let seconds = self.time.as_secs_f64();
         let all = self.cases();
-        line(format!("{all} cases in {seconds:.0} s, {:.0} a second. ", all as f64 / seconds));
-        line("Each is a sound sample, changed at random, read as a user would. It must end with exit code 0 and whole".into());
-        line("output or with 2 and none, within 20 s and 300 MB more than the sound sample takes, without a panic, without".into());
-        line("control characters on the terminal, and with its inputs as they were.\n".into());
-        line(
-            "| format | cases | mean | exit 0 | exit 2 | otherwise | failed | longest, seed | most memory, seed |".into(),
-        );
+        line(format!("{all} cases in {seconds:.0} s, {:.0} a second.", all as f64 / seconds));
+        line(MEANING.into());
+        line(HEADER.into());
         line("|---|---:|---:|---:|---:|---:|---:|---:|---:|".into());
         for (name, row) in &self.rows {
             let ended = |code: i32| row.ends.get(&Ended::Code(code)).copied().unwrap_or(0);
