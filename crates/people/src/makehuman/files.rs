@@ -51,6 +51,11 @@ pub struct Library {
 }
 
 impl Library {
+    /// MakeHuman's folder `data`.
+    pub fn root(&self) -> &Path {
+        &self.root
+    }
+
     /// Opens `folder`: MakeHuman's `data`, or a checkout that has it.
     ///
     /// # Errors

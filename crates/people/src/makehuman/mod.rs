@@ -45,6 +45,9 @@ const ORDER: [(Kind, usize); PARTS] = [
     (Kind::Foot, 1),
 ];
 
+/// Longest side of the box around a person and all that may be worn, metres: what is larger no memory could mesh.
+const LARGEST: f32 = 5.0;
+
 /// The person of this name: life-size in metres, standing on y = 0 and
 /// facing +z.
 ///
@@ -60,6 +63,12 @@ fn with_person<T>(library: &Library, name: &str, then: impl FnOnce(&Person) -> T
     let mut build = Build::draw(&mut random);
     let mut pose = Pose::draw(&mut random);
     let rest = morph(library, &mix, &mut random)?;
+    let (low, high) = bounds(rest.iter().copied());
+    let reach = (high - low).max_element();
+    if reach > LARGEST || !rest.iter().all(|p| p.is_finite()) {
+        let message = format!("a person of {reach} m comes out: one of its targets is damaged");
+        return Err(FileError::unsuitable(library.root(), message));
+    }
     let body = || library.groups.get("body").into_iter().flatten().flatten().map(|row| rest[*row as usize]);
     let (low, high) = bounds(body());
     (build.sex, build.stature) = (mix.sex, (high.y - low.y).max(0.5));
