@@ -222,6 +222,23 @@ fn every_tensor_with_a_value_that_is_not_finite_is_named() {
     assert!(problems[0].contains(QKV) && problems[1].contains("gs_conv.bias"), "{problems:?}");
 }
 
+/// What an import refuses does not leave by an export either.
+#[test]
+fn exports_refuse_values_that_are_not_finite() {
+    let folder = tempfile::tempdir().expect("temporary folder");
+    let [whole, broken, out] = ["a", "b", "c"].map(|name| folder.path().join(name));
+    init(&tiny(), 1, &whole, &|_, _| ()).expect("written");
+    let mut bytes = std::fs::read(&whole).expect("read");
+    let end = bytes.len();
+    bytes[end - 4..].copy_from_slice(&f32::NAN.to_le_bytes());
+    std::fs::write(&broken, bytes).expect("written");
+    export(&whole, &out, &|_, _| ()).expect("exports");
+    let good = std::fs::read(&out).expect("read");
+    let message = export(&broken, &out, &|_, _| ()).expect_err("refuses").to_string();
+    assert!(message.contains("not finite: ") && message.contains("(1 of "), "{message}");
+    assert!(std::fs::read(&out).expect("read") == good, "the old file stays");
+}
+
 #[test]
 fn aliases_that_contradict_each_other_are_refused() {
     let place = Workplace::new();

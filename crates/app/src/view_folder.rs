@@ -5,7 +5,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use image::RgbImage;
-use snapsnap_splat::{Camera, cameras, file};
+use snapsnap_splat::{Camera, cameras};
 
 use crate::commands::is_same_file;
 use crate::failure::Failure;
@@ -62,7 +62,6 @@ impl ViewFolder {
     /// Makes the folder. Where there are cameras, there are all of their pictures: those of an older render go first.
     pub fn begin(&self) -> Result<(), Failure> {
         make_folder(&self.path)?;
-        file::tidy(&self.path);
         if self.keeps_cameras {
             return Ok(());
         }

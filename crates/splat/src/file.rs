@@ -4,7 +4,7 @@ use std::collections::HashSet;
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Read, Write};
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
 use std::thread;
 use std::time::Duration;
 
@@ -107,11 +107,15 @@ fn create(path: &Path) -> io::Result<File> {
     Ok(file)
 }
 
+/// Folders that this run has tidied.
+fn tidied() -> &'static Mutex<HashSet<PathBuf>> {
+    static TIDIED: OnceLock<Mutex<HashSet<PathBuf>>> = OnceLock::new();
+    TIDIED.get_or_init(Mutex::default)
+}
+
 /// Removes the temporary files that killed runs have left in `folder`; once for each folder of a run.
-pub fn tidy(folder: &Path) {
-    static DONE: Mutex<Option<HashSet<PathBuf>>> = Mutex::new(None);
-    let mut done = DONE.lock().unwrap_or_else(PoisonError::into_inner);
-    if !done.get_or_insert_default().insert(folder.to_owned()) {
+fn tidy(folder: &Path) {
+    if !tidied().lock().unwrap_or_else(PoisonError::into_inner).insert(folder.to_owned()) {
         return;
     }
     for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
@@ -142,6 +146,7 @@ pub fn write_whole<E: From<io::Error>>(
     }
     let path = &target_of(path);
     let permissions = permissions_of(path)?;
+    tidy(folder_of(path));
     // Created with the mode of an ordinary new file (the umask applies), not the private one of temporary files.
     let mut file = tempfile::Builder::new()
         .prefix(PREFIX)
@@ -195,7 +200,6 @@ pub fn check_writable(path: &Path) -> io::Result<()> {
     }
     let path = &target_of(path);
     permissions_of(path)?;
-    tidy(folder_of(path));
     tempfile::tempfile_in(folder_of(path)).map(drop)
 }
 
@@ -283,11 +287,13 @@ mod tests {
         let (path, left) = (folder.path().join("a.txt"), folder.path().join(".snapsnap-left"));
         fs::write(&left, "half").expect("write");
         write_whole::<io::Error>(&path, |out| {
+            assert!(!left.exists());
+            // Another run that begins now does not know of this one.
+            tidied().lock().unwrap_or_else(PoisonError::into_inner).clear();
             tidy(folder.path());
             out.write_all(b"whole")
         })
         .expect("writes");
-        assert!(!left.exists());
         assert_eq!(fs::read_to_string(&path).expect("read"), "whole");
     }
 
