@@ -3,11 +3,14 @@
 //! the two together.
 
 mod attention;
+pub mod buffers;
 pub mod conv;
 mod gelu;
 mod math;
+pub mod op;
 mod resize;
 mod rope;
+pub mod unet;
 pub mod wide;
 
 #[cfg(test)]
@@ -27,6 +30,12 @@ pub use rope::Rope;
 pub fn is_fast<const D: usize>(x: &Tensor<D>) -> bool {
     let device = x.device();
     !device.is_autodiff() && device == Device::flex()
+}
+
+/// Whether `x` lives where kernels with gradients of their own apply: on `flex`, in training.
+pub fn is_trained_fast<const D: usize>(x: &Tensor<D>) -> bool {
+    let device = x.device();
+    device.is_autodiff() && device.inner() == Device::flex()
 }
 
 /// softmax(rope(q) · rope(k)ᵀ / √head_dim) · v, heads side by side in the channels: `q` `[B, N, C]`, `k` and `v`

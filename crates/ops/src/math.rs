@@ -24,6 +24,14 @@ pub fn silu(x: f32) -> f32 {
     x / (1.0 + exp(-x))
 }
 
+/// x·σ(x) and its derivative σ(x)·(1 + x·(1 − σ(x))).
+#[inline(always)]
+pub fn silu_and_slope(x: f32) -> [f32; 2] {
+    let sigmoid = 1.0 / (1.0 + exp(-x));
+    let value = x * sigmoid;
+    [value, sigmoid + value * (1.0 - sigmoid)]
+}
+
 /// x·Φ(x) with Φ from the error function's rational approximation 7.1.26 of Abramowitz and Stegun (absolute error
 /// below 1.5e-7).
 #[inline(always)]
@@ -70,6 +78,20 @@ mod tests {
             let error = (f64::from(gelu(x)) - expected).abs();
             // 1.5e-7 times |x|/√2·…, at most |x|, plus f32 rounding of the result.
             assert!(error <= 3e-7 * f64::from(x.abs()).max(0.1), "gelu({x}): {error:e}");
+        }
+    }
+
+    #[test]
+    fn the_slope_of_silu_is_accurate_to_rounding() {
+        for x in sweep() {
+            let sigmoid = (1.0 + (-f64::from(x)).exp()).recip();
+            let expected = [f64::from(x) * sigmoid, sigmoid * (1.0 + f64::from(x) * (1.0 - sigmoid))];
+            let got = silu_and_slope(x);
+            for (got, expected) in got.into_iter().zip(expected) {
+                // exp's 3e-7 and three roundings, of terms that do not exceed max(1, |x|).
+                let error = (f64::from(got) - expected).abs();
+                assert!(error <= 1e-6 * f64::from(x.abs()).max(1.0), "x = {x}: {error:e}");
+            }
         }
     }
 

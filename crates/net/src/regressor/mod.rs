@@ -5,6 +5,7 @@ mod fused;
 mod statistics;
 #[cfg(test)]
 mod tests;
+mod trained;
 mod unet;
 
 use burn::module::Module;
@@ -50,6 +51,9 @@ impl Regressor {
         assert!(h % 4 == 0 && w % 4 == 0, "regressor input {h}×{w}: both sides must be multiples of 4");
         if snapsnap_ops::is_fast(&input) && self.pred_unet.suits_cpu_kernel() {
             return fused::regress(&self.pred_unet, &self.gs_conv, input, statistics);
+        }
+        if snapsnap_ops::is_trained_fast(&input) && self.pred_unet.suits_cpu_kernel() {
+            return trained::regress(&self.pred_unet, &self.gs_conv, input, statistics);
         }
         self.gs_conv.forward(self.pred_unet.forward(input, statistics)).permute([0, 2, 3, 1])
     }

@@ -30,6 +30,13 @@ impl Statistics {
         Some(self.layers.iter().map(|[mean, rstd]| [row(mean), row(rstd)]).collect())
     }
 
+    /// Frozen statistics of all images on the host, layer by layer.
+    pub(crate) fn of_batch(&self) -> Option<Vec<[Vec<f32>; 2]>> {
+        self.next?;
+        let host = |x: &Tensor<2>| x.clone().into_data().try_into_vec().expect("f32");
+        Some(self.layers.iter().map(|[mean, rstd]| [host(mean), host(rstd)]).collect())
+    }
+
     /// Adds the measured statistics of a whole pass; frozen ones stay as they are.
     pub(crate) fn record(&mut self, layers: impl Iterator<Item = [Tensor<2>; 2]>) {
         if self.next.is_none() {

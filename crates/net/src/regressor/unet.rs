@@ -116,6 +116,11 @@ impl UNet {
         }
     }
 
+    /// Groups of every normalisation.
+    pub(crate) fn groups(&self) -> usize {
+        self.norm_out.num_groups
+    }
+
     /// Whether the fused CPU kernel has this width.
     pub(crate) fn suits_cpu_kernel(&self) -> bool {
         self.norm_out.num_channels == snapsnap_ops::conv::CHANNELS

@@ -13,40 +13,13 @@ mod transforms;
 #[cfg(test)]
 mod tests;
 
-use std::sync::{Mutex, PoisonError};
-
+pub use crate::buffers::Buffers;
 pub use convolution::Conv3x3;
 pub use image::{Image, Source};
 pub use pointwise::Pointwise;
 
 /// Channels that stand together.
 pub const GROUP: usize = 16;
-
-/// Memory to use again. The system clears every fresh page, which for images of this size takes about as long as their
-/// arithmetic.
-#[derive(Debug, Default)]
-pub struct Buffers {
-    free: Mutex<Vec<Vec<f32>>>,
-}
-
-impl Buffers {
-    /// `len` floats of any value.
-    pub fn take(&self, len: usize) -> Vec<f32> {
-        let mut free = self.free.lock().unwrap_or_else(PoisonError::into_inner);
-        // Much larger ones are left for those who need them.
-        let fitting = (0..free.len()).filter(|&i| (len..=2 * len).contains(&free[i].capacity()));
-        let best = fitting.min_by_key(|&i| free[i].capacity()).map(|i| free.swap_remove(i));
-        drop(free);
-        let Some(mut buffer) = best else { return vec![0.0; len] };
-        buffer.resize(len, 0.0);
-        buffer
-    }
-
-    /// Takes back what nobody needs any more.
-    pub fn give(&self, buffer: Vec<f32>) {
-        self.free.lock().unwrap_or_else(PoisonError::into_inner).push(buffer);
-    }
-}
 
 /// Cuts every plane of `plane` floats into pieces of `piece` (the last may be shorter): piece after piece, the slices of
 /// all planes. So tasks that each own some rows of all channels can write side by side.

@@ -1,0 +1,91 @@
+//! The regressor in training on `flex`: one operator with a gradient of its own, over all parameters as one vector.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use burn::module::Param;
+use burn::nn::conv::Conv2d;
+use burn::tensor::{Tensor, TensorData};
+use snapsnap_ops::buffers::Buffers;
+use snapsnap_ops::conv::{Layer, Wanted};
+use snapsnap_ops::op::{self, Kept, Kernel};
+use snapsnap_ops::unet::{FEATURES, Network, Saved};
+
+use super::statistics::Statistics;
+use super::unet::UNet;
+use crate::weights::{NamedVisitor, visit_named};
+
+/// Planes of one step are those of the next.
+static BUFFERS: Buffers = Buffers::new();
+
+/// One pass of the network.
+#[derive(Debug)]
+struct Pass {
+    network: Network,
+    /// B, H, W.
+    size: [usize; 3],
+    frozen: Option<Vec<Layer>>,
+    /// What the forward pass measured.
+    measured: Arc<Mutex<Vec<Layer>>>,
+}
+
+impl Kernel for Pass {
+    fn shape(&self) -> Vec<usize> {
+        self.size.into_iter().chain([FEATURES]).collect()
+    }
+
+    fn forward(&self, [input, parameters, _]: [&[f32]; 3], keep: bool) -> (Vec<f32>, Kept) {
+        let pass = self.network.forward(parameters, input, self.size, self.frozen.as_deref(), &BUFFERS);
+        *self.measured.lock().unwrap_or_else(PoisonError::into_inner) = pass.statistics;
+        let saved: Kept = if keep { Some(Box::new(pass.saved)) } else { None };
+        (pass.features, saved)
+    }
+
+    fn backward(
+        &self,
+        [input, parameters, _]: [&[f32]; 3],
+        kept: Kept,
+        upstream: &[f32],
+        [wants_input, wants_parameters, _]: [bool; 3],
+    ) -> [Option<Vec<f32>>; 3] {
+        let saved = kept.and_then(|kept| kept.downcast::<Saved>().ok()).expect("kept by the forward pass");
+        let wanted = Wanted { input: wants_input, parameters: wants_parameters };
+        let gradients = self.network.backward(parameters, input, *saved, upstream, wanted, &BUFFERS);
+        [wants_input.then_some(gradients.input), wants_parameters.then_some(gradients.parameters), None]
+    }
+}
+
+/// Input `[B, 6, H, W]` → features `[B, H, W, 14]`: `unet`, then the 1×1 convolution `last`.
+pub fn regress(unet: &UNet, last: &Conv2d, input: Tensor<4>, statistics: &mut Statistics) -> Tensor<4> {
+    let ([b, _, h, w], device) = (input.dims(), input.device());
+    let network = Network::new(unet.groups());
+    let parameters = flat(unet, last, &network);
+    let measured = Arc::default();
+    let pass =
+        Pass { network, size: [b, h, w], frozen: statistics.of_batch(), measured: Arc::clone(&measured) };
+    let none: Option<Tensor<1>> = None;
+    let features = op::run(pass, input.permute([0, 2, 3, 1]), Some(parameters), none);
+    let measured = std::mem::take(&mut *measured.lock().unwrap_or_else(PoisonError::into_inner));
+    statistics.record(measured.into_iter().map(|layer| {
+        layer.map(|values| {
+            let groups = values.len() / b;
+            Tensor::from_data(TensorData::new(values, [b, groups]), &device)
+        })
+    }));
+    features
+}
+
+/// All parameters in the order of [`Network::tensors`].
+fn flat(unet: &UNet, last: &Conv2d, network: &Network) -> Tensor<1> {
+    struct Collect(HashMap<String, Tensor<1>>);
+    impl NamedVisitor for Collect {
+        fn visit<const D: usize>(&mut self, name: &str, _: bool, parameter: &Param<Tensor<D>>) {
+            self.0.insert(name.to_owned(), parameter.val().reshape([-1]));
+        }
+    }
+    let mut collect = Collect(HashMap::new());
+    visit_named(unet, "", &mut collect);
+    visit_named(last, "gs_conv.", &mut collect);
+    let mut parameter = |name: &str| collect.0.remove(name).expect("the network has this parameter");
+    Tensor::cat(network.tensors().iter().map(|tensor| parameter(&tensor.name)).collect(), 0)
+}

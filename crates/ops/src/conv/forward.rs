@@ -1,0 +1,150 @@
+//! One convolution forward, band by band.
+
+use pulp::{Arch, Simd, WithSimd};
+use rayon::prelude::*;
+
+use super::kernels::{Row, Strided, Tap, square};
+use super::{CHANNELS, Moments, Plane, RowMoments, Source};
+use crate::buffers::Buffers;
+use crate::math::silu;
+
+/// Output rows per task.
+const BAND: usize = 16;
+
+/// What the result is added to before it is scaled.
+pub enum Shortcut<'a> {
+    /// Nothing.
+    None,
+    /// The plane itself.
+    Identity(&'a Plane),
+    /// 1×1 convolution of the planes, weights `[plane][channel in][16]`; its bias is part of the main bias.
+    Project(&'a [&'a Plane], &'a [f32]),
+}
+
+/// A 3×3 convolution with padding 1.
+pub struct Conv<'a> {
+    /// Inputs, whose channels follow one another.
+    pub sources: &'a [Source<'a>],
+    /// `[source][row][column][channel in][16]`.
+    pub weights: &'a [f32],
+    /// Added to every pixel.
+    pub bias: [f32; CHANNELS],
+    /// 1, or 2 to halve the size.
+    pub stride: usize,
+    /// Doubles the input by repetition first.
+    pub enlarge: bool,
+    /// Added to the result.
+    pub shortcut: Shortcut<'a>,
+    /// Factor of the sum.
+    pub scale: f32,
+}
+
+impl Conv<'_> {
+    /// The convolution on all cores; the same bits for any number of them.
+    pub fn run(&self) -> Plane {
+        self.run_into(&Buffers::default())
+    }
+
+    /// The same in memory from `buffers`.
+    pub fn run_into(&self, buffers: &Buffers) -> Plane {
+        let factor = if self.enlarge { 2 } else { 1 };
+        let input = self.sources[0].plane;
+        let (rows, columns) = (input.height * factor, input.width * factor);
+        let (height, width) = (rows.div_ceil(self.stride), columns.div_ceil(self.stride));
+        let mut data = buffers.take(height * width * CHANNELS);
+        let band = |(i, out): (usize, &mut [f32])| self.band(i * BAND, [rows, columns], width, out);
+        let moments: Vec<Moments> =
+            data.par_chunks_mut(BAND * width * CHANNELS).enumerate().map(band).collect();
+        // Joined in the order of the rows, whatever thread they ran on.
+        let moments = moments.iter().fold(Moments::default(), Moments::join);
+        Plane { height, width, data, moments }
+    }
+
+    /// Output rows from `first` on.
+    fn band(&self, first: usize, [rows, columns]: [usize; 2], width: usize, out: &mut [f32]) -> Moments {
+        let arch = Arch::new();
+        let line = (columns + 2) * CHANNELS;
+        // Three activated rows per source, in turn; `held` says which row each slot holds.
+        let mut slots: Vec<[Vec<f32>; 3]> =
+            self.sources.iter().map(|_| std::array::from_fn(|_| vec![0.0; line])).collect();
+        let mut held = [usize::MAX; 3];
+        let mut moments = Moments::default();
+        for (i, out) in out.chunks_exact_mut(width * CHANNELS).enumerate() {
+            let y = first + i;
+            // Padded row numbers, one more than the image's.
+            let window = [0, 1, 2].map(|k| y * self.stride + k);
+            for padded in window {
+                let slot = padded % 3;
+                if held[slot] != padded {
+                    held[slot] = padded;
+                    for (source, slots) in self.sources.iter().zip(&mut slots) {
+                        let row = (1..=rows).contains(&padded).then(|| padded - 1);
+                        arch.dispatch(Fill { source, row, enlarge: self.enlarge, out: &mut slots[slot] });
+                    }
+                }
+            }
+            let mut taps = Vec::with_capacity(9 * self.sources.len() + 2);
+            for (s, slots) in slots.iter().enumerate() {
+                for (ky, padded) in window.into_iter().enumerate() {
+                    for kx in 0..3 {
+                        let row = &slots[padded % 3][kx * CHANNELS..];
+                        taps.push(Tap { row, weights: square(self.weights, (s * 3 + ky) * 3 + kx) });
+                    }
+                }
+            }
+            let line = y * width * CHANNELS..(y + 1) * width * CHANNELS;
+            let mut identity = None;
+            match self.shortcut {
+                Shortcut::None => {}
+                Shortcut::Identity(plane) => identity = Some(&plane.data[line]),
+                Shortcut::Project(planes, weights) => {
+                    for (s, plane) in planes.iter().enumerate() {
+                        taps.push(Tap { row: &plane.data[line.clone()], weights: square(weights, s) });
+                    }
+                }
+            }
+            let row = Row { taps: &taps, bias: &self.bias, identity, scale: self.scale, out };
+            match self.stride {
+                1 => arch.dispatch(Strided::<1>(row)),
+                _ => arch.dispatch(Strided::<2>(row)),
+            }
+            moments = moments.join(&arch.dispatch(RowMoments(out)));
+        }
+        moments
+    }
+}
+
+/// Activates one row of a source into `out` `[columns + 2, 16]`, zero at both ends; a missing row is zero throughout.
+struct Fill<'a> {
+    source: &'a Source<'a>,
+    row: Option<usize>,
+    enlarge: bool,
+    out: &'a mut [f32],
+}
+
+impl WithSimd for Fill<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _simd: S) {
+        let Some(row) = self.row else {
+            self.out.fill(0.0);
+            return;
+        };
+        let (plane, factor) = (self.source.plane, if self.enlarge { 2 } else { 1 });
+        let line = plane.width * CHANNELS;
+        let (pixels, _) = plane.data[row / factor * line..][..line].as_chunks::<CHANNELS>();
+        let end = self.out.len() - CHANNELS;
+        let (out, _) = self.out[CHANNELS..end].as_chunks_mut::<CHANNELS>();
+        for (x, pixel) in pixels.iter().enumerate() {
+            let mut value = *pixel;
+            if let Some([scale, shift]) = &self.source.affine {
+                for c in 0..CHANNELS {
+                    value[c] = silu(value[c] * scale[c] + shift[c]);
+                }
+            }
+            out[x * factor] = value;
+            out[x * factor + factor - 1] = value;
+        }
+    }
+}

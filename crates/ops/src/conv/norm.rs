@@ -1,0 +1,116 @@
+//! Group normalisation between the passes: from moments to affine maps, and from sums over gradients back.
+
+use super::{Affine, CHANNELS, Plane, Sums};
+
+/// Mean and reciprocal standard deviation of every group.
+pub type Layer = [Vec<f32>; 2];
+
+/// A map of a normalised plane's gradient: slope·g + curve·x + shift per channel, with the gradient g before SiLU (behind
+/// scale and shift) and the plane x.
+pub type Linear = [[f32; CHANNELS]; 3];
+
+/// Group normalisation of one or two stacked planes.
+#[derive(Debug, Clone, Copy)]
+pub struct GroupNorm<'a> {
+    /// Groups of neighbouring channels.
+    pub groups: usize,
+    /// Added to the (biased) variance.
+    pub epsilon: f64,
+    /// Factor per channel.
+    pub gamma: &'a [f32],
+    /// Summand per channel.
+    pub beta: &'a [f32],
+}
+
+/// What a normalisation's backward pass gives.
+#[derive(Debug, Clone)]
+pub struct NormGradients {
+    /// Of the factors.
+    pub gamma: Vec<f64>,
+    /// Of the summands.
+    pub beta: Vec<f64>,
+    /// From the gradient behind it to the gradient before it, plane by plane.
+    pub maps: Vec<Linear>,
+}
+
+impl GroupNorm<'_> {
+    fn per_group(&self) -> usize {
+        self.gamma.len() / self.groups
+    }
+
+    /// Statistics of the stacked planes, from their moments.
+    pub fn measure(&self, planes: &[&Plane]) -> Layer {
+        let per_group = self.per_group();
+        let channel = |i: usize| {
+            let moments = &planes[i / CHANNELS].moments;
+            (moments.mean[i % CHANNELS], moments.squares[i % CHANNELS])
+        };
+        let count = planes[0].moments.count;
+        let group = |g: usize| {
+            let members = || (g * per_group..(g + 1) * per_group).map(channel);
+            let mean = members().map(|(mean, _)| mean).sum::<f64>() / per_group as f64;
+            let squares: f64 = members().map(|(m, squares)| squares + count * (m - mean).powi(2)).sum();
+            let variance = squares / (count * per_group as f64);
+            (mean as f32, (variance + self.epsilon).sqrt().recip() as f32)
+        };
+        let (mean, rstd) = (0..self.groups).map(group).unzip();
+        [mean, rstd]
+    }
+
+    /// Normalisation, factor and summand as one map per plane.
+    pub fn affines(&self, [mean, rstd]: &Layer) -> Vec<Affine> {
+        let per_group = self.per_group();
+        let affine = |plane: usize| {
+            let index = |c: usize| plane * CHANNELS + c;
+            let scale: [f32; CHANNELS] =
+                std::array::from_fn(|c| rstd[index(c) / per_group] * self.gamma[index(c)]);
+            let shift = std::array::from_fn(|c| self.beta[index(c)] - mean[index(c) / per_group] * scale[c]);
+            [scale, shift]
+        };
+        (0..self.gamma.len() / CHANNELS).map(affine).collect()
+    }
+
+    /// The backward pass from the sums over each plane's gradient. Measured statistics depend on the planes themselves
+    /// and so add to their gradient; `frozen` ones do not.
+    pub fn backward(
+        &self,
+        [mean, rstd]: &Layer,
+        planes: &[&Plane],
+        sums: &[Sums],
+        frozen: bool,
+    ) -> NormGradients {
+        let per_group = self.per_group();
+        let channels = self.gamma.len();
+        let beta: Vec<f64> = (0..channels).map(|i| sums[i / CHANNELS].gradient[i % CHANNELS]).collect();
+        // Σ g·x̂: the passes sum about the plane's own mean, which need not be the group's.
+        let gamma: Vec<f64> = (0..channels)
+            .map(|i| {
+                let (plane, c, g) = (i / CHANNELS, i % CHANNELS, i / per_group);
+                let distance = planes[plane].centre(c) - f64::from(mean[g]);
+                f64::from(rstd[g]) * (sums[plane].product[c] + distance * sums[plane].gradient[c])
+            })
+            .collect();
+        let members = planes[0].moments.count * per_group as f64;
+        let group_mean = |values: &[f64], g: usize| {
+            let terms = (g * per_group..(g + 1) * per_group).map(|i| f64::from(self.gamma[i]) * values[i]);
+            terms.sum::<f64>() / members
+        };
+        let groups: Vec<[f64; 2]> = (0..self.groups)
+            .map(|g| if frozen { [0.0; 2] } else { [group_mean(&beta, g), group_mean(&gamma, g)] })
+            .collect();
+        // ∂x = rstd·(γ·g − mean(γ·g) − x̂·mean(γ·g·x̂)) with x̂ = rstd·(x − mean).
+        let map = |plane: usize| -> Linear {
+            let coefficients: [[f32; 3]; CHANNELS] = std::array::from_fn(|c| {
+                let i = plane * CHANNELS + c;
+                let g = i / per_group;
+                let rstd = f64::from(rstd[g]);
+                let curve = -rstd * rstd * groups[g][1];
+                let shift = -rstd * groups[g][0] - curve * f64::from(mean[g]);
+                [rstd * f64::from(self.gamma[i]), curve, shift].map(|x| x as f32)
+            });
+            std::array::from_fn(|part| coefficients.map(|channel| channel[part]))
+        };
+        let maps = (0..planes.len()).map(map).collect();
+        NormGradients { gamma, beta, maps }
+    }
+}

@@ -1,0 +1,36 @@
+//! Convolution weights between PyTorch's order and the kernels'.
+
+use super::CHANNELS;
+
+/// Where weight `(out, in, tap)` of `[out, in, k, k]` lies in `[source][k][k][16 in][16 out]`.
+fn position(o: usize, i: usize, tap: usize, taps: usize) -> usize {
+    ((i / CHANNELS * taps + tap) * CHANNELS + i % CHANNELS) * CHANNELS + o
+}
+
+/// A PyTorch weight `[out, in, k, k]` of `taps` = k² as `[source][k][k][16 in][16 out]`, absent channels 0.
+pub fn arrange(values: &[f32], [out, inputs, taps]: [usize; 3]) -> Vec<f32> {
+    let mut arranged = vec![0.0; inputs.div_ceil(CHANNELS) * taps * CHANNELS * CHANNELS];
+    for (from, value) in values[..out * inputs * taps].iter().enumerate() {
+        let (o, i, tap) = (from / taps / inputs, from / taps % inputs, from % taps);
+        arranged[position(o, i, tap, taps)] = *value;
+    }
+    arranged
+}
+
+/// Adds the gradient of the arranged weight to the gradient of PyTorch's.
+pub fn rearrange(arranged: &[f64], [out, inputs, taps]: [usize; 3], values: &mut [f64]) {
+    for (to, value) in values[..out * inputs * taps].iter_mut().enumerate() {
+        let (o, i, tap) = (to / taps / inputs, to / taps % inputs, to % taps);
+        *value += arranged[position(o, i, tap, taps)];
+    }
+}
+
+/// Every 16×16 matrix transposed, as gradients go the other way.
+pub fn transpose(arranged: &[f32]) -> Vec<f32> {
+    let squares = arranged.chunks_exact(CHANNELS * CHANNELS);
+    squares
+        .flat_map(|square| {
+            (0..CHANNELS * CHANNELS).map(|at| square[at % CHANNELS * CHANNELS + at / CHANNELS])
+        })
+        .collect()
+}

@@ -1,0 +1,178 @@
+//! Operators of our own with gradients of their own, as one Burn backend extension. Everything that knows Burn's backend
+//! interfaces is in this file; those interfaces change with every minor version of Burn.
+
+use std::any::Any;
+use std::fmt::Debug;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use burn::backend::autodiff::Autodiff;
+use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::CheckpointStrategy};
+use burn::backend::autodiff::grads::Gradients;
+use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
+use burn::backend::flex::FlexTensor;
+use burn::backend::tensor::FloatTensor;
+use burn::backend::{
+    AutodiffBackend, Backend, Dispatch, ExtensionType, Flex, TensorMetadata, backend_extension,
+};
+use burn::tensor::{Tensor, TensorData};
+
+/// An operator on contiguous f32 values: up to three tensors in, one out.
+pub trait Kernel: Debug + Send + Sync + 'static {
+    /// Shape of the result.
+    fn shape(&self) -> Vec<usize>;
+
+    /// The result, and, where `keep`, what the backward pass needs beside the inputs. An input that was not given is one
+    /// zero.
+    fn forward(&self, inputs: [&[f32]; 3], keep: bool) -> (Vec<f32>, Kept);
+
+    /// ∂L/∂ of the inputs that are wanted, each of the size of its input, from ∂L/∂result.
+    fn backward(
+        &self,
+        inputs: [&[f32]; 3],
+        kept: Kept,
+        upstream: &[f32],
+        wanted: [bool; 3],
+    ) -> [Option<Vec<f32>>; 3];
+}
+
+/// What an operator keeps for its backward pass, which takes it.
+pub type Kept = Option<Box<dyn Any + Send>>;
+
+/// The tensors of a call.
+#[derive(ExtensionType, Clone, Debug)]
+pub struct Inputs<B: Backend> {
+    x: FloatTensor<B>,
+    y: FloatTensor<B>,
+    z: FloatTensor<B>,
+}
+
+/// The result of a call.
+#[derive(ExtensionType, Clone, Debug)]
+pub struct Output<B: Backend> {
+    tensor: FloatTensor<B>,
+}
+
+/// Backends that run a [`Kernel`].
+#[backend_extension(Flex, Autodiff)]
+pub trait KernelBackend: Backend {
+    /// Runs `kernel`.
+    fn run(#[extension_type] inputs: Inputs<Self>, kernel: Arc<dyn Kernel>) -> Output<Self>;
+}
+
+/// What a backend without autodiff brings along.
+pub trait Untracked: Backend {
+    /// As [`Kernel::forward`].
+    fn forward(inputs: &Inputs<Self>, kernel: &dyn Kernel, keep: bool) -> (FloatTensor<Self>, Kept);
+
+    /// As [`Kernel::backward`].
+    fn backward(
+        inputs: &Inputs<Self>,
+        kernel: &dyn Kernel,
+        kept: Kept,
+        upstream: FloatTensor<Self>,
+        wanted: [bool; 3],
+    ) -> [Option<FloatTensor<Self>>; 3];
+}
+
+impl KernelBackend for Flex {
+    fn run(inputs: Inputs<Self>, kernel: Arc<dyn Kernel>) -> Output<Self> {
+        Output { tensor: <Self as Untracked>::forward(&inputs, &*kernel, false).0 }
+    }
+}
+
+impl Untracked for Flex {
+    fn forward(inputs: &Inputs<Self>, kernel: &dyn Kernel, keep: bool) -> (FlexTensor, Kept) {
+        let fields = contiguous(inputs);
+        let (values, kept) = kernel.forward(fields.each_ref().map(slice), keep);
+        (FlexTensor::from_data(TensorData::new(values, kernel.shape())), kept)
+    }
+
+    fn backward(
+        inputs: &Inputs<Self>,
+        kernel: &dyn Kernel,
+        kept: Kept,
+        upstream: FlexTensor,
+        wanted: [bool; 3],
+    ) -> [Option<FlexTensor>; 3] {
+        let fields = contiguous(inputs);
+        let upstream = upstream.to_contiguous();
+        let values = kernel.backward(fields.each_ref().map(slice), kept, slice(&upstream), wanted);
+        let mut fields = fields.into_iter();
+        values.map(|values| {
+            let shape = fields.next().expect("three of each").shape();
+            values.map(|values| FlexTensor::from_data(TensorData::new(values, shape)))
+        })
+    }
+}
+
+fn contiguous(inputs: &Inputs<Flex>) -> [FlexTensor; 3] {
+    [&inputs.x, &inputs.y, &inputs.z].map(FlexTensor::to_contiguous)
+}
+
+fn slice(tensor: &FlexTensor) -> &[f32] {
+    tensor.as_slice().expect("contiguous and f32: all tensors here are")
+}
+
+#[derive(Debug)]
+struct KernelBackward;
+
+/// A call, for the backward pass.
+#[derive(Debug, Clone)]
+struct Call<B: Backend> {
+    inputs: Inputs<B>,
+    kernel: Arc<dyn Kernel>,
+    kept: Arc<Mutex<Kept>>,
+}
+
+impl<B: Untracked> Backward<B, 3> for KernelBackward {
+    type State = Call<B>;
+
+    fn backward(self, ops: Ops<Self::State, 3>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
+        let upstream = grads.consume::<B>(&ops.node);
+        let Call { inputs, kernel, kept } = ops.state;
+        let wanted = ops.parents.each_ref().map(Option::is_some);
+        let kept = kept.lock().unwrap_or_else(PoisonError::into_inner).take();
+        let gradients = B::backward(&inputs, &*kernel, kept, upstream, wanted);
+        for (parent, gradient) in ops.parents.into_iter().zip(gradients) {
+            if let Some((parent, gradient)) = parent.zip(gradient) {
+                grads.register::<B>(parent.id, gradient);
+            }
+        }
+    }
+}
+
+impl<B: Untracked, C: CheckpointStrategy> KernelBackend for Autodiff<B, C> {
+    fn run(inputs: Inputs<Self>, kernel: Arc<dyn Kernel>) -> Output<Self> {
+        let nodes = [inputs.x.node(), inputs.y.node(), inputs.z.node()];
+        let inputs = Inputs {
+            x: inputs.x.into_primitive(),
+            y: inputs.y.into_primitive(),
+            z: inputs.z.into_primitive(),
+        };
+        let tensor = match KernelBackward.prepare::<C>(nodes).compute_bound().stateful() {
+            OpsKind::Tracked(prepared) => {
+                let (tensor, kept) = B::forward(&inputs, &*kernel, true);
+                prepared.finish(Call { inputs, kernel, kept: Arc::new(Mutex::new(kept)) }, tensor)
+            }
+            OpsKind::UnTracked(_) => Self::from_inner(B::forward(&inputs, &*kernel, false).0),
+        };
+        Output { tensor }
+    }
+}
+
+/// Runs a kernel on tensors of `flex`, tracked or not.
+pub fn run<const A: usize, const B: usize, const C: usize, const D: usize>(
+    kernel: impl Kernel,
+    x: Tensor<A>,
+    y: Option<Tensor<B>>,
+    z: Option<Tensor<C>>,
+) -> Tensor<D> {
+    let device = x.device();
+    let none = || Tensor::<1>::zeros([1], &device).into_dispatch();
+    let inputs = Inputs {
+        x: x.into_dispatch(),
+        y: y.map_or_else(none, Tensor::into_dispatch),
+        z: z.map_or_else(none, Tensor::into_dispatch),
+    };
+    Tensor::from_dispatch(<Dispatch as KernelBackend>::run(inputs, Arc::new(kernel)).tensor)
+}

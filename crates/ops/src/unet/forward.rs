@@ -1,0 +1,212 @@
+//! Input → features, and what the way back needs.
+
+use rayon::prelude::*;
+
+use super::layout::{Conv as Place, Network, Norm, Residual, Step};
+use super::{BRANCH_SCALE, FEATURES, INPUT_CHANNELS};
+use crate::buffers::Buffers;
+use crate::conv::{Affine, CHANNELS, Conv, Layer, Moments, Plane, Shortcut, Source, arrange};
+
+/// Pixels that are copied at once.
+const TASK: usize = 4096;
+
+/// What [`Network::forward`] gives.
+#[derive(Debug)]
+pub struct Forward {
+    /// `[B, H, W, 14]`, before activation.
+    pub features: Vec<f32>,
+    /// Per normalisation: means and reciprocal standard deviations `[B, groups]`, measured or as given.
+    pub statistics: Vec<Layer>,
+    /// For [`Network::backward`].
+    pub saved: Saved,
+}
+
+/// The tape: 16 planes' worth of pixels per image at full size (64 bytes per pixel each), the input not among them.
+#[derive(Debug, Clone)]
+pub struct Saved {
+    pub(super) samples: Vec<Sample>,
+    pub(super) frozen: bool,
+}
+
+/// One image's part of the tape.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Sample {
+    /// Outputs of the steps, one more than the step's number; the input's place stays empty.
+    pub planes: Vec<Option<Plane>>,
+    /// Between the convolutions of every residual block, by the block's step.
+    pub hidden: Vec<Option<Plane>>,
+    /// Per normalisation.
+    pub layers: Vec<Layer>,
+}
+
+impl Sample {
+    pub fn plane(&self, index: usize) -> &Plane {
+        self.planes[index].as_ref().expect("a plane outlives its readers")
+    }
+}
+
+impl Network {
+    /// `input` `[B, H, W, 6]`, H and W multiples of 4 → features, with `parameters` in the order of
+    /// [`Network::tensors`]. `frozen` statistics are taken instead of measured ones.
+    ///
+    /// # Panics
+    /// If lengths and sizes do not fit.
+    pub fn forward(
+        &self,
+        parameters: &[f32],
+        input: &[f32],
+        [b, h, w]: [usize; 3],
+        frozen: Option<&[Layer]>,
+        buffers: &Buffers,
+    ) -> Forward {
+        assert!(h % 4 == 0 && w % 4 == 0, "regressor input {h}×{w}: both sides must be multiples of 4");
+        assert_eq!(parameters.len(), self.parameters());
+        assert_eq!(input.len(), b * h * w * INPUT_CHANNELS);
+        let mut features = vec![0.0; b * h * w * FEATURES];
+        let run = |(i, (input, features)): (usize, (&[f32], &mut [f32]))| {
+            let part = |values: &Vec<f32>| values[i * self.groups..(i + 1) * self.groups].to_vec();
+            let frozen = frozen.map(|layers| layers.iter().map(|layer| layer.each_ref().map(part)).collect());
+            let mut pass = Pass { network: self, parameters, frozen, sample: Sample::default(), buffers };
+            let out = pass.run(pad::<INPUT_CHANNELS>(input, [h, w], buffers));
+            cut::<FEATURES>(&out.data, features);
+            buffers.give(out.data);
+            pass.sample
+        };
+        let inputs = input.par_chunks_exact(h * w * INPUT_CHANNELS);
+        let samples: Vec<Sample> =
+            inputs.zip(features.par_chunks_exact_mut(h * w * FEATURES)).enumerate().map(run).collect();
+        let layer = |k: usize| {
+            [0, 1].map(|part| samples.iter().flat_map(|sample| sample.layers[k][part].clone()).collect())
+        };
+        let statistics = (0..samples.first().map_or(0, |sample| sample.layers.len())).map(layer).collect();
+        Forward { features, statistics, saved: Saved { samples, frozen: frozen.is_some() } }
+    }
+}
+
+/// `[h, w, N]` → plane, the other channels 0.
+pub(super) fn pad<const N: usize>(values: &[f32], [height, width]: [usize; 2], buffers: &Buffers) -> Plane {
+    let mut data = buffers.take(height * width * CHANNELS);
+    let pixels = data.as_chunks_mut::<CHANNELS>().0.par_iter_mut().zip(values.as_chunks::<N>().0);
+    pixels.with_min_len(TASK).for_each(|(pixel, values)| {
+        *pixel = std::array::from_fn(|c| if c < N { values[c] } else { 0.0 });
+    });
+    Plane { height, width, data, moments: Moments::default() }
+}
+
+/// Plane → `[h, w, N]`, the first channels.
+pub(super) fn cut<const N: usize>(plane: &[f32], out: &mut [f32]) {
+    let pixels = out.as_chunks_mut::<N>().0.par_iter_mut().zip(plane.as_chunks::<CHANNELS>().0);
+    pixels.with_min_len(TASK).for_each(|(out, pixel)| out.copy_from_slice(&pixel[..N]));
+}
+
+/// Weight and bias in the kernels' order.
+pub(super) fn arranged(place: &Place, parameters: &[f32]) -> (Vec<f32>, [f32; CHANNELS]) {
+    let mut bias = [0.0; CHANNELS];
+    bias[..place.shape[0]].copy_from_slice(&parameters[place.bias.clone()]);
+    (arrange(&parameters[place.weight.clone()], place.shape), bias)
+}
+
+/// A 3×3 convolution followed by a 1×1 convolution, as one: nothing lies between the two.
+pub(super) fn compose(first: &Place, second: &Place, parameters: &[f32]) -> (Vec<f32>, [f32; CHANNELS]) {
+    let (first, first_bias) = arranged(first, parameters);
+    let (second, second_bias) = arranged(second, parameters);
+    let (matrix, _) = second.as_chunks::<CHANNELS>();
+    let apply = |x: &[f32; CHANNELS]| -> [f32; CHANNELS] {
+        let sum = |o: usize| (0..CHANNELS).map(|i| f64::from(x[i]) * f64::from(matrix[i][o])).sum::<f64>();
+        std::array::from_fn(|o| sum(o) as f32)
+    };
+    let weights = first.as_chunks::<CHANNELS>().0.iter().flat_map(apply).collect();
+    let bias = apply(&first_bias);
+    (weights, std::array::from_fn(|o| bias[o] + second_bias[o]))
+}
+
+struct Pass<'a> {
+    network: &'a Network,
+    parameters: &'a [f32],
+    /// Statistics to use instead of measured ones.
+    frozen: Option<Vec<Layer>>,
+    sample: Sample,
+    buffers: &'a Buffers,
+}
+
+impl Pass<'_> {
+    fn run(&mut self, input: Plane) -> Plane {
+        self.sample.planes.push(Some(input));
+        for step in &self.network.steps {
+            let (plane, hidden) = match step {
+                Step::Convolve { conv, from, stride, enlarge } => {
+                    (self.plain(conv, *from, *stride, *enlarge), None)
+                }
+                Step::Residual { block, from, skip } => {
+                    let inputs: Vec<usize> = [*from].into_iter().chain(*skip).collect();
+                    let hidden = self.first(block, &inputs);
+                    (self.second(block, &inputs, &hidden), Some(hidden))
+                }
+            };
+            self.sample.planes.push(Some(plane));
+            self.sample.hidden.push(hidden);
+            // The caller has the input.
+            let input = self.sample.planes[0].take();
+            input.into_iter().for_each(|plane| self.buffers.give(plane.data));
+        }
+        let last = self.network.steps.len();
+        let affine = self.normalise(&self.network.norm_out, &[last], None)[0];
+        let (weights, bias) = compose(&self.network.conv_out, &self.network.gs_conv, self.parameters);
+        let sources = [Source { plane: self.sample.plane(last), affine: Some(affine) }];
+        let (stride, enlarge, shortcut) = (1, false, Shortcut::None);
+        Conv { sources: &sources, weights: &weights, bias, stride, enlarge, shortcut, scale: 1.0 }
+            .run_into(self.buffers)
+    }
+
+    /// A convolution without normalisation or shortcut.
+    fn plain(&self, conv: &Place, from: usize, stride: usize, enlarge: bool) -> Plane {
+        let (weights, bias) = arranged(conv, self.parameters);
+        let sources = [Source { plane: self.sample.plane(from), affine: None }];
+        let shortcut = Shortcut::None;
+        Conv { sources: &sources, weights: &weights, bias, stride, enlarge, shortcut, scale: 1.0 }
+            .run_into(self.buffers)
+    }
+
+    /// The first half of a residual block.
+    fn first(&mut self, block: &Residual, inputs: &[usize]) -> Plane {
+        let affines = self.normalise(&block.norm1, inputs, None);
+        let source = |(&i, affine)| Source { plane: self.sample.plane(i), affine: Some(affine) };
+        let sources: Vec<_> = inputs.iter().zip(affines).map(source).collect();
+        let (weights, bias) = arranged(&block.conv1, self.parameters);
+        let (stride, enlarge, shortcut) = (1, false, Shortcut::None);
+        Conv { sources: &sources, weights: &weights, bias, stride, enlarge, shortcut, scale: 1.0 }
+            .run_into(self.buffers)
+    }
+
+    /// The second half.
+    fn second(&mut self, block: &Residual, inputs: &[usize], hidden: &Plane) -> Plane {
+        let affine = self.normalise(&block.norm2, &[], Some(hidden))[0];
+        let (weights, mut bias) = arranged(&block.conv2, self.parameters);
+        let projection = block.shortcut.as_ref().map(|conv| arranged(conv, self.parameters));
+        let planes: Vec<_> = inputs.iter().map(|&i| self.sample.plane(i)).collect();
+        let shortcut = match &projection {
+            Some((weights, added)) => {
+                bias.iter_mut().zip(added).for_each(|(b, a)| *b += a);
+                Shortcut::Project(&planes, weights)
+            }
+            None => Shortcut::Identity(planes[0]),
+        };
+        let sources = [Source { plane: hidden, affine: Some(affine) }];
+        let scale = BRANCH_SCALE as f32;
+        Conv { sources: &sources, weights: &weights, bias, stride: 1, enlarge: false, shortcut, scale }
+            .run_into(self.buffers)
+    }
+
+    /// The group normalisation of planes on the tape and one that is not there yet, as affine maps.
+    fn normalise(&mut self, norm: &Norm, inputs: &[usize], hidden: Option<&Plane>) -> Vec<Affine> {
+        let planes: Vec<_> = inputs.iter().map(|&i| self.sample.plane(i)).chain(hidden).collect();
+        let group_norm = self.network.norm(norm, self.parameters);
+        let layer = match &self.frozen {
+            Some(frozen) => frozen[norm.index].clone(),
+            None => group_norm.measure(&planes),
+        };
+        let affines = group_norm.affines(&layer);
+        self.sample.layers.push(layer);
+        affines
+    }
+}

@@ -1,0 +1,25 @@
+//! The regressor's network as one differentiable function over the fused convolutions.
+//!
+//! `layout` says which operators there are and where their parameters lie, `forward` and `backward` walk along them.
+//! The tape between the two holds the planes that group normalisations or convolutions read, and nothing else.
+
+mod backward;
+mod forward;
+mod layout;
+#[cfg(test)]
+mod reference;
+#[cfg(test)]
+mod tests;
+
+pub use backward::Gradients;
+pub use forward::{Forward, Saved};
+pub use layout::{Network, Tensor};
+
+/// Channels in: red, green, blue, x, y, z.
+pub const INPUT_CHANNELS: usize = 6;
+/// Channels out.
+pub const FEATURES: usize = 14;
+/// Every sum of two branches is scaled by this, so that its variance stays put.
+pub const BRANCH_SCALE: f64 = std::f64::consts::FRAC_1_SQRT_2;
+/// Added to every variance.
+pub const EPSILON: f64 = 1e-5;
