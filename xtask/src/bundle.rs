@@ -47,8 +47,8 @@ pub fn bundle(options: &Options) -> Result<(), String> {
         ("numerical", build(options, &["test", "--no-run", "--test", "numerical"])?),
         ("splat", build(options, &["bench", "--no-run", "--bench", "splat"])?),
     ];
-    let parent = options.output.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let folder = parent.join("snapsnap-bundle");
+    // Never beside the archive, where somebody may have unpacked one.
+    let folder = Path::new("target/bundle/snapsnap-bundle").to_owned();
     if folder.exists() {
         fs::remove_dir_all(&folder).map_err(failed(&folder))?;
     }
@@ -77,6 +77,7 @@ pub fn bundle(options: &Options) -> Result<(), String> {
     executable(&script).map_err(failed(&script))?;
     pack(&folder, &options.output)?;
     let size = fs::metadata(&options.output).map_err(failed(&options.output))?.len();
+    fs::remove_dir_all(&folder).map_err(failed(&folder))?;
     println!(
         "{}: {:.1} MB; unpack it anywhere and start run.sh",
         options.output.display(),

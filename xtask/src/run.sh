@@ -41,6 +41,8 @@ part "Splatting" splat.log bin/splat --full --device "$device"
 grep '^|' "$out/splat.log" >>"$report"
 
 work=$(mktemp -d) || exit 1
+trap 'rm -rf "$work"' EXIT
+trap 'exit 130' INT TERM
 part "A person to photograph" person.log \
   bin/snapsnap prepare synth --subjects 1 --set views.count=2 -o "$work/people"
 part "Random weights of full size" weights.log \
@@ -53,6 +55,5 @@ for run in 1 2 3 4; do
   sed 's/^/    /' "$out/reconstruct-$run.log" >>"$report"
 done
 cp "$work/turn.png" "$out/turntable.png" 2>/dev/null
-rm -rf "$work"
 echo "$report"
 exit $failed

@@ -95,8 +95,11 @@ fn nth(name: &str, kind: DeviceType, index: Option<usize>) -> Result<Device, Fai
         None if name == "wgpu" => Ok(Device::wgpu(DeviceKind::DefaultDevice)),
         _ => {
             let message = format!("there are {found}, numbered from 0");
-            let device =
-                devices.into_iter().nth(index.unwrap_or(0)).ok_or_else(|| unknown(name, &message))?;
+            let device = match index {
+                Some(index) => devices.into_iter().nth(index),
+                None => devices.iter().find(|device| is_card(device)).or(devices.first()).cloned(),
+            };
+            let device = device.ok_or_else(|| unknown(name, &message))?;
             if name.starts_with("vulkan") && !is_card(&device) {
                 // Mesa's ends the program on the first kernel.
                 let message = format!("{} does not bear SPIR-V kernels: use wgpu", describe(&device));

@@ -72,8 +72,9 @@ fn main() -> ExitCode {
             if arguments.all(|argument| say::printable(&argument) == argument) {
                 e.exit();
             }
-            say::err(e.to_string().trim_end());
-            return ExitCode::from(2);
+            let say = if e.use_stderr() { say::err } else { say::out };
+            say(e.to_string().trim_end());
+            return if e.use_stderr() { ExitCode::from(2) } else { ExitCode::SUCCESS };
         }
     };
     let result = match command {

@@ -6,7 +6,7 @@ use sysinfo::{MemoryRefreshKind, RefreshKind, System};
 
 use crate::failure::Failure;
 
-/// Refuses work on the CPU that may need more bytes than this process can ever get; `what` and `mend` say what it is and
+/// Refuses work on the CPU that needs more bytes than this process can ever get; `what` and `mend` say what it is and
 /// how it needs less.
 pub fn check(what: &str, needed: u64, mend: &str) -> Result<(), Failure> {
     let there = there();
@@ -15,7 +15,7 @@ pub fn check(what: &str, needed: u64, mend: &str) -> Result<(), Failure> {
     }
     let gigabytes = |bytes: u64| bytes as f64 / 1e9;
     let message = format!(
-        "{what} needs up to {:.1} GB of memory, this machine has {:.1} GB: {mend}",
+        "{what} needs {:.1} GB of memory, this machine has {:.1} GB: {mend}",
         gigabytes(needed),
         gigabytes(there)
     );
@@ -24,10 +24,11 @@ pub fn check(what: &str, needed: u64, mend: &str) -> Result<(), Failure> {
 
 /// Bytes that the machine has, or, where that is less, that this process is allowed.
 fn there() -> u64 {
-    let memory = RefreshKind::nothing().with_memory(MemoryRefreshKind::nothing().with_ram());
+    let memory = RefreshKind::nothing().with_memory(MemoryRefreshKind::everything());
     let system = System::new_with_specifics(memory);
     // 0 where the system is not known.
-    let total = Some(system.total_memory()).filter(|bytes| *bytes > 0).unwrap_or(u64::MAX);
+    let total =
+        Some(system.total_memory() + system.total_swap()).filter(|bytes| *bytes > 0).unwrap_or(u64::MAX);
     let group = system.cgroup_limits().map_or(u64::MAX, |limits| limits.total_memory);
     total.min(group).min(address_space().unwrap_or(u64::MAX))
 }

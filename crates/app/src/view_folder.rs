@@ -5,7 +5,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use image::RgbImage;
-use snapsnap_splat::{Camera, cameras};
+use snapsnap_splat::{Camera, cameras, file};
 
 use crate::commands::is_same_file;
 use crate::failure::Failure;
@@ -65,7 +65,8 @@ impl ViewFolder {
         if self.keeps_cameras {
             return Ok(());
         }
-        let path = self.path.join(CAMERAS);
+        // A link stays, as it does when it is written through.
+        let path = file::target_of(&self.path.join(CAMERAS));
         match fs::remove_file(&path) {
             Err(e) if e.kind() != io::ErrorKind::NotFound => Err(Failure::cannot_write(&path, &e)),
             _ => Ok(()),

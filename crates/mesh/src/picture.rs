@@ -12,9 +12,9 @@ use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader};
 use crate::FileError;
 use crate::error::{guarded, open};
 
-/// Bytes that a decoded photograph, mask or view may take: 134 million pixels of red, green, blue and alpha. What comes
-/// after decoding needs about three times as much.
-pub const MAX_BYTES: u64 = 512 << 20;
+/// Bytes that a decoded photograph, mask or view may take: 201 million pixels of red, green, blue and alpha, as many as
+/// telephones give. What comes after decoding needs about twice as much again.
+pub const MAX_BYTES: u64 = 768 << 20;
 /// Largest picture file that is read into memory before it is decoded.
 const MAX_FILE: u64 = 1 << 30;
 
@@ -26,6 +26,19 @@ const MAX_FILE: u64 = 1 << 30;
 pub fn decode(path: &Path, most: u64) -> Result<DynamicImage, FileError> {
     let file = BufReader::new(open(path)?);
     guarded(path, || decode_from(path, file, most))
+}
+
+/// Width and height of the picture in `path`, as stored.
+///
+/// # Errors
+/// [`FileError`] for a file that cannot be read or is no picture.
+pub fn size(path: &Path) -> Result<[u32; 2], FileError> {
+    let file = BufReader::new(open(path)?);
+    guarded(path, || {
+        let reader = ImageReader::new(file).with_guessed_format().map_err(FileError::read(path))?;
+        let size = reader.into_dimensions();
+        size.map(Into::into).map_err(|source| FileError::Decode { path: path.to_owned(), source })
+    })
 }
 
 /// The picture in `bytes`, which are a part of `path`.

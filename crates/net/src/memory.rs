@@ -4,20 +4,20 @@ use crate::config::Config;
 
 /// Bytes of an f32.
 const F32: u64 = 4;
-/// Bytes per pixel of the canvas where every pixel of every view becomes a Gaussian: photographs, point maps on the device
-/// and on the host, side images, the regressor's planes of 16 channels and the Gaussians; measured (docs/inference.md).
-const PER_PIXEL: u64 = 1000;
+/// Bytes per pixel of the canvas where a person stands as high as training subjects do and is seen from the sides as well:
+/// photographs, point maps on the device and on the host, side images, the regressor's planes of 16 channels and the
+/// Gaussians; measured (docs/inference.md). Twice as much is needed where every pixel of every view becomes a Gaussian.
+const PER_PIXEL: u64 = 500;
 /// What neither size nor weights decide: code, buffers of the threads.
 const BASE: u64 = 200 << 20;
 
 impl Config {
-    /// Bytes that [`crate::Reconstructor::reconstruct`] may need at the worst, weights of so many parameters included.
+    /// Bytes that [`crate::Reconstructor::reconstruct`] needs for a standing person, weights of so many parameters included.
     pub fn memory_needed(&self, parameters: u64) -> u64 {
         let n = &self.network;
         let area = |side: usize| (side as u64).saturating_mul(side as u64);
-        // A head's widest maps: its features at half the network's resolution, and those of its last layers at all of it.
-        let channels = 2 * n.feature_dim + 3 * n.last_dim;
-        let head = area(n.net_resolution).saturating_mul(F32 * channels as u64);
+        // A head's maps at half the network's resolution and at all of it.
+        let head = area(n.net_resolution).saturating_mul(F32 * n.feature_dim as u64);
         let canvas = area(n.resolution).saturating_mul(PER_PIXEL);
         BASE.saturating_add(parameters.saturating_mul(F32)).saturating_add(head).saturating_add(canvas)
     }

@@ -3,6 +3,9 @@
 
 use std::sync::{Mutex, PoisonError};
 
+/// Most floats that wait to be used again: 1 GiB.
+const MOST: usize = 1 << 28;
+
 /// Blocks of floats that nobody needs at the moment.
 #[derive(Debug, Default)]
 pub struct Buffers {
@@ -27,8 +30,13 @@ impl Buffers {
         buffer
     }
 
-    /// Takes back what nobody needs any more.
+    /// Takes back what nobody needs any more; beyond [`MOST`] floats, those that have waited longest are let go.
     pub fn give(&self, buffer: Vec<f32>) {
-        self.free.lock().unwrap_or_else(PoisonError::into_inner).push(buffer);
+        let mut free = self.free.lock().unwrap_or_else(PoisonError::into_inner);
+        free.push(buffer);
+        let mut sum: usize = free.iter().map(Vec::capacity).sum();
+        while sum > MOST {
+            sum -= free.remove(0).capacity();
+        }
     }
 }

@@ -10,6 +10,8 @@ use std::time::Duration;
 
 /// How the names of temporary files begin.
 const PREFIX: &str = ".snapsnap-";
+/// Temporary files that nobody has written into for so long are of runs that were killed.
+const LEFT: Duration = Duration::from_secs(600);
 /// How often the removal of a folder is tried.
 const FOLDER_TRIES: usize = 100;
 
@@ -119,9 +121,20 @@ fn tidy(folder: &Path) {
         return;
     }
     for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
-        let is_ours = entry.file_name().to_string_lossy().starts_with(PREFIX);
-        let is_file = || entry.file_type().is_ok_and(|kind| kind.is_file());
-        if is_ours && is_file() && File::open(entry.path()).is_ok_and(|file| file.try_lock().is_ok()) {
+        if !entry.file_type().is_ok_and(|kind| kind.is_file()) {
+            continue;
+        }
+        let name = entry.file_name().to_string_lossy().into_owned();
+        // Behind the prefix come six characters.
+        let is_ours = name.strip_prefix(PREFIX).is_some_and(|rest| rest.len() == 6);
+        let is_old = |file: &File| {
+            let age = file.metadata().and_then(|metadata| metadata.modified()).map(|time| time.elapsed());
+            // Locks do not reach other machines on every file system.
+            age.is_ok_and(|age| age.is_ok_and(|age| age > LEFT))
+        };
+        let Ok(file) = File::open(entry.path()) else { continue };
+        // The lock is held until the file is gone: whoever has just made it waits for it.
+        if is_ours && is_old(&file) && file.try_lock().is_ok() {
             let _ = fs::remove_file(entry.path());
         }
     }
@@ -152,14 +165,15 @@ pub fn write_whole<E: From<io::Error>>(
         .prefix(PREFIX)
         .make_in(folder_of(path), create)
         .map_err(|e| io::Error::from(e.kind()))?;
+    if let Some(permissions) = permissions
+        && file.as_file().metadata()?.permissions() != permissions
+    {
+        file.as_file().set_permissions(permissions)?;
+    }
     let temporary = file.path().to_owned();
     let mut out = BufWriter::with_capacity(1 << 20, file.as_file_mut());
     let filled = fill(&mut out).and_then(|()| Ok(out.flush()?));
     drop(out);
-    let filled = filled.and_then(|()| match permissions {
-        Some(permissions) => Ok(file.as_file().set_permissions(permissions)?),
-        None => Ok(()),
-    });
     let written = filled.and_then(|()| file.persist(path).map(drop).map_err(|e| e.error.into()));
     unfinished().paths.retain(|p| *p != temporary);
     written
@@ -181,9 +195,16 @@ fn permissions_of(path: &Path) -> io::Result<Option<fs::Permissions>> {
     }
 }
 
-/// The file behind a symbolic link.
-fn target_of(path: &Path) -> PathBuf {
-    if path.is_symlink() { path.canonicalize().unwrap_or_else(|_| path.to_owned()) } else { path.to_owned() }
+/// The file behind symbolic links, which need not be there.
+pub fn target_of(path: &Path) -> PathBuf {
+    /// Links may lead round in circles.
+    const LINKS: usize = 40;
+    let mut path = path.to_owned();
+    for _ in 0..LINKS {
+        let Ok(target) = fs::read_link(&path) else { break };
+        path = folder_of(&path).join(target);
+    }
+    path
 }
 
 /// Checks, before any work, that `path` can be written: its folder exists and lets us create a file, and what is there is
@@ -284,10 +305,22 @@ mod tests {
     #[test]
     fn what_a_killed_run_left_is_removed_and_what_is_being_written_is_not() {
         let folder = tempfile::tempdir().expect("temporary folder");
-        let (path, left) = (folder.path().join("a.txt"), folder.path().join(".snapsnap-left"));
-        fs::write(&left, "half").expect("write");
+        let [path, left, other] =
+            ["a.txt", ".snapsnap-aBc123", ".snapsnap-notes"].map(|name| folder.path().join(name));
+        let old = |path: &Path| {
+            let time = std::time::SystemTime::now() - 2 * LEFT;
+            File::options().append(true).open(path).and_then(|f| f.set_modified(time)).expect("sets");
+        };
+        for path in [&left, &other] {
+            fs::write(path, "half").expect("write");
+            old(path);
+        }
         write_whole::<io::Error>(&path, |out| {
-            assert!(!left.exists());
+            assert!(!left.exists() && other.exists());
+            // However long it takes.
+            for entry in fs::read_dir(folder.path()).expect("lists") {
+                old(&entry.expect("entry").path());
+            }
             // Another run that begins now does not know of this one.
             tidied().lock().unwrap_or_else(PoisonError::into_inner).clear();
             tidy(folder.path());

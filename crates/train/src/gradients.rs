@@ -47,10 +47,17 @@ pub fn scaled<M: Module>(module: &M, gradients: GradientsParams, factor: f64) ->
     scale.to
 }
 
-/// Limits the norm of all gradients together to `limit`, as PyTorch's `clip_grad_norm_`; `norm` is what [`norm`] gave.
-pub fn clipped<M: Module>(module: &M, gradients: GradientsParams, norm: f64, limit: f64) -> GradientsParams {
+/// Limits the norm of all gradients together to `limit`, as PyTorch's `clip_grad_norm_`; `norm` is what [`norm`] gave. `None`
+/// where it is not finite: no step can be made of such gradients.
+pub fn clipped<M: Module>(
+    module: &M,
+    gradients: GradientsParams,
+    norm: f64,
+    limit: f64,
+) -> Option<GradientsParams> {
     /// PyTorch's guard against a division by 0.
     const EPSILON: f64 = 1e-6;
     let factor = limit / (norm + EPSILON);
-    if factor < 1.0 { scaled(module, gradients, factor) } else { gradients }
+    let limited = |gradients| if factor < 1.0 { scaled(module, gradients, factor) } else { gradients };
+    norm.is_finite().then(|| limited(gradients))
 }

@@ -1,14 +1,15 @@
 //! Stage 1: how far predicted points lie from the true ones, and how sure the network may be of them (SNAPSNAP §6).
 
 use burn::tensor::Tensor;
-use snapsnap_net::config::Config;
+use snapsnap_net::config::{Config, Downsample, Upsample};
 use snapsnap_net::network::{PointMap, PointPredictor, View, activate};
 use snapsnap_net::resample::shrink;
 
 /// Squares of distances below this have no gradient: the direction of so small an error is noise.
 const MIN_SQUARE: f64 = 1e-24;
-/// Logarithms are no less than this, as in PyTorch's binary cross-entropy.
-const MIN_LOG: f64 = -100.0;
+/// Probabilities are no less than this, the least that f32 has in full: PyTorch's binary cross-entropy takes e⁻¹⁰⁰. Below it
+/// there is no gradient; that of log 0 would not be a number.
+const MIN_PROBABILITY: f64 = 1.2e-38;
 
 /// What stage 1 is trained on.
 #[derive(Debug, Clone)]
@@ -20,8 +21,13 @@ pub struct Losses {
 }
 
 /// Point maps of all views on the canvas, one view after the other, as training sees them: front and back `[B,2,3,S,S]` in
-/// [−1, 1].
-pub fn predict(predictor: &PointPredictor, config: &Config, images: Tensor<5>) -> Vec<(View, PointMap)> {
+/// [−1, 1] and their masks `[B,2,S,S]`, for `mask-aware` interpolation.
+pub fn predict(
+    predictor: &PointPredictor,
+    config: &Config,
+    images: Tensor<5>,
+    masks: &Tensor<4>,
+) -> Vec<(View, PointMap)> {
     let [b, _, channels, h, w] = images.dims();
     let factor = config.upsample_factor();
     let side = |i: usize| {
@@ -34,7 +40,15 @@ pub fn predict(predictor: &PointPredictor, config: &Config, images: Tensor<5>) -
     let maps = net.decode(tokens.clone().narrow(0, 0, b), tokens.narrow(0, b, b), grid);
     let map = |&view: &View| {
         let map = activate(net.raw_points(view, &maps, grid), config.network.conf_mode);
-        (view, predictor.to_canvas(map, factor, config.upsample(), None))
+        // As in inference: photographs have masks, sides the network's own opinion, which gets no gradient from this.
+        let weights = (config.upsample() == Upsample::MaskAware && factor > 1).then(|| match view as usize {
+            photo @ 0..2 => shrink(masks.clone().narrow(1, photo, 1), factor, Downsample::Area),
+            _ => {
+                let body = map.conf.clone().detach().greater_elem(config.network.conf_threshold);
+                body.float().unsqueeze_dim(1)
+            }
+        });
+        (view, predictor.to_canvas(map, factor, config.upsample(), weights))
     };
     net.views().iter().map(map).collect()
 }
@@ -57,7 +71,7 @@ pub fn losses(maps: &[(View, PointMap)], points: &Tensor<5>, valid: &Tensor<4>) 
         let count = inside.clone().sum().clamp_min(1.0);
         regression.push((distance * inside.clone()).sum() / count);
 
-        let log = |p: Tensor<3>| p.log().clamp_min(MIN_LOG);
+        let log = |p: Tensor<3>| p.clamp_min(MIN_PROBABILITY).log();
         let (sure, unsure) = (log(map.conf.clone()), log(1.0 - map.conf.clone()));
         let outside: Tensor<3> = 1.0 - inside.clone();
         let entropy = inside * sure + outside * unsure;

@@ -48,7 +48,7 @@ impl Schedule {
             Self::OneCycle { steps, rise, start_divisor, end_divisor } => {
                 let start = 1.0 / start_divisor;
                 let peak = rise * steps as f64 - 1.0;
-                if at <= peak {
+                if at < peak {
                     return anneal(start, 1.0, at / peak);
                 }
                 let fall = (steps as f64 - 1.0 - peak).max(f64::MIN_POSITIVE);
@@ -76,6 +76,8 @@ mod tests {
         assert!((rate(0) - 4e-6).abs() < 1e-12);
         assert!((rate(1000) - 1e-4).abs() < 1e-12);
         assert!((rate(100_099) - 4e-10).abs() < 1e-14 && (rate(200_000) - 4e-10).abs() < 1e-14);
+        let short = Schedule::OneCycle { steps: 100, rise: 0.01, start_divisor: 25.0, end_divisor: 1e4 };
+        assert!((0..100).all(|step| short.share(step).is_finite()) && (short.share(0) - 1.0).abs() < 1e-12);
         assert!(rate(500) > rate(400) && rate(50_000) > rate(60_000));
     }
 

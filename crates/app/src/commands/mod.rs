@@ -7,7 +7,7 @@ pub mod prepare;
 pub mod reconstruct;
 pub mod render;
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 use snapsnap_net::config::Config;
@@ -20,7 +20,7 @@ use crate::failure::Failure;
 pub struct ConfigArguments {
     /// TOML config; without one, the config stored with the weights, or the published size.
     #[arg(long, value_name = "TOML")]
-    pub config: Option<std::path::PathBuf>,
+    pub config: Option<PathBuf>,
     /// Override one config key; may be repeated.
     #[arg(long, value_name = "SECTION.KEY=VALUE")]
     pub set: Vec<String>,
@@ -49,11 +49,19 @@ pub fn check_outputs(outputs: &[&Path], inputs: &[&Path]) -> Result<(), Failure>
             let message = "is an input of this command and would be overwritten";
             return Err(Failure::Input(format!("{}: {message}", output.display())));
         }
-        if outputs[..i].iter().any(|other| other == output || is_same_file(output, other)) {
+        if outputs[..i].iter().any(|other| place(output) == place(other) || is_same_file(output, other)) {
             return Err(Failure::Input(format!("{}: is given for two outputs", output.display())));
         }
     }
     Ok(())
+}
+
+/// Where a file is or will be, however its path is spelled.
+fn place(path: &Path) -> PathBuf {
+    let path = file::target_of(path);
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let folder = folder.canonicalize().unwrap_or_else(|_| folder.to_owned());
+    folder.join(path.file_name().unwrap_or_default())
 }
 
 /// Whether both paths lead to one existing regular file.

@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 
 use clap::Args;
 use snapsnap_data::photo::{self, Canvas, Placement};
+use snapsnap_mesh::picture;
 use snapsnap_net::weights::schema::Part;
 use snapsnap_net::{Photograph, Reconstructor};
 use snapsnap_splat::{file, ply};
@@ -14,6 +15,10 @@ use crate::failure::Failure;
 use crate::progress::Progress;
 use crate::turntable::Turntable;
 use crate::{device, dump, memory, output, say, weights};
+
+/// Bytes per pixel of a photograph while it is placed on its canvas: as it is decoded, as red, green, blue and mask, and one
+/// plane of numbers.
+const PHOTOGRAPH: u64 = 14;
 
 #[derive(Args)]
 pub struct Arguments {
@@ -63,9 +68,15 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let device = device::choose(&arguments.device)?;
     timed("finding the device", since);
     if device::is_cpu(&device) {
+        let network = config.memory_needed(weights.parameters());
         let what = format!("a canvas of {0}×{0} pixels", config.network.resolution);
-        let mend = "choose a smaller `network.resolution`";
-        memory::check(&what, config.memory_needed(weights.parameters()), mend)?;
+        memory::check(&what, network, "choose a smaller `network.resolution`")?;
+        for path in [&arguments.front, &arguments.back] {
+            let [width, height] = picture::size(path)?;
+            let bytes = PHOTOGRAPH * u64::from(width) * u64::from(height);
+            let what = format!("{}, {width}×{height},", path.display());
+            memory::check(&what, bytes.max(network), "make the picture smaller")?;
+        }
     }
     let placement = match (arguments.as_is, config.mode.compat) {
         (true, _) => Placement::AsIs,

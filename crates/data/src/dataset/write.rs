@@ -101,7 +101,9 @@ impl Folder {
         for mark in fs::read_dir(&unfinished).into_iter().flatten().flatten().map(|entry| entry.path()) {
             let is_mark = mark.extension().is_some_and(|extension| extension == "lock");
             // Held by whoever is at work; the system frees those of the dead.
-            if is_mark && fs::File::open(&mark).is_ok_and(|lock| lock.try_lock().is_ok()) {
+            let Ok(lock) = fs::File::open(&mark) else { continue };
+            // Held until what it marks is gone.
+            if is_mark && lock.try_lock().is_ok() {
                 let _ = fs::remove_dir_all(mark.with_extension(""));
                 let _ = fs::remove_file(&mark);
             }

@@ -1,6 +1,6 @@
 //! Binary glTF 2.0: every triangle of the default scene, in its node's place, with its base colour.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::fmt::Display;
 use std::path::Path;
 use std::sync::Arc;
@@ -22,7 +22,7 @@ use crate::picture::decode_bytes;
 /// Deepest nesting of nodes.
 const MAX_DEPTH: usize = 256;
 
-/// Most positions and corners of faces: nodes may show one mesh many times. Ten times what scans of people have.
+/// Most positions and corners of faces that nodes may add which show a mesh once more.
 const MAX_ELEMENTS: usize = 10_000_000;
 
 /// What an attribute may be stored as.
@@ -57,6 +57,7 @@ pub fn read(path: &Path) -> Result<Mesh, FileError> {
         room: Room::new(),
         nodes_left: document.nodes().len(),
         places: Vec::new(),
+        shown: HashSet::new(),
         elements: 0,
     };
     file.add(&document)?;
@@ -108,7 +109,9 @@ struct File<'a> {
     nodes_left: usize,
     /// Where primitives stand: mesh, primitive and the node's place.
     places: Vec<(usize, usize, Mat4)>,
-    /// Positions and corners of all of them.
+    /// Mesh and primitive of those that stand somewhere.
+    shown: HashSet<(usize, usize)>,
+    /// Positions and corners of those that stand in a further place.
     elements: usize,
 }
 
@@ -173,7 +176,10 @@ impl File<'_> {
         let to_world = parent * Mat4::from_cols_array_2d(&node.transform().matrix());
         if let Some(mesh) = node.mesh() {
             for (row, primitive) in mesh.primitives().enumerate() {
-                self.elements = self.elements.saturating_add(self.checked_size(&primitive)?);
+                let size = self.checked_size(&primitive)?;
+                if !self.shown.insert((mesh.index(), row)) {
+                    self.elements = self.elements.saturating_add(size);
+                }
                 if self.elements > MAX_ELEMENTS {
                     let message =
                         format!("its nodes unfold to more than {MAX_ELEMENTS} positions and corners");

@@ -25,10 +25,10 @@ pub const EXTENSIONS: [&str; 3] = ["obj", "ply", "glb"];
 /// Largest file that is read; the largest published scans take a few hundred megabytes.
 const MAX_BYTES: u64 = 4 << 30;
 
-/// Bytes that a texture may take once it is decoded: 8192×8192 pixels of red, green, blue and alpha.
-const MAX_TEXTURE: u64 = 256 << 20;
+/// Bytes that a texture may take once it is decoded: 8192×8192 pixels of red, green, blue and alpha in 16 bits each.
+const MAX_TEXTURE: u64 = 512 << 20;
 /// The same for all textures of a scan, as red, green and blue.
-const MAX_TEXTURES: u64 = 512 << 20;
+const MAX_TEXTURES: u64 = 1 << 30;
 
 /// Reads a scan. Positions are as in the file; positions that several vertices share are made one, so that shading is
 /// smooth across the seams of textures.
@@ -76,7 +76,14 @@ impl Room {
         &mut self,
         decode: impl FnOnce(u64) -> Result<DynamicImage, FileError>,
     ) -> Result<Arc<RgbImage>, FileError> {
-        let texture = decode(MAX_TEXTURE.min(self.0))?.into_rgb8();
+        let texture = match decode(MAX_TEXTURE.min(self.0)) {
+            Err(FileError::Unsuitable { path, message }) if self.0 < MAX_TEXTURE => {
+                let all = MAX_TEXTURES >> 20;
+                let message = format!("{message} (all textures of a scan together may take {all} MiB)");
+                return Err(FileError::Unsuitable { path, message });
+            }
+            decoded => decoded?.into_rgb8(),
+        };
         self.0 = self.0.saturating_sub(texture.len() as u64);
         Ok(Arc::new(texture))
     }

@@ -122,6 +122,8 @@ fn check_whole(path: &Path, text: &str) -> Result<(), FileError> {
             _ => {}
         }
     }
+    // Old systems end a file with a character of its own.
+    let text = text.trim_end_matches(['\0', '\u{1a}']);
     let end = text.lines().last().unwrap_or_default();
     if counts.vertices > 0
         && !text.ends_with('\n')
@@ -155,35 +157,47 @@ struct Counts {
     triangles: i64,
     /// What comments before the first vertex and the first face say: number and noun.
     promised: Vec<(i64, &'static str)>,
+    /// Whether a comment counts points.
+    has_points: bool,
 }
 
 impl Counts {
-    /// Takes note of comments that count, as exporters write them: `# Vertices: 8`, `# number of triangles: 12`,
-    /// `#Vertex Count 8`. Behind the first vertex or face they count what stands before them, which is there.
+    /// Takes note of comments that count and say nothing else, as exporters write them: `# Vertices: 8`, `# 12 faces`,
+    /// `# number of triangles: 12`, `#Vertex Count 8`. Behind the first vertex or face they count what stands before
+    /// them, which is there.
     fn comment(&mut self, line: &str) {
         let Some(comment) = line.trim_start().strip_prefix('#') else { return };
         if self.vertices + self.faces > 0 || comment.len() > 80 {
             return;
         }
         let comment = comment.to_ascii_lowercase();
-        let words: Vec<&str> = comment.split(|c: char| !c.is_ascii_alphanumeric()).collect();
-        let noun = match () {
-            // Coordinates and normals are others' numbers.
-            () if ["normals", "normal", "texture", "coordinates"].iter().any(|w| words.contains(w)) => return,
-            () if words.contains(&"vertices") || comment.trim().starts_with("vertex count") => "vertices",
-            () if words.contains(&"triangles") => "triangles",
-            () if words.contains(&"faces") || comment.trim().starts_with("face count") => "faces",
-            () => return,
+        let is_filler = |word: &&str| !matches!(*word, "" | "total" | "number" | "of" | "count" | "num");
+        let words: Vec<&str> = comment.split([' ', '\t', '\r', ':', '=']).filter(is_filler).collect();
+        let (number, noun) = match words[..] {
+            [a, b] => match (a.parse::<i64>(), b.parse::<i64>()) {
+                (Ok(number), Err(_)) => (number, b),
+                (Err(_), Ok(number)) => (number, a),
+                _ => return,
+            },
+            _ => return,
         };
-        let mut numbers = words.iter().filter_map(|word| word.parse::<i64>().ok());
-        if let (Some(number), None) = (numbers.next(), numbers.next()) {
-            self.promised.push((number, noun));
-        }
+        let noun = match noun {
+            "vertices" | "vertex" | "verts" => "vertices",
+            "triangles" | "faces" | "face" => "faces",
+            // Houdini calls positions so, and corners of faces vertices.
+            "points" => {
+                self.has_points = true;
+                return;
+            }
+            _ => return,
+        };
+        self.promised.push((number, noun));
     }
 
     /// The first comment that counts more than there is.
     fn missing(&self) -> Option<String> {
         let found = |noun: &str| match noun {
+            "vertices" if self.has_points => i64::MAX,
             "vertices" => self.vertices,
             // Some count polygons as triangles.
             _ => self.faces.max(self.triangles),

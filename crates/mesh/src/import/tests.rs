@@ -253,7 +253,7 @@ fn corrupt_scans_are_refused_by_name() {
         ("faces.ply", b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\nproperty float z\nelement face 1000000000000000\nend_header\n".into(), "no list `vertex_indices`"),
         ("mtl.obj", format!("mtllib no.mtl\n{triangle}").into(), "material file `no.mtl` is missing"),
         ("texture.obj", format!("mtllib absent.mtl\n{triangle}").into(), "texture `absent.png` is missing"),
-        ("absurd.obj", format!("mtllib absurd.mtl\n{triangle}").into(), "is 100000×100000, 28611 MiB in memory, more than 256"),
+        ("absurd.obj", format!("mtllib absurd.mtl\n{triangle}").into(), "is 100000×100000, 28611 MiB in memory, more than 512"),
         ("ascii.ply", billion("ascii").into(), "vertex 1 of 1000000000: `x` is missing"),
         ("binary.ply", billion("binary_big_endian").into(), "of 1000000000: `y` is missing"),
         ("cut.ply", binary[..binary.len() - 3].into(), "face 1 of 2: `vertex_indices` is missing"),
@@ -340,6 +340,7 @@ fn obj_that_is_cut_short_is_refused() {
     assert!(error.contains("its last line, `f 1 3 2`, has no end"), "{error}");
     assert_eq!(outcome(&format!("{start}f 1 2 3\nf 1 3 2\n")), Ok(()));
     assert_eq!(outcome(&format!("{start}f 1 2 3\n# End of File")), Ok(()));
+    assert_eq!(outcome(&format!("{start}f 1 2 3\n\u{1a}")), Ok(()));
     for comment in
         ["# Faces: 2", "# number of triangles: 2", "#Face count 2", "# Vertices: 4", "# 4 vertices"]
     {
@@ -348,7 +349,15 @@ fn obj_that_is_cut_short_is_refused() {
         assert_eq!(outcome(&format!("{comment}\n{start}v 1 1 0\nf 1 2 3\nf 2 4 3\n")), Ok(()), "{comment}");
     }
     // Behind them they count what was before; and normals are no faces.
-    for comment in ["# 9 vertex normals", "# made of 9 vertices and 3 faces", "# Texture vertices: 9"] {
+    for comment in [
+        "# 9 vertex normals",
+        "# made of 9 vertices and 3 faces",
+        "# Texture vertices: 9",
+        "# UV vertices: 9",
+        "# decimated from 2000000 faces",
+        "# Object scan_500000_faces.obj",
+        "# 3 points\n# 9 vertices\n# 1 primitives",
+    ] {
         assert_eq!(outcome(&format!("{comment}\n{start}f 1 2 3\n")), Ok(()), "{comment}");
     }
     assert_eq!(outcome(&format!("{start}# 3 vertices\ng a\nf 1 2 3\n# 1 faces\n")), Ok(()));

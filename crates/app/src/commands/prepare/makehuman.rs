@@ -20,5 +20,8 @@ pub struct Arguments {
 
 pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let library = Library::open(&arguments.folder)?;
-    generate(&arguments.common, &arguments.generate, quiet, "makehuman", |name| person(&library, name))
+    let inputs = [library.root()];
+    generate(&arguments.common, &arguments.generate, quiet, "makehuman", &inputs, |name| {
+        person(&library, name)
+    })
 }

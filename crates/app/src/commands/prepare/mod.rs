@@ -136,6 +136,9 @@ fn check_preview(sheet: &Path, common: &Common, inputs: &[&Path]) -> Result<(), 
     let folder = sheet.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let folder = folder.canonicalize().unwrap_or_else(|_| folder.to_owned());
     for taken in inputs.iter().copied().chain([common.output.as_path()]) {
+        // Beside a scan lie its materials and textures.
+        let taken = if taken.is_file() { taken.parent().unwrap_or(taken) } else { taken };
+        let taken = if taken.as_os_str().is_empty() { Path::new(".") } else { taken };
         if taken.canonicalize().is_ok_and(|taken| taken.is_dir() && folder.starts_with(taken)) {
             return wrong("lies inside the data set or its source");
         }
@@ -176,7 +179,8 @@ fn make(
     }
     let folder = Folder::create(&common.output, config.description(source))?;
     let (path, resolved) = (common.output.join(CONFIG), config.to_toml());
-    if fs::read(&path).ok().as_deref() != Some(resolved.as_bytes()) {
+    let given = common.config.as_deref().is_some_and(|given| super::is_same_file(given, &path));
+    if !given && fs::read(&path).ok().as_deref() != Some(resolved.as_bytes()) {
         output::write(&path, resolved.as_bytes())?;
     }
     let mine: Vec<(usize, &Work)> =
@@ -250,6 +254,7 @@ fn generate(
     generate: &Generate,
     quiet: bool,
     kind: &str,
+    inputs: &[&Path],
     person: impl Fn(&str) -> Result<Mesh, FileError>,
 ) -> Result<(), Failure> {
     if generate.subjects == 0 || generate.subjects > MAX_SUBJECTS {
@@ -271,7 +276,7 @@ fn generate(
     };
     // What is there may have been changed by hand.
     let is_due = |work: &Work| generate.save_scans && !scan(work).exists();
-    let made = make(common, quiet, &source, &[], &works, |_, work| {
+    let made = make(common, quiet, &source, inputs, &works, |_, work| {
         let mut mesh = person(&work.identity)?;
         if is_due(work) {
             export::write_obj(&mesh, &scan(work))?;

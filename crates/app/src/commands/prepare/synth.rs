@@ -15,5 +15,5 @@ pub struct Arguments {
 }
 
 pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
-    generate(&arguments.common, &arguments.generate, quiet, "synth", |name| Ok(synth::person(name)))
+    generate(&arguments.common, &arguments.generate, quiet, "synth", &[], |name| Ok(synth::person(name)))
 }
