@@ -7,9 +7,11 @@ pub mod buffers;
 pub mod conv;
 mod gelu;
 mod math;
+mod multiply;
 pub mod op;
 mod resize;
 mod rope;
+pub mod train;
 pub mod unet;
 pub mod wide;
 
@@ -24,6 +26,7 @@ use burn::tensor::module::{attention, interpolate};
 use burn::tensor::ops::{InterpolateMode, InterpolateOptions};
 use burn::tensor::{Device, Tensor, TensorData};
 
+use multiply::multiply;
 pub use rope::Rope;
 
 /// Whether `x` lives where this crate's own kernels apply: on `flex`, with nothing tracked for gradients.
@@ -110,45 +113,4 @@ pub fn bilinear(x: Tensor<4>, size: [usize; 2], align_corners: bool) -> Tensor<4
 /// If the values are not f32.
 pub fn host<const D: usize>(x: Tensor<D>) -> Vec<f32> {
     x.into_data().try_into_vec().expect("all tensors here are f32")
-}
-
-/// out `[m, n]` row-major = lhs `[m, k]` · rhs `[k, n]`; strides are (column, row) in elements.
-fn multiply(
-    [m, n, k]: [usize; 3],
-    lhs: &[f32],
-    ls: [usize; 2],
-    rhs: &[f32],
-    rs: [usize; 2],
-    out: &mut [f32],
-) {
-    let last =
-        |rows: usize, columns: usize, [column, row]: [usize; 2]| (rows - 1) * row + (columns - 1) * column;
-    assert!(m > 0 && n > 0 && k > 0);
-    assert!(last(m, k, ls) < lhs.len() && last(k, n, rs) < rhs.len() && m * n <= out.len());
-    let s = |x: usize| x as isize;
-    // SAFETY: the assertions above bound every element that the strides reach; `out` is borrowed mutably.
-    #[allow(unsafe_code, reason = "the matrix product of the gemm crate takes pointers")]
-    unsafe {
-        gemm::gemm(
-            m,
-            n,
-            k,
-            out.as_mut_ptr(),
-            1,
-            s(n),
-            false,
-            lhs.as_ptr(),
-            s(ls[0]),
-            s(ls[1]),
-            rhs.as_ptr(),
-            s(rs[0]),
-            s(rs[1]),
-            0.0,
-            1.0,
-            false,
-            false,
-            false,
-            gemm::Parallelism::None,
-        );
-    }
 }

@@ -1,6 +1,10 @@
-//! Bilinear resize of planes: every input row is stretched once, every output row blends two stretched ones.
+//! Bilinear resize of planes: every input row is stretched once, every output row blends two stretched ones. Its
+//! gradient goes the same way back.
 
+use pulp::Arch;
 use rayon::prelude::*;
+
+use crate::wide::Buffers;
 
 /// Where the samples of one target position are: lower index, upper index, weight of the upper.
 pub type Tap = (usize, usize, f32);
@@ -59,5 +63,70 @@ pub fn resize(planes: &[f32], [rows, columns]: [usize; 2], down: &[Tap], across:
 fn stretch(row: &[f32], across: &[Tap], out: &mut [f32]) {
     for (out, &(low, high, weight)) in out.iter_mut().zip(across) {
         *out = row[low] + (row[high] - row[low]) * weight;
+    }
+}
+
+/// Gradient of the planes `[count, rows, columns]` of a [`resize`] from that of its result,
+/// `[count, down.len(), across.len()]`.
+pub fn resize_gradient(
+    gradient: &[f32],
+    [rows, columns]: [usize; 2],
+    down: &[Tap],
+    across: &[Tap],
+    buffers: &Buffers,
+) -> Vec<f32> {
+    let size = down.len() * across.len();
+    let mut out = buffers.take(gradient.len() / size * rows * columns);
+    let (down, across) = (Back::new(down, rows), Back::new(across, columns));
+    let tasks = out.par_chunks_exact_mut(rows * columns).zip(gradient.par_chunks_exact(size));
+    tasks.for_each_init(
+        || vec![0.0; size / down.targets],
+        |sum, (out, gradient)| {
+            // Rows first: whole rows are vectors.
+            for (row, out) in out.chunks_exact_mut(columns).enumerate() {
+                sum.fill(0.0);
+                for &(from, weight) in down.of(row) {
+                    let line = &gradient[from * sum.len()..][..sum.len()];
+                    Arch::new().dispatch(
+                        #[inline(always)]
+                        || sum.iter_mut().zip(line).for_each(|(sum, x)| *sum += weight * x),
+                    );
+                }
+                for (column, out) in out.iter_mut().enumerate() {
+                    *out = across.of(column).iter().map(|&(from, weight)| weight * sum[from]).sum();
+                }
+            }
+        },
+    );
+    out
+}
+
+/// Taps by the position that they read.
+struct Back {
+    /// How many positions they write.
+    targets: usize,
+    /// Where the uses of every position begin, and where the last one's end.
+    starts: Vec<usize>,
+    /// Written positions with their weights, which are not 0.
+    uses: Vec<(usize, f32)>,
+}
+
+impl Back {
+    fn new(taps: &[Tap], from: usize) -> Self {
+        let parts = |&(target, &(low, high, weight)): &(usize, &Tap)| {
+            [(low, target, 1.0 - weight), (high, target, weight)]
+        };
+        let mut all: Vec<_> = taps.iter().enumerate().collect::<Vec<_>>().iter().flat_map(parts).collect();
+        all.retain(|&(.., weight)| weight != 0.0);
+        // Stable, so that uses stay in the order of their targets.
+        all.sort_by_key(|&(position, ..)| position);
+        let starts = (0..=from).map(|position| all.partition_point(|use_| use_.0 < position)).collect();
+        let uses = all.into_iter().map(|(_, target, weight)| (target, weight)).collect();
+        Self { targets: taps.len(), starts, uses }
+    }
+
+    /// Uses of a position.
+    fn of(&self, position: usize) -> &[(usize, f32)] {
+        &self.uses[self.starts[position]..self.starts[position + 1]]
     }
 }

@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use super::image::{Image, Source};
 use super::pointwise::Pointwise;
 use super::product::{Left, PANEL, Product, Right};
-use super::transforms::{Block, Filters, Inputs, Outputs, POINTS, TILE, Then};
+use super::transforms::{Block, Filters, Inputs, Outputs, POINTS, TILE, Then, lines};
 use super::{Buffers, GROUP, pieces};
 
 /// Floats that a block's transformed inputs and products take together: 2 MiB.
@@ -33,10 +33,12 @@ impl Conv3x3 {
         let panel = POINTS * inputs.next_multiple_of(GROUP) * PANEL;
         let mut filters = buffers.take(outputs.div_ceil(PANEL) * panel);
         let arch = Arch::new();
-        filters
-            .par_chunks_exact_mut(panel)
-            .zip(weights.par_chunks(PANEL * inputs * 9))
-            .for_each(|(out, weights)| arch.dispatch(Filters { weights, inputs, out }));
+        filters.par_chunks_exact_mut(panel).zip(weights.par_chunks(PANEL * inputs * 9)).for_each(
+            |(out, weights)| {
+                let (outputs, strides) = (weights.len() / (9 * inputs), [9 * inputs, 9]);
+                arch.dispatch(Filters { weights, outputs, inputs, strides, turned: false, out });
+            },
+        );
         let mut bias = bias.to_vec();
         bias.resize(outputs.next_multiple_of(GROUP), 0.0);
         Self { inputs, outputs, filters, bias }
@@ -109,12 +111,12 @@ impl Conv3x3 {
         let (inputs, outputs) = (self.inputs.next_multiple_of(GROUP), self.bias.len());
         // An odd distance puts the 36 points of a tile into different sets of the cache.
         let stride = (rows * part) | 1;
-        let mut lines = buffers.take(Inputs::lines(part));
+        let mut rows_read = buffers.take(lines(part));
         let mut points = buffers.take(POINTS * inputs * stride);
         let mut products = buffers.take(POINTS * outputs * stride);
         for column in (0..columns).step_by(part) {
             let block = Block { row, column, rows, columns: part.min(columns - column) };
-            let lines = &mut lines[..Inputs::lines(block.columns)];
+            let lines = &mut rows_read[..lines(block.columns)];
             arch.dispatch(Inputs { source, block, stride, lines, out: &mut points });
             let per_point =
                 points.chunks_exact(inputs * stride).zip(products.chunks_exact_mut(outputs * stride));
@@ -129,6 +131,6 @@ impl Conv3x3 {
             let (products, bias) = (&products, &self.bias);
             arch.dispatch(Outputs { products, block, stride, bias, then, width, out });
         }
-        [lines, points, products].into_iter().for_each(|buffer| buffers.give(buffer));
+        [rows_read, points, products].into_iter().for_each(|buffer| buffers.give(buffer));
     }
 }

@@ -3,6 +3,7 @@
 use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
 
+use super::transforms::Lines;
 use super::{Buffers, GROUP};
 use crate::resize::{Tap, taps};
 
@@ -137,9 +138,19 @@ impl<'a> Source<'a> {
     }
 }
 
-/// Part of a row of one group into `out` `[columns][16]`: from column `first` on, where −1 is the border. Outside of the
-/// image everything is 0.
-pub(super) struct Row<'a> {
+impl Lines for Source<'_> {
+    fn groups(&self) -> usize {
+        self.image.groups()
+    }
+
+    #[inline(always)]
+    fn line<S: Simd>(&self, simd: S, group: usize, row: Option<usize>, first: isize, out: &mut [f32]) {
+        Row { source: self, group, row, first, out }.with_simd(simd);
+    }
+}
+
+/// [`Lines::line`] of a source.
+struct Row<'a> {
     pub source: &'a Source<'a>,
     pub group: usize,
     pub row: Option<usize>,

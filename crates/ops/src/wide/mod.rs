@@ -7,8 +7,8 @@
 mod convolution;
 mod image;
 mod pointwise;
-mod product;
-mod transforms;
+pub(crate) mod product;
+pub(crate) mod transforms;
 
 #[cfg(test)]
 mod tests;
@@ -23,7 +23,7 @@ pub const GROUP: usize = 16;
 
 /// Cuts every plane of `plane` floats into pieces of `piece` (the last may be shorter): piece after piece, the slices of
 /// all planes. So tasks that each own some rows of all channels can write side by side.
-fn pieces(data: &mut [f32], plane: usize, piece: usize) -> Vec<Vec<&mut [f32]>> {
+pub(crate) fn pieces(data: &mut [f32], plane: usize, piece: usize) -> Vec<Vec<&mut [f32]>> {
     let mut pieces: Vec<Vec<&mut [f32]>> = (0..plane.div_ceil(piece)).map(|_| Vec::new()).collect();
     for plane in data.chunks_exact_mut(plane) {
         for (slices, slice) in pieces.iter_mut().zip(plane.chunks_mut(piece)) {

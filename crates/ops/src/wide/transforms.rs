@@ -8,21 +8,20 @@
 use pulp::{Simd, WithSimd};
 
 use super::GROUP;
-use super::image::{Row, Source};
 use super::product::PANEL;
 
 /// Rows and columns of outputs of a tile.
 pub const TILE: usize = 4;
 /// Rows and columns of its inputs.
-const SPAN: usize = 6;
+pub const SPAN: usize = 6;
 /// Products per tile and pair of channels.
 pub const POINTS: usize = SPAN * SPAN;
 
 /// The positive finite points.
-const P: f32 = 0.625;
-const Q: f32 = 1.5;
-const P2: f32 = P * P;
-const Q2: f32 = Q * Q;
+pub const P: f32 = 0.625;
+pub const Q: f32 = 1.5;
+pub const P2: f32 = P * P;
+pub const Q2: f32 = Q * Q;
 
 /// A rectangle of tiles.
 #[derive(Clone, Copy)]
@@ -89,10 +88,17 @@ fn outputs<S: Simd>(simd: S, m: [S::f32s; SPAN]) -> [S::f32s; TILE] {
     ]
 }
 
-/// G·g·Gᵀ of up to 32 filters `[32, inputs, 3, 3]`: `[36][inputs in whole groups][32]`.
+/// G·g·Gᵀ of up to 32 filters: `[36][inputs in whole groups][32]`.
 pub struct Filters<'a> {
+    /// From the first filter's first tap on.
     pub weights: &'a [f32],
+    /// At most 32.
+    pub outputs: usize,
     pub inputs: usize,
+    /// Floats from one filter to the next, and from one input to the next.
+    pub strides: [usize; 2],
+    /// Turns the filters by 180°, as the gradient of a convolution's input needs them.
+    pub turned: bool,
     pub out: &'a mut [f32],
 }
 
@@ -101,16 +107,17 @@ impl WithSimd for Filters<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, _simd: S) {
-        let Self { weights, inputs, out } = self;
+        let Self { weights, outputs, inputs, strides, turned, out } = self;
         let rows = inputs.next_multiple_of(GROUP);
         let (out, _) = out.as_chunks_mut::<PANEL>();
         for k in 0..rows {
             let mut g = [[0.0; PANEL]; 9];
             if k < inputs {
-                for (o, filters) in weights.chunks_exact(9 * inputs).enumerate() {
-                    let filter: &[f32; 9] = filters[9 * k..].first_chunk().expect("nine taps");
+                for o in 0..outputs {
+                    let filter = &weights[o * strides[0] + k * strides[1]..];
+                    let filter: &[f32; 9] = filter.first_chunk().expect("nine taps");
                     for tap in 0..9 {
-                        g[tap][o] = filter[tap];
+                        g[tap][o] = filter[if turned { 8 - tap } else { tap }];
                     }
                 }
             }
@@ -129,38 +136,46 @@ impl WithSimd for Filters<'_> {
     }
 }
 
+/// What tiles are read from.
+pub trait Lines: Sync {
+    /// Groups of channels.
+    fn groups(&self) -> usize;
+
+    /// Part of a row of one group into `out` `[columns][16]`: from column `first` on, where −1 is the border. Outside of
+    /// the image (a missing row is) everything is 0.
+    fn line<S: Simd>(&self, simd: S, group: usize, row: Option<usize>, first: isize, out: &mut [f32]);
+}
+
 /// Bᵀ·d·B of every tile of a block: `[36][groups][stride][16]`.
-pub struct Inputs<'a> {
-    pub source: &'a Source<'a>,
+pub struct Inputs<'a, L> {
+    pub source: &'a L,
     pub block: Block,
     /// Tiles from one group to the next, at least those of the block.
     pub stride: usize,
-    /// Room for [`Inputs::lines`] floats.
+    /// Room for [`lines`] floats.
     pub lines: &'a mut [f32],
     pub out: &'a mut [f32],
 }
 
-impl Inputs<'_> {
-    /// Floats of the rows that a row of `columns` tiles reads.
-    pub fn lines(columns: usize) -> usize {
-        SPAN * (TILE * columns + SPAN - TILE) * GROUP
-    }
+/// Floats of the rows that a row of `columns` tiles reads.
+pub fn lines(columns: usize) -> usize {
+    SPAN * (TILE * columns + SPAN - TILE) * GROUP
 }
 
-impl WithSimd for Inputs<'_> {
+impl<L: Lines> WithSimd for Inputs<'_, L> {
     type Output = ();
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
         let Self { source, block, stride, lines, out } = self;
-        let (groups, vectors) = (source.image.groups(), GROUP / S::F32_LANES);
+        let (groups, vectors) = (source.groups(), GROUP / S::F32_LANES);
         let length = lines.len() / SPAN;
         // Input rows and columns begin one before the first output.
         let first = (TILE * block.column) as isize - 1;
         for (group, tile_row) in (0..groups).flat_map(|group| (0..block.rows).map(move |row| (group, row))) {
             for (i, out) in lines.chunks_exact_mut(length).enumerate() {
                 let row = (TILE * (block.row + tile_row) + i).checked_sub(1);
-                Row { source, group, row, first, out }.with_simd(simd);
+                source.line(simd, group, row, first, out);
             }
             mix_rows(simd, lines);
             for (y, line) in lines.chunks_exact(length).enumerate() {

@@ -1,0 +1,350 @@
+//! Attention with rotary positions for training, one head of one sample after the other.
+//!
+//! The forward pass keeps nothing but the logarithm of every row's sum of exponentials. The backward pass computes the
+//! scores again, block of queries by block of queries (Dao, "FlashAttention-2"), so that they never leave the cache.
+
+use pulp::{Arch, Simd, WithSimd};
+use rayon::prelude::*;
+
+use crate::math::exp;
+use crate::multiply::Multiply;
+use crate::wide::Buffers;
+
+/// Queries per block: the scores of 64 queries with 1024 keys, and their gradients, are 512 KiB.
+const BLOCK: usize = 64;
+
+/// Sizes of an attention; tokens hold `heads · head_dim` channels.
+#[derive(Debug, Clone, Copy)]
+pub struct Attention {
+    /// Samples.
+    pub batch: usize,
+    /// Tokens that ask.
+    pub queries: usize,
+    /// Tokens that are asked.
+    pub keys: usize,
+    /// Heads.
+    pub heads: usize,
+    /// Channels of a head, a multiple of 4.
+    pub head_dim: usize,
+}
+
+/// Rotation tables cos and ±sin, `[tokens, head_dim]` each, as [`crate::Rope`] holds them.
+pub type Tables<'a> = [&'a [f32]; 2];
+
+/// Queries, keys or values `[B, tokens, C]`, perhaps as some of the channels of wider tokens.
+#[derive(Debug, Clone, Copy)]
+pub struct Tokens<'a> {
+    values: &'a [f32],
+    /// Floats from one token to the next.
+    width: usize,
+}
+
+impl<'a> Tokens<'a> {
+    /// Queries, keys and values of a self-attention from one tensor `[B, tokens, 3·C]`.
+    pub fn parts(qkv: &'a [f32], channels: usize) -> [Self; 3] {
+        [0, 1, 2].map(|part| Self { values: &qkv[part * channels..], width: 3 * channels })
+    }
+
+    /// Queries, keys and values that are tensors of their own.
+    pub fn apart(qkv: [&'a [f32]; 3], channels: usize) -> [Self; 3] {
+        qkv.map(|values| Self { values, width: channels })
+    }
+}
+
+impl Attention {
+    /// softmax(rotated q · rotated kᵀ / √head_dim) · v: queries `[B, queries, C]`, keys and values `[B, keys, C]` →
+    /// `[B, queries, C]`, and the logarithms of the rows' sums `[B, heads, queries]`.
+    pub fn forward(&self, [q, k, v]: [Tokens; 3], rope: Tables, buffers: &Buffers) -> (Vec<f32>, Vec<f32>) {
+        let Self { queries, keys, head_dim: d, .. } = *self;
+        let arch = Arch::new();
+        let mut by_head = buffers.take(self.batch * queries * self.heads * d);
+        let mut logarithms = vec![0.0; self.batch * self.heads * queries];
+        let heads = by_head.par_chunks_exact_mut(queries * d).zip(logarithms.par_chunks_exact_mut(queries));
+        heads.enumerate().for_each(|(i, (out, logarithms))| {
+            let [packed_q, packed_k] = [(q, queries, self.scale()), (k, keys, 1.0)]
+                .map(|(x, tokens, factor)| self.pack(x, tokens, i, rope, factor, buffers));
+            let values = self.head(v, keys, i);
+            let mut scores = buffers.take(BLOCK.min(queries) * keys);
+            let blocks = packed_q.chunks(BLOCK * d).zip(out.chunks_mut(BLOCK * d));
+            for ((block, out), logarithms) in blocks.zip(logarithms.chunks_mut(BLOCK)) {
+                let rows = logarithms.len();
+                let scores = &mut scores[..rows * keys];
+                product([rows, keys, d], (block, [1, d]), (&packed_k, [d, 1]), scores, false);
+                arch.dispatch(Softmax { scores, keys, logarithms });
+                product([rows, d, keys], (scores, [1, keys]), (values, [1, v.width]), out, false);
+            }
+            [packed_q, packed_k, scores].into_iter().for_each(|buffer| buffers.give(buffer));
+        });
+        let out = self.by_token([&by_head], queries, buffers);
+        buffers.give(by_head);
+        (out, logarithms)
+    }
+
+    /// Gradients of queries, keys and values from that of the output, `dy` `[B, queries, C]`. They come together: each
+    /// needs nearly all of the others' work.
+    pub fn backward(
+        &self,
+        qkv: [Tokens; 3],
+        rope: Tables,
+        logarithms: &[f32],
+        dy: &[f32],
+        buffers: &Buffers,
+    ) -> [Vec<f32>; 3] {
+        let by_head = self.by_head(qkv, rope, logarithms, dy, buffers);
+        let tokens = [self.queries, self.keys, self.keys];
+        let out = [0, 1, 2].map(|i| self.by_token([&by_head[i]], tokens[i], buffers));
+        by_head.into_iter().for_each(|buffer| buffers.give(buffer));
+        out
+    }
+
+    /// As [`Attention::backward`], in one tensor `[B, tokens, 3·C]`.
+    pub fn backward_parts(
+        &self,
+        qkv: [Tokens; 3],
+        rope: Tables,
+        logarithms: &[f32],
+        dy: &[f32],
+        buffers: &Buffers,
+    ) -> Vec<f32> {
+        let by_head = self.by_head(qkv, rope, logarithms, dy, buffers);
+        let out = self.by_token(by_head.each_ref().map(Vec::as_slice), self.queries, buffers);
+        by_head.into_iter().for_each(|buffer| buffers.give(buffer));
+        out
+    }
+
+    /// Gradients of queries, keys and values, `[B, heads, tokens, head_dim]`.
+    fn by_head(
+        &self,
+        [q, k, v]: [Tokens; 3],
+        rope: Tables,
+        logarithms: &[f32],
+        dy: &[f32],
+        buffers: &Buffers,
+    ) -> [Vec<f32>; 3] {
+        let Self { queries, keys, head_dim: d, .. } = *self;
+        let (arch, width) = (Arch::new(), self.heads * d);
+        let mut by_head = [queries, keys, keys].map(|tokens| buffers.take(self.batch * tokens * width));
+        let [dq, dk, dv] = &mut by_head;
+        let heads = dq.par_chunks_exact_mut(queries * d).zip(dk.par_chunks_exact_mut(keys * d));
+        let heads = heads.zip(dv.par_chunks_exact_mut(keys * d)).enumerate();
+        heads.for_each(|(i, ((dq, dk), dv))| {
+            let [packed_q, packed_k] = [(q, queries, self.scale()), (k, keys, 1.0)]
+                .map(|(x, tokens, factor)| self.pack(x, tokens, i, rope, factor, buffers));
+            let (values, dy) = (self.head(v, keys, i), self.head(Tokens { values: dy, width }, queries, i));
+            let [mut scores, mut gradients] = [(); 2].map(|()| buffers.take(BLOCK.min(queries) * keys));
+            let blocks = packed_q.chunks(BLOCK * d).zip(dq.chunks_mut(BLOCK * d));
+            let logarithms = logarithms[i * queries..][..queries].chunks(BLOCK);
+            for (b, ((block, dq), logarithms)) in blocks.zip(logarithms).enumerate() {
+                let (rows, add) = (logarithms.len(), b > 0);
+                let dy = (&dy[b * BLOCK * width..], [1, width]);
+                let (scores, gradients) = (&mut scores[..rows * keys], &mut gradients[..rows * keys]);
+                product([rows, keys, d], (block, [1, d]), (&packed_k, [d, 1]), scores, false);
+                product([rows, keys, d], dy, (values, [v.width, 1]), gradients, false);
+                arch.dispatch(Backward { scores, gradients, keys, logarithms });
+                product([rows, d, keys], (gradients, [1, keys]), (&packed_k, [1, d]), dq, false);
+                product([keys, d, rows], (gradients, [keys, 1]), (block, [1, d]), dk, add);
+                product([keys, d, rows], (scores, [keys, 1]), (dy.0, [1, width]), dv, add);
+            }
+            arch.dispatch(Unrotate { x: dq, d, rope, factor: self.scale() });
+            arch.dispatch(Unrotate { x: dk, d, rope, factor: 1.0 });
+            [packed_q, packed_k, scores, gradients].into_iter().for_each(|buffer| buffers.give(buffer));
+        });
+        by_head
+    }
+
+    fn scale(&self) -> f32 {
+        1.0 / (self.head_dim as f32).sqrt()
+    }
+
+    /// From the first token of the i-th head of all samples on.
+    fn head<'a>(&self, x: Tokens<'a>, tokens: usize, i: usize) -> &'a [f32] {
+        &x.values[i / self.heads * tokens * x.width + i % self.heads * self.head_dim..]
+    }
+
+    /// The i-th head's tokens `[tokens, head_dim]`, rotated and scaled.
+    fn pack(
+        &self,
+        x: Tokens,
+        tokens: usize,
+        i: usize,
+        rope: Tables,
+        factor: f32,
+        buffers: &Buffers,
+    ) -> Vec<f32> {
+        let (d, width) = (self.head_dim, x.width);
+        let mut out = buffers.take(tokens * d);
+        let x = self.head(x, tokens, i);
+        Arch::new().dispatch(Rotate { x, width, d, rope, factor, out: &mut out });
+        out
+    }
+
+    /// Parts `[B, heads, tokens, head_dim]` → `[B, tokens, parts·C]`.
+    fn by_token<const PARTS: usize>(
+        &self,
+        parts: [&[f32]; PARTS],
+        tokens: usize,
+        buffers: &Buffers,
+    ) -> Vec<f32> {
+        /// Tokens per task.
+        const TOKENS: usize = 64;
+        let (d, width) = (self.head_dim, self.heads * self.head_dim);
+        let mut out = buffers.take(PARTS * self.batch * tokens * width);
+        out.par_chunks_mut(TOKENS * PARTS * width).enumerate().for_each(|(i, out)| {
+            for (j, out) in out.chunks_exact_mut(PARTS * width).enumerate() {
+                let (b, n) = ((i * TOKENS + j) / tokens, (i * TOKENS + j) % tokens);
+                for (part, out) in parts.iter().zip(out.chunks_exact_mut(width)) {
+                    for (h, out) in out.chunks_exact_mut(d).enumerate() {
+                        out.copy_from_slice(&part[((b * self.heads + h) * tokens + n) * d..][..d]);
+                    }
+                }
+            }
+        });
+        out
+    }
+}
+
+/// A matrix and its (column, row) strides.
+type Strided<'a> = (&'a [f32], [usize; 2]);
+
+/// Into contiguous rows.
+fn product(size: [usize; 3], lhs: Strided, rhs: Strided, out: &mut [f32], add: bool) {
+    Multiply { size, lhs, rhs, add }.write(out, size[1]);
+}
+
+/// One head's tokens, rotated, scaled and packed.
+struct Rotate<'a> {
+    x: &'a [f32],
+    width: usize,
+    d: usize,
+    rope: Tables<'a>,
+    factor: f32,
+    out: &'a mut [f32],
+}
+
+impl WithSimd for Rotate<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _simd: S) {
+        let (d, quarter) = (self.d, self.d / 4);
+        for (token, out) in self.out.chunks_exact_mut(d).enumerate() {
+            let x = &self.x[token * self.width..][..d];
+            let (cos, sin) = (&self.rope[0][token * d..][..d], &self.rope[1][token * d..][..d]);
+            // Two halves (row, column), each of two quarters whose members pair up.
+            for half in [0, 2 * quarter] {
+                for k in 0..quarter {
+                    let (i, j) = (half + k, half + quarter + k);
+                    out[i] = (x[i] * cos[i] + x[j] * sin[i]) * self.factor;
+                    out[j] = (x[j] * cos[j] + x[i] * sin[j]) * self.factor;
+                }
+            }
+        }
+    }
+}
+
+/// Turns gradients of rotated tokens back, in their place, and scales them.
+struct Unrotate<'a> {
+    x: &'a mut [f32],
+    d: usize,
+    rope: Tables<'a>,
+    factor: f32,
+}
+
+impl WithSimd for Unrotate<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _simd: S) {
+        let (d, quarter) = (self.d, self.d / 4);
+        let tables = self.rope[0].chunks_exact(d).zip(self.rope[1].chunks_exact(d));
+        for (x, (cos, sin)) in self.x.chunks_exact_mut(d).zip(tables) {
+            for half in [0, 2 * quarter] {
+                for k in 0..quarter {
+                    let (i, j) = (half + k, half + quarter + k);
+                    let (a, b) = (x[i] * self.factor, x[j] * self.factor);
+                    x[i] = a * cos[i] + b * sin[j];
+                    x[j] = b * cos[j] + a * sin[i];
+                }
+            }
+        }
+    }
+}
+
+/// Independent accumulators of a reduction, as many as the widest vector has lanes.
+const LANES: usize = 16;
+
+/// Rows of scores → their softmax, and the logarithms of their sums of exponentials.
+struct Softmax<'a> {
+    scores: &'a mut [f32],
+    keys: usize,
+    logarithms: &'a mut [f32],
+}
+
+impl WithSimd for Softmax<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _simd: S) {
+        for (row, logarithm) in self.scores.chunks_exact_mut(self.keys).zip(self.logarithms) {
+            let mut most = [f32::NEG_INFINITY; LANES];
+            let (chunks, rest) = row.as_chunks::<LANES>();
+            for chunk in chunks {
+                for (m, x) in most.iter_mut().zip(chunk) {
+                    *m = if *x > *m { *x } else { *m };
+                }
+            }
+            let most = most.iter().chain(rest).copied().fold(f32::NEG_INFINITY, f32::max);
+            let mut sums = [0.0_f32; LANES];
+            let (chunks, rest) = row.as_chunks_mut::<LANES>();
+            for chunk in chunks {
+                for (s, x) in sums.iter_mut().zip(chunk) {
+                    *x = exp(*x - most);
+                    *s += *x;
+                }
+            }
+            let mut sum: f32 = sums.iter().sum();
+            for x in rest {
+                *x = exp(*x - most);
+                sum += *x;
+            }
+            row.iter_mut().for_each(|x| *x /= sum);
+            *logarithm = most + sum.ln();
+        }
+    }
+}
+
+/// Rows of scores → their softmax p; rows of its gradient dp → that of the scores, p · (dp − Σ p·dp).
+struct Backward<'a> {
+    scores: &'a mut [f32],
+    gradients: &'a mut [f32],
+    keys: usize,
+    logarithms: &'a [f32],
+}
+
+impl WithSimd for Backward<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _simd: S) {
+        let rows = self.scores.chunks_exact_mut(self.keys).zip(self.gradients.chunks_exact_mut(self.keys));
+        for ((scores, gradients), logarithm) in rows.zip(self.logarithms) {
+            let mut sums = [0.0_f32; LANES];
+            let (chunks, rest) = scores.as_chunks_mut::<LANES>();
+            let (given, given_rest) = gradients.as_chunks::<LANES>();
+            for (chunk, given) in chunks.iter_mut().zip(given) {
+                for ((s, x), g) in sums.iter_mut().zip(chunk).zip(given) {
+                    *x = exp(*x - logarithm);
+                    *s += *x * g;
+                }
+            }
+            let mut sum: f32 = sums.iter().sum();
+            for (x, g) in rest.iter_mut().zip(given_rest) {
+                *x = exp(*x - logarithm);
+                sum += *x * g;
+            }
+            for (g, p) in gradients.iter_mut().zip(scores) {
+                *g = *p * (*g - sum);
+            }
+        }
+    }
+}

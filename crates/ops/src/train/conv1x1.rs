@@ -1,0 +1,174 @@
+//! 1×1 convolutions for training: a matrix product per block of pixels, on images as Burn stores them. A block is small
+//! enough that its channels stay in the second-level cache between the products that read them.
+
+use pulp::Arch;
+use rayon::prelude::*;
+
+use super::elements::{add_constant, mask, rectify, total};
+use super::planes::{Planes, Transposer};
+use super::transposed::Accumulate;
+use super::{Gradients, Wanted, join};
+use crate::multiply::Multiply;
+use crate::wide::{Buffers, GROUP, pieces};
+
+/// Floats of a block's inputs and outputs: 128 KiB.
+const BLOCK_FLOATS: usize = 32 * 1024;
+/// Parts that the weight's gradient is summed in at most, before they are joined in their order.
+const PARTS: usize = 16;
+
+/// Sizes of a convolution, and whether it reads max(x, 0) instead of its input x.
+#[derive(Debug, Clone, Copy)]
+pub struct Conv1x1 {
+    /// Images.
+    pub batch: usize,
+    /// Channels of the input.
+    pub inputs: usize,
+    /// Channels of the output.
+    pub outputs: usize,
+    /// Height times width.
+    pub pixels: usize,
+    /// Reads max(x, 0).
+    pub rectified: bool,
+}
+
+/// Some pixels of one image, and where their results belong, channel by channel.
+struct Block<'a> {
+    image: usize,
+    first: usize,
+    count: usize,
+    out: Vec<&'a mut [f32]>,
+}
+
+impl Conv1x1 {
+    /// `x` `[B, inputs, H, W]`, `weight` `[outputs, inputs]`, `bias` `[outputs]` → `[B, outputs, H, W]`.
+    pub fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>, buffers: &Buffers) -> Vec<f32> {
+        let Self { inputs, outputs, pixels, .. } = *self;
+        let mut out = buffers.take(self.batch * outputs * pixels);
+        self.blocks(Some((&mut out, outputs))).into_par_iter().for_each(|block| {
+            let (n, x) = (block.count, &x[block.image * inputs * pixels + block.first..]);
+            let mut read = buffers.take(if self.rectified { inputs * n } else { 0 });
+            let mut results = buffers.take(outputs * n);
+            let x = self.read(x, n, &mut read);
+            Multiply { size: [outputs, n, inputs], lhs: (weight, [1, inputs]), rhs: x, add: false }
+                .write(&mut results, n);
+            for (c, (out, results)) in block.out.into_iter().zip(results.chunks_exact(n)).enumerate() {
+                let bias = bias.map_or(0.0, |bias| bias[c]);
+                add_constant(results, bias, out);
+            }
+            [read, results].into_iter().for_each(|buffer| buffers.give(buffer));
+        });
+        out
+    }
+
+    /// Gradients from that of the output, `dy` `[B, outputs, H, W]`.
+    pub fn backward(
+        &self,
+        x: &[f32],
+        weight: &[f32],
+        dy: &[f32],
+        wanted: Wanted,
+        buffers: &Buffers,
+    ) -> Gradients {
+        let Self { inputs, outputs, .. } = *self;
+        let mut dx = wanted.input.then(|| buffers.take(x.len()));
+        let mut blocks = self.blocks(dx.as_deref_mut().map(|dx| (dx, inputs)));
+        let size = blocks.len().div_ceil(PARTS);
+        let parts: Vec<_> =
+            blocks.par_chunks_mut(size).map(|part| self.part(part, x, weight, dy, wanted, buffers)).collect();
+        let width = inputs.next_multiple_of(GROUP);
+        let weight = wanted.weight.then(|| {
+            let size = outputs.next_multiple_of(GROUP) * width;
+            let sums = join(parts.iter().map(|(weights, _)| &weights[..]), size);
+            sums.chunks_exact(width).take(outputs).flat_map(|row| &row[..inputs]).copied().collect()
+        });
+        Gradients {
+            input: dx,
+            weight,
+            bias: wanted.bias.then(|| join(parts.iter().map(|(_, biases)| &biases[..]), outputs)),
+        }
+    }
+
+    /// One part's gradients. Those of weight (channels in whole groups) and bias are returned, empty where not wanted.
+    fn part(
+        &self,
+        part: &mut [Block],
+        x: &[f32],
+        weight: &[f32],
+        dy: &[f32],
+        wanted: Wanted,
+        buffers: &Buffers,
+    ) -> (Vec<f32>, Vec<f32>) {
+        let Self { inputs, outputs, pixels, rectified, .. } = *self;
+        let [left, right] = [outputs, inputs].map(|channels| channels.next_multiple_of(GROUP));
+        let mut weights = vec![0.0; if wanted.weight { left * right } else { 0 }];
+        let mut biases = vec![0.0; if wanted.bias { outputs } else { 0 }];
+        let mut add = false;
+        for Block { image, first, count: n, out } in part {
+            let (n, x) = (*n, &x[*image * inputs * pixels..][..inputs * pixels]);
+            let dy = &dy[*image * outputs * pixels..][..outputs * pixels];
+            if wanted.weight {
+                let [mut gradients, mut values] = [left, right].map(|channels| buffers.take(channels * n));
+                self.group(dy, *first, false, n, &mut gradients);
+                self.group(x, *first, rectified, n, &mut values);
+                let (left, right, out) = (&gradients, &values, &mut weights);
+                Arch::new().dispatch(Accumulate { left, right, stride: n, tiles: n, add, out });
+                [gradients, values].into_iter().for_each(|buffer| buffers.give(buffer));
+                add = true;
+            }
+            if wanted.bias {
+                for (bias, dy) in biases.iter_mut().zip(dy.chunks_exact(pixels)) {
+                    *bias += total(&dy[*first..][..n]);
+                }
+            }
+            if wanted.input {
+                let mut results = buffers.take(inputs * n);
+                let (lhs, rhs) = ((weight, [inputs, 1]), (&dy[*first..], [1, pixels]));
+                Multiply { size: [inputs, n, outputs], lhs, rhs, add: false }.write(&mut results, n);
+                let channels = out.iter_mut().zip(results.chunks_exact(n)).zip(x.chunks_exact(pixels));
+                for ((out, results), x) in channels {
+                    out.copy_from_slice(results);
+                    if rectified {
+                        mask(&x[*first..][..n], out);
+                    }
+                }
+                buffers.give(results);
+            }
+        }
+        (weights, biases)
+    }
+
+    /// `n` pixels of an image in groups of channels, `[groups][n][16]`.
+    fn group(&self, data: &[f32], first: usize, rectified: bool, n: usize, out: &mut [f32]) {
+        let planes = Planes { data, height: 1, width: self.pixels, rectified, transposer: Transposer::new() };
+        for (group, out) in out.chunks_exact_mut(n * GROUP).enumerate() {
+            planes.read(group, Some(0), first as isize, out);
+        }
+    }
+
+    /// The first `n` pixels of the input as it is read: values and their (column, row) strides.
+    fn read<'a>(&self, x: &'a [f32], n: usize, read: &'a mut [f32]) -> (&'a [f32], [usize; 2]) {
+        if !self.rectified {
+            return (x, [1, self.pixels]);
+        }
+        for (read, x) in read.chunks_exact_mut(n).zip(x.chunks(self.pixels)) {
+            rectify(&x[..n], read);
+        }
+        (read, [1, n])
+    }
+
+    /// All blocks, with the slices of `out` `[B, channels, H, W]` that belong to them, if there is one.
+    fn blocks<'a>(&self, out: Option<(&'a mut [f32], usize)>) -> Vec<Block<'a>> {
+        let Self { batch, pixels, .. } = *self;
+        let piece = (BLOCK_FLOATS / (self.inputs + self.outputs)).next_multiple_of(64).min(pixels);
+        let mut blocks: Vec<_> = (0..batch)
+            .flat_map(|image| (0..pixels).step_by(piece).map(move |first| (image, first)))
+            .map(|(image, first)| Block { image, first, count: piece.min(pixels - first), out: Vec::new() })
+            .collect();
+        if let Some((out, channels)) = out {
+            let slices =
+                out.chunks_exact_mut(channels * pixels).flat_map(|image| pieces(image, pixels, piece));
+            blocks.iter_mut().zip(slices).for_each(|(block, slices)| block.out = slices);
+        }
+        blocks
+    }
+}

@@ -1,0 +1,148 @@
+//! Linear layers for training, alone or with GELU behind them: one matrix product per block of rows, with everything
+//! that is done element by element beside it while the block is in the cache.
+
+use pulp::Arch;
+use rayon::prelude::*;
+
+use super::elements::{add_rows, add_to_rows};
+use super::{Gradients, Wanted, join, parts};
+use crate::math::{gelu, gelu_derivative};
+use crate::multiply::Multiply;
+use crate::wide::Buffers;
+
+/// Rows per task of the products over rows.
+const ROWS: usize = 128;
+/// Rows of the weight's gradient per task, at least and at most: a task reads all of one factor.
+const WEIGHT_ROWS: [usize; 2] = [48, 256];
+/// Tasks that the weight's gradient is cut into between those limits.
+const WEIGHT_TASKS: usize = 16;
+
+/// Sizes of a layer.
+#[derive(Debug, Clone, Copy)]
+pub struct Linear {
+    /// Rows of input and output: tokens of all samples.
+    pub rows: usize,
+    /// Channels of the input.
+    pub inputs: usize,
+    /// Channels of the output.
+    pub outputs: usize,
+    /// The weight is `[outputs, inputs]`, as a convolution's, instead of `[inputs, outputs]`.
+    pub transposed: bool,
+}
+
+impl Linear {
+    /// x · weight + bias: `x` `[rows, inputs]` → `[rows, outputs]`.
+    pub fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>, buffers: &Buffers) -> Vec<f32> {
+        let mut out = buffers.take(self.rows * self.outputs);
+        let tasks = out.par_chunks_mut(ROWS * self.outputs).zip(x.par_chunks(ROWS * self.inputs));
+        tasks.for_each(|(out, x)| self.product(x, weight, bias, out));
+        out
+    }
+
+    /// gelu(z) and z = x · weight + bias, which [`Linear::backward`] needs: `[rows, outputs]` each.
+    pub fn forward_gelu(
+        &self,
+        x: &[f32],
+        weight: &[f32],
+        bias: Option<&[f32]>,
+        buffers: &Buffers,
+    ) -> [Vec<f32>; 2] {
+        let [mut out, mut before] = [(); 2].map(|()| buffers.take(self.rows * self.outputs));
+        let arch = Arch::new();
+        let tasks = out.par_chunks_mut(ROWS * self.outputs).zip(before.par_chunks_mut(ROWS * self.outputs));
+        tasks.zip(x.par_chunks(ROWS * self.inputs)).for_each(|((out, before), x)| {
+            self.product(x, weight, bias, before);
+            arch.dispatch(
+                #[inline(always)]
+                || out.iter_mut().zip(before).for_each(|(out, z)| *out = gelu(*z)),
+            );
+        });
+        [out, before]
+    }
+
+    /// Gradients from that of the output, `dy` `[rows, outputs]`. `before` is what [`Linear::forward_gelu`] told of the
+    /// values before GELU, if there was one.
+    pub fn backward(
+        &self,
+        x: &[f32],
+        weight: &[f32],
+        before: Option<&[f32]>,
+        dy: &[f32],
+        wanted: Wanted,
+        buffers: &Buffers,
+    ) -> Gradients {
+        let Self { rows, inputs, outputs, .. } = *self;
+        let blocks = rows.div_ceil(ROWS);
+        let mut dx = wanted.input.then(|| buffers.take(rows * inputs));
+        let mut dz = before.map(|_| buffers.take(rows * outputs));
+        let mut sums = vec![0.0; if wanted.bias { blocks * outputs } else { 0 }];
+        let results = parts(dx.as_deref_mut(), ROWS * inputs, blocks).into_par_iter();
+        let changed = parts(dz.as_deref_mut(), ROWS * outputs, blocks);
+        let totals = parts(wanted.bias.then_some(&mut sums), outputs, blocks);
+        results.zip(changed).zip(totals).enumerate().for_each(|(i, ((dx, dz), sums))| {
+            let rows = i * ROWS * outputs..((i + 1) * ROWS).min(rows) * outputs;
+            let dy = &dy[rows.clone()];
+            let dz: &[f32] = match (dz, before) {
+                (Some(dz), Some(before)) => {
+                    derive(&before[rows], dy, dz);
+                    dz
+                }
+                _ => dy,
+            };
+            if let Some(sums) = sums {
+                add_rows(dz, sums);
+            }
+            if let Some(dx) = dx {
+                let [column, row] = self.strides();
+                let size = [dz.len() / outputs, inputs, outputs];
+                Multiply { size, lhs: (dz, [1, outputs]), rhs: (weight, [row, column]), add: false }
+                    .write(dx, inputs);
+            }
+        });
+        let weight = wanted.weight.then(|| self.weight_gradient(x, dz.as_deref().unwrap_or(dy), buffers));
+        if let Some(dz) = dz {
+            buffers.give(dz);
+        }
+        Gradients { input: dx, weight, bias: wanted.bias.then(|| join(sums.chunks_exact(outputs), outputs)) }
+    }
+
+    fn weight_gradient(&self, x: &[f32], dz: &[f32], buffers: &Buffers) -> Vec<f32> {
+        // Rows and columns of the weight as it is stored.
+        let (inputs, outputs) = ((x, self.inputs), (dz, self.outputs));
+        let ((left, rows), (right, columns)) =
+            if self.transposed { (outputs, inputs) } else { (inputs, outputs) };
+        let mut out = buffers.take(rows * columns);
+        let block = rows.div_ceil(WEIGHT_TASKS).clamp(WEIGHT_ROWS[0], WEIGHT_ROWS[1]);
+        out.par_chunks_mut(block * columns).enumerate().for_each(|(i, out)| {
+            let size = [out.len() / columns, columns, self.rows];
+            let lhs = (&left[i * block..], [rows, 1]);
+            Multiply { size, lhs, rhs: (right, [1, columns]), add: false }.write(out, columns);
+        });
+        out
+    }
+
+    /// (column, row) strides of the weight as `[inputs, outputs]`.
+    fn strides(&self) -> [usize; 2] {
+        if self.transposed { [self.inputs, 1] } else { [1, self.outputs] }
+    }
+
+    fn product(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>, out: &mut [f32]) {
+        let (size, lhs) = ([x.len() / self.inputs, self.outputs, self.inputs], (x, [1, self.inputs]));
+        Multiply { size, lhs, rhs: (weight, self.strides()), add: false }.write(out, self.outputs);
+        if let Some(bias) = bias {
+            add_to_rows(bias, out);
+        }
+    }
+}
+
+/// dz = dy · gelu'(z).
+fn derive(z: &[f32], dy: &[f32], dz: &mut [f32]) {
+    Arch::new().dispatch(
+        #[inline(always)]
+        || {
+            for ((dz, z), dy) in dz.iter_mut().zip(z).zip(dy) {
+                *dz = dy * gelu_derivative(*z);
+            }
+        },
+    );
+}

@@ -1,0 +1,88 @@
+//! The operators of the networks for training: forward and backward passes as plain functions of f32 slices. (Burn's own
+//! backward pass of a convolution is a forward convolution whose kernel is the whole image, and that of attention is
+//! composed of small steps.)
+//!
+//! Images are `[B, C, H, W]` and tokens `[B, N, C]`, contiguous, of any size. Every result has the same bits for any
+//! number of threads: work is cut by sizes alone, and what several tasks sum is joined in their order.
+
+mod attention;
+mod conv1x1;
+mod conv3x3;
+mod elements;
+mod enlarge;
+mod linear;
+mod norm;
+mod patches;
+mod planes;
+mod transposed;
+mod unfolded;
+mod weights3x3;
+
+#[cfg(test)]
+mod reference;
+#[cfg(test)]
+mod tests;
+
+use rayon::prelude::*;
+
+pub use attention::{Attention, Tables, Tokens};
+pub use conv1x1::Conv1x1;
+pub use conv3x3::Conv3x3;
+pub use enlarge::Enlarge;
+pub use linear::Linear;
+pub use norm::{LayerNorm, Statistics};
+pub use patches::Patches;
+pub use unfolded::Unfolded;
+
+pub use crate::resize::{Tap, resize, resize_gradient, taps};
+
+/// Which gradients are needed; what is not costs nothing.
+#[derive(Debug, Clone, Copy)]
+pub struct Wanted {
+    /// Of the operator's input.
+    pub input: bool,
+    /// Of its weight.
+    pub weight: bool,
+    /// Of its bias.
+    pub bias: bool,
+}
+
+impl Wanted {
+    /// All gradients.
+    pub const ALL: Self = Self { input: true, weight: true, bias: true };
+}
+
+/// Gradients that were wanted, in the shapes of what they belong to.
+#[derive(Debug)]
+pub struct Gradients {
+    /// Of the operator's input.
+    pub input: Option<Vec<f32>>,
+    /// Of its weight.
+    pub weight: Option<Vec<f32>>,
+    /// Of its bias.
+    pub bias: Option<Vec<f32>>,
+}
+
+/// Sums of parts of `len` values each, in their order.
+fn join<'a>(parts: impl Iterator<Item = &'a [f32]>, len: usize) -> Vec<f32> {
+    /// Values per task.
+    const PIECE: usize = 1024;
+    let parts: Vec<_> = parts.collect();
+    let mut out = vec![0.0; len];
+    out.par_chunks_mut(PIECE).enumerate().for_each(|(i, out)| {
+        let mut sums = [0.0_f64; PIECE];
+        for part in &parts {
+            sums.iter_mut().zip(&part[i * PIECE..]).for_each(|(sum, x)| *sum += f64::from(*x));
+        }
+        out.iter_mut().zip(sums).for_each(|(out, sum)| *out = sum as f32);
+    });
+    out
+}
+
+/// `count` pieces of what there is, or of nothing.
+fn parts(data: Option<&mut [f32]>, piece: usize, count: usize) -> Vec<Option<&mut [f32]>> {
+    match data {
+        Some(data) => data.chunks_mut(piece).map(Some).collect(),
+        None => (0..count).map(|_| None).collect(),
+    }
+}

@@ -1,0 +1,197 @@
+//! 3×3 convolutions with padding 1 for training as matrix products of the unfolded input, in which the nine taps of a
+//! channel follow one another. Winograd's method needs stride 1; this one takes any. The heads have one such layer, on
+//! their smallest image.
+
+use rayon::prelude::*;
+
+use super::elements::{add_constant, channel_sums, mask, rectify};
+use super::{Gradients, Wanted};
+use crate::multiply::Multiply;
+use crate::wide::{Buffers, pieces};
+
+/// Taps of a filter.
+const TAPS: usize = 9;
+/// Tasks per image in the forward pass, if each then has this many pixels.
+const BANDS: usize = 4;
+const PIXELS: usize = 64;
+/// Channels per task in the backward pass.
+const CHANNELS: usize = 16;
+
+/// Sizes of a convolution, and whether it reads max(x, 0) instead of its input x.
+#[derive(Debug, Clone, Copy)]
+pub struct Unfolded {
+    /// Images.
+    pub batch: usize,
+    /// Channels of the input.
+    pub inputs: usize,
+    /// Channels of the output.
+    pub outputs: usize,
+    /// Rows of the input.
+    pub height: usize,
+    /// Columns of the input.
+    pub width: usize,
+    /// Rows and columns of the input per row and column of the output.
+    pub stride: usize,
+    /// Reads max(x, 0).
+    pub rectified: bool,
+}
+
+impl Unfolded {
+    /// `x` `[B, inputs, H, W]`, `weight` `[outputs, inputs, 3, 3]`, `bias` `[outputs]` →
+    /// `[B, outputs, ⌈H/stride⌉, ⌈W/stride⌉]`.
+    pub fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>, buffers: &Buffers) -> Vec<f32> {
+        let Self { inputs, outputs, .. } = *self;
+        let [rows, columns] = self.size();
+        let plane = self.height * self.width;
+        let mut out = buffers.take(self.batch * outputs * rows * columns);
+        let band = rows.div_ceil(BANDS).max(PIXELS.div_ceil(columns)).min(rows);
+        let tasks: Vec<_> = out
+            .chunks_exact_mut(outputs * rows * columns)
+            .enumerate()
+            .flat_map(|(image, out)| {
+                let bands = pieces(out, rows * columns, band * columns).into_iter().enumerate();
+                bands.map(move |(i, out)| (image, i * band, out))
+            })
+            .collect();
+        tasks.into_par_iter().for_each(|(image, row, out)| {
+            let n = out[0].len();
+            let mut taps = buffers.take(inputs * TAPS * n);
+            self.unfold(&x[image * inputs * plane..][..inputs * plane], row, &mut taps, buffers);
+            let mut results = buffers.take(outputs * n);
+            let lhs = (weight, [1, inputs * TAPS]);
+            Multiply { size: [outputs, n, inputs * TAPS], lhs, rhs: (&taps, [1, n]), add: false }
+                .write(&mut results, n);
+            for (c, (out, results)) in out.into_iter().zip(results.chunks_exact(n)).enumerate() {
+                add_constant(results, bias.map_or(0.0, |bias| bias[c]), out);
+            }
+            [taps, results].into_iter().for_each(|buffer| buffers.give(buffer));
+        });
+        out
+    }
+
+    /// Gradients from that of the output, `dy` `[B, outputs, ⌈H/stride⌉, ⌈W/stride⌉]`.
+    pub fn backward(
+        &self,
+        x: &[f32],
+        weight: &[f32],
+        dy: &[f32],
+        wanted: Wanted,
+        buffers: &Buffers,
+    ) -> Gradients {
+        let Self { batch, inputs, outputs, .. } = *self;
+        let [rows, columns] = self.size();
+        let (plane, n) = (self.height * self.width, rows * columns);
+        let mut dx = wanted.input.then(|| buffers.take(x.len()));
+        // Every task has its channels of all images.
+        let slices: Vec<Vec<&mut [f32]>> = match &mut dx {
+            Some(dx) => pieces(dx, inputs * plane, CHANNELS * plane),
+            None => (0..inputs.div_ceil(CHANNELS)).map(|_| Vec::new()).collect(),
+        };
+        let task = |(block, mut dx): (usize, Vec<&mut [f32]>)| {
+            let first = block * CHANNELS;
+            let channels = CHANNELS.min(inputs - first);
+            let width = channels * TAPS;
+            let mut sums = buffers.take(if wanted.weight { outputs * width } else { 0 });
+            let mut taps = buffers.take(width * n);
+            for image in 0..batch {
+                let x = &x[(image * inputs + first) * plane..][..channels * plane];
+                let dy = &dy[image * outputs * n..][..outputs * n];
+                if wanted.weight {
+                    self.unfold(x, 0, &mut taps, buffers);
+                    let (lhs, rhs) = ((dy, [1, n]), (&taps[..], [n, 1]));
+                    Multiply { size: [outputs, width, n], lhs, rhs, add: image > 0 }.write(&mut sums, width);
+                }
+                if let Some(dx) = dx.get_mut(image) {
+                    let lhs = (&weight[first * TAPS..], [inputs * TAPS, 1]);
+                    Multiply { size: [width, n, outputs], lhs, rhs: (dy, [1, n]), add: false }
+                        .write(&mut taps, n);
+                    self.fold(&taps, dx);
+                    if self.rectified {
+                        mask(x, dx);
+                    }
+                }
+            }
+            buffers.give(taps);
+            sums
+        };
+        let sums: Vec<_> = slices.into_par_iter().enumerate().map(task).collect();
+        let weight = wanted.weight.then(|| {
+            let mut weight = buffers.take(outputs * inputs * TAPS);
+            weight.par_chunks_exact_mut(inputs * TAPS).enumerate().for_each(|(output, out)| {
+                for (out, sums) in out.chunks_mut(CHANNELS * TAPS).zip(&sums) {
+                    out.copy_from_slice(&sums[output * out.len()..][..out.len()]);
+                }
+            });
+            weight
+        });
+        sums.into_iter().for_each(|buffer| buffers.give(buffer));
+        let bias = wanted.bias.then(|| channel_sums(dy, batch, outputs));
+        Gradients { input: dx, weight, bias }
+    }
+
+    /// Rows and columns of the output.
+    fn size(&self) -> [usize; 2] {
+        [self.height.div_ceil(self.stride), self.width.div_ceil(self.stride)]
+    }
+
+    /// Planes `x` → what the nine taps of every channel see, `[channels, 9, rows, columns]`, for output rows from `row`
+    /// on.
+    fn unfold(&self, x: &[f32], row: usize, taps: &mut [f32], buffers: &Buffers) {
+        let (plane, [_, columns]) = (self.height * self.width, self.size());
+        let mut positive = buffers.take(if self.rectified { x.len() } else { 0 });
+        let x = if self.rectified {
+            rectify(x, &mut positive);
+            &positive
+        } else {
+            x
+        };
+        let size = taps.len() / (x.len() / plane * TAPS);
+        for (i, out) in taps.chunks_exact_mut(size).enumerate() {
+            let (x, tap) = (&x[i / TAPS * plane..][..plane], i % TAPS);
+            let (first, last, from) = self.columns(tap);
+            for (y, out) in out.chunks_exact_mut(columns).enumerate() {
+                // One more than the place in the image.
+                let line = self.stride * (row + y) + tap / 3;
+                if !(1..=self.height).contains(&line) {
+                    out.fill(0.0);
+                    continue;
+                }
+                let line = &x[(line - 1) * self.width + from..line * self.width];
+                out[..first].fill(0.0);
+                out[last..].fill(0.0);
+                let values = line.iter().step_by(self.stride);
+                out[first..last].iter_mut().zip(values).for_each(|(out, x)| *out = *x);
+            }
+        }
+        buffers.give(positive);
+    }
+
+    /// The transpose of `unfold`, for all rows and without max(x, 0).
+    fn fold(&self, taps: &[f32], x: &mut [f32]) {
+        let [rows, columns] = self.size();
+        x.fill(0.0);
+        for (i, taps) in taps.chunks_exact(rows * columns).enumerate() {
+            let (x, tap) = (&mut x[i / TAPS * self.height * self.width..], i % TAPS);
+            let (first, last, from) = self.columns(tap);
+            for (y, taps) in taps.chunks_exact(columns).enumerate() {
+                let line = self.stride * y + tap / 3;
+                if (1..=self.height).contains(&line) {
+                    let line = &mut x[(line - 1) * self.width + from..line * self.width];
+                    let places = line.iter_mut().step_by(self.stride);
+                    places.zip(&taps[first..last]).for_each(|(out, x)| *out += x);
+                }
+            }
+        }
+    }
+
+    /// Output columns for which a tap lies inside the image (first, one after the last), and the input column that it
+    /// reads for the first of them.
+    fn columns(&self, tap: usize) -> (usize, usize, usize) {
+        let [_, columns] = self.size();
+        let shift = tap % 3;
+        let first = usize::from(shift == 0);
+        // stride · x + shift − 1 < width.
+        let last = (self.width + 1 - shift).div_ceil(self.stride).min(columns);
+        (first.min(last), last, (self.stride * first + shift - 1).min(self.width - 1))
+    }
+}

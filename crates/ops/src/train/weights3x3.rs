@@ -1,0 +1,99 @@
+//! The gradients of a 3×3 convolution's weights and biases.
+//!
+//! The images are cut into a fixed number of parts. Each sums the products of its own tiles, block after block, and the
+//! parts' sums are joined in their order: the same bits for any number of threads.
+
+use pulp::Arch;
+use rayon::prelude::*;
+
+use super::Conv3x3;
+use super::planes::{Planes, Transposer};
+use super::transposed::{Accumulate, OutputGradients, Taps};
+use crate::wide::transforms::{Block, Inputs, POINTS, TILE, lines};
+use crate::wide::{Buffers, GROUP};
+
+/// At most so many parts: enough for the cores of a desktop computer.
+const PARTS: usize = 16;
+/// Tiles per part at least, so that the parts' sums are no more data than their transformed tiles.
+const PART_TILES: usize = 96;
+/// Points whose products are one task, where there are fewer parts than cores.
+const TASK_POINTS: usize = 6;
+
+impl Conv3x3 {
+    /// Gradients of weight and bias.
+    pub(super) fn weight_gradient(&self, x: &[f32], dy: &[f32], buffers: &Buffers) -> [Vec<f32>; 2] {
+        let [rows, columns] = [self.height, self.width].map(|side| side.div_ceil(TILE));
+        let band = self.band_rows();
+        let blocks: Vec<_> = (0..self.batch)
+            .flat_map(|image| (0..rows).step_by(band).map(move |row| (image, row, band.min(rows - row))))
+            .collect();
+        let parts = (self.batch * rows * columns / PART_TILES).clamp(1, PARTS.min(blocks.len()));
+        let mut sums: Vec<_> = blocks
+            .par_chunks(blocks.len().div_ceil(parts))
+            .map(|blocks| self.part(x, dy, blocks, buffers))
+            .collect();
+        let [inputs, outputs] = [self.inputs, self.outputs].map(|n| n.next_multiple_of(GROUP));
+        let mut weight = buffers.take(self.outputs * self.inputs * 9);
+        let arch = Arch::new();
+        weight.par_chunks_exact_mut(self.inputs * 9).enumerate().for_each(|(output, out)| {
+            let parts: Vec<_> = sums.iter().map(|(sums, _)| &sums[output * inputs..]).collect();
+            arch.dispatch(Taps { parts: &parts, stride: inputs * outputs, out });
+        });
+        let bias = |c: usize| sums.iter().map(|(_, bias)| bias[c]).sum::<f64>() as f32;
+        let bias = (0..self.outputs).map(bias).collect();
+        sums.drain(..).for_each(|(sums, _)| buffers.give(sums));
+        [weight, bias]
+    }
+
+    /// Sums `[36][outputs][inputs]`, channels in whole groups, of rows of tiles (image, first row, rows), and those of
+    /// the output's gradient.
+    fn part(
+        &self,
+        x: &[f32],
+        dy: &[f32],
+        blocks: &[(usize, usize, usize)],
+        buffers: &Buffers,
+    ) -> (Vec<f32>, Vec<f64>) {
+        let (arch, transposer) = (Arch::new(), Transposer::new());
+        let (plane, columns) = (self.height * self.width, self.width.div_ceil(TILE));
+        let [inputs, outputs] = [self.inputs, self.outputs].map(|n| n.next_multiple_of(GROUP));
+        let part = columns.div_ceil(columns.div_ceil(self.block_tiles()));
+        let stride = (self.band_rows() * part) | 1;
+        let mut read = buffers.take(lines(part));
+        let mut values = buffers.take(POINTS * inputs * stride);
+        let mut gradients = buffers.take(POINTS * outputs * stride);
+        let mut sums = buffers.take(POINTS * outputs * inputs);
+        let mut bias = vec![0.0; outputs];
+        let mut add = false;
+        let image =
+            |data, rectified| Planes { data, height: self.height, width: self.width, rectified, transposer };
+        for &(i, row, rows) in blocks {
+            let x = image(&x[i * self.inputs * plane..][..self.inputs * plane], self.rectified);
+            let dy = image(&dy[i * self.outputs * plane..][..self.outputs * plane], false);
+            for column in (0..columns).step_by(part) {
+                let block = Block { row, column, rows, columns: part.min(columns - column) };
+                let room = &mut read[..lines(block.columns)];
+                arch.dispatch(Inputs { source: &x, block, stride, lines: room, out: &mut values });
+                let (room, out, sums_of) = (&mut read[..], &mut gradients, &mut bias[..]);
+                arch.dispatch(OutputGradients {
+                    source: &dy,
+                    block,
+                    stride,
+                    lines: room,
+                    out,
+                    sums: sums_of,
+                });
+                let task = |(point, out)| {
+                    let left: &[f32] = &gradients[point * outputs * stride..][..outputs * stride];
+                    let right = &values[point * inputs * stride..][..inputs * stride];
+                    arch.dispatch(Accumulate { left, right, stride, tiles: block.tiles(), add, out });
+                };
+                let per_point = sums.par_chunks_exact_mut(outputs * inputs).enumerate();
+                per_point.with_min_len(TASK_POINTS).for_each(task);
+                add = true;
+            }
+        }
+        [read, values, gradients].into_iter().for_each(|buffer| buffers.give(buffer));
+        (sums, bias)
+    }
+}
