@@ -4,7 +4,7 @@
 use std::sync::{Mutex, PoisonError};
 
 /// Most floats that wait to be used again: 1 GiB.
-const MOST: usize = 1 << 28;
+// In floats.
 
 /// Blocks of floats that nobody needs at the moment.
 #[derive(Debug, Default)]
@@ -30,7 +30,7 @@ impl Buffers {
         buffer
     }
 
-    /// Takes back what nobody needs any more; beyond [`MOST`] floats, those that have waited longest are let go.
+    /// Takes back what nobody needs any more; beyond 2²⁸ floats (1 GiB), those that have waited longest are let go.
     pub fn give(&self, buffer: Vec<f32>) {
         let mut free = self.free.lock().unwrap_or_else(PoisonError::into_inner);
         free.push(buffer);
