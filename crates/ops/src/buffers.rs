@@ -4,7 +4,7 @@
 use std::sync::{Mutex, PoisonError};
 
 /// Most floats that wait to be used again: 1 GiB.
-// In floats.
+const MOST: usize = 1 << 28;
 
 /// Blocks of floats that nobody needs at the moment.
 #[derive(Debug, Default)]
