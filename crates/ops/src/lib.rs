@@ -2,7 +2,6 @@
 //! device where nothing is tracked for gradients, and plain tensor code on every other device and in training. Tests hold
 //! the two together.
 
-mod attention;
 pub mod buffers;
 pub mod conv;
 mod gelu;
@@ -26,8 +25,9 @@ use burn::tensor::module::{attention, interpolate};
 use burn::tensor::ops::{InterpolateMode, InterpolateOptions};
 use burn::tensor::{Device, Tensor, TensorData};
 
-use multiply::multiply;
+use buffers::Buffers;
 pub use rope::Rope;
+use train::{Attention, Tokens};
 
 /// Whether `x` lives where this crate's own kernels apply: on `flex`, with nothing tracked for gradients.
 pub fn is_fast<const D: usize>(x: &Tensor<D>) -> bool {
@@ -49,8 +49,9 @@ pub fn rotary_attention(q: Tensor<3>, k: Tensor<3>, v: Tensor<3>, rope: &Rope, h
     }
     let ([b, n, c], m, device) = (q.dims(), k.dims()[1], q.device());
     let (cos, sin) = (host(rope.cos.clone()), host(rope.sin.clone()));
-    let shape = attention::Shape { batch: b, queries: n, keys: m, heads, head_dim: c / heads };
-    let out = attention::attend(&shape, &host(q), &host(k), &host(v), [&cos, &sin]);
+    let attention = Attention { batch: b, queries: n, keys: m, heads, head_dim: c / heads };
+    let [q, k, v] = [q, k, v].map(host);
+    let (out, _) = attention.forward(Tokens::apart([&q, &k, &v], c), [&cos, &sin], &Buffers::new());
     Tensor::from_data(TensorData::new(out, [b, n, c]), &device)
 }
 

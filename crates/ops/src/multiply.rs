@@ -1,18 +1,6 @@
 //! Matrix products by the gemm crate on one thread; what is shared out among threads is decided by its callers, by sizes
 //! alone, so that every element is one sum in one order.
 
-/// out `[m, n]` row-major = lhs `[m, k]` · rhs `[k, n]`; strides are (column, row) in elements.
-pub fn multiply(
-    size @ [_, n, _]: [usize; 3],
-    lhs: &[f32],
-    ls: [usize; 2],
-    rhs: &[f32],
-    rs: [usize; 2],
-    out: &mut [f32],
-) {
-    Multiply { size, lhs: (lhs, ls), rhs: (rhs, rs), add: false }.write(out, n);
-}
-
 /// lhs `[m, k]` · rhs `[k, n]`.
 pub struct Multiply<'a> {
     /// m, n, k.

@@ -1,4 +1,5 @@
-//! Attention with rotary positions for training, one head of one sample after the other.
+//! Attention with rotary positions, one head of one sample after the other: rotate while packing, two matrix products per
+//! block of queries, the exponentials in between while the scores are in cache.
 //!
 //! The forward pass keeps nothing but the logarithm of every row's sum of exponentials. The backward pass computes the
 //! scores again, block of queries by block of queries (Dao, "FlashAttention-2"), so that they never leave the cache.
@@ -10,7 +11,10 @@ use crate::math::exp;
 use crate::multiply::Multiply;
 use crate::wide::Buffers;
 
-/// Queries per block: the scores of 64 queries with 1024 keys, and their gradients, are 512 KiB.
+/// Queries per block of the forward pass: 128 × 1024 scores of 4 bytes fit a second-level cache.
+const FORWARD_BLOCK: usize = 128;
+
+/// Queries per block of the backward pass: 64 × 1024 scores, and their gradients, take the same.
 const BLOCK: usize = 64;
 
 /// Sizes of an attention; tokens hold `heads · head_dim` channels.
@@ -64,14 +68,17 @@ impl Attention {
             let [packed_q, packed_k] = [(q, queries, self.scale()), (k, keys, 1.0)]
                 .map(|(x, tokens, factor)| self.pack(x, tokens, i, rope, factor, buffers));
             let values = self.head(v, keys, i);
-            let mut scores = buffers.take(BLOCK.min(queries) * keys);
-            let blocks = packed_q.chunks(BLOCK * d).zip(out.chunks_mut(BLOCK * d));
-            for ((block, out), logarithms) in blocks.zip(logarithms.chunks_mut(BLOCK)) {
+            let mut scores = buffers.take(FORWARD_BLOCK.min(queries) * keys);
+            let blocks = packed_q.chunks(FORWARD_BLOCK * d).zip(out.chunks_mut(FORWARD_BLOCK * d));
+            for ((block, out), logarithms) in blocks.zip(logarithms.chunks_mut(FORWARD_BLOCK)) {
                 let rows = logarithms.len();
                 let scores = &mut scores[..rows * keys];
                 product([rows, keys, d], (block, [1, d]), (&packed_k, [d, 1]), scores, false);
-                arch.dispatch(Softmax { scores, keys, logarithms });
+                let sums = arch.dispatch(Exponentials { scores, keys, logarithms });
                 product([rows, d, keys], (scores, [1, keys]), (values, [1, v.width]), out, false);
+                for (row, sum) in out.chunks_exact_mut(d).zip(sums) {
+                    row.iter_mut().for_each(|x| *x /= sum);
+                }
             }
             [packed_q, packed_k, scores].into_iter().for_each(|buffer| buffers.give(buffer));
         });
@@ -273,19 +280,19 @@ impl WithSimd for Unrotate<'_> {
 /// Independent accumulators of a reduction, as many as the widest vector has lanes.
 const LANES: usize = 16;
 
-/// Rows of scores → their softmax, and the logarithms of their sums of exponentials.
-struct Softmax<'a> {
+/// Rows of scores → e^(score − row's maximum), and the logarithms of the sums of e^score; returns the rows' sums.
+struct Exponentials<'a> {
     scores: &'a mut [f32],
     keys: usize,
     logarithms: &'a mut [f32],
 }
 
-impl WithSimd for Softmax<'_> {
-    type Output = ();
+impl WithSimd for Exponentials<'_> {
+    type Output = Vec<f32>;
 
     #[inline(always)]
-    fn with_simd<S: Simd>(self, _simd: S) {
-        for (row, logarithm) in self.scores.chunks_exact_mut(self.keys).zip(self.logarithms) {
+    fn with_simd<S: Simd>(self, _simd: S) -> Vec<f32> {
+        let row = |(row, logarithm): (&mut [f32], &mut f32)| {
             let mut most = [f32::NEG_INFINITY; LANES];
             let (chunks, rest) = row.as_chunks::<LANES>();
             for chunk in chunks {
@@ -307,9 +314,10 @@ impl WithSimd for Softmax<'_> {
                 *x = exp(*x - most);
                 sum += *x;
             }
-            row.iter_mut().for_each(|x| *x /= sum);
             *logarithm = most + sum.ln();
-        }
+            sum
+        };
+        self.scores.chunks_exact_mut(self.keys).zip(self.logarithms).map(row).collect()
     }
 }
 
