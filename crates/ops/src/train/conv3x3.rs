@@ -6,14 +6,13 @@
 //! output gradients are summed over all tiles before they are transformed back, 36 instead of 144 multiplications per
 //! sixteen pixels and pair of channels there, too.
 
-use pulp::Arch;
 use rayon::prelude::*;
 
 use super::elements::channel_sums;
 use super::planes::{Planes, Scatter, Transposer};
 use super::{Gradients, Wanted};
-use crate::wide::product::{Left, PANEL, Product, Right};
-use crate::wide::transforms::{Block, Filters, Inputs, Outputs, POINTS, TILE, Then, lines};
+use crate::wide::convolution::{Bands, Weights};
+use crate::wide::transforms::{POINTS, TILE, Then};
 use crate::wide::{Buffers, GROUP, pieces};
 
 /// Floats that a block's transformed inputs and products take together: 1 MiB, of which a core's second-level cache
@@ -94,12 +93,14 @@ impl Conv3x3 {
                 bands.map(move |(i, out)| (image, x, i * band, out))
             })
             .collect();
+        let (tiles, then) = (self.block_tiles(), Then::Store);
+        let bands = Bands { inputs: self.inputs, filters: &transformed, bias: &padded, width, tiles, then };
         tasks.into_par_iter().for_each(|(image, data, row, mut out)| {
             let planes = Planes { data, height: self.height, width, rectified, transposer };
             let pixels = out[0].len();
             let mut grouped = buffers.take(padded.len() * pixels);
             let mut slices: Vec<_> = grouped.chunks_exact_mut(pixels * GROUP).collect();
-            self.band(&planes, row, &transformed, &padded, &mut slices, buffers);
+            bands.run(&planes, row, &mut slices, buffers);
             for (group, planes) in out.chunks_mut(GROUP).enumerate() {
                 let first = (image * self.outputs + group * GROUP) * plane + row * TILE * width;
                 let mask = mask.map(|mask| (&mask[first..], plane));
@@ -120,69 +121,5 @@ impl Conv3x3 {
     /// Rows of tiles per task.
     pub(super) fn band_rows(&self) -> usize {
         (self.block_tiles() / self.width.div_ceil(TILE)).clamp(1, self.height.div_ceil(TILE))
-    }
-
-    /// Output rows from tile row `row` on, as many as `out` `[rows][width][16]` holds per group.
-    fn band(
-        &self,
-        source: &Planes,
-        row: usize,
-        filters: &[f32],
-        bias: &[f32],
-        out: &mut [&mut [f32]],
-        buffers: &Buffers,
-    ) {
-        let (arch, width) = (Arch::new(), self.width);
-        let rows = (out[0].len() / (width * GROUP)).div_ceil(TILE);
-        let columns = width.div_ceil(TILE);
-        // Parts of equal width if a row of tiles is more than a block.
-        let part = columns.div_ceil(columns.div_ceil(self.block_tiles()));
-        let (inputs, outputs) = (self.inputs.next_multiple_of(GROUP), bias.len());
-        // An odd distance puts the 36 points of a tile into different sets of the cache.
-        let stride = (rows * part) | 1;
-        let mut read = buffers.take(lines(part));
-        let mut points = buffers.take(POINTS * inputs * stride);
-        let mut products = buffers.take(POINTS * outputs * stride);
-        for column in (0..columns).step_by(part) {
-            let block = Block { row, column, rows, columns: part.min(columns - column) };
-            let lines = &mut read[..lines(block.columns)];
-            arch.dispatch(Inputs { source, block, stride, lines, out: &mut points });
-            let per_point =
-                points.chunks_exact(inputs * stride).zip(products.chunks_exact_mut(outputs * stride));
-            for (point, (values, products)) in per_point.enumerate() {
-                let left =
-                    Left { values, stride: stride * GROUP, groups: inputs / GROUP, rows: block.tiles() };
-                let right =
-                    Right { values: &filters[point * inputs * PANEL..], stride: POINTS * inputs * PANEL };
-                let out = &mut products.chunks_exact_mut(stride * GROUP).collect::<Vec<_>>();
-                arch.dispatch(Product { left, right, bias: None, out });
-            }
-            let products = &products;
-            arch.dispatch(Outputs { products, block, stride, bias, then: Then::Store, width, out });
-        }
-        [read, points, products].into_iter().for_each(|buffer| buffers.give(buffer));
-    }
-}
-
-/// Filters, `strides` floats from one output to the next and from one input to the next.
-struct Weights<'a> {
-    values: &'a [f32],
-    strides: [usize; 2],
-    turned: bool,
-}
-
-impl Weights<'_> {
-    /// `[panels][36][inputs in whole groups][32]`.
-    fn transform(&self, [inputs, outputs]: [usize; 2], buffers: &Buffers) -> Vec<f32> {
-        let panel = POINTS * inputs.next_multiple_of(GROUP) * PANEL;
-        let mut filters = buffers.take(outputs.div_ceil(PANEL) * panel);
-        let arch = Arch::new();
-        filters.par_chunks_exact_mut(panel).enumerate().for_each(|(i, out)| {
-            let weights = &self.values[i * PANEL * self.strides[0]..];
-            let outputs = PANEL.min(outputs - i * PANEL);
-            let (strides, turned) = (self.strides, self.turned);
-            arch.dispatch(Filters { weights, outputs, inputs, strides, turned, out });
-        });
-        filters
     }
 }

@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use super::image::{Image, Source};
 use super::pointwise::Pointwise;
 use super::product::{Left, PANEL, Product, Right};
-use super::transforms::{Block, Filters, Inputs, Outputs, POINTS, TILE, Then, lines};
+use super::transforms::{Block, Filters, Inputs, Lines, Outputs, POINTS, TILE, Then, lines};
 use super::{Buffers, GROUP, pieces};
 
 /// Floats that a block's transformed inputs and products take together: 2 MiB.
@@ -30,15 +30,8 @@ pub struct Conv3x3 {
 impl Conv3x3 {
     /// `weights` `[outputs, inputs, 3, 3]`, `bias` `[outputs]` or nothing.
     pub fn new(weights: &[f32], bias: &[f32], [inputs, outputs]: [usize; 2], buffers: &Buffers) -> Self {
-        let panel = POINTS * inputs.next_multiple_of(GROUP) * PANEL;
-        let mut filters = buffers.take(outputs.div_ceil(PANEL) * panel);
-        let arch = Arch::new();
-        filters.par_chunks_exact_mut(panel).zip(weights.par_chunks(PANEL * inputs * 9)).for_each(
-            |(out, weights)| {
-                let (outputs, strides) = (weights.len() / (9 * inputs), [9 * inputs, 9]);
-                arch.dispatch(Filters { weights, outputs, inputs, strides, turned: false, out });
-            },
-        );
+        let weights = Weights { values: weights, strides: [9 * inputs, 9], turned: false };
+        let filters = weights.transform([inputs, outputs], buffers);
         let mut bias = bias.to_vec();
         bias.resize(outputs.next_multiple_of(GROUP), 0.0);
         Self { inputs, outputs, filters, bias }
@@ -102,35 +95,84 @@ impl Conv3x3 {
 
     /// Output rows from tile row `row` on, as many as `out` holds per group.
     fn band(&self, source: &Source, row: usize, then: Then, out: &mut [&mut [f32]], buffers: &Buffers) {
-        let arch = Arch::new();
+        let Self { inputs, filters, bias, .. } = self;
         let [_, width] = source.size();
+        let tiles = self.block_tiles();
+        Bands { inputs: *inputs, filters, bias, width, tiles, then }.run(source, row, out, buffers);
+    }
+}
+
+/// Filters, `strides` floats from one output to the next and from one input to the next, perhaps turned by 180°.
+#[derive(Debug, Clone, Copy)]
+pub struct Weights<'a> {
+    pub values: &'a [f32],
+    pub strides: [usize; 2],
+    pub turned: bool,
+}
+
+impl Weights<'_> {
+    /// `[panels][36][inputs in whole groups][32]`.
+    pub fn transform(self, [inputs, outputs]: [usize; 2], buffers: &Buffers) -> Vec<f32> {
+        let Self { values, strides, turned } = self;
+        let panel = POINTS * inputs.next_multiple_of(GROUP) * PANEL;
+        let mut filters = buffers.take(outputs.div_ceil(PANEL) * panel);
+        let arch = Arch::new();
+        filters.par_chunks_exact_mut(panel).enumerate().for_each(|(i, out)| {
+            let weights = &values[i * PANEL * strides[0]..];
+            let outputs = PANEL.min(outputs - i * PANEL);
+            arch.dispatch(Filters { weights, outputs, inputs, strides, turned, out });
+        });
+        filters
+    }
+}
+
+/// A convolution of bands of rows.
+#[derive(Debug, Clone, Copy)]
+pub struct Bands<'a> {
+    pub inputs: usize,
+    /// Of [`Weights::transform`].
+    pub filters: &'a [f32],
+    /// Of all outputs in whole groups.
+    pub bias: &'a [f32],
+    /// Pixels of a row.
+    pub width: usize,
+    /// Tiles per block.
+    pub tiles: usize,
+    pub then: Then,
+}
+
+impl Bands<'_> {
+    /// Output rows from tile row `row` on, as many as `out` `[rows][width][16]` holds per group.
+    pub fn run(&self, source: &impl Lines, row: usize, out: &mut [&mut [f32]], buffers: &Buffers) {
+        let Self { filters, bias, width, then, .. } = *self;
+        let arch = Arch::new();
         let rows = (out[0].len() / (width * GROUP)).div_ceil(TILE);
         let columns = width.div_ceil(TILE);
         // Parts of equal width if a row of tiles is more than a block.
-        let part = columns.div_ceil(columns.div_ceil(self.block_tiles()));
-        let (inputs, outputs) = (self.inputs.next_multiple_of(GROUP), self.bias.len());
+        let part = columns.div_ceil(columns.div_ceil(self.tiles));
+        let (inputs, outputs) = (self.inputs.next_multiple_of(GROUP), bias.len());
         // An odd distance puts the 36 points of a tile into different sets of the cache.
         let stride = (rows * part) | 1;
-        let mut rows_read = buffers.take(lines(part));
+        let mut read = buffers.take(lines(part));
         let mut points = buffers.take(POINTS * inputs * stride);
         let mut products = buffers.take(POINTS * outputs * stride);
         for column in (0..columns).step_by(part) {
             let block = Block { row, column, rows, columns: part.min(columns - column) };
-            let lines = &mut rows_read[..lines(block.columns)];
+            let lines = &mut read[..lines(block.columns)];
             arch.dispatch(Inputs { source, block, stride, lines, out: &mut points });
             let per_point =
                 points.chunks_exact(inputs * stride).zip(products.chunks_exact_mut(outputs * stride));
             for (point, (values, products)) in per_point.enumerate() {
                 let left =
                     Left { values, stride: stride * GROUP, groups: inputs / GROUP, rows: block.tiles() };
-                let filters = &self.filters[point * inputs * PANEL..];
-                let right = Right { values: filters, stride: POINTS * inputs * PANEL };
+                let right =
+                    Right { values: &filters[point * inputs * PANEL..], stride: POINTS * inputs * PANEL };
                 let out = &mut products.chunks_exact_mut(stride * GROUP).collect::<Vec<_>>();
                 arch.dispatch(Product { left, right, bias: None, out });
             }
-            let (products, bias) = (&products, &self.bias);
+            let products = &products;
             arch.dispatch(Outputs { products, block, stride, bias, then, width, out });
         }
-        [rows_read, points, products].into_iter().for_each(|buffer| buffers.give(buffer));
+        [read, points, products].into_iter().for_each(|buffer| buffers.give(buffer));
     }
 }

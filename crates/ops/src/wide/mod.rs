@@ -4,7 +4,7 @@
 //! Channels stand in groups of 16, one vector of the widest kind. So an image is at once the left factor of a matrix
 //! product as the kernel in `product` reads it, and every step between products works on whole vectors.
 
-mod convolution;
+pub(crate) mod convolution;
 mod image;
 mod pointwise;
 pub(crate) mod product;
