@@ -1,15 +1,16 @@
 //! Operators that Burn's CPU backends do slowly. Each is one function with two roads: kernels of our own on Burn's `flex`
-//! device where nothing is tracked for gradients, and plain tensor code on every other device and in training. Tests hold
-//! the two together.
+//! device, in training with gradients of their own, and plain tensor code on every other device. Tests hold them together.
 
 pub mod buffers;
 pub mod conv;
 mod gelu;
+pub mod layers;
 mod math;
 mod multiply;
 pub mod op;
 mod resize;
 mod rope;
+mod tracked;
 pub mod train;
 pub mod unet;
 pub mod wide;
@@ -44,6 +45,9 @@ pub fn is_trained_fast<const D: usize>(x: &Tensor<D>) -> bool {
 /// softmax(rope(q) · rope(k)ᵀ / √head_dim) · v, heads side by side in the channels: `q` `[B, N, C]`, `k` and `v`
 /// `[B, M, C]` → `[B, N, C]`; both sides share one grid, hence one table.
 pub fn rotary_attention(q: Tensor<3>, k: Tensor<3>, v: Tensor<3>, rope: &Rope, heads: usize) -> Tensor<3> {
+    if is_trained_fast(&q) {
+        return tracked::apart(q, k, v, rope, heads);
+    }
     if !is_fast(&q) {
         return plain_attention(q, k, v, rope, heads);
     }
@@ -53,6 +57,16 @@ pub fn rotary_attention(q: Tensor<3>, k: Tensor<3>, v: Tensor<3>, rope: &Rope, h
     let [q, k, v] = [q, k, v].map(host);
     let (out, _) = attention.forward(Tokens::apart([&q, &k, &v], c), [&cos, &sin], &Buffers::new());
     Tensor::from_data(TensorData::new(out, [b, n, c]), &device)
+}
+
+/// The same for queries, keys and values side by side in one tensor: `[B, N, 3·C]` → `[B, N, C]`.
+pub fn rotary_self_attention(qkv: Tensor<3>, rope: &Rope, heads: usize) -> Tensor<3> {
+    if is_trained_fast(&qkv) {
+        return tracked::together(qkv, rope, heads);
+    }
+    let c = qkv.dims()[2] / 3;
+    let part = |i: usize| qkv.clone().narrow(2, i * c, c);
+    rotary_attention(part(0), part(1), part(2), rope, heads)
 }
 
 fn plain_attention(q: Tensor<3>, k: Tensor<3>, v: Tensor<3>, rope: &Rope, heads: usize) -> Tensor<3> {
@@ -68,6 +82,9 @@ fn plain_attention(q: Tensor<3>, k: Tensor<3>, v: Tensor<3>, rope: &Rope, heads:
 
 /// GELU (erf form) of a linear layer: `[B, N, C]` → `[B, N, D]`.
 pub fn linear_gelu(layer: &Linear, x: Tensor<3>) -> Tensor<3> {
+    if is_trained_fast(&x) {
+        return layers::trained_linear_gelu(layer, x);
+    }
     if x.device().is_autodiff() {
         // The gradient of Burn's own operator is that of the approximation by tanh on all backends but flex: 4e-4 off.
         let x = layer.forward(x);
@@ -92,6 +109,9 @@ pub fn linear_gelu(layer: &Linear, x: Tensor<3>) -> Tensor<3> {
 pub fn bilinear(x: Tensor<4>, size: [usize; 2], align_corners: bool) -> Tensor<4> {
     let ([b, c, h, w], device) = (x.dims(), x.device());
     let [down, across] = [(h, size[0]), (w, size[1])].map(|(from, to)| resize::taps(from, to, align_corners));
+    if is_trained_fast(&x) {
+        return tracked::resized(x, down, across);
+    }
     if device.is_autodiff() {
         // Burn's own operator has no backward pass on GPUs; products with constant matrices have.
         let matrix = |taps: &[resize::Tap], from: usize| {

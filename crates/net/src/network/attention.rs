@@ -5,7 +5,8 @@ use burn::module::Module;
 use burn::nn::{Linear, LinearConfig};
 use burn::tensor::{Device, Tensor};
 
-use snapsnap_ops::{Rope, rotary_attention};
+use snapsnap_ops::layers::linear;
+use snapsnap_ops::{Rope, rotary_attention, rotary_self_attention};
 
 /// Self-attention; `qkv`'s output rows are all queries, all keys, all values.
 #[derive(Module, Debug)]
@@ -26,10 +27,7 @@ impl SelfAttention {
 
     /// `[B, N, dim]` → `[B, N, dim]`.
     pub(crate) fn forward(&self, x: Tensor<3>, rope: &Rope) -> Tensor<3> {
-        let dim = x.dims()[2];
-        let qkv = self.qkv.forward(x);
-        let part = |i: usize| qkv.clone().narrow(2, i * dim, dim);
-        self.proj.forward(rotary_attention(part(0), part(1), part(2), rope, self.heads))
+        linear(&self.proj, rotary_self_attention(linear(&self.qkv, x), rope, self.heads))
     }
 }
 
@@ -51,7 +49,7 @@ impl CrossAttention {
 
     /// Queries `x` `[B, N, dim]`, memory `y` `[B, M, dim]` → `[B, N, dim]`.
     pub(crate) fn forward(&self, x: Tensor<3>, y: Tensor<3>, rope: &Rope) -> Tensor<3> {
-        let (q, k, v) = (self.projq.forward(x), self.projk.forward(y.clone()), self.projv.forward(y));
-        self.proj.forward(rotary_attention(q, k, v, rope, self.heads))
+        let (q, k, v) = (linear(&self.projq, x), linear(&self.projk, y.clone()), linear(&self.projv, y));
+        linear(&self.proj, rotary_attention(q, k, v, rope, self.heads))
     }
 }

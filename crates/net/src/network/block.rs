@@ -5,6 +5,7 @@ use burn::nn::{LayerNorm, LayerNormConfig, Linear, LinearConfig};
 use burn::tensor::{Device, Tensor};
 
 use super::attention::{CrossAttention, SelfAttention};
+use snapsnap_ops::layers::{self, linear};
 use snapsnap_ops::{Rope, linear_gelu};
 
 /// Epsilon of every layer normalisation (SNAPSNAP §1.1).
@@ -12,6 +13,11 @@ const NORM_EPSILON: f64 = 1e-6;
 
 pub(crate) fn layer_norm(dim: usize, device: &Device) -> LayerNorm {
     LayerNormConfig::new(dim).with_epsilon(NORM_EPSILON).init(device)
+}
+
+/// Normalises tokens `[B, N, dim]`.
+pub(crate) fn normalise(norm: &LayerNorm, x: Tensor<3>) -> Tensor<3> {
+    layers::layer_norm(norm, NORM_EPSILON, x)
 }
 
 /// Linear → GELU (erf form) → Linear.
@@ -30,7 +36,7 @@ impl Mlp {
     }
 
     fn forward(&self, x: Tensor<3>) -> Tensor<3> {
-        self.fc2.forward(linear_gelu(&self.fc1, x))
+        linear(&self.fc2, linear_gelu(&self.fc1, x))
     }
 }
 
@@ -55,8 +61,8 @@ impl EncoderBlock {
 
     /// `[B, N, dim]` → `[B, N, dim]`.
     pub(crate) fn forward(&self, x: Tensor<3>, rope: &Rope) -> Tensor<3> {
-        let x = x.clone() + self.attn.forward(self.norm1.forward(x), rope);
-        x.clone() + self.mlp.forward(self.norm2.forward(x))
+        let x = x.clone() + self.attn.forward(normalise(&self.norm1, x), rope);
+        x.clone() + self.mlp.forward(normalise(&self.norm2, x))
     }
 }
 
@@ -87,8 +93,9 @@ impl DecoderBlock {
 
     /// `x`, `y` `[B, N, dim]` → `[B, N, dim]`.
     pub(crate) fn forward(&self, x: Tensor<3>, y: Tensor<3>, rope: &Rope) -> Tensor<3> {
-        let x = x.clone() + self.attn.forward(self.norm1.forward(x), rope);
-        let x = x.clone() + self.cross_attn.forward(self.norm2.forward(x), self.norm_y.forward(y), rope);
-        x.clone() + self.mlp.forward(self.norm3.forward(x))
+        let x = x.clone() + self.attn.forward(normalise(&self.norm1, x), rope);
+        let x =
+            x.clone() + self.cross_attn.forward(normalise(&self.norm2, x), normalise(&self.norm_y, y), rope);
+        x.clone() + self.mlp.forward(normalise(&self.norm3, x))
     }
 }

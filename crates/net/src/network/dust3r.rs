@@ -7,11 +7,12 @@ use burn::nn::conv::{Conv2d, Conv2dConfig};
 use burn::nn::{LayerNorm, Linear, LinearConfig, PaddingConfig2d};
 use burn::tensor::{Device, Tensor};
 
-use super::block::{DecoderBlock, EncoderBlock, layer_norm};
+use super::block::{DecoderBlock, EncoderBlock, layer_norm, normalise};
 use super::dpt::DptHead;
 use super::linear::LinearHead;
 use crate::config::{Fusion, HeadKind, NetworkConfig};
 use snapsnap_ops::Rope;
+use snapsnap_ops::layers::{linear, patches};
 
 /// One side of the person. The sides are named as seen in the front picture.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -127,9 +128,9 @@ impl Dust3r {
         let [_, _, h, w] = images.dims();
         let [rows, columns] = self.grid([h, w]);
         let rope = Rope::new(rows, columns, c.enc_dim / c.enc_heads, c.rope_base, &images.device());
-        let tokens = self.patch_embed.proj.forward(images).flatten::<3>(2, 3).swap_dims(1, 2);
+        let tokens = patches(&self.patch_embed.proj, images);
         let tokens = self.enc_blocks.iter().fold(tokens, |x, block| block.forward(x, &rope));
-        self.enc_norm.forward(tokens)
+        normalise(&self.enc_norm, tokens)
     }
 
     /// Encoder tokens of the two photographs `[B, N, enc_dim]` → all token maps of each.
@@ -138,8 +139,8 @@ impl Dust3r {
     pub fn decode(&self, front: Tensor<3>, back: Tensor<3>, [rows, columns]: [usize; 2]) -> [TokenMaps; 2] {
         let c = &self.config;
         let rope = Rope::new(rows, columns, c.dec_dim / c.dec_heads, c.rope_base, &front.device());
-        let mut x = self.decoder_embed.forward(front.clone());
-        let mut y = self.decoder_embed.forward(back.clone());
+        let mut x = linear(&self.decoder_embed, front.clone());
+        let mut y = linear(&self.decoder_embed, back.clone());
         let (mut front, mut back) = (vec![front], vec![back]);
         for (block, block2) in self.dec_blocks.iter().zip(&self.dec_blocks2) {
             (x, y) = (block.forward(x.clone(), y.clone(), &rope), block2.forward(y, x, &rope));
@@ -148,7 +149,7 @@ impl Dust3r {
         }
         for maps in [&mut front, &mut back] {
             let last = maps.pop().expect("never empty");
-            maps.push(self.dec_norm.forward(last));
+            maps.push(normalise(&self.dec_norm, last));
         }
         [front, back]
     }

@@ -3,6 +3,7 @@
 use burn::module::Module;
 use burn::nn::{Linear, LinearConfig};
 use burn::tensor::{Device, Tensor};
+use snapsnap_ops::layers::linear;
 
 /// Channels of a raw point map: x, y, z, confidence.
 const CHANNELS: usize = 4;
@@ -23,8 +24,7 @@ impl LinearHead {
     pub(crate) fn forward(&self, tokens: Tensor<3>, [rows, columns]: [usize; 2]) -> Tensor<4> {
         let [batch, _, _] = tokens.dims();
         let p = self.patch;
-        self.proj
-            .forward(tokens)
+        linear(&self.proj, tokens)
             .reshape([batch, rows, columns, CHANNELS, p, p])
             .permute([0, 3, 1, 4, 2, 5])
             .reshape([batch, CHANNELS, rows * p, columns * p])

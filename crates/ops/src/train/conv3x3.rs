@@ -10,7 +10,7 @@ use rayon::prelude::*;
 
 use super::elements::channel_sums;
 use super::planes::{Planes, Scatter, Transposer};
-use super::{Gradients, Wanted};
+use super::{Gradients, Unfolded, Wanted};
 use crate::wide::convolution::{Bands, Weights};
 use crate::wide::transforms::{POINTS, TILE, Then};
 use crate::wide::{Buffers, GROUP, pieces};
@@ -18,6 +18,11 @@ use crate::wide::{Buffers, GROUP, pieces};
 /// Floats that a block's transformed inputs and products take together: 1 MiB, of which a core's second-level cache
 /// holds most.
 const BLOCK_FLOATS: usize = 256 * 1024;
+
+/// Pixels of all images up to which the weight's gradient is summed tap by tap. Where a channel lives in a few pixels only,
+/// some taps see nothing of it. Winograd's method leaves the others' rounding there instead of 0, and AdamW takes that for
+/// a direction to go.
+const FEW_PIXELS: usize = 1024;
 
 /// Sizes of a convolution, and whether it reads max(x, 0) instead of its input x.
 #[derive(Debug, Clone, Copy)]
@@ -57,7 +62,12 @@ impl Conv3x3 {
             let back = Self { inputs: self.outputs, outputs: self.inputs, ..*self };
             back.run(dy, false, filters, None, self.rectified.then_some(x), buffers)
         });
-        if wanted.weight {
+        if wanted.weight && self.batch * self.height * self.width <= FEW_PIXELS {
+            let Self { batch, inputs, outputs, height, width, rectified } = *self;
+            let direct = Unfolded { batch, inputs, outputs, height, width, stride: 1, rectified };
+            let gradients = direct.backward(x, weight, dy, Wanted { input: false, ..wanted }, buffers);
+            Gradients { input, ..gradients }
+        } else if wanted.weight {
             // The bias's gradient is a by-product.
             let [weight, bias] = self.weight_gradient(x, dy, buffers);
             Gradients { input, weight: Some(weight), bias: wanted.bias.then_some(bias) }

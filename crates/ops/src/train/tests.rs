@@ -84,6 +84,7 @@ fn convolutions_of_three_taps_equal_plain_loops() {
         [3, 33, 17, 1, 21],
         [1, 3, 2, 5, 700],
         [2, 20, 40, 18, 33],
+        [3, 5, 18, 19, 21],
     ];
     for ([batch, inputs, outputs, height, width], stride) in
         sizes.into_iter().flat_map(|size| [1, 2].map(|stride| (size, stride)))
@@ -110,6 +111,19 @@ fn convolutions_of_three_taps_equal_plain_loops() {
             check_layer(&what, [&x, &weight, &bias], plain, &result, &dy, &gradients);
         }
     }
+}
+
+/// A channel that lives in one corner: eight taps see it nowhere beside an output's gradient.
+#[test]
+fn taps_that_see_nothing_have_no_gradient() {
+    let conv = Conv3x3 { batch: 1, inputs: 1, outputs: 1, height: 32, width: 32, rectified: true };
+    let mut x = vec![-1.0; 1024];
+    x[0] = 0.7;
+    let mut dy = vec![0.0; 1024];
+    dy[0] = 0.3;
+    let gradients = conv.backward(&x, &[0.1; 9], &dy, Wanted::ALL, &Buffers::default());
+    let expected: Vec<f32> = (0..9).map(|tap| if tap == 4 { 0.7 * 0.3 } else { 0.0 }).collect();
+    assert_eq!(gradients.weight, Some(expected));
 }
 
 #[test]

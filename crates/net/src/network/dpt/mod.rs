@@ -12,10 +12,10 @@ mod tests;
 use burn::module::Module;
 use burn::nn::PaddingConfig2d::{Explicit, Valid};
 use burn::nn::conv::{Conv2d, Conv2dConfig, ConvTranspose2d, ConvTranspose2dConfig};
-use burn::tensor::activation::relu;
 use burn::tensor::{Device, Tensor};
 
 use crate::config::NetworkConfig;
+use snapsnap_ops::layers::{conv2d, enlarge};
 use snapsnap_ops::{bilinear, is_fast};
 
 fn conv3x3(from: usize, to: usize, stride: usize, bias: bool, device: &Device) -> Conv2d {
@@ -45,7 +45,7 @@ impl Enlarge {
     }
 
     fn forward(&self, x: Tensor<4>) -> Tensor<4> {
-        self.at_1.forward(self.at_0.forward(x))
+        enlarge(&self.at_1, conv2d(&self.at_0, x, false))
     }
 }
 
@@ -85,8 +85,8 @@ impl ResidualConvUnit {
     }
 
     fn forward(&self, x: Tensor<4>) -> Tensor<4> {
-        let h = self.conv1.forward(relu(x.clone()));
-        x + self.conv2.forward(relu(h))
+        let h = conv2d(&self.conv1, x.clone(), true);
+        x + conv2d(&self.conv2, h, true)
     }
 }
 
@@ -120,7 +120,7 @@ impl Fusion {
         let [_, _, h, w] = sum.dims();
         // The published order is enlarge, then 1×1 convolution; the two commute (the interpolation weights of a pixel
         // sum to one), and this way round the convolution does a quarter of the work.
-        bilinear(self.out_conv.forward(sum), [2 * h, 2 * w], true)
+        bilinear(conv2d(&self.out_conv, sum, false), [2 * h, 2 * w], true)
     }
 }
 
@@ -190,22 +190,23 @@ impl DptHead {
         if is_fast(&tokens[0]) { fused::forward(self, tokens, grid) } else { self.compose(tokens, grid) }
     }
 
-    /// The same of Burn's operators, on every device and in training.
+    /// The same layer by layer, on every device and in training.
     fn compose(&self, tokens: [Tensor<3>; 4], [rows, columns]: [usize; 2]) -> Tensor<4> {
         let [m0, m1, m2, m3] = tokens.map(|x| {
             let [b, _, c] = x.dims();
             x.swap_dims(1, 2).reshape([b, c, rows, columns])
         });
         let (branches, s) = (&self.act_postprocess, &self.scratch);
-        let l3 = branches.at_3.at_1.forward(branches.at_3.at_0.forward(m3));
-        let path = s.refinenet4.forward(s.layer4_rn.forward(l3), None);
-        let l2 = s.layer3_rn.forward(branches.at_2.at_0.forward(m2));
+        let conv = |layer: &Conv2d, x| conv2d(layer, x, false);
+        let l3 = conv(&branches.at_3.at_1, conv(&branches.at_3.at_0, m3));
+        let path = s.refinenet4.forward(conv(&s.layer4_rn, l3), None);
+        let l2 = conv(&s.layer3_rn, conv(&branches.at_2.at_0, m2));
         let path = s.refinenet3.forward(path, Some(l2));
-        let path = s.refinenet2.forward(path, Some(s.layer2_rn.forward(branches.at_1.forward(m1))));
-        let path = s.refinenet1.forward(path, Some(s.layer1_rn.forward(branches.at_0.forward(m0))));
-        let x = self.head.at_0.forward(path);
+        let path = s.refinenet2.forward(path, Some(conv(&s.layer2_rn, branches.at_1.forward(m1))));
+        let path = s.refinenet1.forward(path, Some(conv(&s.layer1_rn, branches.at_0.forward(m0))));
+        let x = conv(&self.head.at_0, path);
         let [_, _, h, w] = x.dims();
-        let x = self.head.at_2.forward(bilinear(x, [2 * h, 2 * w], true));
-        self.head.at_4.forward(relu(x))
+        let x = conv(&self.head.at_2, bilinear(x, [2 * h, 2 * w], true));
+        conv2d(&self.head.at_4, x, true)
     }
 }

@@ -1,0 +1,216 @@
+//! Layers of the networks as functions of Burn's modules: kernels with gradients of their own on `flex` in training, Burn's
+//! operators everywhere else.
+
+use burn::module::Param;
+use burn::nn;
+use burn::nn::conv::{Conv2d, ConvTranspose2d};
+use burn::tensor::Tensor;
+use burn::tensor::activation::relu;
+
+use crate::buffers::Buffers;
+use crate::is_trained_fast;
+use crate::op::{self, Kept, Kernel};
+use crate::train::{
+    Conv1x1, Conv3x3, Enlarge, Gradients, LayerNorm, Linear, Patches, Statistics, Unfolded, Wanted,
+};
+
+/// What one step needed, the next one needs again.
+pub(crate) static BUFFERS: Buffers = Buffers::new();
+
+/// `[B, N, inputs]` → `[B, N, outputs]`.
+pub fn linear(layer: &nn::Linear, x: Tensor<3>) -> Tensor<3> {
+    if !is_trained_fast(&x) {
+        return layer.forward(x);
+    }
+    let (sizes, shape) = linear_sizes(layer, &x);
+    run(sizes, shape, x, layer.weight.val(), layer.bias.as_ref())
+}
+
+/// GELU (erf form) of a linear layer, in training on `flex`.
+pub(crate) fn trained_linear_gelu(layer: &nn::Linear, x: Tensor<3>) -> Tensor<3> {
+    let (sizes, shape) = linear_sizes(layer, &x);
+    run(Gelu(sizes), shape, x, layer.weight.val(), layer.bias.as_ref())
+}
+
+fn linear_sizes(layer: &nn::Linear, x: &Tensor<3>) -> (Linear, [usize; 3]) {
+    let ([b, n, _], [inputs, outputs]) = (x.dims(), layer.weight.dims());
+    (Linear { rows: b * n, inputs, outputs, transposed: false }, [b, n, outputs])
+}
+
+/// Layer normalisation of tokens `[B, N, C]`. `epsilon` is what the layer was made with, which it does not tell.
+pub fn layer_norm(layer: &nn::LayerNorm, epsilon: f64, x: Tensor<3>) -> Tensor<3> {
+    let Some(bias) = layer.beta.as_ref().filter(|_| is_trained_fast(&x)) else {
+        return layer.forward(x);
+    };
+    let (weight, shape) = (layer.gamma.val(), x.dims());
+    let sizes = LayerNorm { channels: shape[2], epsilon: epsilon as f32 };
+    run(sizes, shape, x, weight, Some(bias))
+}
+
+/// A convolution of images `[B, C, H, W]`, or, where `rectified`, of max(x, 0).
+pub fn conv2d(layer: &Conv2d, x: Tensor<4>, rectified: bool) -> Tensor<4> {
+    let ([batch, inputs, height, width], [outputs, _, rows, columns]) = (x.dims(), layer.weight.dims());
+    let (weight, bias) = (layer.weight.val(), layer.bias.as_ref());
+    let plain = layer.groups == 1 && layer.dilation == [1, 1] && is_trained_fast(&x);
+    match (plain, [rows, columns], layer.stride) {
+        (true, [3, 3], [1, 1]) => {
+            let sizes = Conv3x3 { batch, inputs, outputs, height, width, rectified };
+            run(sizes, [batch, outputs, height, width], x, weight, bias)
+        }
+        (true, [3, 3], [2, 2]) => {
+            let sizes = Unfolded { batch, inputs, outputs, height, width, stride: 2, rectified };
+            run(sizes, [batch, outputs, height.div_ceil(2), width.div_ceil(2)], x, weight, bias)
+        }
+        (true, [1, 1], [1, 1]) => {
+            let sizes = Conv1x1 { batch, inputs, outputs, pixels: height * width, rectified };
+            run(sizes, [batch, outputs, height, width], x, weight, bias)
+        }
+        _ => layer.forward(if rectified { relu(x) } else { x }),
+    }
+}
+
+/// A transposed convolution whose kernel is as large as its stride: `[B, C, H, W]` → `[B, D, stride·H, stride·W]`.
+pub fn enlarge(layer: &ConvTranspose2d, x: Tensor<4>) -> Tensor<4> {
+    if !is_trained_fast(&x) {
+        return layer.forward(x);
+    }
+    let ([batch, inputs, height, width], [_, outputs, stride, _]) = (x.dims(), layer.weight.dims());
+    assert_eq!(layer.stride, [stride; 2], "the kernel is as large as the stride");
+    let sizes = Enlarge { batch, inputs, outputs, height, width, stride };
+    run(sizes, [batch, outputs, stride * height, stride * width], x, layer.weight.val(), layer.bias.as_ref())
+}
+
+/// A convolution whose kernel is as large as its stride, from images `[B, C, H, W]` to tokens
+/// `[B, H/side · W/side, D]`, row-major.
+pub fn patches(layer: &Conv2d, x: Tensor<4>) -> Tensor<3> {
+    if !is_trained_fast(&x) {
+        return layer.forward(x).flatten::<3>(2, 3).swap_dims(1, 2);
+    }
+    let ([batch, inputs, height, width], [outputs, _, side, _]) = (x.dims(), layer.weight.dims());
+    assert_eq!(layer.stride, [side; 2], "the kernel is as large as the stride");
+    let sizes = Patches { batch, inputs, outputs, height, width, side };
+    let shape = [batch, height / side * (width / side), outputs];
+    run(sizes, shape, x, layer.weight.val(), layer.bias.as_ref())
+}
+
+/// A function of an input, a weight and perhaps a bias, with its gradients.
+trait Layer: std::fmt::Debug + Send + Sync + 'static {
+    /// What the backward pass needs beside the input and the weight.
+    type Kept: Send + 'static;
+
+    fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>) -> (Vec<f32>, Self::Kept);
+
+    fn backward(&self, x: &[f32], weight: &[f32], kept: Self::Kept, dy: &[f32], wanted: Wanted) -> Gradients;
+}
+
+macro_rules! keeps_nothing {
+    ($($layer:ty),+) => {
+        $(impl Layer for $layer {
+            type Kept = ();
+
+            fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>) -> (Vec<f32>, ()) {
+                (<$layer>::forward(self, x, weight, bias, &BUFFERS), ())
+            }
+
+            fn backward(&self, x: &[f32], weight: &[f32], (): (), dy: &[f32], wanted: Wanted) -> Gradients {
+                <$layer>::backward(self, x, weight, dy, wanted, &BUFFERS)
+            }
+        })+
+    };
+}
+
+keeps_nothing!(Conv1x1, Conv3x3, Enlarge, Patches, Unfolded);
+
+impl Layer for Linear {
+    type Kept = ();
+
+    fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>) -> (Vec<f32>, ()) {
+        (Self::forward(self, x, weight, bias, &BUFFERS), ())
+    }
+
+    fn backward(&self, x: &[f32], weight: &[f32], (): (), dy: &[f32], wanted: Wanted) -> Gradients {
+        Self::backward(self, x, weight, None, dy, wanted, &BUFFERS)
+    }
+}
+
+/// A linear layer with GELU behind it.
+#[derive(Debug)]
+struct Gelu(Linear);
+
+impl Layer for Gelu {
+    type Kept = Vec<f32>;
+
+    fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>) -> (Vec<f32>, Vec<f32>) {
+        let [out, before] = self.0.forward_gelu(x, weight, bias, &BUFFERS);
+        (out, before)
+    }
+
+    fn backward(&self, x: &[f32], weight: &[f32], before: Vec<f32>, dy: &[f32], wanted: Wanted) -> Gradients {
+        let gradients = self.0.backward(x, weight, Some(&before), dy, wanted, &BUFFERS);
+        BUFFERS.give(before);
+        gradients
+    }
+}
+
+impl Layer for LayerNorm {
+    type Kept = Vec<Statistics>;
+
+    fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>) -> (Vec<f32>, Vec<Statistics>) {
+        Self::forward(self, x, weight, bias.expect("the published norms have biases"), &BUFFERS)
+    }
+
+    fn backward(
+        &self,
+        x: &[f32],
+        weight: &[f32],
+        statistics: Vec<Statistics>,
+        dy: &[f32],
+        wanted: Wanted,
+    ) -> Gradients {
+        Self::backward(self, x, weight, &statistics, dy, wanted, &BUFFERS)
+    }
+}
+
+/// A layer as an operator.
+#[derive(Debug)]
+struct Operator<L> {
+    layer: L,
+    shape: Vec<usize>,
+    has_bias: bool,
+}
+
+impl<L: Layer> Kernel for Operator<L> {
+    fn shape(&self) -> Vec<usize> {
+        self.shape.clone()
+    }
+
+    fn forward(&self, [x, weight, bias]: [&[f32]; 3], keep: bool) -> (Vec<f32>, Kept) {
+        let (out, kept) = self.layer.forward(x, weight, self.has_bias.then_some(bias));
+        let kept: Kept = if keep { Some(Box::new(kept)) } else { None };
+        (out, kept)
+    }
+
+    fn backward(
+        &self,
+        [x, weight, _]: [&[f32]; 3],
+        kept: Kept,
+        upstream: &[f32],
+        [of_input, of_weight, of_bias]: [bool; 3],
+    ) -> [Option<Vec<f32>>; 3] {
+        let kept = kept.and_then(|kept| kept.downcast::<L::Kept>().ok()).expect("kept by the forward pass");
+        let wanted = Wanted { input: of_input, weight: of_weight, bias: of_bias && self.has_bias };
+        let gradients = self.layer.backward(x, weight, *kept, upstream, wanted);
+        [gradients.input, gradients.weight, gradients.bias]
+    }
+}
+
+fn run<const A: usize, const W: usize, const D: usize>(
+    layer: impl Layer,
+    shape: [usize; D],
+    x: Tensor<A>,
+    weight: Tensor<W>,
+    bias: Option<&Param<Tensor<1>>>,
+) -> Tensor<D> {
+    let operator = Operator { layer, shape: shape.to_vec(), has_bias: bias.is_some() };
+    op::run(operator, x, Some(weight), bias.map(Param::val))
+}

@@ -1,0 +1,84 @@
+//! A training step, forward and backward, of the small predictor (`configs/small`, 256², batch 2) and of the regressor
+//! (two views of 256²): `cargo bench --workspace --bench step`. `docs/step_pytorch.py` runs PyTorch's beside it.
+//!
+//! Arguments: seconds per measurement (20), side (256), batch (2).
+
+use std::hint::black_box;
+use std::time::{Duration, Instant};
+
+use burn::optim::GradientsParams;
+use burn::tensor::{Device, Distribution, Tensor};
+use snapsnap_net::config::Config;
+use snapsnap_net::network::View;
+use snapsnap_net::regressor::Statistics;
+use snapsnap_net::weights::{WeightFile, init};
+
+#[global_allocator]
+static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
+
+/// Forward and backward, the fastest of all repetitions.
+fn measure(seconds: f64, mut step: impl FnMut() -> (Duration, Duration)) -> String {
+    step();
+    let end = Instant::now() + Duration::from_secs_f64(seconds);
+    let (mut best, mut count) = ((Duration::MAX, Duration::ZERO), 0);
+    while Instant::now() < end || count < 3 {
+        let times = step();
+        count += 1;
+        if times.0 + times.1 < best.0.saturating_add(best.1) {
+            best = times;
+        }
+    }
+    let ms = |time: Duration| time.as_secs_f64() * 1e3;
+    format!(
+        "forward {:.0} + backward {:.0} = {:.0} ms, {count} runs",
+        ms(best.0),
+        ms(best.1),
+        ms(best.0 + best.1)
+    )
+}
+
+fn main() {
+    let arguments: Vec<f64> = std::env::args().filter_map(|argument| argument.parse().ok()).collect();
+    let argument = |i: usize, default: f64| arguments.get(i).copied().unwrap_or(default);
+    let (seconds, side, batch) = (argument(0, 20.0), argument(1, 256.0) as usize, argument(2, 2.0) as usize);
+    // On one of rayon's own threads: a caller from outside hands every operator over and waits.
+    rayon::scope(|_| run(seconds, side, batch));
+}
+
+fn run(seconds: f64, side: usize, batch: usize) {
+    let device = Device::flex().autodiff();
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("weights.safetensors");
+    let text = include_str!("../../../configs/small/network.toml");
+    let config = Config::from_toml(text, "configs/small/network.toml", &[]).expect("a config");
+    init(&config, 1, &path, &|_, _| ()).expect("writes");
+    let weights = WeightFile::open(&path, None).expect("opens");
+    let predictor = weights.point_predictor(&device).expect("loads");
+    let regressor = weights.regressors(&device).expect("loads").remove(0);
+    let threads = rayon::current_num_threads();
+
+    let images = Tensor::<4>::random([2 * batch, 3, side, side], Distribution::Uniform(-1.0, 1.0), &device);
+    let net = &predictor.dust3r;
+    let grid = net.grid([side, side]);
+    let time = measure(seconds, || {
+        let start = Instant::now();
+        let tokens = net.encode(images.clone());
+        let maps = net.decode(tokens.clone().narrow(0, 0, batch), tokens.narrow(0, batch, batch), grid);
+        let raw = View::ALL.map(|view| net.raw_points(view, &maps, grid).square().mean());
+        let loss = Tensor::cat(raw.to_vec(), 0).sum();
+        let forward = start.elapsed();
+        black_box(GradientsParams::from_grads(loss.backward(), &predictor));
+        (forward, start.elapsed() - forward)
+    });
+    println!("predictor, batch {batch}, {side}², {threads} threads: {time}");
+
+    let input = Tensor::<4>::random([2, 6, side, side], Distribution::Uniform(-1.0, 1.0), &device);
+    let time = measure(seconds, || {
+        let start = Instant::now();
+        let loss = regressor.forward(input.clone(), &mut Statistics::measured()).square().mean();
+        let forward = start.elapsed();
+        black_box(GradientsParams::from_grads(loss.backward(), &regressor));
+        (forward, start.elapsed() - forward)
+    });
+    println!("regressor, 2×{side}², {threads} threads: {time}");
+}
