@@ -9,6 +9,7 @@ use snapsnap_mesh::FileError;
 use snapsnap_net::config::ConfigError;
 use snapsnap_net::weights::WeightsError;
 use snapsnap_splat::SplatError;
+use snapsnap_train::TrainError;
 
 /// A failed command.
 #[derive(Debug)]
@@ -57,6 +58,16 @@ impl From<SplatError> for Failure {
     fn from(e: SplatError) -> Self {
         match e {
             SplatError::Shape { .. } | SplatError::NotFinite { .. } => Self::Internal(e.to_string()),
+            _ => Self::Input(e.to_string()),
+        }
+    }
+}
+
+impl From<TrainError> for Failure {
+    fn from(e: TrainError) -> Self {
+        match e {
+            TrainError::Splat(e) => e.into(),
+            TrainError::Stuck { .. } => Self::Internal(e.to_string()),
             _ => Self::Input(e.to_string()),
         }
     }

@@ -4,6 +4,7 @@ mod commands;
 mod device;
 mod dump;
 mod failure;
+mod interrupt;
 mod memory;
 mod output;
 mod pictures;
@@ -40,6 +41,9 @@ enum Command {
     Render(commands::render::Arguments),
     /// Make or check a data set of people to train on.
     Prepare(commands::prepare::Arguments),
+    /// Train the point predictor.
+    #[command(name = "train-stage1")]
+    TrainStage1(commands::train::Arguments),
     /// Read checkpoints of Snap-Snap, DUSt3R or CroCo and write one weight file.
     ImportWeights(commands::import_weights::Arguments),
     /// Write random weights for a config.
@@ -56,14 +60,7 @@ fn main() -> ExitCode {
             hook(panic);
         }
     }));
-    // Ctrl-C: 130 as shells expect, and no temporary file stays behind.
-    let handler = ctrlc::set_handler(|| {
-        snapsnap_splat::file::remove_unfinished();
-        std::process::exit(130);
-    });
-    if let Err(e) = handler {
-        say::err(&format!("warning: Ctrl-C will not clean up temporary files: {e}"));
-    }
+    interrupt::listen();
     let Arguments { quiet, command } = match Arguments::try_parse() {
         Ok(arguments) => arguments,
         // clap prints usage errors and help itself, with exit codes 2 and 0, but arguments as they are.
@@ -81,6 +78,7 @@ fn main() -> ExitCode {
         Command::Reconstruct(arguments) => commands::reconstruct::run(&arguments, quiet),
         Command::Render(arguments) => commands::render::run(&arguments, quiet),
         Command::Prepare(arguments) => commands::prepare::run(&arguments, quiet),
+        Command::TrainStage1(arguments) => commands::train::stage1(&arguments, quiet),
         Command::ImportWeights(arguments) => commands::import_weights::run(&arguments, quiet),
         Command::InitWeights(arguments) => commands::init_weights::run(&arguments, quiet),
         Command::ExportWeights(arguments) => commands::export_weights::run(&arguments, quiet),

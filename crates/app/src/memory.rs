@@ -33,6 +33,22 @@ fn there() -> u64 {
     total.min(group).min(address_space().unwrap_or(u64::MAX))
 }
 
+/// Bytes that this process has at the moment, where the system tells.
+pub fn used() -> Option<u64> {
+    status("VmRSS")
+}
+
+/// Bytes that this process had at most, where the system tells.
+pub fn most_used() -> Option<u64> {
+    status("VmHWM")
+}
+
+fn status(key: &str) -> Option<u64> {
+    let status = fs::read_to_string("/proc/self/status").ok()?;
+    let line = status.lines().find_map(|line| line.strip_prefix(key)?.strip_prefix(':'))?;
+    Some(line.split_whitespace().next()?.parse::<u64>().ok()? * 1024)
+}
+
 /// The limit that `ulimit -v` sets, in bytes.
 fn address_space() -> Option<u64> {
     let limits = fs::read_to_string("/proc/self/limits").ok()?;

@@ -352,7 +352,11 @@ impl Config {
         self.mode.person_height.unwrap_or(if self.mode.compat { 700 } else { 739 })
     }
 
-    fn checked(self, origin: &str) -> Result<Self, ConfigError> {
+    /// The config itself, if all its values make sense; `origin` names it in errors.
+    ///
+    /// # Errors
+    /// [`ConfigError::Value`].
+    pub fn checked(self, origin: &str) -> Result<Self, ConfigError> {
         match self.problem() {
             Some((key, message)) => Err(ConfigError::Value { origin: origin.to_owned(), key, message }),
             None => Ok(self),

@@ -1,7 +1,22 @@
 //! Training: stage 1 (points) and stage 2 (Gaussians), their losses, optimisers and schedules.
 
+mod checkpoint;
+pub mod config;
+mod curves;
+mod ema;
+mod error;
+mod events;
 pub mod gradients;
+mod learner;
+pub mod log;
+pub mod networks;
 pub mod optimizer;
 pub mod photometric;
 pub mod points;
+mod preview;
+pub mod run;
 pub mod schedule;
+pub mod stage1;
+pub mod task;
+
+pub use error::TrainError;

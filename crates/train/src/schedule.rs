@@ -4,14 +4,14 @@ use std::f64::consts::PI;
 
 use serde::{Deserialize, Serialize};
 
-/// A schedule as a share of the highest rate, for steps from 0 to one below [`Schedule::steps`].
+/// A schedule as a share of the highest rate: the section `[schedule]`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
 pub enum Schedule {
     /// PyTorch's `OneCycleLR` with cosine annealing, as the published code trains (SNAPSNAP §6).
     OneCycle {
-        /// Steps of the cycle.
-        steps: usize,
+        /// Steps that the cycle is longer than the run.
+        overhang: usize,
         /// Share of the steps that rise.
         rise: f64,
         /// The highest rate over the first.
@@ -21,8 +21,6 @@ pub enum Schedule {
     },
     /// A linear rise, then half a cosine.
     Cosine {
-        /// All steps.
-        steps: usize,
         /// Steps that rise.
         warm_up: usize,
         /// The last rate over the highest.
@@ -31,21 +29,37 @@ pub enum Schedule {
 }
 
 impl Schedule {
-    /// All steps.
-    pub fn steps(&self) -> usize {
-        match self {
-            Self::OneCycle { steps, .. } | Self::Cosine { steps, .. } => *steps,
+    /// That of the published code.
+    pub fn published() -> Self {
+        Self::OneCycle { overhang: 100, rise: 0.01, start_divisor: 25.0, end_divisor: 1e4 }
+    }
+
+    /// The first key that makes no sense, and why.
+    pub fn problem(&self) -> Option<(&'static str, String)> {
+        let range = |key, value: f64, least: f64, most: f64| {
+            let wrong = !(least..=most).contains(&value);
+            wrong.then(|| (key, format!("is {value}, must be {least} to {most}")))
+        };
+        match *self {
+            Self::OneCycle { rise, start_divisor, end_divisor, .. } => range("rise", rise, 0.0, 1.0)
+                .or_else(|| range("start_divisor", start_divisor, 1.0, 1e12))
+                .or_else(|| range("end_divisor", end_divisor, 1.0, 1e12)),
+            Self::Cosine { end, .. } => range("end", end, 0.0, 1.0),
         }
     }
 
-    /// Share of the highest rate at a step; beyond the last step the last share.
-    pub fn share(&self, step: usize) -> f64 {
+    /// Share of the highest rate at a step of a run of `steps`; beyond the last step the last share.
+    pub fn share(&self, step: usize, steps: usize) -> f64 {
         let anneal = |from: f64, to: f64, progress: f64| {
             to + (from - to) / 2.0 * (1.0 + (PI * progress.clamp(0.0, 1.0)).cos())
         };
-        let at = step.min(self.steps().saturating_sub(1)) as f64;
+        let steps = match self {
+            Self::OneCycle { overhang, .. } => steps + overhang,
+            Self::Cosine { .. } => steps,
+        };
+        let at = step.min(steps.saturating_sub(1)) as f64;
         match *self {
-            Self::OneCycle { steps, rise, start_divisor, end_divisor } => {
+            Self::OneCycle { rise, start_divisor, end_divisor, .. } => {
                 let start = 1.0 / start_divisor;
                 let peak = rise * steps as f64 - 1.0;
                 if at < peak {
@@ -55,7 +69,7 @@ impl Schedule {
                 anneal(1.0, start / end_divisor, (at - peak) / fall)
             }
             Self::Cosine { warm_up, .. } if at < warm_up as f64 => (at + 1.0) / (warm_up as f64 + 1.0),
-            Self::Cosine { steps, warm_up, end } => {
+            Self::Cosine { warm_up, end } => {
                 let fall = (steps.saturating_sub(1).saturating_sub(warm_up)).max(1) as f64;
                 anneal(1.0, end, (at - warm_up as f64) / fall)
             }
@@ -70,23 +84,26 @@ mod tests {
     /// Of the published run: 4e-6, 1e-4 at step 1000, 4e-10 (SNAPSNAP §6).
     #[test]
     fn one_cycle_is_the_published_one() {
-        let schedule =
-            Schedule::OneCycle { steps: 100_100, rise: 0.01, start_divisor: 25.0, end_divisor: 1e4 };
-        let rate = |step| 1e-4 * schedule.share(step);
+        let schedule = Schedule::published();
+        let rate = |step| 1e-4 * schedule.share(step, 100_000);
         assert!((rate(0) - 4e-6).abs() < 1e-12);
         assert!((rate(1000) - 1e-4).abs() < 1e-12);
         assert!((rate(100_099) - 4e-10).abs() < 1e-14 && (rate(200_000) - 4e-10).abs() < 1e-14);
-        let short = Schedule::OneCycle { steps: 100, rise: 0.01, start_divisor: 25.0, end_divisor: 1e4 };
-        assert!((0..100).all(|step| short.share(step).is_finite()) && (short.share(0) - 1.0).abs() < 1e-12);
+        let short = |step| {
+            let schedule =
+                Schedule::OneCycle { overhang: 0, rise: 0.01, start_divisor: 25.0, end_divisor: 1e4 };
+            schedule.share(step, 100)
+        };
+        assert!((0..100).all(|step| short(step).is_finite()) && (short(0) - 1.0).abs() < 1e-12);
         assert!(rate(500) > rate(400) && rate(50_000) > rate(60_000));
     }
 
     #[test]
     fn cosine_rises_and_ends_where_it_should() {
-        let schedule = Schedule::Cosine { steps: 1000, warm_up: 99, end: 1e-3 };
-        assert!((schedule.share(0) - 0.01).abs() < 1e-12 && (schedule.share(98) - 0.99).abs() < 1e-12);
-        assert!((schedule.share(99) - 1.0).abs() < 1e-12 && (schedule.share(999) - 1e-3).abs() < 1e-12);
-        let short = Schedule::Cosine { steps: 1, warm_up: 0, end: 0.1 };
-        assert!(short.share(0).is_finite() && short.share(7).is_finite());
+        let share = |step| Schedule::Cosine { warm_up: 99, end: 1e-3 }.share(step, 1000);
+        assert!((share(0) - 0.01).abs() < 1e-12 && (share(98) - 0.99).abs() < 1e-12);
+        assert!((share(99) - 1.0).abs() < 1e-12 && (share(999) - 1e-3).abs() < 1e-12);
+        let short = |step| Schedule::Cosine { warm_up: 0, end: 0.1 }.share(step, 1);
+        assert!(short(0).is_finite() && short(7).is_finite());
     }
 }

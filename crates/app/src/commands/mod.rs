@@ -6,6 +6,7 @@ pub mod init_weights;
 pub mod prepare;
 pub mod reconstruct;
 pub mod render;
+pub mod train;
 
 use std::path::{Path, PathBuf};
 

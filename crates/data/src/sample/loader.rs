@@ -121,7 +121,8 @@ impl Turns {
 
 type Made<O> = Result<O, DatasetError>;
 
-struct Iter<O> {
+/// Batches of one pass, in their order.
+pub struct Batches<O> {
     turns: Arc<Turns>,
     made: Receiver<(usize, Made<O>)>,
     /// Made before their turn.
@@ -133,12 +134,14 @@ struct Iter<O> {
 }
 
 impl<I: Send + Sync + 'static, O: Send + 'static> Loader<I, O> {
-    fn start(&self) -> Iter<O> {
+    /// The next pass without its first `skipped` batches, as a training that goes on needs it.
+    pub fn batches(&self, skipped: usize) -> Batches<O> {
         let mut order: Vec<usize> = self.range.clone().collect();
         if let Some(seed) = self.shuffle {
             let pass = self.passes.fetch_add(1, Ordering::Relaxed);
             order.shuffle(&mut stream(&format!("order/{seed}/{pass}")));
         }
+        order.drain(..(skipped * self.batch).min(order.len()));
         let order = Arc::new(order);
         let turns = Arc::new(Turns::default());
         let (sender, made) = channel();
@@ -153,7 +156,7 @@ impl<I: Send + Sync + 'static, O: Send + 'static> Loader<I, O> {
             })
             .collect();
         let items = order.len();
-        Iter { turns, made, early: BTreeMap::new(), workers, batch: self.batch, items, taken: 0 }
+        Batches { turns, made, early: BTreeMap::new(), workers, batch: self.batch, items, taken: 0 }
     }
 }
 
@@ -180,7 +183,7 @@ fn work<I, O>(
     }
 }
 
-impl<O> Iterator for Iter<O> {
+impl<O> Iterator for Batches<O> {
     type Item = Made<O>;
 
     fn next(&mut self) -> Option<Made<O>> {
@@ -201,13 +204,13 @@ impl<O> Iterator for Iter<O> {
     }
 }
 
-impl<O> DataLoaderIterator<O> for Iter<O> {
+impl<O> DataLoaderIterator<O> for Batches<O> {
     fn progress(&self) -> Progress {
         Progress::new((self.taken * self.batch).min(self.items), self.items, Some("items".to_owned()))
     }
 }
 
-impl<O> Drop for Iter<O> {
+impl<O> Drop for Batches<O> {
     fn drop(&mut self) {
         self.turns.lock().stop = true;
         self.turns.moved.notify_all();
@@ -220,7 +223,7 @@ impl<O> Drop for Iter<O> {
 
 impl<I: Send + Sync + 'static, O: Send + 'static> DataLoader<O> for Loader<I, O> {
     fn iter<'a>(&'a self) -> Box<dyn DataLoaderIterator<O> + 'a> {
-        Box::new(self.start())
+        Box::new(self.batches(0))
     }
 
     fn num_items(&self) -> usize {
@@ -314,6 +317,11 @@ mod tests {
         let [first, second] = shuffled(1);
         let later = loader(50, 2, None).0.shuffled(7).from_pass(1);
         assert_eq!(order(&later), second);
+        // In the middle of a pass, too.
+        let rest = loader(50, 3, None).0.shuffled(7).from_pass(1).batches(5);
+        let rest: Vec<usize> = rest.flat_map(|batch| batch.expect("whole")).map(|held| held.0).collect();
+        assert_eq!(rest, second[20..]);
+        assert_eq!(loader(50, 2, None).0.batches(13).count(), 0);
         assert_eq!([first.clone(), second.clone()], shuffled(3));
         assert_ne!(first, second);
         let mut sorted = first;

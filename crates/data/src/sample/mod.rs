@@ -1,6 +1,7 @@
 //! Training samples: Burn data sets of stage 1 and stage 2 (SNAPSNAP §5.6, §5.7), their batches, and a loader.
 
 mod augment;
+mod joined;
 mod loader;
 mod stage1;
 mod stage2;
@@ -19,7 +20,8 @@ use snapsnap_splat::Camera;
 
 use crate::dataset::{Folder, Layout, Split, StoredView};
 pub use augment::Augment;
-pub use loader::Loader;
+pub use joined::Joined;
+pub use loader::{Batches, Loader};
 use snapsnap_mesh::FileError;
 use snapsnap_people::random::stream;
 pub use stage1::{Stage1, Stage1Batch, Stage1Batcher, Stage1Item};
@@ -40,6 +42,8 @@ pub struct SampleConfig {
     pub compat: bool,
     /// How often each subject comes in an epoch.
     pub repeat: usize,
+    /// How far from the subject's own front, in degrees, the front photograph may be taken; 180: from anywhere.
+    pub front_within_degrees: f32,
     /// Stage 2: random views to be compared, beside the two side views.
     pub supervision: usize,
     /// Stage 2: compare at twice the side, where the data set has it.
@@ -56,6 +60,7 @@ impl Default for SampleConfig {
         Self {
             compat: false,
             repeat: 50,
+            front_within_degrees: 180.0,
             supervision: 3,
             high_resolution: false,
             seed: 1,
@@ -74,6 +79,13 @@ impl SampleConfig {
     pub fn problem(&self) -> Option<(String, String)> {
         if self.repeat == 0 || self.repeat > 1_000_000 {
             return Some(("repeat".into(), format!("is {}, must be 1 to 1000000", self.repeat)));
+        }
+        if !(0.0..=180.0).contains(&self.front_within_degrees) {
+            let message = format!("is {}, must be 0 to 180", self.front_within_degrees);
+            return Some(("front_within_degrees".into(), message));
+        }
+        if self.compat && self.front_within_degrees != 180.0 {
+            return Some(("front_within_degrees".into(), "must be 180 beside `compat = true`".into()));
         }
         if self.supervision > 64 {
             return Some(("supervision".into(), format!("is {}, must be 0 to 64", self.supervision)));
@@ -133,6 +145,17 @@ impl Source {
         (subject, random)
     }
 
+    /// A view for the front photograph.
+    fn front(&self, random: &mut impl Rng) -> usize {
+        let count = self.folder.description().views;
+        // View 0 is the subject's own front, and the views go round evenly.
+        let reach = (f64::from(self.config.front_within_degrees) * count as f64 / 360.0 + 1e-6) as usize;
+        if 2 * reach >= count {
+            return random.random_range(0..count);
+        }
+        (count + random.random_range(0..=2 * reach) - reach) % count
+    }
+
     /// A view; without its picture where that is not needed.
     fn view_for(&self, subject: &str, view: usize, picture: bool) -> Result<StoredView, FileError> {
         if picture {
@@ -148,14 +171,14 @@ impl Source {
         if self.config.compat { *stored } else { self.folder.exact_camera(stored) }
     }
 
-    /// What a view sees, to be compared with: `[3,h,w]` in [0, 1], over a colour.
+    /// What a view sees, to be compared with: `[3,h,w]` in [0, 1], over a colour, and the share of the person `[h,w]`.
     fn target(
         &self,
         subject: &str,
         view: usize,
         high_resolution: bool,
         background: [f32; 3],
-    ) -> Result<Vec<f32>, FileError> {
+    ) -> Result<(Vec<f32>, Vec<f32>), FileError> {
         let (color, mask) = self.folder.picture(self.split, subject, view, high_resolution)?;
         // The authors' pictures are over black already, and their masks half as fine as the larger ones.
         let is_done = self.folder.description().layout == Layout::Authors && background == [0.0; 3];
@@ -167,7 +190,8 @@ impl Source {
             let pixels = color.pixels().zip(mask.pixels());
             pixels.map(move |(c, a)| value(c.0[channel], a.0[0], background[channel]))
         };
-        Ok((0..3).flat_map(pixels).collect())
+        let share = mask.as_raw().iter().map(|a| f32::from(*a) / 255.0).collect();
+        Ok(((0..3).flat_map(pixels).collect(), share))
     }
 
     /// Front and back as the networks see them: `[2,3,H,W]` and their masks `[2,H,W]`.

@@ -5,7 +5,6 @@ use std::sync::Arc;
 use burn::data::dataloader::batcher::Batcher;
 use burn::data::dataset::{Dataset, DatasetError};
 use burn::tensor::{Device, Tensor};
-use rand::Rng;
 
 use super::{COMPAT_FAR, INSIDE, SampleConfig, Source, together};
 use crate::dataset::{Folder, Split, unproject};
@@ -18,6 +17,8 @@ pub struct Stage1(Source);
 /// One sample; H and W are the side of the data set's views.
 #[derive(Debug, Clone)]
 pub struct Stage1Item {
+    /// Data set, subject and front view, for messages.
+    pub name: String,
     /// H and W.
     pub side: usize,
     /// `[2,3,H,W]` front and back in [−1, 1] times the mask.
@@ -67,7 +68,7 @@ impl Stage1 {
         let source = &self.0;
         let (subject, mut random) = source.subject(1, index);
         let count = source.folder.description().views;
-        let first = random.random_range(0..count);
+        let first = source.front(&mut random);
         // Front, back, and the sides at +90° and +270° (SNAPSNAP §5.6).
         let order = [0, 2, 1, 3].map(|quarter| (first + quarter * count / 4) % count);
         let compat = source.config.compat;
@@ -91,7 +92,8 @@ impl Stage1 {
         }
         let [front, back] = [0, 1].map(|i| (&pictures[i].0, &pictures[i].1));
         let (images, masks) = source.photographs([front, back], &mut random);
-        Ok(Stage1Item { side, images, masks, points, valid })
+        let name = format!("{}: {subject}, view {first}", source.folder.root().display());
+        Ok(Stage1Item { name, side, images, masks, points, valid })
     }
 }
 

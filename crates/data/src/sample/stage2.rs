@@ -12,14 +12,16 @@ use super::{SampleConfig, Source, together};
 use crate::dataset::{Folder, Layout, Split};
 use snapsnap_mesh::FileError;
 
-/// Samples of stage 2 (SNAPSNAP §5.6): front and back are the first view and the opposite one; compared are the sides and
-/// random views.
+/// Samples of stage 2 (SNAPSNAP §5.6): with `compat`, front and back are the first view and the opposite one, else any that
+/// the config allows and the opposite one; compared are the sides and random views.
 #[derive(Debug, Clone)]
 pub struct Stage2(Source);
 
 /// One sample; H and W are the side of the data set's views, h and w that of the views to compare.
 #[derive(Debug, Clone)]
 pub struct Stage2Item {
+    /// Data set, subject and front view, for messages.
+    pub name: String,
     /// H and W.
     pub side: usize,
     /// `[2,3,H,W]` front and back in [−1, 1] times the mask.
@@ -32,6 +34,8 @@ pub struct Stage2Item {
     pub target_side: usize,
     /// `[V,3,h,w]` views to compare in [0, 1], over `background`: the random ones, then right and left.
     pub targets: Vec<f32>,
+    /// `[V,h,w]` share of the person in each of their pixels.
+    pub target_masks: Vec<f32>,
     /// Their cameras.
     pub target_cameras: Vec<Camera>,
     /// Colour behind the person.
@@ -49,6 +53,8 @@ pub struct Stage2Batch {
     pub cameras: Vec<[Camera; 4]>,
     /// `[B,V,3,h,w]`.
     pub targets: Tensor<5>,
+    /// `[B,V,h,w]` share of the person.
+    pub target_masks: Tensor<4>,
     /// V cameras of each sample.
     pub target_cameras: Vec<Vec<Camera>>,
     /// Colour behind each sample.
@@ -85,7 +91,8 @@ impl Stage2 {
         let (subject, mut random) = source.subject(2, index);
         let description = folder.description();
         let count = description.views;
-        let [front, right, back, left] = [0, 1, 2, 3].map(|quarter| quarter * count / 4);
+        let first = if config.compat { 0 } else { source.front(&mut random) };
+        let [front, right, back, left] = [0, 1, 2, 3].map(|quarter| (first + quarter * count / 4) % count);
         let picture = |view: usize| folder.picture(*split, subject, view, false);
         let (a, b) = (picture(front)?, picture(back)?);
         let camera = |view: usize| folder.camera(*split, subject, view).map(|stored| source.camera(&stored));
@@ -96,21 +103,25 @@ impl Stage2 {
             if config.augment.background_color { [(); 3].map(|()| random.random()) } else { [0.0; 3] };
         let scale = if config.high_resolution { 2 } else { 1 };
         let target_side = description.resolution * scale;
-        let (mut targets, mut target_cameras) = (Vec::new(), Vec::new());
+        let (mut targets, mut target_masks, mut target_cameras) = (Vec::new(), Vec::new(), Vec::new());
         for view in random_views.into_iter().chain([right, left]) {
-            targets.extend(source.target(subject, view, config.high_resolution, background)?);
+            let (target, mask) = source.target(subject, view, config.high_resolution, background)?;
+            targets.extend(target);
+            target_masks.extend(mask);
             // Sampled where the stored picture is, at its own size.
             let stored = folder.camera(*split, subject, view)?.resized(target_side, target_side);
             target_cameras.push(source.camera(&stored));
         }
         let (images, masks) = source.photographs([(&a.0, &a.1), (&b.0, &b.1)], &mut random);
         Ok(Stage2Item {
+            name: format!("{}: {subject}, view {first}", folder.root().display()),
             side: description.resolution as usize,
             images,
             masks,
             cameras,
             target_side: target_side as usize,
             targets,
+            target_masks,
             target_cameras,
             background,
         })
@@ -141,6 +152,12 @@ impl Batcher<Stage2Item, Stage2Batch> for Stage2Batcher {
             images: together(&items, |item| &item.images, [b, 2, 3, side, side], device),
             masks: together(&items, |item| &item.masks, [b, 2, side, side], device),
             targets: together(&items, |item| &item.targets, [b, views, 3, target_side, target_side], device),
+            target_masks: together(
+                &items,
+                |item| &item.target_masks,
+                [b, views, target_side, target_side],
+                device,
+            ),
             cameras: items.iter().map(|item| item.cameras).collect(),
             backgrounds: items.iter().map(|item| item.background).collect(),
             target_cameras: items.into_iter().map(|item| item.target_cameras).collect(),

@@ -67,7 +67,7 @@ impl Test {
     /// # Errors
     /// As [`Self::sample`].
     pub fn target(&self, index: usize, view: usize, background: [f32; 3]) -> Result<Vec<f32>, FileError> {
-        self.0.target(self.0.subject(3, index).0, view, false, background)
+        Ok(self.0.target(self.0.subject(3, index).0, view, false, background)?.0)
     }
 }
 

@@ -1,6 +1,6 @@
 //! Our weight file: writing it tensor by tensor, and opening it.
 
-use std::collections::{BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::io::{self, Write};
 use std::path::Path;
 
@@ -41,7 +41,13 @@ pub(super) fn write(
     write_tensors(path, origin, metadata, infos.collect(), |i| values(&tensors[i]), progress)
 }
 
-pub(super) fn write_tensors(
+/// Writes f32 tensors, names and shapes, in order, asking `values` for one at a time; `metadata` of more than one entry comes
+/// in no fixed order.
+///
+/// # Errors
+/// [`WeightsError`] of `values`, for values that are not finite, which are named as `origin`'s, or if the file cannot be
+/// written. What was there before stays.
+pub fn write_tensors(
     path: &Path,
     origin: &str,
     metadata: HashMap<String, String>,
@@ -93,6 +99,25 @@ pub(super) fn write_tensors(
         Failure::Io(source) => WeightsError::Write { path: path.to_owned(), source },
         Failure::Weights(e) => e,
     })
+}
+
+/// Writes the values of parameters by name, as checkpoints lay them out, as a weight file of `config`. Values of only one
+/// part make a file of that part.
+///
+/// # Errors
+/// [`WeightsError::Write`], or [`WeightsError::Tensors`] for values that are not finite.
+///
+/// # Panics
+/// If a tensor of a part that is there is missing or has another size.
+pub fn save(config: &Config, values: &BTreeMap<String, Vec<f32>>, path: &Path) -> Result<(), WeightsError> {
+    let parts = parts_of(values.keys());
+    let tensors: Vec<_> = schema::tensors(config).into_iter().filter(|t| parts.contains(t.part)).collect();
+    let read = |spec: &TensorSpec| {
+        let values = &values[&spec.name];
+        assert_eq!(values.len(), spec.elements(), "{}", spec.name);
+        Ok(values.clone())
+    };
+    write(path, &path.display().to_string(), config, &tensors, read, &|_, _| ())
 }
 
 /// A line for a tensor with values that are not finite.

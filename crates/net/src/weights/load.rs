@@ -1,12 +1,16 @@
 //! Filling networks from a weight file.
 
+use std::collections::HashMap;
+
 use burn::module::{Module, ModuleMapper, Param};
 use burn::tensor::{Device, Tensor, TensorData};
 
+use super::WeightsError;
 use super::file::{WeightFile, not_finite};
+use super::init::draw;
 use super::names::Path;
-use super::schema::{Part, SIDE};
-use super::{Source, WeightsError};
+use super::schema::{self, Part, SIDE, TensorSpec};
+use crate::config::Config;
 use crate::network::PointPredictor;
 use crate::regressor::Regressor;
 
@@ -33,26 +37,55 @@ impl WeightFile {
     }
 
     fn fill<M: Module>(&self, module: M, prefix: &str, device: &Device) -> Result<M, WeightsError> {
-        let mut loader = Loader {
-            source: &self.source,
-            device,
-            path: Path::new(prefix),
-            problems: Vec::new(),
-            failure: None,
-        };
-        let module = module.map(&mut loader);
-        if let Some(failure) = loader.failure {
-            return Err(failure);
-        }
-        if loader.problems.is_empty() {
-            return Ok(module);
-        }
-        Err(WeightsError::Tensors { origin: self.path().display().to_string(), problems: loader.problems })
+        let read = |name: &str| Ok((self.source.read_f32(name)?, self.source.tensors()[name].shape.clone()));
+        fill(module, prefix, device, &self.path().display().to_string(), &read)
     }
 }
 
+/// A point predictor with the random weights that [`super::init`] writes.
+pub fn random_predictor(config: &Config, seed: u64, device: &Device) -> PointPredictor {
+    random(config, seed, "", PointPredictor::new(&config.network, device), device)
+}
+
+/// Regressors with the random weights that [`super::init`] writes.
+pub fn random_regressors(config: &Config, seed: u64, device: &Device) -> Vec<Regressor> {
+    ["", SIDE][..config.regressor.networks]
+        .iter()
+        .map(|prefix| random(config, seed, prefix, Regressor::new(&config.regressor, device), device))
+        .collect()
+}
+
+fn random<M: Module>(config: &Config, seed: u64, prefix: &str, module: M, device: &Device) -> M {
+    let specs: HashMap<String, TensorSpec> =
+        schema::tensors(config).into_iter().map(|spec| (spec.name.clone(), spec)).collect();
+    let read = |name: &str| Ok((draw(&specs[name], seed), specs[name].shape.clone()));
+    fill(module, prefix, device, "random weights", &read).expect("random weights are finite")
+}
+
+/// Values and PyTorch shape of a tensor.
+type Read<'a> = &'a dyn Fn(&str) -> Result<(Vec<f32>, Vec<usize>), WeightsError>;
+
+fn fill<M: Module>(
+    module: M,
+    prefix: &str,
+    device: &Device,
+    origin: &str,
+    read: Read,
+) -> Result<M, WeightsError> {
+    let path = Path::new(prefix);
+    let mut loader = Loader { source: read, device, path, problems: Vec::new(), failure: None };
+    let module = module.map(&mut loader);
+    if let Some(failure) = loader.failure {
+        return Err(failure);
+    }
+    if loader.problems.is_empty() {
+        return Ok(module);
+    }
+    Err(WeightsError::Tensors { origin: origin.to_owned(), problems: loader.problems })
+}
+
 struct Loader<'a> {
-    source: &'a Source,
+    source: Read<'a>,
     device: &'a Device,
     path: Path<'a>,
     problems: Vec<String>,
@@ -60,11 +93,11 @@ struct Loader<'a> {
 }
 
 impl Loader<'_> {
-    /// Values and PyTorch shape of the tensor at the current path.
+    /// The tensor at the current path.
     fn read<const D: usize>(&mut self) -> Option<Tensor<D>> {
         let name = self.path.name();
-        let values = match self.source.read_f32(&name) {
-            Ok(values) => values,
+        let (values, mut shape) = match (self.source)(&name) {
+            Ok(read) => read,
             Err(e) => {
                 self.failure.get_or_insert(e);
                 return None;
@@ -74,7 +107,6 @@ impl Loader<'_> {
             self.problems.push(problem);
             return None;
         }
-        let mut shape = self.source.tensors()[&name].shape.clone();
         if shape.is_empty() {
             shape.push(1); // δ is a scalar in the file and [1] here
         }

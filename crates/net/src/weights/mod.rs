@@ -15,10 +15,11 @@ mod source;
 use std::path::{Path, PathBuf};
 
 pub use export::export;
-pub use file::{CONFIG_KEY, Progress, WeightFile};
+pub use file::{CONFIG_KEY, Progress, WeightFile, save, write_tensors};
 pub use import::{ImportOptions, ImportReport, import};
 pub use init::{SideHeads, init};
-pub use names::{NamedVisitor, names, visit_named};
+pub use load::{random_predictor, random_regressors};
+pub use names::{NamedMapper, NamedVisitor, map_named, names, visit_named};
 pub use source::{Entry, Source};
 
 /// What can be wrong with weights.

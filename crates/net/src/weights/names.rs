@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 
-use burn::module::{Module, ModuleVisitor, Param, ParamId};
+use burn::module::{Module, ModuleMapper, ModuleVisitor, Param, ParamId};
 use burn::tensor::Tensor;
 
 /// Where in a module a traversal is, as the checkpoint's key.
@@ -77,6 +77,42 @@ pub fn visit_named<M: Module>(module: &M, prefix: &str, visitor: &mut impl Named
         }
     }
     module.visit(&mut Adapter { path: Path::new(prefix), visitor });
+}
+
+/// What changes the parameters of a module by name.
+pub trait NamedMapper {
+    /// One parameter's values; neither tracked nor on a device with gradients.
+    fn map<const D: usize>(&mut self, name: &str, values: Tensor<D>) -> Tensor<D>;
+}
+
+/// Changes every parameter of `module`, whose names begin with `prefix`, in the order of [`visit_named`]. What is tracked
+/// stays so.
+pub fn map_named<M: Module>(module: M, prefix: &str, mapper: &mut impl NamedMapper) -> M {
+    struct Adapter<'a, V> {
+        path: Path<'a>,
+        mapper: &'a mut V,
+    }
+    impl<V: NamedMapper> ModuleMapper for Adapter<'_, V> {
+        fn enter_module(&mut self, name: &str, container_type: &str) {
+            self.path.enter(name, container_type);
+        }
+
+        fn exit_module(&mut self, _name: &str, _container_type: &str) {
+            self.path.leave();
+        }
+
+        fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
+            let (id, tensor, mapper) = param.consume();
+            let (tracked, strategy) = (tensor.is_require_grad(), tensor.gradient_checkpointing_strategy());
+            let values = self.mapper.map(&self.path.name(), tensor.without_autodiff());
+            let values = match strategy {
+                Some(strategy) => values.autodiff().with_gradient_checkpointing_strategy(strategy),
+                None => values,
+            };
+            Param::from_mapped_value(id, values.set_require_grad(tracked), mapper)
+        }
+    }
+    module.map(&mut Adapter { path: Path::new(prefix), mapper })
 }
 
 /// Names of the parameters of `module` by their ids, which are others in every run.

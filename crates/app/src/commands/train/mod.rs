@@ -1,0 +1,189 @@
+//! `snapsnap train-stage1` and `snapsnap train-stage2`.
+
+mod folder;
+mod report;
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use burn::tensor::Device;
+use clap::Args;
+use snapsnap_data::dataset::Folder;
+use snapsnap_net::weights::schema::{self, Part};
+use snapsnap_net::weights::{WeightFile, random_predictor};
+use snapsnap_train::config::TrainConfig;
+use snapsnap_train::networks::Networks;
+use snapsnap_train::run::{self, BEST, LAST, Options, Outcome};
+use snapsnap_train::stage1::PointTask;
+use snapsnap_train::task::Task;
+
+use crate::failure::Failure;
+use crate::{device, interrupt, memory, say};
+
+use folder::RunFolder;
+use report::Reporter;
+
+#[derive(Args)]
+pub struct Arguments {
+    /// Networks, data and steps, as in configs/*/stage1.toml and stage2.toml; with --resume the run's own.
+    #[arg(long, value_name = "TOML", required_unless_present = "resume")]
+    config: Option<PathBuf>,
+    /// Override one config key; may be repeated.
+    #[arg(long, value_name = "SECTION.KEY=VALUE")]
+    set: Vec<String>,
+    /// Data sets whose people are mixed [default: data.folders of the config].
+    #[arg(long, value_name = "DATASET", num_args = 1..)]
+    data: Vec<PathBuf>,
+    /// Folder of the run: its config, weights, state, logs and previews.
+    #[arg(short, long, value_name = "RUN", required_unless_present = "dry_run")]
+    output: Option<PathBuf>,
+    /// Weight file to begin with [default: training.start of the config; stage 1: random weights].
+    #[arg(long, value_name = "FILE")]
+    weights: Option<PathBuf>,
+    /// End this session after so many minutes; --resume goes on.
+    #[arg(long, value_name = "M")]
+    minutes: Option<f64>,
+    /// Go on where the run in this folder ended, or begin it.
+    #[arg(long)]
+    resume: bool,
+    /// Check config and data, make a few steps without writing anything, and say how long the run will take.
+    #[arg(long)]
+    dry_run: bool,
+    /// auto, cpu, ndarray, wgpu, vulkan, cuda or metal; wgpu:1 is the second adapter.
+    #[arg(long, default_value = "auto")]
+    device: String,
+}
+
+/// A training that can begin.
+struct Plan<'a> {
+    arguments: &'a Arguments,
+    config: TrainConfig,
+    folders: Vec<Arc<Folder>>,
+    device: Device,
+    quiet: bool,
+}
+
+pub fn stage1(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
+    let plan = Plan::new(arguments, quiet)?;
+    let task = PointTask::new(&plan.folders, &plan.config, &plan.device)?;
+    if task.validation_samples() == 0 && plan.config.training.validation_samples > 0 {
+        plan.note("no data set has people to validate on (split val): the latest weights will be the best");
+    }
+    plan.run(&task, |tracked| {
+        let networks = plan.config.networks();
+        let predictor = match plan.start() {
+            Some(path) => open(path, &plan.config)?.point_predictor(tracked)?,
+            None => random_predictor(&networks, plan.config.training.seed, tracked),
+        };
+        Ok(Networks { predictor: Some(predictor), regressors: Vec::new() })
+    })
+}
+
+/// Opens the weights to begin with, which must fit the config.
+fn open(path: &Path, config: &TrainConfig) -> Result<WeightFile, Failure> {
+    Ok(WeightFile::open(path, Some(config.networks()))?)
+}
+
+impl<'a> Plan<'a> {
+    fn new(arguments: &'a Arguments, quiet: bool) -> Result<Self, Failure> {
+        if let Some(minutes) = arguments.minutes.filter(|minutes| !(*minutes > 0.0 && *minutes < 1e6)) {
+            return Err(Failure::Input(format!("--minutes {minutes}: must be more than 0")));
+        }
+        let config = folder::config(arguments)?;
+        if config.data.folders.is_empty() {
+            let message =
+                "no data: give --data DATASET, made with `snapsnap prepare`, or data.folders in the config";
+            return Err(Failure::Input(message.into()));
+        }
+        let folders = config.data.folders.iter().map(|path| Folder::open(path).map(Arc::new));
+        let folders = folders.collect::<Result<_, _>>()?;
+        let device = device::choose(&arguments.device)?;
+        if device::is_cpu(&device) {
+            // Weights, gradients, two moments and averages; activations are measured by --dry-run.
+            let parameters = schema::parameters(&config.networks(), Part::PointPredictor) as u64;
+            memory::check(
+                "a training of these networks",
+                5 * 4 * parameters,
+                "a smaller network needs less",
+            )?;
+        }
+        Ok(Self { arguments, config, folders, device, quiet })
+    }
+
+    fn note(&self, message: &str) {
+        if !self.quiet {
+            say::err(&format!("note: {message}"));
+        }
+    }
+
+    /// Weights to begin with.
+    fn start(&self) -> Option<&Path> {
+        self.config.training.start.as_deref()
+    }
+
+    /// A rehearsal, or a session in the run's folder.
+    fn run<T: Task>(
+        &self,
+        task: &T,
+        networks: impl Fn(&Device) -> Result<Networks, Failure> + Sync,
+    ) -> Result<(), Failure> {
+        let tracked = self.device.clone().autodiff();
+        let tracked =
+            if self.config.training.checkpointing { tracked.gradient_checkpointing() } else { tracked };
+        if self.arguments.dry_run {
+            return run::on_best_thread(&self.device, || {
+                let rehearsal = run::rehearse(task, &self.config, networks(&tracked)?)?;
+                report::rehearsed(&self.config, task, &self.device, rehearsal);
+                Ok(())
+            });
+        }
+        let path = self.arguments.output.as_deref().expect("clap asks for it");
+        let folder = RunFolder::open(path, self.arguments, &self.config, &self.folders)?;
+        let limit = self.arguments.minutes.map(|minutes| Duration::from_secs_f64(60.0 * minutes));
+        let stop = interrupt::patiently();
+        let options = Options { folder: folder.path(), device: &self.device, limit, stop };
+        let mut reporter = Reporter::new(self.quiet, &self.config, limit);
+        let start = Instant::now();
+        let outcome = run::on_best_thread(&self.device, || {
+            Ok::<_, Failure>(run::train(task, &self.config, networks(&tracked)?, &options, &mut reporter)?)
+        })?;
+        drop(reporter);
+        if !self.quiet {
+            summarise(T::STAGE, folder.path(), &outcome, start.elapsed());
+        }
+        Ok(())
+    }
+}
+
+/// What a person wants to know and do next.
+fn summarise(stage: u32, folder: &Path, outcome: &Outcome, session: Duration) {
+    let run = folder.display();
+    let state = if outcome.finished { "finished" } else { "interrupted" };
+    let minutes = |seconds: f64| seconds / 60.0;
+    say::out(&format!(
+        "{run}: {state} after {} steps, {:.1} minutes of training, {:.1} of them in this session",
+        outcome.step,
+        minutes(outcome.seconds),
+        minutes(session.as_secs_f64()),
+    ));
+    if outcome.skipped > 0 {
+        say::out(&format!("{} steps were skipped", outcome.skipped));
+    }
+    let weights = match outcome.best {
+        Some((step, score)) => {
+            say::out(&format!("best validation: {score:.3} after step {step}, {run}/{BEST}"));
+            BEST
+        }
+        None => LAST,
+    };
+    say::out(&format!("curves: {run}/curves.svg; TensorBoard: tensorboard --logdir {run}"));
+    if !outcome.finished {
+        say::out(&format!("go on:   snapsnap train-stage{stage} --resume -o {run}"));
+    }
+    let next = match stage {
+        1 => format!("snapsnap train-stage2 --config CONFIG --weights {run}/{weights} -o RUN2"),
+        _ => format!("snapsnap reconstruct FRONT BACK --weights {run}/{weights} --turntable turn.png"),
+    };
+    say::out(&format!("next:    {next}"));
+}

@@ -1,0 +1,142 @@
+//! What a person sees of a training.
+
+use std::io::IsTerminal;
+use std::time::{Duration, Instant};
+
+use burn::tensor::Device;
+use indicatif::{ProgressBar, ProgressStyle};
+use snapsnap_train::config::TrainConfig;
+use snapsnap_train::log::Line;
+use snapsnap_train::run::{Rehearsal, Watch};
+use snapsnap_train::task::{Task, Validation};
+
+use crate::{device, memory, say};
+
+/// Seconds between two plain lines.
+const PAUSE: Duration = Duration::from_secs(10);
+
+/// A bar on a terminal, plain lines elsewhere, nothing with --quiet.
+pub struct Reporter {
+    bar: Option<ProgressBar>,
+    quiet: bool,
+    start: Instant,
+    limit: Option<Duration>,
+    /// Steps before this session, once known.
+    first: Option<u64>,
+    printed: Option<Instant>,
+}
+
+impl Reporter {
+    pub fn new(quiet: bool, config: &TrainConfig, limit: Option<Duration>) -> Self {
+        let bar = (!quiet && std::io::stderr().is_terminal()).then(|| {
+            let bar = ProgressBar::new(config.training.steps as u64);
+            let style = ProgressStyle::with_template("{bar:30} {pos}/{len} {msg}").expect("a valid template");
+            bar.set_style(style);
+            bar
+        });
+        Self { bar, quiet, start: Instant::now(), limit, first: None, printed: None }
+    }
+
+    fn line(&self, message: &str) {
+        match &self.bar {
+            Some(bar) => bar.println(say::printable(message)),
+            None if !self.quiet => say::err(message),
+            None => {}
+        }
+    }
+
+    /// Until the end of the run, or of the session where that comes first.
+    fn left(&self, line: &Line, steps: u64) -> String {
+        let rate = line.values.get("steps_per_second").copied().unwrap_or_default();
+        let run = (steps.saturating_sub(line.step)) as f64 / rate.max(1e-9);
+        let session = self.limit.map(|limit| limit.saturating_sub(self.start.elapsed()).as_secs_f64());
+        match session {
+            Some(session) if session < run => format!("{} left in this session", clock(session)),
+            _ => format!("{} left", clock(run)),
+        }
+    }
+}
+
+impl Watch for Reporter {
+    fn step(&mut self, line: &Line, steps: u64, skipped: u64) {
+        if self.quiet {
+            return;
+        }
+        let value = |name: &str| line.values.get(name).copied().unwrap_or_default();
+        /// What is not a part of the loss.
+        const OTHERS: [&str; 5] = ["loss", "norm", "rate", "samples_per_second", "steps_per_second"];
+        let parts: Vec<String> = line
+            .values
+            .iter()
+            .filter(|(name, _)| !OTHERS.contains(&name.as_str()))
+            .map(|(name, value)| format!("{name} {value:.4}"))
+            .collect();
+        let memory = memory::used().map_or(String::new(), |bytes| format!(", {:.1} GB", bytes as f64 / 1e9));
+        let skipped = if skipped > 0 { format!(", {skipped} skipped") } else { String::new() };
+        let message = format!(
+            "loss {:.4} ({}), {:.2} it/s, {:.1} samples/s, rate {:.1e}, norm {:.2}{memory}{skipped}, {}",
+            value("loss"),
+            parts.join(", "),
+            value("steps_per_second"),
+            value("samples_per_second"),
+            value("rate"),
+            value("norm"),
+            self.left(line, steps),
+        );
+        let first = *self.first.get_or_insert(line.step);
+        if let Some(bar) = &self.bar {
+            bar.set_position(line.step);
+            bar.set_message(message);
+        } else if line.step == first || self.printed.is_none_or(|printed| printed.elapsed() >= PAUSE) {
+            self.printed = Some(Instant::now());
+            say::err(&format!("step {} of {steps}: {message}", line.step));
+        }
+    }
+
+    fn validated(&mut self, step: u64, validation: &Validation) {
+        let figures: Vec<String> =
+            validation.figures.iter().map(|(name, value)| format!("{name} {value:.3}")).collect();
+        self.line(&format!("step {step}: validation: {}", figures.join(", ")));
+    }
+
+    fn note(&mut self, message: &str) {
+        self.line(&format!("note: {message}"));
+    }
+}
+
+impl Drop for Reporter {
+    fn drop(&mut self) {
+        if let Some(bar) = &self.bar {
+            bar.finish_and_clear();
+        }
+    }
+}
+
+/// Hours, minutes and seconds.
+fn clock(seconds: f64) -> String {
+    let seconds = seconds.min(1e9) as u64;
+    format!("{}:{:02}:{:02}", seconds / 3600, seconds / 60 % 60, seconds % 60)
+}
+
+/// Says what a run would take.
+pub fn rehearsed<T: Task>(config: &TrainConfig, _task: &T, on: &Device, rehearsal: Rehearsal) {
+    let t = &config.training;
+    let step = rehearsal.step.as_secs_f64();
+    let samples = (t.batch * t.accumulate) as f64;
+    say::out(&format!(
+        "device {}: a step of {samples} samples takes {:.3} s, {:.1} samples a second",
+        device::describe(on),
+        step,
+        samples / step
+    ));
+    let mut total = step * t.steps as f64;
+    if let Some(validation) = rehearsal.validation {
+        let count = 1 + t.steps.checked_div(t.validate_every).unwrap_or(0);
+        total += validation.as_secs_f64() * count as f64;
+        say::out(&format!("a validation takes {:.1} s; there will be {count}", validation.as_secs_f64()));
+    }
+    if let Some(bytes) = memory::most_used() {
+        say::out(&format!("memory: {:.2} GB at most so far", bytes as f64 / 1e9));
+    }
+    say::out(&format!("{} steps will take about {}", t.steps, clock(total)));
+}

@@ -1,0 +1,109 @@
+//! The state of a run in one file, which is there as a whole or not at all: weights, averages, what the optimiser remembers,
+//! and how far the run has come. Everything random follows from the seed and the step.
+
+use std::collections::{BTreeMap, HashMap};
+use std::path::Path;
+
+use burn::tensor::Device;
+use serde::{Deserialize, Serialize};
+use snapsnap_net::weights::{Source, WeightsError, write_tensors};
+
+use crate::learner::Learner;
+use crate::networks::{Rows, host, row};
+use crate::task::Task;
+
+/// Metadata key of the progress, as JSON.
+const PROGRESS_KEY: &str = "snapsnap.training";
+
+/// How far a run has come.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Progress {
+    /// Which stage is trained, 1 or 2.
+    pub stage: u32,
+    /// Steps so far, those that were skipped included.
+    pub step: u64,
+    /// Steps that were skipped because a loss or gradient was not finite, or a sample could not be read.
+    pub skipped: u64,
+    /// Those of them that came one after another up to here.
+    pub skipped_in_a_row: u64,
+    /// Step and score of the best validation.
+    pub best: Option<(u64, f64)>,
+    /// AdamW's steps so far by parameter.
+    pub times: BTreeMap<String, u64>,
+}
+
+/// Writes the state of a run.
+///
+/// # Errors
+/// [`WeightsError::Write`]; what was there before stays.
+pub(crate) fn save<T: Task>(path: &Path, learner: &Learner<T>) -> Result<(), WeightsError> {
+    let (mut rows, times) = learner.optimizer.record();
+    let progress = Progress { times, ..learner.progress.clone() };
+    let mut add = |kind: &str, new: &Rows| {
+        rows.extend(new.iter().map(|(name, row)| (format!("{kind}/{name}"), host(row.clone()))));
+    };
+    add("weight", &learner.networks.rows());
+    if let Some(average) = &learner.average {
+        add("average", &average.rows);
+    }
+    let text = serde_json::to_string(&progress).expect("plain numbers");
+    let metadata = HashMap::from([(PROGRESS_KEY.to_owned(), text)]);
+    let names: Vec<_> = rows.iter().map(|(name, row)| (name.clone(), vec![row.len()])).collect();
+    let mut rows: Vec<_> = rows.into_values().collect();
+    let values = |i: usize| Ok(std::mem::take(&mut rows[i]));
+    write_tensors(path, "the state of the training", metadata, names, values, &|_, _| ())
+}
+
+/// Brings a learner of the same config to where the state of a run is.
+///
+/// # Errors
+/// [`WeightsError`] for a file that is damaged or belongs to other networks.
+pub(crate) fn load<T: Task>(
+    path: &Path,
+    learner: &mut Learner<T>,
+    device: &Device,
+) -> Result<(), WeightsError> {
+    let wrong = |message: String| WeightsError::Format { path: path.to_owned(), message };
+    let source = Source::open(path)?;
+    let text = source.metadata.get(PROGRESS_KEY).ok_or_else(|| wrong("is no state of a training".into()))?;
+    let progress: Progress = serde_json::from_str(text).map_err(|e| wrong(format!("{PROGRESS_KEY}: {e}")))?;
+    if progress.stage != T::STAGE {
+        return Err(wrong(format!("is of stage {}, not of stage {}", progress.stage, T::STAGE)));
+    }
+    let mut rows = BTreeMap::new();
+    for name in source.tensors().keys() {
+        rows.insert(name.clone(), source.read_f32(name)?);
+    }
+    let shapes = learner.networks.shapes();
+    let size = |name: &str| shapes.get(name).map(|shape| shape.iter().product::<usize>());
+    for (key, values) in &rows {
+        let name = key.split_once('/').map_or("", |(_, name)| name);
+        let fits = match key.strip_prefix("muon/") {
+            Some(path) => shapes.keys().any(|name| {
+                path.strip_prefix(name.as_str()).is_some_and(|rest| rest.starts_with('.'))
+                    && size(name) == Some(values.len())
+            }),
+            None => size(name) == Some(values.len()),
+        };
+        if !fits {
+            return Err(wrong(format!("{key} does not fit the configured networks")));
+        }
+    }
+    let mut take = |kind: &str| -> Result<Rows, WeightsError> {
+        let one = |name: &String| {
+            let values = rows.remove(&format!("{kind}/{name}"));
+            let values = values.ok_or_else(|| wrong(format!("{kind}/{name} is missing")))?;
+            Ok((name.clone(), row(values, device)))
+        };
+        shapes.keys().map(one).collect()
+    };
+    let weights = take("weight")?;
+    if let Some(average) = &mut learner.average {
+        average.rows = take("average")?;
+    }
+    learner.networks = std::mem::take(&mut learner.networks).with_rows(&weights);
+    learner.optimizer.restore(&learner.networks, &mut rows, &progress.times, device);
+    learner.progress = progress;
+    Ok(())
+}

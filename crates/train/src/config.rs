@@ -1,0 +1,258 @@
+//! The TOML schema of a training: the networks' sections and those of data, steps, optimiser and losses.
+
+use std::path::PathBuf;
+
+use serde::{Deserialize, Serialize};
+use snapsnap_data::sample::SampleConfig;
+use snapsnap_net::config::{Config, ConfigError, ModeConfig, NetworkConfig, RegressorConfig, parse};
+
+use crate::optimizer::OptimizerConfig;
+use crate::schedule::Schedule;
+
+/// Everything that decides what a training computes.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct TrainConfig {
+    /// The point predictor.
+    pub network: NetworkConfig,
+    /// The Gaussian regressor.
+    pub regressor: RegressorConfig,
+    /// Quirks of the published code.
+    pub mode: ModeConfig,
+    /// Data sets; `--data` replaces them.
+    pub data: DataSets,
+    /// How samples are made.
+    pub samples: SampleConfig,
+    /// Steps, batches, reports.
+    pub training: TrainingConfig,
+    /// The optimiser.
+    pub optimizer: OptimizerConfig,
+    /// Learning rates over the steps.
+    pub schedule: Schedule,
+    /// Stage 1's losses.
+    pub stage1: Stage1Config,
+    /// Stage 2's losses.
+    pub stage2: Stage2Config,
+}
+
+/// The section `[data]`.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct DataSets {
+    /// Folders of data sets, whose people are mixed.
+    pub folders: Vec<PathBuf>,
+}
+
+/// The section `[training]`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct TrainingConfig {
+    /// Optimiser steps.
+    pub steps: usize,
+    /// Samples per batch.
+    pub batch: usize,
+    /// Batches per step.
+    pub accumulate: usize,
+    /// Largest norm of all gradients together.
+    pub clip: f64,
+    /// Share of the past in the averaged weights, which are validated and written; 0: the weights themselves.
+    pub average: f64,
+    /// Weight file to begin with, ours or imported; `--weights` replaces it. Without one, stage 1 begins with random weights.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub start: Option<PathBuf>,
+    /// Decides random weights and the order of samples.
+    pub seed: u64,
+    /// People in random order instead of one after another.
+    pub shuffle: bool,
+    /// Threads that make samples.
+    pub workers: usize,
+    /// Batches that may wait.
+    pub prefetch: usize,
+    /// Steps between two lines of the log.
+    pub log_every: usize,
+    /// Steps between two validations; 0: only at the end.
+    pub validate_every: usize,
+    /// Samples of a validation; 0: none.
+    pub validation_samples: usize,
+    /// Which people are validated on.
+    pub validate_on: ValidationSplit,
+    /// Steps between two checkpoints; 0: only at the end.
+    pub checkpoint_every: usize,
+    /// Steps between two previews; 0: only at the end.
+    pub preview_every: usize,
+    /// Computes what is cheap again instead of keeping it, on devices without kernels of our own.
+    pub checkpointing: bool,
+}
+
+/// Which people are validated on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ValidationSplit {
+    /// Those set apart.
+    Val,
+    /// Those trained on, to see whether they can be learned at all.
+    Train,
+}
+
+/// The section `[stage1]`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Stage1Config {
+    /// λ, the weight of the confidences' cross-entropy: 0.5 in the published code, 1 in the paper.
+    pub confidence: f64,
+}
+
+/// The section `[stage2]`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Stage2Config {
+    /// β: the share of the absolute difference, beside the structural similarity.
+    pub beta: f64,
+    /// The published curriculum: the sides alone with small scales, then front and back alone, then everything.
+    pub curriculum: bool,
+    /// Weight of the mean absolute difference of coverage and mask.
+    pub alpha: f64,
+    /// Weight of what a Gaussian's longest axis has beyond `anisotropy` times its shortest, as logarithms.
+    pub needle: f64,
+    /// How many times as long as its shortest axis a Gaussian's longest may be for free.
+    pub anisotropy: f64,
+    /// Standard deviation in metres by which a sample's predicted points are shifted at random, since points of people
+    /// trained on are better than others'.
+    pub noise: f64,
+    /// Whether the point predictor is tuned as well, with stage 1's loss kept on at this weight; 0: it is frozen.
+    pub points: f64,
+}
+
+impl Default for TrainConfig {
+    /// The published one.
+    fn default() -> Self {
+        Self {
+            network: NetworkConfig::default(),
+            regressor: RegressorConfig::default(),
+            mode: ModeConfig::default(),
+            data: DataSets::default(),
+            samples: SampleConfig::default(),
+            training: TrainingConfig::default(),
+            optimizer: OptimizerConfig::default(),
+            schedule: Schedule::published(),
+            stage1: Stage1Config::default(),
+            stage2: Stage2Config::default(),
+        }
+    }
+}
+
+impl Default for TrainingConfig {
+    fn default() -> Self {
+        Self {
+            steps: 100_000,
+            batch: 1,
+            accumulate: 1,
+            clip: 1.0,
+            average: 0.0,
+            start: None,
+            seed: 3407,
+            shuffle: true,
+            workers: 1,
+            prefetch: 2,
+            log_every: 10,
+            validate_every: 2000,
+            validation_samples: 50,
+            validate_on: ValidationSplit::Val,
+            checkpoint_every: 1000,
+            preview_every: 2000,
+            checkpointing: false,
+        }
+    }
+}
+
+impl Default for Stage1Config {
+    fn default() -> Self {
+        Self { confidence: 0.5 }
+    }
+}
+
+impl Default for Stage2Config {
+    fn default() -> Self {
+        Self {
+            beta: 0.8,
+            curriculum: false,
+            alpha: 0.0,
+            needle: 0.0,
+            anisotropy: 8.0,
+            noise: 0.0,
+            points: 0.0,
+        }
+    }
+}
+
+impl TrainConfig {
+    /// Parses and checks TOML text; `origin` names it in errors, `overrides` are `a.b=c` assignments applied on top.
+    ///
+    /// # Errors
+    /// [`ConfigError`], naming origin, key and allowed values.
+    pub fn from_toml(text: &str, origin: &str, overrides: &[String]) -> Result<Self, ConfigError> {
+        let (config, origin): (Self, String) = parse(text, origin, overrides)?;
+        config.networks().checked(&origin)?;
+        match config.problem() {
+            Some((key, message)) => {
+                Err(ConfigError::Syntax { origin, message: format!("`{key}`: {message}") })
+            }
+            None => Ok(config),
+        }
+    }
+
+    /// The config as TOML, every set key written out.
+    ///
+    /// # Panics
+    /// Never: every field is representable in TOML.
+    pub fn to_toml(&self) -> String {
+        toml::to_string_pretty(self).expect("the config has only TOML types")
+    }
+
+    /// The part that a weight file holds.
+    pub fn networks(&self) -> Config {
+        Config { network: self.network.clone(), regressor: self.regressor.clone(), mode: self.mode.clone() }
+    }
+
+    fn problem(&self) -> Option<(String, String)> {
+        let t = &self.training;
+        let counts = [
+            ("steps", t.steps, 1, 100_000_000),
+            ("batch", t.batch, 1, 4096),
+            ("accumulate", t.accumulate, 1, 4096),
+            ("workers", t.workers, 1, 256),
+            ("prefetch", t.prefetch, 0, 256),
+            ("log_every", t.log_every, 1, 1_000_000),
+            ("validation_samples", t.validation_samples, 0, 100_000),
+        ];
+        if let Some((key, value, least, most)) =
+            counts.into_iter().find(|(_, value, least, most)| value < least || value > most)
+        {
+            return Some((format!("training.{key}"), format!("is {value}, must be {least} to {most}")));
+        }
+        let two = &self.stage2;
+        let ranges = [
+            ("training.clip", t.clip, 1e-9, 1e9),
+            ("training.average", t.average, 0.0, 0.999_999),
+            ("stage1.confidence", self.stage1.confidence, 0.0, 1e6),
+            ("stage2.beta", two.beta, 0.0, 1.0),
+            ("stage2.alpha", two.alpha, 0.0, 1e6),
+            ("stage2.needle", two.needle, 0.0, 1e6),
+            ("stage2.anisotropy", two.anisotropy, 1.0, 1e6),
+            ("stage2.noise", two.noise, 0.0, 1.0),
+            ("stage2.points", two.points, 0.0, 1e6),
+        ];
+        if let Some((key, value, least, most)) =
+            ranges.into_iter().find(|(_, value, least, most)| !(*least..=*most).contains(value))
+        {
+            return Some((key.into(), format!("is {value}, must be {least} to {most}")));
+        }
+        if let Some((key, message)) = self.samples.problem() {
+            return Some((format!("samples.{key}"), message));
+        }
+        if let Some((key, message)) = self.optimizer.problem() {
+            return Some((format!("optimizer.{key}"), message));
+        }
+        self.schedule.problem().map(|(key, message)| (format!("schedule.{key}"), message))
+    }
+}

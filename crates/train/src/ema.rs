@@ -1,0 +1,48 @@
+//! Weights averaged over the last steps, which see people they were not trained on better than the last ones do.
+
+use burn::tensor::{Device, Tensor};
+use rayon::prelude::*;
+
+use crate::networks::{Rows, host, row};
+
+/// Values per task on the CPU.
+const PIECE: usize = 1 << 14;
+
+/// An exponential moving average.
+pub struct Average {
+    /// Share of the past per step, once there is enough of it.
+    decay: f64,
+    /// The averages.
+    pub rows: Rows,
+}
+
+impl Average {
+    /// Begins at `rows`.
+    pub fn new(decay: f64, rows: Rows) -> Self {
+        Self { decay, rows }
+    }
+
+    /// Takes in the weights after `step` steps. At first the past counts less: it is mostly the start.
+    pub fn update(&mut self, step: u64, rows: Rows) {
+        let decay = self.decay.min((1.0 + step as f64) / (10.0 + step as f64));
+        for (name, new) in rows {
+            if let Some(average) = self.rows.remove(&name) {
+                self.rows.insert(name, blended(average, new, decay));
+            }
+        }
+    }
+}
+
+fn blended(average: Tensor<1>, new: Tensor<1>, decay: f64) -> Tensor<1> {
+    let device = average.device();
+    if device != Device::flex() {
+        return average * decay + new * (1.0 - decay);
+    }
+    let (mut average, new) = (host(average), new.into_data());
+    let new: &[f32] = new.as_slice().expect("all tensors here are f32");
+    let share = (1.0 - decay) as f32;
+    average.par_chunks_mut(PIECE).zip(new.par_chunks(PIECE)).for_each(|(average, new)| {
+        average.iter_mut().zip(new).for_each(|(average, new)| *average += (new - *average) * share);
+    });
+    row(average, &device)
+}

@@ -1,0 +1,126 @@
+//! TensorBoard's event files: records of length, data and checksums, the data being a protocol buffer with a time, a step
+//! and named values. (The crates that write them need protobuf's compiler or have not been kept.)
+
+use std::fs::{File, OpenOptions};
+use std::io::{self, Write};
+use std::path::Path;
+use std::time::{SystemTime, UNIX_EPOCH};
+
+/// An event file that is being written.
+pub struct Events(File);
+
+impl Events {
+    /// Begins a file anew.
+    ///
+    /// # Errors
+    /// The operating system's refusal.
+    pub fn create(path: &Path) -> io::Result<Self> {
+        let file = OpenOptions::new().create(true).write(true).truncate(true).open(path)?;
+        let mut events = Self(file);
+        // Field 3, text: the version of the format.
+        let mut event = now();
+        text(&mut event, 3, b"brain.Event:2");
+        events.record(&event)?;
+        Ok(events)
+    }
+
+    /// Values of a step.
+    ///
+    /// # Errors
+    /// The operating system's refusal.
+    pub fn add<'a>(&mut self, step: u64, values: impl Iterator<Item = (&'a str, f64)>) -> io::Result<()> {
+        let mut summary = Vec::new();
+        for (name, value) in values {
+            let mut entry = Vec::new();
+            text(&mut entry, 1, name.as_bytes());
+            // Field 2, four bytes.
+            entry.push(2 << 3 | 5);
+            entry.extend((value as f32).to_le_bytes());
+            text(&mut summary, 1, &entry);
+        }
+        let mut event = now();
+        event.push(2 << 3);
+        varint(&mut event, step);
+        text(&mut event, 5, &summary);
+        self.record(&event)
+    }
+
+    fn record(&mut self, data: &[u8]) -> io::Result<()> {
+        let length = (data.len() as u64).to_le_bytes();
+        let mut record = length.to_vec();
+        record.extend(masked(crc32c(&length)).to_le_bytes());
+        record.extend(data);
+        record.extend(masked(crc32c(data)).to_le_bytes());
+        self.0.write_all(&record)
+    }
+}
+
+/// Field 1, eight bytes: seconds since 1970.
+fn now() -> Vec<u8> {
+    let seconds = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |time| time.as_secs_f64());
+    let mut event = vec![1 << 3 | 1];
+    event.extend(seconds.to_le_bytes());
+    event
+}
+
+fn varint(out: &mut Vec<u8>, mut value: u64) {
+    while value >= 0x80 {
+        out.push(value as u8 | 0x80);
+        value >>= 7;
+    }
+    out.push(value as u8);
+}
+
+fn text(out: &mut Vec<u8>, field: u8, bytes: &[u8]) {
+    out.push(field << 3 | 2);
+    varint(out, bytes.len() as u64);
+    out.extend(bytes);
+}
+
+/// The checksum as TensorFlow's records store it.
+fn masked(crc: u32) -> u32 {
+    crc.rotate_right(15).wrapping_add(0xa282_ead8)
+}
+
+/// Castagnoli's checksum.
+fn crc32c(bytes: &[u8]) -> u32 {
+    let byte = |crc: u32, byte: &u8| {
+        (0..8).fold(
+            crc ^ u32::from(*byte),
+            |crc, _| {
+                if crc & 1 == 1 { crc >> 1 ^ 0x82f6_3b78 } else { crc >> 1 }
+            },
+        )
+    };
+    !bytes.iter().fold(!0, byte)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// RFC 3720, B.4, and TensorFlow's own test of the mask.
+    #[test]
+    fn checksums_are_the_published_ones() {
+        assert_eq!(crc32c(&[0; 32]), 0x8a91_36aa);
+        assert_eq!(crc32c(&[0xff; 32]), 0x62a8_ab43);
+        assert_eq!(crc32c(b"123456789"), 0xe306_9283);
+    }
+
+    #[test]
+    fn records_hold_what_was_added() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("events");
+        let mut events = Events::create(&path).expect("writes");
+        events.add(300, [("loss", 0.5)].into_iter()).expect("writes");
+        let bytes = std::fs::read(&path).expect("there");
+        // Length 8 + 4, time 9, version 2 + 13, checksum 4: then the second record.
+        let second = &bytes[12 + 9 + 15 + 4..];
+        let length = u64::from_le_bytes(second[..8].try_into().expect("eight")) as usize;
+        let data = &second[12..12 + length];
+        assert_eq!(second.len(), 12 + length + 4);
+        assert_eq!(&data[9..12], &[2 << 3, 0xac, 0x02]);
+        let value = [&[5 << 3 | 2, 13, 1 << 3 | 2, 11, 1 << 3 | 2, 4][..], b"loss", &[2 << 3 | 5]].concat();
+        assert_eq!(&data[12..], [&value[..], &0.5_f32.to_le_bytes()].concat());
+    }
+}

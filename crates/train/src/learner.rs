@@ -1,0 +1,164 @@
+//! One step after another: samples → loss → gradients → weights. No file is written here.
+
+use std::collections::BTreeMap;
+
+use burn::data::dataloader::batcher::Batcher;
+use burn::data::dataset::Dataset;
+use burn::tensor::{Device, Tensor};
+use snapsnap_data::sample::{Batches, Loader};
+
+use crate::checkpoint::Progress;
+use crate::config::TrainConfig;
+use crate::ema::Average;
+use crate::networks::{Networks, Rows, host};
+use crate::optimizer::Optimizer;
+use crate::task::Task;
+use crate::{TrainError, gradients};
+
+/// What is trained, and how far it has come.
+pub(crate) struct Learner<'a, T: Task> {
+    pub task: &'a T,
+    pub config: &'a TrainConfig,
+    pub networks: Networks,
+    pub average: Option<Average>,
+    pub optimizer: Optimizer,
+    pub progress: Progress,
+    samples: Samples<'a, T>,
+}
+
+/// Why there was no step, and what it would have been made of.
+#[derive(Debug, Clone)]
+pub(crate) struct Skipped {
+    pub why: String,
+    pub samples: String,
+}
+
+impl<'a, T: Task> Learner<'a, T> {
+    /// At the beginning of a run.
+    pub fn new(task: &'a T, config: &'a TrainConfig, networks: Networks) -> Self {
+        let share = config.training.average;
+        Self {
+            task,
+            config,
+            average: (share > 0.0).then(|| Average::new(share, networks.rows())),
+            optimizer: config.optimizer.init(),
+            networks,
+            progress: Progress { stage: T::STAGE, ..Progress::default() },
+            samples: Samples::new(task, config),
+        }
+    }
+
+    /// The averaged networks, or the networks themselves; not tracked.
+    pub fn averaged(&self) -> Networks {
+        let networks = self.networks.valid();
+        match &self.average {
+            Some(average) => networks.with_rows(&average.rows),
+            None => networks,
+        }
+    }
+
+    /// One step: what there is to log of it, or why it was skipped. Either way it counts.
+    ///
+    /// # Errors
+    /// [`TrainError`] if the task cannot go on.
+    pub fn step(&mut self) -> Result<Result<BTreeMap<String, f64>, Skipped>, TrainError> {
+        let step = self.progress.step;
+        let made = self.update(step)?;
+        self.progress.step += 1;
+        if made.is_ok() {
+            self.progress.skipped_in_a_row = 0;
+        } else {
+            self.progress.skipped += 1;
+            self.progress.skipped_in_a_row += 1;
+        }
+        Ok(made)
+    }
+
+    fn update(&mut self, step: u64) -> Result<Result<BTreeMap<String, f64>, Skipped>, TrainError> {
+        let t = &self.config.training;
+        let (mut sum, mut values) = (Rows::new(), BTreeMap::<String, f64>::new());
+        let mut all: Vec<String> = Vec::new();
+        for batch in 0..t.accumulate {
+            let items = match self.samples.get(step * t.accumulate as u64 + batch as u64) {
+                Ok(items) => items,
+                Err(why) => return Ok(Err(Skipped { why, samples: all.join("; ") })),
+            };
+            all.extend(items.iter().map(|item| T::name(item).to_owned()));
+            let parts = self.task.losses(&self.networks, items, step)?;
+            let read = host(Tensor::cat(parts.iter().map(|part| part.value.clone()).collect(), 0));
+            let share = 1.0 / t.accumulate as f64;
+            let mut total = 0.0;
+            for (part, value) in parts.iter().zip(read) {
+                *values.entry(part.name.to_owned()).or_default() += share * f64::from(value);
+                total += part.weight * f64::from(value);
+            }
+            *values.entry("loss".to_owned()).or_default() += share * total;
+            if !total.is_finite() {
+                return Ok(Err(Skipped { why: "the loss is not finite".into(), samples: all.join("; ") }));
+            }
+            let weighted = parts.into_iter().map(|part| part.value * (part.weight * share)).collect();
+            let mut tracked = Tensor::cat(weighted, 0).sum().backward();
+            gradients::add(&mut sum, gradients::collect(&self.networks, &mut tracked));
+        }
+        let norm = gradients::norm(&sum);
+        let Some(factor) = gradients::clip_factor(norm, t.clip) else {
+            return Ok(Err(Skipped { why: "a gradient is not finite".into(), samples: all.join("; ") }));
+        };
+        let share = self.config.schedule.share(step as usize, t.steps);
+        let networks = std::mem::take(&mut self.networks);
+        self.networks = self.optimizer.step(share, networks, sum, factor);
+        if let Some(average) = &mut self.average {
+            average.update(step, self.networks.rows());
+        }
+        values.insert("rate".to_owned(), share * self.config.optimizer.rate);
+        values.insert("norm".to_owned(), norm);
+        Ok(Ok(values))
+    }
+}
+
+/// Batches, pass after pass.
+struct Samples<'a, T: Task> {
+    task: &'a T,
+    config: &'a TrainConfig,
+    /// Batches of one pass.
+    per_pass: u64,
+    /// The pass that is under way, and the number of its next batch since the beginning of the run.
+    open: Option<(Batches<Vec<T::Item>>, u64)>,
+}
+
+/// Leaves items as they are.
+struct Together;
+
+impl<I: Send + Sync> Batcher<I, Vec<I>> for Together {
+    fn batch(&self, items: Vec<I>, _device: &Device) -> Vec<I> {
+        items
+    }
+}
+
+impl<'a, T: Task> Samples<'a, T> {
+    fn new(task: &'a T, config: &'a TrainConfig) -> Self {
+        let per_pass = task.samples(0).len().div_ceil(config.training.batch).max(1) as u64;
+        Self { task, config, per_pass, open: None }
+    }
+
+    /// A batch by its number since the beginning of the run, or why there is none. What each holds follows from its number
+    /// alone.
+    fn get(&mut self, number: u64) -> Result<Vec<T::Item>, String> {
+        let (pass, place) = (number / self.per_pass, number % self.per_pass);
+        let mut open = self.open.take().filter(|(_, next)| *next == number && place > 0);
+        let (batches, next) = open.get_or_insert_with(|| {
+            let t = &self.config.training;
+            let samples = self.task.samples(pass);
+            let loader = Loader::new(samples, Together, t.batch, t.workers, t.prefetch, &Device::flex());
+            let loader = if t.shuffle { loader.shuffled(t.seed) } else { loader };
+            (loader.from_pass(pass).batches(place as usize), number)
+        });
+        *next += 1;
+        let made = batches.next();
+        self.open = open;
+        match made {
+            Some(made) => made.map_err(|e| e.to_string()),
+            None => Err("the data ended early".to_owned()),
+        }
+    }
+}

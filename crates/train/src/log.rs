@@ -1,0 +1,97 @@
+//! What a run leaves behind for people: `log.jsonl`, TensorBoard's events, curves.
+
+use std::collections::BTreeMap;
+use std::fs::{File, OpenOptions};
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use snapsnap_mesh::FileError;
+use snapsnap_splat::file;
+
+use crate::curves;
+use crate::events::Events;
+
+/// Longest log that is read when a run goes on.
+const MOST_BYTES: u64 = 1 << 30;
+
+/// One line of `log.jsonl`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Line {
+    /// Steps so far.
+    pub step: u64,
+    /// Seconds of training so far, all sessions together.
+    pub seconds: f64,
+    /// What was measured, by name: loss parts, learning rate, gradient norm, or, as `validation/…`, what a validation
+    /// found.
+    pub values: BTreeMap<String, f64>,
+}
+
+/// The logs of a run.
+pub struct Log {
+    path: PathBuf,
+    file: File,
+    events: Events,
+    /// All lines so far.
+    pub lines: Vec<Line>,
+}
+
+impl Log {
+    /// Begins the logs of the run in `folder`, or goes on after its step `step`; later lines, of a session that was killed,
+    /// are dropped.
+    ///
+    /// # Errors
+    /// [`FileError`] if a file cannot be read or written.
+    pub fn open(folder: &Path, step: u64) -> Result<Self, FileError> {
+        let path = folder.join("log.jsonl");
+        let mut lines = Vec::new();
+        if step > 0 && path.exists() {
+            let text = file::read_text(&path, MOST_BYTES).map_err(FileError::read(&path))?;
+            // The last line of a killed session may be torn.
+            lines = text.lines().filter_map(|line| serde_json::from_str(line).ok()).collect();
+            lines.retain(|line: &Line| line.step <= step);
+        }
+        let text: String = lines.iter().map(text).collect();
+        file::write_whole(&path, |out| out.write_all(text.as_bytes())).map_err(FileError::write(&path))?;
+        let appended = OpenOptions::new().append(true).open(&path).map_err(FileError::write(&path))?;
+        let events_path = folder.join("events.out.tfevents.snapsnap");
+        let mut events = Events::create(&events_path).map_err(FileError::write(&events_path))?;
+        for line in &lines {
+            let values = line.values.iter().map(|(name, value)| (name.as_str(), *value));
+            events.add(line.step, values).map_err(FileError::write(&events_path))?;
+        }
+        Ok(Self { path, file: appended, events, lines })
+    }
+
+    /// Seconds of training before this session.
+    pub fn seconds(&self) -> f64 {
+        self.lines.last().map_or(0.0, |line| line.seconds)
+    }
+
+    /// Adds a line.
+    ///
+    /// # Errors
+    /// [`FileError`] if a file cannot be written.
+    pub fn add(&mut self, line: Line) -> Result<(), FileError> {
+        let values = line.values.iter().map(|(name, value)| (name.as_str(), *value));
+        let written = self.events.add(line.step, values);
+        written
+            .and_then(|()| self.file.write_all(text(&line).as_bytes()))
+            .map_err(FileError::write(&self.path))?;
+        self.lines.push(line);
+        Ok(())
+    }
+
+    /// Draws the curves of all lines.
+    ///
+    /// # Errors
+    /// [`FileError`] if the file cannot be written.
+    pub fn draw(&self, path: &Path) -> Result<(), FileError> {
+        let svg = curves::draw(&self.lines);
+        file::write_whole(path, |out| out.write_all(svg.as_bytes())).map_err(FileError::write(path))
+    }
+}
+
+fn text(line: &Line) -> String {
+    serde_json::to_string(line).expect("plain numbers") + "\n"
+}

@@ -1,0 +1,279 @@
+//! A session of a run: steps, with validations, checkpoints, logs and previews in between.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use burn::tensor::Device;
+use snapsnap_mesh::FileError;
+use snapsnap_net::weights;
+
+use crate::checkpoint;
+use crate::config::TrainConfig;
+use crate::learner::Learner;
+use crate::log::{Line, Log};
+use crate::networks::Networks;
+use crate::task::{Task, Validation};
+use crate::{TrainError, preview};
+
+/// So many steps in a row may fail before a run gives up.
+const PATIENCE: u64 = 20;
+
+/// Where the state of a run lies in its folder.
+pub const STATE: &str = "state/state.safetensors";
+/// The latest weights of a run.
+pub const LAST: &str = "last.safetensors";
+/// The weights that did best in a validation.
+pub const BEST: &str = "best.safetensors";
+
+/// How a session is made, beside the run's config.
+pub struct Options<'a> {
+    /// The run's folder, which is there.
+    pub folder: &'a Path,
+    /// Where it is computed.
+    pub device: &'a Device,
+    /// Ends the session after so long.
+    pub limit: Option<Duration>,
+    /// Ends the session once it is set.
+    pub stop: &'a AtomicBool,
+}
+
+/// What hears how a run goes.
+pub trait Watch {
+    /// A step was logged: the line of the log, how many steps there will be, and how many were skipped so far.
+    fn step(&mut self, line: &Line, steps: u64, skipped: u64);
+    /// A validation was made after so many steps.
+    fn validated(&mut self, step: u64, validation: &Validation);
+    /// Something that a person should know.
+    fn note(&mut self, message: &str);
+}
+
+/// How a session ended.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Outcome {
+    /// Steps so far.
+    pub step: u64,
+    /// Whether all steps were made.
+    pub finished: bool,
+    /// Steps that were skipped.
+    pub skipped: u64,
+    /// Step and score of the best validation.
+    pub best: Option<(u64, f64)>,
+    /// Seconds of training, all sessions together.
+    pub seconds: f64,
+}
+
+/// Trains `networks`, freshly made, or goes on where the state in the run's folder says.
+///
+/// # Errors
+/// [`TrainError`] if data cannot be read, a file cannot be written, or twenty steps in a row failed.
+pub fn train<T: Task>(
+    task: &T,
+    config: &TrainConfig,
+    networks: Networks,
+    options: &Options,
+    watch: &mut dyn Watch,
+) -> Result<Outcome, TrainError> {
+    let mut session = Session::start(task, config, networks, options, watch)?;
+    let steps = config.training.steps as u64;
+    let first = session.learner.progress.step;
+    while session.learner.progress.step < steps && !session.is_over() {
+        session.step()?;
+    }
+    let progress = &session.learner.progress;
+    // A run that was finished before has nothing to write.
+    if progress.step > first || first < steps {
+        session.finish()?;
+    }
+    let progress = &session.learner.progress;
+    Ok(Outcome {
+        step: progress.step,
+        finished: progress.step >= steps,
+        skipped: progress.skipped,
+        best: progress.best,
+        seconds: session.seconds(),
+    })
+}
+
+/// What a step takes.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Rehearsal {
+    /// Time of one step, the first ones left out.
+    pub step: Duration,
+    /// Time of one validation, if there is one.
+    pub validation: Option<Duration>,
+}
+
+/// Makes a few steps without writing anything, and measures the last.
+///
+/// # Errors
+/// As [`train`].
+pub fn rehearse<T: Task>(
+    task: &T,
+    config: &TrainConfig,
+    networks: Networks,
+) -> Result<Rehearsal, TrainError> {
+    /// The first steps find their memory, and on a GPU their kernels.
+    const STEPS: usize = 3;
+    let mut learner = Learner::new(task, config, networks);
+    let mut step = Duration::ZERO;
+    for _ in 0..STEPS {
+        let start = Instant::now();
+        if let Err(skipped) = learner.step()? {
+            let message = format!("no step can be made: {} ({})", skipped.why, skipped.samples);
+            return Err(TrainError::Unsuitable(message));
+        }
+        step = start.elapsed();
+    }
+    let start = Instant::now();
+    let validation = task.validate(&learner.averaged())?.map(|_| start.elapsed());
+    Ok(Rehearsal { step, validation })
+}
+
+struct Session<'a, T: Task> {
+    learner: Learner<'a, T>,
+    options: &'a Options<'a>,
+    watch: &'a mut dyn Watch,
+    start: Instant,
+    log: Log,
+    /// Seconds of earlier sessions.
+    before: f64,
+    /// When the last line was logged, and at which step.
+    logged: (Instant, u64),
+}
+
+impl<'a, T: Task> Session<'a, T> {
+    fn start(
+        task: &'a T,
+        config: &'a TrainConfig,
+        networks: Networks,
+        options: &'a Options<'a>,
+        watch: &'a mut dyn Watch,
+    ) -> Result<Self, TrainError> {
+        let mut learner = Learner::new(task, config, networks);
+        let state = options.folder.join(STATE);
+        if state.exists() {
+            checkpoint::load(&state, &mut learner, &options.device.clone().inner())?;
+        }
+        let log = Log::open(options.folder, learner.progress.step)?;
+        let (before, now, step) = (log.seconds(), Instant::now(), learner.progress.step);
+        Ok(Self { learner, options, watch, start: now, log, before, logged: (now, step) })
+    }
+
+    fn is_over(&self) -> bool {
+        self.options.stop.load(Ordering::Relaxed)
+            || self.options.limit.is_some_and(|limit| self.start.elapsed() >= limit)
+    }
+
+    fn seconds(&self) -> f64 {
+        self.before + self.start.elapsed().as_secs_f64()
+    }
+
+    /// One step and what is due after it.
+    fn step(&mut self) -> Result<(), TrainError> {
+        let t = &self.learner.config.training;
+        let made = self.learner.step()?;
+        let now = self.learner.progress.step;
+        let due = |every: usize| every > 0 && now.is_multiple_of(every as u64);
+        match made {
+            Ok(values) if due(t.log_every) => self.report(values)?,
+            Ok(_) => {}
+            Err(skipped) => {
+                let (step, why, samples) = (now - 1, skipped.why, skipped.samples);
+                self.watch.note(&format!("step {step} skipped: {why} ({samples})"));
+                if self.learner.progress.skipped_in_a_row >= PATIENCE {
+                    return Err(TrainError::Stuck { count: PATIENCE, step, why, samples });
+                }
+            }
+        }
+        if now >= t.steps as u64 {
+            return Ok(());
+        }
+        if due(t.validate_every) {
+            self.validate()?;
+        }
+        if due(t.preview_every) {
+            self.preview()?;
+        }
+        if due(t.checkpoint_every) {
+            self.save()?;
+        }
+        Ok(())
+    }
+
+    /// What a run's folder holds at the session's end.
+    fn finish(&mut self) -> Result<(), TrainError> {
+        if self.learner.progress.step >= self.learner.config.training.steps as u64 {
+            self.validate()?;
+            self.preview()?;
+        }
+        self.save()
+    }
+
+    fn report(&mut self, mut values: BTreeMap<String, f64>) -> Result<(), TrainError> {
+        let (t, now, step) = (&self.learner.config.training, Instant::now(), self.learner.progress.step);
+        let rate = (step - self.logged.1) as f64 / (now - self.logged.0).as_secs_f64().max(1e-9);
+        self.logged = (now, step);
+        values.insert("steps_per_second".to_owned(), rate);
+        values.insert("samples_per_second".to_owned(), rate * (t.batch * t.accumulate) as f64);
+        let line = Line { step, seconds: self.seconds(), values };
+        self.watch.step(&line, t.steps as u64, self.learner.progress.skipped);
+        Ok(self.log.add(line)?)
+    }
+
+    fn validate(&mut self) -> Result<(), TrainError> {
+        let networks = self.learner.averaged();
+        let Some(validation) = self.learner.task.validate(&networks)? else { return Ok(()) };
+        let step = self.learner.progress.step;
+        let named = validation.figures.iter().map(|(name, value)| (format!("validation/{name}"), *value));
+        let score = ("validation/score".to_owned(), validation.score);
+        // What is not finite has no place in a log, and is never the best.
+        let values = named.chain([score]).filter(|(_, value)| value.is_finite()).collect();
+        self.log.add(Line { step, seconds: self.seconds(), values })?;
+        self.watch.validated(step, &validation);
+        let best = &mut self.learner.progress.best;
+        if validation.score.is_finite() && best.is_none_or(|(_, best)| validation.score < best) {
+            *best = Some((step, validation.score));
+            self.write(&networks, BEST)?;
+        }
+        Ok(())
+    }
+
+    fn write(&self, networks: &Networks, name: &str) -> Result<(), TrainError> {
+        let mut values = networks.checkpoint();
+        values.extend(self.learner.task.frozen());
+        Ok(weights::save(&self.learner.config.networks(), &values, &self.options.folder.join(name))?)
+    }
+
+    fn preview(&mut self) -> Result<(), TrainError> {
+        let Some(sheet) = self.learner.task.preview(&self.learner.averaged())? else { return Ok(()) };
+        let folder = self.options.folder.join("previews");
+        fs::create_dir_all(&folder).map_err(FileError::write(&folder))?;
+        let path = folder.join(format!("{:07}.png", self.learner.progress.step));
+        Ok(preview::write_png(&path, &sheet)?)
+    }
+
+    /// Weights first: where there is a state, there are its weights as well.
+    fn save(&mut self) -> Result<(), TrainError> {
+        self.write(&self.learner.averaged(), LAST)?;
+        let path = self.options.folder.join(STATE);
+        let folder = path.parent().expect("lies in a folder");
+        fs::create_dir_all(folder).map_err(FileError::write(folder))?;
+        checkpoint::save(&path, &self.learner)?;
+        Ok(self.log.draw(&self.options.folder.join("curves.svg"))?)
+    }
+}
+
+/// Runs `work` where the CPU's operators are fastest: on one of rayon's own threads. (A caller from outside hands every
+/// operator over and waits.) On other devices, which order work by the calling thread, it stays where it is.
+pub fn on_best_thread<R: Send>(device: &Device, work: impl FnOnce() -> R + Send) -> R {
+    if device.clone().inner() == Device::flex() {
+        let mut result = None;
+        rayon::scope(|_| result = Some(work()));
+        result.expect("the scope runs it")
+    } else {
+        work()
+    }
+}

@@ -1,0 +1,304 @@
+//! Stage 1: the point predictor learns from the points that four views see (SNAPSNAP §6).
+
+use std::sync::Arc;
+
+use burn::data::dataloader::batcher::Batcher;
+use burn::data::dataset::Dataset;
+use burn::tensor::Device;
+use image::RgbImage;
+use snapsnap_data::dataset::{Folder, Split};
+use snapsnap_data::sample::{Augment, Joined, SampleConfig, Stage1, Stage1Batch, Stage1Batcher, Stage1Item};
+use snapsnap_net::config::Config;
+use snapsnap_net::network::{PointMap, View};
+
+use crate::TrainError;
+use crate::config::{TrainConfig, ValidationSplit};
+use crate::networks::{Networks, host};
+use crate::points::{losses, predict};
+use crate::preview::{grid, heat, picture};
+use crate::task::{Part, Task, Validation};
+
+/// Samples of a preview.
+const PREVIEWS: usize = 2;
+/// Error that a preview shows white, metres.
+const WORST: f32 = 0.2;
+
+/// The training of the point predictor.
+pub struct PointTask {
+    networks: Config,
+    /// λ.
+    confidence: f64,
+    sets: Vec<Stage1>,
+    validation: Fixed,
+    device: Device,
+}
+
+/// Samples that are the same in every validation.
+struct Fixed {
+    samples: Joined<Stage1Item>,
+    count: usize,
+}
+
+impl Fixed {
+    /// Spread over all data sets.
+    fn indices(&self, count: usize) -> impl Iterator<Item = usize> {
+        let (len, count) = (self.samples.len(), count.min(self.count));
+        (0..count).map(move |i| i * len / count)
+    }
+}
+
+/// Which subjects of a data set are meant; the authors' test sets have no splits.
+pub(crate) fn split_of(folder: &Folder, wanted: Split) -> Option<Option<Split>> {
+    let splits = folder.splits();
+    splits.contains(&Some(wanted)).then_some(Some(wanted))
+}
+
+/// Changes that a validation's photographs are spared, and so many samples of each subject that there are enough.
+pub(crate) fn validation_samples(config: &TrainConfig, subjects: usize) -> SampleConfig {
+    let repeat = config.training.validation_samples.div_ceil(subjects.max(1)).max(1);
+    SampleConfig { repeat, augment: Augment::none(), seed: 0, ..config.samples.clone() }
+}
+
+/// The split to validate on.
+pub(crate) fn validation_split(config: &TrainConfig) -> Split {
+    match config.training.validate_on {
+        ValidationSplit::Val => Split::Val,
+        ValidationSplit::Train => Split::Train,
+    }
+}
+
+/// Refuses data sets whose views have another size than the canvas.
+pub(crate) fn check_resolution(folder: &Folder, config: &TrainConfig) -> Result<(), TrainError> {
+    let (there, wanted) = (folder.description().resolution as usize, config.network.resolution);
+    if there == wanted {
+        return Ok(());
+    }
+    Err(TrainError::Unsuitable(format!(
+        "{}: has views of {there}² pixels, network.resolution is {wanted}",
+        folder.root().display()
+    )))
+}
+
+impl PointTask {
+    /// A training on these data sets.
+    ///
+    /// # Errors
+    /// [`TrainError`] if a data set cannot be used with this config.
+    pub fn new(folders: &[Arc<Folder>], config: &TrainConfig, device: &Device) -> Result<Self, TrainError> {
+        let mut sets = Vec::new();
+        for folder in folders {
+            check_resolution(folder, config)?;
+            sets.push(Stage1::new(folder.clone(), Some(Split::Train), config.samples.clone())?);
+        }
+        let wanted = validation_split(config);
+        let there: Vec<_> =
+            folders.iter().filter_map(|folder| Some((folder, split_of(folder, wanted)?))).collect();
+        let mut subjects = 0;
+        for (folder, split) in &there {
+            subjects += folder.subjects(*split)?.len();
+        }
+        let fixed = validation_samples(config, subjects);
+        let mut validation: Vec<Box<dyn Dataset<Stage1Item>>> = Vec::new();
+        for (folder, split) in there {
+            validation.push(Box::new(Stage1::new(folder.clone(), split, fixed.clone())?));
+        }
+        let validation = Joined::new(validation);
+        let count = config.training.validation_samples.min(validation.len());
+        Ok(Self {
+            networks: config.networks(),
+            confidence: config.stage1.confidence,
+            sets,
+            validation: Fixed { samples: validation, count },
+            device: device.clone(),
+        })
+    }
+
+    /// People to validate on, in samples.
+    pub fn validation_samples(&self) -> usize {
+        self.validation.count
+    }
+
+    fn fixed(&self, index: usize) -> Result<Stage1Item, TrainError> {
+        let item = self.validation.samples.get(index);
+        item.map_err(|e| TrainError::Unsuitable(e.to_string()))
+    }
+
+    fn predict(&self, networks: &Networks, batch: &Stage1Batch) -> Vec<(View, PointMap)> {
+        let predictor = networks.predictor.as_ref().expect("stage 1 trains the predictor");
+        predict(predictor, &self.networks, batch.images.clone(), &batch.masks)
+    }
+}
+
+impl Task for PointTask {
+    type Item = Stage1Item;
+    const STAGE: u32 = 1;
+
+    fn samples(&self, pass: u64) -> Joined<Stage1Item> {
+        let sets = self.sets.iter().map(|set| Box::new(set.with_epoch(pass)) as Box<dyn Dataset<_>>);
+        Joined::new(sets.collect())
+    }
+
+    fn name(item: &Stage1Item) -> &str {
+        &item.name
+    }
+
+    fn losses(
+        &self,
+        networks: &Networks,
+        items: Vec<Stage1Item>,
+        _step: u64,
+    ) -> Result<Vec<Part>, TrainError> {
+        let batch = Stage1Batcher.batch(items, &self.device.clone().autodiff());
+        let losses = losses(&self.predict(networks, &batch), &batch.points, &batch.valid);
+        Ok(vec![
+            Part { name: "points", weight: 1.0, value: losses.regression },
+            Part { name: "confidence", weight: self.confidence, value: losses.confidence },
+        ])
+    }
+
+    fn validate(&self, networks: &Networks) -> Result<Option<Validation>, TrainError> {
+        if self.validation.count == 0 {
+            return Ok(None);
+        }
+        let mut errors = Errors::default();
+        for index in self.validation.indices(self.validation.count) {
+            let item = self.fixed(index)?;
+            let batch = Stage1Batcher.batch(vec![item.clone()], &self.device);
+            errors.add(&item, &self.predict(networks, &batch), self.networks.network.conf_threshold);
+        }
+        Ok(Some(errors.validation()))
+    }
+
+    fn preview(&self, networks: &Networks) -> Result<Option<RgbImage>, TrainError> {
+        let mut rows: Vec<Vec<RgbImage>> = Vec::new();
+        for (place, index) in self.validation.indices(PREVIEWS).enumerate() {
+            let item = self.fixed(index)?;
+            let (side, area) = (item.side, item.side * item.side);
+            let batch = Stage1Batcher.batch(vec![item.clone()], &self.device);
+            let maps = self.predict(networks, &batch);
+            for (row, (view, map)) in maps.iter().enumerate() {
+                let (points, conf) = (host(map.points.clone()), host(map.conf.clone()));
+                let view = *view as usize;
+                let truth = |i: usize| at(&item.points, view * area + i);
+                let there = |i: usize| item.valid[view * area + i] > 0.5;
+                let threshold = self.networks.network.conf_threshold;
+                let seen =
+                    |i: usize| if view < 2 { item.masks[view * area + i] > 0.5 } else { conf[i] > threshold };
+                let photo = |i: usize| match view {
+                    0 | 1 => [0, 1, 2].map(|c| item.images[(3 * view + c) * area + i] * 0.5 + 0.5),
+                    _ => [1.0; 3],
+                };
+                let shown = |there: bool, p: [f32; 3]| if there { place_color(p) } else { [0.0; 3] };
+                let error = |i: usize| if there(i) { distance(at(&points, i), truth(i)) } else { 0.0 };
+                let pictures = [
+                    picture(side, photo),
+                    picture(side, |i| shown(seen(i), at(&points, i))),
+                    picture(side, |i| shown(there(i), truth(i))),
+                    picture(side, |i| heat(error(i), WORST)),
+                ];
+                if place == 0 {
+                    rows.push(Vec::new());
+                }
+                if let Some(row) = rows.get_mut(row) {
+                    row.extend(pictures);
+                }
+            }
+        }
+        Ok(grid(&rows))
+    }
+}
+
+fn at(points: &[f32], i: usize) -> [f32; 3] {
+    [points[3 * i], points[3 * i + 1], points[3 * i + 2]]
+}
+
+fn distance(a: [f32; 3], b: [f32; 3]) -> f32 {
+    (0..3).map(|i| (a[i] - b[i]).powi(2)).sum::<f32>().sqrt()
+}
+
+/// A point in the front camera's frame as a colour: the published cameras have the body two metres away.
+fn place_color([x, y, z]: [f32; 3]) -> [f32; 3] {
+    [x / 1.8 + 0.5, y / 1.8 + 0.5, (z - 2.0) / 0.8 + 0.5]
+}
+
+/// Distances between predicted and true points, summed over people.
+#[derive(Default)]
+struct Errors {
+    people: f64,
+    /// Per view: people that it sees, mean distances in metres, and those after each person's mean shift is removed.
+    views: [[f64; 3]; 4],
+    /// Side pixels that are both predicted and true, and that are either.
+    overlap: [f64; 2],
+}
+
+impl Errors {
+    fn add(&mut self, item: &Stage1Item, maps: &[(View, PointMap)], threshold: f32) {
+        let area = item.side * item.side;
+        let maps: Vec<_> = maps
+            .iter()
+            .map(|(view, map)| (*view as usize, host(map.points.clone()), host(map.conf.clone())))
+            .collect();
+        let off = |view: usize, points: &[f32], i: usize| -> [f64; 3] {
+            let (p, t) = (at(points, i), at(&item.points, view * area + i));
+            [0, 1, 2].map(|c| f64::from(p[c]) - f64::from(t[c]))
+        };
+        let there = |view: usize| (0..area).filter(move |i| item.valid[view * area + i] > 0.5);
+        let (mut shift, mut count) = ([0.0; 3], 0.0);
+        for (view, points, _) in &maps {
+            for i in there(*view) {
+                let off = off(*view, points, i);
+                (0..3).for_each(|c| shift[c] += off[c]);
+                count += 1.0;
+            }
+        }
+        let shift = shift.map(|sum| sum / f64::max(count, 1.0));
+        self.people += 1.0;
+        for (view, points, conf) in &maps {
+            let (mut sums, mut count) = ([0.0; 2], 0.0);
+            for i in there(*view) {
+                let off = off(*view, points, i);
+                let length = |v: [f64; 3]| v.iter().map(|x| x * x).sum::<f64>().sqrt();
+                sums[0] += length(off);
+                sums[1] += length([0, 1, 2].map(|c| off[c] - shift[c]));
+                count += 1.0;
+            }
+            if count > 0.0 {
+                let sum = &mut self.views[*view];
+                sum[0] += 1.0;
+                sum[1] += sums[0] / count;
+                sum[2] += sums[1] / count;
+            }
+            if *view > 1 {
+                for i in 0..area {
+                    let (seen, true_) = (conf[i] > threshold, item.valid[*view * area + i] > 0.5);
+                    self.overlap[0] += f64::from(u8::from(seen && true_));
+                    self.overlap[1] += f64::from(u8::from(seen || true_));
+                }
+            }
+        }
+    }
+
+    fn validation(&self) -> Validation {
+        const NAMES: [[&str; 2]; 4] = [
+            ["front_mm", "front_centred_mm"],
+            ["back_mm", "back_centred_mm"],
+            ["right_mm", "right_centred_mm"],
+            ["left_mm", "left_centred_mm"],
+        ];
+        let mut figures = Vec::new();
+        let (mut sum, mut count) = (0.0, 0.0);
+        for (names, [people, error, centred]) in NAMES.iter().zip(self.views) {
+            if people > 0.0 {
+                figures.extend([(names[0], 1e3 * error / people), (names[1], 1e3 * centred / people)]);
+                sum += 1e3 * error / people;
+                count += 1.0;
+            }
+        }
+        if self.overlap[1] > 0.0 {
+            figures.push(("sides_iou", self.overlap[0] / self.overlap[1]));
+        }
+        let mean = sum / f64::max(count, 1.0);
+        figures.insert(0, ("points_mm", mean));
+        Validation { score: mean, figures }
+    }
+}
