@@ -44,6 +44,9 @@ enum Command {
     /// Train the point predictor.
     #[command(name = "train-stage1")]
     TrainStage1(commands::train::Arguments),
+    /// Train the Gaussian regressor on what a trained point predictor gives.
+    #[command(name = "train-stage2")]
+    TrainStage2(commands::train::Arguments),
     /// Read checkpoints of Snap-Snap, DUSt3R or CroCo and write one weight file.
     ImportWeights(commands::import_weights::Arguments),
     /// Write random weights for a config.
@@ -79,6 +82,7 @@ fn main() -> ExitCode {
         Command::Render(arguments) => commands::render::run(&arguments, quiet),
         Command::Prepare(arguments) => commands::prepare::run(&arguments, quiet),
         Command::TrainStage1(arguments) => commands::train::stage1(&arguments, quiet),
+        Command::TrainStage2(arguments) => commands::train::stage2(&arguments, quiet),
         Command::ImportWeights(arguments) => commands::import_weights::run(&arguments, quiet),
         Command::InitWeights(arguments) => commands::init_weights::run(&arguments, quiet),
         Command::ExportWeights(arguments) => commands::export_weights::run(&arguments, quiet),

@@ -124,11 +124,21 @@ pub struct RegressorConfig {
     pub channels: usize,
     /// Groups of every group normalisation.
     pub groups: usize,
+    /// What the network's output is measured from; unset: as published.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub start: Option<RegressorStart>,
+}
+
+impl RegressorConfig {
+    /// What the network's output is measured from.
+    pub fn start(&self) -> RegressorStart {
+        self.start.unwrap_or(RegressorStart::Published)
+    }
 }
 
 impl Default for RegressorConfig {
     fn default() -> Self {
-        Self { networks: 1, channels: 16, groups: 16 }
+        Self { networks: 1, channels: 16, groups: 16, start: None }
     }
 }
 
@@ -200,6 +210,16 @@ names! {
         Bilinear = "bilinear",
         /// Bilinear, normalised by the mask: only body points are blended (SNAPSNAP §13.3 fix 6).
         MaskAware = "mask-aware",
+    }
+}
+names! {
+    /// What the regressor's output is measured from (LEARNING.md).
+    RegressorStart {
+        /// Nothing: sizes of 0.7 mm, half transparent, grey (SNAPSNAP §8.3).
+        Published = "published",
+        /// The point map and the picture: at zero output a Gaussian is round, as large as its point's distance from its
+        /// neighbours asks, opaque, and has the pixel's colour.
+        Geometric = "geometric",
     }
 }
 names! {
@@ -293,6 +313,7 @@ impl Config {
     pub fn resolved(&self) -> Self {
         let mut config = self.clone();
         config.network.upsample = Some(self.upsample());
+        config.regressor.start = Some(self.regressor.start());
         config.mode = ModeConfig {
             compat: self.mode.compat,
             rotation_frame: Some(self.rotation_frame()),

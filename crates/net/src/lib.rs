@@ -2,6 +2,7 @@
 
 pub mod config;
 mod crop;
+pub mod gaussians;
 mod memory;
 mod neighbours;
 pub mod network;

@@ -2,15 +2,16 @@
 
 use std::time::{Duration, Instant};
 
-use burn::tensor::{Device, Int, Tensor, TensorData};
+use burn::tensor::{Device, Tensor, TensorData};
 use snapsnap_splat::{Camera, Gaussians, RigidTransform};
 
-use crate::config::{Config, Downsample, RotationFrame, Upsample, WorldFrame};
+use crate::config::{Config, Downsample, Upsample, WorldFrame};
 use crate::crop::Window;
+use crate::gaussians::{Seen, assemble, placed, regress, side_images};
 use crate::network::{PointMap, PointPredictor, View, activate};
-use crate::regressor::{Attributes, FEATURES, Regressor, Statistics};
+use crate::regressor::Regressor;
 use crate::resample::shrink;
-use crate::sides::{Cloud, EMPTY, is_finite};
+use crate::sides::is_finite;
 use crate::weights::{WeightFile, WeightsError};
 
 /// One photograph on its square canvas of `resolution` pixels; row-major, side S.
@@ -56,10 +57,7 @@ impl Reconstruction {
                 translation: glam::DVec3::new(0.0, 0.0, 2.0),
             },
         };
-        match config.rotation_frame() {
-            RotationFrame::Camera => gaussians.transformed(&camera_to_world),
-            RotationFrame::World => gaussians.with_means_transformed(&camera_to_world),
-        }
+        placed(config, gaussians, &camera_to_world)
     }
 }
 
@@ -169,11 +167,7 @@ impl Run<'_> {
 
         let side_images = if views.len() > 2 {
             self.timed("side colours", |_| {
-                let cloud = Cloud::new((0..2).flat_map(|view| {
-                    let (photo, mask) = (photos[view], &valid[view]);
-                    (0..area).filter(|&i| mask[i]).map(move |i| (point(view, i), pixel(&photo.rgb, area, i)))
-                }));
-                (2..4).map(|view| paint(cloud.as_ref(), |i| point(view, i), &valid[view])).collect()
+                side_images(photos.map(|photo| photo.rgb.as_slice()), &points, &valid)
             })
         } else {
             self.plan.push("side colours left out: the network has no side heads".into());
@@ -271,108 +265,27 @@ impl Run<'_> {
                 .push(format!("{what}: {window} of {0}×{0} pixels each, person's box {person}", self.side));
             let network = &self.model.regressors[pair.min(self.model.regressors.len() - 1)];
             let part = self.timed(what, |run| {
-                let views = pair_views.clone().map(|v| (images[v], points.clone().narrow(0, v, 1)));
-                run.regress(network, views, &valid[pair_views], window)
+                let views: Vec<_> = pair_views
+                    .clone()
+                    .map(|v| Seen {
+                        image: images[v],
+                        points: points.clone().narrow(0, v, 1),
+                        valid: &valid[v],
+                    })
+                    .collect();
+                regress(network, &run.model.config, &views, &window)
             });
             parts.extend(part);
         }
-        self.timed("activations", |run| run.assemble(parts))
-    }
-
-    /// Features `[n, 14]` and points `[n, 3]` of one pair's valid pixels, view by view.
-    fn regress<'a>(
-        &self,
-        network: &Regressor,
-        views: impl Iterator<Item = (&'a [f32], Tensor<4>)>,
-        valid: &[Vec<bool>],
-        window: Window,
-    ) -> Vec<[Tensor<2>; 2]> {
-        let device = &self.model.device;
-        let (h, w) = (window.rows.len(), window.columns.len());
-        let (colors, points): (Vec<_>, Vec<_>) = views
-            .map(|(image, points)| {
-                let crop = TensorData::new(window.crop(image, 3, self.side), [1, 3, h, w]);
-                let points = points.narrow(1, window.rows.start, h).narrow(2, window.columns.start, w);
-                (Tensor::<4>::from_data(crop, device), points)
-            })
-            .unzip();
-        let points = Tensor::cat(points, 0);
-        let input = Tensor::cat(vec![Tensor::cat(colors, 0), points.clone().permute([0, 3, 1, 2])], 1);
-        let features = network.forward(input, &mut Statistics::measured());
-        let mut parts = Vec::new();
-        for (view, mask) in valid.iter().enumerate() {
-            let rows = window.indices(mask, self.side);
-            if rows.is_empty() {
-                continue;
+        self.timed("activations", |run| {
+            let (gaussians, lost) = assemble(&run.model.config, parts, &run.model.device);
+            run.plan.push(format!("{} Gaussians", gaussians.len()));
+            if lost > 0 {
+                run.plan.push(format!("{lost} Gaussians left out: their attributes are not finite"));
             }
-            let n = rows.len();
-            let rows = Tensor::<1, Int>::from_data(TensorData::new(rows, [n]), device);
-            let pick =
-                |x: Tensor<4>, c: usize| x.narrow(0, view, 1).reshape([h * w, c]).select(0, rows.clone());
-            parts.push([pick(features.clone(), FEATURES), pick(points.clone(), 3)]);
-        }
-        parts
+            gaussians
+        })
     }
-
-    /// Activates and joins the parts; Gaussians that are not finite are left out and counted.
-    fn assemble(&mut self, parts: Vec<[Tensor<2>; 2]>) -> Gaussians {
-        let device = &self.model.device;
-        if parts.is_empty() {
-            let empty = |c: usize| Tensor::<2>::zeros([0, c], device);
-            return Gaussians::new(empty(3), empty(4), empty(3), Tensor::zeros([0], device), empty(3))
-                .expect("consistent by construction");
-        }
-        /// Coordinates beyond this could overflow on their way to the world frame.
-        const FARTHEST: f32 = 1e30;
-        let (features, points): (Vec<_>, Vec<_>) = parts.into_iter().map(|[f, p]| (f, p)).unzip();
-        let (features, points) = (Tensor::cat(features, 0), Tensor::cat(points, 0));
-        let attributes = Attributes::from_features(features.clone());
-        let means = points + attributes.offset.clone();
-        let (raw, centres) = (host::<2>(features), host::<2>(means.clone()));
-        let rows = raw.chunks_exact(FEATURES).zip(centres.chunks_exact(3)).enumerate();
-        let sound = |raw: &[f32], centre: &[f32]| {
-            raw.iter().all(|v| v.is_finite()) && centre.iter().all(|v| v.abs() <= FARTHEST)
-        };
-        let keep: Vec<i64> =
-            rows.filter(|(_, (raw, centre))| sound(raw, centre)).map(|(i, _)| i as i64).collect();
-        let (n, kept) = (means.dims()[0], keep.len());
-        self.plan.push(format!("{kept} Gaussians"));
-        if kept < n {
-            self.plan.push(format!("{} Gaussians left out: their attributes are not finite", n - kept));
-        }
-        if kept == 0 {
-            return self.assemble(Vec::new());
-        }
-        let index = Tensor::<1, Int>::from_data(TensorData::new(keep, [kept]), device);
-        let pick = |x: Tensor<2>| if kept < n { x.select(0, index.clone()) } else { x };
-        Gaussians::new(
-            pick(means),
-            pick(attributes.rotation),
-            pick(attributes.scale),
-            pick(attributes.opacity).squeeze_dim(1),
-            pick(attributes.color) * 0.5 + 0.5,
-        )
-        .expect("consistent by construction")
-    }
-}
-
-/// A side's pseudo image `[3, S, S]`.
-fn paint(cloud: Option<&Cloud>, point: impl Fn(usize) -> [f32; 3], valid: &[bool]) -> Vec<f32> {
-    let area = valid.len();
-    let mut image = vec![EMPTY; 3 * area];
-    let Some(cloud) = cloud else { return image };
-    let pixels: Vec<usize> = (0..area).filter(|&i| valid[i]).collect();
-    let points: Vec<[f32; 3]> = pixels.iter().map(|&i| point(i)).collect();
-    for (&i, color) in pixels.iter().zip(cloud.nearest_colors(&points)) {
-        for (channel, value) in color.into_iter().enumerate() {
-            image[channel * area + i] = value;
-        }
-    }
-    image
-}
-
-fn pixel(rgb: &[f32], area: usize, i: usize) -> [f32; 3] {
-    [rgb[i], rgb[area + i], rgb[2 * area + i]]
 }
 
 fn count(mask: &[bool]) -> usize {

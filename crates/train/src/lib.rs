@@ -6,6 +6,7 @@ mod curves;
 mod ema;
 mod error;
 mod events;
+mod fixed;
 pub mod gradients;
 mod learner;
 pub mod log;
@@ -17,6 +18,7 @@ mod preview;
 pub mod run;
 pub mod schedule;
 pub mod stage1;
+pub mod stage2;
 pub mod task;
 
 pub use error::TrainError;

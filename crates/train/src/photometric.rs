@@ -34,6 +34,17 @@ impl Photometric {
     }
 }
 
+/// Peak signal-to-noise ratio in dB of pictures `[B,C,H,W]` with values in [0, 1], over the pixels where `mask` `[B,H,W]` is 1;
+/// ∞ for equal ones.
+pub fn psnr(image: Tensor<4>, target: Tensor<4>, mask: &Tensor<3>) -> f64 {
+    let channels = image.dims()[1];
+    // Values beyond what a picture can hold are no error: files and screens cut them.
+    let squares = (image.clamp(0.0, 1.0) - target).square() * mask.clone().unsqueeze_dim::<4>(1);
+    let sum = |x: Tensor<1>| f64::from(x.into_scalar::<f32>());
+    let (error, count) = (sum(squares.sum()), sum(mask.clone().sum()));
+    -10.0 * (error / (count * channels as f64)).log10()
+}
+
 /// Structural similarity of every pixel and channel, `[B,C,H,W]`: an 11×11 Gaussian window of σ = 1.5, beyond the border
 /// zeros, population variances.
 pub fn ssim(x: Tensor<4>, y: Tensor<4>) -> Tensor<4> {

@@ -7,12 +7,13 @@ use burn::data::dataset::Dataset;
 use burn::tensor::Device;
 use image::RgbImage;
 use snapsnap_data::dataset::{Folder, Split};
-use snapsnap_data::sample::{Augment, Joined, SampleConfig, Stage1, Stage1Batch, Stage1Batcher, Stage1Item};
+use snapsnap_data::sample::{Joined, Stage1, Stage1Batch, Stage1Batcher, Stage1Item};
 use snapsnap_net::config::Config;
 use snapsnap_net::network::{PointMap, View};
 
 use crate::TrainError;
-use crate::config::{TrainConfig, ValidationSplit};
+use crate::config::TrainConfig;
+use crate::fixed::{Fixed, check_resolution};
 use crate::networks::{Networks, host};
 use crate::points::{losses, predict};
 use crate::preview::{grid, heat, picture};
@@ -29,54 +30,8 @@ pub struct PointTask {
     /// λ.
     confidence: f64,
     sets: Vec<Stage1>,
-    validation: Fixed,
+    validation: Fixed<Stage1Item>,
     device: Device,
-}
-
-/// Samples that are the same in every validation.
-struct Fixed {
-    samples: Joined<Stage1Item>,
-    count: usize,
-}
-
-impl Fixed {
-    /// Spread over all data sets.
-    fn indices(&self, count: usize) -> impl Iterator<Item = usize> {
-        let (len, count) = (self.samples.len(), count.min(self.count));
-        (0..count).map(move |i| i * len / count)
-    }
-}
-
-/// Which subjects of a data set are meant; the authors' test sets have no splits.
-pub(crate) fn split_of(folder: &Folder, wanted: Split) -> Option<Option<Split>> {
-    let splits = folder.splits();
-    splits.contains(&Some(wanted)).then_some(Some(wanted))
-}
-
-/// Changes that a validation's photographs are spared, and so many samples of each subject that there are enough.
-pub(crate) fn validation_samples(config: &TrainConfig, subjects: usize) -> SampleConfig {
-    let repeat = config.training.validation_samples.div_ceil(subjects.max(1)).max(1);
-    SampleConfig { repeat, augment: Augment::none(), seed: 0, ..config.samples.clone() }
-}
-
-/// The split to validate on.
-pub(crate) fn validation_split(config: &TrainConfig) -> Split {
-    match config.training.validate_on {
-        ValidationSplit::Val => Split::Val,
-        ValidationSplit::Train => Split::Train,
-    }
-}
-
-/// Refuses data sets whose views have another size than the canvas.
-pub(crate) fn check_resolution(folder: &Folder, config: &TrainConfig) -> Result<(), TrainError> {
-    let (there, wanted) = (folder.description().resolution as usize, config.network.resolution);
-    if there == wanted {
-        return Ok(());
-    }
-    Err(TrainError::Unsuitable(format!(
-        "{}: has views of {there}² pixels, network.resolution is {wanted}",
-        folder.root().display()
-    )))
 }
 
 impl PointTask {
@@ -90,37 +45,21 @@ impl PointTask {
             check_resolution(folder, config)?;
             sets.push(Stage1::new(folder.clone(), Some(Split::Train), config.samples.clone())?);
         }
-        let wanted = validation_split(config);
-        let there: Vec<_> =
-            folders.iter().filter_map(|folder| Some((folder, split_of(folder, wanted)?))).collect();
-        let mut subjects = 0;
-        for (folder, split) in &there {
-            subjects += folder.subjects(*split)?.len();
-        }
-        let fixed = validation_samples(config, subjects);
-        let mut validation: Vec<Box<dyn Dataset<Stage1Item>>> = Vec::new();
-        for (folder, split) in there {
-            validation.push(Box::new(Stage1::new(folder.clone(), split, fixed.clone())?));
-        }
-        let validation = Joined::new(validation);
-        let count = config.training.validation_samples.min(validation.len());
+        let validation = Fixed::new(folders, config, |folder, split, samples| {
+            Ok(Box::new(Stage1::new(folder, split, samples)?))
+        })?;
         Ok(Self {
             networks: config.networks(),
             confidence: config.stage1.confidence,
             sets,
-            validation: Fixed { samples: validation, count },
+            validation,
             device: device.clone(),
         })
     }
 
-    /// People to validate on, in samples.
+    /// Samples of a validation.
     pub fn validation_samples(&self) -> usize {
         self.validation.count
-    }
-
-    fn fixed(&self, index: usize) -> Result<Stage1Item, TrainError> {
-        let item = self.validation.samples.get(index);
-        item.map_err(|e| TrainError::Unsuitable(e.to_string()))
     }
 
     fn predict(&self, networks: &Networks, batch: &Stage1Batch) -> Vec<(View, PointMap)> {
@@ -162,7 +101,7 @@ impl Task for PointTask {
         }
         let mut errors = Errors::default();
         for index in self.validation.indices(self.validation.count) {
-            let item = self.fixed(index)?;
+            let item = self.validation.get(index)?;
             let batch = Stage1Batcher.batch(vec![item.clone()], &self.device);
             errors.add(&item, &self.predict(networks, &batch), self.networks.network.conf_threshold);
         }
@@ -172,7 +111,7 @@ impl Task for PointTask {
     fn preview(&self, networks: &Networks) -> Result<Option<RgbImage>, TrainError> {
         let mut rows: Vec<Vec<RgbImage>> = Vec::new();
         for (place, index) in self.validation.indices(PREVIEWS).enumerate() {
-            let item = self.fixed(index)?;
+            let item = self.validation.get(index)?;
             let (side, area) = (item.side, item.side * item.side);
             let batch = Stage1Batcher.batch(vec![item.clone()], &self.device);
             let maps = self.predict(networks, &batch);

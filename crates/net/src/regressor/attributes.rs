@@ -1,7 +1,9 @@
-//! Activations of the regressor's 14 channels (SNAPSNAP §8.3).
+//! Activations of the regressor's 14 channels (SNAPSNAP §8.3, LEARNING.md).
 
-use burn::tensor::Tensor;
 use burn::tensor::activation::sigmoid;
+use burn::tensor::{Tensor, TensorData};
+
+use crate::config::{RegressorConfig, RegressorStart};
 
 /// Gaussian attributes of N pixels.
 #[derive(Debug, Clone)]
@@ -18,8 +20,97 @@ pub struct Attributes {
     pub offset: Tensor<2>,
 }
 
+/// What N Gaussians are before the network corrects them.
+#[derive(Debug, Clone)]
+pub struct Geometry {
+    /// Distance of neighbouring points `[N, 1]`, metres.
+    pub spacing: Tensor<2>,
+    /// Colours of the pixels `[N, 3]` in [−1, 1].
+    pub colors: Tensor<2>,
+}
+
+/// Standard deviation of a Gaussian at the start over the distance of its neighbours. (0.2 and 0.4 render true points with
+/// 23.3 and 22.3 dB at right angles, LEARNING.md; the first shows holes where the camera comes closer.)
+const START_SCALE: f64 = 0.3;
+/// Opacity at the start, as the logit of 0.9.
+const START_OPACITY: f64 = 2.197_224_577_336_219;
+/// The network changes a scale by up to this factor's logarithm.
+const LOG_SCALE: f64 = 2.0;
+/// A point's neighbours are no further than so many times the distance of the pixels there: beyond lies another limb.
+const MOST_SPACING: f32 = 3.0;
+
+impl Geometry {
+    /// Of the valid pixels of a view on a canvas of `side`² pixels, row by row: colours `[3, S, S]` and points
+    /// `[1, S, S, 3]`.
+    pub fn new(image: &[f32], points: &Tensor<4>, valid: &[bool], side: usize) -> Self {
+        let device = points.device();
+        let points: Vec<f32> = points.clone().into_data().try_into_vec().expect("f32");
+        let point = |i: usize| [points[3 * i], points[3 * i + 1], points[3 * i + 2]];
+        let (mut spacing, mut colors) = (Vec::new(), Vec::new());
+        for i in (0..side * side).filter(|i| valid[*i]) {
+            let (here, row, column) = (point(i), i / side, i % side);
+            // The published cameras' focal length is 0.8 of the canvas (SNAPSNAP §5.3).
+            let footprint = (here[2].abs() / (0.8 * side as f32)).clamp(1e-5, 1.0);
+            let beside = [
+                (column > 0, i.wrapping_sub(1)),
+                (column + 1 < side, i + 1),
+                (row > 0, i.wrapping_sub(side)),
+                (row + 1 < side, i + side),
+            ];
+            let distance = |j: usize| {
+                let there = point(j);
+                (0..3).map(|c| (here[c] - there[c]).powi(2)).sum::<f32>().sqrt()
+            };
+            let near = beside.into_iter().filter(|(inside, j)| *inside && valid[*j]);
+            let near = near.map(|(_, j)| distance(j)).filter(|d| *d <= MOST_SPACING * footprint);
+            let (sum, count) = near.fold((0.0, 0), |(sum, count), d| (sum + d, count + 1));
+            spacing.push(if count > 0 { (sum / count as f32).max(0.5 * footprint) } else { footprint });
+            colors.extend([0, 1, 2].map(|c| image[c * side * side + i]));
+        }
+        let n = spacing.len();
+        Self {
+            spacing: Tensor::from_data(TensorData::new(spacing, [n, 1]), &device),
+            colors: Tensor::from_data(TensorData::new(colors, [n, 3]), &device),
+        }
+    }
+}
+
 impl Attributes {
-    /// Features `[N, 14]`: opacity, scale, rotation, colour, offset.
+    /// Features `[N, 14]`, measured from what the config says; `geometry` is needed where it says `geometric`.
+    pub fn new(config: &RegressorConfig, features: Tensor<2>, geometry: Option<Geometry>) -> Self {
+        match (config.start(), geometry) {
+            (RegressorStart::Geometric, Some(geometry)) => Self::corrections(features, geometry),
+            _ => Self::from_features(features),
+        }
+    }
+
+    /// Corrections of what the geometry gives.
+    fn corrections(features: Tensor<2>, Geometry { spacing, colors }: Geometry) -> Self {
+        let part = |from: usize, width: usize| features.clone().narrow(1, from, width);
+        let upright = Tensor::from_data([[1.0, 0.0, 0.0, 0.0]], &features.device());
+        Self {
+            opacity: sigmoid(part(0, 1) + START_OPACITY),
+            scale: (part(1, 3).tanh() * LOG_SCALE).exp() * (spacing.clone() * START_SCALE),
+            rotation: unit(part(4, 4) + upright),
+            color: colors + part(8, 3).tanh(),
+            offset: part(11, 3) * spacing,
+        }
+    }
+
+    /// Those of several parts, one part after the other.
+    pub fn joined(parts: Vec<Self>) -> Self {
+        let join =
+            |of: fn(&Self) -> &Tensor<2>| Tensor::cat(parts.iter().map(|part| of(part).clone()).collect(), 0);
+        Self {
+            opacity: join(|part| &part.opacity),
+            scale: join(|part| &part.scale),
+            rotation: join(|part| &part.rotation),
+            color: join(|part| &part.color),
+            offset: join(|part| &part.offset),
+        }
+    }
+
+    /// Features `[N, 14]`: opacity, scale, rotation, colour, offset, as published (SNAPSNAP §8.3).
     pub fn from_features(features: Tensor<2>) -> Self {
         let part = |from: usize, width: usize| features.clone().narrow(1, from, width);
         Self {

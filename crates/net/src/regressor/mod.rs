@@ -13,7 +13,7 @@ use burn::nn::PaddingConfig2d;
 use burn::nn::conv::{Conv2d, Conv2dConfig};
 use burn::tensor::{Device, Tensor};
 
-pub use attributes::Attributes;
+pub use attributes::{Attributes, Geometry};
 pub use statistics::Statistics;
 pub use unet::{RECEPTIVE_RADIUS, UNet};
 

@@ -1,6 +1,6 @@
 //! Names, shapes and initial distributions of every tensor of a checkpoint, from the config alone (SNAPSNAP §3.1, §8.2).
 
-use crate::config::{Config, Fusion, HeadKind, NetworkConfig, RegressorConfig};
+use crate::config::{Config, Fusion, HeadKind, NetworkConfig, RegressorConfig, RegressorStart};
 use crate::regressor::{FEATURES, INPUT_CHANNELS};
 
 /// What of a checkpoint a tensor belongs to.
@@ -206,6 +206,10 @@ fn regressor(c: &RegressorConfig, prefix: &str, list: &mut List) {
     list.norm(&format!("{unet}.norm_out"), width);
     list.conv(&format!("{unet}.conv_out"), width, FEATURES, 3);
     list.conv(&format!("{prefix}gs_conv"), FEATURES, FEATURES, 1);
+    if c.start() == RegressorStart::Geometric {
+        // Nothing is corrected at first.
+        list.tensors.iter_mut().rev().take(2).for_each(|spec| spec.init = Init::Constant(0.0));
+    }
 }
 
 #[cfg(test)]

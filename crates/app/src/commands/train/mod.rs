@@ -11,11 +11,12 @@ use burn::tensor::Device;
 use clap::Args;
 use snapsnap_data::dataset::Folder;
 use snapsnap_net::weights::schema::{self, Part};
-use snapsnap_net::weights::{WeightFile, random_predictor};
+use snapsnap_net::weights::{WeightFile, random_predictor, random_regressors};
 use snapsnap_train::config::TrainConfig;
 use snapsnap_train::networks::Networks;
-use snapsnap_train::run::{self, BEST, LAST, Options, Outcome};
+use snapsnap_train::run::{self, BEST, LAST, Options, Outcome, STATE};
 use snapsnap_train::stage1::PointTask;
+use snapsnap_train::stage2::GaussianTask;
 use snapsnap_train::task::Task;
 
 use crate::failure::Failure;
@@ -67,9 +68,7 @@ struct Plan<'a> {
 pub fn stage1(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let plan = Plan::new(arguments, quiet)?;
     let task = PointTask::new(&plan.folders, &plan.config, &plan.device)?;
-    if task.validation_samples() == 0 && plan.config.training.validation_samples > 0 {
-        plan.note("no data set has people to validate on (split val): the latest weights will be the best");
-    }
+    plan.check_validation(task.validation_samples());
     plan.run(&task, |tracked| {
         let networks = plan.config.networks();
         let predictor = match plan.start() {
@@ -77,6 +76,31 @@ pub fn stage1(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
             None => random_predictor(&networks, plan.config.training.seed, tracked),
         };
         Ok(Networks { predictor: Some(predictor), regressors: Vec::new() })
+    })
+}
+
+pub fn stage2(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
+    let plan = Plan::new(arguments, quiet)?;
+    // A run that goes on has its point predictor beside its state.
+    let own = arguments.output.as_ref().filter(|run| arguments.resume && run.join(STATE).exists());
+    let start = own.map(|run| run.join(LAST)).or_else(|| plan.start().map(Path::to_owned));
+    let Some(start) = start else {
+        let message = "stage 2 needs a trained point predictor: give --weights FILE, as train-stage1 writes it, or \
+                       training.start in the config";
+        return Err(Failure::Input(message.into()));
+    };
+    let weights = open(&start, &plan.config)?;
+    let predictor = weights.point_predictor(&plan.device)?;
+    let task = GaussianTask::new(&plan.folders, &plan.config, predictor, &plan.device)?;
+    plan.check_validation(task.validation_samples());
+    plan.run(&task, |tracked| {
+        let networks = plan.config.networks();
+        let regressors = if weights.require(Part::Regressor).is_ok() {
+            weights.regressors(tracked)?
+        } else {
+            random_regressors(&networks, plan.config.training.seed, tracked)
+        };
+        Ok(Networks { predictor: None, regressors })
     })
 }
 
@@ -111,9 +135,11 @@ impl<'a> Plan<'a> {
         Ok(Self { arguments, config, folders, device, quiet })
     }
 
-    fn note(&self, message: &str) {
-        if !self.quiet {
-            say::err(&format!("note: {message}"));
+    fn check_validation(&self, samples: usize) {
+        if samples == 0 && self.config.training.validation_samples > 0 && !self.quiet {
+            say::err(
+                "note: no data set has people to validate on (split val): only the latest weights are kept",
+            );
         }
     }
 

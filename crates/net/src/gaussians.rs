@@ -1,0 +1,152 @@
+//! From point maps to Gaussians, as inference and training do it: side colours, the regressor on a window, activations.
+
+use burn::tensor::{Device, Int, Tensor, TensorData};
+use snapsnap_splat::{Gaussians, RigidTransform};
+
+use crate::config::{Config, RegressorStart, RotationFrame};
+use crate::crop::Window;
+use crate::regressor::{Attributes, FEATURES, Geometry, Regressor, Statistics};
+use crate::sides::{Cloud, EMPTY};
+
+/// One view on its square canvas of side S.
+pub struct Seen<'a> {
+    /// `[3, S, S]` colours in [−1, 1], a photograph's or a side's pseudo image.
+    pub image: &'a [f32],
+    /// `[1, S, S, 3]` metres, front camera's frame; tracked where the predictor is trained as well.
+    pub points: Tensor<4>,
+    /// `[S, S]`: which pixels become Gaussians.
+    pub valid: &'a [bool],
+}
+
+/// What one view's N valid pixels give.
+pub struct Part {
+    features: Tensor<2>,
+    points: Tensor<2>,
+    geometry: Option<Geometry>,
+}
+
+/// Pseudo images of the right and the left `[3, S, S]`: every valid pixel has the colour of the nearest valid point of the
+/// photographs `[3, S, S]`. `points` are all four views' `[4, S, S, 3]`.
+pub fn side_images(photos: [&[f32]; 2], points: &[f32], valid: &[Vec<bool>]) -> Vec<Vec<f32>> {
+    let area = valid[0].len();
+    let point = |view: usize, i: usize| -> [f32; 3] {
+        let at = 3 * (view * area + i);
+        [points[at], points[at + 1], points[at + 2]]
+    };
+    let cloud = Cloud::new((0..2).flat_map(|view| {
+        let (photo, mask) = (photos[view], &valid[view]);
+        (0..area).filter(|&i| mask[i]).map(move |i| (point(view, i), pixel(photo, area, i)))
+    }));
+    (2..4).map(|view| paint(cloud.as_ref(), |i| point(view, i), &valid[view])).collect()
+}
+
+fn paint(cloud: Option<&Cloud>, point: impl Fn(usize) -> [f32; 3], valid: &[bool]) -> Vec<f32> {
+    let area = valid.len();
+    let mut image = vec![EMPTY; 3 * area];
+    let Some(cloud) = cloud else { return image };
+    let pixels: Vec<usize> = (0..area).filter(|&i| valid[i]).collect();
+    let points: Vec<[f32; 3]> = pixels.iter().map(|&i| point(i)).collect();
+    for (&i, color) in pixels.iter().zip(cloud.nearest_colors(&points)) {
+        for (channel, value) in color.into_iter().enumerate() {
+            image[channel * area + i] = value;
+        }
+    }
+    image
+}
+
+fn pixel(rgb: &[f32], area: usize, i: usize) -> [f32; 3] {
+    [rgb[i], rgb[area + i], rgb[2 * area + i]]
+}
+
+/// The regressor on a window of some views, which are one batch; views without a valid pixel give nothing.
+pub fn regress(network: &Regressor, config: &Config, views: &[Seen], window: &Window) -> Vec<Part> {
+    let (side, device) = (config.network.resolution, views[0].points.device());
+    let (h, w) = (window.rows.len(), window.columns.len());
+    let (colors, points): (Vec<_>, Vec<_>) = views
+        .iter()
+        .map(|view| {
+            let crop = TensorData::new(window.crop(view.image, 3, side), [1, 3, h, w]);
+            let points =
+                view.points.clone().narrow(1, window.rows.start, h).narrow(2, window.columns.start, w);
+            (Tensor::<4>::from_data(crop, &device), points)
+        })
+        .unzip();
+    let points = Tensor::cat(points, 0);
+    let input = Tensor::cat(vec![Tensor::cat(colors, 0), points.clone().permute([0, 3, 1, 2])], 1);
+    let features = network.forward(input, &mut Statistics::measured());
+    let mut parts = Vec::new();
+    for (i, view) in views.iter().enumerate() {
+        let rows = window.indices(view.valid, side);
+        if rows.is_empty() {
+            continue;
+        }
+        let n = rows.len();
+        let rows = Tensor::<1, Int>::from_data(TensorData::new(rows, [n]), &device);
+        let pick = |x: Tensor<4>, c: usize| x.narrow(0, i, 1).reshape([h * w, c]).select(0, rows.clone());
+        let geometry = (config.regressor.start() == RegressorStart::Geometric)
+            .then(|| Geometry::new(view.image, &view.points, view.valid, side));
+        parts.push(Part {
+            features: pick(features.clone(), FEATURES),
+            points: pick(points.clone(), 3),
+            geometry,
+        });
+    }
+    parts
+}
+
+/// Activates and joins the parts: Gaussians in the front camera's frame, and how many were left out because they are not
+/// finite.
+pub fn assemble(config: &Config, parts: Vec<Part>, device: &Device) -> (Gaussians, usize) {
+    /// Coordinates beyond this could overflow on their way to the world frame.
+    const FARTHEST: f32 = 1e30;
+    if parts.is_empty() {
+        return (nobody(device), 0);
+    }
+    let (mut features, mut points, mut attributes) = (Vec::new(), Vec::new(), Vec::new());
+    for part in parts {
+        attributes.push(Attributes::new(&config.regressor, part.features.clone(), part.geometry));
+        features.push(part.features);
+        points.push(part.points);
+    }
+    let (features, attributes) = (Tensor::cat(features, 0), Attributes::joined(attributes));
+    let means = Tensor::cat(points, 0) + attributes.offset;
+    let (raw, centres) = (host(features), host(means.clone()));
+    let rows = raw.chunks_exact(FEATURES).zip(centres.chunks_exact(3)).enumerate();
+    let sound = |raw: &[f32], centre: &[f32]| {
+        raw.iter().all(|v| v.is_finite()) && centre.iter().all(|v| v.abs() <= FARTHEST)
+    };
+    let keep: Vec<i64> =
+        rows.filter(|(_, (raw, centre))| sound(raw, centre)).map(|(i, _)| i as i64).collect();
+    let (n, kept) = (means.dims()[0], keep.len());
+    if kept == 0 {
+        return (nobody(device), n);
+    }
+    let index = Tensor::<1, Int>::from_data(TensorData::new(keep, [kept]), &means.device());
+    let pick = |x: Tensor<2>| if kept < n { x.select(0, index.clone()) } else { x };
+    let gaussians = Gaussians::new(
+        pick(means),
+        pick(attributes.rotation),
+        pick(attributes.scale),
+        pick(attributes.opacity).squeeze_dim(1),
+        pick(attributes.color) * 0.5 + 0.5,
+    );
+    (gaussians.expect("consistent by construction"), n - kept)
+}
+
+fn nobody(device: &Device) -> Gaussians {
+    let empty = |c: usize| Tensor::<2>::zeros([0, c], device);
+    Gaussians::new(empty(3), empty(4), empty(3), Tensor::zeros([0], device), empty(3))
+        .expect("consistent by construction")
+}
+
+/// Gaussians of the front camera's frame in the frame that `camera_to_world` leads to.
+pub fn placed(config: &Config, gaussians: Gaussians, camera_to_world: &RigidTransform) -> Gaussians {
+    match config.rotation_frame() {
+        RotationFrame::Camera => gaussians.transformed(camera_to_world),
+        RotationFrame::World => gaussians.with_means_transformed(camera_to_world),
+    }
+}
+
+fn host(x: Tensor<2>) -> Vec<f32> {
+    x.into_data().try_into_vec().expect("all tensors here are f32")
+}

@@ -1,0 +1,72 @@
+//! Samples that are the same in every validation, and what all stages ask of data sets.
+
+use std::sync::Arc;
+
+use burn::data::dataset::Dataset;
+use snapsnap_data::dataset::{Folder, Split};
+use snapsnap_data::sample::{Augment, Joined, SampleConfig};
+use snapsnap_mesh::FileError;
+
+use crate::TrainError;
+use crate::config::{TrainConfig, ValidationSplit};
+
+/// Samples of the split to validate on, of all data sets that have it.
+pub(crate) struct Fixed<I> {
+    samples: Joined<I>,
+    /// How many of them are used.
+    pub count: usize,
+}
+
+impl<I: Send + Sync + 'static> Fixed<I> {
+    /// `samples` makes those of a data set.
+    pub fn new(
+        folders: &[Arc<Folder>],
+        config: &TrainConfig,
+        samples: impl Fn(Arc<Folder>, Option<Split>, SampleConfig) -> Result<Box<dyn Dataset<I>>, FileError>,
+    ) -> Result<Self, TrainError> {
+        let wanted = Some(match config.training.validate_on {
+            ValidationSplit::Val => Split::Val,
+            ValidationSplit::Train => Split::Train,
+        });
+        let there: Vec<_> = folders.iter().filter(|folder| folder.splits().contains(&wanted)).collect();
+        let mut people = 0;
+        for folder in &there {
+            people += folder.subjects(wanted)?.len();
+        }
+        let wished = config.training.validation_samples;
+        // Photographs as they are, and enough samples of everybody.
+        let fixed = SampleConfig {
+            repeat: wished.div_ceil(people.max(1)).max(1),
+            augment: Augment::none(),
+            seed: 0,
+            ..config.samples.clone()
+        };
+        let sets = there.into_iter().map(|folder| samples(folder.clone(), wanted, fixed.clone()));
+        let samples = Joined::new(sets.collect::<Result<_, _>>()?);
+        let count = wished.min(samples.len());
+        Ok(Self { samples, count })
+    }
+
+    /// So many of them, spread over all data sets.
+    pub fn indices(&self, count: usize) -> impl Iterator<Item = usize> {
+        let (len, count) = (self.samples.len(), count.min(self.count));
+        (0..count).map(move |i| i * len / count)
+    }
+
+    /// One sample.
+    pub fn get(&self, index: usize) -> Result<I, TrainError> {
+        self.samples.get(index).map_err(|e| TrainError::Unsuitable(e.to_string()))
+    }
+}
+
+/// Refuses data sets whose views have another size than the canvas.
+pub(crate) fn check_resolution(folder: &Folder, config: &TrainConfig) -> Result<(), TrainError> {
+    let (there, wanted) = (folder.description().resolution as usize, config.network.resolution);
+    if there == wanted {
+        return Ok(());
+    }
+    Err(TrainError::Unsuitable(format!(
+        "{}: has views of {there}² pixels, network.resolution is {wanted}",
+        folder.root().display()
+    )))
+}

@@ -1,0 +1,397 @@
+//! Stage 2: the regressor learns Gaussians that look like the person from every side (SNAPSNAP §9.2, LEARNING.md).
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use burn::data::dataset::Dataset;
+use burn::tensor::{Device, Tensor, TensorData};
+use image::RgbImage;
+use rand::Rng;
+use snapsnap_data::dataset::{Folder, Split};
+use snapsnap_data::sample::{Joined, Stage2, Stage2Item};
+use snapsnap_net::Window;
+use snapsnap_net::config::Config;
+use snapsnap_net::gaussians::{Seen, assemble, placed, regress, side_images};
+use snapsnap_net::network::{PointPredictor, View};
+use snapsnap_people::random::stream;
+use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
+
+use crate::TrainError;
+use crate::config::{Stage2Config, TrainConfig};
+use crate::fixed::{Fixed, check_resolution};
+use crate::networks::{Networks, host};
+use crate::photometric::{Photometric, psnr};
+use crate::points::predict;
+use crate::preview::{grid, heat, picture};
+use crate::task::{Part, Task, Validation};
+
+/// Samples of a preview.
+const PREVIEWS: usize = 3;
+/// Error that a preview shows white.
+const WORST: f32 = 0.5;
+/// Where the published curriculum goes from the sides to front and back, and from these to everything (SNAPSNAP §9.2).
+const CURRICULUM: [u64; 2] = [2000, 4000];
+/// Until here the published curriculum compares one view per step, then all.
+const ONE_VIEW: u64 = 10_000;
+/// Its weight of the mean scale while the sides are alone.
+const SCALE_PENALTY: f64 = 2.0;
+
+/// The training of the regressor on what a frozen point predictor gives.
+pub struct GaussianTask {
+    networks: Config,
+    losses: Stage2Config,
+    seed: u64,
+    predictor: PointPredictor,
+    sets: Vec<Stage2>,
+    validation: Fixed<Stage2Item>,
+    device: Device,
+}
+
+/// Which views' Gaussians take part, and what is compared.
+#[derive(Debug, Clone, PartialEq)]
+struct Phase {
+    /// Views by their place.
+    views: std::ops::Range<usize>,
+    /// Weight of the mean scale.
+    scale: f64,
+    /// Whether only one view is compared.
+    one_view: bool,
+}
+
+impl Phase {
+    fn new(curriculum: bool, step: u64) -> Self {
+        let one_view = curriculum && step < ONE_VIEW;
+        match step {
+            _ if !curriculum => Self { views: 0..4, scale: 0.0, one_view },
+            step if step < CURRICULUM[0] => Self { views: 2..4, scale: SCALE_PENALTY, one_view },
+            step if step < CURRICULUM[1] => Self { views: 0..2, scale: 0.0, one_view },
+            _ => Self { views: 0..4, scale: 0.0, one_view },
+        }
+    }
+}
+
+impl GaussianTask {
+    /// A training on these data sets; `predictor` is not tracked.
+    ///
+    /// # Errors
+    /// [`TrainError`] if a data set cannot be used with this config.
+    pub fn new(
+        folders: &[Arc<Folder>],
+        config: &TrainConfig,
+        predictor: PointPredictor,
+        device: &Device,
+    ) -> Result<Self, TrainError> {
+        let mut sets = Vec::new();
+        for folder in folders {
+            check_resolution(folder, config)?;
+            sets.push(Stage2::new(folder.clone(), Some(Split::Train), config.samples.clone())?);
+        }
+        let validation = Fixed::new(folders, config, |folder, split, samples| {
+            Ok(Box::new(Stage2::new(folder, split, samples)?))
+        })?;
+        Ok(Self {
+            networks: config.networks(),
+            losses: config.stage2.clone(),
+            seed: config.training.seed,
+            predictor,
+            sets,
+            validation,
+            device: device.clone(),
+        })
+    }
+
+    /// Samples of a validation.
+    pub fn validation_samples(&self) -> usize {
+        self.validation.count
+    }
+
+    /// Gaussians of a sample in the data set's world; `None` if no pixel is valid. With `noise`, points stray by so many
+    /// metres.
+    fn gaussians(
+        &self,
+        networks: &Networks,
+        item: &Stage2Item,
+        phase: &Phase,
+        noise: Option<&mut dyn FnMut() -> f32>,
+        device: &Device,
+    ) -> Option<Gaussians> {
+        let (config, side) = (&self.networks, item.side);
+        let area = side * side;
+        let tensor = |values: &[f32], shape: [usize; 5]| {
+            Tensor::<5>::from_data(TensorData::new(values.to_vec(), shape), &self.device)
+        };
+        let images = tensor(&item.images, [1, 2, 3, side, side]);
+        let masks = tensor(&item.masks, [1, 1, 2, side, side]).reshape([1, 2, side, side]);
+        let maps = predict(&self.predictor, config, images, &masks);
+        let (mut points, mut conf) = (Vec::new(), Vec::new());
+        for (_, map) in maps {
+            points.extend(host(map.points));
+            conf.extend(host(map.conf));
+        }
+        let views = points.len() / (3 * area);
+        if let Some(noise) = noise {
+            // Every view's shell is shifted as a whole: that is how predictions are off.
+            for view in points.chunks_exact_mut(3 * area) {
+                let shift = [noise(), noise(), noise()];
+                view.chunks_exact_mut(3).for_each(|p| (0..3).for_each(|c| p[c] += shift[c]));
+            }
+        }
+        let finite = |i: usize| points[3 * i..3 * i + 3].iter().all(|v| v.is_finite());
+        let valid: Vec<Vec<bool>> = (0..views)
+            .map(|view| {
+                let chosen = |i: usize| match view {
+                    0 | 1 => item.masks[view * area + i] > 0.5,
+                    _ => conf[view * area + i] > config.network.conf_threshold,
+                };
+                (0..area).map(|i| chosen(i) && finite(view * area + i)).collect()
+            })
+            .collect();
+        let photos = [0, 1].map(|view| &item.images[3 * view * area..3 * (view + 1) * area]);
+        let sides = if views > 2 { side_images(photos, &points, &valid) } else { Vec::new() };
+        let images: Vec<&[f32]> = photos.into_iter().chain(sides.iter().map(Vec::as_slice)).collect();
+        // One overflow would spoil the normalisation of a whole view.
+        points.iter_mut().filter(|v| !v.is_finite()).for_each(|v| *v = 0.0);
+        let points = Tensor::<4>::from_data(TensorData::new(points, [views, side, side, 3]), device);
+        let mut parts = Vec::new();
+        for (pair, first) in (0..views).step_by(2).enumerate().filter(|(_, v)| phase.views.contains(v)) {
+            let person = Window::around(valid[first..first + 2].iter().map(Vec::as_slice), side);
+            let Some(person) = person else { continue };
+            let window = if config.crop() { person.padded(side) } else { Window::whole(side) };
+            let regressor = &networks.regressors[pair.min(networks.regressors.len() - 1)];
+            let seen: Vec<_> = (first..first + 2)
+                .map(|v| Seen { image: images[v], points: points.clone().narrow(0, v, 1), valid: &valid[v] })
+                .collect();
+            parts.extend(regress(regressor, config, &seen, &window));
+        }
+        if parts.is_empty() {
+            return None;
+        }
+        let (gaussians, _) = assemble(config, parts, device);
+        (!gaussians.is_empty())
+            .then(|| placed(config, gaussians, &item.cameras[View::Front as usize].world_to_camera.inverse()))
+    }
+
+    /// Rendered pictures `[V,3,h,w]` and coverage `[V,h,w]`.
+    fn render(
+        &self,
+        gaussians: &Gaussians,
+        cameras: &[Camera],
+        background: [f32; 3],
+    ) -> Result<(Tensor<4>, Tensor<3>), TrainError> {
+        let color = Tensor::<1>::from_floats(background, &gaussians.device());
+        let options = RenderOptions { background: Some(color), ..RenderOptions::inria() };
+        let rendered = render(gaussians, cameras, &options)?;
+        Ok((rendered.color.permute([0, 3, 1, 2]), rendered.alpha))
+    }
+}
+
+/// Target pictures `[V,3,h,w]` and masks `[V,h,w]` of some views.
+fn targets(item: &Stage2Item, views: &[usize], device: &Device) -> (Tensor<4>, Tensor<3>) {
+    let (side, count) = (item.target_side, views.len());
+    let area = side * side;
+    let pick = |values: &[f32], size: usize| -> Vec<f32> {
+        views.iter().flat_map(|v| values[v * size..(v + 1) * size].iter().copied()).collect()
+    };
+    let pictures = TensorData::new(pick(&item.targets, 3 * area), [count, 3, side, side]);
+    let masks = TensorData::new(pick(&item.target_masks, area), [count, side, side]);
+    (Tensor::from_data(pictures, device), Tensor::from_data(masks, device))
+}
+
+impl Task for GaussianTask {
+    type Item = Stage2Item;
+    const STAGE: u32 = 2;
+
+    fn samples(&self, pass: u64) -> Joined<Stage2Item> {
+        let sets = self.sets.iter().map(|set| Box::new(set.with_epoch(pass)) as Box<dyn Dataset<_>>);
+        Joined::new(sets.collect())
+    }
+
+    fn name(item: &Stage2Item) -> &str {
+        &item.name
+    }
+
+    fn losses(
+        &self,
+        networks: &Networks,
+        items: Vec<Stage2Item>,
+        step: u64,
+    ) -> Result<Vec<Part>, TrainError> {
+        let (phase, device) = (Phase::new(self.losses.curriculum, step), self.device.clone().autodiff());
+        let mut random = stream(&format!("stage2/{}/{step}", self.seed));
+        let mut sums: BTreeMap<&'static str, Vec<Tensor<1>>> = BTreeMap::new();
+        for item in &items {
+            let count = item.target_cameras.len();
+            let all: Vec<usize> = (0..count).collect();
+            // The sides' two views are the last ones.
+            let chosen = match (&phase.views, phase.one_view) {
+                (views, true) if views.start == 2 => vec![random.random_range(count - 2..count)],
+                (_, true) => vec![random.random_range(0..count)],
+                _ => all,
+            };
+            let deviation = self.losses.noise as f32;
+            let mut noise = || {
+                // Sum of uniform numbers: nearly normal, and bounded.
+                deviation * (0..3).map(|_| random.random_range(-1.0_f32..1.0)).sum::<f32>()
+            };
+            let noise: Option<&mut dyn FnMut() -> f32> =
+                if deviation > 0.0 { Some(&mut noise) } else { None };
+            let Some(gaussians) = self.gaussians(networks, item, &phase, noise, &device) else { continue };
+            let cameras: Vec<Camera> = chosen.iter().map(|v| item.target_cameras[*v]).collect();
+            let (image, coverage) = self.render(&gaussians, &cameras, item.background)?;
+            let (target, mask) = targets(item, &chosen, &device);
+            let photometric = Photometric::new(image, target);
+            let mut add = |name, value: Tensor<1>| sums.entry(name).or_default().push(value);
+            add("l1", photometric.l1);
+            add("dissimilarity", 1.0 - photometric.ssim);
+            if self.losses.alpha > 0.0 {
+                add("alpha", (coverage - mask).abs().mean());
+            }
+            if phase.scale > 0.0 {
+                add("scale", gaussians.scales.clone().mean());
+            }
+            if self.losses.needle > 0.0 {
+                add("needle", needles(&gaussians, self.losses.anisotropy));
+            }
+        }
+        if sums.is_empty() {
+            let message = format!(
+                "no pixel of {} is part of a person, as the point predictor sees it",
+                items.first().map_or("nothing", |item| item.name.as_str())
+            );
+            return Err(TrainError::Unsuitable(message));
+        }
+        let weight = |name| match name {
+            "l1" => self.losses.beta,
+            "dissimilarity" => 1.0 - self.losses.beta,
+            "alpha" => self.losses.alpha,
+            "scale" => phase.scale,
+            _ => self.losses.needle,
+        };
+        let part = |(name, values): (&'static str, Vec<Tensor<1>>)| Part {
+            name,
+            weight: weight(name),
+            value: Tensor::cat(values, 0).mean(),
+        };
+        Ok(sums.into_iter().map(part).collect())
+    }
+
+    fn validate(&self, networks: &Networks) -> Result<Option<Validation>, TrainError> {
+        if self.validation.count == 0 {
+            return Ok(None);
+        }
+        let mut sums = [0.0_f64; 5];
+        for index in self.validation.indices(self.validation.count) {
+            let item = self.validation.get(index)?;
+            let device = &self.device;
+            let views: Vec<usize> = (0..item.target_cameras.len()).collect();
+            let (target, mask) = targets(&item, &views, device);
+            let image = match self.gaussians(networks, &item, &Phase::new(false, 0), None, device) {
+                Some(gaussians) => self.render(&gaussians, &item.target_cameras, item.background)?.0,
+                None => target.zeros_like(),
+            };
+            let there = |from: usize, count: usize| {
+                let inside = mask.clone().narrow(0, from, count).greater_elem(0.0).float();
+                psnr(image.clone().narrow(0, from, count), target.clone().narrow(0, from, count), &inside)
+            };
+            let photometric = Photometric::new(image.clone(), target.clone());
+            let ssim: f64 = host(photometric.ssim).into_iter().map(f64::from).sum();
+            let all = mask.ones_like();
+            let sides = views.len() - 2;
+            let values = [
+                psnr(image.clone(), target.clone(), &all),
+                there(0, views.len()),
+                there(sides, 2),
+                ssim,
+                1.0,
+            ];
+            sums.iter_mut().zip(values).for_each(|(sum, value)| *sum += value);
+        }
+        let [full, masked, sides, ssim, count] = sums;
+        let figures = vec![
+            ("psnr_masked", masked / count),
+            ("psnr_masked_sides", sides / count),
+            ("psnr", full / count),
+            ("ssim", ssim / count),
+        ];
+        Ok(Some(Validation { score: -masked / count, figures }))
+    }
+
+    fn preview(&self, networks: &Networks) -> Result<Option<RgbImage>, TrainError> {
+        let mut rows = Vec::new();
+        for index in self.validation.indices(PREVIEWS) {
+            let item = self.validation.get(index)?;
+            let (side, area) = (item.side, item.side * item.side);
+            let photo = |view: usize| {
+                picture(side, |i| [0, 1, 2].map(|c| item.images[(3 * view + c) * area + i] * 0.5 + 0.5))
+            };
+            let mut row = vec![photo(0), photo(1)];
+            let views = [0, item.target_cameras.len() - 2];
+            let cameras = views.map(|v| item.target_cameras[v]);
+            let seen = match self.gaussians(networks, &item, &Phase::new(false, 0), None, &self.device) {
+                Some(gaussians) => host(self.render(&gaussians, &cameras, item.background)?.0),
+                None => vec![0.0; 2 * 3 * item.target_side.pow(2)],
+            };
+            let (side, area) = (item.target_side, item.target_side.pow(2));
+            for (place, view) in views.into_iter().enumerate() {
+                let at = |values: &[f32], view: usize, i: usize| {
+                    [0, 1, 2].map(|c| values[(3 * view + c) * area + i])
+                };
+                let (got, truth) = (|i| at(&seen, place, i), |i| at(&item.targets, view, i));
+                let error = |i: usize| {
+                    let (a, b) = (got(i), truth(i));
+                    (0..3).map(|c| (a[c] - b[c]).abs()).sum::<f32>() / 3.0
+                };
+                row.extend([
+                    picture(side, got),
+                    picture(side, truth),
+                    picture(side, |i| heat(error(i), WORST)),
+                ]);
+            }
+            rows.push(row);
+        }
+        Ok(grid(&rows))
+    }
+
+    fn frozen(&self) -> BTreeMap<String, Vec<f32>> {
+        Networks { predictor: Some(self.predictor.clone()), regressors: Vec::new() }.checkpoint()
+    }
+}
+
+/// Mean over all Gaussians of ln(longest / shortest axis) − ln(limit), where that is positive. (A mean penalty on scales
+/// alone misses the few that are too long.)
+fn needles(gaussians: &Gaussians, limit: f64) -> Tensor<1> {
+    let logs = gaussians.scales.clone().clamp_min(1e-12).log();
+    let ratio = logs.clone().max_dim(1) - logs.min_dim(1);
+    (ratio - limit.ln()).clamp_min(0.0).mean()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_published_curriculum_goes_from_the_sides_to_everything() {
+        let phase = |step| Phase::new(true, step);
+        assert_eq!(phase(0), Phase { views: 2..4, scale: 2.0, one_view: true });
+        assert_eq!(phase(1999), phase(0));
+        assert_eq!(phase(2000), Phase { views: 0..2, scale: 0.0, one_view: true });
+        assert_eq!(phase(4000), Phase { views: 0..4, scale: 0.0, one_view: true });
+        assert_eq!(phase(10_000), Phase { views: 0..4, scale: 0.0, one_view: false });
+        assert_eq!(Phase::new(false, 0), phase(10_000));
+    }
+
+    #[test]
+    fn only_what_a_needle_has_too_much_costs() {
+        let device = Device::flex();
+        let scales = Tensor::<2>::from_floats([[0.01, 0.01, 0.08], [0.01, 0.1, 1.0]], &device);
+        let gaussians = Gaussians::new(
+            Tensor::zeros([2, 3], &device),
+            Tensor::ones([2, 4], &device),
+            scales,
+            Tensor::ones([2], &device),
+            Tensor::ones([2, 3], &device),
+        );
+        let cost = host(needles(&gaussians.expect("fits"), 10.0))[0];
+        assert!((cost - 10.0_f32.ln() / 2.0).abs() < 1e-5, "{cost}");
+    }
+}
