@@ -76,6 +76,10 @@ pub struct NetworkConfig {
     pub upsample: Option<Upsample>,
     /// Initial value of δ, the learned global scale of the points (metres per network unit).
     pub delta: f64,
+    /// What the predicted points are measured from.
+    pub anchor: Anchor,
+    /// Whether the predictor sees only the window of the canvas that holds the person (LEARNING.md).
+    pub window: bool,
 }
 
 impl Default for NetworkConfig {
@@ -103,6 +107,8 @@ impl Default for NetworkConfig {
             conf_threshold: 0.9,
             upsample: None,
             delta: 5.0,
+            anchor: Anchor::None,
+            window: false,
         }
     }
 }
@@ -181,6 +187,15 @@ names! {
         Dpt = "dpt",
         /// One linear layer and a pixel shuffle.
         Linear = "linear",
+    }
+}
+names! {
+    /// What predicted points are measured from (LEARNING.md).
+    Anchor {
+        /// The front camera: direction and exponential distance, as published.
+        None = "none",
+        /// Where the pixel's ray, of the nominal camera, meets the plane through the body's axis: metres over δ.
+        Ray = "ray",
     }
 }
 names! {

@@ -3,6 +3,9 @@
 use std::fmt;
 use std::ops::Range;
 
+use burn::tensor::Tensor;
+
+use crate::config::Config;
 use crate::regressor::RECEPTIVE_RADIUS;
 
 /// The regressor halves the image twice, so windows start and end at multiples of this.
@@ -38,6 +41,14 @@ impl Window {
         found
     }
 
+    /// What the point predictor looks at on the canvas of `config`: everything, or the window of the persons in the masks.
+    pub fn of_predictor<'a>(config: &Config, masks: impl Iterator<Item = &'a [bool]>) -> Self {
+        let side = config.network.resolution;
+        let person = if config.network.window { Self::around(masks, side) } else { None };
+        let cell = config.network.patch * config.upsample_factor();
+        person.map_or_else(|| Self::whole(side), |person| person.in_cells(cell, side))
+    }
+
     /// Grown by the regressor's receptive radius, so that what lies outside cannot matter, to aligned edges inside the
     /// canvas (whose side is a multiple of 4).
     pub fn padded(&self, side: usize) -> Self {
@@ -46,6 +57,29 @@ impl Window {
             start..(r.end + RECEPTIVE_RADIUS).next_multiple_of(ALIGNMENT).min(side)
         };
         Self { rows: grow(&self.rows), columns: grow(&self.columns) }
+    }
+
+    /// Grown to whole cells of `cell` pixels, of which the canvas has a whole number, for the point predictor. The sides'
+    /// pictures are no wider than half a person's height, nearly always; what is narrower is widened to that.
+    pub fn in_cells(&self, cell: usize, side: usize) -> Self {
+        let (middle, width) =
+            ((self.columns.start + self.columns.end) / 2, self.columns.len().max(self.rows.len() / 2).max(1));
+        let columns = middle.saturating_sub(width.div_ceil(2))..middle + width.div_ceil(2);
+        let whole = |r: &Range<usize>| r.start / cell * cell..r.end.next_multiple_of(cell).min(side);
+        Self { rows: whole(&self.rows), columns: whole(&columns) }
+    }
+
+    /// This part of images `[.., side, side]`, the last two axes.
+    pub fn cut<const D: usize>(&self, images: Tensor<D>) -> Tensor<D> {
+        let rows = images.narrow(D - 2, self.rows.start, self.rows.len());
+        rows.narrow(D - 1, self.columns.start, self.columns.len())
+    }
+
+    /// Maps of this part `[B, h, w, C]` on a canvas of zeros `[B, side, side, C]`.
+    pub fn pasted(&self, maps: Tensor<4>, side: usize) -> Tensor<4> {
+        let [b, _, _, c] = maps.dims();
+        let canvas = Tensor::zeros([b, side, side, c], &maps.device());
+        canvas.slice_assign([0..b, self.rows.clone(), self.columns.clone(), 0..c], maps)
     }
 
     /// This part of an image `[channels, side, side]`.
@@ -87,6 +121,22 @@ mod tests {
         assert_eq!(padded, Window { rows: 100..404, columns: 100..352 });
         assert_eq!(padded.indices(&mask, side), vec![(101 * 252 + 150), (200 * 252 + 103)]);
         assert_eq!(Window::around([vec![false; 16].as_slice()].into_iter(), 4), None);
+    }
+
+    #[test]
+    fn the_predictors_windows_are_whole_cells_and_wide_enough_for_the_sides() {
+        let person = Window { rows: 201..401, columns: 240..260 };
+        assert_eq!(person.in_cells(16, 512), Window { rows: 192..416, columns: 192..304 });
+        let corner = Window { rows: 0..500, columns: 490..512 };
+        assert_eq!(corner.in_cells(32, 512), Window { rows: 0..512, columns: 352..512 });
+        let device = burn::tensor::Device::flex();
+        let window = Window { rows: 1..3, columns: 2..3 };
+        let map = Tensor::<4>::from_floats([[[[5.0]], [[7.0]]]], &device);
+        let canvas = window.pasted(map, 4);
+        let values: Vec<f32> = canvas.clone().into_data().try_into_vec().expect("f32");
+        assert_eq!((values[6], values[10], values.iter().sum::<f32>()), (5.0, 7.0, 12.0));
+        let cut: Vec<f32> = window.cut(canvas.reshape([1, 1, 4, 4])).into_data().try_into_vec().expect("f32");
+        assert_eq!(cut, [5.0, 7.0]);
     }
 
     #[test]

@@ -196,19 +196,21 @@ impl Run<'_> {
                 &self.model.device,
             )
         };
+        let window = self.predictor_window(photos);
         let images = self.timed("input", |_| {
             let images = Tensor::cat(photos.map(|p| upload(&p.rgb, 3)).to_vec(), 0);
-            shrink(images, factor, config.downsample())
+            shrink(window.cut(images), factor, config.downsample())
         });
-        let grid = net.dust3r.grid([config.network.net_resolution; 2]);
+        let [_, _, height, width] = images.dims();
+        let grid = net.dust3r.grid([height, width]);
         self.plan.push(format!(
-            "point predictor: 2 photographs of {0}×{0} ({1} of {side}×{side}), {2} tokens each",
-            config.network.net_resolution,
+            "point predictor: 2 photographs of {width}×{height} ({} of {window}{}), {} tokens each",
             match config.downsample() {
                 _ if factor == 1 => "as they are instead",
                 Downsample::Area => "area means",
                 Downsample::Nearest => "every first pixel",
             },
+            if window == Window::whole(side) { "" } else { ", the person's window" },
             grid[0] * grid[1],
         ));
         let tokens = self.timed("encoder", |_| net.dust3r.encode(images));
@@ -216,8 +218,7 @@ impl Run<'_> {
         let tokens = self.timed("decoders", |_| net.dust3r.decode(front, back, grid));
         let heads = if net.dust3r.views().len() == 4 { "heads (4)" } else { "heads (2)" };
         let maps = self.timed(heads, |_| {
-            let map =
-                |&view: &View| activate(net.dust3r.raw_points(view, &tokens, grid), config.network.conf_mode);
+            let map = |&view: &View| activate(net.dust3r.raw_points(view, &tokens, grid), &config.network);
             net.dust3r.views().iter().map(map).collect::<Vec<_>>()
         });
         self.timed("up-sampling", |_| {
@@ -225,17 +226,25 @@ impl Run<'_> {
             let on_canvas = net.dust3r.views().iter().zip(maps).map(|(&view, map)| {
                 let weights =
                     (method == Upsample::MaskAware && factor > 1).then(|| match photos.get(view as usize) {
-                        Some(photo) => shrink(upload(&photo.mask, 1), factor, Downsample::Area),
+                        Some(photo) => shrink(window.cut(upload(&photo.mask, 1)), factor, Downsample::Area),
                         None => {
                             let body = map.conf.clone().greater_elem(config.network.conf_threshold);
                             body.float().unsqueeze_dim(1)
                         }
                     });
-                net.to_canvas(map, factor, method, weights)
+                let map = net.anchored(view, net.to_canvas(map, factor, method, weights), &window);
+                map.on_canvas(&window, side)
             });
             let (points, conf): (Vec<_>, Vec<_>) = on_canvas.map(|m| (m.points, m.conf)).unzip();
             PointMap { points: Tensor::cat(points, 0), conf: Tensor::cat(conf, 0) }
         })
+    }
+
+    /// What the point predictor looks at.
+    fn predictor_window(&self, photos: [&Photograph; 2]) -> Window {
+        let config = &self.model.config;
+        let masks = photos.map(|photo| photo.mask.iter().map(|m| *m > 0.0).collect::<Vec<_>>());
+        Window::of_predictor(config, masks.iter().map(Vec::as_slice))
     }
 
     /// Gaussians of all valid pixels, view after view.

@@ -1,9 +1,12 @@
 //! Stage 1: how far predicted points lie from the true ones, and how sure the network may be of them (SNAPSNAP §6).
 
 use burn::tensor::Tensor;
+use snapsnap_net::Window;
 use snapsnap_net::config::{Config, Downsample, Upsample};
 use snapsnap_net::network::{PointMap, PointPredictor, View, activate};
 use snapsnap_net::resample::shrink;
+
+use crate::networks::host;
 
 /// Squares of distances below this have no gradient: the direction of so small an error is noise.
 const MIN_SQUARE: f64 = 1e-24;
@@ -20,50 +23,78 @@ pub struct Losses {
     pub confidence: Tensor<1>,
 }
 
-/// Point maps of all views on the canvas, one view after the other, as training sees them: front and back `[B,2,3,S,S]` in
-/// [−1, 1] and their masks `[B,2,S,S]`, for `mask-aware` interpolation.
+/// Point maps of all views, one after the other, on the window of the canvas that the predictor sees.
+#[derive(Debug, Clone)]
+pub struct Prediction {
+    /// The window.
+    pub window: Window,
+    /// `[B,h,w,3]` and `[B,h,w]` of every view.
+    pub maps: Vec<(View, PointMap)>,
+}
+
+impl Prediction {
+    /// The same on the whole canvas; what lies outside is 0.
+    pub fn on_canvas(self, side: usize) -> Vec<(View, PointMap)> {
+        self.maps.into_iter().map(|(view, map)| (view, map.on_canvas(&self.window, side))).collect()
+    }
+}
+
+/// Point maps as training sees them: front and back `[B,2,3,S,S]` in [−1, 1] and their masks `[B,2,S,S]`, which decide the
+/// window and `mask-aware` interpolation.
 pub fn predict(
     predictor: &PointPredictor,
     config: &Config,
     images: Tensor<5>,
     masks: &Tensor<4>,
-) -> Vec<(View, PointMap)> {
-    let [b, _, channels, h, w] = images.dims();
+) -> Prediction {
+    let [b, _, channels, side, _] = images.dims();
+    let window = if config.network.window {
+        let masks: Vec<bool> = host(masks.clone()).into_iter().map(|mask| mask > 0.0).collect();
+        Window::of_predictor(config, masks.chunks_exact(side * side))
+    } else {
+        Window::whole(side)
+    };
     let factor = config.upsample_factor();
-    let side = |i: usize| {
-        let image = images.clone().narrow(1, i, 1).reshape([b, channels, h, w]);
-        shrink(image, factor, config.downsample())
+    let photograph = |i: usize| {
+        let image = images.clone().narrow(1, i, 1).reshape([b, channels, side, side]);
+        shrink(window.cut(image), factor, config.downsample())
     };
     let net = &predictor.dust3r;
-    let grid = net.grid([h / factor, w / factor]);
-    let tokens = net.encode(Tensor::cat(vec![side(0), side(1)], 0));
+    let photographs = Tensor::cat(vec![photograph(0), photograph(1)], 0);
+    let [_, _, height, width] = photographs.dims();
+    let grid = net.grid([height, width]);
+    let tokens = net.encode(photographs);
     let maps = net.decode(tokens.clone().narrow(0, 0, b), tokens.narrow(0, b, b), grid);
     let map = |&view: &View| {
-        let map = activate(net.raw_points(view, &maps, grid), config.network.conf_mode);
+        let map = activate(net.raw_points(view, &maps, grid), &config.network);
         // As in inference: photographs have masks, sides the network's own opinion, which gets no gradient from this.
         let weights = (config.upsample() == Upsample::MaskAware && factor > 1).then(|| match view as usize {
-            photo @ 0..2 => shrink(masks.clone().narrow(1, photo, 1), factor, Downsample::Area),
+            photo @ 0..2 => shrink(window.cut(masks.clone().narrow(1, photo, 1)), factor, Downsample::Area),
             _ => {
                 let body = map.conf.clone().detach().greater_elem(config.network.conf_threshold);
                 body.float().unsqueeze_dim(1)
             }
         });
-        (view, predictor.to_canvas(map, factor, config.upsample(), weights))
+        let map = predictor.to_canvas(map, factor, config.upsample(), weights);
+        (view, predictor.anchored(view, map, &window))
     };
-    net.views().iter().map(map).collect()
+    let maps = net.views().iter().map(map).collect();
+    Prediction { window, maps }
 }
 
 /// The losses of predicted maps: true points `[B,V,S,S,3]` in the front camera's frame, metres, and where there are any
 /// `[B,V,S,S]`, 0 or 1. Confidences must be probabilities. All samples' pixels are pooled.
-pub fn losses(maps: &[(View, PointMap)], points: &Tensor<5>, valid: &Tensor<4>) -> Losses {
-    let [b, _, h, w, _] = points.dims();
+pub fn losses(prediction: &Prediction, points: &Tensor<5>, valid: &Tensor<4>) -> Losses {
+    let Prediction { window, maps } = prediction;
+    let (b, h, w) = (points.dims()[0], window.rows.len(), window.columns.len());
     let mut regression = Vec::new();
     let mut confidence = Vec::new();
     for (view, map) in maps {
         let row = *view as usize;
-        let inside = valid.clone().narrow(1, row, 1).reshape([b, h, w]);
+        let inside = window.cut(valid.clone().narrow(1, row, 1)).reshape([b, h, w]);
         let there = inside.clone().greater_elem(0.5);
-        let truth = points.clone().narrow(1, row, 1).reshape([b, h, w, 3]);
+        let truth = points.clone().narrow(1, row, 1).narrow(2, window.rows.start, h);
+        let truth = truth.narrow(3, window.columns.start, w).reshape([b, h, w, 3]);
         // What is not there may be anything, 10⁸ metres or NaN, and must not reach the gradient.
         let nowhere = there.clone().bool_not().unsqueeze_dim::<4>(3).expand([b, h, w, 3]);
         let off = (map.points.clone() - truth).mask_fill(nowhere, 0.0);

@@ -15,7 +15,7 @@ use crate::TrainError;
 use crate::config::TrainConfig;
 use crate::fixed::{Fixed, check_resolution};
 use crate::networks::{Networks, host};
-use crate::points::{losses, predict};
+use crate::points::{Prediction, losses, predict};
 use crate::preview::{grid, heat, picture};
 use crate::task::{Part, Task, Validation};
 
@@ -62,7 +62,7 @@ impl PointTask {
         self.validation.count
     }
 
-    fn predict(&self, networks: &Networks, batch: &Stage1Batch) -> Vec<(View, PointMap)> {
+    fn predict(&self, networks: &Networks, batch: &Stage1Batch) -> Prediction {
         let predictor = networks.predictor.as_ref().expect("stage 1 trains the predictor");
         predict(predictor, &self.networks, batch.images.clone(), &batch.masks)
     }
@@ -103,7 +103,11 @@ impl Task for PointTask {
         for index in self.validation.indices(self.validation.count) {
             let item = self.validation.get(index)?;
             let batch = Stage1Batcher.batch(vec![item.clone()], &self.device);
-            errors.add(&item, &self.predict(networks, &batch), self.networks.network.conf_threshold);
+            errors.add(
+                &item,
+                &self.predict(networks, &batch).on_canvas(item.side),
+                self.networks.network.conf_threshold,
+            );
         }
         Ok(Some(errors.validation()))
     }
@@ -114,7 +118,7 @@ impl Task for PointTask {
             let item = self.validation.get(index)?;
             let (side, area) = (item.side, item.side * item.side);
             let batch = Stage1Batcher.batch(vec![item.clone()], &self.device);
-            let maps = self.predict(networks, &batch);
+            let maps = self.predict(networks, &batch).on_canvas(side);
             for (row, (view, map)) in maps.iter().enumerate() {
                 let (points, conf) = (host(map.points.clone()), host(map.conf.clone()));
                 let view = *view as usize;

@@ -122,7 +122,7 @@ impl GaussianTask {
         };
         let images = tensor(&item.images, [1, 2, 3, side, side]);
         let masks = tensor(&item.masks, [1, 1, 2, side, side]).reshape([1, 2, side, side]);
-        let maps = predict(&self.predictor, config, images, &masks);
+        let maps = predict(&self.predictor, config, images, &masks).on_canvas(side);
         let (mut points, mut conf) = (Vec::new(), Vec::new());
         for (_, map) in maps {
             points.extend(host(map.points));

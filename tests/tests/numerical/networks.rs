@@ -76,7 +76,7 @@ fn network(name: &str) {
         if !io.has(&format!("points.{k}")) {
             continue;
         }
-        let map = activate(net.dust3r.raw_points(view, &maps, grid), config.network.conf_mode);
+        let map = activate(net.dust3r.raw_points(view, &maps, grid), &config.network);
         let what = format!("{name} {}", view.name());
         assert_close(&format!("{what} points"), map.points, &io.f32(&format!("points.{k}")), POINTS);
         assert_close(&format!("{what} conf"), map.conf, &io.f32(&format!("conf.{k}")), POINTS);

@@ -111,7 +111,7 @@ fn points_have_their_published_check_value_and_lose_nothing_near_zero() {
     let Some(device) = device() else { return };
     let raw = |r: [f32; 3]| {
         let data = TensorData::new(vec![r[0], r[1], r[2], 0.0], [1, 4, 1, 1]);
-        values(activate(Tensor::from_data(data, &device), config(&[]).network.conf_mode).points)
+        values(activate(Tensor::from_data(data, &device), &config(&[]).network).points)
     };
     let p = raw([0.3, 0.0, 0.4]);
     assert!((p[0] - 0.389_233).abs() < 1e-6 && p[1] == 0.0 && (p[2] - 0.518_977).abs() < 1e-6, "{p:?}");
@@ -247,7 +247,7 @@ fn swapping_two_heads_weights_swaps_their_outputs() {
         |seed| Tensor::<4>::from_data(TensorData::new(noise(3 * 64 * 64, seed), [1, 3, 64, 64]), &device);
     let points = |weights: &WeightFile| {
         let net = weights.point_predictor(&device).expect("weights");
-        let maps = net.forward(image(1), image(2), config.network.conf_mode);
+        let maps = net.forward(image(1), image(2));
         maps.into_iter().map(|(_, map)| values(map.points)).collect::<Vec<_>>()
     };
     let before = points(&weights);
@@ -270,7 +270,7 @@ fn every_fusion_head_and_view_count_runs_on_sizes_that_are_no_squares() {
             let config = config(&[&format!("network.head={head}"), &format!("network.fusion={fusion}")]);
             let (_file, weights) = weights(&config, 2);
             let net = weights.point_predictor(&device).expect("weights");
-            let maps = net.forward(image(1), image(2), config.network.conf_mode);
+            let maps = net.forward(image(1), image(2));
             assert_eq!(maps.len(), 4);
             let right = values(maps[2].1.points.clone());
             assert_eq!(maps[2].1.points.dims(), [1, 48, 80, 3]);
@@ -281,7 +281,7 @@ fn every_fusion_head_and_view_count_runs_on_sizes_that_are_no_squares() {
         let config = config(&[&format!("network.head={head}"), "network.side_heads=false"]);
         let (_file, weights) = weights(&config, 2);
         let net = weights.point_predictor(&device).expect("weights");
-        assert_eq!(net.forward(image(1), image(2), config.network.conf_mode).len(), 2);
+        assert_eq!(net.forward(image(1), image(2)).len(), 2);
     }
 }
 

@@ -1,47 +1,26 @@
 //! Training against the authors' code: losses, gradients and weights of its steps (f64 arithmetic, stored as f32 or f64).
 
-use std::collections::HashMap;
+use std::collections::BTreeMap;
 
-use burn::module::Param;
-use burn::optim::GradientsParams;
 use burn::tensor::{Device, Tensor, TensorData};
 use snapsnap_net::config::Config;
-use snapsnap_net::network::PointPredictor;
 use snapsnap_net::regressor::Statistics;
-use snapsnap_net::weights::{ImportOptions, NamedVisitor, SideHeads, WeightFile, import, visit_named};
+use snapsnap_net::weights::{ImportOptions, SideHeads, WeightFile, import};
 use snapsnap_tests::{Numbers, data, device, fixture, relative_error, values};
+use snapsnap_train::networks::{Networks, Rows};
 use snapsnap_train::optimizer::OptimizerConfig;
 use snapsnap_train::photometric::Photometric;
 use snapsnap_train::schedule::Schedule;
 use snapsnap_train::{gradients, points};
 
-/// Values of a module's parameters, or of their gradients, by the checkpoint's names and in its layout.
-struct Named<'a> {
-    gradients: Option<&'a GradientsParams>,
-    values: HashMap<String, Vec<f32>>,
-}
-
-impl NamedVisitor for Named<'_> {
-    fn visit<const D: usize>(&mut self, name: &str, is_transposed: bool, parameter: &Param<Tensor<D>>) {
-        let tensor = match self.gradients {
-            Some(gradients) => gradients.get::<D>(parameter.id),
-            None => Some(parameter.val().inner()),
-        };
-        if let Some(tensor) = tensor {
-            let tensor = if is_transposed { tensor.swap_dims(0, 1) } else { tensor };
-            self.values.insert(name.to_owned(), values(tensor));
-        }
-    }
-}
-
-fn named(predictor: &PointPredictor, gradients: Option<&GradientsParams>) -> HashMap<String, Vec<f32>> {
-    let mut named = Named { gradients, values: HashMap::new() };
-    visit_named(predictor, "", &mut named);
-    named.values
+/// Rows by the checkpoint's names and in its layout.
+fn named(networks: &Networks, rows: &Rows) -> BTreeMap<String, Vec<f32>> {
+    let there = networks.clone().with_rows(rows).checkpoint();
+    there.into_iter().filter(|(name, _)| rows.contains_key(name)).collect()
 }
 
 /// The point predictor of the `pipeline` fixture, ready to be trained.
-fn predictor(device: &Device) -> (Config, PointPredictor) {
+fn predictor(device: &Device) -> (Config, Networks) {
     let folder = tempfile::tempdir().expect("temporary folder");
     let config = Config::from_toml(CONFIG, "the fixture's config", &[]).expect("a config");
     let path = folder.path().join("weights.safetensors");
@@ -49,7 +28,7 @@ fn predictor(device: &Device) -> (Config, PointPredictor) {
     import(&[data("pipeline/stage1.pth")], &config, options, &path, &|_, _| ()).expect("imports");
     let weights = WeightFile::open(&path, None).expect("opens");
     let predictor = weights.point_predictor(&device.clone().autodiff()).expect("loads");
-    (config, predictor)
+    (config, Networks { predictor: Some(predictor), regressors: Vec::new() })
 }
 
 const CONFIG: &str = r#"
@@ -94,11 +73,12 @@ fn follow(steps: usize) {
     let trace = Numbers::read(&folder.join("trace.safetensors"));
     let expected = Numbers::read(&folder.join("gradients_step0.safetensors"));
     let after = Numbers::read(&folder.join("weights_after.safetensors"));
-    let (config, mut predictor) = predictor(&device);
-    let before = named(&predictor, None);
+    let (config, mut networks) = predictor(&device);
+    let before = networks.checkpoint();
     let optimizer = OptimizerConfig { rate: 1e-3, ..OptimizerConfig::default() };
-    let mut optimizer = optimizer.init(&predictor);
-    let schedule = Schedule::OneCycle { steps: 120, rise: 0.01, start_divisor: 25.0, end_divisor: 1e4 };
+    let mut optimizer = optimizer.init();
+    // Of the published run's shape: 20 steps, and 100 by which the cycle is longer.
+    let schedule = Schedule::published();
 
     let tracked = device.clone().autodiff();
     let images: Tensor<5> = trace.tensor("images", &tracked);
@@ -112,27 +92,33 @@ fn follow(steps: usize) {
     for step in 0..steps {
         let sample = step % 3;
         let photographs = masks.clone().narrow(0, sample, 1).narrow(1, 0, 2);
-        let maps = points::predict(&predictor, &config, images.clone().narrow(0, sample, 1), &photographs);
+        let predictor = networks.predictor.as_ref().expect("is trained");
+        let prediction =
+            points::predict(predictor, &config, images.clone().narrow(0, sample, 1), &photographs);
         let [truth, masks] = [
             truth.clone().narrow(0, sample, 1).reshape([-1]),
             masks.clone().narrow(0, sample, 1).reshape([-1]),
         ];
         let side = config.network.resolution;
-        let losses =
-            points::losses(&maps, &truth.reshape([1, 4, side, side, 3]), &masks.reshape([1, 4, side, side]));
+        let losses = points::losses(
+            &prediction,
+            &truth.reshape([1, 4, side, side, 3]),
+            &masks.reshape([1, 4, side, side]),
+        );
         let got = [losses.regression.clone(), losses.confidence.clone()];
         let [r, c] = got.map(|loss| f64::from(loss.into_scalar::<f32>()));
         worst = worst.max(off(r, reg[step])).max(off(c, conf[step]));
         let loss = losses.regression + losses.confidence * 0.5;
-        let gradients = GradientsParams::from_grads(loss.backward(), &predictor);
+        let rows = gradients::collect(&networks, &mut loss.backward());
         if step == 0 {
-            compare_gradients(&named(&predictor, Some(&gradients)), &expected);
+            compare_gradients(&named(&networks, &rows), &expected);
         }
-        let norm = gradients::norm(&predictor, &gradients);
+        let norm = gradients::norm(&rows);
         assert!(off(norm, norms[step]) < 5e-3, "step {step}: norm {norm}, expected {}", norms[step]);
-        let gradients = gradients::clipped(&predictor, gradients, norm, 1.0).expect("finite");
-        assert!(off(1e-3 * schedule.share(step), rates[step]) < 1e-9, "step {step}: rate");
-        predictor = optimizer.step(schedule.share(step), predictor, gradients);
+        let factor = gradients::clip_factor(norm, 1.0).expect("finite");
+        let share = schedule.share(step, 20);
+        assert!(off(1e-3 * share, rates[step]) < 1e-9, "step {step}: rate");
+        networks = optimizer.step(share, networks, rows, factor);
     }
     println!("losses: relative error {worst:.1e}");
     assert!(worst <= 5e-4, "losses: {worst:e}");
@@ -141,7 +127,7 @@ fn follow(steps: usize) {
     }
 
     let (mut way, mut error) = (0.0, 0.0);
-    for (name, got) in named(&predictor, None) {
+    for (name, got) in networks.checkpoint() {
         let expected = after.f32(&name).1;
         let square = |a: &[f32], b: &[f32]| -> f64 {
             a.iter().zip(b).map(|(a, b)| (f64::from(*a) - f64::from(*b)).powi(2)).sum()
@@ -154,7 +140,7 @@ fn follow(steps: usize) {
     assert!(share <= 1e-3, "{share:e}");
 }
 
-fn compare_gradients(got: &HashMap<String, Vec<f32>>, expected: &Numbers) {
+fn compare_gradients(got: &BTreeMap<String, Vec<f32>>, expected: &Numbers) {
     let mut worst = (0.0, "");
     let mut compared = 0;
     for (name, got) in got {
@@ -178,7 +164,7 @@ fn compare_gradients(got: &HashMap<String, Vec<f32>>, expected: &Numbers) {
 fn gradients_of_the_regressor_are_the_authors() {
     let Some(device) = device() else { return };
     let Some(path) = fixture("unet/gradients.safetensors") else { return };
-    let gradients = Numbers::read(&path);
+    let expected_gradients = Numbers::read(&path);
     let io = Numbers::read(&data("unet/io.safetensors"));
     let tracked = device.autodiff();
     let weights =
@@ -186,31 +172,30 @@ fn gradients_of_the_regressor_are_the_authors() {
     let regressor = weights.regressors(&tracked).expect("loads").remove(0);
     let input = io.tensor::<4>("input", &tracked).require_grad();
     let features = regressor.forward(input.clone(), &mut Statistics::measured());
-    let (shape, upstream) = gradients.f32("upstream");
+    let (shape, upstream) = expected_gradients.f32("upstream");
     // `[B,H,W,14]`, as the features.
     assert_eq!(features.dims().as_slice(), shape.as_slice());
     let upstream = Tensor::<4>::from_data(TensorData::new(upstream, shape), &tracked);
     let mut all = (features * upstream).sum().backward();
     let of_input = input.grad(&all).expect("tracked");
-    let of_weights = GradientsParams::from_module(&mut all, &regressor);
-    let mut named = Named { gradients: Some(&of_weights), values: HashMap::new() };
-    visit_named(&regressor, "", &mut named);
+    let networks = Networks { predictor: None, regressors: vec![regressor] };
+    let named = named(&networks, &gradients::collect(&networks, &mut all));
 
-    let error = relative_error(&values(of_input), &gradients.f32("input").1);
+    let error = relative_error(&values(of_input), &expected_gradients.f32("input").1);
     println!("input: relative error {error:.1e}");
     assert!(error <= 1e-4, "input: {error:e}");
     // Biases in front of a normalisation of single channels have no gradient; rounding leaves some.
     let norm = |values: &[f32]| values.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
     let mut worst = (0.0, "");
-    for (name, got) in &named.values {
-        let expected = gradients.f32(name).1;
+    for (name, got) in &named {
+        let expected = expected_gradients.f32(name).1;
         if norm(&expected) > 1e-3 {
             let error = relative_error(got, &expected);
             worst = if error > worst.0 { (error, name) } else { worst };
         }
     }
-    println!("{} tensors: relative error up to {:.1e} ({})", named.values.len(), worst.0, worst.1);
-    assert!(named.values.len() == 170 && worst.0 <= 1e-4, "{}: {:e}", worst.1, worst.0);
+    println!("{} tensors: relative error up to {:.1e} ({})", named.len(), worst.0, worst.1);
+    assert!(named.len() == 170 && worst.0 <= 1e-4, "{}: {:e}", worst.1, worst.0);
 }
 
 /// Stage 2's loss and its gradient.

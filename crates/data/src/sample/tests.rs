@@ -282,7 +282,8 @@ fn stage_two_samples_have_cameras_for_what_they_compare() {
         let (_temporary, folder) = data_set(person(), layout, 64, 8, true, 1);
         let high = layout == Layout::Exact;
         let compat = SampleConfig { high_resolution: true, ..SampleConfig::compat() };
-        let ours = SampleConfig { high_resolution: true, ..SampleConfig::default() };
+        let ours =
+            SampleConfig { high_resolution: true, front_within_degrees: 0.0, ..SampleConfig::default() };
         let stage =
             Stage2::new(folder.clone(), TRAIN, if high { ours } else { compat }).expect("makes samples");
         let item = stage.sample(3).expect("reads");

@@ -2,7 +2,7 @@
 
 use crate::weights::schema::{self, TensorSpec};
 
-use super::{Config, Downsample, HeadKind, RegressorStart, RotationFrame, Upsample, WorldFrame};
+use super::{Anchor, Config, Downsample, HeadKind, RegressorStart, RotationFrame, Upsample, WorldFrame};
 
 /// Seven times the published size; 16 GB of f32. Beyond, a slip of the finger is likelier than a wish.
 const MAX_PARAMETERS: usize = 4_000_000_000;
@@ -122,6 +122,8 @@ impl Config {
         }
         let quirks = [
             ("network.upsample", self.upsample() == Upsample::Bilinear, "\"bilinear\""),
+            ("network.anchor", self.network.anchor == Anchor::None, "\"none\""),
+            ("network.window", !self.network.window, "false"),
             ("regressor.start", self.regressor.start() == RegressorStart::Published, "\"published\""),
             ("mode.rotation_frame", self.rotation_frame() == RotationFrame::World, "\"world\""),
             ("mode.downsample", self.downsample() == Downsample::Nearest, "\"nearest\""),

@@ -104,6 +104,11 @@ impl Dust3r {
         }
     }
 
+    /// Its sizes and modes.
+    pub fn config(&self) -> &NetworkConfig {
+        &self.config
+    }
+
     /// Views that have a head.
     pub fn views(&self) -> &'static [View] {
         if self.downstream_head3.is_some() { &View::ALL } else { &View::ALL[..2] }

@@ -4,8 +4,10 @@ use burn::module::{Module, Param};
 use burn::tensor::activation::sigmoid;
 use burn::tensor::{Device, Tensor};
 
+use super::anchor::anchors;
 use super::dust3r::{Dust3r, View};
-use crate::config::{ConfMode, NetworkConfig, Upsample};
+use crate::config::{Anchor, ConfMode, NetworkConfig, Upsample};
+use crate::crop::Window;
 use snapsnap_ops::bilinear;
 
 /// Points and confidences on one view's pixel grid.
@@ -17,18 +19,35 @@ pub struct PointMap {
     pub conf: Tensor<3>,
 }
 
-/// Raw x, y, z, confidence `[B, 4, H, W]` → point map (SNAPSNAP §2.2): p = r / ‖r‖ · (e^‖r‖ − 1).
-pub fn activate(raw: Tensor<4>, conf_mode: ConfMode) -> PointMap {
+impl PointMap {
+    /// A map of a window on the whole canvas; what lies outside is 0.
+    pub fn on_canvas(self, window: &Window, side: usize) -> Self {
+        if *window == Window::whole(side) {
+            return self;
+        }
+        let conf = window.pasted(self.conf.unsqueeze_dim(3), side).squeeze_dim(3);
+        Self { points: window.pasted(self.points, side), conf }
+    }
+}
+
+/// Raw x, y, z, confidence `[B, 4, H, W]` → point map: p = r / ‖r‖ · (e^‖r‖ − 1) (SNAPSNAP §2.2), or p = r where points are
+/// measured from anchors.
+pub fn activate(raw: Tensor<4>, config: &NetworkConfig) -> PointMap {
     /// Below this ‖r‖ the direction is numerically meaningless.
     const MIN_NORM: f64 = 1e-8;
     let [b, _, h, w] = raw.dims();
     let xyz = raw.clone().narrow(1, 0, 3).permute([0, 2, 3, 1]);
-    // The square root has no gradient at 0; below f32's reach of 1 nothing changes.
-    const MIN_SQUARE: f64 = 1e-30;
-    let norm = xyz.clone().square().sum_dim(3).clamp_min(MIN_SQUARE).sqrt();
-    let points = xyz / norm.clone().clamp_min(MIN_NORM) * expm1(norm);
+    let points = match config.anchor {
+        Anchor::None => {
+            // The square root has no gradient at 0; below f32's reach of 1 nothing changes.
+            const MIN_SQUARE: f64 = 1e-30;
+            let norm = xyz.clone().square().sum_dim(3).clamp_min(MIN_SQUARE).sqrt();
+            xyz / norm.clone().clamp_min(MIN_NORM) * expm1(norm)
+        }
+        Anchor::Ray => xyz,
+    };
     let conf = raw.narrow(1, 3, 1).reshape([b, h, w]);
-    let conf = match conf_mode {
+    let conf = match config.conf_mode {
         ConfMode::Sigmoid => sigmoid(conf),
         ConfMode::Exp => conf.exp() + 1.0,
     };
@@ -100,14 +119,27 @@ impl PointPredictor {
         PointMap { points, conf }
     }
 
+    /// The map of a view on a window of the canvas, measured from the anchors in force.
+    pub fn anchored(&self, view: View, map: PointMap, window: &Window) -> PointMap {
+        let config = self.dust3r.config();
+        match config.anchor {
+            Anchor::None => map,
+            Anchor::Ray => {
+                let anchors = anchors(view, config.resolution, window, &map.points.device());
+                PointMap { points: map.points + anchors, ..map }
+            }
+        }
+    }
+
     /// Point maps of all views in one call, at network resolution and without δ: photographs `[B, 3, H, W]` in
     /// [−1, 1], both sides multiples of the patch.
-    pub fn forward(&self, front: Tensor<4>, back: Tensor<4>, conf_mode: ConfMode) -> Vec<(View, PointMap)> {
+    pub fn forward(&self, front: Tensor<4>, back: Tensor<4>) -> Vec<(View, PointMap)> {
         let [b, _, h, w] = front.dims();
         let grid = self.dust3r.grid([h, w]);
         let tokens = self.dust3r.encode(Tensor::cat(vec![front, back], 0));
         let maps = self.dust3r.decode(tokens.clone().narrow(0, 0, b), tokens.narrow(0, b, b), grid);
-        let activated = |&view| (view, activate(self.dust3r.raw_points(view, &maps, grid), conf_mode));
+        let activated =
+            |&view| (view, activate(self.dust3r.raw_points(view, &maps, grid), self.dust3r.config()));
         self.dust3r.views().iter().map(activated).collect()
     }
 }

@@ -1,0 +1,325 @@
+//! `snapsnap train-stage1` and `train-stage2` as a user types them: what they leave behind, that a run which is killed,
+//! interrupted or out of disk goes on as if nothing had happened, and what is refused.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::sync::OnceLock;
+use std::time::Duration;
+
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use snapsnap_tests::{refused, snapsnap, succeed};
+
+/// A training of thousands of parameters on pictures of 64².
+const CONFIG: &str = r#"
+[network]
+enc_dim = 16
+enc_depth = 1
+enc_heads = 2
+dec_dim = 16
+dec_depth = 2
+dec_heads = 2
+layer_dims = [4, 4, 8, 8]
+feature_dim = 8
+last_dim = 4
+hooks = [0, 1, 1, 2]
+resolution = 64
+net_resolution = 64
+delta = 0.2
+anchor = "ray"
+window = true
+[regressor]
+start = "geometric"
+[mode]
+compat = false
+[samples]
+supervision = 1
+[training]
+steps = 40
+batch = 2
+average = 0.9
+log_every = 1
+validate_every = 10
+validation_samples = 2
+checkpoint_every = 4
+preview_every = 20
+[optimizer]
+rate = 1e-2
+decay_all = false
+[optimizer.muon]
+rate = 1e-2
+[schedule]
+kind = "cosine"
+warm_up = 4
+end = 0.01
+[stage2]
+alpha = 0.5
+needle = 0.01
+noise = 0.01
+"#;
+
+/// Three people to learn from and one to validate on, made once.
+fn people() -> &'static Path {
+    static PEOPLE: OnceLock<PathBuf> = OnceLock::new();
+    PEOPLE.get_or_init(|| {
+        let folder =
+            PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("people-{}", std::process::id()));
+        for (split, count) in [("train", "3"), ("val", "1")] {
+            let mut command = snapsnap();
+            command.args(["prepare", "synth", "--seed", "5", "--subjects", count, "--split", split]);
+            command.args(["--set", "views.count=4", "--set", "views.resolution=64", "-o"]).arg(&folder);
+            succeed(&mut command);
+        }
+        folder
+    })
+}
+
+/// A folder with the config above.
+fn place() -> (tempfile::TempDir, PathBuf) {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let config = temporary.path().join("train.toml");
+    fs::write(&config, CONFIG).expect("writes");
+    (temporary, config)
+}
+
+fn train(stage: u32, config: &Path, run: &Path) -> Command {
+    let mut command = snapsnap();
+    command.arg(format!("train-stage{stage}")).arg("--config").arg(config);
+    command.args(["--device", "cpu", "--data"]).arg(people()).arg("-o").arg(run);
+    command
+}
+
+/// The files that must not depend on how a run went.
+fn results(run: &Path) -> Vec<Vec<u8>> {
+    let names = ["last.safetensors", "best.safetensors", "state/state.safetensors"];
+    names.map(|name| fs::read(run.join(name)).unwrap_or_else(|e| panic!("{name}: {e}"))).to_vec()
+}
+
+/// The values of a field over the lines of a log.
+fn logged(run: &Path, name: &str) -> Vec<(u64, f64)> {
+    let text = fs::read_to_string(run.join("log.jsonl")).expect("a log");
+    let lines = text.lines().map(|line| serde_json::from_str::<serde_json::Value>(line).expect("a line"));
+    let value = |line: serde_json::Value| Some((line["step"].as_u64()?, line["values"][name].as_f64()?));
+    lines.filter_map(value).collect()
+}
+
+#[test]
+fn both_stages_learn_and_leave_what_a_reconstruction_needs() {
+    let (temporary, config) = place();
+    let (one, two) = (temporary.path().join("one"), temporary.path().join("two"));
+    let said = succeed(&mut train(1, &config, &one));
+    assert!(said.contains("finished after 40 steps") && said.contains("train-stage2"), "{said}");
+    let losses = logged(&one, "loss");
+    assert_eq!(losses.len(), 40);
+    let mean = |part: &[(u64, f64)]| part.iter().map(|(_, loss)| loss).sum::<f64>() / part.len() as f64;
+    assert!(mean(&losses[35..]) < 0.8 * mean(&losses[..5]), "{losses:?}");
+    let steps: Vec<u64> = logged(&one, "validation/points_mm").iter().map(|(step, _)| *step).collect();
+    assert_eq!(steps, [10, 20, 30, 40]);
+    for file in ["config.toml", "curves.svg", "previews/0000020.png", "previews/0000040.png"] {
+        assert!(one.join(file).is_file(), "{file}");
+    }
+    assert!(fs::read(one.join("events.out.tfevents.snapsnap")).expect("events").len() > 1000);
+    let svg = fs::read_to_string(one.join("curves.svg")).expect("curves");
+    assert!(svg.contains("<polyline"), "{svg}");
+
+    let weights = one.join("best.safetensors");
+    let said = succeed(train(2, &config, &two).arg("--weights").arg(&weights));
+    assert!(said.contains("reconstruct"), "{said}");
+    assert_eq!(logged(&two, "validation/psnr_masked").len(), 4);
+
+    // Both parts are in one file now, which makes a person of two photographs.
+    let view = |view: u32| people().join(format!("val/img/0000/{view}.png"));
+    let ply = temporary.path().join("human.ply");
+    let mut command = snapsnap();
+    command.arg("reconstruct").arg(view(0)).arg(view(2)).args(["--as-is", "--device", "cpu", "--weights"]);
+    succeed(command.arg(two.join("last.safetensors")).arg("-o").arg(&ply));
+    assert!(fs::metadata(&ply).expect("a file").len() > 10_000);
+}
+
+/// Kills a training at random moments until it is done. Returns how often it was killed.
+fn killed_at_random(command: impl Fn() -> Command, random: &mut ChaCha8Rng, most: u32) -> u32 {
+    for kills in 0..most {
+        let mut child = start(command().arg("--resume"));
+        let patience = Duration::from_millis(random.random_range(50..1500));
+        std::thread::sleep(patience);
+        if let Some(status) = child.try_wait().expect("waits") {
+            assert!(status.success(), "{status}");
+            return kills;
+        }
+        child.kill().expect("kills");
+        child.wait().expect("ends");
+    }
+    succeed(command().arg("--resume"));
+    most
+}
+
+fn start(command: &mut Command) -> Child {
+    command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().expect("starts")
+}
+
+#[test]
+fn runs_that_were_killed_end_with_the_bytes_of_an_undisturbed_one() {
+    let (temporary, config) = place();
+    let undisturbed = temporary.path().join("undisturbed");
+    // Long enough to be killed often, with a checkpoint every few moments.
+    let long = ["--set", "training.steps=240"];
+    succeed(train(1, &config, &undisturbed).args(long));
+    let seed = std::env::var("SNAPSNAP_TEST_SEED").ok().and_then(|s| s.parse().ok()).unwrap_or(7);
+    println!("seed {seed}");
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    let killed = temporary.path().join("killed");
+    let command = || {
+        let mut command = train(1, &config, &killed);
+        command.args(long);
+        command
+    };
+    let kills = killed_at_random(command, &mut random, 20);
+    println!("killed {kills} times");
+    assert!(kills > 0, "the run was too short to be killed");
+    assert!(results(&undisturbed) == results(&killed), "other bytes after {kills} kills");
+    let steps = |run: &Path| logged(run, "loss").into_iter().map(|(step, _)| step).collect::<Vec<_>>();
+    assert_eq!(steps(&killed), steps(&undisturbed), "the log has every step once");
+}
+
+#[test]
+fn time_budgets_and_interrupts_end_a_session_that_goes_on_to_the_same_bytes() {
+    let (temporary, config) = place();
+    let weights = temporary.path().join("start.safetensors");
+    let one = temporary.path().join("one");
+    succeed(&mut train(1, &config, &one));
+    fs::copy(one.join("last.safetensors"), &weights).expect("copies");
+    let (whole, pieces) = (temporary.path().join("whole"), temporary.path().join("pieces"));
+    succeed(train(2, &config, &whole).arg("--weights").arg(&weights));
+    let said = succeed(train(2, &config, &pieces).arg("--weights").arg(&weights).args([
+        "--minutes",
+        "0.001",
+        "--resume",
+    ]));
+    assert!(said.contains("interrupted") && said.contains("--resume"), "{said}");
+    // The run knows its own predictor, data and config.
+    fs::remove_file(&weights).expect("removes");
+    let own = || {
+        let mut command = snapsnap();
+        command.args(["train-stage2", "--resume", "--device", "cpu", "-o"]).arg(&pieces);
+        command
+    };
+    #[cfg(unix)]
+    {
+        let child = own().stdout(Stdio::null()).stderr(Stdio::piped()).spawn().expect("starts");
+        std::thread::sleep(Duration::from_millis(700));
+        Command::new("kill").args(["-INT", &child.id().to_string()]).status().expect("kill");
+        let output = child.wait_with_output().expect("ends");
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    }
+    succeed(&mut own());
+    assert!(results(&whole) == results(&pieces), "other bytes");
+    // A finished run that is asked to go on changes nothing.
+    let before = results(&whole);
+    succeed(train(2, &config, &whole).arg("--resume"));
+    assert!(results(&whole) == before);
+}
+
+/// A limit on the size of files stands for a full disk: the checkpoint does not fit, the log does.
+#[cfg(unix)]
+#[test]
+fn a_full_disk_leaves_the_last_checkpoint_and_exit_code_2() {
+    let (temporary, config) = place();
+    let run = temporary.path().join("run");
+    succeed(train(1, &config, &run).args(["--set", "training.steps=8"]));
+    let before = results(&run);
+    let command = train(1, &config, &run);
+    let mut shell = Command::new("sh");
+    shell.args(["-c", "trap '' XFSZ; ulimit -f 20; exec \"$@\"", "sh"]).arg(command.get_program());
+    let said = refused(shell.args(command.get_args()).arg("--resume"));
+    assert!(said.contains("cannot write"), "{said}");
+    assert!(results(&run) == before, "a file was changed");
+    succeed(train(1, &config, &run).arg("--resume"));
+    assert_eq!(logged(&run, "loss").len(), 40);
+}
+
+#[test]
+fn a_broken_sample_is_skipped_and_named_and_twenty_in_a_row_end_the_run() {
+    let (temporary, config) = place();
+    let copy = temporary.path().join("people");
+    copy_folder(people(), &copy);
+    let broken = copy.join("train/img/0001/2.png");
+    fs::write(&broken, b"not a picture").expect("writes");
+    let one = ["--set", "training.batch=1", "--set", "training.validation_samples=0"];
+    let train = |run: &str| {
+        let mut command = snapsnap();
+        command.args(["train-stage1", "--device", "cpu", "--config"]).arg(&config).args(one);
+        command.arg("--data").arg(&copy).arg("-o").arg(temporary.path().join(run));
+        command
+    };
+    let output = train("some").output().expect("runs");
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success() && said.contains("skipped") && said.contains("img/0001/2.png"), "{said}");
+    for (subject, view) in (0..3).flat_map(|subject| (0..4).map(move |view| (subject, view))) {
+        fs::write(copy.join(format!("train/img/000{subject}/{view}.png")), b"").expect("writes");
+    }
+    let output = train("none").output().expect("runs");
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(said.contains("20 steps in a row") && said.contains(".png: "), "{said}");
+}
+
+fn copy_folder(from: &Path, to: &Path) {
+    fs::create_dir_all(to).expect("makes");
+    for entry in fs::read_dir(from).expect("lists").map(|entry| entry.expect("entry").path()) {
+        let target = to.join(entry.file_name().expect("named"));
+        if entry.is_dir() {
+            copy_folder(&entry, &target);
+        } else {
+            fs::copy(&entry, &target).expect("copies");
+        }
+    }
+}
+
+#[test]
+fn a_rehearsal_writes_nothing_and_says_how_long_the_run_will_take() {
+    let (temporary, config) = place();
+    let run = temporary.path().join("run");
+    let said = succeed(train(1, &config, &run).arg("--dry-run"));
+    assert!(said.contains("40 steps will take about") && said.contains("memory"), "{said}");
+    assert!(!run.exists());
+}
+
+#[test]
+fn what_cannot_be_trained_is_refused_by_name() {
+    let (temporary, config) = place();
+    let run = temporary.path().join("run");
+    let wrong = |arguments: &[&str], expected: &[&str]| {
+        let said = refused(train(1, &config, &run).args(arguments));
+        for part in expected {
+            assert!(said.contains(part), "{arguments:?}: {said}");
+        }
+        assert!(!run.join("state").exists());
+    };
+    wrong(&["--set", "training.batches=3"], &["unknown field", "batches"]);
+    wrong(&["--set", "training.steps=0"], &["training.steps", "must be"]);
+    wrong(&["--set", "training.clip=nan"], &["training.clip"]);
+    wrong(&["--set", "optimizer.beta2=1.0"], &["optimizer.beta2"]);
+    wrong(&["--set", "schedule.end=2"], &["schedule.end"]);
+    wrong(&["--set", "network.resolution=128", "--set", "network.net_resolution=128"], &["64", "128"]);
+    wrong(&["--minutes", "0"], &["--minutes"]);
+    wrong(&["--weights", "nowhere.safetensors"], &["nowhere.safetensors"]);
+    let said = refused(&mut train(2, &config, &run));
+    assert!(said.contains("point predictor") && said.contains("--weights"), "{said}");
+    let said = refused(&mut train(1, &config, &people().join("run")));
+    assert!(said.contains("lies in a data set"), "{said}");
+
+    // A run is not begun twice, nor gone on with by other networks or another stage.
+    succeed(train(1, &config, &run).args(["--set", "training.steps=2"]));
+    let before = results(&run);
+    let said = refused(&mut train(1, &config, &run));
+    assert!(said.contains("--resume"), "{said}");
+    let said = refused(train(1, &config, &run).args(["--resume", "--set", "network.enc_depth=2"]));
+    assert!(said.contains("other [network]"), "{said}");
+    let said = refused(train(2, &config, &run).args(["--resume"]));
+    assert!(said.contains("stage 1"), "{said}");
+    fs::write(run.join("state/state.safetensors"), &before[2][..before[2].len() / 2]).expect("writes");
+    let said = refused(train(1, &config, &run).arg("--resume"));
+    assert!(said.contains("state.safetensors"), "{said}");
+    assert!(results(&run)[..2] == before[..2]);
+}
