@@ -276,6 +276,41 @@ fn copy_folder(from: &Path, to: &Path) {
     }
 }
 
+/// Two implementations on the same processor stand for two cards.
+#[test]
+fn two_devices_share_batches_and_learn_what_one_does() {
+    let (temporary, config) = place();
+    let weights = temporary.path().join("start.safetensors");
+    for stage in [1, 2] {
+        let losses = |devices: &str| {
+            let run = temporary.path().join(format!("{stage}-{devices}"));
+            let mut command = snapsnap();
+            command.arg(format!("train-stage{stage}")).arg("--config").arg(&config).arg("--data").arg(people());
+            command.args(["--device", devices, "--set", "training.steps=3", "--set", "training.batch=3"]);
+            // What is random within a step follows from the device's number.
+            command.args(["--set", "stage2.noise=0", "-o"]).arg(&run);
+            if stage == 2 {
+                command.arg("--weights").arg(&weights);
+            }
+            succeed(&mut command);
+            (logged(&run, "loss"), run.join("last.safetensors"))
+        };
+        let ((one, last), (two, _)) = (losses("cpu"), losses("cpu,ndarray"));
+        println!("stage {stage}: {one:?} {two:?}");
+        for ((step, one), (_, two)) in one.iter().zip(&two) {
+            // Pixels of all samples are pooled on one device and averaged over two.
+            assert!((one - two).abs() < 0.05 * one, "stage {stage}, step {step}: {one} and {two}");
+        }
+        fs::copy(last, &weights).expect("copies");
+    }
+    let said = refused(train(1, &config, &temporary.path().join("x")).args(["--set", "training.batch=0"]));
+    assert!(said.contains("training.batch"), "{said}");
+    let mut command = snapsnap();
+    command.args(["train-stage1", "--device", "cpu,cpu,ndarray", "--config"]).arg(&config);
+    let said = refused(command.arg("--data").arg(people()).arg("-o").arg(temporary.path().join("y")));
+    assert!(said.contains("3 devices share a batch of 2"), "{said}");
+}
+
 #[test]
 fn a_rehearsal_writes_nothing_and_says_how_long_the_run_will_take() {
     let (temporary, config) = place();

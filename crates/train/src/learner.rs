@@ -1,6 +1,8 @@
 //! One step after another: samples → loss → gradients → weights. No file is written here.
 
 use std::collections::BTreeMap;
+use std::panic::resume_unwind;
+use std::thread;
 
 use burn::data::dataloader::batcher::Batcher;
 use burn::data::dataset::Dataset;
@@ -23,6 +25,8 @@ pub(crate) struct Learner<'a, T: Task> {
     pub average: Option<Average>,
     pub optimizer: Optimizer,
     pub progress: Progress,
+    /// Those that train, with gradients.
+    devices: &'a [Device],
     samples: Samples<'a, T>,
 }
 
@@ -34,8 +38,8 @@ pub(crate) struct Skipped {
 }
 
 impl<'a, T: Task> Learner<'a, T> {
-    /// At the beginning of a run.
-    pub fn new(task: &'a T, config: &'a TrainConfig, networks: Networks) -> Self {
+    /// At the beginning of a run; `networks` are on the first of the devices.
+    pub fn new(task: &'a T, config: &'a TrainConfig, networks: Networks, devices: &'a [Device]) -> Self {
         let share = config.training.average;
         Self {
             task,
@@ -44,6 +48,7 @@ impl<'a, T: Task> Learner<'a, T> {
             optimizer: config.optimizer.init(),
             networks,
             progress: Progress { stage: T::STAGE, ..Progress::default() },
+            devices,
             samples: Samples::new(task, config),
         }
     }
@@ -84,21 +89,18 @@ impl<'a, T: Task> Learner<'a, T> {
                 Err(why) => return Ok(Err(Skipped { why, samples: all.join("; ") })),
             };
             all.extend(items.iter().map(|item| T::name(item).to_owned()));
-            let parts = self.task.losses(&self.networks, items, step)?;
-            let read = host(Tensor::cat(parts.iter().map(|part| part.value.clone()).collect(), 0));
             let share = 1.0 / t.accumulate as f64;
-            let mut total = 0.0;
-            for (part, value) in parts.iter().zip(read) {
-                *values.entry(part.name.to_owned()).or_default() += share * f64::from(value);
-                total += part.weight * f64::from(value);
+            let made = on_devices(self.task, &self.networks, self.devices, items, step, share)?;
+            for (name, value) in &made.values {
+                *values.entry((*name).to_owned()).or_default() += value;
             }
-            *values.entry("loss".to_owned()).or_default() += share * total;
-            if !total.is_finite() {
-                return Ok(Err(Skipped { why: "the loss is not finite".into(), samples: all.join("; ") }));
+            match made.gradients {
+                Some(gradients) => gradients::add(&mut sum, gradients),
+                None => {
+                    let why = "the loss is not finite".into();
+                    return Ok(Err(Skipped { why, samples: all.join("; ") }));
+                }
             }
-            let weighted = parts.into_iter().map(|part| part.value * (part.weight * share)).collect();
-            let mut tracked = Tensor::cat(weighted, 0).sum().backward();
-            gradients::add(&mut sum, gradients::collect(&self.networks, &mut tracked));
         }
         let norm = gradients::norm(&sum);
         let Some(factor) = gradients::clip_factor(norm, t.clip) else {
@@ -114,6 +116,85 @@ impl<'a, T: Task> Learner<'a, T> {
         values.insert("norm".to_owned(), norm);
         Ok(Ok(values))
     }
+}
+
+/// Loss parts by name, the loss among them, and gradients, unless a loss was not finite.
+struct Made {
+    values: BTreeMap<&'static str, f64>,
+    gradients: Option<Rows>,
+}
+
+/// Loss and gradients of a batch, times `share`: on the one device, or of equal parts of the batch on all of them at
+/// once, with gradients and losses averaged on the first. (Burn has collectives for CUDA alone; copies go anywhere.)
+fn on_devices<T: Task>(
+    task: &T,
+    networks: &Networks,
+    devices: &[Device],
+    mut items: Vec<T::Item>,
+    step: u64,
+    share: f64,
+) -> Result<Made, TrainError> {
+    if devices.len() == 1 {
+        return on_device(task, networks, items, step, 0, share);
+    }
+    let (all, size) = (items.len() as f64, items.len().div_ceil(devices.len()));
+    let mut parts = Vec::new();
+    while !items.is_empty() {
+        let rest = items.split_off(size.min(items.len()));
+        parts.push(std::mem::replace(&mut items, rest));
+    }
+    let made: Vec<Result<Made, TrainError>> = thread::scope(|scope| {
+        let start = |(place, part): (usize, Vec<T::Item>)| {
+            scope.spawn(move || {
+                let (device, share) = (&devices[place], share * part.len() as f64 / all);
+                on_device(task, &networks.fork(device), part, step, place, share)
+            })
+        };
+        let threads: Vec<_> = parts.into_iter().enumerate().map(start).collect();
+        let ended = threads.into_iter().map(|thread| thread.join().unwrap_or_else(|e| resume_unwind(e)));
+        ended.collect()
+    });
+    let first = devices[0].clone().inner();
+    let mut total = Made { values: BTreeMap::new(), gradients: Some(Rows::new()) };
+    for made in made {
+        let made = made?;
+        for (name, value) in made.values {
+            *total.values.entry(name).or_default() += value;
+        }
+        total.gradients = match (total.gradients.take(), made.gradients) {
+            (Some(mut sum), Some(rows)) => {
+                let there = rows.into_iter().map(|(name, row)| (name, row.to_device(&first)));
+                gradients::add(&mut sum, there.collect());
+                Some(sum)
+            }
+            _ => None,
+        };
+    }
+    Ok(total)
+}
+
+fn on_device<T: Task>(
+    task: &T,
+    networks: &Networks,
+    items: Vec<T::Item>,
+    step: u64,
+    place: usize,
+    share: f64,
+) -> Result<Made, TrainError> {
+    let parts = task.losses(networks, items, step, place)?;
+    let read = host(Tensor::cat(parts.iter().map(|part| part.value.clone()).collect(), 0));
+    let (mut values, mut total) = (BTreeMap::new(), 0.0);
+    for (part, value) in parts.iter().zip(read) {
+        values.insert(part.name, share * f64::from(value));
+        total += part.weight * f64::from(value);
+    }
+    values.insert("loss", share * total);
+    if !total.is_finite() {
+        return Ok(Made { values, gradients: None });
+    }
+    let weighted = parts.into_iter().map(|part| part.value * (part.weight * share)).collect();
+    let mut tracked = Tensor::cat(weighted, 0).sum().backward();
+    Ok(Made { values, gradients: Some(gradients::collect(networks, &mut tracked)) })
 }
 
 /// Batches, pass after pass.

@@ -50,6 +50,14 @@ impl Networks {
         }
     }
 
+    /// The same networks on another device, tracked as they are here.
+    pub fn fork(&self, device: &Device) -> Self {
+        Self {
+            predictor: self.predictor.clone().map(|predictor| predictor.fork(device)),
+            regressors: self.regressors.iter().map(|regressor| regressor.clone().fork(device)).collect(),
+        }
+    }
+
     /// All values, without gradients.
     pub fn rows(&self) -> Rows {
         struct Collect(Rows);

@@ -32,8 +32,8 @@ pub const BEST: &str = "best.safetensors";
 pub struct Options<'a> {
     /// The run's folder, which is there.
     pub folder: &'a Path,
-    /// Where it is computed.
-    pub device: &'a Device,
+    /// Where it is computed: one device at least, with gradients.
+    pub devices: &'a [Device],
     /// Ends the session after so long.
     pub limit: Option<Duration>,
     /// Ends the session once it is set.
@@ -114,10 +114,11 @@ pub fn rehearse<T: Task>(
     task: &T,
     config: &TrainConfig,
     networks: Networks,
+    devices: &[Device],
 ) -> Result<Rehearsal, TrainError> {
     /// The first steps find their memory, and on a GPU their kernels.
     const STEPS: usize = 3;
-    let mut learner = Learner::new(task, config, networks);
+    let mut learner = Learner::new(task, config, networks, devices);
     let mut step = Duration::ZERO;
     for _ in 0..STEPS {
         let start = Instant::now();
@@ -152,10 +153,10 @@ impl<'a, T: Task> Session<'a, T> {
         options: &'a Options<'a>,
         watch: &'a mut dyn Watch,
     ) -> Result<Self, TrainError> {
-        let mut learner = Learner::new(task, config, networks);
+        let mut learner = Learner::new(task, config, networks, options.devices);
         let state = options.folder.join(STATE);
         if state.exists() {
-            checkpoint::load(&state, &mut learner, &options.device.clone().inner())?;
+            checkpoint::load(&state, &mut learner, &options.devices[0].clone().inner())?;
         }
         let log = Log::open(options.folder, learner.progress.step)?;
         let (before, now, step) = (log.seconds(), Instant::now(), learner.progress.step);

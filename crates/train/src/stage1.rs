@@ -31,15 +31,22 @@ pub struct PointTask {
     confidence: f64,
     sets: Vec<Stage1>,
     validation: Fixed<Stage1Item>,
+    /// Those that train, with gradients.
+    devices: Vec<Device>,
+    /// Where validations are made.
     device: Device,
 }
 
 impl PointTask {
-    /// A training on these data sets.
+    /// A training on these data sets and these devices, of which there is one at least and which have gradients.
     ///
     /// # Errors
     /// [`TrainError`] if a data set cannot be used with this config.
-    pub fn new(folders: &[Arc<Folder>], config: &TrainConfig, device: &Device) -> Result<Self, TrainError> {
+    pub fn new(
+        folders: &[Arc<Folder>],
+        config: &TrainConfig,
+        devices: &[Device],
+    ) -> Result<Self, TrainError> {
         let mut sets = Vec::new();
         for folder in folders {
             check_resolution(folder, config)?;
@@ -53,7 +60,8 @@ impl PointTask {
             confidence: config.stage1.confidence,
             sets,
             validation,
-            device: device.clone(),
+            devices: devices.to_vec(),
+            device: devices[0].clone().inner(),
         })
     }
 
@@ -86,8 +94,9 @@ impl Task for PointTask {
         networks: &Networks,
         items: Vec<Stage1Item>,
         _step: u64,
+        device: usize,
     ) -> Result<Vec<Part>, TrainError> {
-        let batch = Stage1Batcher.batch(items, &self.device.clone().autodiff());
+        let batch = Stage1Batcher.batch(items, &self.devices[device]);
         let losses = losses(&self.predict(networks, &batch), &batch.points, &batch.valid);
         Ok(vec![
             Part { name: "points", weight: 1.0, value: losses.regression },

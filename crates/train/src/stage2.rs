@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use burn::data::dataset::Dataset;
+use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use image::RgbImage;
 use rand::Rng;
@@ -41,10 +42,12 @@ pub struct GaussianTask {
     networks: Config,
     losses: Stage2Config,
     seed: u64,
-    predictor: PointPredictor,
+    /// One for each device that trains.
+    predictors: Vec<PointPredictor>,
     sets: Vec<Stage2>,
     validation: Fixed<Stage2Item>,
-    device: Device,
+    /// Those that train, with gradients.
+    devices: Vec<Device>,
 }
 
 /// Which views' Gaussians take part, and what is compared.
@@ -71,7 +74,8 @@ impl Phase {
 }
 
 impl GaussianTask {
-    /// A training on these data sets; `predictor` is not tracked.
+    /// A training on these data sets and these devices, of which there is one at least and which have gradients; `predictor`
+    /// is not tracked and on the first of them.
     ///
     /// # Errors
     /// [`TrainError`] if a data set cannot be used with this config.
@@ -79,7 +83,7 @@ impl GaussianTask {
         folders: &[Arc<Folder>],
         config: &TrainConfig,
         predictor: PointPredictor,
-        device: &Device,
+        devices: &[Device],
     ) -> Result<Self, TrainError> {
         let mut sets = Vec::new();
         for folder in folders {
@@ -93,10 +97,13 @@ impl GaussianTask {
             networks: config.networks(),
             losses: config.stage2.clone(),
             seed: config.training.seed,
-            predictor,
+            predictors: devices
+                .iter()
+                .map(|device| predictor.clone().fork(&device.clone().inner()))
+                .collect(),
             sets,
             validation,
-            device: device.clone(),
+            devices: devices.to_vec(),
         })
     }
 
@@ -113,16 +120,16 @@ impl GaussianTask {
         item: &Stage2Item,
         phase: &Phase,
         noise: Option<&mut dyn FnMut() -> f32>,
-        device: &Device,
+        (place, device): (usize, &Device),
     ) -> Option<Gaussians> {
         let (config, side) = (&self.networks, item.side);
         let area = side * side;
         let tensor = |values: &[f32], shape: [usize; 5]| {
-            Tensor::<5>::from_data(TensorData::new(values.to_vec(), shape), &self.device)
+            Tensor::<5>::from_data(TensorData::new(values.to_vec(), shape), &device.clone().inner())
         };
         let images = tensor(&item.images, [1, 2, 3, side, side]);
         let masks = tensor(&item.masks, [1, 1, 2, side, side]).reshape([1, 2, side, side]);
-        let maps = predict(&self.predictor, config, images, &masks).on_canvas(side);
+        let maps = predict(&self.predictors[place], config, images, &masks).on_canvas(side);
         let (mut points, mut conf) = (Vec::new(), Vec::new());
         for (_, map) in maps {
             points.extend(host(map.points));
@@ -215,9 +222,11 @@ impl Task for GaussianTask {
         networks: &Networks,
         items: Vec<Stage2Item>,
         step: u64,
+        device: usize,
     ) -> Result<Vec<Part>, TrainError> {
-        let (phase, device) = (Phase::new(self.losses.curriculum, step), self.device.clone().autodiff());
-        let mut random = stream(&format!("stage2/{}/{step}", self.seed));
+        let (phase, place, device) =
+            (Phase::new(self.losses.curriculum, step), device, &self.devices[device]);
+        let mut random = stream(&format!("stage2/{}/{step}/{place}", self.seed));
         let mut sums: BTreeMap<&'static str, Vec<Tensor<1>>> = BTreeMap::new();
         for item in &items {
             let count = item.target_cameras.len();
@@ -235,10 +244,12 @@ impl Task for GaussianTask {
             };
             let noise: Option<&mut dyn FnMut() -> f32> =
                 if deviation > 0.0 { Some(&mut noise) } else { None };
-            let Some(gaussians) = self.gaussians(networks, item, &phase, noise, &device) else { continue };
+            let Some(gaussians) = self.gaussians(networks, item, &phase, noise, (place, device)) else {
+                continue;
+            };
             let cameras: Vec<Camera> = chosen.iter().map(|v| item.target_cameras[*v]).collect();
             let (image, coverage) = self.render(&gaussians, &cameras, item.background)?;
-            let (target, mask) = targets(item, &chosen, &device);
+            let (target, mask) = targets(item, &chosen, device);
             let photometric = Photometric::new(image, target);
             let mut add = |name, value: Tensor<1>| sums.entry(name).or_default().push(value);
             add("l1", photometric.l1);
@@ -282,10 +293,10 @@ impl Task for GaussianTask {
         let mut sums = [0.0_f64; 5];
         for index in self.validation.indices(self.validation.count) {
             let item = self.validation.get(index)?;
-            let device = &self.device;
+            let device = &self.devices[0].clone().inner();
             let views: Vec<usize> = (0..item.target_cameras.len()).collect();
             let (target, mask) = targets(&item, &views, device);
-            let image = match self.gaussians(networks, &item, &Phase::new(false, 0), None, device) {
+            let image = match self.gaussians(networks, &item, &Phase::new(false, 0), None, (0, device)) {
                 Some(gaussians) => self.render(&gaussians, &item.target_cameras, item.background)?.0,
                 None => target.zeros_like(),
             };
@@ -317,6 +328,7 @@ impl Task for GaussianTask {
     }
 
     fn preview(&self, networks: &Networks) -> Result<Option<RgbImage>, TrainError> {
+        let device = self.devices[0].clone().inner();
         let mut rows = Vec::new();
         for index in self.validation.indices(PREVIEWS) {
             let item = self.validation.get(index)?;
@@ -327,7 +339,7 @@ impl Task for GaussianTask {
             let mut row = vec![photo(0), photo(1)];
             let views = [0, item.target_cameras.len() - 2];
             let cameras = views.map(|v| item.target_cameras[v]);
-            let seen = match self.gaussians(networks, &item, &Phase::new(false, 0), None, &self.device) {
+            let seen = match self.gaussians(networks, &item, &Phase::new(false, 0), None, (0, &device)) {
                 Some(gaussians) => host(self.render(&gaussians, &cameras, item.background)?.0),
                 None => vec![0.0; 2 * 3 * item.target_side.pow(2)],
             };
@@ -353,7 +365,7 @@ impl Task for GaussianTask {
     }
 
     fn frozen(&self) -> BTreeMap<String, Vec<f32>> {
-        Networks { predictor: Some(self.predictor.clone()), regressors: Vec::new() }.checkpoint()
+        Networks { predictor: Some(self.predictors[0].clone()), regressors: Vec::new() }.checkpoint()
     }
 }
 

@@ -43,20 +43,25 @@ pub trait Task: Sync {
     /// What a sample was made of.
     fn name(item: &Self::Item) -> &str;
 
-    /// The loss of a batch.
+    /// The loss of a batch, computed where `networks` are: on the device of number `device` among those that train.
     ///
     /// # Errors
     /// [`TrainError`] if the batch cannot be used.
-    fn losses(&self, networks: &Networks, items: Vec<Self::Item>, step: u64)
-    -> Result<Vec<Part>, TrainError>;
+    fn losses(
+        &self,
+        networks: &Networks,
+        items: Vec<Self::Item>,
+        step: u64,
+        device: usize,
+    ) -> Result<Vec<Part>, TrainError>;
 
-    /// Compares what the networks, which are not tracked, make of people set apart; `None` if there are none.
+    /// Compares what the networks, which are not tracked and on the first device, make of people set apart; `None` if there are none.
     ///
     /// # Errors
     /// [`TrainError`] if a sample cannot be read.
     fn validate(&self, networks: &Networks) -> Result<Option<Validation>, TrainError>;
 
-    /// A picture of what the networks, which are not tracked, make of a few samples.
+    /// A picture of what the networks, which are not tracked and on the first device, make of a few samples.
     ///
     /// # Errors
     /// [`TrainError`] if a sample cannot be read.

@@ -51,7 +51,8 @@ pub struct Arguments {
     /// Check config and data, make a few steps without writing anything, and say how long the run will take.
     #[arg(long)]
     dry_run: bool,
-    /// auto, cpu, ndarray, wgpu, vulkan, cuda or metal; wgpu:1 is the second adapter.
+    /// auto, cpu, ndarray, wgpu, vulkan, cuda or metal; wgpu:1 is the second adapter. Several, with commas between them,
+    /// share every batch.
     #[arg(long, default_value = "auto")]
     device: String,
 }
@@ -61,13 +62,14 @@ struct Plan<'a> {
     arguments: &'a Arguments,
     config: TrainConfig,
     folders: Vec<Arc<Folder>>,
-    device: Device,
+    /// With gradients.
+    devices: Vec<Device>,
     quiet: bool,
 }
 
 pub fn stage1(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let plan = Plan::new(arguments, quiet)?;
-    let task = PointTask::new(&plan.folders, &plan.config, &plan.device)?;
+    let task = PointTask::new(&plan.folders, &plan.config, &plan.devices)?;
     plan.check_validation(task.validation_samples());
     plan.run(&task, |tracked| {
         let networks = plan.config.networks();
@@ -90,8 +92,8 @@ pub fn stage2(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
         return Err(Failure::Input(message.into()));
     };
     let weights = open(&start, &plan.config)?;
-    let predictor = weights.point_predictor(&plan.device)?;
-    let task = GaussianTask::new(&plan.folders, &plan.config, predictor, &plan.device)?;
+    let predictor = weights.point_predictor(&plan.devices[0].clone().inner())?;
+    let task = GaussianTask::new(&plan.folders, &plan.config, predictor, &plan.devices)?;
     plan.check_validation(task.validation_samples());
     plan.run(&task, |tracked| {
         let networks = plan.config.networks();
@@ -122,8 +124,17 @@ impl<'a> Plan<'a> {
         }
         let folders = config.data.folders.iter().map(|path| Folder::open(path).map(Arc::new));
         let folders = folders.collect::<Result<_, _>>()?;
-        let device = device::choose(&arguments.device)?;
-        if device::is_cpu(&device) {
+        let devices = arguments.device.split(',').map(device::choose).collect::<Result<Vec<_>, _>>()?;
+        if devices.len() > config.training.batch {
+            let message = format!(
+                "--device {}: {} devices share a batch of {}: set training.batch higher",
+                arguments.device,
+                devices.len(),
+                config.training.batch
+            );
+            return Err(Failure::Input(message));
+        }
+        if device::is_cpu(&devices[0]) {
             // Weights, gradients, two moments and averages; activations are measured by --dry-run.
             let parameters = schema::parameters(&config.networks(), Part::PointPredictor) as u64;
             memory::check(
@@ -132,7 +143,12 @@ impl<'a> Plan<'a> {
                 "a smaller network needs less",
             )?;
         }
-        Ok(Self { arguments, config, folders, device, quiet })
+        let tracked = |device: Device| match config.training.checkpointing {
+            true => device.autodiff().gradient_checkpointing(),
+            false => device.autodiff(),
+        };
+        let devices = devices.into_iter().map(tracked).collect();
+        Ok(Self { arguments, config, folders, devices, quiet })
     }
 
     fn check_validation(&self, samples: usize) {
@@ -154,13 +170,11 @@ impl<'a> Plan<'a> {
         task: &T,
         networks: impl Fn(&Device) -> Result<Networks, Failure> + Sync,
     ) -> Result<(), Failure> {
-        let tracked = self.device.clone().autodiff();
-        let tracked =
-            if self.config.training.checkpointing { tracked.gradient_checkpointing() } else { tracked };
+        let tracked = &self.devices[0];
         if self.arguments.dry_run {
-            return run::on_best_thread(&self.device, || {
-                let rehearsal = run::rehearse(task, &self.config, networks(&tracked)?)?;
-                report::rehearsed(&self.config, task, &self.device, rehearsal);
+            return run::on_best_thread(tracked, || {
+                let rehearsal = run::rehearse(task, &self.config, networks(tracked)?, &self.devices)?;
+                report::rehearsed(&self.config, tracked, rehearsal);
                 Ok(())
             });
         }
@@ -168,11 +182,11 @@ impl<'a> Plan<'a> {
         let folder = RunFolder::open(path, self.arguments, &self.config, &self.folders)?;
         let limit = self.arguments.minutes.map(|minutes| Duration::from_secs_f64(60.0 * minutes));
         let stop = interrupt::patiently();
-        let options = Options { folder: folder.path(), device: &self.device, limit, stop };
+        let options = Options { folder: folder.path(), devices: &self.devices, limit, stop };
         let mut reporter = Reporter::new(self.quiet, &self.config, limit);
         let start = Instant::now();
-        let outcome = run::on_best_thread(&self.device, || {
-            Ok::<_, Failure>(run::train(task, &self.config, networks(&tracked)?, &options, &mut reporter)?)
+        let outcome = run::on_best_thread(tracked, || {
+            Ok::<_, Failure>(run::train(task, &self.config, networks(tracked)?, &options, &mut reporter)?)
         })?;
         drop(reporter);
         if !self.quiet {

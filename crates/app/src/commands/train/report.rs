@@ -8,7 +8,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use snapsnap_train::config::TrainConfig;
 use snapsnap_train::log::Line;
 use snapsnap_train::run::{Rehearsal, Watch};
-use snapsnap_train::task::{Task, Validation};
+use snapsnap_train::task::Validation;
 
 use crate::{device, memory, say};
 
@@ -119,13 +119,13 @@ fn clock(seconds: f64) -> String {
 }
 
 /// Says what a run would take.
-pub fn rehearsed<T: Task>(config: &TrainConfig, _task: &T, on: &Device, rehearsal: Rehearsal) {
+pub fn rehearsed(config: &TrainConfig, on: &Device, rehearsal: Rehearsal) {
     let t = &config.training;
     let step = rehearsal.step.as_secs_f64();
     let samples = (t.batch * t.accumulate) as f64;
     say::out(&format!(
         "device {}: a step of {samples} samples takes {:.3} s, {:.1} samples a second",
-        device::describe(on),
+        device::describe(&on.clone().inner()),
         step,
         samples / step
     ));
