@@ -285,7 +285,12 @@ fn two_devices_share_batches_and_learn_what_one_does() {
         let losses = |devices: &str| {
             let run = temporary.path().join(format!("{stage}-{devices}"));
             let mut command = snapsnap();
-            command.arg(format!("train-stage{stage}")).arg("--config").arg(&config).arg("--data").arg(people());
+            command
+                .arg(format!("train-stage{stage}"))
+                .arg("--config")
+                .arg(&config)
+                .arg("--data")
+                .arg(people());
             command.args(["--device", devices, "--set", "training.steps=3", "--set", "training.batch=3"]);
             // What is random within a step follows from the device's number.
             command.args(["--set", "stage2.noise=0", "-o"]).arg(&run);

@@ -247,6 +247,10 @@ impl TrainConfig {
         {
             return Some((key.into(), format!("is {value}, must be {least} to {most}")));
         }
+        if two.points > 0.0 && two.curriculum {
+            let message = "must be 0 beside `stage2.curriculum = true`, which renders parts of a person";
+            return Some(("stage2.points".into(), message.into()));
+        }
         if let Some((key, message)) = self.samples.problem() {
             return Some((format!("samples.{key}"), message));
         }

@@ -244,7 +244,7 @@ impl<'a, T: Task> Session<'a, T> {
 
     fn write(&self, networks: &Networks, name: &str) -> Result<(), TrainError> {
         let mut values = networks.checkpoint();
-        values.extend(self.learner.task.frozen());
+        values.extend(self.learner.task.frozen(networks));
         Ok(weights::save(&self.learner.config.networks(), &values, &self.options.folder.join(name))?)
     }
 

@@ -9,7 +9,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use image::RgbImage;
 use rand::Rng;
 use snapsnap_data::dataset::{Folder, Split};
-use snapsnap_data::sample::{Joined, Stage2, Stage2Item};
+use snapsnap_data::sample::{Joined, SampleConfig, Stage2, Stage2Item};
 use snapsnap_net::Window;
 use snapsnap_net::config::Config;
 use snapsnap_net::gaussians::{Seen, assemble, placed, regress, side_images};
@@ -22,7 +22,7 @@ use crate::config::{Stage2Config, TrainConfig};
 use crate::fixed::{Fixed, check_resolution};
 use crate::networks::{Networks, host};
 use crate::photometric::{Photometric, psnr};
-use crate::points::predict;
+use crate::points::{Prediction, losses, predict};
 use crate::preview::{grid, heat, picture};
 use crate::task::{Part, Task, Validation};
 
@@ -41,6 +41,8 @@ const SCALE_PENALTY: f64 = 2.0;
 pub struct GaussianTask {
     networks: Config,
     losses: Stage2Config,
+    /// λ of the point loss.
+    confidence: f64,
     seed: u64,
     /// One for each device that trains.
     predictors: Vec<PointPredictor>,
@@ -86,9 +88,10 @@ impl GaussianTask {
         devices: &[Device],
     ) -> Result<Self, TrainError> {
         let mut sets = Vec::new();
+        let samples = SampleConfig { points: config.stage2.points > 0.0, ..config.samples.clone() };
         for folder in folders {
             check_resolution(folder, config)?;
-            sets.push(Stage2::new(folder.clone(), Some(Split::Train), config.samples.clone())?);
+            sets.push(Stage2::new(folder.clone(), Some(Split::Train), samples.clone())?);
         }
         let validation = Fixed::new(folders, config, |folder, split, samples| {
             Ok(Box::new(Stage2::new(folder, split, samples)?))
@@ -96,6 +99,7 @@ impl GaussianTask {
         Ok(Self {
             networks: config.networks(),
             losses: config.stage2.clone(),
+            confidence: config.stage1.confidence,
             seed: config.training.seed,
             predictors: devices
                 .iter()
@@ -112,31 +116,45 @@ impl GaussianTask {
         self.validation.count
     }
 
+    /// What the point predictor, the one that is trained or the frozen one, makes of a sample's photographs.
+    fn predict(
+        &self,
+        networks: &Networks,
+        item: &Stage2Item,
+        (place, device): (usize, &Device),
+    ) -> Prediction {
+        let (predictor, device) = match &networks.predictor {
+            Some(predictor) => (predictor, device.clone()),
+            None => (&self.predictors[place], device.clone().inner()),
+        };
+        let side = item.side;
+        let images = TensorData::new(item.images.clone(), [1, 2, 3, side, side]);
+        let masks = TensorData::new(item.masks.clone(), [1, 2, side, side]);
+        let (images, masks) = (Tensor::from_data(images, &device), Tensor::from_data(masks, &device));
+        predict(predictor, &self.networks, images, &masks)
+    }
+
     /// Gaussians of a sample in the data set's world; `None` if no pixel is valid. With `noise`, points stray by so many
     /// metres.
     fn gaussians(
         &self,
         networks: &Networks,
         item: &Stage2Item,
+        prediction: Prediction,
         phase: &Phase,
         noise: Option<&mut dyn FnMut() -> f32>,
-        (place, device): (usize, &Device),
+        device: &Device,
     ) -> Option<Gaussians> {
         let (config, side) = (&self.networks, item.side);
         let area = side * side;
-        let tensor = |values: &[f32], shape: [usize; 5]| {
-            Tensor::<5>::from_data(TensorData::new(values.to_vec(), shape), &device.clone().inner())
-        };
-        let images = tensor(&item.images, [1, 2, 3, side, side]);
-        let masks = tensor(&item.masks, [1, 1, 2, side, side]).reshape([1, 2, side, side]);
-        let maps = predict(&self.predictors[place], config, images, &masks).on_canvas(side);
-        let (mut points, mut conf) = (Vec::new(), Vec::new());
-        for (_, map) in maps {
-            points.extend(host(map.points));
+        let (mut points, mut conf, mut maps) = (Vec::new(), Vec::new(), Vec::new());
+        for (_, map) in prediction.on_canvas(side) {
+            points.extend(host(map.points.clone()));
             conf.extend(host(map.conf));
+            maps.push(map.points);
         }
         let views = points.len() / (3 * area);
-        if let Some(noise) = noise {
+        if let Some(noise) = noise.filter(|_| networks.predictor.is_none()) {
             // Every view's shell is shifted as a whole: that is how predictions are off.
             for view in points.chunks_exact_mut(3 * area) {
                 let shift = [noise(), noise(), noise()];
@@ -156,9 +174,14 @@ impl GaussianTask {
         let photos = [0, 1].map(|view| &item.images[3 * view * area..3 * (view + 1) * area]);
         let sides = if views > 2 { side_images(photos, &points, &valid) } else { Vec::new() };
         let images: Vec<&[f32]> = photos.into_iter().chain(sides.iter().map(Vec::as_slice)).collect();
-        // One overflow would spoil the normalisation of a whole view.
-        points.iter_mut().filter(|v| !v.is_finite()).for_each(|v| *v = 0.0);
-        let points = Tensor::<4>::from_data(TensorData::new(points, [views, side, side, 3]), device);
+        let points = if networks.predictor.is_some() {
+            // Where the predictor is trained, what looks like its error must lead back to it.
+            Tensor::cat(maps, 0)
+        } else {
+            // One overflow would spoil the normalisation of a whole view.
+            points.iter_mut().filter(|v| !v.is_finite()).for_each(|v| *v = 0.0);
+            Tensor::<4>::from_data(TensorData::new(points, [views, side, side, 3]), device)
+        };
         let mut parts = Vec::new();
         for (pair, first) in (0..views).step_by(2).enumerate().filter(|(_, v)| phase.views.contains(v)) {
             let person = Window::around(valid[first..first + 2].iter().map(Vec::as_slice), side);
@@ -176,6 +199,12 @@ impl GaussianTask {
         let (gaussians, _) = assemble(config, parts, device);
         (!gaussians.is_empty())
             .then(|| placed(config, gaussians, &item.cameras[View::Front as usize].world_to_camera.inverse()))
+    }
+
+    /// Gaussians of all views, for validations.
+    fn whole(&self, networks: &Networks, item: &Stage2Item, device: &Device) -> Option<Gaussians> {
+        let prediction = self.predict(networks, item, (0, device));
+        self.gaussians(networks, item, prediction, &Phase::new(false, 0), None, device)
     }
 
     /// Rendered pictures `[V,3,h,w]` and coverage `[V,h,w]`.
@@ -244,14 +273,21 @@ impl Task for GaussianTask {
             };
             let noise: Option<&mut dyn FnMut() -> f32> =
                 if deviation > 0.0 { Some(&mut noise) } else { None };
-            let Some(gaussians) = self.gaussians(networks, item, &phase, noise, (place, device)) else {
-                continue;
-            };
+            let prediction = self.predict(networks, item, (place, device));
+            let mut add = |name, value: Tensor<1>| sums.entry(name).or_default().push(value);
+            if networks.predictor.is_some() {
+                let (side, points, valid) = (item.side, item.points.clone(), item.valid.clone());
+                let points = Tensor::from_data(TensorData::new(points, [1, 4, side, side, 3]), device);
+                let valid = Tensor::from_data(TensorData::new(valid, [1, 4, side, side]), device);
+                let losses = losses(&prediction, &points, &valid);
+                add("points", losses.regression + losses.confidence * self.confidence);
+            }
+            let made = self.gaussians(networks, item, prediction, &phase, noise, device);
+            let Some(gaussians) = made else { continue };
             let cameras: Vec<Camera> = chosen.iter().map(|v| item.target_cameras[*v]).collect();
             let (image, coverage) = self.render(&gaussians, &cameras, item.background)?;
             let (target, mask) = targets(item, &chosen, device);
             let photometric = Photometric::new(image, target);
-            let mut add = |name, value: Tensor<1>| sums.entry(name).or_default().push(value);
             add("l1", photometric.l1);
             add("dissimilarity", 1.0 - photometric.ssim);
             if self.losses.alpha > 0.0 {
@@ -276,6 +312,7 @@ impl Task for GaussianTask {
             "dissimilarity" => 1.0 - self.losses.beta,
             "alpha" => self.losses.alpha,
             "scale" => phase.scale,
+            "points" => self.losses.points,
             _ => self.losses.needle,
         };
         let part = |(name, values): (&'static str, Vec<Tensor<1>>)| Part {
@@ -296,7 +333,7 @@ impl Task for GaussianTask {
             let device = &self.devices[0].clone().inner();
             let views: Vec<usize> = (0..item.target_cameras.len()).collect();
             let (target, mask) = targets(&item, &views, device);
-            let image = match self.gaussians(networks, &item, &Phase::new(false, 0), None, (0, device)) {
+            let image = match self.whole(networks, &item, device) {
                 Some(gaussians) => self.render(&gaussians, &item.target_cameras, item.background)?.0,
                 None => target.zeros_like(),
             };
@@ -339,7 +376,7 @@ impl Task for GaussianTask {
             let mut row = vec![photo(0), photo(1)];
             let views = [0, item.target_cameras.len() - 2];
             let cameras = views.map(|v| item.target_cameras[v]);
-            let seen = match self.gaussians(networks, &item, &Phase::new(false, 0), None, (0, &device)) {
+            let seen = match self.whole(networks, &item, &device) {
                 Some(gaussians) => host(self.render(&gaussians, &cameras, item.background)?.0),
                 None => vec![0.0; 2 * 3 * item.target_side.pow(2)],
             };
@@ -364,7 +401,10 @@ impl Task for GaussianTask {
         Ok(grid(&rows))
     }
 
-    fn frozen(&self) -> BTreeMap<String, Vec<f32>> {
+    fn frozen(&self, networks: &Networks) -> BTreeMap<String, Vec<f32>> {
+        if networks.predictor.is_some() {
+            return BTreeMap::new();
+        }
         Networks { predictor: Some(self.predictors[0].clone()), regressors: Vec::new() }.checkpoint()
     }
 }

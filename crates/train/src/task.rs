@@ -68,7 +68,7 @@ pub trait Task: Sync {
     fn preview(&self, networks: &Networks) -> Result<Option<RgbImage>, TrainError>;
 
     /// Weights to be written beside the trained ones, as checkpoints lay them out.
-    fn frozen(&self) -> BTreeMap<String, Vec<f32>> {
+    fn frozen(&self, _networks: &Networks) -> BTreeMap<String, Vec<f32>> {
         BTreeMap::new()
     }
 }

@@ -18,7 +18,7 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use snapsnap_splat::Camera;
 
-use crate::dataset::{Folder, Layout, Split, StoredView};
+use crate::dataset::{Folder, Layout, Split, StoredView, unproject};
 pub use augment::Augment;
 pub use joined::Joined;
 pub use loader::{Batches, Loader};
@@ -48,6 +48,8 @@ pub struct SampleConfig {
     pub supervision: usize,
     /// Stage 2: compare at twice the side, where the data set has it.
     pub high_resolution: bool,
+    /// Stage 2: also the points that four views see, for the point loss.
+    pub points: bool,
     /// Decides everything that is random.
     pub seed: u64,
     /// Changes to the two input photographs.
@@ -63,6 +65,7 @@ impl Default for SampleConfig {
             front_within_degrees: 180.0,
             supervision: 3,
             high_resolution: false,
+            points: false,
             seed: 1,
             augment: Augment::default(),
         }
@@ -169,6 +172,35 @@ impl Source {
     /// reads it.
     fn camera(&self, stored: &Camera) -> Camera {
         if self.config.compat { *stored } else { self.folder.exact_camera(stored) }
+    }
+
+    /// Points that views see, `[V,H,W,3]` metres in the first one's frame, and where there are any `[V,H,W]`; and the
+    /// pictures and masks of the first two.
+    #[allow(clippy::type_complexity, reason = "two arrays and the pictures")]
+    fn points(
+        &self,
+        subject: &str,
+        views: &[usize],
+    ) -> Result<(Vec<f32>, Vec<f32>, Vec<(RgbImage, GrayImage)>), FileError> {
+        let compat = self.config.compat;
+        let area = (self.folder.description().resolution as usize).pow(2);
+        let mut points = Vec::with_capacity(3 * views.len() * area);
+        let mut valid = Vec::with_capacity(views.len() * area);
+        let (mut pictures, mut front) = (Vec::new(), None);
+        for (place, view) in views.iter().enumerate() {
+            let stored = self.view_for(subject, *view, place < 2 || compat)?;
+            let camera = self.camera(&stored.camera);
+            let front = *front.get_or_insert(camera);
+            points.extend(unproject(&stored, &camera, &front, if compat { COMPAT_FAR } else { 0.0 }));
+            valid.extend(stored.depth.iter().enumerate().map(|(pixel, z)| {
+                let there = if compat { stored.mask.as_raw()[pixel] >= INSIDE } else { *z > 0.0 };
+                f32::from(u8::from(there))
+            }));
+            if place < 2 {
+                pictures.push((stored.color, stored.mask));
+            }
+        }
+        Ok((points, valid, pictures))
     }
 
     /// What a view sees, to be compared with: `[3,h,w]` in [0, 1], over a colour, and the share of the person `[h,w]`.

@@ -6,8 +6,8 @@ use burn::data::dataloader::batcher::Batcher;
 use burn::data::dataset::{Dataset, DatasetError};
 use burn::tensor::{Device, Tensor};
 
-use super::{COMPAT_FAR, INSIDE, SampleConfig, Source, together};
-use crate::dataset::{Folder, Split, unproject};
+use super::{SampleConfig, Source, together};
+use crate::dataset::{Folder, Split};
 use snapsnap_mesh::FileError;
 
 /// Samples of stage 1 (SNAPSNAP §5.6): any view is the front, the opposite one the back, those at right angles the sides.
@@ -71,25 +71,8 @@ impl Stage1 {
         let first = source.front(&mut random);
         // Front, back, and the sides at +90° and +270° (SNAPSNAP §5.6).
         let order = [0, 2, 1, 3].map(|quarter| (first + quarter * count / 4) % count);
-        let compat = source.config.compat;
         let side = source.folder.description().resolution as usize;
-        let (mut points, mut valid) =
-            (Vec::with_capacity(12 * side * side), Vec::with_capacity(4 * side * side));
-        let mut pictures = Vec::new();
-        let mut front = None;
-        for (place, view) in order.into_iter().enumerate() {
-            let stored = source.view_for(subject, view, place < 2 || compat)?;
-            let camera = source.camera(&stored.camera);
-            let front = *front.get_or_insert(camera);
-            points.extend(unproject(&stored, &camera, &front, if compat { COMPAT_FAR } else { 0.0 }));
-            valid.extend(stored.depth.iter().enumerate().map(|(pixel, z)| {
-                let there = if compat { stored.mask.as_raw()[pixel] >= INSIDE } else { *z > 0.0 };
-                f32::from(u8::from(there))
-            }));
-            if place < 2 {
-                pictures.push((stored.color, stored.mask));
-            }
-        }
+        let (points, valid, pictures) = source.points(subject, &order)?;
         let [front, back] = [0, 1].map(|i| (&pictures[i].0, &pictures[i].1));
         let (images, masks) = source.photographs([front, back], &mut random);
         let name = format!("{}: {subject}, view {first}", source.folder.root().display());

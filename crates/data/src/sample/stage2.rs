@@ -30,6 +30,10 @@ pub struct Stage2Item {
     pub masks: Vec<f32>,
     /// Cameras of front, back, right and left, side H.
     pub cameras: [Camera; 4],
+    /// `[4,H,W,3]` points that they see, metres in the front camera's frame; empty unless the config asks for them.
+    pub points: Vec<f32>,
+    /// `[4,H,W]` 1 where a point is one; empty likewise.
+    pub valid: Vec<f32>,
     /// h and w.
     pub target_side: usize,
     /// `[V,3,h,w]` views to compare in [0, 1], over `background`: the random ones, then right and left.
@@ -93,8 +97,13 @@ impl Stage2 {
         let count = description.views;
         let first = if config.compat { 0 } else { source.front(&mut random) };
         let [front, right, back, left] = [0, 1, 2, 3].map(|quarter| (first + quarter * count / 4) % count);
-        let picture = |view: usize| folder.picture(*split, subject, view, false);
-        let (a, b) = (picture(front)?, picture(back)?);
+        let (points, valid, pictures) = if config.points {
+            source.points(subject, &[front, back, right, left])?
+        } else {
+            let picture = |view: usize| folder.picture(*split, subject, view, false);
+            (Vec::new(), Vec::new(), vec![picture(front)?, picture(back)?])
+        };
+        let [a, b] = [0, 1].map(|i| &pictures[i]);
         let camera = |view: usize| folder.camera(*split, subject, view).map(|stored| source.camera(&stored));
         let cameras = [camera(front)?, camera(back)?, camera(right)?, camera(left)?];
 
@@ -119,6 +128,8 @@ impl Stage2 {
             images,
             masks,
             cameras,
+            points,
+            valid,
             target_side: target_side as usize,
             targets,
             target_masks,

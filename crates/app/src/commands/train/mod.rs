@@ -102,7 +102,9 @@ pub fn stage2(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
         } else {
             random_regressors(&networks, plan.config.training.seed, tracked)
         };
-        Ok(Networks { predictor: None, regressors })
+        let joint = plan.config.stage2.points > 0.0;
+        let predictor = joint.then(|| weights.point_predictor(tracked)).transpose()?;
+        Ok(Networks { predictor, regressors })
     })
 }
 
