@@ -8,6 +8,7 @@ pub mod layers;
 mod math;
 mod multiply;
 pub mod op;
+pub mod orthogonal;
 mod resize;
 mod rope;
 mod tracked;

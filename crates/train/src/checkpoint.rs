@@ -79,13 +79,7 @@ pub(crate) fn load<T: Task>(
     let size = |name: &str| shapes.get(name).map(|shape| shape.iter().product::<usize>());
     for (key, values) in &rows {
         let name = key.split_once('/').map_or("", |(_, name)| name);
-        let fits = match key.strip_prefix("muon/") {
-            Some(path) => shapes.keys().any(|name| {
-                path.strip_prefix(name.as_str()).is_some_and(|rest| rest.starts_with('.'))
-                    && size(name) == Some(values.len())
-            }),
-            None => size(name) == Some(values.len()),
-        };
+        let fits = size(name) == Some(values.len());
         if !fits {
             return Err(wrong(format!("{key} does not fit the configured networks")));
         }

@@ -2,15 +2,10 @@
 
 use std::collections::BTreeMap;
 
-use burn::optim::decay::WeightDecayConfig;
-use burn::optim::momentum::MomentumConfig;
-use burn::optim::{
-    AdjustLrFn, Muon, MuonConfig, MuonState, Optimizer as _, RecordState, StateSink, StateSource,
-};
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::{Device, Tensor};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
-use snapsnap_net::weights::NamedMapper;
+use snapsnap_ops::orthogonal::{COEFFICIENTS, MIN_NORM, STEPS, orthogonalised};
 
 use crate::networks::{Networks, Rows, host, row};
 
@@ -46,7 +41,7 @@ pub struct MuonSettings {
     /// Share of the past in the direction of a step.
     pub momentum: f64,
     /// As AdamW's.
-    pub weight_decay: f32,
+    pub weight_decay: f64,
 }
 
 impl Default for OptimizerConfig {
@@ -82,7 +77,7 @@ impl OptimizerConfig {
             ("weight_decay", self.weight_decay, 10.0),
             ("muon.rate", muon.rate, 10.0),
             ("muon.momentum", muon.momentum, 1.0),
-            ("muon.weight_decay", f64::from(muon.weight_decay), 10.0),
+            ("muon.weight_decay", muon.weight_decay, 10.0),
         ];
         let (key, value, limit) =
             shares.into_iter().find(|(_, value, limit)| !(0.0..*limit).contains(value))?;
@@ -91,29 +86,21 @@ impl OptimizerConfig {
 
     /// An optimiser that has made no step yet.
     pub fn init(&self) -> Optimizer {
-        let muon = self.muon.as_ref().map(|muon| {
-            let momentum = MomentumConfig { momentum: muon.momentum, dampening: 0.0, nesterov: true };
-            MuonConfig::new()
-                .with_momentum(momentum)
-                .with_weight_decay(Some(WeightDecayConfig::new(muon.weight_decay)))
-                .with_adjust_lr_fn(AdjustLrFn::MatchRmsAdamW)
-                .build()
-        });
-        Optimizer { config: self.clone(), muon, states: BTreeMap::new() }
+        Optimizer { config: self.clone(), states: BTreeMap::new() }
     }
 }
 
 /// What an optimiser remembers of a parameter.
 #[derive(Clone)]
+#[allow(clippy::large_enum_variant, reason = "what it points at is larger by far")]
 enum State {
     AdamW { time: u64, mean: Tensor<1>, squares: Tensor<1> },
-    Muon(MuonState<2>),
+    Muon { velocity: Tensor<1> },
 }
 
 /// An optimiser in the middle of a training.
 pub struct Optimizer {
     config: OptimizerConfig,
-    muon: Option<Muon>,
     states: BTreeMap<String, State>,
 }
 
@@ -127,58 +114,61 @@ fn is_hidden(name: &str, rank: usize) -> bool {
     rank >= 2 && !OUTER.iter().any(|part| name.contains(part)) && !is_linear_head
 }
 
+/// A parameter that has a gradient.
+struct Work {
+    name: String,
+    shape: Vec<usize>,
+    values: Tensor<1>,
+    gradient: Tensor<1>,
+    state: Option<State>,
+}
+
 impl Optimizer {
     /// One step of all parameters that have a gradient, each multiplied by `factor` first, at `share` of the highest
     /// rates.
-    pub fn step(&mut self, share: f64, networks: Networks, gradients: Rows, factor: f64) -> Networks {
-        struct Step<'a> {
-            optimizer: &'a mut Optimizer,
-            share: f64,
-            factor: f64,
-            gradients: Rows,
+    pub fn step(&mut self, share: f64, networks: Networks, mut gradients: Rows, factor: f64) -> Networks {
+        let mut shapes = networks.shapes();
+        let rows = networks.rows().into_iter();
+        let work = rows.filter_map(|(name, values)| {
+            let gradient = gradients.remove(&name)?;
+            let (shape, state) = (shapes.remove(&name)?, self.states.remove(&name));
+            Some(Work { name, shape, values, gradient, state })
+        });
+        let work: Vec<_> = work.collect();
+        let one = |work: Work| self.step_one(share, work, factor);
+        // Parameters are many and small: on the CPU all cores take some. Other devices order work by the calling thread.
+        let is_cpu = work.first().is_some_and(|work| work.values.device() == Device::flex());
+        let done: Vec<_> = if is_cpu {
+            work.into_par_iter().with_max_len(1).map(one).collect()
+        } else {
+            work.into_iter().map(one).collect()
+        };
+        let mut rows = Rows::new();
+        for (name, values, state) in done {
+            rows.insert(name.clone(), values);
+            self.states.insert(name, state);
         }
-        impl NamedMapper for Step<'_> {
-            fn map<const D: usize>(&mut self, name: &str, values: Tensor<D>) -> Tensor<D> {
-                match self.gradients.remove(name) {
-                    Some(gradient) => {
-                        self.optimizer.step_one(self.share, name, values, gradient, self.factor)
-                    }
-                    None => values,
-                }
-            }
-        }
-        networks.map(&mut Step { optimizer: self, share, factor, gradients })
+        networks.with_rows(&rows)
     }
 
-    fn step_one<const D: usize>(
-        &mut self,
-        share: f64,
-        name: &str,
-        values: Tensor<D>,
-        gradient: Tensor<1>,
-        factor: f64,
-    ) -> Tensor<D> {
-        let (shape, state) = (values.shape(), self.states.remove(name));
-        let (values, state) = match (&self.muon, &self.config.muon) {
-            (Some(muon), Some(settings)) if is_hidden(name, D) => {
-                // Kernels `[out, in, k, k]` are taken for matrices `[out, in·k·k]`.
-                let size = [shape[0], shape.num_elements() / shape[0]];
-                let state = match state {
-                    Some(State::Muon(state)) => Some(state),
+    fn step_one(&self, share: f64, work: Work, factor: f64) -> (String, Tensor<1>, State) {
+        let Work { name, shape, values, gradient, state } = work;
+        let (values, state) = match &self.config.muon {
+            Some(settings) if is_hidden(&name, shape.len()) => {
+                let velocity = match state {
+                    Some(State::Muon { velocity }) => Some(velocity),
                     _ => None,
                 };
-                let gradient = if factor == 1.0 { gradient } else { gradient * factor };
-                let (values, state) =
-                    muon.step(share * settings.rate, values.reshape(size), gradient.reshape(size), state);
-                (values.reshape([-1]), State::Muon(state.expect("Muon has a state after a step")))
+                // Kernels `[out, in, k, k]` are taken for matrices `[out, in·k·k]`.
+                let size = [shape[0], shape[1..].iter().product()];
+                muon(settings, share, values, gradient, factor, velocity, size)
             }
             _ => {
-                let decays = D >= 2 || self.config.decay_all;
-                self.adamw(share, decays, values.reshape([-1]), gradient, factor, state)
+                let decays = shape.len() >= 2 || self.config.decay_all;
+                self.adamw(share, decays, values, gradient, factor, state)
             }
         };
-        self.states.insert(name.to_owned(), state);
-        values.reshape(shape)
+        (name, values, state)
     }
 
     /// AdamW (Loshchilov and Hutter). Burn's corrects the moments' bias in f32, which makes the second step 1.5e-5 too long
@@ -243,13 +233,8 @@ impl Optimizer {
                     rows.insert(format!("mean/{name}"), host(mean.clone()));
                     rows.insert(format!("squares/{name}"), host(squares.clone()));
                 }
-                State::Muon(state) => {
-                    let mut sink = StateSink::default();
-                    state.state_flatten(&format!("muon/{name}"), &mut sink);
-                    let tensors = sink.tensors.into_iter();
-                    rows.extend(tensors.map(|(path, values)| {
-                        (path, values.try_into_vec().expect("all tensors here are f32"))
-                    }));
+                State::Muon { velocity } => {
+                    rows.insert(format!("velocity/{name}"), host(velocity.clone()));
                 }
             }
         }
@@ -264,26 +249,106 @@ impl Optimizer {
         times: &BTreeMap<String, u64>,
         device: &Device,
     ) {
-        for (name, shape) in networks.shapes() {
-            let prefix = format!("muon/{name}");
-            // Muon keeps one tensor, under a name of Burn's.
-            let path = rows.range(format!("{prefix}.")..).next().map(|(path, _)| path.clone());
-            if let Some(path) = path.filter(|path| path.starts_with(&format!("{prefix}."))) {
-                let velocity = rows.remove(&path).expect("just found");
-                let size = [shape[0], velocity.len() / shape[0]];
-                let mut source = StateSource::default();
-                source.insert_tensor(path, TensorData::new(velocity, size));
-                if let Some(state) = MuonState::state_unflatten(&prefix, &mut source, device) {
-                    self.states.insert(name, State::Muon(state));
-                }
-                continue;
-            }
-            let mut take = |kind: &str| rows.remove(&format!("{kind}/{name}"));
-            if let (Some(mean), Some(squares), Some(time)) = (take("mean"), take("squares"), times.get(&name))
+        for name in networks.shapes().into_keys() {
+            let mut take = |kind: &str| Some(row(rows.remove(&format!("{kind}/{name}"))?, device));
+            if let Some(velocity) = take("velocity") {
+                self.states.insert(name, State::Muon { velocity });
+            } else if let (Some(mean), Some(squares), Some(time)) =
+                (take("mean"), take("squares"), times.get(&name))
             {
-                let [mean, squares] = [mean, squares].map(|values| row(values, device));
                 self.states.insert(name, State::AdamW { time: *time, mean, squares });
             }
+        }
+    }
+}
+
+/// Muon (Jordan et al.): a step along the orthogonalised momentum, looked ahead as Nesterov's, as long as AdamW's steps are
+/// (Liu et al., "Muon is scalable", the factor of 0.2·√(longest side)).
+fn muon(
+    settings: &MuonSettings,
+    share: f64,
+    values: Tensor<1>,
+    gradient: Tensor<1>,
+    factor: f64,
+    velocity: Option<Tensor<1>>,
+    [rows, columns]: [usize; 2],
+) -> (Tensor<1>, State) {
+    let (device, momentum) = (values.device(), settings.momentum);
+    let rate = share * settings.rate;
+    let kept = 1.0 - rate * settings.weight_decay;
+    let pace = rate * 0.2 * (rows.max(columns) as f64).sqrt();
+    if device != Device::flex() {
+        let gradient = gradient * factor;
+        let velocity = match velocity {
+            Some(velocity) => velocity.to_device(&device) * momentum + gradient.clone(),
+            None => gradient.clone(),
+        };
+        let direction = velocity.clone() * momentum + gradient;
+        let update = orthogonalised_tensor(direction.reshape([rows, columns])).reshape([-1]);
+        return (values * kept - update * pace, State::Muon { velocity });
+    }
+    let mut velocity = velocity.map_or_else(|| vec![0.0; rows * columns], host);
+    let (mut values, mut direction) = (host(values), host(gradient));
+    let [momentum, factor, kept, pace] = [momentum, factor, kept, pace].map(|value| value as f32);
+    for (velocity, gradient) in velocity.iter_mut().zip(&mut direction) {
+        *gradient *= factor;
+        *velocity = *velocity * momentum + *gradient;
+        *gradient += *velocity * momentum;
+    }
+    let update = orthogonalised(direction, [rows, columns]);
+    values.iter_mut().zip(update).for_each(|(value, update)| *value = *value * kept - update * pace);
+    (row(values, &device), State::Muon { velocity: row(velocity, &device) })
+}
+
+/// As [`orthogonalised`], on any device.
+fn orthogonalised_tensor(x: Tensor<2>) -> Tensor<2> {
+    let [rows, columns] = x.dims();
+    if rows > columns {
+        return orthogonalised_tensor(x.transpose()).transpose();
+    }
+    let norm = x.clone().square().sum().sqrt().clamp_min(MIN_NORM).reshape([1, 1]);
+    let [a, b, c] = COEFFICIENTS;
+    (0..STEPS).fold(x / norm, |x, _| {
+        let gram = x.clone().matmul(x.clone().transpose());
+        let inner = gram.clone() * b + gram.clone().matmul(gram) * c;
+        x.clone() * a + inner.matmul(x)
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use burn::optim::momentum::MomentumConfig;
+    use burn::optim::{AdjustLrFn, MuonConfig, Optimizer as _};
+    use burn::tensor::{Distribution, Tolerance};
+
+    /// Burn's own Muon, which takes matrices only, is the yardstick of both roads.
+    #[test]
+    fn muon_is_burns() {
+        let settings = MuonSettings { rate: 0.01, momentum: 0.9, weight_decay: 0.0 };
+        let momentum = MomentumConfig { momentum: 0.9, dampening: 0.0, nesterov: true };
+        let burns =
+            MuonConfig::new().with_momentum(momentum).with_adjust_lr_fn(AdjustLrFn::MatchRmsAdamW).build();
+        #[allow(deprecated, reason = "the second CPU implementation")]
+        let devices = [Device::flex(), Device::ndarray()];
+        for (device, size) in devices.iter().flat_map(|device| [[6, 10], [24, 7]].map(|size| (device, size)))
+        {
+            let random = || Tensor::<2>::random(size, Distribution::Normal(0.0, 1.0), device);
+            let mut values = random();
+            let (mut ours, mut velocity, mut theirs) = (values.clone().reshape([-1]), None, None);
+            for _ in 0..3 {
+                let gradient = random();
+                let (new, state) = burns.step(0.01, values, gradient.clone(), theirs);
+                (values, theirs) = (new, state);
+                let (new, state) = muon(&settings, 1.0, ours, gradient.reshape([-1]), 1.0, velocity, size);
+                ours = new;
+                velocity = match state {
+                    State::Muon { velocity } => Some(velocity),
+                    State::AdamW { .. } => panic!("Muon's state is Muon's"),
+                };
+            }
+            let ours = ours.reshape(size).into_data();
+            ours.assert_approx_eq::<f32>(&values.clone().into_data(), Tolerance::absolute(2e-5));
         }
     }
 }

@@ -100,13 +100,13 @@ pub fn train<T: Task>(
 /// What a step takes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Rehearsal {
-    /// Time of one step, the first ones left out.
+    /// Mean time of a step, the first ones left out.
     pub step: Duration,
     /// Time of one validation, if there is one.
     pub validation: Option<Duration>,
 }
 
-/// Makes a few steps without writing anything, and measures the last.
+/// Makes a few steps without writing anything, and measures the last ones.
 ///
 /// # Errors
 /// As [`train`].
@@ -117,17 +117,19 @@ pub fn rehearse<T: Task>(
     devices: &[Device],
 ) -> Result<Rehearsal, TrainError> {
     /// The first steps find their memory, and on a GPU their kernels.
-    const STEPS: usize = 3;
+    const STEPS: [u32; 2] = [5, 5];
     let mut learner = Learner::new(task, config, networks, devices);
-    let mut step = Duration::ZERO;
-    for _ in 0..STEPS {
-        let start = Instant::now();
+    let mut start = Instant::now();
+    for step in 0..STEPS[0] + STEPS[1] {
+        if step == STEPS[0] {
+            start = Instant::now();
+        }
         if let Err(skipped) = learner.step()? {
             let message = format!("no step can be made: {} ({})", skipped.why, skipped.samples);
             return Err(TrainError::Unsuitable(message));
         }
-        step = start.elapsed();
     }
+    let step = start.elapsed() / STEPS[1];
     let start = Instant::now();
     let validation = task.validate(&learner.averaged())?.map(|_| start.elapsed());
     Ok(Rehearsal { step, validation })

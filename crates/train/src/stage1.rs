@@ -221,10 +221,10 @@ impl Errors {
                 sum[2] += sums[1] / count;
             }
             if *view > 1 {
-                for i in 0..area {
-                    let (seen, true_) = (conf[i] > threshold, item.valid[*view * area + i] > 0.5);
-                    self.overlap[0] += f64::from(u8::from(seen && true_));
-                    self.overlap[1] += f64::from(u8::from(seen || true_));
+                for (conf, valid) in conf.iter().zip(&item.valid[*view * area..]) {
+                    let (seen, there) = (*conf > threshold, *valid > 0.5);
+                    self.overlap[0] += f64::from(u8::from(seen && there));
+                    self.overlap[1] += f64::from(u8::from(seen || there));
                 }
             }
         }
