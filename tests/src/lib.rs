@@ -51,6 +51,11 @@ fn adapter(kind: DeviceType) -> bool {
     found
 }
 
+/// Whether a device is a GPU made of software, on which kernels take their time.
+pub fn is_software(device: &Device) -> bool {
+    device.identity().is_some_and(|identity| identity.physical.is_none())
+}
+
 #[allow(deprecated, reason = "still the second CPU implementation that results are checked on")]
 fn ndarray() -> Device {
     Device::ndarray()

@@ -68,8 +68,9 @@ fn blur(x: Tensor<4>) -> Tensor<4> {
     };
     let sum: f64 = (0..WINDOW).map(weight).sum();
     let kernel: Vec<f32> = (0..WINDOW).map(|i| (weight(i) / sum) as f32).collect();
-    let kernel =
-        |shape: [usize; 4]| Tensor::<4>::from_data(TensorData::new(kernel.clone(), shape), &x.device());
+    let kernel = |shape: [usize; 4]| {
+        Tensor::<4>::from_data(TensorData::new(kernel.clone(), shape), &x.device()).cast(x.dtype())
+    };
     let (down, across) = (kernel([1, 1, WINDOW, 1]), kernel([1, 1, 1, WINDOW]));
     let half = WINDOW / 2;
     let planes = x.reshape([b * c, 1, h, w]);

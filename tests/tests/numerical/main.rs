@@ -8,4 +8,5 @@ mod splat_fit;
 mod splat_fixtures;
 mod splat_invariants;
 mod splat_oracle;
+mod steps;
 mod training;

@@ -6,7 +6,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use snapsnap_net::config::Config;
 use snapsnap_net::regressor::Statistics;
 use snapsnap_net::weights::{ImportOptions, SideHeads, WeightFile, import};
-use snapsnap_tests::{Numbers, data, device, fixture, relative_error, values};
+use snapsnap_tests::{Numbers, data, device, fixture, is_software, relative_error, values};
 use snapsnap_train::networks::{Networks, Rows};
 use snapsnap_train::optimizer::OptimizerConfig;
 use snapsnap_train::photometric::Photometric;
@@ -59,8 +59,7 @@ fn stage_1_follows_the_authors_first_steps() {
 
 #[test]
 fn stage_1_follows_the_authors_twenty_steps() {
-    let software = device().and_then(|device| device.identity()).is_some_and(|id| id.physical.is_none());
-    if software && std::env::var_os("SNAPSNAP_ALL_STEPS").is_none() {
+    if device().is_some_and(|device| is_software(&device)) && std::env::var_os("SNAPSNAP_ALL_STEPS").is_none() {
         println!("SKIPPED: twenty steps take minutes on a software adapter; SNAPSNAP_ALL_STEPS=1 runs them");
         return;
     }

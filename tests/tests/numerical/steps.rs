@@ -1,0 +1,233 @@
+//! Steps of a training: the same on every device, and with gradients that finite differences confirm.
+
+use std::sync::Arc;
+
+use burn::data::dataset::Dataset;
+use burn::tensor::{DType, Device, Tensor, TensorData};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use snapsnap_data::dataset::{Folder, Split};
+use snapsnap_data::prepare::{DataConfig, Subject};
+use snapsnap_net::Window;
+use snapsnap_net::network::{PointMap, View, activate};
+use snapsnap_net::weights::{random_predictor, random_regressors};
+use snapsnap_people::synth;
+use snapsnap_tests::{device, is_software, relative_error, values};
+use snapsnap_train::config::TrainConfig;
+use snapsnap_train::gradients;
+use snapsnap_train::networks::{Networks, Rows};
+use snapsnap_train::photometric::Photometric;
+use snapsnap_train::points::{Prediction, losses};
+use snapsnap_train::stage1::PointTask;
+use snapsnap_train::stage2::GaussianTask;
+use snapsnap_train::task::Task;
+
+/// Both roads of every layer are in it: attention, all kinds of convolutions, resizing, windows, anchors.
+const CONFIG: &str = r#"
+[network]
+enc_dim = 16
+enc_depth = 1
+enc_heads = 2
+dec_dim = 16
+dec_depth = 2
+dec_heads = 2
+layer_dims = [4, 4, 8, 8]
+feature_dim = 8
+last_dim = 4
+hooks = [0, 1, 1, 2]
+resolution = 64
+net_resolution = 32
+delta = 0.2
+anchor = "ray"
+window = true
+conf_threshold = 0.4
+[regressor]
+start = "geometric"
+[mode]
+compat = false
+[samples]
+supervision = 1
+[training]
+validation_samples = 0
+[stage2]
+alpha = 0.5
+needle = 0.1
+anisotropy = 1.5
+[optimizer]
+rate = 1e-3
+[optimizer.muon]
+"#;
+
+fn config() -> TrainConfig {
+    TrainConfig::from_toml(CONFIG, "the test's config", &[]).expect("a config")
+}
+
+/// A data set of two people.
+fn people(root: &std::path::Path) -> Arc<Folder> {
+    let mut config = DataConfig::default();
+    (config.views.count, config.views.resolution) = (4, 64);
+    let folder = Folder::create(&root.join("people"), config.description("test")).expect("makes");
+    for index in 0..2 {
+        let (name, person) = (format!("{index:04}"), synth::person(&format!("steps/{index}")));
+        config.add(&folder, &Subject::plain(Split::Train, &name), &person).expect("adds");
+    }
+    Arc::new(folder)
+}
+
+/// Loss, gradients and weights after a step.
+fn step<T: Task>(task: &T, networks: Networks) -> (f64, Rows, Networks) {
+    let samples = task.samples(0);
+    let items = vec![samples.get(0).expect("reads"), samples.get(1).expect("reads")];
+    let parts = task.losses(&networks, items, 0, 0).expect("a loss");
+    let weighted: Vec<Tensor<1>> = parts.into_iter().map(|part| part.value * part.weight).collect();
+    let loss = Tensor::cat(weighted, 0).sum();
+    let value = f64::from(loss.clone().into_scalar::<f32>());
+    let rows = gradients::collect(&networks, &mut loss.backward());
+    let factor = gradients::clip_factor(gradients::norm(&rows), 1.0).expect("finite");
+    let networks = config().optimizer.init().step(1.0, networks, rows.clone(), factor);
+    (value, rows, networks)
+}
+
+fn compare(stage: &str, on: impl Fn(&Device) -> (f64, Rows, Networks), device: &Device) {
+    let ((loss, rows, after), (expected, expected_rows, expected_after)) =
+        (on(&device.clone().autodiff()), on(&Device::flex().autodiff()));
+    assert!((loss - expected).abs() <= 1e-5 * expected, "{stage}: loss {loss} instead of {expected}");
+    assert_eq!(rows.len(), expected_rows.len());
+    let total: f64 = gradients::norm(&expected_rows);
+    let mut worst = (0.0, String::new());
+    for (name, expected) in &expected_rows {
+        let (got, expected) = (values(rows[name].clone()), values(expected.clone()));
+        let norm = expected.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
+        // Biases in front of a normalisation have no gradient; rounding leaves some.
+        if norm > 1e-5 * total {
+            let error = relative_error(&got, &expected);
+            worst = if error > worst.0 { (error, name.clone()) } else { worst };
+        }
+    }
+    println!("{stage}: {} gradients, relative error up to {:.1e} ({})", rows.len(), worst.0, worst.1);
+    assert!(worst.0 <= 1e-4, "{stage}: {}: {:e}", worst.1, worst.0);
+    let (got, expected) = (after.checkpoint(), expected_after.checkpoint());
+    for (name, expected) in expected {
+        // A first step of AdamW is as long for a gradient of rounding as for any other.
+        let Some(row) = expected_rows.get(&name) else {
+            // The first unit of the coarsest fusion never runs.
+            assert_eq!(got[&name], expected, "{stage}: {name} has no gradient");
+            continue;
+        };
+        let norm = values(row.clone()).iter().map(|v| f64::from(*v).powi(2)).sum::<f64>();
+        let size = expected.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
+        if norm.sqrt() > 1e-3 * total && size > 1e-3 {
+            let error = relative_error(&got[&name], &expected);
+            assert!(error <= 1e-4, "{stage}: {name} after a step: {error:e}");
+        }
+    }
+}
+
+#[test]
+fn a_step_of_stage_1_is_the_same_on_every_device() {
+    let Some(device) = device() else { return };
+    if is_software(&device) {
+        println!("SKIPPED: on a software adapter stage 2 has stage 1's loss in it, and takes minutes");
+        return;
+    }
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let (folder, config) = (people(temporary.path()), config());
+    let on = |device: &Device| {
+        let task = PointTask::new(&[folder.clone()], &config, std::slice::from_ref(device)).expect("a task");
+        let predictor = Some(random_predictor(&config.networks(), 3, device));
+        step(&task, Networks { predictor, regressors: Vec::new() })
+    };
+    compare("stage 1", on, &device);
+}
+
+#[test]
+fn a_step_of_stage_2_is_the_same_on_every_device() {
+    let Some(device) = device() else { return };
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let folder = people(temporary.path());
+    for joint in [false, true] {
+        if !joint && is_software(&device) {
+            println!("SKIPPED: on a software adapter only both networks together, which takes minutes");
+            continue;
+        }
+        let mut config = config();
+        config.stage2.points = if joint { 1.0 } else { 0.0 };
+        let networks = config.networks();
+        // Corrections of nothing have no gradient but the last layer's.
+        let mut published = networks.clone();
+        published.regressor.start = None;
+        let on = |device: &Device| {
+            let predictor = |device: &Device| random_predictor(&networks, 3, device);
+            let frozen = predictor(&device.clone().inner());
+            let task = GaussianTask::new(&[folder.clone()], &config, frozen, std::slice::from_ref(device));
+            let regressors = random_regressors(&published, 4, device);
+            let predictor = joint.then(|| predictor(device));
+            step(&task.expect("a task"), Networks { predictor, regressors })
+        };
+        compare(if joint { "stage 2, joint" } else { "stage 2" }, on, &device);
+    }
+}
+
+/// Random values in f64, tracked.
+fn random(shape: &[usize], range: std::ops::Range<f64>, seed: u64) -> Vec<f64> {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    (0..shape.iter().product()).map(|_| random.random_range(range.clone())).collect()
+}
+
+fn tensor<const D: usize>(values: &[f64], shape: [usize; D]) -> Tensor<D> {
+    let device = Device::flex().autodiff();
+    Tensor::from_data(TensorData::new(values.to_vec(), shape), (&device, DType::F64))
+}
+
+/// Compares the gradient of `loss` with central differences, all in f64.
+fn check<const D: usize>(
+    what: &str,
+    point: &[f64],
+    shape: [usize; D],
+    loss: impl Fn(Tensor<D>) -> Tensor<1>,
+) {
+    const STEP: f64 = 1e-6;
+    let x = tensor(point, shape).require_grad();
+    let gradient: Vec<f64> =
+        x.grad(&loss(x.clone()).backward()).expect("tracked").into_data().try_into_vec().expect("f64");
+    let at = |i: usize, step: f64| -> f64 {
+        let mut moved = point.to_vec();
+        moved[i] += step;
+        loss(tensor(&moved, shape)).into_data().try_into_vec::<f64>().expect("f64")[0]
+    };
+    let largest = gradient.iter().fold(0.0_f64, |most, g| most.max(g.abs()));
+    assert!(largest > 0.0, "{what}: no gradient");
+    for (i, gradient) in gradient.iter().enumerate() {
+        let expected = (at(i, STEP) - at(i, -STEP)) / (2.0 * STEP);
+        let off = (gradient - expected).abs();
+        assert!(off <= 1e-6 * largest.max(1.0), "{what}, value {i}: {gradient} instead of {expected}");
+    }
+}
+
+#[test]
+fn gradients_of_the_losses_are_finite_differences() {
+    let (h, w) = (4, 5);
+    let config = config().networks();
+    let mut published = config.clone();
+    published.network.anchor = snapsnap_net::config::Anchor::None;
+    let truth = tensor(&random(&[2, 1, h, w, 3], -1.0..1.0, 1), [2, 1, h, w, 3]);
+    let valid: Vec<f64> = random(&[2, 1, h, w], 0.0..1.0, 2).iter().map(|v| f64::from(*v > 0.4)).collect();
+    let valid = tensor(&valid, [2, 1, h, w]);
+    for (name, config) in [("ray", &config), ("published", &published)] {
+        let stage1 = |raw: Tensor<4>| {
+            let PointMap { points, conf } = activate(raw, &config.network);
+            let window = Window { rows: 0..h, columns: 0..w };
+            let prediction = Prediction { window, maps: vec![(View::Front, PointMap { points, conf })] };
+            let losses = losses(&prediction, &truth, &valid);
+            losses.regression + losses.confidence * 0.5
+        };
+        check(&format!("stage 1, {name}"), &random(&[2, 4, h, w], -1.5..1.5, 3), [2, 4, h, w], stage1);
+    }
+
+    let target = tensor(&random(&[1, 2, 13, 12], 0.0..1.0, 4), [1, 2, 13, 12]);
+    let photometric = |image: Tensor<4>| Photometric::new(image, target.clone()).loss(0.8);
+    check("photometric", &random(&[1, 2, 13, 12], 0.0..1.0, 5), [1, 2, 13, 12], photometric);
+
+    let needle = |scales: Tensor<2>| snapsnap_train::stage2::needles(&scales, 2.0);
+    check("needles", &random(&[6, 3], 0.01..1.0, 6), [6, 3], needle);
+}
