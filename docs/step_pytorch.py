@@ -231,7 +231,7 @@ def main():
     print(f"PyTorch {torch.__version__}, {a.threads} threads")
     print(f"predictor: {sum(p.numel() for p in predictor.parameters()):,} parameters")
     for turn in range(2):
-        ours = [a.program, str(a.seconds), str(a.side), str(a.batch)]
+        ours = [a.program, str(a.seconds), str(a.side), str(a.batch), "whole"]
         print(subprocess.run(ours, capture_output=True, text=True, check=True).stdout.rstrip())
         for name, network, x in (("predictor", predictor, images), ("regressor", regressor, views)):
             (forward, backward), count = measure(network, x, a.seconds)

@@ -358,8 +358,49 @@ fn what_cannot_be_trained_is_refused_by_name() {
     assert!(said.contains("other [network]"), "{said}");
     let said = refused(train(2, &config, &run).args(["--resume"]));
     assert!(said.contains("stage 1"), "{said}");
-    fs::write(run.join("state/state.safetensors"), &before[2][..before[2].len() / 2]).expect("writes");
-    let said = refused(train(1, &config, &run).arg("--resume"));
-    assert!(said.contains("state.safetensors"), "{said}");
-    assert!(results(&run)[..2] == before[..2]);
+    assert!(results(&run) == before);
+    let said = refused(train(1, &config, &run.join("other")).args(["--set", "training.batch=4096"]).args([
+        "--set",
+        "network.resolution=4096",
+        "--set",
+        "network.net_resolution=4096",
+    ]));
+    assert!(said.contains("GB of memory"), "{said}");
+}
+
+#[test]
+fn a_damaged_state_is_refused_and_changes_nothing() {
+    let (temporary, config) = place();
+    let run = temporary.path().join("run");
+    succeed(train(1, &config, &run).args(["--set", "training.steps=2"]));
+    let (before, state) = (results(&run), run.join("state/state.safetensors"));
+    let whole = before[2].clone();
+    let header = 8 + u64::from_le_bytes(whole[..8].try_into().expect("eight bytes")) as usize;
+    let mut random = ChaCha8Rng::seed_from_u64(11);
+    let mut damaged: Vec<Vec<u8>> = [0, 7, 100, header, whole.len() / 2, whole.len() - 1]
+        .map(|length| whole[..length].to_vec())
+        .into_iter()
+        .collect();
+    for _ in 0..12 {
+        // In the header, where the bytes mean something.
+        let mut bytes = whole.clone();
+        let at = random.random_range(0..header);
+        bytes[at] = bytes[at].wrapping_add(random.random_range(1..255));
+        damaged.push(bytes);
+    }
+    for bytes in damaged {
+        fs::write(&state, &bytes).expect("writes");
+        let output = train(1, &config, &run).args(["--resume", "--set", "training.steps=2"]).output();
+        let output = output.expect("runs");
+        let said = String::from_utf8_lossy(&output.stderr);
+        // What is damaged may still be a state, of another step, say.
+        if output.status.code() != Some(0) {
+            assert_eq!(output.status.code(), Some(2), "{said}");
+            assert!(said.contains("state.safetensors") && !said.contains("panicked"), "{said}");
+            assert!(fs::read(&state).expect("reads") == bytes && results(&run)[..2] == before[..2]);
+        }
+        for (name, bytes) in ["last.safetensors", "best.safetensors"].iter().zip(&before) {
+            fs::write(run.join(name), bytes).expect("writes");
+        }
+    }
 }

@@ -10,6 +10,8 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use snapsnap_splat::file;
 
+use crate::regressor::RECEPTIVE_RADIUS;
+
 /// Longest config that is read.
 const MAX_BYTES: u64 = 1 << 20;
 
@@ -133,9 +135,18 @@ pub struct RegressorConfig {
     /// What the network's output is measured from; unset: as published.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub start: Option<RegressorStart>,
+    /// With `mode.crop`, pixels around the person's box that the network sees; unset: as far as any pixel of the person can
+    /// be reached from. What is trained with less does with less.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub margin: Option<usize>,
 }
 
 impl RegressorConfig {
+    /// Pixels around the person's box.
+    pub fn margin(&self) -> usize {
+        self.margin.unwrap_or(RECEPTIVE_RADIUS)
+    }
+
     /// What the network's output is measured from.
     pub fn start(&self) -> RegressorStart {
         self.start.unwrap_or(RegressorStart::Published)
@@ -144,7 +155,7 @@ impl RegressorConfig {
 
 impl Default for RegressorConfig {
     fn default() -> Self {
-        Self { networks: 1, channels: 16, groups: 16, start: None }
+        Self { networks: 1, channels: 16, groups: 16, start: None, margin: None }
     }
 }
 
@@ -329,6 +340,7 @@ impl Config {
         let mut config = self.clone();
         config.network.upsample = Some(self.upsample());
         config.regressor.start = Some(self.regressor.start());
+        config.regressor.margin = self.crop().then(|| self.regressor.margin());
         config.mode = ModeConfig {
             compat: self.mode.compat,
             rotation_frame: Some(self.rotation_frame()),

@@ -6,7 +6,6 @@ use std::ops::Range;
 use burn::tensor::Tensor;
 
 use crate::config::Config;
-use crate::regressor::RECEPTIVE_RADIUS;
 
 /// The regressor halves the image twice, so windows start and end at multiples of this.
 const ALIGNMENT: usize = 4;
@@ -49,12 +48,12 @@ impl Window {
         person.map_or_else(|| Self::whole(side), |person| person.in_cells(cell, side))
     }
 
-    /// Grown by the regressor's receptive radius, so that what lies outside cannot matter, to aligned edges inside the
-    /// canvas (whose side is a multiple of 4).
-    pub fn padded(&self, side: usize) -> Self {
+    /// Grown by `margin` pixels to aligned edges inside the canvas (whose side is a multiple of 4). By the regressor's
+    /// receptive radius, what lies outside cannot matter.
+    pub fn padded(&self, margin: usize, side: usize) -> Self {
         let grow = |r: &Range<usize>| {
-            let start = r.start.saturating_sub(RECEPTIVE_RADIUS) / ALIGNMENT * ALIGNMENT;
-            start..(r.end + RECEPTIVE_RADIUS).next_multiple_of(ALIGNMENT).min(side)
+            let start = r.start.saturating_sub(margin) / ALIGNMENT * ALIGNMENT;
+            start..(r.end + margin).next_multiple_of(ALIGNMENT).min(side)
         };
         Self { rows: grow(&self.rows), columns: grow(&self.columns) }
     }
@@ -117,7 +116,7 @@ mod tests {
         mask[300 * side + 203] = true;
         let person = Window::around([mask.as_slice()].into_iter(), side).expect("pixels");
         assert_eq!(person, Window { rows: 201..301, columns: 203..251 });
-        let padded = person.padded(side);
+        let padded = person.padded(crate::regressor::RECEPTIVE_RADIUS, side);
         assert_eq!(padded, Window { rows: 100..404, columns: 100..352 });
         assert_eq!(padded.indices(&mask, side), vec![(101 * 252 + 150), (200 * 252 + 103)]);
         assert_eq!(Window::around([vec![false; 16].as_slice()].into_iter(), 4), None);

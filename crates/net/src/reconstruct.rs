@@ -268,8 +268,11 @@ impl Run<'_> {
                 self.plan.push(format!("{what} left out: no pixel of these views is valid"));
                 continue;
             };
-            let window =
-                if self.model.config.crop() { person.padded(self.side) } else { Window::whole(self.side) };
+            let window = if self.model.config.crop() {
+                person.padded(self.model.config.regressor.margin(), self.side)
+            } else {
+                Window::whole(self.side)
+            };
             self.plan
                 .push(format!("{what}: {window} of {0}×{0} pixels each, person's box {person}", self.side));
             let network = &self.model.regressors[pair.min(self.model.regressors.len() - 1)];

@@ -1,17 +1,18 @@
 //! A training step, forward and backward, of the small predictor (`configs/small`, 256², batch 2) and of the regressor
 //! (two views of 256²): `cargo bench --workspace --bench step`. `docs/step_pytorch.py` runs PyTorch's beside it.
 //!
-//! Arguments: seconds per measurement (20), side (256), batch (2).
+//! Arguments: seconds per measurement (20), side (256), batch (2), and `whole` to leave out what is partly frozen.
 
 use std::hint::black_box;
 use std::time::{Duration, Instant};
 
+use burn::module::{Module, Param, ParamGroup, ParamId};
 use burn::optim::GradientsParams;
 use burn::tensor::{Device, Distribution, Tensor};
-use snapsnap_net::config::Config;
-use snapsnap_net::network::View;
+use snapsnap_net::network::{PointPredictor, View};
 use snapsnap_net::regressor::Statistics;
-use snapsnap_net::weights::{WeightFile, init};
+use snapsnap_net::weights::{NamedVisitor, random_predictor, random_regressors, visit_named};
+use snapsnap_train::config::TrainConfig;
 
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
@@ -45,32 +46,58 @@ fn main() {
     rayon::scope(|_| run(seconds, side, batch));
 }
 
+/// The predictor with all parameters frozen whose names begin with none of `trained`.
+fn frozen(predictor: PointPredictor, trained: &[&str]) -> PointPredictor {
+    struct Frozen<'a>(&'a [&'a str], Vec<ParamId>);
+    impl NamedVisitor for Frozen<'_> {
+        fn visit<const D: usize>(&mut self, name: &str, _: bool, parameter: &Param<Tensor<D>>) {
+            if !self.0.iter().any(|part| name.starts_with(part)) {
+                self.1.push(parameter.id);
+            }
+        }
+    }
+    let mut frozen = Frozen(trained, Vec::new());
+    visit_named(&predictor, "", &mut frozen);
+    if frozen.1.is_empty() { predictor } else { predictor.freeze_group(ParamGroup::from_ids(frozen.1)) }
+}
+
 fn run(seconds: f64, side: usize, batch: usize) {
     let device = Device::flex().autodiff();
-    let folder = tempfile::tempdir().expect("a folder");
-    let path = folder.path().join("weights.safetensors");
-    let text = include_str!("../../../configs/small/network.toml");
-    let config = Config::from_toml(text, "configs/small/network.toml", &[]).expect("a config");
-    init(&config, 1, &path, &|_, _| ()).expect("writes");
-    let weights = WeightFile::open(&path, None).expect("opens");
-    let predictor = weights.point_predictor(&device).expect("loads");
-    let regressor = weights.regressors(&device).expect("loads").remove(0);
+    let text = include_str!("../../../configs/small/stage1.toml");
+    let config = TrainConfig::from_toml(text, "configs/small/stage1.toml", &[]).expect("a config").networks();
+    let predictor = random_predictor(&config, 1, &device);
+    let regressor = random_regressors(&config, 1, &device).remove(0);
     let threads = rayon::current_num_threads();
 
     let images = Tensor::<4>::random([2 * batch, 3, side, side], Distribution::Uniform(-1.0, 1.0), &device);
-    let net = &predictor.dust3r;
-    let grid = net.grid([side, side]);
-    let time = measure(seconds, || {
-        let start = Instant::now();
-        let tokens = net.encode(images.clone());
-        let maps = net.decode(tokens.clone().narrow(0, 0, batch), tokens.narrow(0, batch, batch), grid);
-        let raw = View::ALL.map(|view| net.raw_points(view, &maps, grid).square().mean());
-        let loss = Tensor::cat(raw.to_vec(), 0).sum();
-        let forward = start.elapsed();
-        black_box(GradientsParams::from_grads(loss.backward(), &predictor));
-        (forward, start.elapsed() - forward)
-    });
-    println!("predictor, batch {batch}, {side}², {threads} threads: {time}");
+    // What is frozen is not differentiated: the later the first trained layer, the less there is to do.
+    for (what, trained) in [
+        ("all trained", ""),
+        ("decoders and heads trained", "dust3r.dec_,dust3r.decoder_embed,dust3r.downstream_,scale"),
+        ("heads trained", "dust3r.downstream_,scale"),
+        ("front head trained", "dust3r.downstream_head1"),
+        ("nothing trained", "nothing"),
+    ] {
+        if !trained.is_empty() && std::env::args().any(|argument| argument == "whole") {
+            continue;
+        }
+        let predictor = frozen(predictor.clone(), &trained.split(',').collect::<Vec<_>>());
+        let net = &predictor.dust3r;
+        let grid = net.grid([side, side]);
+        let time = measure(seconds, || {
+            let start = Instant::now();
+            let tokens = net.encode(images.clone());
+            let maps = net.decode(tokens.clone().narrow(0, 0, batch), tokens.narrow(0, batch, batch), grid);
+            let raw = View::ALL.map(|view| net.raw_points(view, &maps, grid).square().mean());
+            let loss = Tensor::cat(raw.to_vec(), 0).sum();
+            let forward = start.elapsed();
+            if trained != "nothing" {
+                black_box(GradientsParams::from_grads(loss.backward(), &predictor));
+            }
+            (forward, start.elapsed() - forward)
+        });
+        println!("predictor, {what}, batch {batch}, {side}², {threads} threads: {time}");
+    }
 
     let input = Tensor::<4>::random([2, 6, side, side], Distribution::Uniform(-1.0, 1.0), &device);
     let time = measure(seconds, || {

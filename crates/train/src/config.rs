@@ -260,3 +260,42 @@ impl TrainConfig {
         self.schedule.problem().map(|(key, message)| (format!("schedule.{key}"), message))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn read(size: &str, stage: u32) -> TrainConfig {
+        let path = format!("{}/../../configs/{size}/stage{stage}.toml", env!("CARGO_MANIFEST_DIR"));
+        let text = std::fs::read_to_string(&path).expect("a config");
+        TrainConfig::from_toml(&text, &path, &[]).expect("makes sense")
+    }
+
+    #[test]
+    fn all_configs_make_sense_and_both_stages_are_of_the_same_predictor() {
+        for size in ["tiny", "small", "full"] {
+            let [one, two] = [1, 2].map(|stage| read(size, stage));
+            assert_eq!(one.network, two.network, "{size}");
+            assert_eq!(one.mode, two.mode, "{size}");
+            let again = TrainConfig::from_toml(&two.to_toml(), "itself", &[]).expect("its own");
+            assert_eq!(again, two);
+        }
+    }
+
+    /// What nothing is said about is as published.
+    #[test]
+    fn full_is_the_papers() {
+        let published = TrainConfig {
+            mode: ModeConfig { compat: true, ..ModeConfig::default() },
+            samples: SampleConfig::compat(),
+            ..TrainConfig::default()
+        };
+        let [one, two] = [1, 2].map(|stage| read("full", stage));
+        assert_eq!(one.networks().resolved(), published.networks().resolved());
+        assert_eq!((&one.samples, &one.optimizer), (&published.samples, &published.optimizer));
+        assert_eq!((one.schedule, &one.stage1), (published.schedule, &published.stage1));
+        assert_eq!((one.training.steps, one.training.batch, one.training.clip), (100_000, 1, 1.0));
+        assert_eq!((two.training.steps, two.stage2.beta, two.stage2.curriculum), (50_000, 0.8, true));
+        assert_eq!((two.schedule, &two.optimizer), (one.schedule, &one.optimizer));
+    }
+}

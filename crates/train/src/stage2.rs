@@ -1,7 +1,7 @@
 //! Stage 2: the regressor learns Gaussians that look like the person from every side (SNAPSNAP §9.2, LEARNING.md).
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use burn::data::dataset::Dataset;
 use burn::module::Module;
@@ -11,9 +11,10 @@ use rand::Rng;
 use snapsnap_data::dataset::{Folder, Split};
 use snapsnap_data::sample::{Joined, SampleConfig, Stage2, Stage2Item};
 use snapsnap_net::Window;
-use snapsnap_net::config::Config;
+use snapsnap_net::config::{Config, RegressorStart};
 use snapsnap_net::gaussians::{Seen, assemble, placed, regress, side_images};
-use snapsnap_net::network::{PointPredictor, View};
+use snapsnap_net::network::{PointMap, PointPredictor, View, anchors};
+use snapsnap_net::weights::random_regressors;
 use snapsnap_people::random::stream;
 use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
 
@@ -48,6 +49,8 @@ pub struct GaussianTask {
     predictors: Vec<PointPredictor>,
     sets: Vec<Stage2>,
     validation: Fixed<Stage2Item>,
+    /// Found once.
+    billboard: OnceLock<Scores>,
     /// Those that train, with gradients.
     devices: Vec<Device>,
 }
@@ -107,6 +110,7 @@ impl GaussianTask {
                 .collect(),
             sets,
             validation,
+            billboard: OnceLock::new(),
             devices: devices.to_vec(),
         })
     }
@@ -134,77 +138,53 @@ impl GaussianTask {
         predict(predictor, &self.networks, images, &masks)
     }
 
-    /// Gaussians of a sample in the data set's world; `None` if no pixel is valid. With `noise`, points stray by so many
-    /// metres.
-    fn gaussians(
-        &self,
-        networks: &Networks,
-        item: &Stage2Item,
-        prediction: Prediction,
-        phase: &Phase,
-        noise: Option<&mut dyn FnMut() -> f32>,
-        device: &Device,
-    ) -> Option<Gaussians> {
-        let (config, side) = (&self.networks, item.side);
-        let area = side * side;
-        let (mut points, mut conf, mut maps) = (Vec::new(), Vec::new(), Vec::new());
-        for (_, map) in prediction.on_canvas(side) {
-            points.extend(host(map.points.clone()));
-            conf.extend(host(map.conf));
-            maps.push(map.points);
-        }
-        let views = points.len() / (3 * area);
-        if let Some(noise) = noise.filter(|_| networks.predictor.is_none()) {
-            // Every view's shell is shifted as a whole: that is how predictions are off.
-            for view in points.chunks_exact_mut(3 * area) {
-                let shift = [noise(), noise(), noise()];
-                view.chunks_exact_mut(3).for_each(|p| (0..3).for_each(|c| p[c] += shift[c]));
-            }
-        }
-        let finite = |i: usize| points[3 * i..3 * i + 3].iter().all(|v| v.is_finite());
-        let valid: Vec<Vec<bool>> = (0..views)
-            .map(|view| {
-                let chosen = |i: usize| match view {
-                    0 | 1 => item.masks[view * area + i] > 0.5,
-                    _ => conf[view * area + i] > config.network.conf_threshold,
-                };
-                (0..area).map(|i| chosen(i) && finite(view * area + i)).collect()
-            })
-            .collect();
-        let photos = [0, 1].map(|view| &item.images[3 * view * area..3 * (view + 1) * area]);
-        let sides = if views > 2 { side_images(photos, &points, &valid) } else { Vec::new() };
-        let images: Vec<&[f32]> = photos.into_iter().chain(sides.iter().map(Vec::as_slice)).collect();
-        let points = if networks.predictor.is_some() {
-            // Where the predictor is trained, what looks like its error must lead back to it.
-            Tensor::cat(maps, 0)
-        } else {
-            // One overflow would spoil the normalisation of a whole view.
-            points.iter_mut().filter(|v| !v.is_finite()).for_each(|v| *v = 0.0);
-            Tensor::<4>::from_data(TensorData::new(points, [views, side, side, 3]), device)
-        };
-        let mut parts = Vec::new();
-        for (pair, first) in (0..views).step_by(2).enumerate().filter(|(_, v)| phase.views.contains(v)) {
-            let person = Window::around(valid[first..first + 2].iter().map(Vec::as_slice), side);
-            let Some(person) = person else { continue };
-            let window = if config.crop() { person.padded(side) } else { Window::whole(side) };
-            let regressor = &networks.regressors[pair.min(networks.regressors.len() - 1)];
-            let seen: Vec<_> = (first..first + 2)
-                .map(|v| Seen { image: images[v], points: points.clone().narrow(0, v, 1), valid: &valid[v] })
-                .collect();
-            parts.extend(regress(regressor, config, &seen, &window));
-        }
-        if parts.is_empty() {
-            return None;
-        }
-        let (gaussians, _) = assemble(config, parts, device);
-        (!gaussians.is_empty())
-            .then(|| placed(config, gaussians, &item.cameras[View::Front as usize].world_to_camera.inverse()))
-    }
-
     /// Gaussians of all views, for validations.
     fn whole(&self, networks: &Networks, item: &Stage2Item, device: &Device) -> Option<Gaussians> {
         let prediction = self.predict(networks, item, (0, device));
-        self.gaussians(networks, item, prediction, &Phase::new(false, 0), None, device)
+        gaussians(&self.networks, networks, item, prediction, &Phase::new(false, 0), None, device)
+    }
+
+    /// Pictures of all views to compare `[V,3,h,w]`; the background alone where there is nobody.
+    fn shown(
+        &self,
+        item: &Stage2Item,
+        gaussians: Option<Gaussians>,
+        device: &Device,
+    ) -> Result<Tensor<4>, TrainError> {
+        match gaussians {
+            Some(gaussians) => Ok(self.render(&gaussians, &item.target_cameras, item.background)?.0),
+            None => {
+                let color = Tensor::<1>::from_floats(item.background, device).reshape([1, 3, 1, 1]);
+                Ok(color.expand([item.target_cameras.len(), 3, item.target_side, item.target_side]))
+            }
+        }
+    }
+
+    /// What the photographs give as flat cut-outs in the plane through the body's axis: who learned nothing beats it by
+    /// nothing.
+    fn billboard(&self) -> Result<Scores, TrainError> {
+        if let Some(scores) = self.billboard.get() {
+            return Ok(*scores);
+        }
+        let device = self.devices[0].clone().inner();
+        let mut config = self.networks.clone();
+        config.mode.compat = false;
+        config.regressor.start = Some(RegressorStart::Geometric);
+        let networks = Networks { predictor: None, regressors: random_regressors(&config, 0, &device) };
+        let mut sums = Scores::default();
+        for index in self.validation.indices(self.validation.count) {
+            let item = self.validation.get(index)?;
+            let window = Window::whole(item.side);
+            let map = |view: View| {
+                let points = anchors(view, item.side, &window, &device);
+                (view, PointMap { conf: Tensor::zeros([1, item.side, item.side], &device), points })
+            };
+            let prediction = Prediction { maps: View::ALL.map(map).to_vec(), window: window.clone() };
+            let gaussians =
+                gaussians(&config, &networks, &item, prediction, &Phase::new(false, 0), None, &device);
+            sums.add(&item, self.shown(&item, gaussians, &device)?, &device);
+        }
+        Ok(*self.billboard.get_or_init(|| sums.mean()))
     }
 
     /// Rendered pictures `[V,3,h,w]` and coverage `[V,h,w]`.
@@ -219,6 +199,74 @@ impl GaussianTask {
         let rendered = render(gaussians, cameras, &options)?;
         Ok((rendered.color.permute([0, 3, 1, 2]), rendered.alpha))
     }
+}
+
+/// Gaussians of a sample in the data set's world; `None` if no pixel is valid. With `noise`, points stray by so many
+/// metres.
+fn gaussians(
+    config: &Config,
+    networks: &Networks,
+    item: &Stage2Item,
+    prediction: Prediction,
+    phase: &Phase,
+    noise: Option<&mut dyn FnMut() -> f32>,
+    device: &Device,
+) -> Option<Gaussians> {
+    let side = item.side;
+    let area = side * side;
+    let (mut points, mut conf, mut maps) = (Vec::new(), Vec::new(), Vec::new());
+    for (_, map) in prediction.on_canvas(side) {
+        points.extend(host(map.points.clone()));
+        conf.extend(host(map.conf));
+        maps.push(map.points);
+    }
+    let views = points.len() / (3 * area);
+    if let Some(noise) = noise.filter(|_| networks.predictor.is_none()) {
+        // Every view's shell is shifted as a whole: that is how predictions are off.
+        for view in points.chunks_exact_mut(3 * area) {
+            let shift = [noise(), noise(), noise()];
+            view.chunks_exact_mut(3).for_each(|p| (0..3).for_each(|c| p[c] += shift[c]));
+        }
+    }
+    let finite = |i: usize| points[3 * i..3 * i + 3].iter().all(|v| v.is_finite());
+    let valid: Vec<Vec<bool>> = (0..views)
+        .map(|view| {
+            let chosen = |i: usize| match view {
+                0 | 1 => item.masks[view * area + i] > 0.5,
+                _ => conf[view * area + i] > config.network.conf_threshold,
+            };
+            (0..area).map(|i| chosen(i) && finite(view * area + i)).collect()
+        })
+        .collect();
+    let photos = [0, 1].map(|view| &item.images[3 * view * area..3 * (view + 1) * area]);
+    let sides = if views > 2 { side_images(photos, &points, &valid) } else { Vec::new() };
+    let images: Vec<&[f32]> = photos.into_iter().chain(sides.iter().map(Vec::as_slice)).collect();
+    let points = if networks.predictor.is_some() {
+        // Where the predictor is trained, what looks like its error must lead back to it.
+        Tensor::cat(maps, 0)
+    } else {
+        // One overflow would spoil the normalisation of a whole view.
+        points.iter_mut().filter(|v| !v.is_finite()).for_each(|v| *v = 0.0);
+        Tensor::<4>::from_data(TensorData::new(points, [views, side, side, 3]), device)
+    };
+    let mut parts = Vec::new();
+    for (pair, first) in (0..views).step_by(2).enumerate().filter(|(_, v)| phase.views.contains(v)) {
+        let person = Window::around(valid[first..first + 2].iter().map(Vec::as_slice), side);
+        let Some(person) = person else { continue };
+        let window =
+            if config.crop() { person.padded(config.regressor.margin(), side) } else { Window::whole(side) };
+        let regressor = &networks.regressors[pair.min(networks.regressors.len() - 1)];
+        let seen: Vec<_> = (first..first + 2)
+            .map(|v| Seen { image: images[v], points: points.clone().narrow(0, v, 1), valid: &valid[v] })
+            .collect();
+        parts.extend(regress(regressor, config, &seen, &window));
+    }
+    if parts.is_empty() {
+        return None;
+    }
+    let (gaussians, _) = assemble(config, parts, device);
+    (!gaussians.is_empty())
+        .then(|| placed(config, gaussians, &item.cameras[View::Front as usize].world_to_camera.inverse()))
 }
 
 /// Target pictures `[V,3,h,w]` and masks `[V,h,w]` of some views.
@@ -282,7 +330,7 @@ impl Task for GaussianTask {
                 let losses = losses(&prediction, &points, &valid);
                 add("points", losses.regression + losses.confidence * self.confidence);
             }
-            let made = self.gaussians(networks, item, prediction, &phase, noise, device);
+            let made = gaussians(&self.networks, networks, item, prediction, &phase, noise, device);
             let Some(gaussians) = made else { continue };
             let cameras: Vec<Camera> = chosen.iter().map(|v| item.target_cameras[*v]).collect();
             let (image, coverage) = self.render(&gaussians, &cameras, item.background)?;
@@ -327,41 +375,22 @@ impl Task for GaussianTask {
         if self.validation.count == 0 {
             return Ok(None);
         }
-        let mut sums = [0.0_f64; 5];
+        let device = self.devices[0].clone().inner();
+        let mut sums = Scores::default();
         for index in self.validation.indices(self.validation.count) {
             let item = self.validation.get(index)?;
-            let device = &self.devices[0].clone().inner();
-            let views: Vec<usize> = (0..item.target_cameras.len()).collect();
-            let (target, mask) = targets(&item, &views, device);
-            let image = match self.whole(networks, &item, device) {
-                Some(gaussians) => self.render(&gaussians, &item.target_cameras, item.background)?.0,
-                None => target.zeros_like(),
-            };
-            let there = |from: usize, count: usize| {
-                let inside = mask.clone().narrow(0, from, count).greater_elem(0.0).float();
-                psnr(image.clone().narrow(0, from, count), target.clone().narrow(0, from, count), &inside)
-            };
-            let photometric = Photometric::new(image.clone(), target.clone());
-            let ssim: f64 = host(photometric.ssim).into_iter().map(f64::from).sum();
-            let all = mask.ones_like();
-            let sides = views.len() - 2;
-            let values = [
-                psnr(image.clone(), target.clone(), &all),
-                there(0, views.len()),
-                there(sides, 2),
-                ssim,
-                1.0,
-            ];
-            sums.iter_mut().zip(values).for_each(|(sum, value)| *sum += value);
+            sums.add(&item, self.shown(&item, self.whole(networks, &item, &device), &device)?, &device);
         }
-        let [full, masked, sides, ssim, count] = sums;
+        let (scores, billboard) = (sums.mean(), self.billboard()?);
         let figures = vec![
-            ("psnr_masked", masked / count),
-            ("psnr_masked_sides", sides / count),
-            ("psnr", full / count),
-            ("ssim", ssim / count),
+            ("psnr_masked", scores.masked),
+            ("psnr_masked_sides", scores.sides),
+            ("psnr", scores.full),
+            ("ssim", scores.ssim),
+            ("billboard_psnr_masked", billboard.masked),
+            ("billboard_psnr_masked_sides", billboard.sides),
         ];
-        Ok(Some(Validation { score: -masked / count, figures }))
+        Ok(Some(Validation { score: -scores.masked, figures }))
     }
 
     fn preview(&self, networks: &Networks) -> Result<Option<RgbImage>, TrainError> {
@@ -415,6 +444,46 @@ pub fn needles(scales: &Tensor<2>, limit: f64) -> Tensor<1> {
     let logs = scales.clone().clamp_min(1e-12).log();
     let ratio = logs.clone().max_dim(1) - logs.min_dim(1);
     (ratio - limit.ln()).clamp_min(0.0).mean()
+}
+
+/// How like the truth pictures are, summed or averaged over samples.
+#[derive(Debug, Clone, Copy, Default)]
+struct Scores {
+    samples: f64,
+    /// dB, over whole pictures, where the person is, and there in the two sides alone.
+    full: f64,
+    masked: f64,
+    sides: f64,
+    ssim: f64,
+}
+
+impl Scores {
+    fn add(&mut self, item: &Stage2Item, image: Tensor<4>, device: &Device) {
+        let count = item.target_cameras.len();
+        let (target, mask) = targets(item, &(0..count).collect::<Vec<_>>(), device);
+        let there = |from: usize| {
+            let part = |x: &Tensor<4>| x.clone().narrow(0, from, count - from);
+            let inside = mask.clone().narrow(0, from, count - from).greater_elem(0.0).float();
+            psnr(part(&image), part(&target), &inside)
+        };
+        self.samples += 1.0;
+        self.masked += there(0);
+        // The sides' views are the last ones.
+        self.sides += there(count - 2);
+        self.full += psnr(image.clone(), target.clone(), &mask.ones_like());
+        self.ssim += f64::from(host(Photometric::new(image, target).ssim)[0]);
+    }
+
+    fn mean(self) -> Self {
+        let mean = |sum: f64| sum / self.samples;
+        Self {
+            samples: 1.0,
+            full: mean(self.full),
+            masked: mean(self.masked),
+            sides: mean(self.sides),
+            ssim: mean(self.ssim),
+        }
+    }
 }
 
 #[cfg(test)]

@@ -59,7 +59,8 @@ fn stage_1_follows_the_authors_first_steps() {
 
 #[test]
 fn stage_1_follows_the_authors_twenty_steps() {
-    if device().is_some_and(|device| is_software(&device)) && std::env::var_os("SNAPSNAP_ALL_STEPS").is_none() {
+    if device().is_some_and(|device| is_software(&device)) && std::env::var_os("SNAPSNAP_ALL_STEPS").is_none()
+    {
         println!("SKIPPED: twenty steps take minutes on a software adapter; SNAPSNAP_ALL_STEPS=1 runs them");
         return;
     }

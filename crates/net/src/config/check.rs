@@ -95,6 +95,12 @@ impl Config {
                 "is 2, but `network.side_heads = false` leaves the second unused".into(),
             ));
         }
+        if r.margin.is_some_and(|margin| margin > 4_096) {
+            return Some(("regressor.margin", format!("is {}, must be at most 4096", r.margin())));
+        }
+        if r.margin.is_some() && !self.crop() {
+            return Some(("regressor.margin", "has no meaning where `mode.crop` is false".into()));
+        }
         if !r.channels.is_multiple_of(r.groups) {
             return Some((
                 "regressor.channels",

@@ -137,13 +137,7 @@ impl<'a> Plan<'a> {
             return Err(Failure::Input(message));
         }
         if device::is_cpu(&devices[0]) {
-            // Weights, gradients, two moments and averages; activations are measured by --dry-run.
-            let parameters = schema::parameters(&config.networks(), Part::PointPredictor) as u64;
-            memory::check(
-                "a training of these networks",
-                5 * 4 * parameters,
-                "a smaller network needs less",
-            )?;
+            memory::check("this training", least_memory(&config), "a smaller network or batch needs less")?;
         }
         let tracked = |device: Device| match config.training.checkpointing {
             true => device.autodiff().gradient_checkpointing(),
@@ -196,6 +190,19 @@ impl<'a> Plan<'a> {
         }
         Ok(())
     }
+}
+
+/// Bytes that a training takes at least: weights, gradients, two moments and averages, samples, and the last layers of the
+/// heads. What it really takes, --dry-run measures.
+fn least_memory(config: &TrainConfig) -> u64 {
+    let (n, batch) = (&config.network, config.training.batch as u64);
+    let parameters = schema::parameters(&config.networks(), Part::PointPredictor) as u64;
+    // Two photographs with masks, four maps of points and where they are valid; as they are loaded and as they are used.
+    let sample = 2 * (2 * 4 + 4 * 4) * n.resolution.pow(2) as u64;
+    // A window of the canvas may be a tenth of it.
+    let share = if n.window { 10 } else { 1 };
+    let heads = 4 * (2 * n.last_dim + n.feature_dim) as u64 * n.net_resolution.pow(2) as u64 / share;
+    4 * (5 * parameters + batch * (sample + heads))
 }
 
 /// What a person wants to know and do next.
