@@ -40,18 +40,19 @@ pub struct Progress {
 pub(crate) fn save<T: Task>(path: &Path, learner: &Learner<T>) -> Result<(), WeightsError> {
     let (mut rows, times) = learner.optimizer.record();
     let progress = Progress { times, ..learner.progress.clone() };
-    let mut add = |kind: &str, new: &Rows| {
-        rows.extend(new.iter().map(|(name, row)| (format!("{kind}/{name}"), host(row.clone()))));
+    let mut add = |kind: &str, new: Rows| {
+        rows.extend(new.into_iter().map(|(name, row)| (format!("{kind}/{name}"), row)));
     };
-    add("weight", &learner.networks.rows());
+    add("weight", learner.networks.rows());
     if let Some(average) = &learner.average {
-        add("average", &average.rows);
+        add("average", average.rows.clone());
     }
     let text = serde_json::to_string(&progress).expect("plain numbers");
     let metadata = HashMap::from([(PROGRESS_KEY.to_owned(), text)]);
-    let names: Vec<_> = rows.iter().map(|(name, row)| (name.clone(), vec![row.len()])).collect();
-    let mut rows: Vec<_> = rows.into_values().collect();
-    let values = |i: usize| Ok(std::mem::take(&mut rows[i]));
+    let names = rows.iter().map(|(name, row)| (name.clone(), row.dims().to_vec())).collect();
+    // Never more than one copy at a time.
+    let rows: Vec<_> = rows.into_values().collect();
+    let values = |i: usize| Ok(host(rows[i].clone()));
     write_tensors(path, "the state of the training", metadata, names, values, &|_, _| ())
 }
 

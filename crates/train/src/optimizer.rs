@@ -224,17 +224,17 @@ impl Optimizer {
     }
 
     /// What a checkpoint needs: rows `KIND/NAME`, and AdamW's steps so far by name.
-    pub fn record(&self) -> (BTreeMap<String, Vec<f32>>, BTreeMap<String, u64>) {
-        let (mut rows, mut times) = (BTreeMap::new(), BTreeMap::new());
+    pub fn record(&self) -> (Rows, BTreeMap<String, u64>) {
+        let (mut rows, mut times) = (Rows::new(), BTreeMap::new());
         for (name, state) in &self.states {
             match state {
                 State::AdamW { time, mean, squares } => {
                     times.insert(name.clone(), *time);
-                    rows.insert(format!("mean/{name}"), host(mean.clone()));
-                    rows.insert(format!("squares/{name}"), host(squares.clone()));
+                    rows.insert(format!("mean/{name}"), mean.clone());
+                    rows.insert(format!("squares/{name}"), squares.clone());
                 }
                 State::Muon { velocity } => {
-                    rows.insert(format!("velocity/{name}"), host(velocity.clone()));
+                    rows.insert(format!("velocity/{name}"), velocity.clone());
                 }
             }
         }

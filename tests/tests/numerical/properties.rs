@@ -332,7 +332,7 @@ fn cropping_changes_nothing_inside_the_mask_with_frozen_statistics() {
         inside(&values(regressor.forward(crop, &mut statistics.frozen())), window)
     };
     let expected = inside(&whole, &Window::whole(side));
-    let padded = person.padded(side);
+    let padded = person.padded(config.regressor.margin(), side);
     assert!(padded.rows.len() < side && padded.columns.len() < side, "the window is a real crop");
     let error = relative_error(&cropped(&padded), &expected);
     println!("cropped with a margin of {RECEPTIVE_RADIUS} pixels: relative error {error:.2e}");

@@ -1,5 +1,6 @@
 //! Steps of a training: the same on every device, and with gradients that finite differences confirm.
 
+use std::slice::from_ref;
 use std::sync::Arc;
 
 use burn::data::dataset::Dataset;
@@ -133,7 +134,7 @@ fn a_step_of_stage_1_is_the_same_on_every_device() {
     let temporary = tempfile::tempdir().expect("temporary folder");
     let (folder, config) = (people(temporary.path()), config());
     let on = |device: &Device| {
-        let task = PointTask::new(&[folder.clone()], &config, std::slice::from_ref(device)).expect("a task");
+        let task = PointTask::new(from_ref(&folder), &config, from_ref(device)).expect("a task");
         let predictor = Some(random_predictor(&config.networks(), 3, device));
         step(&task, Networks { predictor, regressors: Vec::new() })
     };
@@ -159,7 +160,7 @@ fn a_step_of_stage_2_is_the_same_on_every_device() {
         let on = |device: &Device| {
             let predictor = |device: &Device| random_predictor(&networks, 3, device);
             let frozen = predictor(&device.clone().inner());
-            let task = GaussianTask::new(&[folder.clone()], &config, frozen, std::slice::from_ref(device));
+            let task = GaussianTask::new(from_ref(&folder), &config, frozen, from_ref(device));
             let regressors = random_regressors(&published, 4, device);
             let predictor = joint.then(|| predictor(device));
             step(&task.expect("a task"), Networks { predictor, regressors })
