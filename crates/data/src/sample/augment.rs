@@ -26,6 +26,8 @@ pub struct Augment {
     pub background: bool,
     /// Stage 2: views are compared over a random colour instead of black.
     pub background_color: bool,
+    /// Stage 1: every other person is seen in a mirror, which makes two people of each.
+    pub mirror: bool,
 }
 
 impl Default for Augment {
@@ -39,6 +41,7 @@ impl Default for Augment {
             jpeg_quality: 70,
             background: true,
             background_color: true,
+            mirror: false,
         }
     }
 }
@@ -54,6 +57,7 @@ impl Augment {
             jpeg_quality: 0,
             background: false,
             background_color: false,
+            mirror: false,
         }
     }
 

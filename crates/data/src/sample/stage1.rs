@@ -5,6 +5,7 @@ use std::sync::Arc;
 use burn::data::dataloader::batcher::Batcher;
 use burn::data::dataset::{Dataset, DatasetError};
 use burn::tensor::{Device, Tensor};
+use rand::Rng;
 
 use super::{SampleConfig, Source, together};
 use crate::dataset::{Folder, Split};
@@ -75,8 +76,32 @@ impl Stage1 {
         let (points, valid, pictures) = source.points(subject, &order)?;
         let [front, back] = [0, 1].map(|i| (&pictures[i].0, &pictures[i].1));
         let (images, masks) = source.photographs([front, back], &mut random);
-        let name = format!("{}: {subject}, view {first}", source.folder.root().display());
-        Ok(Stage1Item { name, side, images, masks, points, valid })
+        let mut item = Stage1Item { name: String::new(), side, images, masks, points, valid };
+        if source.config.augment.mirror && random.random() {
+            item.mirror();
+        }
+        item.name = format!("{}: {subject}, view {first}", source.folder.root().display());
+        Ok(item)
+    }
+}
+
+impl Stage1Item {
+    /// The same seen in a mirror: left is right, and so are the sides.
+    fn mirror(&mut self) {
+        let (side, area) = (self.side, self.side * self.side);
+        for image in [&mut self.images, &mut self.masks, &mut self.valid] {
+            image.chunks_exact_mut(side).for_each(<[f32]>::reverse);
+        }
+        for line in self.points.chunks_exact_mut(3 * side) {
+            let (points, _) = line.as_chunks_mut::<3>();
+            points.reverse();
+            points.iter_mut().for_each(|point| point[0] = -point[0]);
+        }
+        // Right and left are the third and the fourth.
+        let (right, left) = self.points[6 * area..].split_at_mut(3 * area);
+        right.swap_with_slice(left);
+        let (right, left) = self.valid[2 * area..].split_at_mut(area);
+        right.swap_with_slice(left);
     }
 }
 

@@ -400,3 +400,43 @@ fn contradictions_are_refused() {
     assert!(refusal(Layout::Exact, false).contains("`high_resolution` asks for"));
     assert!(refusal(Layout::Authors, true).contains("no masks at twice the side"));
 }
+
+/// A point that a mirrored view sees projects into it where the mirrored pixel is.
+#[test]
+fn mirrored_samples_are_those_of_a_mirrored_person() {
+    let (_temporary, folder) = data_set(person(), Layout::Exact, 64, 4, false, 1);
+    let config = |mirror| SampleConfig {
+        augment: Augment { mirror, ..Augment::none() },
+        front_within_degrees: 0.0,
+        ..SampleConfig::default()
+    };
+    let [plain, mirrored] = [false, true]
+        .map(|mirror| Stage1::new(folder.clone(), TRAIN, config(mirror)).expect("makes samples"));
+    let (mut same, mut turned) = (0, 0);
+    let area = 64 * 64;
+    for index in 0..12 {
+        let (a, b) = (plain.sample(index).expect("reads"), mirrored.sample(index).expect("reads"));
+        if a.points == b.points {
+            same += 1;
+            continue;
+        }
+        turned += 1;
+        for (view, other) in [(0, 0), (1, 1), (2, 3), (3, 2)] {
+            for i in 0..area {
+                let j = i / 64 * 64 + 63 - i % 64;
+                let at = |points: &[f32], view: usize, i: usize| -> [f32; 3] {
+                    let at = 3 * (view * area + i);
+                    [points[at], points[at + 1], points[at + 2]]
+                };
+                let [x, y, z] = at(&a.points, view, i);
+                assert_eq!(at(&b.points, other, j), [-x, y, z], "view {view}, pixel {i}");
+                assert_eq!(a.valid[view * area + i], b.valid[other * area + j]);
+                if view < 2 {
+                    assert_eq!(a.masks[view * area + i], b.masks[view * area + j]);
+                    assert_eq!(a.images[3 * view * area + i], b.images[3 * view * area + j]);
+                }
+            }
+        }
+    }
+    assert!(same > 1 && turned > 1, "{same} and {turned}");
+}
