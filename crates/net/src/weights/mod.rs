@@ -19,7 +19,7 @@ pub use file::{CONFIG_KEY, Progress, WeightFile, save, write_tensors};
 pub use import::{ImportOptions, ImportReport, import};
 pub use init::{SideHeads, init};
 pub use load::{random_predictor, random_regressors};
-pub use names::{NamedMapper, NamedVisitor, map_named, names, visit_named};
+pub use names::{NamedMapper, NamedVisitor, map_named, visit_named};
 pub use source::{Entry, Source};
 
 /// What can be wrong with weights.

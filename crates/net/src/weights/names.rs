@@ -1,8 +1,6 @@
 //! Parameters of the networks by the names that checkpoints give them.
 
-use std::collections::HashMap;
-
-use burn::module::{Module, ModuleMapper, ModuleVisitor, Param, ParamId};
+use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::tensor::Tensor;
 
 /// Where in a module a traversal is, as the checkpoint's key.
@@ -113,17 +111,4 @@ pub fn map_named<M: Module>(module: M, prefix: &str, mapper: &mut impl NamedMapp
         }
     }
     module.map(&mut Adapter { path: Path::new(prefix), mapper })
-}
-
-/// Names of the parameters of `module` by their ids, which are others in every run.
-pub fn names<M: Module>(module: &M, prefix: &str) -> HashMap<ParamId, String> {
-    struct Collect(HashMap<ParamId, String>);
-    impl NamedVisitor for Collect {
-        fn visit<const D: usize>(&mut self, name: &str, _: bool, parameter: &Param<Tensor<D>>) {
-            self.0.insert(parameter.id, name.to_owned());
-        }
-    }
-    let mut collect = Collect(HashMap::new());
-    visit_named(module, prefix, &mut collect);
-    collect.0
 }

@@ -1,12 +1,13 @@
 //! Stage 2: the regressor learns Gaussians that look like the person from every side (SNAPSNAP §9.2, LEARNING.md).
 
+mod scene;
+mod scores;
+
 use std::collections::BTreeMap;
 use std::sync::{Arc, OnceLock};
 
 use burn::data::dataset::Dataset;
 use burn::module::Module;
-use burn::tensor::module::max_pool2d;
-use burn::tensor::ops::MaxPoolOptions;
 use burn::tensor::{Device, Tensor, TensorData};
 use image::RgbImage;
 use rand::Rng;
@@ -14,7 +15,6 @@ use snapsnap_data::dataset::{Folder, Split};
 use snapsnap_data::sample::{Joined, SampleConfig, Stage2, Stage2Item};
 use snapsnap_net::Window;
 use snapsnap_net::config::{Config, RegressorStart};
-use snapsnap_net::gaussians::{Seen, assemble, placed, regress, side_images};
 use snapsnap_net::network::{PointMap, PointPredictor, View, anchors};
 use snapsnap_net::weights::random_regressors;
 use snapsnap_people::random::stream;
@@ -24,22 +24,19 @@ use crate::TrainError;
 use crate::config::{Stage2Config, TrainConfig};
 use crate::fixed::{Fixed, check_resolution};
 use crate::networks::{Networks, host};
-use crate::photometric::{Photometric, psnr};
+use crate::photometric::Photometric;
 use crate::points::{Prediction, losses, predict};
 use crate::preview::{grid, heat, picture};
 use crate::task::{Part, Task, Validation};
+
+pub use scene::needles;
+use scene::{Phase, gaussians, targets};
+use scores::Scores;
 
 /// Samples of a preview.
 const PREVIEWS: usize = 3;
 /// Error that a preview shows white.
 const WORST: f32 = 0.5;
-/// Where the published curriculum goes from the sides to front and back, and from these to everything (SNAPSNAP §9.2).
-const CURRICULUM: [u64; 2] = [2000, 4000];
-/// Until here the published curriculum compares one view per step, then all.
-const ONE_VIEW: u64 = 10_000;
-/// Its weight of the mean scale while the sides are alone.
-const SCALE_PENALTY: f64 = 2.0;
-
 /// The training of the regressor on what a frozen point predictor gives.
 pub struct GaussianTask {
     networks: Config,
@@ -55,29 +52,6 @@ pub struct GaussianTask {
     billboard: OnceLock<Scores>,
     /// Those that train, with gradients.
     devices: Vec<Device>,
-}
-
-/// Which views' Gaussians take part, and what is compared.
-#[derive(Debug, Clone, PartialEq)]
-struct Phase {
-    /// Views by their place.
-    views: std::ops::Range<usize>,
-    /// Weight of the mean scale.
-    scale: f64,
-    /// Whether only one view is compared.
-    one_view: bool,
-}
-
-impl Phase {
-    fn new(curriculum: bool, step: u64) -> Self {
-        let one_view = curriculum && step < ONE_VIEW;
-        match step {
-            _ if !curriculum => Self { views: 0..4, scale: 0.0, one_view },
-            step if step < CURRICULUM[0] => Self { views: 2..4, scale: SCALE_PENALTY, one_view },
-            step if step < CURRICULUM[1] => Self { views: 0..2, scale: 0.0, one_view },
-            _ => Self { views: 0..4, scale: 0.0, one_view },
-        }
-    }
 }
 
 impl GaussianTask {
@@ -201,86 +175,6 @@ impl GaussianTask {
         let rendered = render(gaussians, cameras, &options)?;
         Ok((rendered.color.permute([0, 3, 1, 2]), rendered.alpha))
     }
-}
-
-/// Gaussians of a sample in the data set's world; `None` if no pixel is valid. With `noise`, points stray by so many
-/// metres.
-fn gaussians(
-    config: &Config,
-    networks: &Networks,
-    item: &Stage2Item,
-    prediction: Prediction,
-    phase: &Phase,
-    noise: Option<&mut dyn FnMut() -> f32>,
-    device: &Device,
-) -> Option<Gaussians> {
-    let side = item.side;
-    let area = side * side;
-    let (mut points, mut conf, mut maps) = (Vec::new(), Vec::new(), Vec::new());
-    for (_, map) in prediction.on_canvas(side) {
-        points.extend(host(map.points.clone()));
-        conf.extend(host(map.conf));
-        maps.push(map.points);
-    }
-    let views = points.len() / (3 * area);
-    if let Some(noise) = noise.filter(|_| networks.predictor.is_none()) {
-        // Every view's shell is shifted as a whole: that is how predictions are off.
-        for view in points.chunks_exact_mut(3 * area) {
-            let shift = [noise(), noise(), noise()];
-            view.chunks_exact_mut(3).for_each(|p| (0..3).for_each(|c| p[c] += shift[c]));
-        }
-    }
-    let finite = |i: usize| points[3 * i..3 * i + 3].iter().all(|v| v.is_finite());
-    let valid: Vec<Vec<bool>> = (0..views)
-        .map(|view| {
-            let chosen = |i: usize| match view {
-                0 | 1 => item.masks[view * area + i] > 0.5,
-                _ => conf[view * area + i] > config.network.conf_threshold,
-            };
-            (0..area).map(|i| chosen(i) && finite(view * area + i)).collect()
-        })
-        .collect();
-    let photos = [0, 1].map(|view| &item.images[3 * view * area..3 * (view + 1) * area]);
-    let sides = if views > 2 { side_images(photos, &points, &valid) } else { Vec::new() };
-    let images: Vec<&[f32]> = photos.into_iter().chain(sides.iter().map(Vec::as_slice)).collect();
-    let points = if networks.predictor.is_some() {
-        // Where the predictor is trained, what looks like its error must lead back to it.
-        Tensor::cat(maps, 0)
-    } else {
-        // One overflow would spoil the normalisation of a whole view.
-        points.iter_mut().filter(|v| !v.is_finite()).for_each(|v| *v = 0.0);
-        Tensor::<4>::from_data(TensorData::new(points, [views, side, side, 3]), device)
-    };
-    let mut parts = Vec::new();
-    for (pair, first) in (0..views).step_by(2).enumerate().filter(|(_, v)| phase.views.contains(v)) {
-        let person = Window::around(valid[first..first + 2].iter().map(Vec::as_slice), side);
-        let Some(person) = person else { continue };
-        let window =
-            if config.crop() { person.padded(config.regressor.margin(), side) } else { Window::whole(side) };
-        let regressor = &networks.regressors[pair.min(networks.regressors.len() - 1)];
-        let seen: Vec<_> = (first..first + 2)
-            .map(|v| Seen { image: images[v], points: points.clone().narrow(0, v, 1), valid: &valid[v] })
-            .collect();
-        parts.extend(regress(regressor, config, &seen, &window));
-    }
-    if parts.is_empty() {
-        return None;
-    }
-    let (gaussians, _) = assemble(config, parts, device);
-    (!gaussians.is_empty())
-        .then(|| placed(config, gaussians, &item.cameras[View::Front as usize].world_to_camera.inverse()))
-}
-
-/// Target pictures `[V,3,h,w]` and masks `[V,h,w]` of some views.
-fn targets(item: &Stage2Item, views: &[usize], device: &Device) -> (Tensor<4>, Tensor<3>) {
-    let (side, count) = (item.target_side, views.len());
-    let area = side * side;
-    let pick = |values: &[f32], size: usize| -> Vec<f32> {
-        views.iter().flat_map(|v| values[v * size..(v + 1) * size].iter().copied()).collect()
-    };
-    let pictures = TensorData::new(pick(&item.targets, 3 * area), [count, 3, side, side]);
-    let masks = TensorData::new(pick(&item.target_masks, area), [count, side, side]);
-    (Tensor::from_data(pictures, device), Tensor::from_data(masks, device))
 }
 
 impl Task for GaussianTask {
@@ -437,86 +331,5 @@ impl Task for GaussianTask {
             return BTreeMap::new();
         }
         Networks { predictor: Some(self.predictors[0].clone()), regressors: Vec::new() }.checkpoint()
-    }
-}
-
-/// Mean over Gaussians with these `scales` `[N,3]` of ln(longest / shortest axis) − ln(limit), where that is positive. (A mean
-/// penalty on scales alone misses the few that are too long.)
-pub fn needles(scales: &Tensor<2>, limit: f64) -> Tensor<1> {
-    let logs = scales.clone().clamp_min(1e-12).log();
-    let ratio = logs.clone().max_dim(1) - logs.min_dim(1);
-    (ratio - limit.ln()).clamp_min(0.0).mean()
-}
-
-/// How like the truth pictures are, summed or averaged over samples.
-#[derive(Debug, Clone, Copy, Default)]
-struct Scores {
-    samples: f64,
-    /// dB, over whole pictures, where the person is and a little around it, and there in the two sides alone.
-    full: f64,
-    masked: f64,
-    sides: f64,
-    ssim: f64,
-}
-
-/// 1 where masks `[V,h,w]` are not 0, and 8 pixels of 1024 around it (EVALUATION.md, protocol `masked`).
-fn around(mask: Tensor<3>) -> Tensor<3> {
-    let reach = (8 * mask.dims()[2]).div_ceil(1024);
-    let inside = mask.greater_elem(0.0).float().unsqueeze_dim(1);
-    let side = 2 * reach + 1;
-    let options = MaxPoolOptions::new([side, side]).with_stride([1, 1]).with_padding([reach, reach]);
-    max_pool2d(inside, options).squeeze_dim(1)
-}
-
-impl Scores {
-    fn add(&mut self, item: &Stage2Item, image: Tensor<4>, device: &Device) {
-        let count = item.target_cameras.len();
-        let (target, mask) = targets(item, &(0..count).collect::<Vec<_>>(), device);
-        let inside = around(mask.clone());
-        let there = |from: usize| {
-            let part = |x: &Tensor<4>| x.clone().narrow(0, from, count - from);
-            psnr(part(&image), part(&target), &inside.clone().narrow(0, from, count - from))
-        };
-        self.samples += 1.0;
-        self.masked += there(0);
-        // The sides' views are the last ones.
-        self.sides += there(count - 2);
-        self.full += psnr(image.clone(), target.clone(), &mask.ones_like());
-        self.ssim += f64::from(host(Photometric::new(image, target).ssim)[0]);
-    }
-
-    fn mean(self) -> Self {
-        let mean = |sum: f64| sum / self.samples;
-        Self {
-            samples: 1.0,
-            full: mean(self.full),
-            masked: mean(self.masked),
-            sides: mean(self.sides),
-            ssim: mean(self.ssim),
-        }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_published_curriculum_goes_from_the_sides_to_everything() {
-        let phase = |step| Phase::new(true, step);
-        assert_eq!(phase(0), Phase { views: 2..4, scale: 2.0, one_view: true });
-        assert_eq!(phase(1999), phase(0));
-        assert_eq!(phase(2000), Phase { views: 0..2, scale: 0.0, one_view: true });
-        assert_eq!(phase(4000), Phase { views: 0..4, scale: 0.0, one_view: true });
-        assert_eq!(phase(10_000), Phase { views: 0..4, scale: 0.0, one_view: false });
-        assert_eq!(Phase::new(false, 0), phase(10_000));
-    }
-
-    #[test]
-    fn only_what_a_needle_has_too_much_costs() {
-        let device = Device::flex();
-        let scales = Tensor::<2>::from_floats([[0.01, 0.01, 0.08], [0.01, 0.1, 1.0]], &device);
-        let cost = host(needles(&scales, 10.0))[0];
-        assert!((cost - 10.0_f32.ln() / 2.0).abs() < 1e-5, "{cost}");
     }
 }
