@@ -342,6 +342,8 @@ fn what_cannot_be_trained_is_refused_by_name() {
     wrong(&["--set", "optimizer.beta2=1.0"], &["optimizer.beta2"]);
     wrong(&["--set", "schedule.end=2"], &["schedule.end"]);
     wrong(&["--set", "network.resolution=128", "--set", "network.net_resolution=128"], &["64", "128"]);
+    wrong(&["--set", "network.conf_mode=exp"], &["conf_mode", "sigmoid"]);
+    wrong(&["--set", "optimizer.epsilon=0"], &["optimizer.epsilon"]);
     wrong(&["--minutes", "0"], &["--minutes"]);
     wrong(&["--weights", "nowhere.safetensors"], &["nowhere.safetensors"]);
     let said = refused(&mut train(2, &config, &run));
@@ -358,6 +360,12 @@ fn what_cannot_be_trained_is_refused_by_name() {
     assert!(said.contains("other [network]"), "{said}");
     let said = refused(train(2, &config, &run).args(["--resume"]));
     assert!(said.contains("stage 1"), "{said}");
+    assert!(results(&run) == before);
+    // Without its state a folder is none of a run's, but weights that a run begins with are not replaced by it.
+    fs::rename(run.join("state"), run.join("elsewhere")).expect("moves");
+    let said = refused(train(2, &config, &run).arg("--weights").arg(run.join("best.safetensors")));
+    assert!(said.contains("would be replaced"), "{said}");
+    fs::rename(run.join("elsewhere"), run.join("state")).expect("moves back");
     assert!(results(&run) == before);
     let said = refused(train(1, &config, &run.join("other")).args(["--set", "training.batch=4096"]).args([
         "--set",

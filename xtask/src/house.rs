@@ -12,7 +12,7 @@ const FLOORS: [(&str, &[&str]); 8] = [
     ("net", &["splat", "ops"]),
     ("people", &["mesh"]),
     ("data", &["people", "mesh", "splat"]),
-    ("train", &["data", "net", "ops", "splat"]),
+    ("train", &["data", "people", "net", "ops", "mesh", "splat"]),
     ("app", &["train", "data", "people", "net", "ops", "mesh", "splat"]),
 ];
 

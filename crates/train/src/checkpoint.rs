@@ -27,8 +27,8 @@ pub struct Progress {
     pub skipped: u64,
     /// Those of them that came one after another up to here.
     pub skipped_in_a_row: u64,
-    /// Step and score of the best validation.
-    pub best: Option<(u64, f64)>,
+    /// Step of the best validation, and the bits of its score, which decimals might change.
+    pub best: Option<(u64, u64)>,
     /// AdamW's steps so far by parameter.
     pub times: BTreeMap<String, u64>,
 }

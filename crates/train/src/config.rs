@@ -4,7 +4,9 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 use snapsnap_data::sample::SampleConfig;
-use snapsnap_net::config::{Config, ConfigError, ModeConfig, NetworkConfig, RegressorConfig, parse};
+use snapsnap_net::config::{
+    ConfMode, Config, ConfigError, ModeConfig, NetworkConfig, RegressorConfig, parse,
+};
 
 use crate::optimizer::OptimizerConfig;
 use crate::schedule::Schedule;
@@ -246,6 +248,17 @@ impl TrainConfig {
             ranges.into_iter().find(|(_, value, least, most)| !(*least..=*most).contains(value))
         {
             return Some((key.into(), format!("is {value}, must be {least} to {most}")));
+        }
+        if self.network.conf_mode != ConfMode::Sigmoid {
+            return Some(("network.conf_mode".into(), "must be \"sigmoid\" to be trained".into()));
+        }
+        if two.curriculum && !self.network.side_heads {
+            let message = "begins with the sides alone, which `network.side_heads = false` leaves out";
+            return Some(("stage2.curriculum".into(), message.into()));
+        }
+        if two.points > 0.0 && two.noise > 0.0 {
+            let message = "must be 0 beside `stage2.points`: what is trained makes errors of its own";
+            return Some(("stage2.noise".into(), message.into()));
         }
         if two.points > 0.0 && two.curriculum {
             let message = "must be 0 beside `stage2.curriculum = true`, which renders parts of a person";

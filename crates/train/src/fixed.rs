@@ -28,12 +28,13 @@ impl<I: Send + Sync + 'static> Fixed<I> {
             ValidationSplit::Val => Split::Val,
             ValidationSplit::Train => Split::Train,
         });
-        let there: Vec<_> = folders.iter().filter(|folder| folder.splits().contains(&wanted)).collect();
-        let mut people = 0;
-        for folder in &there {
-            people += folder.subjects(wanted)?.len();
-        }
         let wished = config.training.validation_samples;
+        let (mut there, mut people) = (Vec::new(), 0);
+        for folder in folders.iter().filter(|folder| wished > 0 && folder.splits().contains(&wanted)) {
+            let count = folder.subjects(wanted)?.len();
+            people += count;
+            there.extend((count > 0).then_some(folder));
+        }
         // Photographs as they are, and enough samples of everybody.
         let fixed = SampleConfig {
             repeat: wished.div_ceil(people.max(1)).max(1),

@@ -14,7 +14,7 @@ use crate::config::TrainConfig;
 use crate::ema::Average;
 use crate::networks::{Networks, Rows, host};
 use crate::optimizer::Optimizer;
-use crate::task::Task;
+use crate::task::{Moment, Task};
 use crate::{TrainError, gradients};
 
 /// What is trained, and how far it has come.
@@ -90,7 +90,18 @@ impl<'a, T: Task> Learner<'a, T> {
             };
             all.extend(items.iter().map(|item| T::name(item).to_owned()));
             let share = 1.0 / t.accumulate as f64;
-            let made = on_devices(self.task, &self.networks, self.devices, items, step, share)?;
+            let at = Moment { step, batch: batch as u64, device: 0 };
+            let made = match on_devices(self.task, &self.networks, self.devices, items, at, share) {
+                // A scene that the rasteriser cannot hold is a sample's affair.
+                Err(TrainError::Splat(e)) => {
+                    return Ok(Err(Skipped { why: e.to_string(), samples: all.join("; ") }));
+                }
+                made => made?,
+            };
+            if made.values.is_empty() {
+                let why = "no pixel is part of a person, as the point predictor sees it".into();
+                return Ok(Err(Skipped { why, samples: all.join("; ") }));
+            }
             for (name, value) in &made.values {
                 *values.entry((*name).to_owned()).or_default() += value;
             }
@@ -118,7 +129,8 @@ impl<'a, T: Task> Learner<'a, T> {
     }
 }
 
-/// Loss parts by name, the loss among them, and gradients, unless a loss was not finite.
+/// Loss parts by name, the loss among them, or none where nothing could be trained on; and gradients, unless a loss was not
+/// finite.
 struct Made {
     values: BTreeMap<&'static str, f64>,
     gradients: Option<Rows>,
@@ -131,11 +143,11 @@ fn on_devices<T: Task>(
     networks: &Networks,
     devices: &[Device],
     mut items: Vec<T::Item>,
-    step: u64,
+    at: Moment,
     share: f64,
 ) -> Result<Made, TrainError> {
     if devices.len() == 1 {
-        return on_device(task, networks, items, step, 0, share);
+        return on_device(task, networks, items, at, share);
     }
     let (all, size) = (items.len() as f64, items.len().div_ceil(devices.len()));
     let mut parts = Vec::new();
@@ -147,7 +159,7 @@ fn on_devices<T: Task>(
         let start = |(place, part): (usize, Vec<T::Item>)| {
             scope.spawn(move || {
                 let (device, share) = (&devices[place], share * part.len() as f64 / all);
-                on_device(task, &networks.fork(device), part, step, place, share)
+                on_device(task, &networks.fork(device), part, Moment { device: place, ..at }, share)
             })
         };
         let threads: Vec<_> = parts.into_iter().enumerate().map(start).collect();
@@ -177,11 +189,13 @@ fn on_device<T: Task>(
     task: &T,
     networks: &Networks,
     items: Vec<T::Item>,
-    step: u64,
-    place: usize,
+    at: Moment,
     share: f64,
 ) -> Result<Made, TrainError> {
-    let parts = task.losses(networks, items, step, place)?;
+    let parts = task.losses(networks, items, at)?;
+    if parts.is_empty() {
+        return Ok(Made { values: BTreeMap::new(), gradients: Some(Rows::new()) });
+    }
     let read = host(Tensor::cat(parts.iter().map(|part| part.value.clone()).collect(), 0));
     let (mut values, mut total) = (BTreeMap::new(), 0.0);
     for (part, value) in parts.iter().zip(read) {

@@ -44,15 +44,18 @@ impl Log {
     /// [`FileError`] if a file cannot be read or written.
     pub fn open(folder: &Path, step: u64) -> Result<Self, FileError> {
         let path = folder.join("log.jsonl");
-        let mut lines = Vec::new();
+        let (mut lines, mut kept) = (Vec::new(), String::new());
         if step > 0 && path.exists() {
             let text = file::read_text(&path, MOST_BYTES).map_err(FileError::read(&path))?;
             // The last line of a killed session may be torn.
-            lines = text.lines().filter_map(|line| serde_json::from_str(line).ok()).collect();
-            lines.retain(|line: &Line| line.step <= step);
+            for line in text.lines() {
+                if let Some(read) = serde_json::from_str(line).ok().filter(|read: &Line| read.step <= step) {
+                    lines.push(read);
+                    kept.extend([line, "\n"]);
+                }
+            }
         }
-        let text: String = lines.iter().map(text).collect();
-        file::write_whole(&path, |out| out.write_all(text.as_bytes())).map_err(FileError::write(&path))?;
+        file::write_whole(&path, |out| out.write_all(kept.as_bytes())).map_err(FileError::write(&path))?;
         let appended = OpenOptions::new().append(true).open(&path).map_err(FileError::write(&path))?;
         let events_path = folder.join("events.out.tfevents.snapsnap");
         let mut events = Events::create(&events_path).map_err(FileError::write(&events_path))?;

@@ -79,6 +79,9 @@ impl OptimizerConfig {
             ("muon.momentum", muon.momentum, 1.0),
             ("muon.weight_decay", muon.weight_decay, 10.0),
         ];
+        if self.epsilon < 1e-30 {
+            return Some(("epsilon", format!("is {}, must be at least 1e-30", self.epsilon)));
+        }
         let (key, value, limit) =
             shares.into_iter().find(|(_, value, limit)| !(0.0..*limit).contains(value))?;
         Some((key, format!("is {value}, must be at least 0 and less than {limit}")))

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::fs;
+use std::io::Write;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -9,6 +10,7 @@ use std::time::{Duration, Instant};
 use burn::tensor::Device;
 use snapsnap_mesh::FileError;
 use snapsnap_net::weights;
+use snapsnap_splat::file;
 
 use crate::checkpoint;
 use crate::config::TrainConfig;
@@ -23,6 +25,8 @@ const PATIENCE: u64 = 20;
 
 /// Where the state of a run lies in its folder.
 pub const STATE: &str = "state/state.safetensors";
+/// Its config in force.
+pub const CONFIG: &str = "config.toml";
 /// The latest weights of a run.
 pub const LAST: &str = "last.safetensors";
 /// The weights that did best in a validation.
@@ -92,7 +96,7 @@ pub fn train<T: Task>(
         step: progress.step,
         finished: progress.step >= steps,
         skipped: progress.skipped,
-        best: progress.best,
+        best: progress.best.map(|(step, score)| (step, f64::from_bits(score))),
         seconds: session.seconds(),
     })
 }
@@ -159,6 +163,13 @@ impl<'a, T: Task> Session<'a, T> {
         let state = options.folder.join(STATE);
         if state.exists() {
             checkpoint::load(&state, &mut learner, &options.devices[0].clone().inner())?;
+        }
+        // Only now is it sure that the config goes with the run.
+        let path = options.folder.join(CONFIG);
+        let text = config.to_toml();
+        if fs::read(&path).ok().as_deref() != Some(text.as_bytes()) {
+            file::write_whole(&path, |out| out.write_all(text.as_bytes()))
+                .map_err(FileError::write(&path))?;
         }
         let log = Log::open(options.folder, learner.progress.step)?;
         let (before, now, step) = (log.seconds(), Instant::now(), learner.progress.step);
@@ -237,8 +248,9 @@ impl<'a, T: Task> Session<'a, T> {
         self.log.add(Line { step, seconds: self.seconds(), values })?;
         self.watch.validated(step, &validation);
         let best = &mut self.learner.progress.best;
-        if validation.score.is_finite() && best.is_none_or(|(_, best)| validation.score < best) {
-            *best = Some((step, validation.score));
+        let beats = |best: u64| validation.score < f64::from_bits(best);
+        if validation.score.is_finite() && best.is_none_or(|(_, best)| beats(best)) {
+            *best = Some((step, validation.score.to_bits()));
             self.write(&networks, BEST)?;
         }
         Ok(())
@@ -270,9 +282,10 @@ impl<'a, T: Task> Session<'a, T> {
 }
 
 /// Runs `work` where the CPU's operators are fastest: on one of rayon's own threads. (A caller from outside hands every
-/// operator over and waits.) On other devices, which order work by the calling thread, it stays where it is.
-pub fn on_best_thread<R: Send>(device: &Device, work: impl FnOnce() -> R + Send) -> R {
-    if device.clone().inner() == Device::flex() {
+/// operator over and waits.) On other devices, which order work by the calling thread, it stays where it is; so it does
+/// with several, whose threads would wait for the one that waits for them.
+pub fn on_best_thread<R: Send>(devices: &[Device], work: impl FnOnce() -> R + Send) -> R {
+    if matches!(devices, [device] if device.clone().inner() == Device::flex()) {
         let mut result = None;
         rayon::scope(|_| result = Some(work()));
         result.expect("the scope runs it")

@@ -17,7 +17,7 @@ use crate::fixed::{Fixed, check_resolution};
 use crate::networks::{Networks, host};
 use crate::points::{Prediction, losses, predict};
 use crate::preview::{grid, heat, picture};
-use crate::task::{Part, Task, Validation};
+use crate::task::{Moment, Part, Task, Validation};
 
 /// Samples of a preview.
 const PREVIEWS: usize = 2;
@@ -93,10 +93,9 @@ impl Task for PointTask {
         &self,
         networks: &Networks,
         items: Vec<Stage1Item>,
-        _step: u64,
-        device: usize,
+        at: Moment,
     ) -> Result<Vec<Part>, TrainError> {
-        let batch = Stage1Batcher.batch(items, &self.devices[device]);
+        let batch = Stage1Batcher.batch(items, &self.devices[at.device]);
         let losses = losses(&self.predict(networks, &batch), &batch.points, &batch.valid);
         Ok(vec![
             Part { name: "points", weight: 1.0, value: losses.regression },

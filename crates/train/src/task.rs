@@ -20,6 +20,17 @@ pub struct Part {
     pub value: Tensor<1>,
 }
 
+/// When a batch is computed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Moment {
+    /// Steps before this one.
+    pub step: u64,
+    /// Batches of this step before this one.
+    pub batch: u64,
+    /// Number of the device among those that train.
+    pub device: usize,
+}
+
 /// What a validation found.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Validation {
@@ -43,7 +54,8 @@ pub trait Task: Sync {
     /// What a sample was made of.
     fn name(item: &Self::Item) -> &str;
 
-    /// The loss of a batch, computed where `networks` are: on the device of number `device` among those that train.
+    /// The loss of a batch, computed where `networks` are: on the moment's device. Empty if nothing of the batch can be
+    /// trained on.
     ///
     /// # Errors
     /// [`TrainError`] if the batch cannot be used.
@@ -51,8 +63,7 @@ pub trait Task: Sync {
         &self,
         networks: &Networks,
         items: Vec<Self::Item>,
-        step: u64,
-        device: usize,
+        at: Moment,
     ) -> Result<Vec<Part>, TrainError>;
 
     /// Compares what the networks, which are not tracked and on the first device, make of people set apart; `None` if there are none.

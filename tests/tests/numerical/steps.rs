@@ -26,7 +26,7 @@ use snapsnap_train::points::{Prediction, losses};
 use snapsnap_train::run::{Options, Outcome, Watch, train};
 use snapsnap_train::stage1::PointTask;
 use snapsnap_train::stage2::GaussianTask;
-use snapsnap_train::task::{Task, Validation};
+use snapsnap_train::task::{Moment, Task, Validation};
 
 /// Both roads of every layer are in it: attention, all kinds of convolutions, resizing, windows, anchors.
 const CONFIG: &str = r#"
@@ -84,7 +84,7 @@ fn people(root: &std::path::Path) -> Arc<Folder> {
 fn step<T: Task>(task: &T, networks: Networks) -> (f64, Rows, Networks) {
     let samples = task.samples(0);
     let items = vec![samples.get(0).expect("reads"), samples.get(1).expect("reads")];
-    let parts = task.losses(&networks, items, 0, 0).expect("a loss");
+    let parts = task.losses(&networks, items, Moment { step: 0, batch: 0, device: 0 }).expect("a loss");
     let weighted: Vec<Tensor<1>> = parts.into_iter().map(|part| part.value * part.weight).collect();
     let loss = Tensor::cat(weighted, 0).sum();
     let value = f64::from(loss.clone().into_scalar::<f32>());

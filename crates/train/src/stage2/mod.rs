@@ -27,7 +27,7 @@ use crate::networks::{Networks, host};
 use crate::photometric::Photometric;
 use crate::points::{Prediction, losses, predict};
 use crate::preview::{grid, heat, picture};
-use crate::task::{Part, Task, Validation};
+use crate::task::{Moment, Part, Task, Validation};
 
 pub use scene::needles;
 use scene::{Phase, gaussians, targets};
@@ -194,12 +194,10 @@ impl Task for GaussianTask {
         &self,
         networks: &Networks,
         items: Vec<Stage2Item>,
-        step: u64,
-        device: usize,
+        Moment { step, batch, device: place }: Moment,
     ) -> Result<Vec<Part>, TrainError> {
-        let (phase, place, device) =
-            (Phase::new(self.losses.curriculum, step), device, &self.devices[device]);
-        let mut random = stream(&format!("stage2/{}/{step}/{place}", self.seed));
+        let (phase, device) = (Phase::new(self.losses.curriculum, step), &self.devices[place]);
+        let mut random = stream(&format!("stage2/{}/{step}/{batch}/{place}", self.seed));
         let mut sums: BTreeMap<&'static str, Vec<Tensor<1>>> = BTreeMap::new();
         for item in &items {
             let count = item.target_cameras.len();
@@ -243,13 +241,6 @@ impl Task for GaussianTask {
             if self.losses.needle > 0.0 {
                 add("needle", needles(&gaussians.scales, self.losses.anisotropy));
             }
-        }
-        if sums.is_empty() {
-            let message = format!(
-                "no pixel of {} is part of a person, as the point predictor sees it",
-                items.first().map_or("nothing", |item| item.name.as_str())
-            );
-            return Err(TrainError::Unsuitable(message));
         }
         let weight = |name| match name {
             "l1" => self.losses.beta,

@@ -1,20 +1,17 @@
 //! The folder of a run: who may write into it, and the config that it was begun with.
 
-use std::fs::{self, File};
+use std::fs::{self, File, OpenOptions, TryLockError};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use snapsnap_data::dataset::Folder;
 use snapsnap_splat::file;
 use snapsnap_train::config::TrainConfig;
-use snapsnap_train::run::STATE;
+use snapsnap_train::run::{BEST, CONFIG, LAST, STATE};
 
 use super::Arguments;
 use crate::failure::Failure;
-use crate::output;
 
-/// Name of the config in force.
-const CONFIG: &str = "config.toml";
 /// Longest config that is read.
 const MOST: u64 = 1 << 20;
 
@@ -32,6 +29,16 @@ pub fn config(arguments: &Arguments) -> Result<TrainConfig, Failure> {
     }
     if let Some(weights) = &arguments.weights {
         config.training.start = Some(weights.clone());
+    }
+    // Whole paths: a run may go on from another folder.
+    let paths = config.data.folders.iter_mut().chain(&mut config.training.start);
+    for path in paths {
+        *path = std::path::absolute(&*path).unwrap_or_else(|_| path.clone());
+        if path.to_str().is_none() {
+            let message =
+                format!("{}: the path is not UTF-8, which the run's config must be", path.display());
+            return Err(Failure::Input(message));
+        }
     }
     Ok(config)
 }
@@ -61,39 +68,49 @@ impl RunFolder {
         data: &[Arc<Folder>],
     ) -> Result<Self, Failure> {
         let wrong = |message: &str| Failure::Input(format!("{}: {message}", path.display()));
-        fs::create_dir_all(path).map_err(|e| Failure::cannot_write(path, &e))?;
-        let place = path.canonicalize().map_err(|e| Failure::cannot_write(path, &e))?;
+        // Before anything is made: an empty folder among a data set's would be a subject without pictures.
+        let whole = std::path::absolute(path).map_err(|e| Failure::cannot_write(path, &e))?;
+        let there = whole.ancestors().find_map(|above| above.canonicalize().ok());
         for folder in data {
-            if folder.root().canonicalize().is_ok_and(|root| place.starts_with(root)) {
+            let root = folder.root().canonicalize().ok();
+            if root.zip(there.as_ref()).is_some_and(|(root, there)| there.starts_with(root)) {
                 return Err(wrong("lies in a data set"));
             }
         }
+        fs::create_dir_all(path).map_err(|e| Failure::cannot_write(path, &e))?;
         let lock = path.join("lock");
-        let file = File::create(&lock).map_err(|e| Failure::cannot_write(&lock, &e))?;
-        if file.try_lock().is_err() {
+        let file = OpenOptions::new().create(true).truncate(false).write(true).open(&lock);
+        let file = file.map_err(|e| Failure::cannot_write(&lock, &e))?;
+        // Where the file system has no locks, nobody is kept out.
+        if matches!(file.try_lock(), Err(TryLockError::WouldBlock)) {
             return Err(wrong("is being trained by another process"));
         }
-        let (own, resolved) = (path.join(CONFIG), config.to_toml());
+        let own = path.join(CONFIG);
+        let same = |a: &Path, b: &Path| super::super::is_same_file(a, b);
         if path.join(STATE).exists() {
             if !arguments.resume {
                 return Err(wrong("holds a run: add --resume to go on, or give another folder"));
             }
-            let before = read(&own, &[])?;
-            if before.networks() != config.networks() {
+            if read(&own, &[])?.networks() != config.networks() {
                 return Err(wrong(
                     "was begun with other [network], [regressor] or [mode] sections (its config.toml): give \
                      another folder",
                 ));
             }
-        } else if own.exists() && !arguments.resume {
-            // Of a run that never came to a checkpoint: nothing is lost, unless it is what the config is read from.
-            let given = arguments.config.as_deref();
-            if given.is_some_and(|given| super::super::is_same_file(given, &own)) {
-                return Err(wrong("holds the config itself, which would be replaced: give another folder"));
+        } else {
+            // Of a run that never came to a checkpoint nothing is lost, unless it is what this one begins with.
+            if own.exists() {
+                read(&own, &[]).map_err(|_| wrong("holds a config.toml of something else"))?;
             }
-        }
-        if fs::read(&own).ok().as_deref() != Some(resolved.as_bytes()) {
-            output::write(&own, resolved.as_bytes())?;
+            let start = config.training.start.as_deref().into_iter();
+            let mut inputs = start.chain(arguments.config.as_deref());
+            if let Some(input) =
+                inputs.find(|input| [BEST, LAST, CONFIG].iter().any(|name| same(input, &path.join(name))))
+            {
+                let message =
+                    format!("{}: would be replaced by the run: give another folder", input.display());
+                return Err(Failure::Input(message));
+            }
         }
         Ok(Self { path: path.to_owned(), _lock: file })
     }

@@ -73,7 +73,9 @@ pub fn stage1(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     plan.check_validation(task.validation_samples());
     plan.run(&task, |tracked| {
         let networks = plan.config.networks();
-        let predictor = match plan.start() {
+        // A run that goes on has its weights in its state.
+        let own = arguments.output.as_ref().is_some_and(|run| arguments.resume && run.join(STATE).exists());
+        let predictor = match plan.start().filter(|_| !own) {
             Some(path) => open(path, &plan.config)?.point_predictor(tracked)?,
             None => random_predictor(&networks, plan.config.training.seed, tracked),
         };
@@ -168,7 +170,7 @@ impl<'a> Plan<'a> {
     ) -> Result<(), Failure> {
         let tracked = &self.devices[0];
         if self.arguments.dry_run {
-            return run::on_best_thread(tracked, || {
+            return run::on_best_thread(&self.devices, || {
                 let rehearsal = run::rehearse(task, &self.config, networks(tracked)?, &self.devices)?;
                 report::rehearsed(&self.config, tracked, rehearsal);
                 Ok(())
@@ -181,7 +183,7 @@ impl<'a> Plan<'a> {
         let options = Options { folder: folder.path(), devices: &self.devices, limit, stop };
         let mut reporter = Reporter::new(self.quiet, &self.config, limit);
         let start = Instant::now();
-        let outcome = run::on_best_thread(tracked, || {
+        let outcome = run::on_best_thread(&self.devices, || {
             Ok::<_, Failure>(run::train(task, &self.config, networks(tracked)?, &options, &mut reporter)?)
         })?;
         drop(reporter);
