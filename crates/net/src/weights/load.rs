@@ -42,12 +42,12 @@ impl WeightFile {
     }
 }
 
-/// A point predictor with the random weights that [`super::init`] writes.
+/// A point predictor with the random weights that [`super::init()`] writes.
 pub fn random_predictor(config: &Config, seed: u64, device: &Device) -> PointPredictor {
     random(config, seed, "", PointPredictor::new(&config.network, device), device)
 }
 
-/// Regressors with the random weights that [`super::init`] writes.
+/// Regressors with the random weights that [`super::init()`] writes.
 pub fn random_regressors(config: &Config, seed: u64, device: &Device) -> Vec<Regressor> {
     ["", SIDE][..config.regressor.networks]
         .iter()
