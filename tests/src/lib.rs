@@ -12,6 +12,55 @@ use std::sync::OnceLock;
 use burn::tensor::{Device, DeviceKind, DeviceType, Tensor, TensorData};
 use safetensors::SafeTensors;
 
+/// A training of thousands of parameters on pictures of 64²: attention, all kinds of convolutions, resizing, windows and
+/// anchors are in it.
+pub const TRAINING: &str = r#"
+[network]
+enc_dim = 16
+enc_depth = 1
+enc_heads = 2
+dec_dim = 16
+dec_depth = 2
+dec_heads = 2
+layer_dims = [4, 4, 8, 8]
+feature_dim = 8
+last_dim = 4
+hooks = [0, 1, 1, 2]
+resolution = 64
+net_resolution = 64
+delta = 0.2
+anchor = "ray"
+window = true
+[regressor]
+start = "geometric"
+[mode]
+compat = false
+[samples]
+supervision = 1
+[training]
+steps = 40
+batch = 2
+average = 0.9
+log_every = 1
+validate_every = 10
+validation_samples = 2
+checkpoint_every = 4
+preview_every = 20
+[optimizer]
+rate = 1e-2
+decay_all = false
+[optimizer.muon]
+rate = 1e-2
+[schedule]
+kind = "cosine"
+warm_up = 4
+end = 0.01
+[stage2]
+alpha = 0.5
+needle = 0.01
+noise = 0.01
+"#;
+
 /// Name of the device that tests run on: `SNAPSNAP_TEST_DEVICE` = `flex` (default), `ndarray`, `wgpu`, or, where it is
 /// compiled in, `vulkan`.
 pub fn device_name() -> String {

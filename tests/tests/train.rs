@@ -9,55 +9,7 @@ use std::time::Duration;
 
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use snapsnap_tests::{refused, snapsnap, succeed};
-
-/// A training of thousands of parameters on pictures of 64².
-const CONFIG: &str = r#"
-[network]
-enc_dim = 16
-enc_depth = 1
-enc_heads = 2
-dec_dim = 16
-dec_depth = 2
-dec_heads = 2
-layer_dims = [4, 4, 8, 8]
-feature_dim = 8
-last_dim = 4
-hooks = [0, 1, 1, 2]
-resolution = 64
-net_resolution = 64
-delta = 0.2
-anchor = "ray"
-window = true
-[regressor]
-start = "geometric"
-[mode]
-compat = false
-[samples]
-supervision = 1
-[training]
-steps = 40
-batch = 2
-average = 0.9
-log_every = 1
-validate_every = 10
-validation_samples = 2
-checkpoint_every = 4
-preview_every = 20
-[optimizer]
-rate = 1e-2
-decay_all = false
-[optimizer.muon]
-rate = 1e-2
-[schedule]
-kind = "cosine"
-warm_up = 4
-end = 0.01
-[stage2]
-alpha = 0.5
-needle = 0.01
-noise = 0.01
-"#;
+use snapsnap_tests::{TRAINING, refused, snapsnap, succeed};
 
 /// Three people to learn from and one to validate on, made once.
 fn people() -> &'static Path {
@@ -79,7 +31,7 @@ fn people() -> &'static Path {
 fn place() -> (tempfile::TempDir, PathBuf) {
     let temporary = tempfile::tempdir().expect("temporary folder");
     let config = temporary.path().join("train.toml");
-    fs::write(&config, CONFIG).expect("writes");
+    fs::write(&config, TRAINING).expect("writes");
     (temporary, config)
 }
 

@@ -1,6 +1,7 @@
 //! From point maps to Gaussians, as inference and training do it: side colours, the regressor on a window, activations.
 
 use burn::tensor::{Device, Int, Tensor, TensorData};
+use snapsnap_ops::host;
 use snapsnap_splat::{Gaussians, RigidTransform};
 
 use crate::config::{Config, RegressorStart, RotationFrame};
@@ -145,8 +146,4 @@ pub fn placed(config: &Config, gaussians: Gaussians, camera_to_world: &RigidTran
         RotationFrame::Camera => gaussians.transformed(camera_to_world),
         RotationFrame::World => gaussians.with_means_transformed(camera_to_world),
     }
-}
-
-fn host(x: Tensor<2>) -> Vec<f32> {
-    x.into_data().try_into_vec().expect("all tensors here are f32")
 }

@@ -3,6 +3,7 @@
 use std::time::{Duration, Instant};
 
 use burn::tensor::{Device, Tensor, TensorData};
+use snapsnap_ops::host;
 use snapsnap_splat::{Camera, Gaussians, RigidTransform};
 
 use crate::config::{Config, Downsample, Upsample, WorldFrame};
@@ -135,7 +136,7 @@ impl Run<'_> {
         let maps = self.point_maps(photos);
         let views: Vec<View> = self.model.predictor.dust3r.views().to_vec();
         let (points, conf) =
-            self.timed("reading back", |_| (host::<4>(maps.points.clone()), host::<3>(maps.conf.clone())));
+            self.timed("reading back", |_| (host(maps.points.clone()), host(maps.conf.clone())));
         let area = self.side * self.side;
         let point = |view: usize, i: usize| -> [f32; 3] {
             let at = 3 * (view * area + i);
@@ -302,8 +303,4 @@ impl Run<'_> {
 
 fn count(mask: &[bool]) -> usize {
     mask.iter().filter(|v| **v).count()
-}
-
-fn host<const D: usize>(x: Tensor<D>) -> Vec<f32> {
-    x.into_data().try_into_vec().expect("all tensors here are f32")
 }

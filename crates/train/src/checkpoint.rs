@@ -7,9 +7,10 @@ use std::path::Path;
 use burn::tensor::Device;
 use serde::{Deserialize, Serialize};
 use snapsnap_net::weights::{Source, WeightsError, write_tensors};
+use snapsnap_ops::host;
 
 use crate::learner::Learner;
-use crate::networks::{Rows, host, row};
+use crate::networks::{Rows, row};
 use crate::task::Task;
 
 /// Metadata key of the progress, as JSON.

@@ -2,8 +2,9 @@
 
 use burn::tensor::{Device, Tensor};
 use rayon::prelude::*;
+use snapsnap_ops::host;
 
-use crate::networks::{Rows, host, row};
+use crate::networks::{Rows, row};
 
 /// Values per task on the CPU.
 const PIECE: usize = 1 << 14;

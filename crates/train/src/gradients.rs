@@ -3,8 +3,9 @@
 use burn::module::Param;
 use burn::tensor::{Gradients, Tensor};
 use snapsnap_net::weights::NamedVisitor;
+use snapsnap_ops::host;
 
-use crate::networks::{Networks, Rows, host};
+use crate::networks::{Networks, Rows};
 
 /// The gradients of all parameters that have one.
 pub fn collect(networks: &Networks, gradients: &mut Gradients) -> Rows {
@@ -43,11 +44,6 @@ pub fn norm(gradients: &Rows) -> f64 {
     }
     // Read back once, and added in f64.
     host(Tensor::cat(sums, 0)).into_iter().map(f64::from).sum::<f64>().sqrt()
-}
-
-/// The gradients times `factor`.
-pub fn scaled(gradients: Rows, factor: f64) -> Rows {
-    gradients.into_iter().map(|(name, gradient)| (name, gradient * factor)).collect()
 }
 
 /// The factor by which PyTorch's `clip_grad_norm_` multiplies gradients of this norm to limit it. `None` where it is not

@@ -8,11 +8,12 @@ use burn::data::dataloader::batcher::Batcher;
 use burn::data::dataset::Dataset;
 use burn::tensor::{Device, Tensor};
 use snapsnap_data::sample::{Batches, Loader};
+use snapsnap_ops::host;
 
 use crate::checkpoint::Progress;
 use crate::config::TrainConfig;
 use crate::ema::Average;
-use crate::networks::{Networks, Rows, host};
+use crate::networks::{Networks, Rows};
 use crate::optimizer::Optimizer;
 use crate::task::{Moment, Task};
 use crate::{TrainError, gradients};

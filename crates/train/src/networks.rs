@@ -8,6 +8,7 @@ use snapsnap_net::network::PointPredictor;
 use snapsnap_net::regressor::Regressor;
 use snapsnap_net::weights::schema::SIDE;
 use snapsnap_net::weights::{NamedMapper, NamedVisitor, map_named, visit_named};
+use snapsnap_ops::host;
 
 /// Networks whose parameters are trained.
 #[derive(Debug, Clone, Default)]
@@ -117,11 +118,6 @@ impl Networks {
         self.visit(&mut collect);
         collect.0
     }
-}
-
-/// Values on the host.
-pub(crate) fn host<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
-    tensor.into_data().try_into_vec().expect("all tensors here are f32")
 }
 
 /// A row of values on a device.

@@ -5,9 +5,10 @@ use std::collections::BTreeMap;
 use burn::tensor::{Device, Tensor};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
+use snapsnap_ops::host;
 use snapsnap_ops::orthogonal::{COEFFICIENTS, MIN_NORM, STEPS, orthogonalised};
 
-use crate::networks::{Networks, Rows, host, row};
+use crate::networks::{Networks, Rows, row};
 
 /// Values per task of a step on the CPU.
 const PIECE: usize = 1 << 14;

@@ -5,8 +5,7 @@ use snapsnap_net::Window;
 use snapsnap_net::config::{Config, Downsample, Upsample};
 use snapsnap_net::network::{PointMap, PointPredictor, View, activate};
 use snapsnap_net::resample::shrink;
-
-use crate::networks::host;
+use snapsnap_ops::host;
 
 /// Squares of distances below this have no gradient: the direction of so small an error is noise.
 const MIN_SQUARE: f64 = 1e-24;

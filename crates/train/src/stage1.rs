@@ -10,11 +10,12 @@ use snapsnap_data::dataset::{Folder, Split};
 use snapsnap_data::sample::{Joined, Stage1, Stage1Batch, Stage1Batcher, Stage1Item};
 use snapsnap_net::config::Config;
 use snapsnap_net::network::{PointMap, View};
+use snapsnap_ops::host;
 
 use crate::TrainError;
 use crate::config::TrainConfig;
 use crate::fixed::{Fixed, check_resolution};
-use crate::networks::{Networks, host};
+use crate::networks::Networks;
 use crate::points::{Prediction, losses, predict};
 use crate::preview::{grid, heat, picture};
 use crate::task::{Moment, Part, Task, Validation};
@@ -175,7 +176,6 @@ fn place_color([x, y, z]: [f32; 3]) -> [f32; 3] {
 /// Distances between predicted and true points, summed over people.
 #[derive(Default)]
 struct Errors {
-    people: f64,
     /// Per view: people that it sees, mean distances in metres, and those after each person's mean shift is removed.
     views: [[f64; 3]; 4],
     /// Side pixels that are both predicted and true, and that are either.
@@ -203,7 +203,6 @@ impl Errors {
             }
         }
         let shift = shift.map(|sum| sum / f64::max(count, 1.0));
-        self.people += 1.0;
         for (view, points, conf) in &maps {
             let (mut sums, mut count) = ([0.0; 2], 0.0);
             for i in there(*view) {

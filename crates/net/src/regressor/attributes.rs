@@ -3,6 +3,8 @@
 use burn::tensor::activation::sigmoid;
 use burn::tensor::{Tensor, TensorData};
 
+use snapsnap_ops::host;
+
 use crate::config::{RegressorConfig, RegressorStart};
 
 /// Gaussian attributes of N pixels.
@@ -44,7 +46,7 @@ impl Geometry {
     /// `[1, S, S, 3]`.
     pub fn new(image: &[f32], points: &Tensor<4>, valid: &[bool], side: usize) -> Self {
         let device = points.device();
-        let points: Vec<f32> = points.clone().into_data().try_into_vec().expect("f32");
+        let points = host(points.clone());
         let point = |i: usize| [points[3 * i], points[3 * i + 1], points[3 * i + 2]];
         let (mut spacing, mut colors) = (Vec::new(), Vec::new());
         for i in (0..side * side).filter(|i| valid[*i]) {

@@ -17,13 +17,14 @@ use snapsnap_net::Window;
 use snapsnap_net::config::{Config, RegressorStart};
 use snapsnap_net::network::{PointMap, PointPredictor, View, anchors};
 use snapsnap_net::weights::random_regressors;
+use snapsnap_ops::host;
 use snapsnap_people::random::stream;
 use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
 
 use crate::TrainError;
 use crate::config::{Stage2Config, TrainConfig};
 use crate::fixed::{Fixed, check_resolution};
-use crate::networks::{Networks, host};
+use crate::networks::Networks;
 use crate::photometric::Photometric;
 use crate::points::{Prediction, losses, predict};
 use crate::preview::{grid, heat, picture};
@@ -37,6 +38,7 @@ use scores::Scores;
 const PREVIEWS: usize = 3;
 /// Error that a preview shows white.
 const WORST: f32 = 0.5;
+
 /// The training of the regressor on what a frozen point predictor gives.
 pub struct GaussianTask {
     networks: Config,

@@ -8,9 +8,10 @@ use snapsnap_net::Window;
 use snapsnap_net::config::Config;
 use snapsnap_net::gaussians::{Seen, assemble, placed, regress, side_images};
 use snapsnap_net::network::View;
+use snapsnap_ops::host;
 use snapsnap_splat::Gaussians;
 
-use crate::networks::{Networks, host};
+use crate::networks::Networks;
 use crate::points::Prediction;
 
 /// Where the published curriculum goes from the sides to front and back, and from these to everything (SNAPSNAP §9.2).

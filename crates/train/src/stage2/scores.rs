@@ -4,9 +4,9 @@ use burn::tensor::module::max_pool2d;
 use burn::tensor::ops::MaxPoolOptions;
 use burn::tensor::{Device, Tensor};
 use snapsnap_data::sample::Stage2Item;
+use snapsnap_ops::host;
 
 use super::scene::targets;
-use crate::networks::host;
 use crate::photometric::{Photometric, psnr};
 
 /// How like the truth pictures are, summed or averaged over samples.

@@ -57,7 +57,7 @@ pub struct RunFolder {
 }
 
 impl RunFolder {
-    /// Makes or enters the folder and notes the config in it.
+    /// Makes or enters the folder.
     ///
     /// # Errors
     /// [`Failure::Input`] if it holds a run that is not to go on, one of other networks, or one that is under way.
