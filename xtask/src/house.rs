@@ -5,15 +5,16 @@ use std::fs;
 use std::path::Path;
 
 /// Crates and the crates of ours that each may depend on, lowest floor first.
-const FLOORS: [(&str, &[&str]); 8] = [
+const FLOORS: [(&str, &[&str]); 9] = [
     ("splat", &[]),
     ("ops", &[]),
     ("mesh", &["splat"]),
     ("net", &["splat", "ops"]),
     ("people", &["mesh"]),
     ("data", &["people", "mesh", "splat"]),
-    ("train", &["data", "people", "net", "ops", "mesh", "splat"]),
-    ("app", &["train", "data", "people", "net", "ops", "mesh", "splat"]),
+    ("eval", &["net", "data", "mesh", "splat"]),
+    ("train", &["eval", "data", "people", "net", "ops", "mesh", "splat"]),
+    ("app", &["train", "eval", "data", "people", "net", "ops", "mesh", "splat"]),
 ];
 
 /// Our crates that the manifest of each folder below `crates` asks for, those for tests included.

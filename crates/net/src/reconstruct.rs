@@ -6,7 +6,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use snapsnap_ops::host;
 use snapsnap_splat::{Camera, Gaussians, RigidTransform};
 
-use crate::config::{Config, Downsample, Upsample, WorldFrame};
+use crate::config::{Config, Downsample, WorldFrame};
 use crate::crop::Window;
 use crate::gaussians::{Seen, assemble, placed, regress, side_images};
 use crate::network::{PointMap, PointPredictor, View, activate};
@@ -223,18 +223,9 @@ impl Run<'_> {
             net.dust3r.views().iter().map(map).collect::<Vec<_>>()
         });
         self.timed("up-sampling", |_| {
-            let method = config.upsample();
             let on_canvas = net.dust3r.views().iter().zip(maps).map(|(&view, map)| {
-                let weights =
-                    (method == Upsample::MaskAware && factor > 1).then(|| match photos.get(view as usize) {
-                        Some(photo) => shrink(window.cut(upload(&photo.mask, 1)), factor, Downsample::Area),
-                        None => {
-                            let body = map.conf.clone().greater_elem(config.network.conf_threshold);
-                            body.float().unsqueeze_dim(1)
-                        }
-                    });
-                let map = net.anchored(view, net.to_canvas(map, factor, method, weights), &window);
-                map.on_canvas(&window, side)
+                let mask = photos.get(view as usize).map(|photo| upload(&photo.mask, 1));
+                net.finished(config, view, map, &window, mask).on_canvas(&window, side)
             });
             let (points, conf): (Vec<_>, Vec<_>) = on_canvas.map(|m| (m.points, m.conf)).unzip();
             PointMap { points: Tensor::cat(points, 0), conf: Tensor::cat(conf, 0) }

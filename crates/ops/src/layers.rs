@@ -8,11 +8,11 @@ use burn::tensor::Tensor;
 use burn::tensor::activation::relu;
 
 use crate::buffers::Buffers;
-use crate::is_trained_fast;
 use crate::op::{self, Kept, Kernel};
 use crate::train::{
     Conv1x1, Conv3x3, Enlarge, Gradients, LayerNorm, Linear, Patches, Statistics, Unfolded, Wanted,
 };
+use crate::{in_f32, is_trained_fast};
 
 /// What one step needed, the next one needs again.
 pub(crate) static BUFFERS: Buffers = Buffers::new();
@@ -40,7 +40,7 @@ fn linear_sizes(layer: &nn::Linear, x: &Tensor<3>) -> (Linear, [usize; 3]) {
 /// Layer normalisation of tokens `[B, N, C]`. `epsilon` is what the layer was made with, which it does not tell.
 pub fn layer_norm(layer: &nn::LayerNorm, epsilon: f64, x: Tensor<3>) -> Tensor<3> {
     let Some(bias) = layer.beta.as_ref().filter(|_| is_trained_fast(&x)) else {
-        return layer.forward(x);
+        return in_f32(x, |x| layer.forward(x));
     };
     let (weight, shape) = (layer.gamma.val(), x.dims());
     let sizes = LayerNorm { channels: shape[2], epsilon: epsilon as f32 };

@@ -1,5 +1,6 @@
 //! Operators that Burn's CPU backends do slowly. Each is one function with two roads: kernels of our own on Burn's `flex`
-//! device, in training with gradients of their own, and plain tensor code on every other device. Tests hold them together.
+//! device, in training with gradients of their own, and plain tensor code on every other device and in 16 bits. Tests hold
+//! them together.
 
 pub mod buffers;
 pub mod conv;
@@ -25,22 +26,38 @@ use burn::nn::Linear;
 use burn::tensor::activation::gelu;
 use burn::tensor::module::{attention, interpolate};
 use burn::tensor::ops::{InterpolateMode, InterpolateOptions};
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::{DType, Device, FloatDType, Tensor, TensorData};
 
 use buffers::Buffers;
 pub use rope::Rope;
 use train::{Attention, Tokens};
 
-/// Whether `x` lives where this crate's own kernels apply: on `flex`, with nothing tracked for gradients.
+/// Whether `x` lives where this crate's own kernels apply: in f32 on `flex`, with nothing tracked for gradients.
 pub fn is_fast<const D: usize>(x: &Tensor<D>) -> bool {
     let device = x.device();
-    !device.is_autodiff() && device == Device::flex()
+    x.dtype() == DType::F32 && !device.is_autodiff() && device == Device::flex()
 }
 
-/// Whether `x` lives where kernels with gradients of their own apply: on `flex`, in training.
+/// Whether `x` lives where kernels with gradients of their own apply: in f32 on `flex`, in training.
 pub fn is_trained_fast<const D: usize>(x: &Tensor<D>) -> bool {
     let device = x.device();
-    device.is_autodiff() && device.inner() == Device::flex()
+    x.dtype() == DType::F32 && device.is_autodiff() && device.inner() == Device::flex()
+}
+
+/// Whether `x` has 16 bits per value.
+fn is_half<const D: usize>(x: &Tensor<D>) -> bool {
+    matches!(x.dtype(), DType::F16 | DType::BF16)
+}
+
+/// `x` in f32 if it has 16 bits per value.
+pub fn widened<const D: usize>(x: Tensor<D>) -> Tensor<D> {
+    if is_half(&x) { x.cast(FloatDType::F32) } else { x }
+}
+
+/// What is computed in f32 for 16 bits: norms, rotations.
+pub fn in_f32<const D: usize>(x: Tensor<D>, compute: impl FnOnce(Tensor<D>) -> Tensor<D>) -> Tensor<D> {
+    let dtype = x.dtype();
+    if is_half(&x) { compute(x.cast(FloatDType::F32)).cast(dtype) } else { compute(x) }
 }
 
 /// softmax(rope(q) · rope(k)ᵀ / √head_dim) · v, heads side by side in the channels: `q` `[B, N, C]`, `k` and `v`
@@ -117,9 +134,10 @@ pub fn bilinear(x: Tensor<4>, size: [usize; 2], align_corners: bool) -> Tensor<4
         // Burn's own operator has no backward pass on GPUs; products with constant matrices have.
         let matrix = |taps: &[resize::Tap], from: usize| {
             let data = TensorData::new(resize::matrix(taps, from), [taps.len(), from]);
-            Tensor::<2>::from_data(data, &device)
+            Tensor::<2>::from_data(data, &device).cast(x.dtype())
         };
-        return matrix(&down, h).unsqueeze().matmul(x).matmul(matrix(&across, w).transpose().unsqueeze());
+        let (down, across) = (matrix(&down, h).unsqueeze(), matrix(&across, w).transpose().unsqueeze());
+        return down.matmul(x).matmul(across);
     }
     if is_fast(&x) {
         let out = resize::resize(&host(x), [h, w], &down, &across);

@@ -3,6 +3,8 @@
 
 use burn::tensor::{Device, Tensor, TensorData};
 
+use crate::in_f32;
+
 /// Cosines and sines of every token's rotation angles, for one grid and one head size.
 #[derive(Debug, Clone)]
 pub struct Rope {
@@ -49,8 +51,10 @@ impl Rope {
     /// Rotates queries or keys `[B, heads, N, head_dim]`.
     pub fn apply(&self, x: Tensor<4>) -> Tensor<4> {
         let [b, h, n, d] = x.dims();
-        // Each half (row, column) holds pairs k and k + d/4; swapping the members gives the sine's factor.
-        let swapped = x.clone().reshape([b * h * n, 2, 2, d / 4]).flip([2]).reshape([b, h, n, d]);
-        x * self.cos.clone().unsqueeze() + swapped * self.sin.clone().unsqueeze()
+        in_f32(x, |x| {
+            // Each half (row, column) holds pairs k and k + d/4; swapping the members gives the sine's factor.
+            let swapped = x.clone().reshape([b * h * n, 2, 2, d / 4]).flip([2]).reshape([b, h, n, d]);
+            x * self.cos.clone().unsqueeze() + swapped * self.sin.clone().unsqueeze()
+        })
     }
 }

@@ -11,6 +11,7 @@ use snapsnap_ops::host;
 
 use crate::learner::Learner;
 use crate::networks::{Rows, row};
+use crate::precision::LossScale;
 use crate::task::Task;
 
 /// Metadata key of the progress, as JSON.
@@ -30,6 +31,8 @@ pub struct Progress {
     pub skipped_in_a_row: u64,
     /// Step of the best validation, and the bits of its score, which decimals might change.
     pub best: Option<(u64, u64)>,
+    /// What the loss is scaled by.
+    pub loss_scale: Option<LossScale>,
     /// AdamW's steps so far by parameter.
     pub times: BTreeMap<String, u64>,
 }

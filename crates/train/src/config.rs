@@ -4,11 +4,13 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 use snapsnap_data::sample::SampleConfig;
+use snapsnap_eval::lpips::MIN_SIDE;
 use snapsnap_net::config::{
     ConfMode, Config, ConfigError, ModeConfig, NetworkConfig, RegressorConfig, parse,
 };
 
 use crate::optimizer::OptimizerConfig;
+use crate::precision::Precision;
 use crate::schedule::Schedule;
 
 /// Everything that decides what a training computes.
@@ -82,6 +84,8 @@ pub struct TrainingConfig {
     pub checkpoint_every: usize,
     /// Steps between two previews; 0: only at the end.
     pub preview_every: usize,
+    /// What the networks compute in, on devices that have it.
+    pub precision: Precision,
     /// Computes what is cheap again instead of keeping it, on devices without kernels of our own.
     pub checkpointing: bool,
 }
@@ -121,8 +125,31 @@ pub struct Stage2Config {
     /// Standard deviation in metres by which a sample's predicted points are shifted at random, since points of people
     /// trained on are better than others'.
     pub noise: f64,
+    /// Perceptual distance, towards the end.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lpips: Option<LpipsConfig>,
+    /// Folder that keeps the frozen predictor's point maps from step to step and from run to run.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub maps: Option<PathBuf>,
     /// Whether the point predictor is tuned as well, with stage 1's loss kept on at this weight; 0: it is frozen.
     pub points: f64,
+}
+
+/// The section `[stage2.lpips]`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LpipsConfig {
+    /// Weight of the mean distance.
+    pub weight: f64,
+    /// Share of the steps before it counts.
+    #[serde(default = "late")]
+    pub after: f64,
+    /// AlexNet as torchvision publishes it and the learned layers of LPIPS v0.1, `.pth` or `.safetensors`.
+    pub files: Vec<PathBuf>,
+}
+
+fn late() -> f64 {
+    0.8
 }
 
 impl Default for TrainConfig {
@@ -162,6 +189,7 @@ impl Default for TrainingConfig {
             validate_on: ValidationSplit::Val,
             checkpoint_every: 1000,
             preview_every: 2000,
+            precision: Precision::F32,
             checkpointing: false,
         }
     }
@@ -182,6 +210,8 @@ impl Default for Stage2Config {
             needle: 0.0,
             anisotropy: 8.0,
             noise: 0.0,
+            lpips: None,
+            maps: None,
             points: 0.0,
         }
     }
@@ -263,6 +293,28 @@ impl TrainConfig {
         if two.points > 0.0 && two.curriculum {
             let message = "must be 0 beside `stage2.curriculum = true`, which renders parts of a person";
             return Some(("stage2.points".into(), message.into()));
+        }
+        if let Some(lpips) = &two.lpips {
+            if !(0.0..=1e6).contains(&lpips.weight) || !(0.0..=1.0).contains(&lpips.after) {
+                let message = format!(
+                    "weight is {}, must be 0 to 1e6; after is {}, must be 0 to 1",
+                    lpips.weight, lpips.after
+                );
+                return Some(("stage2.lpips".into(), message));
+            }
+            if self.network.resolution < MIN_SIDE {
+                let message = format!("needs network.resolution of {MIN_SIDE} at least");
+                return Some(("stage2.lpips".into(), message));
+            }
+        }
+        if two.maps.is_some() && two.points > 0.0 {
+            let message = "needs a predictor that stays as it is, which `stage2.points = 0` means";
+            return Some(("stage2.maps".into(), message.into()));
+        }
+        if two.maps.is_some() && self.samples.augment.changes_photographs() {
+            let message = "needs photographs that stay as they are, for which exposure, white_balance, mask_erosion, \
+                           mask_dilation and jpeg_quality of `samples.augment` are 0 and background is false";
+            return Some(("stage2.maps".into(), message.into()));
         }
         if let Some((key, message)) = self.samples.problem() {
             return Some((format!("samples.{key}"), message));

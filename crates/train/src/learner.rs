@@ -15,6 +15,7 @@ use crate::config::TrainConfig;
 use crate::ema::Average;
 use crate::networks::{Networks, Rows};
 use crate::optimizer::Optimizer;
+use crate::precision::{LossScale, Precision};
 use crate::task::{Moment, Task};
 use crate::{TrainError, gradients};
 
@@ -82,6 +83,7 @@ impl<'a, T: Task> Learner<'a, T> {
 
     fn update(&mut self, step: u64) -> Result<Result<BTreeMap<String, f64>, Skipped>, TrainError> {
         let t = &self.config.training;
+        let scale = *self.progress.loss_scale.get_or_insert_with(|| LossScale::new(t.precision));
         let (mut sum, mut values) = (Rows::new(), BTreeMap::<String, f64>::new());
         let mut all: Vec<String> = Vec::new();
         for batch in 0..t.accumulate {
@@ -90,9 +92,9 @@ impl<'a, T: Task> Learner<'a, T> {
                 Err(why) => return Ok(Err(Skipped { why, samples: all.join("; ") })),
             };
             all.extend(items.iter().map(|item| T::name(item).to_owned()));
-            let share = 1.0 / t.accumulate as f64;
             let at = Moment { step, batch: batch as u64, device: 0 };
-            let made = match on_devices(self.task, &self.networks, self.devices, items, at, share) {
+            let how = How { precision: t.precision, scale: scale.factor, share: 1.0 / t.accumulate as f64 };
+            let made = match on_devices(self.task, &self.networks, self.devices, items, at, how) {
                 // A scene that the rasteriser cannot hold is a sample's affair.
                 Err(TrainError::Splat(e)) => {
                     return Ok(Err(Skipped { why: e.to_string(), samples: all.join("; ") }));
@@ -115,7 +117,10 @@ impl<'a, T: Task> Learner<'a, T> {
             }
         }
         let norm = gradients::norm(&sum);
-        let Some(factor) = gradients::clip_factor(norm, t.clip) else {
+        let clipped = gradients::clip_factor(norm, t.clip);
+        let scale = self.progress.loss_scale.as_mut().expect("set above");
+        scale.update(t.precision, clipped.is_some());
+        let Some(factor) = clipped else {
             return Ok(Err(Skipped { why: "a gradient is not finite".into(), samples: all.join("; ") }));
         };
         let share = self.config.schedule.share(step as usize, t.steps);
@@ -137,7 +142,17 @@ struct Made {
     gradients: Option<Rows>,
 }
 
-/// Loss and gradients of a batch, times `share`: on the one device, or of equal parts of the batch on all of them at
+/// How a batch is computed.
+#[derive(Debug, Clone, Copy)]
+struct How {
+    precision: Precision,
+    /// What the loss is multiplied by, and its gradients are divided by.
+    scale: f64,
+    /// The batch's share in its step.
+    share: f64,
+}
+
+/// Loss and gradients of a batch, times its share: on the one device, or of equal parts of the batch on all of them at
 /// once, with gradients and losses averaged on the first. (Burn has collectives for CUDA alone; copies go anywhere.)
 fn on_devices<T: Task>(
     task: &T,
@@ -145,10 +160,10 @@ fn on_devices<T: Task>(
     devices: &[Device],
     mut items: Vec<T::Item>,
     at: Moment,
-    share: f64,
+    how: How,
 ) -> Result<Made, TrainError> {
     if devices.len() == 1 {
-        return on_device(task, networks, items, at, share);
+        return on_device(task, networks, items, at, how);
     }
     let (all, size) = (items.len() as f64, items.len().div_ceil(devices.len()));
     let mut parts = Vec::new();
@@ -159,8 +174,9 @@ fn on_devices<T: Task>(
     let made: Vec<Result<Made, TrainError>> = thread::scope(|scope| {
         let start = |(place, part): (usize, Vec<T::Item>)| {
             scope.spawn(move || {
-                let (device, share) = (&devices[place], share * part.len() as f64 / all);
-                on_device(task, &networks.fork(device), part, Moment { device: place, ..at }, share)
+                let (device, share) = (&devices[place], how.share * part.len() as f64 / all);
+                let (at, how) = (Moment { device: place, ..at }, How { share, ..how });
+                on_device(task, &networks.fork(device), part, at, how)
             })
         };
         let threads: Vec<_> = parts.into_iter().enumerate().map(start).collect();
@@ -191,9 +207,9 @@ fn on_device<T: Task>(
     networks: &Networks,
     items: Vec<T::Item>,
     at: Moment,
-    share: f64,
+    How { precision, scale, share }: How,
 ) -> Result<Made, TrainError> {
-    let parts = task.losses(networks, items, at)?;
+    let parts = task.losses(&precision.lower(networks), items, at)?;
     if parts.is_empty() {
         return Ok(Made { values: BTreeMap::new(), gradients: Some(Rows::new()) });
     }
@@ -207,9 +223,13 @@ fn on_device<T: Task>(
     if !total.is_finite() {
         return Ok(Made { values, gradients: None });
     }
-    let weighted = parts.into_iter().map(|part| part.value * (part.weight * share)).collect();
+    let weighted = parts.into_iter().map(|part| part.value * (part.weight * share * scale)).collect();
     let mut tracked = Tensor::cat(weighted, 0).sum().backward();
-    Ok(Made { values, gradients: Some(gradients::collect(networks, &mut tracked)) })
+    let mut rows = gradients::collect(networks, &mut tracked);
+    if scale != 1.0 {
+        rows.values_mut().for_each(|row| *row = row.clone() / scale);
+    }
+    Ok(Made { values, gradients: Some(rows) })
 }
 
 /// Batches, pass after pass.

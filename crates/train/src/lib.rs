@@ -14,6 +14,7 @@ pub mod networks;
 pub mod optimizer;
 pub mod photometric;
 pub mod points;
+pub mod precision;
 mod preview;
 pub mod run;
 pub mod schedule;

@@ -2,7 +2,7 @@
 
 use burn::tensor::Tensor;
 use snapsnap_net::Window;
-use snapsnap_net::config::{Config, Downsample, Upsample};
+use snapsnap_net::config::Config;
 use snapsnap_net::network::{PointMap, PointPredictor, View, activate};
 use snapsnap_net::resample::shrink;
 use snapsnap_ops::host;
@@ -38,6 +38,12 @@ impl Prediction {
     }
 }
 
+/// The window of the canvas that the predictor sees of photographs with these masks `[.., S, S]`.
+pub(crate) fn window(config: &Config, masks: &[f32], side: usize) -> Window {
+    let masks: Vec<bool> = masks.iter().map(|mask| *mask > 0.0).collect();
+    Window::of_predictor(config, masks.chunks_exact(side * side))
+}
+
 /// Point maps as training sees them: front and back `[B,2,3,S,S]` in [−1, 1] and their masks `[B,2,S,S]`, which decide the
 /// window and `mask-aware` interpolation.
 pub fn predict(
@@ -47,12 +53,8 @@ pub fn predict(
     masks: &Tensor<4>,
 ) -> Prediction {
     let [b, _, channels, side, _] = images.dims();
-    let window = if config.network.window {
-        let masks: Vec<bool> = host(masks.clone()).into_iter().map(|mask| mask > 0.0).collect();
-        Window::of_predictor(config, masks.chunks_exact(side * side))
-    } else {
-        Window::whole(side)
-    };
+    let window =
+        if config.network.window { window(config, &host(masks.clone()), side) } else { Window::whole(side) };
     let factor = config.upsample_factor();
     let photograph = |i: usize| {
         let image = images.clone().narrow(1, i, 1).reshape([b, channels, side, side]);
@@ -66,16 +68,8 @@ pub fn predict(
     let maps = net.decode(tokens.clone().narrow(0, 0, b), tokens.narrow(0, b, b), grid);
     let map = |&view: &View| {
         let map = activate(net.raw_points(view, &maps, grid), &config.network);
-        // As in inference: photographs have masks, sides the network's own opinion, which gets no gradient from this.
-        let weights = (config.upsample() == Upsample::MaskAware && factor > 1).then(|| match view as usize {
-            photo @ 0..2 => shrink(window.cut(masks.clone().narrow(1, photo, 1)), factor, Downsample::Area),
-            _ => {
-                let body = map.conf.clone().detach().greater_elem(config.network.conf_threshold);
-                body.float().unsqueeze_dim(1)
-            }
-        });
-        let map = predictor.to_canvas(map, factor, config.upsample(), weights);
-        (view, predictor.anchored(view, map, &window))
+        let mask = ((view as usize) < 2).then(|| masks.clone().narrow(1, view as usize, 1));
+        (view, predictor.finished(config, view, map, &window, mask))
     };
     let maps = net.views().iter().map(map).collect();
     Prediction { window, maps }

@@ -206,7 +206,7 @@ impl<'a, T: Task> Session<'a, T> {
             return Ok(());
         }
         if due(t.validate_every) {
-            self.validate()?;
+            self.validate_or_save()?;
         }
         if due(t.preview_every) {
             self.preview()?;
@@ -220,10 +220,15 @@ impl<'a, T: Task> Session<'a, T> {
     /// What a run's folder holds at the session's end.
     fn finish(&mut self) -> Result<(), TrainError> {
         if self.learner.progress.step >= self.learner.config.training.steps as u64 {
-            self.validate()?;
+            self.validate_or_save()?;
             self.preview()?;
         }
         self.save()
+    }
+
+    /// A validation whose samples cannot be read ends the session, but costs none of its steps.
+    fn validate_or_save(&mut self) -> Result<(), TrainError> {
+        self.validate().or_else(|failed| self.save().and(Err(failed)))
     }
 
     fn report(&mut self, mut values: BTreeMap<String, f64>) -> Result<(), TrainError> {

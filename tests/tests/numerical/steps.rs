@@ -23,6 +23,7 @@ use snapsnap_train::networks::{Networks, Rows};
 use snapsnap_train::optimizer::MuonSettings;
 use snapsnap_train::photometric::Photometric;
 use snapsnap_train::points::{Prediction, losses};
+use snapsnap_train::precision::Precision;
 use snapsnap_train::run::{Options, Outcome, Watch, train};
 use snapsnap_train::stage1::PointTask;
 use snapsnap_train::stage2::GaussianTask;
@@ -147,12 +148,58 @@ fn a_step_of_stage_2_is_the_same_on_every_device() {
         let on = |device: &Device| {
             let predictor = |device: &Device| random_predictor(&networks, 3, device);
             let frozen = predictor(&device.clone().inner());
-            let task = GaussianTask::new(from_ref(&folder), &config, frozen, from_ref(device));
+            let task = GaussianTask::new(from_ref(&folder), &config, Some(frozen), from_ref(device));
             let regressors = random_regressors(&published, 4, device);
             let predictor = joint.then(|| predictor(device));
             step(&task.expect("a task"), Networks { predictor, regressors })
         };
         compare(if joint { "stage 2, joint" } else { "stage 2" }, on, &device);
+    }
+}
+
+/// Losses and gradients in 16 bits are those in 32, but for their rounding.
+#[test]
+fn sixteen_bits_have_the_same_gradients_but_for_rounding() {
+    let Some(device) = device() else { return };
+    if is_software(&device) {
+        println!("SKIPPED: on a software adapter this takes minutes");
+        return;
+    }
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let folder = people(temporary.path());
+    let mut config = config();
+    config.stage2.points = 1.0;
+    let device = device.autodiff();
+    let networks = config.networks();
+    let both = Networks {
+        predictor: Some(random_predictor(&networks, 3, &device)),
+        regressors: random_regressors(&networks, 4, &device),
+    };
+    let task = GaussianTask::new(from_ref(&folder), &config, None, from_ref(&device)).expect("a task");
+    let samples = task.samples(0);
+    let made = |precision: Precision| {
+        let items = vec![samples.get(0).expect("reads"), samples.get(1).expect("reads")];
+        let lower = precision.lower(&both);
+        let parts = task.losses(&lower, items, Moment { step: 0, batch: 0, device: 0 }).expect("a loss");
+        let weighted = parts.into_iter().map(|part| part.value * part.weight);
+        let loss = Tensor::cat(weighted.collect(), 0).sum();
+        let value = f64::from(loss.clone().into_scalar::<f32>());
+        let rows = gradients::collect(&both, &mut (loss * 1024.0).backward());
+        (value, rows.into_values().flat_map(values).map(f64::from).collect::<Vec<f64>>())
+    };
+    let (loss, gradient) = made(Precision::F32);
+    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+    // 11 and 8 bits of mantissa, through a dozen layers.
+    for (precision, of_loss, of_gradient) in [(Precision::F16, 2e-3, 1e-3), (Precision::Bf16, 2e-2, 2e-2)] {
+        if !device.supports_dtype(precision.dtype()) {
+            println!("SKIPPED: the device does not compute in {}", precision.name());
+            continue;
+        }
+        let (low, rough) = made(precision);
+        let cosine = dot(&gradient, &rough) / (dot(&gradient, &gradient) * dot(&rough, &rough)).sqrt();
+        println!("{}: loss {low} instead of {loss}, cosine of gradients {cosine}", precision.name());
+        assert!((low - loss).abs() <= of_loss * loss && 1.0 - cosine <= of_gradient);
+        assert_ne!(low, loss, "it was computed in f32");
     }
 }
 
@@ -295,7 +342,7 @@ fn stiff_settings_train_without_a_step_that_is_not_finite() {
         let fresh = Networks { predictor: Some(predictor(&device[0])), regressors: Vec::new() };
         let one = trained(&stage1, &config, fresh, &device);
         let frozen = predictor(&device[0].clone().inner());
-        let stage2 = GaussianTask::new(from_ref(&folder), &config, frozen, &device).expect("a task");
+        let stage2 = GaussianTask::new(from_ref(&folder), &config, Some(frozen), &device).expect("a task");
         let regressors = random_regressors(&networks, 4, &device[0]);
         let fresh = Networks { predictor: Some(predictor(&device[0])), regressors };
         let two = trained(&stage2, &config, fresh, &device);

@@ -61,6 +61,12 @@ impl Augment {
         }
     }
 
+    /// Whether photographs and masks differ from pass to pass.
+    pub fn changes_photographs(&self) -> bool {
+        let same = Self { background_color: self.background_color, mirror: self.mirror, ..Self::none() };
+        *self != same
+    }
+
     pub(super) fn problem(&self) -> Option<(&'static str, String)> {
         let limits = [
             ("exposure", self.exposure, 0.9),

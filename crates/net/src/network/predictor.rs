@@ -6,8 +6,9 @@ use burn::tensor::{Device, Tensor};
 
 use super::anchor::anchors;
 use super::dust3r::{Dust3r, View};
-use crate::config::{Anchor, ConfMode, NetworkConfig, Upsample};
+use crate::config::{Anchor, ConfMode, Config, Downsample, NetworkConfig, Upsample};
 use crate::crop::Window;
+use crate::resample::shrink;
 use snapsnap_ops::bilinear;
 
 /// Points and confidences on one view's pixel grid.
@@ -129,6 +130,28 @@ impl PointPredictor {
                 PointMap { points: map.points + anchors, ..map }
             }
         }
+    }
+
+    /// A head's map of a view, activated, on the `window` of the canvas that the network saw, in metres. `mask`
+    /// `[B, 1, S, S]` is the photograph's own; sides, which have none, go by the network's own opinion of where the person
+    /// is, which gets no gradient from this.
+    pub fn finished(
+        &self,
+        config: &Config,
+        view: View,
+        map: PointMap,
+        window: &Window,
+        mask: Option<Tensor<4>>,
+    ) -> PointMap {
+        let (method, factor) = (config.upsample(), config.upsample_factor());
+        let weights = (method == Upsample::MaskAware && factor > 1).then(|| match mask {
+            Some(mask) => shrink(window.cut(mask), factor, Downsample::Area),
+            None => {
+                let body = map.conf.clone().detach().greater_elem(config.network.conf_threshold);
+                body.float().unsqueeze_dim(1)
+            }
+        });
+        self.anchored(view, self.to_canvas(map, factor, method, weights), window)
     }
 
     /// Point maps of all views in one call, at network resolution and without δ: photographs `[B, 3, H, W]` in

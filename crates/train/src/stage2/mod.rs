@@ -1,5 +1,6 @@
 //! Stage 2: the regressor learns Gaussians that look like the person from every side (SNAPSNAP §9.2, LEARNING.md).
 
+mod maps;
 mod scene;
 mod scores;
 
@@ -13,6 +14,7 @@ use image::RgbImage;
 use rand::Rng;
 use snapsnap_data::dataset::{Folder, Split};
 use snapsnap_data::sample::{Joined, SampleConfig, Stage2, Stage2Item};
+use snapsnap_eval::lpips::Lpips;
 use snapsnap_net::Window;
 use snapsnap_net::config::{Config, RegressorStart};
 use snapsnap_net::network::{PointMap, PointPredictor, View, anchors};
@@ -22,14 +24,15 @@ use snapsnap_people::random::stream;
 use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
 
 use crate::TrainError;
-use crate::config::{Stage2Config, TrainConfig};
+use crate::config::{LpipsConfig, Stage2Config, TrainConfig};
 use crate::fixed::{Fixed, check_resolution};
 use crate::networks::Networks;
 use crate::photometric::Photometric;
-use crate::points::{Prediction, losses, predict};
+use crate::points::{Prediction, losses, predict, window};
 use crate::preview::{grid, heat, picture};
 use crate::task::{Moment, Part, Task, Validation};
 
+use maps::Maps;
 pub use scene::needles;
 use scene::{Phase, gaussians, targets};
 use scores::Scores;
@@ -39,15 +42,23 @@ const PREVIEWS: usize = 3;
 /// Error that a preview shows white.
 const WORST: f32 = 0.5;
 
-/// The training of the regressor on what a frozen point predictor gives.
+/// The training of the regressor on what a point predictor gives, which is frozen or trained as well.
 pub struct GaussianTask {
     networks: Config,
     losses: Stage2Config,
     /// λ of the point loss.
     confidence: f64,
     seed: u64,
-    /// One for each device that trains.
+    /// The predictor where it is frozen.
+    frozen: Option<PointPredictor>,
+    /// The same in the precision of the training, on each device that trains.
     predictors: Vec<PointPredictor>,
+    /// What it made so far, if that is kept.
+    maps: Option<Maps>,
+    /// Perceptual distance on each device that trains, if it is asked for.
+    lpips: Vec<Lpips>,
+    /// From this step on it counts.
+    lpips_from: u64,
     sets: Vec<Stage2>,
     validation: Fixed<Stage2Item>,
     /// Found once.
@@ -57,15 +68,15 @@ pub struct GaussianTask {
 }
 
 impl GaussianTask {
-    /// A training on these data sets and these devices, of which there is one at least and which have gradients; `predictor`
-    /// is not tracked and on the first of them.
+    /// A training on these data sets and these devices, of which there is one at least and which have gradients.
+    /// `predictor`, unless the config trains it as well, is the frozen one, not tracked and on the first of them.
     ///
     /// # Errors
-    /// [`TrainError`] if a data set cannot be used with this config.
+    /// [`TrainError`] if a data set cannot be used with this config, or point maps cannot be kept where it says.
     pub fn new(
         folders: &[Arc<Folder>],
         config: &TrainConfig,
-        predictor: PointPredictor,
+        predictor: Option<PointPredictor>,
         devices: &[Device],
     ) -> Result<Self, TrainError> {
         let mut sets = Vec::new();
@@ -77,15 +88,31 @@ impl GaussianTask {
         let validation = Fixed::new(folders, config, |folder, split, samples| {
             Ok(Box::new(Stage2::new(folder, split, samples)?))
         })?;
+        let (mut lpips, mut lpips_from) = (Vec::new(), 0);
+        if let Some(LpipsConfig { weight, after, files }) = &config.stage2.lpips
+            && *weight > 0.0
+        {
+            let network = Lpips::load(files, &devices[0].clone().inner())?;
+            lpips = devices.iter().map(|device| network.to_device(device)).collect();
+            lpips_from = (after * config.training.steps as f64).ceil() as u64;
+        }
         Ok(Self {
+            maps: match (&config.stage2.maps, &predictor) {
+                (Some(folder), Some(predictor)) => Some(Maps::new(folder, config, predictor)?),
+                _ => None,
+            },
             networks: config.networks(),
             losses: config.stage2.clone(),
             confidence: config.stage1.confidence,
             seed: config.training.seed,
-            predictors: devices
-                .iter()
-                .map(|device| predictor.clone().fork(&device.clone().inner()))
-                .collect(),
+            predictors: predictor.as_ref().map_or_else(Vec::new, |predictor| {
+                let networks = Networks { predictor: Some(predictor.clone()), regressors: Vec::new() };
+                let lower = config.training.precision.lower(&networks).predictor.expect("there is one");
+                devices.iter().map(|device| lower.clone().fork(&device.clone().inner())).collect()
+            }),
+            frozen: predictor,
+            lpips,
+            lpips_from,
             sets,
             validation,
             billboard: OnceLock::new(),
@@ -104,22 +131,36 @@ impl GaussianTask {
         networks: &Networks,
         item: &Stage2Item,
         (place, device): (usize, &Device),
-    ) -> Prediction {
-        let (predictor, device) = match &networks.predictor {
-            Some(predictor) => (predictor, device.clone()),
-            None => (&self.predictors[place], device.clone().inner()),
-        };
+    ) -> Result<Prediction, TrainError> {
         let side = item.side;
-        let images = TensorData::new(item.images.clone(), [1, 2, 3, side, side]);
-        let masks = TensorData::new(item.masks.clone(), [1, 2, side, side]);
-        let (images, masks) = (Tensor::from_data(images, &device), Tensor::from_data(masks, &device));
-        predict(predictor, &self.networks, images, &masks)
+        let made = |predictor: &PointPredictor, device: &Device| {
+            let images = TensorData::new(item.images.clone(), [1, 2, 3, side, side]);
+            let masks = TensorData::new(item.masks.clone(), [1, 2, side, side]);
+            let (images, masks) = (Tensor::from_data(images, device), Tensor::from_data(masks, device));
+            predict(predictor, &self.networks, images, &masks)
+        };
+        if let Some(predictor) = &networks.predictor {
+            return Ok(made(predictor, device));
+        }
+        let (predictor, device) = (&self.predictors[place], device.clone().inner());
+        match &self.maps {
+            Some(maps) => {
+                let window = || window(&self.networks, &item.masks, side);
+                Ok(maps.of(item, window, &device, || made(predictor, &device))?)
+            }
+            None => Ok(made(predictor, &device)),
+        }
     }
 
     /// Gaussians of all views, for validations.
-    fn whole(&self, networks: &Networks, item: &Stage2Item, device: &Device) -> Option<Gaussians> {
-        let prediction = self.predict(networks, item, (0, device));
-        gaussians(&self.networks, networks, item, prediction, &Phase::new(false, 0), None, device)
+    fn whole(
+        &self,
+        networks: &Networks,
+        item: &Stage2Item,
+        device: &Device,
+    ) -> Result<Option<Gaussians>, TrainError> {
+        let prediction = self.predict(networks, item, (0, device))?;
+        Ok(gaussians(&self.networks, networks, item, prediction, &Phase::new(false, 0), None, device))
     }
 
     /// Pictures of all views to compare `[V,3,h,w]`; the background alone where there is nobody.
@@ -217,7 +258,7 @@ impl Task for GaussianTask {
             };
             let noise: Option<&mut dyn FnMut() -> f32> =
                 if deviation > 0.0 { Some(&mut noise) } else { None };
-            let prediction = self.predict(networks, item, (place, device));
+            let prediction = self.predict(networks, item, (place, device))?;
             let mut add = |name, value: Tensor<1>| sums.entry(name).or_default().push(value);
             if networks.predictor.is_some() {
                 let (side, points, valid) = (item.side, item.points.clone(), item.valid.clone());
@@ -231,6 +272,9 @@ impl Task for GaussianTask {
             let cameras: Vec<Camera> = chosen.iter().map(|v| item.target_cameras[*v]).collect();
             let (image, coverage) = self.render(&gaussians, &cameras, item.background)?;
             let (target, mask) = targets(item, &chosen, device);
+            if let Some(lpips) = self.lpips.get(place).filter(|_| step >= self.lpips_from) {
+                add("lpips", lpips.distance(image.clone(), target.clone()).mean());
+            }
             let photometric = Photometric::new(image, target);
             add("l1", photometric.l1);
             add("dissimilarity", 1.0 - photometric.ssim);
@@ -250,6 +294,7 @@ impl Task for GaussianTask {
             "alpha" => self.losses.alpha,
             "scale" => phase.scale,
             "points" => self.losses.points,
+            "lpips" => self.losses.lpips.as_ref().map_or(0.0, |lpips| lpips.weight),
             _ => self.losses.needle,
         };
         let part = |(name, values): (&'static str, Vec<Tensor<1>>)| Part {
@@ -268,7 +313,7 @@ impl Task for GaussianTask {
         let mut sums = Scores::default();
         for index in self.validation.indices(self.validation.count) {
             let item = self.validation.get(index)?;
-            sums.add(&item, self.shown(&item, self.whole(networks, &item, &device), &device)?, &device);
+            sums.add(&item, self.shown(&item, self.whole(networks, &item, &device)?, &device)?, &device);
         }
         let (scores, billboard) = (sums.mean(), self.billboard()?);
         let figures = vec![
@@ -294,7 +339,7 @@ impl Task for GaussianTask {
             let mut row = vec![photo(0), photo(1)];
             let views = [0, item.target_cameras.len() - 2];
             let cameras = views.map(|v| item.target_cameras[v]);
-            let seen = match self.whole(networks, &item, &device) {
+            let seen = match self.whole(networks, &item, &device)? {
                 Some(gaussians) => host(self.render(&gaussians, &cameras, item.background)?.0),
                 None => vec![0.0; 2 * 3 * item.target_side.pow(2)],
             };
@@ -320,9 +365,11 @@ impl Task for GaussianTask {
     }
 
     fn frozen(&self, networks: &Networks) -> BTreeMap<String, Vec<f32>> {
-        if networks.predictor.is_some() {
-            return BTreeMap::new();
+        match (&networks.predictor, &self.frozen) {
+            (None, Some(frozen)) => {
+                Networks { predictor: Some(frozen.clone()), regressors: Vec::new() }.checkpoint()
+            }
+            _ => BTreeMap::new(),
         }
-        Networks { predictor: Some(self.predictors[0].clone()), regressors: Vec::new() }.checkpoint()
     }
 }

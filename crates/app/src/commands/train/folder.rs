@@ -31,7 +31,9 @@ pub fn config(arguments: &Arguments) -> Result<TrainConfig, Failure> {
         config.training.start = Some(weights.clone());
     }
     // Whole paths: a run may go on from another folder.
-    let paths = config.data.folders.iter_mut().chain(&mut config.training.start);
+    let lpips = config.stage2.lpips.iter_mut().flat_map(|lpips| &mut lpips.files);
+    let others = config.training.start.iter_mut().chain(&mut config.stage2.maps).chain(lpips);
+    let paths = config.data.folders.iter_mut().chain(others);
     for path in paths {
         *path = std::path::absolute(&*path).unwrap_or_else(|_| path.clone());
         if path.to_str().is_none() {
@@ -47,6 +49,20 @@ fn read(path: &Path, overrides: &[String]) -> Result<TrainConfig, Failure> {
     let text = file::read_text(path, MOST)
         .map_err(|e| Failure::Input(format!("{}: cannot read the config: {e}", path.display())))?;
     Ok(TrainConfig::from_toml(&text, &path.display().to_string(), overrides)?)
+}
+
+/// Refuses a folder to write into that lies in a data set, before it is made: an empty folder among a data set's would be a
+/// subject without pictures.
+pub fn outside(path: &Path, data: &[Arc<Folder>]) -> Result<(), Failure> {
+    let whole = std::path::absolute(path).map_err(|e| Failure::cannot_write(path, &e))?;
+    let there = whole.ancestors().find_map(|above| above.canonicalize().ok());
+    for folder in data {
+        let root = folder.root().canonicalize().ok();
+        if root.zip(there.as_ref()).is_some_and(|(root, there)| there.starts_with(root)) {
+            return Err(Failure::Input(format!("{}: lies in a data set", path.display())));
+        }
+    }
+    Ok(())
 }
 
 /// The folder of a run, which nobody else writes into.
@@ -68,15 +84,7 @@ impl RunFolder {
         data: &[Arc<Folder>],
     ) -> Result<Self, Failure> {
         let wrong = |message: &str| Failure::Input(format!("{}: {message}", path.display()));
-        // Before anything is made: an empty folder among a data set's would be a subject without pictures.
-        let whole = std::path::absolute(path).map_err(|e| Failure::cannot_write(path, &e))?;
-        let there = whole.ancestors().find_map(|above| above.canonicalize().ok());
-        for folder in data {
-            let root = folder.root().canonicalize().ok();
-            if root.zip(there.as_ref()).is_some_and(|(root, there)| there.starts_with(root)) {
-                return Err(wrong("lies in a data set"));
-            }
-        }
+        outside(path, data)?;
         fs::create_dir_all(path).map_err(|e| Failure::cannot_write(path, &e))?;
         let lock = path.join("lock");
         let file = OpenOptions::new().create(true).truncate(false).write(true).open(&lock);

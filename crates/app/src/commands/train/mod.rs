@@ -94,8 +94,12 @@ pub fn stage2(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
         return Err(Failure::Input(message.into()));
     };
     let weights = open(&start, &plan.config)?;
-    let predictor = weights.point_predictor(&plan.devices[0].clone().inner())?;
-    let task = GaussianTask::new(&plan.folders, &plan.config, predictor, &plan.devices)?;
+    if let Some(maps) = &plan.config.stage2.maps {
+        folder::outside(maps, &plan.folders)?;
+    }
+    let joint = plan.config.stage2.points > 0.0;
+    let frozen = (!joint).then(|| weights.point_predictor(&plan.devices[0].clone().inner())).transpose()?;
+    let task = GaussianTask::new(&plan.folders, &plan.config, frozen, &plan.devices)?;
     plan.check_validation(task.validation_samples());
     plan.run(&task, |tracked| {
         let networks = plan.config.networks();
@@ -104,7 +108,6 @@ pub fn stage2(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
         } else {
             random_regressors(&networks, plan.config.training.seed, tracked)
         };
-        let joint = plan.config.stage2.points > 0.0;
         let predictor = joint.then(|| weights.point_predictor(tracked)).transpose()?;
         Ok(Networks { predictor, regressors })
     })
@@ -120,7 +123,10 @@ impl<'a> Plan<'a> {
         if let Some(minutes) = arguments.minutes.filter(|minutes| !(*minutes > 0.0 && *minutes < 1e6)) {
             return Err(Failure::Input(format!("--minutes {minutes}: must be more than 0")));
         }
-        let config = folder::config(arguments)?;
+        let mut config = folder::config(arguments)?;
+        if arguments.dry_run {
+            config.stage2.maps = None;
+        }
         if config.data.folders.is_empty() {
             let message =
                 "no data: give --data DATASET, made with `snapsnap prepare`, or data.folders in the config";
@@ -140,6 +146,16 @@ impl<'a> Plan<'a> {
         }
         if device::is_cpu(&devices[0]) {
             memory::check("this training", least_memory(&config), "a smaller network or batch needs less")?;
+        }
+        let precision = config.training.precision;
+        for (name, device) in arguments.device.split(',').zip(&devices) {
+            if !device.supports_dtype(precision.dtype()) {
+                let message = format!(
+                    "--device {name}: does not compute in {}, which training.precision asks for; f32 goes everywhere",
+                    precision.name()
+                );
+                return Err(Failure::Input(message));
+            }
         }
         let tracked = |device: Device| match config.training.checkpointing {
             true => device.autodiff().gradient_checkpointing(),

@@ -1,0 +1,3 @@
+//! How like the truth pictures are.
+
+pub mod lpips;

@@ -1,0 +1,282 @@
+//! LPIPS v0.1 on AlexNet (Zhang et al. 2018, "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric"):
+//! distances between features of two pictures, weighted by learned layers.
+
+use std::path::PathBuf;
+
+use burn::tensor::activation::relu;
+use burn::tensor::module::{conv2d, max_pool2d};
+use burn::tensor::ops::{ConvOptions, MaxPoolOptions};
+use burn::tensor::{Device, Tensor, TensorData};
+use snapsnap_net::weights::{Source, WeightsError};
+
+/// Least side of a picture: below it nothing is left for the third layer.
+pub const MIN_SIDE: usize = 32;
+
+/// What is subtracted from red, green and blue in [−1, 1], and what they are divided by.
+const SHIFT: [f32; 3] = [-0.030, -0.088, -0.188];
+const SCALE: [f32; 3] = [0.458, 0.448, 0.450];
+/// Added to the length of a pixel's features.
+const EPSILON: f64 = 1e-10;
+
+/// A convolution of torchvision's AlexNet.
+struct Layer {
+    /// Its place in `features`.
+    place: usize,
+    /// Outputs, inputs, side of the kernel.
+    size: [usize; 3],
+    stride: usize,
+    padding: usize,
+    /// Whether the largest of 3×3 pixels, of every second, is what it sees.
+    pooled: bool,
+}
+
+const LAYERS: [Layer; 5] = [
+    Layer { place: 0, size: [64, 3, 11], stride: 4, padding: 2, pooled: false },
+    Layer { place: 3, size: [192, 64, 5], stride: 1, padding: 2, pooled: true },
+    Layer { place: 6, size: [384, 192, 3], stride: 1, padding: 1, pooled: true },
+    Layer { place: 8, size: [256, 384, 3], stride: 1, padding: 1, pooled: false },
+    Layer { place: 10, size: [256, 256, 3], stride: 1, padding: 1, pooled: false },
+];
+
+/// The network and its learned layers, not tracked.
+#[derive(Debug, Clone)]
+pub struct Lpips {
+    layers: Vec<Parameters>,
+}
+
+#[derive(Debug, Clone)]
+struct Parameters {
+    /// `[D, C, k, k]`.
+    weight: Tensor<4>,
+    /// `[D]`.
+    bias: Tensor<1>,
+    /// `[1, D, 1, 1]`.
+    linear: Tensor<4>,
+}
+
+impl Lpips {
+    /// Reads AlexNet (`features.*`; its classifier is not needed) and the learned layers (`lin0.model.1.weight` to `lin4…`),
+    /// as torchvision and the authors publish them, in one file or several.
+    ///
+    /// # Errors
+    /// [`WeightsError`] for files that cannot be read and for tensors that are missing, unknown, given twice or mis-shaped.
+    pub fn load(files: &[PathBuf], device: &Device) -> Result<Self, WeightsError> {
+        let sources = files.iter().map(|path| Source::open(path)).collect::<Result<Vec<_>, _>>()?;
+        let mut problems = Vec::new();
+        let mut find = |name: String, shape: &[usize]| {
+            let mut holders = sources.iter().filter(|source| source.tensors().contains_key(&name));
+            match (holders.next(), holders.next()) {
+                (Some(source), None) if source.tensors()[&name].shape == shape => Some((source, name)),
+                (Some(source), None) => {
+                    let there = &source.tensors()[&name].shape;
+                    problems.push(format!("mis-shaped: {name} {there:?} instead of {shape:?}"));
+                    None
+                }
+                (Some(_), Some(_)) => {
+                    problems.push(format!("given twice: {name}"));
+                    None
+                }
+                _ => {
+                    problems.push(format!("missing: {name} {shape:?}"));
+                    None
+                }
+            }
+        };
+        let mut wanted = Vec::new();
+        for (number, Layer { place, size: [outputs, inputs, side], .. }) in LAYERS.into_iter().enumerate() {
+            let weight = find(format!("features.{place}.weight"), &[outputs, inputs, side, side]);
+            let bias = find(format!("features.{place}.bias"), &[outputs]);
+            let linear = find(format!("lin{number}.model.1.weight"), &[1, outputs, 1, 1]);
+            wanted.extend([weight, bias, linear]);
+        }
+        let known: Vec<&str> = wanted.iter().flatten().map(|(_, name)| name.as_str()).collect();
+        for name in sources.iter().flat_map(|source| source.tensors().keys()) {
+            if problems.is_empty() && !known.contains(&name.as_str()) && !name.starts_with("classifier.") {
+                problems.push(format!("not part of AlexNet or LPIPS: {}", name.escape_debug()));
+            }
+        }
+        if !problems.is_empty() {
+            return Err(WeightsError::Tensors { origin: origin(files), problems });
+        }
+        let mut values = Vec::new();
+        for (source, name) in wanted.into_iter().flatten() {
+            let read = source.read_f32(&name)?;
+            if read.iter().any(|v| !v.is_finite()) {
+                let problems = vec![format!("not finite: {name}")];
+                return Err(WeightsError::Tensors { origin: origin(files), problems });
+            }
+            values.push(read);
+        }
+        let mut values = values.into_iter();
+        let mut next = || values.next().expect("three of each layer");
+        let layers = LAYERS.map(|Layer { size: [outputs, inputs, side], .. }| Parameters {
+            weight: Tensor::from_data(TensorData::new(next(), [outputs, inputs, side, side]), device),
+            bias: Tensor::from_data(TensorData::new(next(), [outputs]), device),
+            linear: Tensor::from_data(TensorData::new(next(), [1, outputs, 1, 1]), device),
+        });
+        Ok(Self { layers: layers.into() })
+    }
+
+    /// The same on another device.
+    pub fn to_device(&self, device: &Device) -> Self {
+        let moved = |layer: &Parameters| Parameters {
+            weight: layer.weight.clone().to_device(device),
+            bias: layer.bias.clone().to_device(device),
+            linear: layer.linear.clone().to_device(device),
+        };
+        Self { layers: self.layers.iter().map(moved).collect() }
+    }
+
+    /// Distance of each picture from its truth, `[B]`: pictures `[B, 3, H, W]` with values in [0, 1], sides of
+    /// [`MIN_SIDE`] at least, on the device of the network.
+    ///
+    /// # Panics
+    /// If a picture is smaller, or has another number of channels.
+    pub fn distance(&self, image: Tensor<4>, target: Tensor<4>) -> Tensor<1> {
+        let [_, channels, h, w] = image.dims();
+        assert!(channels == 3 && h.min(w) >= MIN_SIDE, "LPIPS of {h}×{w} pixels, {channels} channels");
+        let (mut x, mut y) = (normalised(image), normalised(target));
+        let mut total: Option<Tensor<1>> = None;
+        for (layer, parameters) in LAYERS.iter().zip(&self.layers) {
+            (x, y) = (parameters.run(layer, x), parameters.run(layer, y));
+            let apart = (unit(x.clone()) - unit(y.clone())).square() * parameters.linear.clone();
+            let [b, c, h, w] = apart.dims();
+            let distance = apart.reshape([b, c * h * w]).sum_dim(1).squeeze_dim(1) / (h * w) as f64;
+            total = Some(match total {
+                Some(total) => total + distance,
+                None => distance,
+            });
+        }
+        total.expect("there are layers")
+    }
+}
+
+impl Parameters {
+    fn run(&self, layer: &Layer, x: Tensor<4>) -> Tensor<4> {
+        let x = if layer.pooled { max_pool2d(x, MaxPoolOptions::new([3, 3]).with_stride([2, 2])) } else { x };
+        let options = ConvOptions::new([layer.stride; 2], [layer.padding; 2], [1, 1], 1);
+        relu(conv2d(x, self.weight.clone(), Some(self.bias.clone()), options))
+    }
+}
+
+/// Values in [0, 1] as the network was trained to see them.
+fn normalised(x: Tensor<4>) -> Tensor<4> {
+    let of_channel = |values: [f32; 3]| {
+        Tensor::<1>::from_floats(values, &x.device()).reshape([1, 3, 1, 1]).cast(x.dtype())
+    };
+    (x.clone() * 2.0 - 1.0 - of_channel(SHIFT)) / of_channel(SCALE)
+}
+
+/// Features of length 1 per pixel.
+fn unit(x: Tensor<4>) -> Tensor<4> {
+    /// The square root has no gradient at 0, which is where a pixel has no features at all.
+    const MIN_SQUARE: f64 = 1e-30;
+    let length = x.clone().square().sum_dim(1).clamp_min(MIN_SQUARE).sqrt();
+    x / (length + EPSILON)
+}
+
+fn origin(files: &[PathBuf]) -> String {
+    files.iter().map(|path| path.display().to_string()).collect::<Vec<_>>().join(", ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::collections::HashMap;
+    use std::path::Path;
+
+    use snapsnap_net::weights::write_tensors;
+
+    /// Numbers in [0, 1) that any language makes alike.
+    fn number(stream: u32, place: usize) -> f64 {
+        let mixed = (place as u32).wrapping_mul(2_654_435_761).wrapping_add(stream.wrapping_mul(40_503_121));
+        let mixed = (mixed ^ (mixed >> 15)).wrapping_mul(2_246_822_519);
+        f64::from(mixed ^ (mixed >> 13)) / 4_294_967_296.0
+    }
+
+    fn values(stream: u32, count: usize, value: impl Fn(f64) -> f64) -> Vec<f32> {
+        (0..count).map(|place| value(number(stream, place)) as f32).collect()
+    }
+
+    /// Random weights, named and shaped as the published ones.
+    fn tensors() -> Vec<(String, Vec<usize>, Vec<f32>)> {
+        let mut tensors = Vec::new();
+        for (number, Layer { place, size: [outputs, inputs, side], .. }) in LAYERS.into_iter().enumerate() {
+            let (stream, fan_in) = (number as u32, inputs * side * side);
+            let bound = (6.0 / fan_in as f64).sqrt();
+            let weight = values(3 * stream, outputs * fan_in, |u| (2.0 * u - 1.0) * bound);
+            tensors.push((format!("features.{place}.weight"), vec![outputs, inputs, side, side], weight));
+            let bias = values(3 * stream + 1, outputs, |u| 0.1 * (u - 0.5));
+            tensors.push((format!("features.{place}.bias"), vec![outputs], bias));
+            let linear = values(3 * stream + 2, outputs, |u| u);
+            tensors.push((format!("lin{number}.model.1.weight"), vec![1, outputs, 1, 1], linear));
+        }
+        tensors
+    }
+
+    fn written(folder: &Path, tensors: &[(String, Vec<usize>, Vec<f32>)], name: &str) -> PathBuf {
+        let path = folder.join(name);
+        let names = tensors.iter().map(|(name, shape, _)| (name.clone(), shape.clone())).collect();
+        let values = |i: usize| Ok(tensors[i].2.clone());
+        write_tensors(&path, name, HashMap::new(), names, values, &|_, _| ()).expect("writes");
+        path
+    }
+
+    fn picture(stream: u32, [h, w]: [usize; 2], device: &Device) -> Tensor<4> {
+        Tensor::from_data(TensorData::new(values(stream, 3 * h * w, |u| u), [1, 3, h, w]), device)
+    }
+
+    /// What the authors' package gives (docs/lpips_reference.py): distance, and norm and sum of its gradient.
+    #[test]
+    fn distances_and_gradients_are_the_authors() {
+        const EXPECTED: [([usize; 2], [f64; 3]); 3] = [
+            ([64, 64], [0.382_813_364_3, 0.093_032_305_6, -0.998_284_591_0]),
+            ([33, 97], [0.333_402_633_7, 0.072_990_611_6, -0.617_572_682_2]),
+            ([256, 160], [0.364_796_519_3, 0.023_899_100_8, -0.908_892_297_5]),
+        ];
+        let device = Device::flex().autodiff();
+        let tensors = tensors();
+        let (network, learned) = tensors.iter().cloned().partition::<Vec<_>, _>(|t| t.0.starts_with('f'));
+        let folder = tempfile::tempdir().expect("a folder");
+        let files = [(&network, "alexnet"), (&learned, "learned")];
+        let files = files.map(|(tensors, name)| written(folder.path(), tensors, name));
+        let lpips = Lpips::load(&files, &Device::flex()).expect("loads").to_device(&device);
+        for (size, [distance, norm, sum]) in EXPECTED {
+            let a = picture(100, size, &device).require_grad();
+            let b = (a.clone() + picture(101, size, &device)).detach() * 0.5;
+            let got = lpips.distance(a.clone(), b.clone());
+            let gradient = a.grad(&got.clone().sum().backward()).expect("tracked");
+            let host = |x: Tensor<1>| f64::from(x.into_scalar::<f32>());
+            let got = [host(got), host(gradient.clone().square().sum()).sqrt(), host(gradient.sum())];
+            for ((got, expected), limit) in got.into_iter().zip([distance, norm, sum]).zip([1e-5, 1e-4, 1e-3])
+            {
+                assert!((got - expected).abs() < limit * expected.abs(), "{size:?}: {got}, not {expected}");
+            }
+            assert_eq!(host(lpips.distance(b.clone(), b)), 0.0);
+        }
+    }
+
+    #[test]
+    fn weights_of_something_else_are_refused_by_name() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let problems = |tensors: &[(String, Vec<usize>, Vec<f32>)], name: &str| {
+            let file = written(folder.path(), tensors, name);
+            let error = Lpips::load(&[file], &Device::flex()).expect_err("no LPIPS");
+            error.to_string()
+        };
+        let whole = tensors();
+        let said = problems(&whole[1..], "less");
+        assert!(said.contains("missing: features.0.weight [64, 3, 11, 11]"), "{said}");
+        let mut other = whole.clone();
+        other[2].1 = vec![64, 1, 1, 1];
+        assert!(problems(&other, "other").contains("mis-shaped: lin0.model.1.weight"));
+        let mut more = whole.clone();
+        more.push(("features.12.weight".into(), vec![1], vec![0.0]));
+        assert!(problems(&more, "more").contains("not part of AlexNet or LPIPS: features.12.weight"));
+        let file = written(folder.path(), &whole, "twice");
+        let said = Lpips::load(&[file.clone(), file], &Device::flex()).expect_err("twice").to_string();
+        assert!(said.contains("given twice: features.0.weight"), "{said}");
+        let said = Lpips::load(&[PathBuf::from("nowhere.pth")], &Device::flex()).expect_err("nothing");
+        assert!(said.to_string().contains("nowhere.pth"));
+    }
+}

@@ -1,0 +1,136 @@
+//! Steps in 16 bits: weights, moments, losses, norms and the rasteriser stay in f32; matrix products and convolutions, and
+//! what is kept for the backward pass, do not.
+
+use burn::module::{Module, ModuleMapper, Param};
+use burn::tensor::{FloatDType, Tensor};
+use serde::{Deserialize, Serialize};
+
+use crate::networks::Networks;
+
+/// What the networks compute in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Precision {
+    /// 24 bits of mantissa.
+    #[default]
+    F32,
+    /// 8 bits of mantissa, the range of f32.
+    Bf16,
+    /// 11 bits of mantissa, up to 65,504: the loss is scaled, so that small gradients do not vanish.
+    F16,
+}
+
+impl Precision {
+    /// As in configs.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::F32 => "f32",
+            Self::Bf16 => "bf16",
+            Self::F16 => "f16",
+        }
+    }
+
+    /// Burn's name.
+    pub fn dtype(self) -> FloatDType {
+        match self {
+            Self::F32 => FloatDType::F32,
+            Self::Bf16 => FloatDType::BF16,
+            Self::F16 => FloatDType::F16,
+        }
+    }
+
+    /// The networks in this precision; gradients lead back to those that were given. Norms and δ stay as they are.
+    pub fn lower(self, networks: &Networks) -> Networks {
+        let mut networks = networks.clone();
+        if self != Self::F32 {
+            let mut lower = Lower { dtype: self.dtype(), open: Vec::new() };
+            networks.predictor = networks.predictor.map(|predictor| predictor.map(&mut lower));
+            networks.regressors = networks.regressors.into_iter().map(|net| net.map(&mut lower)).collect();
+        }
+        networks
+    }
+}
+
+struct Lower {
+    dtype: FloatDType,
+    /// Kinds of the open modules.
+    open: Vec<String>,
+}
+
+impl ModuleMapper for Lower {
+    fn enter_module(&mut self, _name: &str, container_type: &str) {
+        self.open.push(container_type.to_owned());
+    }
+
+    fn exit_module(&mut self, _name: &str, _container_type: &str) {
+        self.open.pop();
+    }
+
+    fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
+        let is_layer = |kind: &String| {
+            ["Struct:Linear", "Struct:Conv2d", "Struct:ConvTranspose2d"].contains(&kind.as_str())
+        };
+        if !self.open.last().is_some_and(is_layer) {
+            return param;
+        }
+        let (id, values, mapper) = param.consume();
+        Param::from_mapped_value(id, values.cast(self.dtype), mapper)
+    }
+}
+
+/// What the loss is multiplied by before it is differentiated, and its gradients are divided by: halved where a gradient
+/// is not finite, doubled after long without.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LossScale {
+    /// A power of two.
+    pub factor: f64,
+    /// Steps since it was changed.
+    pub steps: u64,
+}
+
+impl LossScale {
+    /// Where a training begins, and the most there is: twenty failed steps in a row reach 1 from here.
+    const MOST: f64 = 65_536.0;
+    /// Steps until a larger one is tried.
+    const PATIENCE: u64 = 2000;
+
+    /// That of a training in this precision.
+    pub fn new(precision: Precision) -> Self {
+        Self { factor: if precision == Precision::F16 { Self::MOST } else { 1.0 }, steps: 0 }
+    }
+
+    /// After a step that was made, or was not because of its gradients.
+    pub fn update(&mut self, precision: Precision, made: bool) {
+        if precision != Precision::F16 {
+            return;
+        }
+        self.steps += 1;
+        if !made {
+            *self = Self { factor: (self.factor / 2.0).max(1.0), steps: 0 };
+        } else if self.steps >= Self::PATIENCE {
+            *self = Self { factor: (self.factor * 2.0).min(Self::MOST), steps: 0 };
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_loss_scale_falls_at_once_and_rises_late() {
+        let mut scale = LossScale::new(Precision::F16);
+        scale.update(Precision::F16, false);
+        assert_eq!(scale, LossScale { factor: 32_768.0, steps: 0 });
+        (0..1999).for_each(|_| scale.update(Precision::F16, true));
+        assert_eq!(scale, LossScale { factor: 32_768.0, steps: 1999 });
+        scale.update(Precision::F16, true);
+        assert_eq!(scale, LossScale { factor: 65_536.0, steps: 0 });
+        (0..40).for_each(|_| scale.update(Precision::F16, false));
+        assert_eq!(scale.factor, 1.0);
+        let mut one = LossScale::new(Precision::Bf16);
+        one.update(Precision::Bf16, false);
+        assert_eq!(one, LossScale { factor: 1.0, steps: 0 });
+    }
+}
