@@ -2,7 +2,8 @@
 
     pip install torch
     cargo bench --workspace --bench step --no-run       # prints the program's path
-    python docs/step_pytorch.py PROGRAM [--threads 2] [--seconds 20] [--side 256] [--batch 2]
+    python docs/step_pytorch.py PROGRAM [--threads 2] [--seconds 20] [--side 256] [--batch 2] [--network tiny]
+    python docs/step_pytorch.py PROGRAM --memory [...]  # each network alone, and the most memory of its process
 
 Both networks are those of SNAPSNAP sections 1, 2 and 8, in their plainest form, with PyTorch's own operators; the loss is
 the mean square of what comes out. Forward and backward, the fastest of all repetitions; programs take turns.
@@ -10,15 +11,22 @@ the mean square of what comes out. Forward and backward, the fastest of all repe
 
 import argparse
 import os
+import resource
 import subprocess
+import sys
 import time
 
 import torch
 from torch import nn
 from torch.nn import functional
 
-WIDTH, HEADS, PATCH = 192, 3, 16
-BRANCHES, FEATURES, LAST = (32, 64, 96, 128), 64, 32
+PATCH = 16
+# Width, heads, blocks of the encoder and of each decoder, the four layers that the heads read; the heads' widths.
+NETWORKS = {
+    "small": (192, 3, 6, 4, (0, 2, 3, 4), (32, 64, 96, 128), 64, 32),
+    "tiny": (128, 4, 4, 3, (0, 1, 2, 3), (16, 32, 48, 64), 32, 16),
+}
+WIDTH, HEADS, ENCODER, DECODER, HOOKS, BRANCHES, FEATURES, LAST = NETWORKS["small"]
 
 
 def tables(rows, columns, channels):
@@ -127,9 +135,9 @@ class Predictor(nn.Module):
         self.grid = (side // PATCH, side // PATCH)
         self.table = tables(*self.grid, WIDTH // HEADS)
         self.patches = nn.Conv2d(3, WIDTH, PATCH, PATCH)
-        self.encoder = nn.ModuleList(Block(False) for _ in range(6))
+        self.encoder = nn.ModuleList(Block(False) for _ in range(ENCODER))
         self.norm, self.embed = nn.LayerNorm(WIDTH, eps=1e-6), nn.Linear(WIDTH, WIDTH)
-        self.decoders = nn.ModuleList(nn.ModuleList(Block(True) for _ in range(4)) for _ in range(2))
+        self.decoders = nn.ModuleList(nn.ModuleList(Block(True) for _ in range(DECODER)) for _ in range(2))
         self.last = nn.LayerNorm(WIDTH, eps=1e-6)
         self.heads = nn.ModuleList(Head() for _ in range(4))
 
@@ -146,9 +154,8 @@ class Predictor(nn.Module):
         for side in sides:
             side[-1] = self.last(side[-1])
         fused = [(a + b) * 0.5 for a, b in zip(*sides)]
-        hooks = (0, 2, 3, 4)
         return [
-            head([maps[i] for i in hooks], self.grid)
+            head([maps[i] for i in HOOKS], self.grid)
             for head, maps in zip(self.heads, (*sides, fused, fused))
         ]
 
@@ -222,18 +229,36 @@ def main():
     parser.add_argument("--seconds", type=float, default=20)
     parser.add_argument("--side", type=int, default=256)
     parser.add_argument("--batch", type=int, default=2)
+    parser.add_argument("--network", choices=NETWORKS, default="small")
+    parser.add_argument("--memory", action="store_true")
+    parser.add_argument("--only", choices=("predictor", "regressor"), help=argparse.SUPPRESS)
     a = parser.parse_args()
+    global WIDTH, HEADS, ENCODER, DECODER, HOOKS, BRANCHES, FEATURES, LAST
+    WIDTH, HEADS, ENCODER, DECODER, HOOKS, BRANCHES, FEATURES, LAST = NETWORKS[a.network]
     torch.set_num_threads(a.threads)
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: a.threads])
     predictor, images = Predictor(a.side), torch.rand(2 * a.batch, 3, a.side, a.side)
     regressor, views = Regressor(), torch.rand(2, 6, a.side, a.side)
+    networks = (("predictor", predictor, images), ("regressor", regressor, views))
+    ours = [a.program, str(a.seconds), str(a.side), str(a.batch), "whole", a.network]
+    if a.only:
+        [(network, x)] = [(network, x) for name, network, x in networks if name == a.only]
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
+        measure(network, x, a.seconds)
+        after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
+        print(f"{a.only}, PyTorch: {after} MB at most, {before} MB of it before the first step")
+        return
+    if a.memory:
+        for name in ("predictor", "regressor"):
+            subprocess.run([*ours, name], check=True)
+            subprocess.run([sys.executable, *sys.argv, "--only", name], check=True)
+        return
     print(f"PyTorch {torch.__version__}, {a.threads} threads")
     print(f"predictor: {sum(p.numel() for p in predictor.parameters()):,} parameters")
     for turn in range(2):
-        ours = [a.program, str(a.seconds), str(a.side), str(a.batch), "whole"]
         print(subprocess.run(ours, capture_output=True, text=True, check=True).stdout.rstrip())
-        for name, network, x in (("predictor", predictor, images), ("regressor", regressor, views)):
+        for name, network, x in networks:
             (forward, backward), count = measure(network, x, a.seconds)
             total = forward + backward
             print(

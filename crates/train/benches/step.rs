@@ -1,7 +1,8 @@
 //! A training step, forward and backward, of the small predictor (`configs/small`, 256², batch 2) and of the regressor
 //! (two views of 256²): `cargo bench --workspace --bench step`. `docs/step_pytorch.py` runs PyTorch's beside it.
 //!
-//! Arguments: seconds per measurement (20), side (256), batch (2), and `whole` to leave out what is partly frozen.
+//! Arguments: seconds per measurement (20), side (256), batch (2); `tiny` for `configs/tiny`; `whole` to leave out what is
+//! partly frozen; `predictor` or `regressor` for one alone, so that the most memory that is said to be used is its own.
 
 use std::hint::black_box;
 use std::time::{Duration, Instant};
@@ -61,10 +62,25 @@ fn frozen(predictor: PointPredictor, trained: &[&str]) -> PointPredictor {
     if frozen.1.is_empty() { predictor } else { predictor.freeze_group(ParamGroup::from_ids(frozen.1)) }
 }
 
+fn asked_for(word: &str) -> bool {
+    std::env::args().any(|argument| argument == word)
+}
+
+/// The most memory of the process so far, as Linux tells it.
+fn peak() -> String {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"));
+    let kilobytes = line.and_then(|line| line.trim().strip_suffix(" kB")?.trim().parse::<u64>().ok());
+    kilobytes.map_or_else(String::new, |kilobytes| format!(", {} MB at most", kilobytes / 1024))
+}
+
 fn run(seconds: f64, side: usize, batch: usize) {
     let device = Device::flex().autodiff();
-    let text = include_str!("../../../configs/small/stage1.toml");
-    let config = TrainConfig::from_toml(text, "configs/small/stage1.toml", &[]).expect("a config").networks();
+    let text = match asked_for("tiny") {
+        true => include_str!("../../../configs/tiny/stage1.toml"),
+        false => include_str!("../../../configs/small/stage1.toml"),
+    };
+    let config = TrainConfig::from_toml(text, "the config", &[]).expect("a config").networks();
     let predictor = random_predictor(&config, 1, &device);
     let regressor = random_regressors(&config, 1, &device).remove(0);
     let threads = rayon::current_num_threads();
@@ -78,7 +94,7 @@ fn run(seconds: f64, side: usize, batch: usize) {
         ("front head trained", "dust3r.downstream_head1"),
         ("nothing trained", "nothing"),
     ] {
-        if !trained.is_empty() && std::env::args().any(|argument| argument == "whole") {
+        if asked_for("regressor") || (!trained.is_empty() && asked_for("whole")) {
             continue;
         }
         let predictor = frozen(predictor.clone(), &trained.split(',').collect::<Vec<_>>());
@@ -96,9 +112,12 @@ fn run(seconds: f64, side: usize, batch: usize) {
             }
             (forward, start.elapsed() - forward)
         });
-        println!("predictor, {what}, batch {batch}, {side}², {threads} threads: {time}");
+        println!("predictor, {what}, batch {batch}, {side}², {threads} threads: {time}{}", peak());
     }
 
+    if asked_for("predictor") {
+        return;
+    }
     let input = Tensor::<4>::random([2, 6, side, side], Distribution::Uniform(-1.0, 1.0), &device);
     let time = measure(seconds, || {
         let start = Instant::now();
@@ -107,5 +126,5 @@ fn run(seconds: f64, side: usize, batch: usize) {
         black_box(GradientsParams::from_grads(loss.backward(), &regressor));
         (forward, start.elapsed() - forward)
     });
-    println!("regressor, 2×{side}², {threads} threads: {time}");
+    println!("regressor, 2×{side}², {threads} threads: {time}{}", peak());
 }
