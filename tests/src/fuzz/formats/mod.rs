@@ -6,6 +6,7 @@ mod makehuman;
 mod pickle;
 mod pictures;
 mod scans;
+mod training;
 mod weights;
 
 use std::fs;
@@ -22,6 +23,7 @@ pub fn all() -> impl Iterator<Item = &'static Format> {
         scans::FORMATS,
         datasets::FORMATS,
         makehuman::FORMATS,
+        training::FORMATS,
     ];
     groups.into_iter().flatten()
 }

@@ -10,7 +10,7 @@ use super::super::Format;
 use super::{gaussians, pickle, pictures, put};
 
 /// The smallest networks that make sense.
-const CONFIG: &str = r#"# As small as it gets.
+pub const CONFIG: &str = r#"# As small as it gets.
 [network]
 enc_dim = 8
 enc_depth = 1
