@@ -20,17 +20,13 @@ pub enum TrainError {
     #[error("{0}")]
     Unsuitable(String),
     /// Too many steps in a row could not be made.
-    #[error(
-        "{count} steps in a row could not be made, the last one, {step}, because {why} (samples: {samples})"
-    )]
+    #[error("{count} steps in a row could not be made, the last one, {step}, because {why}")]
     Stuck {
         /// Steps in a row.
         count: u64,
         /// The last one.
         step: u64,
-        /// What was wrong with it.
+        /// What was wrong with it, and which samples it was made of.
         why: String,
-        /// What it was made of.
-        samples: String,
     },
 }

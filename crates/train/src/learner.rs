@@ -32,12 +32,8 @@ pub(crate) struct Learner<'a, T: Task> {
     samples: Samples<'a, T>,
 }
 
-/// Why there was no step, and what it would have been made of.
-#[derive(Debug, Clone)]
-pub(crate) struct Skipped {
-    pub why: String,
-    pub samples: String,
-}
+/// Why there was no step, and which samples it would have been made of.
+pub(crate) type Skipped = String;
 
 impl<'a, T: Task> Learner<'a, T> {
     /// At the beginning of a run; `networks` are on the first of the devices.
@@ -86,10 +82,12 @@ impl<'a, T: Task> Learner<'a, T> {
         let scale = *self.progress.loss_scale.get_or_insert_with(|| LossScale::new(t.precision));
         let (mut sum, mut values) = (Rows::new(), BTreeMap::<String, f64>::new());
         let mut all: Vec<String> = Vec::new();
+        let skipped = |why: &str, all: &[String]| Ok(Err(format!("{why} (samples: {})", all.join("; "))));
         for batch in 0..t.accumulate {
             let items = match self.samples.get(step * t.accumulate as u64 + batch as u64) {
                 Ok(items) => items,
-                Err(why) => return Ok(Err(Skipped { why, samples: all.join("; ") })),
+                // Names the file that is to blame.
+                Err(why) => return Ok(Err(why)),
             };
             all.extend(items.iter().map(|item| T::name(item).to_owned()));
             let at = Moment { step, batch: batch as u64, device: 0 };
@@ -97,23 +95,19 @@ impl<'a, T: Task> Learner<'a, T> {
             let made = match on_devices(self.task, &self.networks, self.devices, items, at, how) {
                 // A scene that the rasteriser cannot hold is a sample's affair.
                 Err(TrainError::Splat(e)) => {
-                    return Ok(Err(Skipped { why: e.to_string(), samples: all.join("; ") }));
+                    return skipped(&e.to_string(), &all);
                 }
                 made => made?,
             };
             if made.values.is_empty() {
-                let why = "no pixel is part of a person, as the point predictor sees it".into();
-                return Ok(Err(Skipped { why, samples: all.join("; ") }));
+                return skipped("no pixel is part of a person, as the point predictor sees it", &all);
             }
             for (name, value) in &made.values {
                 *values.entry((*name).to_owned()).or_default() += value;
             }
             match made.gradients {
                 Some(gradients) => gradients::add(&mut sum, gradients),
-                None => {
-                    let why = "the loss is not finite".into();
-                    return Ok(Err(Skipped { why, samples: all.join("; ") }));
-                }
+                None => return skipped("the loss is not finite", &all),
             }
         }
         let norm = gradients::norm(&sum);
@@ -121,7 +115,7 @@ impl<'a, T: Task> Learner<'a, T> {
         let scale = self.progress.loss_scale.as_mut().expect("set above");
         scale.update(t.precision, clipped.is_some());
         let Some(factor) = clipped else {
-            return Ok(Err(Skipped { why: "a gradient is not finite".into(), samples: all.join("; ") }));
+            return skipped("a gradient is not finite", &all);
         };
         let share = self.config.schedule.share(step as usize, t.steps);
         let networks = std::mem::take(&mut self.networks);

@@ -129,8 +129,7 @@ pub fn rehearse<T: Task>(
             start = Instant::now();
         }
         if let Err(skipped) = learner.step()? {
-            let message = format!("no step can be made: {} ({})", skipped.why, skipped.samples);
-            return Err(TrainError::Unsuitable(message));
+            return Err(TrainError::Unsuitable(format!("no step can be made: {skipped}")));
         }
     }
     let step = start.elapsed() / STEPS[1];
@@ -194,11 +193,11 @@ impl<'a, T: Task> Session<'a, T> {
         match made {
             Ok(values) if due(t.log_every) => self.report(values)?,
             Ok(_) => {}
-            Err(skipped) => {
-                let (step, why, samples) = (now - 1, skipped.why, skipped.samples);
-                self.watch.note(&format!("step {step} skipped: {why} ({samples})"));
+            Err(why) => {
+                let step = now - 1;
+                self.watch.note(&format!("step {step} skipped: {why}"));
                 if self.learner.progress.skipped_in_a_row >= PATIENCE {
-                    return Err(TrainError::Stuck { count: PATIENCE, step, why, samples });
+                    return Err(TrainError::Stuck { count: PATIENCE, step, why });
                 }
             }
         }

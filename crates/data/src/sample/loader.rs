@@ -172,11 +172,12 @@ fn work<I, O>(
     sender: &Sender<(usize, Made<O>)>,
 ) {
     while let Some(claimed) = turns.claim(order.len().div_ceil(batch), ahead) {
-        let rows = order[claimed * batch..].iter().take(batch).copied().collect();
+        let rows: Vec<usize> = order[claimed * batch..].iter().take(batch).copied().collect();
+        let named = format!("a loader's worker panicked, at samples {rows:?}");
         let make = || dataset.get_many(rows).map(|items| batcher.batch(items, device));
         // A worker that dies would leave the consumer waiting for ever.
         let made = catch_unwind(AssertUnwindSafe(make))
-            .unwrap_or_else(|_| Err(DatasetError::new(std::io::Error::other("a loader's worker panicked"))));
+            .unwrap_or_else(|_| Err(DatasetError::new(std::io::Error::other(named))));
         if sender.send((claimed, made)).is_err() {
             return;
         }
