@@ -31,7 +31,7 @@ pub struct Progress {
     pub skipped_in_a_row: u64,
     /// Step of the best validation, and the bits of its score, which decimals might change.
     pub best: Option<(u64, u64)>,
-    /// What the loss is scaled by.
+    /// What the loss is scaled by, in f16.
     pub loss_scale: Option<LossScale>,
     /// AdamW's steps so far by parameter.
     pub times: BTreeMap<String, u64>,
@@ -75,6 +75,9 @@ pub(crate) fn load<T: Task>(
     let progress: Progress = serde_json::from_str(text).map_err(|e| wrong(format!("{PROGRESS_KEY}: {e}")))?;
     if progress.stage != T::STAGE {
         return Err(wrong(format!("is of stage {}, not of stage {}", progress.stage, T::STAGE)));
+    }
+    if progress.loss_scale.is_some_and(|scale| !scale.is_sound()) {
+        return Err(wrong(format!("{PROGRESS_KEY}: no training comes to this loss_scale")));
     }
     let mut rows = BTreeMap::new();
     for name in source.tensors().keys() {

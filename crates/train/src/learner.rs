@@ -15,7 +15,7 @@ use crate::config::TrainConfig;
 use crate::ema::Average;
 use crate::networks::{Networks, Rows};
 use crate::optimizer::Optimizer;
-use crate::precision::{LossScale, Precision};
+use crate::precision::Precision;
 use crate::task::{Moment, Task};
 use crate::{TrainError, gradients};
 
@@ -79,7 +79,9 @@ impl<'a, T: Task> Learner<'a, T> {
 
     fn update(&mut self, step: u64) -> Result<Result<BTreeMap<String, f64>, Skipped>, TrainError> {
         let t = &self.config.training;
-        let scale = *self.progress.loss_scale.get_or_insert_with(|| LossScale::new(t.precision));
+        let scale = &mut self.progress.loss_scale;
+        *scale = (t.precision == Precision::F16).then(|| scale.unwrap_or_default());
+        let scale = scale.map_or(1.0, |scale| scale.factor);
         let (mut sum, mut values) = (Rows::new(), BTreeMap::<String, f64>::new());
         let mut all: Vec<String> = Vec::new();
         let skipped = |why: &str, all: &[String]| Ok(Err(format!("{why} (samples: {})", all.join("; "))));
@@ -91,7 +93,7 @@ impl<'a, T: Task> Learner<'a, T> {
             };
             all.extend(items.iter().map(|item| T::name(item).to_owned()));
             let at = Moment { step, batch: batch as u64, device: 0 };
-            let how = How { precision: t.precision, scale: scale.factor, share: 1.0 / t.accumulate as f64 };
+            let how = How { precision: t.precision, scale, share: 1.0 / t.accumulate as f64 };
             let made = match on_devices(self.task, &self.networks, self.devices, items, at, how) {
                 // A scene that the rasteriser cannot hold is a sample's affair.
                 Err(TrainError::Splat(e)) => {
@@ -112,8 +114,9 @@ impl<'a, T: Task> Learner<'a, T> {
         }
         let norm = gradients::norm(&sum);
         let clipped = gradients::clip_factor(norm, t.clip);
-        let scale = self.progress.loss_scale.as_mut().expect("set above");
-        scale.update(t.precision, clipped.is_some());
+        if let Some(scale) = &mut self.progress.loss_scale {
+            scale.update(clipped.is_some());
+        }
         let Some(factor) = clipped else {
             return skipped("a gradient is not finite", &all);
         };

@@ -89,22 +89,26 @@ pub struct LossScale {
     pub steps: u64,
 }
 
+impl Default for LossScale {
+    /// At the beginning of a training.
+    fn default() -> Self {
+        Self { factor: Self::MOST, steps: 0 }
+    }
+}
+
 impl LossScale {
     /// Where a training begins, and the most there is: twenty failed steps in a row reach 1 from here.
     const MOST: f64 = 65_536.0;
     /// Steps until a larger one is tried.
     const PATIENCE: u64 = 2000;
 
-    /// That of a training in this precision.
-    pub fn new(precision: Precision) -> Self {
-        Self { factor: if precision == Precision::F16 { Self::MOST } else { 1.0 }, steps: 0 }
+    /// Whether a training can have come to this.
+    pub fn is_sound(&self) -> bool {
+        (1.0..=Self::MOST).contains(&self.factor) && self.steps < Self::PATIENCE
     }
 
     /// After a step that was made, or was not because of its gradients.
-    pub fn update(&mut self, precision: Precision, made: bool) {
-        if precision != Precision::F16 {
-            return;
-        }
+    pub fn update(&mut self, made: bool) {
         self.steps += 1;
         if !made {
             *self = Self { factor: (self.factor / 2.0).max(1.0), steps: 0 };
@@ -120,17 +124,14 @@ mod tests {
 
     #[test]
     fn the_loss_scale_falls_at_once_and_rises_late() {
-        let mut scale = LossScale::new(Precision::F16);
-        scale.update(Precision::F16, false);
+        let mut scale = LossScale::default();
+        scale.update(false);
         assert_eq!(scale, LossScale { factor: 32_768.0, steps: 0 });
-        (0..1999).for_each(|_| scale.update(Precision::F16, true));
+        (0..1999).for_each(|_| scale.update(true));
         assert_eq!(scale, LossScale { factor: 32_768.0, steps: 1999 });
-        scale.update(Precision::F16, true);
+        scale.update(true);
         assert_eq!(scale, LossScale { factor: 65_536.0, steps: 0 });
-        (0..40).for_each(|_| scale.update(Precision::F16, false));
+        (0..40).for_each(|_| scale.update(false));
         assert_eq!(scale.factor, 1.0);
-        let mut one = LossScale::new(Precision::Bf16);
-        one.update(Precision::Bf16, false);
-        assert_eq!(one, LossScale { factor: 1.0, steps: 0 });
     }
 }
