@@ -293,7 +293,19 @@ fn sixteen_bits_learn_what_thirty_two_do() {
         assert!((error - expected).abs() < 0.1 * expected, "{precision}: {error} instead of {expected}");
     }
     let state = fs::read(temporary.path().join("f16/state/state.safetensors")).expect("a state");
-    assert!(String::from_utf8_lossy(&state[..20_000]).contains("loss_scale"));
+    assert!(String::from_utf8_lossy(&state[..20_000]).contains("\\\"loss_scale\\\":{"));
+    // The regressor as well, on a predictor that is frozen; validations are in f32.
+    let start = temporary.path().join("f32/best.safetensors");
+    let scores = ["f32", "f16"].map(|precision| {
+        let run = temporary.path().join(format!("two-{precision}"));
+        let set = format!("--set=training.precision={precision}");
+        succeed(train(2, &config, &run).args([&set, "--set=training.steps=10"]).arg("--weights").arg(&start));
+        logged(&run, "validation/psnr_masked").last().expect("validations").1
+    });
+    println!("stage 2: {scores:?} dB");
+    assert!((scores[0] - scores[1]).abs() < 0.1, "{scores:?}");
+    let mut rehearsal = train(1, &config, &temporary.path().join("rehearsal"));
+    succeed(rehearsal.args(["--dry-run", "--set=training.precision=f16"]));
     let mut command = snapsnap();
     command.args(["train-stage1", "--device", "ndarray", "--set", "training.precision=f16", "--config"]);
     command.arg(&config).arg("--data").arg(people()).arg("-o").arg(temporary.path().join("ndarray"));
@@ -343,6 +355,34 @@ fn a_broken_sample_is_skipped_and_named_and_twenty_in_a_row_end_the_run() {
     let said = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(1), "{said}");
     assert!(said.contains("20 steps in a row") && said.contains(".png: "), "{said}");
+}
+
+/// A picture that cannot be read costs the validations it is in, but no step, and the last one is made up for.
+#[test]
+fn validations_that_cannot_be_made_cost_no_step() {
+    let (temporary, config) = place();
+    let (copy, run) = (temporary.path().join("people"), temporary.path().join("run"));
+    copy_folder(people(), &copy);
+    let train = || {
+        let mut command = snapsnap();
+        command.args(["train-stage1", "--device", "cpu", "--resume", "--config"]).arg(&config);
+        command.arg("--data").arg(&copy).arg("-o").arg(&run);
+        command
+    };
+    let pictures: Vec<PathBuf> = (0..4).map(|view| copy.join(format!("val/img/0000/{view}.png"))).collect();
+    let sound: Vec<Vec<u8>> = pictures.iter().map(|path| fs::read(path).expect("reads")).collect();
+    pictures.iter().for_each(|path| fs::write(path, b"not a picture").expect("writes"));
+    let said = refused(&mut train());
+    assert!(said.contains("no validation after step 10") && said.contains("val/img/0000/"), "{said}");
+    assert_eq!(logged(&run, "loss").len(), 40);
+    assert!(logged(&run, "validation/points_mm").is_empty() && !run.join("best.safetensors").exists());
+    pictures.iter().zip(&sound).for_each(|(path, bytes)| fs::write(path, bytes).expect("writes"));
+    succeed(&mut train());
+    assert_eq!(logged(&run, "validation/points_mm").len(), 1);
+    assert!(run.join("best.safetensors").exists() && run.join("previews/0000040.png").exists());
+    let before = results(&run);
+    succeed(&mut train());
+    assert!(results(&run) == before);
 }
 
 fn copy_folder(from: &Path, to: &Path) {

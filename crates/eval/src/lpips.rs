@@ -10,7 +10,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use snapsnap_net::weights::{Source, WeightsError};
 
 /// Least side of a picture: below it nothing is left for the third layer.
-pub const MIN_SIDE: usize = 32;
+pub const MIN_SIDE: usize = 31;
 
 /// What is subtracted from red, green and blue in [−1, 1], and what they are divided by.
 const SHIFT: [f32; 3] = [-0.030, -0.088, -0.188];

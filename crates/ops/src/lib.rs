@@ -22,6 +22,7 @@ mod tests;
 
 use std::f64::consts::FRAC_1_SQRT_2;
 
+use burn::module::Param;
 use burn::nn::Linear;
 use burn::tensor::activation::gelu;
 use burn::tensor::module::{attention, interpolate};
@@ -44,20 +45,16 @@ pub fn is_trained_fast<const D: usize>(x: &Tensor<D>) -> bool {
     x.dtype() == DType::F32 && device.is_autodiff() && device.inner() == Device::flex()
 }
 
-/// Whether `x` has 16 bits per value.
-fn is_half<const D: usize>(x: &Tensor<D>) -> bool {
-    matches!(x.dtype(), DType::F16 | DType::BF16)
-}
-
-/// `x` in f32 if it has 16 bits per value.
-pub fn widened<const D: usize>(x: Tensor<D>) -> Tensor<D> {
-    if is_half(&x) { x.cast(FloatDType::F32) } else { x }
+/// `x` in what a layer's weight is in.
+pub fn as_weight<const D: usize, const W: usize>(x: Tensor<D>, weight: &Param<Tensor<W>>) -> Tensor<D> {
+    x.cast(weight.val().dtype())
 }
 
 /// What is computed in f32 for 16 bits: norms, rotations.
 pub fn in_f32<const D: usize>(x: Tensor<D>, compute: impl FnOnce(Tensor<D>) -> Tensor<D>) -> Tensor<D> {
     let dtype = x.dtype();
-    if is_half(&x) { compute(x.cast(FloatDType::F32)).cast(dtype) } else { compute(x) }
+    let is_half = matches!(dtype, DType::F16 | DType::BF16);
+    if is_half { compute(x.cast(FloatDType::F32)).cast(dtype) } else { compute(x) }
 }
 
 /// softmax(rope(q) · rope(k)ᵀ / √head_dim) · v, heads side by side in the channels: `q` `[B, N, C]`, `k` and `v`

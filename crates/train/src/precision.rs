@@ -39,7 +39,8 @@ impl Precision {
         }
     }
 
-    /// The networks in this precision; gradients lead back to those that were given. Norms and δ stay as they are.
+    /// The networks in this precision; gradients lead back to those that were given. Norms, δ, the regressor's first
+    /// layer and the last layers of it and of the heads stay as they are.
     pub fn lower(self, networks: &Networks) -> Networks {
         let mut networks = networks.clone();
         if self != Self::F32 {
@@ -53,13 +54,30 @@ impl Precision {
 
 struct Lower {
     dtype: FloatDType,
-    /// Kinds of the open modules.
-    open: Vec<String>,
+    /// Names and kinds of the open modules.
+    open: Vec<[String; 2]>,
+}
+
+impl Lower {
+    /// Whether the open module is a layer of weights, and none that reads points or gives what is activated: points of
+    /// 2 m would be rounded by a centimetre in bf16.
+    fn applies(&self) -> bool {
+        // The innermost entry is the parameter's own.
+        let [.., [name, _], [_, kind]] = self.open.as_slice() else { return false };
+        let is_layer = ["Struct:Linear", "Struct:Conv2d", "Struct:ConvTranspose2d"].contains(&kind.as_str());
+        let in_head = self.open.iter().any(|[name, _]| name.starts_with("downstream_head"));
+        let at_an_end = match name.as_str() {
+            "conv_in" | "gs_conv" => true,
+            "at_4" | "proj" => in_head,
+            _ => false,
+        };
+        is_layer && !at_an_end
+    }
 }
 
 impl ModuleMapper for Lower {
-    fn enter_module(&mut self, _name: &str, container_type: &str) {
-        self.open.push(container_type.to_owned());
+    fn enter_module(&mut self, name: &str, container_type: &str) {
+        self.open.push([name.to_owned(), container_type.to_owned()]);
     }
 
     fn exit_module(&mut self, _name: &str, _container_type: &str) {
@@ -67,10 +85,7 @@ impl ModuleMapper for Lower {
     }
 
     fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
-        let is_layer = |kind: &String| {
-            ["Struct:Linear", "Struct:Conv2d", "Struct:ConvTranspose2d"].contains(&kind.as_str())
-        };
-        if !self.open.last().is_some_and(is_layer) {
+        if !self.applies() {
             return param;
         }
         let (id, values, mapper) = param.consume();
@@ -97,7 +112,7 @@ impl Default for LossScale {
 }
 
 impl LossScale {
-    /// Where a training begins, and the most there is: twenty failed steps in a row reach 1 from here.
+    /// Where a training begins, and the most there is: 1 is reached before twenty failed steps in a row end a run.
     const MOST: f64 = 65_536.0;
     /// Steps until a larger one is tried.
     const PATIENCE: u64 = 2000;

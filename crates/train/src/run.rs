@@ -87,8 +87,8 @@ pub fn train<T: Task>(
         session.step()?;
     }
     let progress = &session.learner.progress;
-    // A run that was finished before has nothing to write.
-    if progress.step > first || first < steps {
+    // A run that was finished before, its last validation included, has nothing to write.
+    if progress.step > first || first < steps || progress.validated < steps {
         session.finish()?;
     }
     let progress = &session.learner.progress;
@@ -124,12 +124,20 @@ pub fn rehearse<T: Task>(
     const STEPS: [u32; 2] = [5, 5];
     let mut learner = Learner::new(task, config, networks, devices);
     let mut start = Instant::now();
-    for step in 0..STEPS[0] + STEPS[1] {
-        if step == STEPS[0] {
+    let (mut made, mut failed) = (0, 0);
+    while made < STEPS[0] + STEPS[1] {
+        if made == STEPS[0] {
             start = Instant::now();
         }
-        if let Err(skipped) = learner.step()? {
-            return Err(TrainError::Unsuitable(format!("no step can be made: {skipped}")));
+        match learner.step()? {
+            Ok(_) => made += 1,
+            // The loss scale of f16 is found by trying.
+            Err(_) if learner.progress.loss_scale.is_some() && made < STEPS[0] && failed < PATIENCE => {
+                failed += 1;
+            }
+            Err(skipped) => {
+                return Err(TrainError::Unsuitable(format!("no step can be made: {skipped}")));
+            }
         }
     }
     let step = start.elapsed() / STEPS[1];
@@ -187,7 +195,8 @@ impl<'a, T: Task> Session<'a, T> {
     /// One step and what is due after it.
     fn step(&mut self) -> Result<(), TrainError> {
         let t = &self.learner.config.training;
-        let made = self.learner.step()?;
+        // What fails leaves everything as it was before the step.
+        let made = self.learner.step().or_else(|failed| self.save().and(Err(failed)))?;
         let now = self.learner.progress.step;
         let due = |every: usize| every > 0 && now.is_multiple_of(every as u64);
         match made {
@@ -204,11 +213,16 @@ impl<'a, T: Task> Session<'a, T> {
         if now >= t.steps as u64 {
             return Ok(());
         }
-        if due(t.validate_every) {
-            self.validate_or_save()?;
+        // People who cannot be read cost a validation, not the run.
+        if due(t.validate_every)
+            && let Err(e) = self.validate()
+        {
+            self.watch.note(&format!("no validation after step {now}: {e}"));
         }
-        if due(t.preview_every) {
-            self.preview()?;
+        if due(t.preview_every)
+            && let Err(e) = self.preview()
+        {
+            self.watch.note(&format!("no preview after step {now}: {e}"));
         }
         if due(t.checkpoint_every) {
             self.save()?;
@@ -218,16 +232,10 @@ impl<'a, T: Task> Session<'a, T> {
 
     /// What a run's folder holds at the session's end.
     fn finish(&mut self) -> Result<(), TrainError> {
-        if self.learner.progress.step >= self.learner.config.training.steps as u64 {
-            self.validate_or_save()?;
-            self.preview()?;
-        }
-        self.save()
-    }
-
-    /// A validation whose samples cannot be read ends the session, but costs none of its steps.
-    fn validate_or_save(&mut self) -> Result<(), TrainError> {
-        self.validate().or_else(|failed| self.save().and(Err(failed)))
+        let is_last = self.learner.progress.step >= self.learner.config.training.steps as u64;
+        let shown = if is_last { self.validate().and_then(|()| self.preview()) } else { Ok(()) };
+        self.save()?;
+        shown
     }
 
     fn report(&mut self, mut values: BTreeMap<String, f64>) -> Result<(), TrainError> {
@@ -242,21 +250,23 @@ impl<'a, T: Task> Session<'a, T> {
     }
 
     fn validate(&mut self) -> Result<(), TrainError> {
-        let networks = self.learner.averaged();
-        let Some(validation) = self.learner.task.validate(&networks)? else { return Ok(()) };
-        let step = self.learner.progress.step;
+        let (networks, step) = (self.learner.averaged(), self.learner.progress.step);
+        let Some(validation) = self.learner.task.validate(&networks)? else {
+            self.learner.progress.validated = step;
+            return Ok(());
+        };
         let named = validation.figures.iter().map(|(name, value)| (format!("validation/{name}"), *value));
         let score = ("validation/score".to_owned(), validation.score);
         // What is not finite has no place in a log, and is never the best.
         let values = named.chain([score]).filter(|(_, value)| value.is_finite()).collect();
         self.log.add(Line { step, seconds: self.seconds(), values })?;
         self.watch.validated(step, &validation);
-        let best = &mut self.learner.progress.best;
         let beats = |best: u64| validation.score < f64::from_bits(best);
-        if validation.score.is_finite() && best.is_none_or(|(_, best)| beats(best)) {
-            *best = Some((step, validation.score.to_bits()));
+        if validation.score.is_finite() && self.learner.progress.best.is_none_or(|(_, best)| beats(best)) {
             self.write(&networks, BEST)?;
+            self.learner.progress.best = Some((step, validation.score.to_bits()));
         }
+        self.learner.progress.validated = step;
         Ok(())
     }
 

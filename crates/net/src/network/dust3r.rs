@@ -12,7 +12,7 @@ use super::dpt::DptHead;
 use super::linear::LinearHead;
 use crate::config::{Fusion, HeadKind, NetworkConfig};
 use snapsnap_ops::layers::{linear, patches};
-use snapsnap_ops::{Rope, widened};
+use snapsnap_ops::{Rope, as_weight};
 
 /// One side of the person. The sides are named as seen in the front picture.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -134,7 +134,7 @@ impl Dust3r {
         let [rows, columns] = self.grid([h, w]);
         let rope = Rope::new(rows, columns, c.enc_dim / c.enc_heads, c.rope_base, &images.device());
         let proj = &self.patch_embed.proj;
-        let tokens = patches(proj, images.cast(proj.weight.val().dtype()));
+        let tokens = patches(proj, as_weight(images, &proj.weight));
         let tokens = self.enc_blocks.iter().fold(tokens, |x, block| block.forward(x, &rope));
         normalise(&self.enc_norm, tokens)
     }
@@ -160,7 +160,7 @@ impl Dust3r {
         [front, back]
     }
 
-    /// Raw x, y, z, confidence `[B, 4, H, W]` of one view in f32, from both photographs' token maps.
+    /// Raw x, y, z, confidence `[B, 4, H, W]` of one view, from both photographs' token maps.
     ///
     /// # Panics
     /// If the network has no head for `view`.
@@ -176,10 +176,10 @@ impl Dust3r {
             View::Back => back[i].clone(),
             View::Right | View::Left => self.fuse(front[i].clone(), back[i].clone(), grid),
         };
-        widened(match head {
+        match head {
             Head::Linear(head) => head.forward(tokens(self.config.dec_depth), grid),
             Head::Dpt(head) => head.forward(self.config.hooks.map(tokens), grid),
-        })
+        }
     }
 
     /// Tokens of an unseen side.

@@ -3,6 +3,7 @@
 use burn::module::Module;
 use burn::nn::{Linear, LinearConfig};
 use burn::tensor::{Device, Tensor};
+use snapsnap_ops::as_weight;
 use snapsnap_ops::layers::linear;
 
 /// Channels of a raw point map: x, y, z, confidence.
@@ -24,7 +25,7 @@ impl LinearHead {
     pub(crate) fn forward(&self, tokens: Tensor<3>, [rows, columns]: [usize; 2]) -> Tensor<4> {
         let [batch, _, _] = tokens.dims();
         let p = self.patch;
-        linear(&self.proj, tokens)
+        linear(&self.proj, as_weight(tokens, &self.proj.weight))
             .reshape([batch, rows, columns, CHANNELS, p, p])
             .permute([0, 3, 1, 4, 2, 5])
             .reshape([batch, CHANNELS, rows * p, columns * p])

@@ -10,66 +10,69 @@ use sha2::{Digest, Sha256};
 use snapsnap_data::sample::Stage2Item;
 use snapsnap_mesh::FileError;
 use snapsnap_net::Window;
+use snapsnap_net::config::Config;
 use snapsnap_net::network::{PointMap, PointPredictor, View};
 use snapsnap_net::weights::{Source, WeightsError, write_tensors};
 use snapsnap_ops::host;
 
 use crate::TrainError;
-use crate::config::TrainConfig;
 use crate::networks::Networks;
 use crate::points::Prediction;
+use crate::precision::Precision;
 
-/// Folder of one predictor's point maps, a file for each pair of photographs. Names follow from what the networks are, from
-/// their weights and from the photographs, so that nothing in it can be out of date.
+/// Metadata key of the checksum of a file's values.
+const CHECKSUM: &str = "snapsnap.checksum";
+
+/// Folder of one predictor's point maps, a file for each pair of photographs. Names follow from the program's version, from
+/// what the predictor is, from its weights, from the photographs, and from where and how they are computed: what is out
+/// of date is not found.
 pub(super) struct Maps {
     folder: PathBuf,
+    views: Vec<View>,
 }
 
 impl Maps {
     /// Those of this predictor below `root`.
-    ///
-    /// # Errors
-    /// [`TrainError::File`] if the folder cannot be made.
-    pub fn new(root: &Path, config: &TrainConfig, predictor: &PointPredictor) -> Result<Self, TrainError> {
+    pub fn new(root: &Path, config: &Config, predictor: &PointPredictor) -> Self {
         let mut hash = Sha256::new();
-        hash.update(config.networks().resolved().to_toml());
-        hash.update(config.training.precision.name());
+        hash.update(env!("CARGO_PKG_VERSION"));
+        hash.update(config.resolved().to_toml());
         let networks = Networks { predictor: Some(predictor.clone()), regressors: Vec::new() };
         for (name, values) in networks.checkpoint() {
             hash.update(name);
             update(&mut hash, &values);
         }
-        let folder = root.join(name(hash));
-        fs::create_dir_all(&folder).map_err(FileError::write(&folder))?;
-        Ok(Self { folder })
+        Self { folder: root.join(name(hash)), views: predictor.dust3r.views().to_vec() }
     }
 
-    /// The point maps of a sample's photographs: those that are there, or else what `predict` makes, which is kept. A file
-    /// that is damaged is made again.
+    /// The point maps of a sample's photographs, computed in `precision` on `device`: those that are there, or else what
+    /// `predict` makes, which is kept. A file that is damaged is made again.
     ///
     /// # Errors
-    /// [`WeightsError::Write`] if they cannot be written.
+    /// [`TrainError`] if they cannot be written.
     pub fn of(
         &self,
         item: &Stage2Item,
         window: impl FnOnce() -> Window,
-        device: &Device,
+        (device, precision): (&Device, Precision),
         predict: impl FnOnce() -> Prediction,
-    ) -> Result<Prediction, WeightsError> {
+    ) -> Result<Prediction, TrainError> {
         let mut hash = Sha256::new();
+        hash.update(format!("{device:?} {}", precision.name()));
         update(&mut hash, &item.images);
         update(&mut hash, &item.masks);
         let path = self.folder.join(format!("{}.safetensors", name(hash)));
         if path.exists()
-            && let Some(there) = read(&path, window(), device)
+            && let Some(there) = read(&path, &self.views, window(), device)
         {
             return Ok(there);
         }
         let prediction = predict();
+        fs::create_dir_all(&self.folder).map_err(FileError::write(&self.folder))?;
         match write(&path, &prediction) {
             // Maps that are not finite are not kept; what becomes of them is the sample's affair.
             Err(WeightsError::Tensors { .. }) | Ok(()) => Ok(prediction),
-            Err(e) => Err(e),
+            Err(e) => Err(e.into()),
         }
     }
 }
@@ -95,31 +98,39 @@ fn write(path: &Path, prediction: &Prediction) -> Result<(), WeightsError> {
         names.push((format!("{}/conf", view.name()), map.conf.dims().to_vec()));
         tensors.push(host(map.conf.clone()));
     }
+    let metadata = HashMap::from([(CHECKSUM.to_owned(), checksum(&tensors))]);
     let values = |i: usize| Ok(std::mem::take(&mut tensors[i]));
-    write_tensors(path, "the point maps", HashMap::new(), names, values, &|_, _| ())
+    write_tensors(path, "the point maps", metadata, names, values, &|_, _| ())
 }
 
-/// The maps of a file, if it is whole and of this window.
-fn read(path: &Path, window: Window, device: &Device) -> Option<Prediction> {
+fn checksum(tensors: &[Vec<f32>]) -> String {
+    let mut hash = Sha256::new();
+    tensors.iter().for_each(|values| update(&mut hash, values));
+    name(hash)
+}
+
+/// The maps of a file, if it is whole and of these views and this window.
+fn read(path: &Path, views: &[View], window: Window, device: &Device) -> Option<Prediction> {
     let source = Source::open(path).ok()?;
     let (h, w) = (window.rows.len(), window.columns.len());
-    let mut maps = Vec::new();
-    for view in View::ALL {
-        let tensor = |what: &str, shape: &[usize]| {
+    let mut tensors = Vec::new();
+    for view in views {
+        for (what, shape) in [("points", &[1, h, w, 3][..]), ("conf", &[1, h, w])] {
             let key = format!("{}/{what}", view.name());
-            let entry = source.tensors().get(&key)?;
-            let values = (entry.shape == shape).then(|| source.read_f32(&key).ok())??;
-            Some(TensorData::new(values, shape.to_vec()))
-        };
-        let there = source.tensors().contains_key(&format!("{}/points", view.name()));
-        if !there && view as usize >= 2 {
-            continue;
+            let there = source.tensors().get(&key)?.shape == shape;
+            tensors.push(there.then(|| source.read_f32(&key).ok())??);
         }
-        let (points, conf) = (tensor("points", &[1, h, w, 3])?, tensor("conf", &[1, h, w])?);
-        maps.push((
-            view,
-            PointMap { points: Tensor::from_data(points, device), conf: Tensor::from_data(conf, device) },
-        ));
     }
+    if source.metadata.get(CHECKSUM) != Some(&checksum(&tensors)) {
+        return None;
+    }
+    let mut tensors = tensors.into_iter();
+    let mut next = || tensors.next().expect("two of each view");
+    let map = |view: &View| {
+        let points = Tensor::from_data(TensorData::new(next(), [1, h, w, 3]), device);
+        let conf = Tensor::from_data(TensorData::new(next(), [1, h, w]), device);
+        (*view, PointMap { points, conf })
+    };
+    let maps = views.iter().map(map).collect();
     Some(Prediction { window, maps })
 }

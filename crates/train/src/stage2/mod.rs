@@ -29,6 +29,7 @@ use crate::fixed::{Fixed, check_resolution};
 use crate::networks::Networks;
 use crate::photometric::Photometric;
 use crate::points::{Prediction, losses, predict, window};
+use crate::precision::Precision;
 use crate::preview::{grid, heat, picture};
 use crate::task::{Moment, Part, Task, Validation};
 
@@ -53,6 +54,7 @@ pub struct GaussianTask {
     frozen: Option<PointPredictor>,
     /// The same in the precision of the training, on each device that trains.
     predictors: Vec<PointPredictor>,
+    precision: Precision,
     /// What it made so far, if that is kept.
     maps: Option<Maps>,
     /// Perceptual distance on each device that trains, if it is asked for.
@@ -72,7 +74,7 @@ impl GaussianTask {
     /// `predictor`, unless the config trains it as well, is the frozen one, not tracked and on the first of them.
     ///
     /// # Errors
-    /// [`TrainError`] if a data set cannot be used with this config, or point maps cannot be kept where it says.
+    /// [`TrainError`] if a data set cannot be used with this config, or weights of LPIPS cannot be read.
     pub fn new(
         folders: &[Arc<Folder>],
         config: &TrainConfig,
@@ -98,7 +100,7 @@ impl GaussianTask {
         }
         Ok(Self {
             maps: match (&config.stage2.maps, &predictor) {
-                (Some(folder), Some(predictor)) => Some(Maps::new(folder, config, predictor)?),
+                (Some(folder), Some(predictor)) => Some(Maps::new(folder, &config.networks(), predictor)),
                 _ => None,
             },
             networks: config.networks(),
@@ -111,6 +113,7 @@ impl GaussianTask {
                 devices.iter().map(|device| lower.clone().fork(&device.clone().inner())).collect()
             }),
             frozen: predictor,
+            precision: config.training.precision,
             lpips,
             lpips_from,
             sets,
@@ -125,12 +128,13 @@ impl GaussianTask {
         self.validation.count
     }
 
-    /// What the point predictor, the one that is trained or the frozen one, makes of a sample's photographs.
+    /// What the point predictor, the one that is trained or the frozen one, makes of a sample's photographs: in a step on
+    /// one of the devices, or, with none, for a validation, in f32.
     fn predict(
         &self,
         networks: &Networks,
         item: &Stage2Item,
-        (place, device): (usize, &Device),
+        place: Option<usize>,
     ) -> Result<Prediction, TrainError> {
         let side = item.side;
         let made = |predictor: &PointPredictor, device: &Device| {
@@ -139,14 +143,20 @@ impl GaussianTask {
             let (images, masks) = (Tensor::from_data(images, device), Tensor::from_data(masks, device));
             predict(predictor, &self.networks, images, &masks)
         };
+        let device = &self.devices[place.unwrap_or(0)];
+        let inner = device.clone().inner();
         if let Some(predictor) = &networks.predictor {
-            return Ok(made(predictor, device));
+            return Ok(made(predictor, if place.is_some() { device } else { &inner }));
         }
-        let (predictor, device) = (&self.predictors[place], device.clone().inner());
+        let (predictor, precision) = match place {
+            Some(place) => (&self.predictors[place], self.precision),
+            None => (self.frozen.as_ref().expect("trained or frozen"), Precision::F32),
+        };
+        let device = inner;
         match &self.maps {
             Some(maps) => {
                 let window = || window(&self.networks, &item.masks, side);
-                Ok(maps.of(item, window, &device, || made(predictor, &device))?)
+                maps.of(item, window, (&device, precision), || made(predictor, &device))
             }
             None => Ok(made(predictor, &device)),
         }
@@ -159,7 +169,7 @@ impl GaussianTask {
         item: &Stage2Item,
         device: &Device,
     ) -> Result<Option<Gaussians>, TrainError> {
-        let prediction = self.predict(networks, item, (0, device))?;
+        let prediction = self.predict(networks, item, None)?;
         Ok(gaussians(&self.networks, networks, item, prediction, &Phase::new(false, 0), None, device))
     }
 
@@ -258,7 +268,7 @@ impl Task for GaussianTask {
             };
             let noise: Option<&mut dyn FnMut() -> f32> =
                 if deviation > 0.0 { Some(&mut noise) } else { None };
-            let prediction = self.predict(networks, item, (place, device))?;
+            let prediction = self.predict(networks, item, Some(place))?;
             let mut add = |name, value: Tensor<1>| sums.entry(name).or_default().push(value);
             if networks.predictor.is_some() {
                 let (side, points, valid) = (item.side, item.points.clone(), item.valid.clone());

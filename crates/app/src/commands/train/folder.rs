@@ -111,7 +111,8 @@ impl RunFolder {
                 read(&own, &[]).map_err(|_| wrong("holds a config.toml of something else"))?;
             }
             let start = config.training.start.as_deref().into_iter();
-            let mut inputs = start.chain(arguments.config.as_deref());
+            let lpips = config.stage2.lpips.iter().flat_map(|lpips| &lpips.files).map(PathBuf::as_path);
+            let mut inputs = start.chain(arguments.config.as_deref()).chain(lpips);
             if let Some(input) =
                 inputs.find(|input| [BEST, LAST, CONFIG].iter().any(|name| same(input, &path.join(name))))
             {

@@ -126,6 +126,8 @@ impl<'a> Plan<'a> {
         let mut config = folder::config(arguments)?;
         if arguments.dry_run {
             config.stage2.maps = None;
+            // What counts late takes time and memory as well.
+            config.stage2.lpips.iter_mut().for_each(|lpips| lpips.after = 0.0);
         }
         if config.data.folders.is_empty() {
             let message =

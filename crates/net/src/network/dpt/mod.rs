@@ -16,7 +16,7 @@ use burn::tensor::{Device, Tensor};
 
 use crate::config::NetworkConfig;
 use snapsnap_ops::layers::{conv2d, enlarge};
-use snapsnap_ops::{bilinear, is_fast};
+use snapsnap_ops::{as_weight, bilinear, is_fast};
 
 fn conv3x3(from: usize, to: usize, stride: usize, bias: bool, device: &Device) -> Conv2d {
     Conv2dConfig::new([from, to], [3, 3])
@@ -207,6 +207,7 @@ impl DptHead {
         let x = conv(&self.head.at_0, path);
         let [_, _, h, w] = x.dims();
         let x = conv(&self.head.at_2, bilinear(x, [2 * h, 2 * w], true));
-        conv2d(&self.head.at_4, x, true)
+        let last = &self.head.at_4;
+        conv2d(last, as_weight(x, &last.weight), true)
     }
 }
