@@ -228,6 +228,10 @@ fn point_maps_that_are_kept_change_nothing() {
     assert!(said.contains("stage2.maps") && said.contains("exposure"), "{said}");
     let said = refused(&["--set", "stage2.maps=maps", "--set", "stage2.points=1", "--set", "stage2.noise=0"]);
     assert!(said.contains("stage2.maps"), "{said}");
+    let said = refused(&["--set=stage2.maps="]);
+    assert!(said.contains("stage2.maps") && said.contains("folder"), "{said}");
+    let said = refused(&["--set=stage2.lpips={ weight = 1.0, files = [] }"]);
+    assert!(said.contains("stage2.lpips.files"), "{said}");
     let inside = format!("stage2.maps='{}'", people().join("maps").display());
     let said = refused(&["--set", &inside]);
     assert!(said.contains("lies in a data set"), "{said}");

@@ -185,6 +185,8 @@ mod tests {
     use std::collections::HashMap;
     use std::path::Path;
 
+    use burn::tensor::FloatDType;
+
     use snapsnap_net::weights::write_tensors;
 
     /// Numbers in [0, 1) that any language makes alike.
@@ -254,6 +256,29 @@ mod tests {
             }
             assert_eq!(host(lpips.distance(b.clone(), b)), 0.0);
         }
+    }
+
+    #[test]
+    fn the_gradient_is_that_of_finite_differences_in_f64() {
+        const STEP: f64 = 1e-6;
+        let device = Device::flex().autodiff();
+        let folder = tempfile::tempdir().expect("a folder");
+        let file = written(folder.path(), &tensors(), "all");
+        let mut lpips = Lpips::load(&[file], &Device::flex()).expect("loads").to_device(&device);
+        for layer in &mut lpips.layers {
+            layer.weight = layer.weight.clone().cast(FloatDType::F64);
+            layer.bias = layer.bias.clone().cast(FloatDType::F64);
+            layer.linear = layer.linear.clone().cast(FloatDType::F64);
+        }
+        let [a, b, along] = [7, 8, 9].map(|stream| picture(stream, [48, 40], &device).cast(FloatDType::F64));
+        let a = a.detach().require_grad();
+        let distance = |x: Tensor<4>| lpips.distance(x, b.clone());
+        let gradient = a.grad(&distance(a.clone()).sum().backward()).expect("tracked");
+        let host = |x: Tensor<1>| x.into_scalar::<f64>();
+        let got = host((gradient * along.clone().inner()).sum());
+        let at = |t: f64| host(distance(a.clone().detach() + along.clone() * t));
+        let expected = (at(STEP) - at(-STEP)) / (2.0 * STEP);
+        assert!((got - expected).abs() < 1e-6 * expected.abs(), "{got}, not {expected}");
     }
 
     #[test]

@@ -1,8 +1,8 @@
 //! A training step, forward and backward, of the small predictor (`configs/small`, 256², batch 2) and of the regressor
 //! (two views of 256²): `cargo bench --workspace --bench step`. `docs/step_pytorch.py` runs PyTorch's beside it.
 //!
-//! Arguments: seconds per measurement (20), side (256), batch (2); `tiny` for `configs/tiny`; `whole` to leave out what is
-//! partly frozen; `predictor` or `regressor` for one alone, so that the most memory that is said to be used is its own.
+//! Arguments: seconds per measurement (20), side (256), batch (2); `tiny` or `full` for that folder of `configs`; `whole` to leave out
+//! what is partly frozen; `predictor` or `regressor` for one alone, so that the most memory that is said to be used is its own.
 
 use std::hint::black_box;
 use std::time::{Duration, Instant};
@@ -76,9 +76,10 @@ fn peak() -> String {
 
 fn run(seconds: f64, side: usize, batch: usize) {
     let device = Device::flex().autodiff();
-    let text = match asked_for("tiny") {
-        true => include_str!("../../../configs/tiny/stage1.toml"),
-        false => include_str!("../../../configs/small/stage1.toml"),
+    let text = match ["tiny", "full"].map(asked_for) {
+        [true, _] => include_str!("../../../configs/tiny/stage1.toml"),
+        [_, true] => include_str!("../../../configs/full/stage1.toml"),
+        _ => include_str!("../../../configs/small/stage1.toml"),
     };
     let config = TrainConfig::from_toml(text, "the config", &[]).expect("a config").networks();
     let predictor = random_predictor(&config, 1, &device);

@@ -302,10 +302,19 @@ impl TrainConfig {
                 );
                 return Some(("stage2.lpips".into(), message));
             }
+            if lpips.files.is_empty() {
+                return Some((
+                    "stage2.lpips.files".into(),
+                    "must name AlexNet and the learned layers".into(),
+                ));
+            }
             if self.network.resolution < MIN_SIDE {
                 let message = format!("needs network.resolution of {MIN_SIDE} at least");
                 return Some(("stage2.lpips".into(), message));
             }
+        }
+        if two.maps.as_ref().is_some_and(|folder| folder.as_os_str().is_empty()) {
+            return Some(("stage2.maps".into(), "must name a folder".into()));
         }
         if two.maps.is_some() && two.points > 0.0 {
             let message = "needs a predictor that stays as it is, which `stage2.points = 0` means";
