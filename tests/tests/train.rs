@@ -361,6 +361,34 @@ fn a_broken_sample_is_skipped_and_named_and_twenty_in_a_row_end_the_run() {
     assert!(said.contains("20 steps in a row") && said.contains(".png: "), "{said}");
 }
 
+/// A person who is not in their photographs cannot be trained on; the others can.
+#[test]
+fn samples_that_show_nobody_are_skipped_and_named() {
+    let (temporary, config) = place();
+    let (copy, one) = (temporary.path().join("people"), temporary.path().join("one"));
+    copy_folder(people(), &copy);
+    for view in 0..4 {
+        let nobody = image::RgbaImage::new(64, 64);
+        nobody.save(copy.join(format!("train/img/0001/{view}.png"))).expect("writes");
+    }
+    let set = ["--set=training.steps=9", "--set=training.batch=1", "--set=network.conf_threshold=0.999"];
+    succeed(train(1, &config, &one).args(set));
+    let run = temporary.path().join("run");
+    let mut command = snapsnap();
+    command
+        .args(["train-stage2", "--device", "cpu", "--config"])
+        .arg(&config)
+        .args(set)
+        .arg("--data")
+        .arg(&copy);
+    command.arg("--weights").arg(one.join("best.safetensors")).arg("-o").arg(&run);
+    let output = command.output().expect("runs");
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success() && said.contains("skipped: no pixel is part of a person"), "{said}");
+    assert!(said.contains("0001, view ") && !said.contains("0000, view "), "{said}");
+    assert_eq!(logged(&run, "loss").len(), 9 - said.matches("skipped: ").count());
+}
+
 /// A picture that cannot be read costs the validations it is in, but no step, and the last one is made up for.
 #[test]
 fn validations_that_cannot_be_made_cost_no_step() {
