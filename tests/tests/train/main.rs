@@ -1,0 +1,60 @@
+//! `snapsnap train-stage1` and `train-stage2` as a user types them: what they leave behind, that a run which is killed,
+//! interrupted or out of disk goes on as if nothing had happened, and what is refused.
+
+mod options;
+mod refusals;
+mod resume;
+mod runs;
+mod samples;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::sync::OnceLock;
+
+use snapsnap_tests::{TRAINING, snapsnap, succeed};
+
+/// Three people to learn from and one to validate on, made once.
+fn people() -> &'static Path {
+    static PEOPLE: OnceLock<PathBuf> = OnceLock::new();
+    PEOPLE.get_or_init(|| {
+        let folder =
+            PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("people-{}", std::process::id()));
+        for (split, count) in [("train", "3"), ("val", "1")] {
+            let mut command = snapsnap();
+            command.args(["prepare", "synth", "--seed", "5", "--subjects", count, "--split", split]);
+            command.args(["--set", "views.count=4", "--set", "views.resolution=64", "-o"]).arg(&folder);
+            succeed(&mut command);
+        }
+        folder
+    })
+}
+
+/// A folder with the config above.
+fn place() -> (tempfile::TempDir, PathBuf) {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let config = temporary.path().join("train.toml");
+    fs::write(&config, TRAINING).expect("writes");
+    (temporary, config)
+}
+
+fn train(stage: u32, config: &Path, run: &Path) -> Command {
+    let mut command = snapsnap();
+    command.arg(format!("train-stage{stage}")).arg("--config").arg(config);
+    command.args(["--device", "cpu", "--data"]).arg(people()).arg("-o").arg(run);
+    command
+}
+
+/// The files that must not depend on how a run went.
+fn results(run: &Path) -> Vec<Vec<u8>> {
+    let names = ["last.safetensors", "best.safetensors", "state/state.safetensors"];
+    names.map(|name| fs::read(run.join(name)).unwrap_or_else(|e| panic!("{name}: {e}"))).to_vec()
+}
+
+/// The values of a field over the lines of a log.
+fn logged(run: &Path, name: &str) -> Vec<(u64, f64)> {
+    let text = fs::read_to_string(run.join("log.jsonl")).expect("a log");
+    let lines = text.lines().map(|line| serde_json::from_str::<serde_json::Value>(line).expect("a line"));
+    let value = |line: serde_json::Value| Some((line["step"].as_u64()?, line["values"][name].as_f64()?));
+    lines.filter_map(value).collect()
+}

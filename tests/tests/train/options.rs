@@ -1,0 +1,155 @@
+//! What a run may use beside the usual: kept point maps, perceptual distance, 16 bits.
+
+use std::collections::HashMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use snapsnap_net::weights::write_tensors;
+use snapsnap_tests::{refused, snapsnap, succeed};
+
+use super::{logged, people, place, results, train};
+
+/// Maps that were kept, all or some of them damaged, are what the predictor makes again.
+#[test]
+fn point_maps_that_are_kept_change_nothing() {
+    let (temporary, config) = place();
+    let (one, maps) = (temporary.path().join("one"), temporary.path().join("maps"));
+    const PLAIN: [&str; 6] = [
+        "exposure=0",
+        "white_balance=0",
+        "mask_erosion=0",
+        "mask_dilation=0",
+        "jpeg_quality=0",
+        "background=false",
+    ];
+    let plain = PLAIN.map(|key| format!("--set=samples.augment.{key}"));
+    succeed(train(1, &config, &one).arg("--set=training.steps=12"));
+    let learn = |run: &str, kept: bool| {
+        let run = temporary.path().join(run);
+        let mut command = train(2, &config, &run);
+        command
+            .arg("--set=training.steps=12")
+            .args(&plain)
+            .arg("--weights")
+            .arg(one.join("best.safetensors"));
+        if kept {
+            command.arg("--set").arg(format!("stage2.maps='{}'", maps.display()));
+        }
+        succeed(&mut command);
+        results(&run)
+    };
+    let live = learn("live", false);
+    assert!(learn("first", true) == live, "other bytes while maps are made");
+    let folder = fs::read_dir(&maps).expect("lists").next().expect("one predictor").expect("entry").path();
+    let files: Vec<PathBuf> =
+        fs::read_dir(&folder).expect("lists").map(|entry| entry.expect("entry").path()).collect();
+    // Four views of three people to learn from, each of which may be the front, and one to validate on, at most.
+    assert!((4..=14).contains(&files.len()), "{files:?}");
+    let before: Vec<Vec<u8>> = files.iter().map(|file| fs::read(file).expect("reads")).collect();
+    fs::write(&files[0], &before[0][..before[0].len() / 2]).expect("writes");
+    fs::write(&files[1], b"").expect("writes");
+    fs::remove_file(&files[2]).expect("removes");
+    assert!(learn("second", true) == live, "other bytes of maps that were kept");
+    for (file, before) in files.iter().zip(&before) {
+        assert!(fs::read(file).expect("reads") == *before, "{}", file.display());
+    }
+
+    let refused = |arguments: &[&str]| {
+        let mut command = train(2, &config, &temporary.path().join("wrong"));
+        command.args(&plain).arg("--weights").arg(one.join("best.safetensors"));
+        refused(command.args(arguments))
+    };
+    let said = refused(&["--set", "stage2.maps=maps", "--set", "samples.augment.exposure=0.1"]);
+    assert!(said.contains("stage2.maps") && said.contains("exposure"), "{said}");
+    let said = refused(&["--set", "stage2.maps=maps", "--set", "stage2.points=1", "--set", "stage2.noise=0"]);
+    assert!(said.contains("stage2.maps"), "{said}");
+    let said = refused(&["--set=stage2.maps="]);
+    assert!(said.contains("stage2.maps") && said.contains("folder"), "{said}");
+    let said = refused(&["--set=stage2.lpips={ weight = 1.0, files = [] }"]);
+    assert!(said.contains("stage2.lpips.files"), "{said}");
+    let inside = format!("stage2.maps='{}'", people().join("maps").display());
+    let said = refused(&["--set", &inside]);
+    assert!(said.contains("lies in a data set"), "{said}");
+}
+
+/// Random weights of AlexNet and of the learned layers.
+fn perceptual(path: &Path) {
+    let mut tensors: Vec<(String, Vec<usize>)> = Vec::new();
+    for (number, (place, outputs, inputs, side)) in
+        [(0, 64, 3, 11), (3, 192, 64, 5), (6, 384, 192, 3), (8, 256, 384, 3), (10, 256, 256, 3)]
+            .into_iter()
+            .enumerate()
+    {
+        tensors.push((format!("features.{place}.weight"), vec![outputs, inputs, side, side]));
+        tensors.push((format!("features.{place}.bias"), vec![outputs]));
+        tensors.push((format!("lin{number}.model.1.weight"), vec![1, outputs, 1, 1]));
+    }
+    let mut random = ChaCha8Rng::seed_from_u64(4);
+    let sizes: Vec<usize> = tensors.iter().map(|(_, shape)| shape.iter().product()).collect();
+    let values = |i: usize| Ok((0..sizes[i]).map(|_| random.random_range(0.0..0.05)).collect());
+    write_tensors(path, "AlexNet", HashMap::new(), tensors, values, &|_, _| ()).expect("writes");
+}
+
+#[test]
+fn perceptual_distance_counts_towards_the_end() {
+    let (temporary, config) = place();
+    let (one, two) = (temporary.path().join("one"), temporary.path().join("two"));
+    succeed(train(1, &config, &one).arg("--set=training.steps=4"));
+    let weights = temporary.path().join("alexnet.safetensors");
+    let learn = || {
+        let mut command = train(2, &config, &two);
+        command.arg("--weights").arg(one.join("best.safetensors")).arg("--set=training.steps=8");
+        let lpips = format!("{{ weight = 0.1, after = 0.5, files = ['{}'] }}", weights.display());
+        command.arg(format!("--set=stage2.lpips={lpips}"));
+        command
+    };
+    let said = refused(&mut learn());
+    assert!(said.contains("alexnet.safetensors"), "{said}");
+    perceptual(&weights);
+    succeed(&mut learn());
+    let logged = logged(&two, "lpips");
+    assert_eq!(logged.iter().map(|(step, _)| *step).collect::<Vec<_>>(), [5, 6, 7, 8]);
+    assert!(logged.iter().all(|(_, distance)| (0.0..1.0).contains(distance)), "{logged:?}");
+    let said = refused(learn().arg("--set=stage2.lpips.weight=-1"));
+    assert!(said.contains("stage2.lpips"), "{said}");
+}
+
+/// Too large a loss scale is found out within a few steps, which are skipped.
+#[test]
+fn sixteen_bits_learn_what_thirty_two_do() {
+    let (temporary, config) = place();
+    let losses = |precision: &str| {
+        let run = temporary.path().join(precision);
+        let set = format!("training.precision={precision}");
+        let said = succeed(train(1, &config, &run).args(["--set", &set]));
+        assert!(said.contains("finished after 40 steps"), "{said}");
+        logged(&run, "validation/points_mm")
+    };
+    let (_, expected) = *losses("f32").last().expect("validations");
+    for precision in ["bf16", "f16"] {
+        let (_, error) = *losses(precision).last().expect("validations");
+        println!("{precision}: {error} mm instead of {expected}");
+        assert!((error - expected).abs() < 0.1 * expected, "{precision}: {error} instead of {expected}");
+    }
+    let state = fs::read(temporary.path().join("f16/state/state.safetensors")).expect("a state");
+    assert!(String::from_utf8_lossy(&state[..20_000]).contains("\\\"loss_scale\\\":{"));
+    // The regressor as well, on a predictor that is frozen; validations are in f32.
+    let start = temporary.path().join("f32/best.safetensors");
+    let scores = ["f32", "f16"].map(|precision| {
+        let run = temporary.path().join(format!("two-{precision}"));
+        let set = format!("--set=training.precision={precision}");
+        succeed(train(2, &config, &run).args([&set, "--set=training.steps=10"]).arg("--weights").arg(&start));
+        logged(&run, "validation/psnr_masked").last().expect("validations").1
+    });
+    println!("stage 2: {scores:?} dB");
+    assert!((scores[0] - scores[1]).abs() < 0.1, "{scores:?}");
+    let mut rehearsal = train(1, &config, &temporary.path().join("rehearsal"));
+    succeed(rehearsal.args(["--dry-run", "--set=training.precision=f16"]));
+    let mut command = snapsnap();
+    command.args(["train-stage1", "--device", "ndarray", "--set", "training.precision=f16", "--config"]);
+    command.arg(&config).arg("--data").arg(people()).arg("-o").arg(temporary.path().join("ndarray"));
+    let said = refused(&mut command);
+    assert!(said.contains("training.precision") && said.contains("ndarray"), "{said}");
+}

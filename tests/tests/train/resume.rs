@@ -1,0 +1,150 @@
+//! Runs that were killed, interrupted or out of disk go on as if nothing had happened; damaged states are refused.
+
+use std::fs;
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::time::Duration;
+
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use snapsnap_tests::{refused, snapsnap, succeed};
+
+use super::{logged, place, results, train};
+
+/// Kills a training at random moments until it is done. Returns how often it was killed.
+fn killed_at_random(command: impl Fn() -> Command, random: &mut ChaCha8Rng, most: u32) -> u32 {
+    for kills in 0..most {
+        let mut child = start(command().arg("--resume"));
+        let patience = Duration::from_millis(random.random_range(50..1500));
+        std::thread::sleep(patience);
+        if let Some(status) = child.try_wait().expect("waits") {
+            assert!(status.success(), "{status}");
+            return kills;
+        }
+        child.kill().expect("kills");
+        child.wait().expect("ends");
+    }
+    succeed(command().arg("--resume"));
+    most
+}
+
+fn start(command: &mut Command) -> Child {
+    command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().expect("starts")
+}
+
+#[test]
+fn runs_that_were_killed_end_with_the_bytes_of_an_undisturbed_one() {
+    let (temporary, config) = place();
+    let undisturbed = temporary.path().join("undisturbed");
+    // Long enough to be killed often, with a checkpoint every few moments.
+    let long = ["--set", "training.steps=240"];
+    succeed(train(1, &config, &undisturbed).args(long));
+    let seed = std::env::var("SNAPSNAP_TEST_SEED").ok().and_then(|s| s.parse().ok()).unwrap_or(7);
+    println!("seed {seed}");
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    let killed = temporary.path().join("killed");
+    let command = || {
+        let mut command = train(1, &config, &killed);
+        command.args(long);
+        command
+    };
+    let kills = killed_at_random(command, &mut random, 20);
+    println!("killed {kills} times");
+    assert!(kills > 0, "the run was too short to be killed");
+    assert!(results(&undisturbed) == results(&killed), "other bytes after {kills} kills");
+    let steps = |run: &Path| logged(run, "loss").into_iter().map(|(step, _)| step).collect::<Vec<_>>();
+    assert_eq!(steps(&killed), steps(&undisturbed), "the log has every step once");
+}
+
+#[test]
+fn time_budgets_and_interrupts_end_a_session_that_goes_on_to_the_same_bytes() {
+    let (temporary, config) = place();
+    let weights = temporary.path().join("start.safetensors");
+    let one = temporary.path().join("one");
+    succeed(&mut train(1, &config, &one));
+    fs::copy(one.join("last.safetensors"), &weights).expect("copies");
+    let (whole, pieces) = (temporary.path().join("whole"), temporary.path().join("pieces"));
+    succeed(train(2, &config, &whole).arg("--weights").arg(&weights));
+    let said = succeed(train(2, &config, &pieces).arg("--weights").arg(&weights).args([
+        "--minutes",
+        "0.001",
+        "--resume",
+    ]));
+    assert!(said.contains("interrupted") && said.contains("--resume"), "{said}");
+    // The run knows its own predictor, data and config.
+    fs::remove_file(&weights).expect("removes");
+    let own = || {
+        let mut command = snapsnap();
+        command.args(["train-stage2", "--resume", "--device", "cpu", "-o"]).arg(&pieces);
+        command
+    };
+    #[cfg(unix)]
+    {
+        let child = own().stdout(Stdio::null()).stderr(Stdio::piped()).spawn().expect("starts");
+        std::thread::sleep(Duration::from_millis(700));
+        Command::new("kill").args(["-INT", &child.id().to_string()]).status().expect("kill");
+        let output = child.wait_with_output().expect("ends");
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    }
+    succeed(&mut own());
+    assert!(results(&whole) == results(&pieces), "other bytes");
+    // A finished run that is asked to go on changes nothing.
+    let before = results(&whole);
+    succeed(train(2, &config, &whole).arg("--resume"));
+    assert!(results(&whole) == before);
+}
+
+/// A limit on the size of files stands for a full disk: the checkpoint does not fit, the log does.
+#[cfg(unix)]
+#[test]
+fn a_full_disk_leaves_the_last_checkpoint_and_exit_code_2() {
+    let (temporary, config) = place();
+    let run = temporary.path().join("run");
+    succeed(train(1, &config, &run).args(["--set", "training.steps=8"]));
+    let before = results(&run);
+    let command = train(1, &config, &run);
+    let mut shell = Command::new("sh");
+    shell.args(["-c", "trap '' XFSZ; ulimit -f 20; exec \"$@\"", "sh"]).arg(command.get_program());
+    let said = refused(shell.args(command.get_args()).arg("--resume"));
+    assert!(said.contains("cannot write"), "{said}");
+    assert!(results(&run) == before, "a file was changed");
+    succeed(train(1, &config, &run).arg("--resume"));
+    assert_eq!(logged(&run, "loss").len(), 40);
+}
+
+#[test]
+fn a_damaged_state_is_refused_and_changes_nothing() {
+    let (temporary, config) = place();
+    let run = temporary.path().join("run");
+    succeed(train(1, &config, &run).args(["--set", "training.steps=2"]));
+    let (before, state) = (results(&run), run.join("state/state.safetensors"));
+    let whole = before[2].clone();
+    let header = 8 + u64::from_le_bytes(whole[..8].try_into().expect("eight bytes")) as usize;
+    let mut random = ChaCha8Rng::seed_from_u64(11);
+    let mut damaged: Vec<Vec<u8>> = [0, 7, 100, header, whole.len() / 2, whole.len() - 1]
+        .map(|length| whole[..length].to_vec())
+        .into_iter()
+        .collect();
+    for _ in 0..12 {
+        // In the header, where the bytes mean something.
+        let mut bytes = whole.clone();
+        let at = random.random_range(0..header);
+        bytes[at] = bytes[at].wrapping_add(random.random_range(1..255));
+        damaged.push(bytes);
+    }
+    for bytes in damaged {
+        fs::write(&state, &bytes).expect("writes");
+        let output = train(1, &config, &run).args(["--resume", "--set", "training.steps=2"]).output();
+        let output = output.expect("runs");
+        let said = String::from_utf8_lossy(&output.stderr);
+        // What is damaged may still be a state, of another step, say.
+        if output.status.code() != Some(0) {
+            assert_eq!(output.status.code(), Some(2), "{said}");
+            assert!(said.contains("state.safetensors") && !said.contains("panicked"), "{said}");
+            assert!(fs::read(&state).expect("reads") == bytes && results(&run)[..2] == before[..2]);
+        }
+        for (name, bytes) in ["last.safetensors", "best.safetensors"].iter().zip(&before) {
+            fs::write(run.join(name), bytes).expect("writes");
+        }
+    }
+}

@@ -1,0 +1,89 @@
+//! Runs that nothing disturbs, on one device and on two.
+
+use std::fs;
+
+use snapsnap_tests::{refused, snapsnap, succeed};
+
+use super::{logged, people, place, train};
+
+#[test]
+fn both_stages_learn_and_leave_what_a_reconstruction_needs() {
+    let (temporary, config) = place();
+    let (one, two) = (temporary.path().join("one"), temporary.path().join("two"));
+    let said = succeed(&mut train(1, &config, &one));
+    assert!(said.contains("finished after 40 steps") && said.contains("train-stage2"), "{said}");
+    let losses = logged(&one, "loss");
+    assert_eq!(losses.len(), 40);
+    let mean = |part: &[(u64, f64)]| part.iter().map(|(_, loss)| loss).sum::<f64>() / part.len() as f64;
+    assert!(mean(&losses[35..]) < 0.8 * mean(&losses[..5]), "{losses:?}");
+    let steps: Vec<u64> = logged(&one, "validation/points_mm").iter().map(|(step, _)| *step).collect();
+    assert_eq!(steps, [10, 20, 30, 40]);
+    for file in ["config.toml", "curves.svg", "previews/0000020.png", "previews/0000040.png"] {
+        assert!(one.join(file).is_file(), "{file}");
+    }
+    assert!(fs::read(one.join("events.out.tfevents.snapsnap")).expect("events").len() > 1000);
+    let svg = fs::read_to_string(one.join("curves.svg")).expect("curves");
+    assert!(svg.contains("<polyline"), "{svg}");
+
+    let weights = one.join("best.safetensors");
+    let said = succeed(train(2, &config, &two).arg("--weights").arg(&weights));
+    assert!(said.contains("reconstruct"), "{said}");
+    assert_eq!(logged(&two, "validation/psnr_masked").len(), 4);
+
+    // Both parts are in one file now, which makes a person of two photographs.
+    let view = |view: u32| people().join(format!("val/img/0000/{view}.png"));
+    let ply = temporary.path().join("human.ply");
+    let mut command = snapsnap();
+    command.arg("reconstruct").arg(view(0)).arg(view(2)).args(["--as-is", "--device", "cpu", "--weights"]);
+    succeed(command.arg(two.join("last.safetensors")).arg("-o").arg(&ply));
+    assert!(fs::metadata(&ply).expect("a file").len() > 10_000);
+}
+
+/// Two implementations on the same processor stand for two cards.
+#[test]
+fn two_devices_share_batches_and_learn_what_one_does() {
+    let (temporary, config) = place();
+    let weights = temporary.path().join("start.safetensors");
+    for stage in [1, 2] {
+        let losses = |devices: &str| {
+            let run = temporary.path().join(format!("{stage}-{devices}"));
+            let mut command = snapsnap();
+            command
+                .arg(format!("train-stage{stage}"))
+                .arg("--config")
+                .arg(&config)
+                .arg("--data")
+                .arg(people());
+            command.args(["--device", devices, "--set", "training.steps=3", "--set", "training.batch=3"]);
+            // What is random within a step follows from the device's number.
+            command.args(["--set", "stage2.noise=0", "-o"]).arg(&run);
+            if stage == 2 {
+                command.arg("--weights").arg(&weights);
+            }
+            succeed(&mut command);
+            (logged(&run, "loss"), run.join("last.safetensors"))
+        };
+        let ((one, last), (two, _)) = (losses("cpu"), losses("cpu,ndarray"));
+        println!("stage {stage}: {one:?} {two:?}");
+        for ((step, one), (_, two)) in one.iter().zip(&two) {
+            // Pixels of all samples are pooled on one device and averaged over two.
+            assert!((one - two).abs() < 0.05 * one, "stage {stage}, step {step}: {one} and {two}");
+        }
+        fs::copy(last, &weights).expect("copies");
+    }
+    let said = refused(train(1, &config, &temporary.path().join("x")).args(["--set", "training.batch=0"]));
+    assert!(said.contains("training.batch"), "{said}");
+    let mut command = snapsnap();
+    command.args(["train-stage1", "--device", "cpu,cpu,ndarray", "--config"]).arg(&config);
+    let said = refused(command.arg("--data").arg(people()).arg("-o").arg(temporary.path().join("y")));
+    assert!(said.contains("3 devices share a batch of 2"), "{said}");
+}
+
+#[test]
+fn a_rehearsal_writes_nothing_and_says_how_long_the_run_will_take() {
+    let (temporary, config) = place();
+    let run = temporary.path().join("run");
+    let said = succeed(train(1, &config, &run).arg("--dry-run"));
+    assert!(said.contains("40 steps will take about") && said.contains("memory"), "{said}");
+    assert!(!run.exists());
+}

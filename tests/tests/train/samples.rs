@@ -1,0 +1,102 @@
+//! Samples that cannot be read or show nobody cost steps or validations, not the run.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use snapsnap_tests::{refused, snapsnap, succeed};
+
+use super::{logged, people, place, results, train};
+
+#[test]
+fn a_broken_sample_is_skipped_and_named_and_twenty_in_a_row_end_the_run() {
+    let (temporary, config) = place();
+    let copy = temporary.path().join("people");
+    copy_folder(people(), &copy);
+    let broken = copy.join("train/img/0001/2.png");
+    fs::write(&broken, b"not a picture").expect("writes");
+    let one = ["--set", "training.batch=1", "--set", "training.validation_samples=0"];
+    let train = |run: &str| {
+        let mut command = snapsnap();
+        command.args(["train-stage1", "--device", "cpu", "--config"]).arg(&config).args(one);
+        command.arg("--data").arg(&copy).arg("-o").arg(temporary.path().join(run));
+        command
+    };
+    let output = train("some").output().expect("runs");
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success() && said.contains("skipped") && said.contains("img/0001/2.png"), "{said}");
+    for (subject, view) in (0..3).flat_map(|subject| (0..4).map(move |view| (subject, view))) {
+        fs::write(copy.join(format!("train/img/000{subject}/{view}.png")), b"").expect("writes");
+    }
+    let output = train("none").output().expect("runs");
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(said.contains("20 steps in a row") && said.contains(".png: "), "{said}");
+}
+
+/// A person who is not in their photographs cannot be trained on; the others can.
+#[test]
+fn samples_that_show_nobody_are_skipped_and_named() {
+    let (temporary, config) = place();
+    let (copy, one) = (temporary.path().join("people"), temporary.path().join("one"));
+    copy_folder(people(), &copy);
+    for view in 0..4 {
+        let nobody = image::RgbaImage::new(64, 64);
+        nobody.save(copy.join(format!("train/img/0001/{view}.png"))).expect("writes");
+    }
+    let set = ["--set=training.steps=9", "--set=training.batch=1", "--set=network.conf_threshold=0.999"];
+    succeed(train(1, &config, &one).args(set));
+    let run = temporary.path().join("run");
+    let mut command = snapsnap();
+    command
+        .args(["train-stage2", "--device", "cpu", "--config"])
+        .arg(&config)
+        .args(set)
+        .arg("--data")
+        .arg(&copy);
+    command.arg("--weights").arg(one.join("best.safetensors")).arg("-o").arg(&run);
+    let output = command.output().expect("runs");
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success() && said.contains("skipped: no pixel is part of a person"), "{said}");
+    assert!(said.contains("0001, view ") && !said.contains("0000, view "), "{said}");
+    assert_eq!(logged(&run, "loss").len(), 9 - said.matches("skipped: ").count());
+}
+
+/// A picture that cannot be read costs the validations it is in, but no step, and the last one is made up for.
+#[test]
+fn validations_that_cannot_be_made_cost_no_step() {
+    let (temporary, config) = place();
+    let (copy, run) = (temporary.path().join("people"), temporary.path().join("run"));
+    copy_folder(people(), &copy);
+    let train = || {
+        let mut command = snapsnap();
+        command.args(["train-stage1", "--device", "cpu", "--resume", "--config"]).arg(&config);
+        command.arg("--data").arg(&copy).arg("-o").arg(&run);
+        command
+    };
+    let pictures: Vec<PathBuf> = (0..4).map(|view| copy.join(format!("val/img/0000/{view}.png"))).collect();
+    let sound: Vec<Vec<u8>> = pictures.iter().map(|path| fs::read(path).expect("reads")).collect();
+    pictures.iter().for_each(|path| fs::write(path, b"not a picture").expect("writes"));
+    let said = refused(&mut train());
+    assert!(said.contains("no validation after step 10") && said.contains("val/img/0000/"), "{said}");
+    assert_eq!(logged(&run, "loss").len(), 40);
+    assert!(logged(&run, "validation/points_mm").is_empty() && !run.join("best.safetensors").exists());
+    pictures.iter().zip(&sound).for_each(|(path, bytes)| fs::write(path, bytes).expect("writes"));
+    succeed(&mut train());
+    assert_eq!(logged(&run, "validation/points_mm").len(), 1);
+    assert!(run.join("best.safetensors").exists() && run.join("previews/0000040.png").exists());
+    let before = results(&run);
+    succeed(&mut train());
+    assert!(results(&run) == before);
+}
+
+fn copy_folder(from: &Path, to: &Path) {
+    fs::create_dir_all(to).expect("makes");
+    for entry in fs::read_dir(from).expect("lists").map(|entry| entry.expect("entry").path()) {
+        let target = to.join(entry.file_name().expect("named"));
+        if entry.is_dir() {
+            copy_folder(&entry, &target);
+        } else {
+            fs::copy(&entry, &target).expect("copies");
+        }
+    }
+}
