@@ -123,8 +123,8 @@ fn sixteen_bits_learn_what_thirty_two_do() {
     let losses = |precision: &str| {
         let run = temporary.path().join(precision);
         let set = format!("training.precision={precision}");
-        let said = succeed(train(1, &config, &run).args(["--set", &set]));
-        assert!(said.contains("finished after 40 steps"), "{said}");
+        let said = succeed(train(1, &config, &run).args(["--set", &set, "--set=training.steps=20"]));
+        assert!(said.contains("finished after 20 steps"), "{said}");
         logged(&run, "validation/points_mm")
     };
     let (_, expected) = *losses("f32").last().expect("validations");

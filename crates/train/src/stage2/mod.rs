@@ -1,5 +1,6 @@
 //! Stage 2: the regressor learns Gaussians that look like the person from every side (SNAPSNAP §9.2, LEARNING.md).
 
+mod frozen;
 mod maps;
 mod scene;
 mod scores;
@@ -8,7 +9,6 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, OnceLock};
 
 use burn::data::dataset::Dataset;
-use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use image::RgbImage;
 use rand::Rng;
@@ -28,12 +28,11 @@ use crate::config::{LpipsConfig, Stage2Config, TrainConfig};
 use crate::fixed::{Fixed, check_resolution};
 use crate::networks::Networks;
 use crate::photometric::Photometric;
-use crate::points::{Prediction, losses, predict, window};
-use crate::precision::Precision;
+use crate::points::{Prediction, losses};
 use crate::preview::{grid, heat, picture};
 use crate::task::{Moment, Part, Task, Validation};
 
-use maps::Maps;
+use frozen::{Frozen, of_sample};
 pub use scene::needles;
 use scene::{Phase, gaussians, targets};
 use scores::Scores;
@@ -50,13 +49,8 @@ pub struct GaussianTask {
     /// λ of the point loss.
     confidence: f64,
     seed: u64,
-    /// The predictor where it is frozen.
-    frozen: Option<PointPredictor>,
-    /// The same in the precision of the training, on each device that trains.
-    predictors: Vec<PointPredictor>,
-    precision: Precision,
-    /// What it made so far, if that is kept.
-    maps: Option<Maps>,
+    /// The predictor, unless it is trained as well.
+    frozen: Option<Frozen>,
     /// Perceptual distance on each device that trains, if it is asked for.
     lpips: Vec<Lpips>,
     /// From this step on it counts.
@@ -99,21 +93,11 @@ impl GaussianTask {
             lpips_from = (after * config.training.steps as f64).ceil() as u64;
         }
         Ok(Self {
-            maps: match (&config.stage2.maps, &predictor) {
-                (Some(folder), Some(predictor)) => Some(Maps::new(folder, &config.networks(), predictor)),
-                _ => None,
-            },
             networks: config.networks(),
             losses: config.stage2.clone(),
             confidence: config.stage1.confidence,
             seed: config.training.seed,
-            predictors: predictor.as_ref().map_or_else(Vec::new, |predictor| {
-                let networks = Networks { predictor: Some(predictor.clone()), regressors: Vec::new() };
-                let lower = config.training.precision.lower(&networks).predictor.expect("there is one");
-                devices.iter().map(|device| lower.clone().fork(&device.clone().inner())).collect()
-            }),
-            frozen: predictor,
-            precision: config.training.precision,
+            frozen: predictor.map(|predictor| Frozen::new(config, predictor, devices)),
             lpips,
             lpips_from,
             sets,
@@ -129,36 +113,24 @@ impl GaussianTask {
     }
 
     /// What the point predictor, the one that is trained or the frozen one, makes of a sample's photographs: in a step on
-    /// one of the devices, or, with none, for a validation, in f32.
+    /// one of the devices, by its place, or, with none, for a validation, in f32.
     fn predict(
         &self,
         networks: &Networks,
         item: &Stage2Item,
         place: Option<usize>,
     ) -> Result<Prediction, TrainError> {
-        let side = item.side;
-        let made = |predictor: &PointPredictor, device: &Device| {
-            let images = TensorData::new(item.images.clone(), [1, 2, 3, side, side]);
-            let masks = TensorData::new(item.masks.clone(), [1, 2, side, side]);
-            let (images, masks) = (Tensor::from_data(images, device), Tensor::from_data(masks, device));
-            predict(predictor, &self.networks, images, &masks)
-        };
         let device = &self.devices[place.unwrap_or(0)];
         let inner = device.clone().inner();
-        if let Some(predictor) = &networks.predictor {
-            return Ok(made(predictor, if place.is_some() { device } else { &inner }));
-        }
-        let (predictor, precision) = match place {
-            Some(place) => (&self.predictors[place], self.precision),
-            None => (self.frozen.as_ref().expect("trained or frozen"), Precision::F32),
-        };
-        let device = inner;
-        match &self.maps {
-            Some(maps) => {
-                let window = || window(&self.networks, &item.masks, side);
-                maps.of(item, window, (&device, precision), || made(predictor, &device))
+        match (&networks.predictor, &self.frozen) {
+            (Some(predictor), _) => {
+                let device = if place.is_some() { device } else { &inner };
+                Ok(of_sample(predictor, &self.networks, item, device))
             }
-            None => Ok(made(predictor, &device)),
+            (None, frozen) => {
+                let frozen = frozen.as_ref().expect("what is not trained is frozen");
+                frozen.predict(&self.networks, item, place, &inner)
+            }
         }
     }
 
@@ -376,9 +348,7 @@ impl Task for GaussianTask {
 
     fn frozen(&self, networks: &Networks) -> BTreeMap<String, Vec<f32>> {
         match (&networks.predictor, &self.frozen) {
-            (None, Some(frozen)) => {
-                Networks { predictor: Some(frozen.clone()), regressors: Vec::new() }.checkpoint()
-            }
+            (None, Some(frozen)) => frozen.networks.checkpoint(),
             _ => BTreeMap::new(),
         }
     }
