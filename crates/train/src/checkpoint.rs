@@ -31,9 +31,9 @@ pub struct Progress {
     pub skipped_in_a_row: u64,
     /// Step of the best validation, and the bits of its score, which decimals might change.
     pub best: Option<(u64, u64)>,
-    /// Step of the last validation.
+    /// The step at which the run ended with a validation and a preview, 0 while it has not.
     #[serde(default)]
-    pub validated: u64,
+    pub shown: u64,
     /// What the loss is scaled by, in f16.
     pub loss_scale: Option<LossScale>,
     /// AdamW's steps so far by parameter.

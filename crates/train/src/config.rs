@@ -84,7 +84,7 @@ pub struct TrainingConfig {
     pub checkpoint_every: usize,
     /// Steps between two previews; 0: only at the end.
     pub preview_every: usize,
-    /// What the networks compute in, on devices that have it.
+    /// What the point predictor computes in, on devices that have it.
     pub precision: Precision,
     /// Computes what is cheap again instead of keeping it, on devices without kernels of our own.
     pub checkpointing: bool,

@@ -1,5 +1,6 @@
-//! Steps in 16 bits: weights, moments, losses, norms and the rasteriser stay in f32; matrix products and convolutions, and
-//! what is kept for the backward pass, do not.
+//! Steps in 16 bits: the point predictor's matrix products and convolutions, and what they keep for the backward pass. The
+//! regressor is left alone, whose deepest layers get gradients of rounding then (docs/training.md), as are weights, moments,
+//! norms, losses and the rasteriser.
 
 use burn::module::{Module, ModuleMapper, Param};
 use burn::tensor::{FloatDType, Tensor};
@@ -7,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::networks::Networks;
 
-/// What the networks compute in.
+/// What the point predictor computes in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Precision {
@@ -39,14 +40,13 @@ impl Precision {
         }
     }
 
-    /// The networks in this precision; gradients lead back to those that were given. Norms, δ, the regressor's first
-    /// layer and the last layers of it and of the heads stay as they are.
+    /// The networks with a predictor in this precision; gradients lead back to the one that was given. Norms, δ and the last
+    /// layers of the heads stay as they are.
     pub fn lower(self, networks: &Networks) -> Networks {
         let mut networks = networks.clone();
         if self != Self::F32 {
             let mut lower = Lower { dtype: self.dtype(), open: Vec::new() };
             networks.predictor = networks.predictor.map(|predictor| predictor.map(&mut lower));
-            networks.regressors = networks.regressors.into_iter().map(|net| net.map(&mut lower)).collect();
         }
         networks
     }
@@ -59,19 +59,14 @@ struct Lower {
 }
 
 impl Lower {
-    /// Whether the open module is a layer of weights, and none that reads points or gives what is activated: points of
-    /// 2 m would be rounded by a centimetre in bf16.
+    /// Whether the open module is a layer of weights, and none that gives what is activated: points of 2 m would be
+    /// rounded by a centimetre in bf16.
     fn applies(&self) -> bool {
         // The innermost entry is the parameter's own.
         let [.., [name, _], [_, kind]] = self.open.as_slice() else { return false };
         let is_layer = ["Struct:Linear", "Struct:Conv2d", "Struct:ConvTranspose2d"].contains(&kind.as_str());
         let in_head = self.open.iter().any(|[name, _]| name.starts_with("downstream_head"));
-        let at_an_end = match name.as_str() {
-            "conv_in" | "gs_conv" => true,
-            "at_4" | "proj" => in_head,
-            _ => false,
-        };
-        is_layer && !at_an_end
+        is_layer && !(in_head && ["at_4", "proj"].contains(&name.as_str()))
     }
 }
 

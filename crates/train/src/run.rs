@@ -87,8 +87,8 @@ pub fn train<T: Task>(
         session.step()?;
     }
     let progress = &session.learner.progress;
-    // A run that was finished before, its last validation included, has nothing to write.
-    if progress.step > first || first < steps || progress.validated < steps {
+    // A run that was finished before, its last validation and preview included, has nothing to write.
+    if progress.step > first || first < steps || progress.shown < progress.step {
         session.finish()?;
     }
     let progress = &session.learner.progress;
@@ -132,8 +132,8 @@ pub fn rehearse<T: Task>(
         match learner.step()? {
             Ok(_) => made += 1,
             // The loss scale of f16 is found by trying.
-            Err(_) if learner.progress.loss_scale.is_some() && made < STEPS[0] && failed < PATIENCE => {
-                failed += 1;
+            Err(_) if learner.progress.loss_scale.is_some() && failed < PATIENCE => {
+                (made, failed) = (0, failed + 1);
             }
             Err(skipped) => {
                 return Err(TrainError::Unsuitable(format!("no step can be made: {skipped}")));
@@ -213,16 +213,13 @@ impl<'a, T: Task> Session<'a, T> {
         if now >= t.steps as u64 {
             return Ok(());
         }
-        // People who cannot be read cost a validation, not the run.
-        if due(t.validate_every)
-            && let Err(e) = self.validate()
-        {
-            self.watch.note(&format!("no validation after step {now}: {e}"));
+        if due(t.validate_every) {
+            let validated = self.validate();
+            self.spared("validation", validated)?;
         }
-        if due(t.preview_every)
-            && let Err(e) = self.preview()
-        {
-            self.watch.note(&format!("no preview after step {now}: {e}"));
+        if due(t.preview_every) {
+            let previewed = self.preview();
+            self.spared("preview", previewed)?;
         }
         if due(t.checkpoint_every) {
             self.save()?;
@@ -234,8 +231,23 @@ impl<'a, T: Task> Session<'a, T> {
     fn finish(&mut self) -> Result<(), TrainError> {
         let is_last = self.learner.progress.step >= self.learner.config.training.steps as u64;
         let shown = if is_last { self.validate().and_then(|()| self.preview()) } else { Ok(()) };
+        if is_last && shown.is_ok() {
+            self.learner.progress.shown = self.learner.progress.step;
+        }
         self.save()?;
         shown
+    }
+
+    /// People who cannot be read or rendered cost what they were to show, not the run.
+    fn spared(&mut self, what: &str, shown: Result<(), TrainError>) -> Result<(), TrainError> {
+        match shown {
+            Err(e @ (TrainError::Unsuitable(_) | TrainError::Splat(_))) => {
+                let step = self.learner.progress.step;
+                self.watch.note(&format!("no {what} after step {step}: {e}"));
+                Ok(())
+            }
+            shown => shown,
+        }
     }
 
     fn report(&mut self, mut values: BTreeMap<String, f64>) -> Result<(), TrainError> {
@@ -251,22 +263,18 @@ impl<'a, T: Task> Session<'a, T> {
 
     fn validate(&mut self) -> Result<(), TrainError> {
         let (networks, step) = (self.learner.averaged(), self.learner.progress.step);
-        let Some(validation) = self.learner.task.validate(&networks)? else {
-            self.learner.progress.validated = step;
-            return Ok(());
-        };
+        let Some(validation) = self.learner.task.validate(&networks)? else { return Ok(()) };
+        let beats = |best: u64| validation.score < f64::from_bits(best);
+        if validation.score.is_finite() && self.learner.progress.best.is_none_or(|(_, best)| beats(best)) {
+            self.write(&networks, BEST)?;
+            self.learner.progress.best = Some((step, validation.score.to_bits()));
+        }
         let named = validation.figures.iter().map(|(name, value)| (format!("validation/{name}"), *value));
         let score = ("validation/score".to_owned(), validation.score);
         // What is not finite has no place in a log, and is never the best.
         let values = named.chain([score]).filter(|(_, value)| value.is_finite()).collect();
         self.log.add(Line { step, seconds: self.seconds(), values })?;
         self.watch.validated(step, &validation);
-        let beats = |best: u64| validation.score < f64::from_bits(best);
-        if validation.score.is_finite() && self.learner.progress.best.is_none_or(|(_, best)| beats(best)) {
-            self.write(&networks, BEST)?;
-            self.learner.progress.best = Some((step, validation.score.to_bits()));
-        }
-        self.learner.progress.validated = step;
         Ok(())
     }
 

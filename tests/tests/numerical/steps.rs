@@ -1,5 +1,6 @@
 //! Steps of a training: the same on every device, and with gradients that finite differences confirm.
 
+use std::collections::BTreeMap;
 use std::slice::from_ref;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -23,7 +24,7 @@ use snapsnap_train::networks::{Networks, Rows};
 use snapsnap_train::optimizer::MuonSettings;
 use snapsnap_train::photometric::Photometric;
 use snapsnap_train::points::{Prediction, losses};
-use snapsnap_train::precision::Precision;
+use snapsnap_train::precision::{LossScale, Precision};
 use snapsnap_train::run::{Options, Outcome, Watch, train};
 use snapsnap_train::stage1::PointTask;
 use snapsnap_train::stage2::GaussianTask;
@@ -157,7 +158,7 @@ fn a_step_of_stage_2_is_the_same_on_every_device() {
     }
 }
 
-/// Losses and gradients in 16 bits are those in 32, but for their rounding.
+/// Losses and gradients of a predictor in 16 bits are those in 32, but for their rounding.
 #[test]
 fn sixteen_bits_have_the_same_gradients_but_for_rounding() {
     let Some(device) = device() else { return };
@@ -166,40 +167,49 @@ fn sixteen_bits_have_the_same_gradients_but_for_rounding() {
         return;
     }
     let temporary = tempfile::tempdir().expect("temporary folder");
-    let folder = people(temporary.path());
-    let mut config = config();
-    config.stage2.points = 1.0;
-    let device = device.autodiff();
-    let networks = config.networks();
-    let both = Networks {
-        predictor: Some(random_predictor(&networks, 3, &device)),
-        regressors: random_regressors(&networks, 4, &device),
-    };
-    let task = GaussianTask::new(from_ref(&folder), &config, None, from_ref(&device)).expect("a task");
+    let (folder, config, device) = (people(temporary.path()), config(), device.autodiff());
+    let predictor = Some(random_predictor(&config.networks(), 3, &device));
+    let networks = Networks { predictor, regressors: Vec::new() };
+    let task = PointTask::new(from_ref(&folder), &config, from_ref(&device)).expect("a task");
     let samples = task.samples(0);
     let made = |precision: Precision| {
         let items = vec![samples.get(0).expect("reads"), samples.get(1).expect("reads")];
-        let lower = precision.lower(&both);
+        let lower = precision.lower(&networks);
         let parts = task.losses(&lower, items, Moment { step: 0, batch: 0, device: 0 }).expect("a loss");
         let weighted = parts.into_iter().map(|part| part.value * part.weight);
         let loss = Tensor::cat(weighted.collect(), 0).sum();
         let value = f64::from(loss.clone().into_scalar::<f32>());
-        let rows = gradients::collect(&both, &mut (loss * 1024.0).backward());
-        (value, rows.into_values().flat_map(values).map(f64::from).collect::<Vec<f64>>())
+        let rows = gradients::collect(&networks, &mut (loss * LossScale::default().factor).backward());
+        (value, rows.into_iter().map(|(name, row)| (name, values(row))).collect::<BTreeMap<_, _>>())
     };
-    let (loss, gradient) = made(Precision::F32);
-    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
-    // 11 and 8 bits of mantissa, through a dozen layers.
-    for (precision, of_loss, of_gradient) in [(Precision::F16, 2e-3, 1e-3), (Precision::Bf16, 2e-2, 2e-2)] {
+    let (loss, gradients) = made(Precision::F32);
+    let dot = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum::<f64>();
+    let total = gradients.values().map(|row| dot(row, row)).sum::<f64>();
+    for precision in [Precision::Bf16, Precision::F16] {
         if !device.supports_dtype(precision.dtype()) {
             println!("SKIPPED: the device does not compute in {}", precision.name());
             continue;
         }
         let (low, rough) = made(precision);
-        let cosine = dot(&gradient, &rough) / (dot(&gradient, &gradient) * dot(&rough, &rough)).sqrt();
-        println!("{}: loss {low} instead of {loss}, cosine of gradients {cosine}", precision.name());
-        assert!((low - loss).abs() <= of_loss * loss && 1.0 - cosine <= of_gradient);
         assert_ne!(low, loss, "it was computed in f32");
+        let off = (low - loss).abs() / loss;
+        let mut worst = (0.0, "", 0);
+        for (name, row) in &gradients {
+            // Where what pixels ask for cancels out, rounding is what is left.
+            if dot(row, row) > 1e-4 * total {
+                let rough = &rough[name];
+                let sine = 1.0 - dot(row, rough) / (dot(row, row) * dot(rough, rough)).sqrt();
+                worst =
+                    if sine > worst.0 { (sine, name, worst.2 + 1) } else { (worst.0, worst.1, worst.2 + 1) };
+            }
+        }
+        let (apart, name, count) = worst;
+        println!(
+            "{}: loss {off:.1e} off, {count} gradients, 1 − cosine ≤ {apart:.1e} ({name})",
+            precision.name()
+        );
+        // Rounding also carries values over kinks, of ReLU and of distances, whatever the number of bits.
+        assert!(off <= 1e-4 && apart <= 3e-3, "{name}");
     }
 }
 

@@ -18,7 +18,6 @@ pub use statistics::Statistics;
 pub use unet::{RECEPTIVE_RADIUS, UNet};
 
 use crate::config::RegressorConfig;
-use snapsnap_ops::{as_weight, is_fast, is_trained_fast};
 
 /// Channels in: red, green, blue in [−1, 1], then x, y, z in metres (front camera's frame).
 pub const INPUT_CHANNELS: usize = 6;
@@ -50,13 +49,12 @@ impl Regressor {
         let [_, channels, h, w] = input.dims();
         assert_eq!(channels, INPUT_CHANNELS, "regressor input must be [B, {INPUT_CHANNELS}, H, W]");
         assert!(h % 4 == 0 && w % 4 == 0, "regressor input {h}×{w}: both sides must be multiples of 4");
-        if is_fast(&input) && self.pred_unet.suits_cpu_kernel() {
+        if snapsnap_ops::is_fast(&input) && self.pred_unet.suits_cpu_kernel() {
             return fused::regress(&self.pred_unet, &self.gs_conv, input, statistics);
         }
-        if is_trained_fast(&input) && self.pred_unet.suits_cpu_kernel() {
+        if snapsnap_ops::is_trained_fast(&input) && self.pred_unet.suits_cpu_kernel() {
             return trained::regress(&self.pred_unet, &self.gs_conv, input, statistics);
         }
-        let features = as_weight(self.pred_unet.forward(input, statistics), &self.gs_conv.weight);
-        self.gs_conv.forward(features).permute([0, 2, 3, 1])
+        self.gs_conv.forward(self.pred_unet.forward(input, statistics)).permute([0, 2, 3, 1])
     }
 }

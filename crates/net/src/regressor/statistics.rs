@@ -2,7 +2,6 @@
 
 use burn::nn::GroupNorm;
 use burn::tensor::Tensor;
-use snapsnap_ops::in_f32;
 
 /// Means and reciprocal standard deviations of every group normalisation of one forward pass, in order of execution.
 ///
@@ -62,10 +61,6 @@ impl Statistics {
 
 /// Group normalisation of `[B, C, H, W]` with controllable statistics.
 pub(crate) fn normalise(norm: &GroupNorm, x: Tensor<4>, statistics: &mut Statistics) -> Tensor<4> {
-    in_f32(x, |x| normalise_in_f32(norm, x, statistics))
-}
-
-fn normalise_in_f32(norm: &GroupNorm, x: Tensor<4>, statistics: &mut Statistics) -> Tensor<4> {
     let [b, c, h, w] = x.dims();
     let groups = norm.num_groups;
     let [mean, rstd] = statistics.layer(|| {

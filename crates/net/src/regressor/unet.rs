@@ -6,8 +6,7 @@ use burn::module::Module;
 use burn::nn::conv::{Conv2d, Conv2dConfig};
 use burn::nn::{GroupNorm, GroupNormConfig, PaddingConfig2d};
 use burn::tensor::activation::silu;
-use burn::tensor::{DType, Device, Tensor};
-use snapsnap_ops::as_weight;
+use burn::tensor::{Device, Tensor};
 
 use super::statistics::{Statistics, normalise};
 use super::{FEATURES, INPUT_CHANNELS};
@@ -122,16 +121,14 @@ impl UNet {
         self.norm_out.num_groups
     }
 
-    /// Whether the fused CPU kernel has this width and type.
+    /// Whether the fused CPU kernel has this width.
     pub(crate) fn suits_cpu_kernel(&self) -> bool {
         self.norm_out.num_channels == snapsnap_ops::conv::CHANNELS
-            && self.conv_out.weight.val().dtype() == DType::F32
     }
 
     /// `[B, 6, H, W]`, H and W multiples of 4 → `[B, 14, H, W]`.
     pub fn forward(&self, x: Tensor<4>, statistics: &mut Statistics) -> Tensor<4> {
-        // In 16 bits the first layer, which sees coordinates, is not.
-        let mut x = as_weight(self.conv_in.forward(x), &self.conv_out.weight);
+        let mut x = self.conv_in.forward(x);
         let mut skips = vec![x.clone()];
         for block in &self.down_blocks {
             for net in &block.nets {
