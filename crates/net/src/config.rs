@@ -11,11 +11,14 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use snapsnap_splat::file;
 
-use crate::regressor::RECEPTIVE_RADIUS;
-
 pub use modes::{
     Anchor, ConfMode, Downsample, Fusion, HeadKind, RegressorStart, RotationFrame, Upsample, WorldFrame,
 };
+
+/// How far from an output pixel of the regressor an input pixel can matter, statistics aside: the reach of the 3×3 convolutions on the
+/// longest path, in pixels of the input: 14 at full size, 12 at half size (·2), 14 at a quarter (·4), and up to 3 more
+/// because an enlarged pixel lies beside, not on, the one it came from. Rounded up to a multiple of 4.
+pub const RECEPTIVE_RADIUS: usize = 100;
 
 /// Longest config that is read.
 const MAX_BYTES: u64 = 1 << 20;

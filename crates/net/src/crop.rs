@@ -116,7 +116,7 @@ mod tests {
         mask[300 * side + 203] = true;
         let person = Window::around([mask.as_slice()].into_iter(), side).expect("pixels");
         assert_eq!(person, Window { rows: 201..301, columns: 203..251 });
-        let padded = person.padded(crate::regressor::RECEPTIVE_RADIUS, side);
+        let padded = person.padded(crate::config::RECEPTIVE_RADIUS, side);
         assert_eq!(padded, Window { rows: 100..404, columns: 100..352 });
         assert_eq!(padded.indices(&mask, side), vec![(101 * 252 + 150), (200 * 252 + 103)]);
         assert_eq!(Window::around([vec![false; 16].as_slice()].into_iter(), 4), None);

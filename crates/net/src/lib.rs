@@ -4,6 +4,7 @@ pub mod config;
 mod crop;
 pub mod gaussians;
 mod memory;
+pub mod names;
 mod neighbours;
 pub mod network;
 mod reconstruct;

@@ -10,12 +10,12 @@ use burn::tensor::{Device, Tensor};
 use snapsnap_data::sample::{Batches, Loader};
 use snapsnap_ops::host;
 
-use crate::checkpoint::Progress;
 use crate::config::TrainConfig;
 use crate::ema::Average;
 use crate::networks::{Networks, Rows};
 use crate::optimizer::Optimizer;
 use crate::precision::Precision;
+use crate::progress::Progress;
 use crate::task::{Moment, Task};
 use crate::{TrainError, gradients};
 

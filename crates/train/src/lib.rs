@@ -16,6 +16,7 @@ pub mod photometric;
 pub mod points;
 pub mod precision;
 mod preview;
+mod progress;
 pub mod run;
 pub mod schedule;
 pub mod stage1;

@@ -1,4 +1,4 @@
-//! What a run leaves behind for people: `log.jsonl`, TensorBoard's events, curves.
+//! What a run leaves behind for people: `log.jsonl`, TensorBoard's events.
 
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
@@ -9,7 +9,6 @@ use serde::{Deserialize, Serialize};
 use snapsnap_mesh::FileError;
 use snapsnap_splat::file;
 
-use crate::curves;
 use crate::events::Events;
 
 /// Longest log that is read when a run goes on.
@@ -83,15 +82,6 @@ impl Log {
             .map_err(FileError::write(&self.path))?;
         self.lines.push(line);
         Ok(())
-    }
-
-    /// Draws the curves of all lines.
-    ///
-    /// # Errors
-    /// [`FileError`] if the file cannot be written.
-    pub fn draw(&self, path: &Path) -> Result<(), FileError> {
-        let svg = curves::draw(&self.lines);
-        file::write_whole(path, |out| out.write_all(svg.as_bytes())).map_err(FileError::write(path))
     }
 }
 

@@ -18,7 +18,7 @@ use crate::learner::Learner;
 use crate::log::{Line, Log};
 use crate::networks::Networks;
 use crate::task::{Task, Validation};
-use crate::{TrainError, preview};
+use crate::{TrainError, curves, preview};
 
 /// So many steps in a row may fail before a run gives up.
 const PATIENCE: u64 = 20;
@@ -299,7 +299,8 @@ impl<'a, T: Task> Session<'a, T> {
         let folder = path.parent().expect("lies in a folder");
         fs::create_dir_all(folder).map_err(FileError::write(folder))?;
         checkpoint::save(&path, &self.learner)?;
-        Ok(self.log.draw(&self.options.folder.join("curves.svg"))?)
+        let (path, svg) = (self.options.folder.join("curves.svg"), curves::draw(&self.log.lines));
+        Ok(file::write_whole(&path, |out| out.write_all(svg.as_bytes())).map_err(FileError::write(&path))?)
     }
 }
 

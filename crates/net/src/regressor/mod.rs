@@ -13,9 +13,10 @@ use burn::nn::PaddingConfig2d;
 use burn::nn::conv::{Conv2d, Conv2dConfig};
 use burn::tensor::{Device, Tensor};
 
+pub use crate::config::RECEPTIVE_RADIUS;
 pub use attributes::{Attributes, Geometry};
 pub use statistics::Statistics;
-pub use unet::{RECEPTIVE_RADIUS, UNet};
+pub use unet::UNet;
 
 use crate::config::RegressorConfig;
 

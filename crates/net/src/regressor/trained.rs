@@ -13,7 +13,7 @@ use snapsnap_ops::unet::{FEATURES, Network, Saved};
 
 use super::statistics::Statistics;
 use super::unet::UNet;
-use crate::weights::{NamedVisitor, visit_named};
+use crate::names::{NamedVisitor, visit_named};
 
 /// Planes of one step are those of the next.
 static BUFFERS: Buffers = Buffers::new();

@@ -15,11 +15,6 @@ use crate::config::RegressorConfig;
 /// Every sum of two branches is scaled by this, so that its variance stays put.
 pub(crate) const BRANCH_SCALE: f64 = std::f64::consts::FRAC_1_SQRT_2;
 
-/// How far from an output pixel an input pixel can matter, statistics aside: the reach of the 3×3 convolutions on the
-/// longest path, in pixels of the input: 14 at full size, 12 at half size (·2), 14 at a quarter (·4), and up to 3 more
-/// because an enlarged pixel lies beside, not on, the one it came from. Rounded up to a multiple of 4.
-pub const RECEPTIVE_RADIUS: usize = 100;
-
 fn conv3x3(from: usize, to: usize, stride: usize, device: &Device) -> Conv2d {
     Conv2dConfig::new([from, to], [3, 3])
         .with_stride([stride, stride])

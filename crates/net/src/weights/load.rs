@@ -8,9 +8,9 @@ use burn::tensor::{Device, Tensor, TensorData};
 use super::WeightsError;
 use super::file::{WeightFile, not_finite};
 use super::init::draw;
-use super::names::Path;
 use super::schema::{self, Part, SIDE, TensorSpec};
 use crate::config::Config;
+use crate::names::Path;
 use crate::network::PointPredictor;
 use crate::regressor::Regressor;
 

@@ -8,18 +8,17 @@ mod file;
 mod import;
 mod init;
 mod load;
-mod names;
 pub mod schema;
 mod source;
 
 use std::path::{Path, PathBuf};
 
+pub use crate::names::{NamedMapper, NamedVisitor, map_named, visit_named};
 pub use export::export;
 pub use file::{CONFIG_KEY, Progress, WeightFile, save, write_tensors};
 pub use import::{ImportOptions, ImportReport, import};
 pub use init::{SideHeads, init};
 pub use load::{random_predictor, random_regressors};
-pub use names::{NamedMapper, NamedVisitor, map_named, visit_named};
 pub use source::{Entry, Source};
 
 /// What can be wrong with weights.

@@ -8,8 +8,7 @@ use pulp::Arch;
 use rayon::prelude::*;
 
 use super::kernels::{Products, Row, Strided, Tap, square};
-use super::norm::Linear;
-use super::rows::{Activate, Descend, Fill, Sum, double, halve};
+use super::rows::{Activate, Descend, Fill, Sum, Upstream, double, halve};
 use super::weights::transpose;
 use super::{CHANNELS, Plane, Source};
 use crate::buffers::Buffers;
@@ -20,15 +19,6 @@ const CHUNK: usize = 120;
 const REST: usize = 12;
 /// Pixels whose products are summed in f32 before they join the f64 sums.
 const SINGLE: usize = 1024;
-
-/// Gradient of a convolution's output.
-#[derive(Debug, Clone, Copy)]
-pub enum Upstream<'a> {
-    /// A plane's data and a factor.
-    Scaled(&'a [f32], f32),
-    /// The output is normalised: gradient behind the normalisation, the output, and the map that joins them.
-    Normalised(&'a [f32], &'a [f32], &'a Linear),
-}
 
 /// Which gradients are needed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

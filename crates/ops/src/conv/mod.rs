@@ -17,10 +17,11 @@ mod rows;
 mod tests;
 mod weights;
 
-pub use backward::{Backward, Gradients, Sums, Upstream, Wanted};
+pub use backward::{Backward, Gradients, Sums, Wanted};
 pub use forward::{Conv, Shortcut};
 pub use merge::{Branch, Merge, add};
 pub use norm::{GroupNorm, Layer, Linear, NormGradients};
+pub use rows::Upstream;
 pub use weights::{arrange, rearrange, transpose};
 
 /// Channels of every plane.

@@ -2,9 +2,18 @@
 
 use pulp::{Simd, WithSimd};
 
-use super::backward::Upstream;
+use super::norm::Linear;
 use super::{Affine, CHANNELS};
 use crate::math::silu_and_slope;
+
+/// Gradient of a convolution's output.
+#[derive(Debug, Clone, Copy)]
+pub enum Upstream<'a> {
+    /// A plane's data and a factor.
+    Scaled(&'a [f32], f32),
+    /// The output is normalised: gradient behind the normalisation, the output, and the map that joins them.
+    Normalised(&'a [f32], &'a [f32], &'a Linear),
+}
 
 /// Every pixel twice.
 pub fn double(input: &[f32], out: &mut [f32]) {

@@ -4,7 +4,7 @@ use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::tensor::Tensor;
 
 /// Where in a module a traversal is, as the checkpoint's key.
-pub(super) struct Path<'a> {
+pub(crate) struct Path<'a> {
     prefix: &'a str,
     /// Component of the key and container type, per open module.
     open: Vec<(String, String)>,
@@ -25,26 +25,26 @@ fn component(name: &str, container: &str) -> String {
 }
 
 impl<'a> Path<'a> {
-    pub(super) fn new(prefix: &'a str) -> Self {
+    pub(crate) fn new(prefix: &'a str) -> Self {
         Self { prefix, open: Vec::new() }
     }
 
-    pub(super) fn enter(&mut self, name: &str, container: &str) {
+    pub(crate) fn enter(&mut self, name: &str, container: &str) {
         self.open.push((component(name, container), container.to_owned()));
     }
 
-    pub(super) fn leave(&mut self) {
+    pub(crate) fn leave(&mut self) {
         self.open.pop();
     }
 
-    pub(super) fn name(&self) -> String {
+    pub(crate) fn name(&self) -> String {
         let parts: Vec<&str> =
             self.open.iter().map(|(part, _)| part.as_str()).filter(|p| !p.is_empty()).collect();
         format!("{}{}", self.prefix, parts.join("."))
     }
 
     /// Whether the current parameter is the weight of a Burn `Linear`, which is the transpose of PyTorch's.
-    pub(super) fn is_transposed(&self) -> bool {
+    pub(crate) fn is_transposed(&self) -> bool {
         self.open.last().is_some_and(|(name, container)| name == "weight" && container == "Struct:Linear")
     }
 }
