@@ -7,7 +7,7 @@ use burn::tensor::activation::relu;
 use burn::tensor::module::{conv2d, max_pool2d};
 use burn::tensor::ops::{ConvOptions, MaxPoolOptions};
 use burn::tensor::{Device, Tensor, TensorData};
-use snapsnap_net::weights::{Source, WeightsError};
+use snapsnap_net::weights::{Source, WeightsError, not_finite};
 
 /// Least side of a picture: below it nothing is left for the third layer.
 pub const MIN_SIDE: usize = 31;
@@ -101,11 +101,11 @@ impl Lpips {
         let mut values = Vec::new();
         for (source, name) in wanted.into_iter().flatten() {
             let read = source.read_f32(&name)?;
-            if read.iter().any(|v| !v.is_finite()) {
-                let problems = vec![format!("not finite: {name}")];
-                return Err(WeightsError::Tensors { origin: origin(files), problems });
-            }
+            problems.extend(not_finite(&name, &read));
             values.push(read);
+        }
+        if !problems.is_empty() {
+            return Err(WeightsError::Tensors { origin: origin(files), problems });
         }
         let mut values = values.into_iter();
         let mut next = || values.next().expect("three of each layer");

@@ -1,6 +1,5 @@
 //! Steps in 16 bits: the point predictor's matrix products and convolutions, and what they keep for the backward pass. The
-//! regressor is left alone, whose gradients suffer most (docs/training.md), as are weights, moments, norms, losses and the
-//! rasteriser.
+//! regressor, which reads coordinates, is left alone, as are weights, moments, norms, losses and the rasteriser.
 
 use burn::module::{Module, ModuleMapper, Param};
 use burn::tensor::{FloatDType, Tensor};

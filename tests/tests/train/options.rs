@@ -138,7 +138,7 @@ fn sixteen_bits_learn_what_thirty_two_do() {
     for precision in ["bf16", "f16"] {
         let (_, error) = *losses(precision).last().expect("validations");
         println!("{precision}: {error} mm instead of {expected}");
-        assert!((error - expected).abs() < 0.1 * expected, "{precision}: {error} instead of {expected}");
+        assert!((error - expected).abs() < 0.02 * expected, "{precision}: {error} instead of {expected}");
     }
     let state = fs::read(temporary.path().join("f16/state/state.safetensors")).expect("a state");
     assert!(String::from_utf8_lossy(&state[..20_000]).contains("\\\"loss_scale\\\":{"));

@@ -121,7 +121,7 @@ pub fn save(config: &Config, values: &BTreeMap<String, Vec<f32>>, path: &Path) -
 }
 
 /// A line for a tensor with values that are not finite.
-pub(super) fn not_finite(name: &str, values: &[f32]) -> Option<String> {
+pub fn not_finite(name: &str, values: &[f32]) -> Option<String> {
     let bad =
         values.par_chunks(CHUNK).map(|part| part.iter().filter(|v| !v.is_finite()).count()).sum::<usize>();
     (bad > 0).then(|| format!("not finite: {name} ({bad} of {} values)", values.len()))

@@ -15,7 +15,7 @@ use std::path::{Path, PathBuf};
 
 pub use crate::names::{NamedMapper, NamedVisitor, map_named, visit_named};
 pub use export::export;
-pub use file::{CONFIG_KEY, Progress, WeightFile, save, write_tensors};
+pub use file::{CONFIG_KEY, Progress, WeightFile, not_finite, save, write_tensors};
 pub use import::{ImportOptions, ImportReport, import};
 pub use init::{SideHeads, init};
 pub use load::{random_predictor, random_regressors};

@@ -57,6 +57,13 @@ pub struct Arguments {
     device: String,
 }
 
+impl Arguments {
+    /// The run that goes on, if there is one.
+    fn begun(&self) -> Option<&Path> {
+        self.output.as_deref().filter(|run| self.resume && run.join(STATE).exists())
+    }
+}
+
 /// A training that can begin.
 struct Plan<'a> {
     arguments: &'a Arguments,
@@ -74,8 +81,7 @@ pub fn stage1(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     plan.run(&task, |tracked| {
         let networks = plan.config.networks();
         // A run that goes on has its weights in its state.
-        let own = arguments.output.as_ref().is_some_and(|run| arguments.resume && run.join(STATE).exists());
-        let predictor = match plan.start().filter(|_| !own) {
+        let predictor = match plan.start().filter(|_| arguments.begun().is_none()) {
             Some(path) => open(path, &plan.config)?.point_predictor(tracked)?,
             None => random_predictor(&networks, plan.config.training.seed, tracked),
         };
@@ -86,8 +92,7 @@ pub fn stage1(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
 pub fn stage2(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let plan = Plan::new(arguments, quiet)?;
     // A run that goes on has its point predictor beside its state.
-    let own = arguments.output.as_ref().filter(|run| arguments.resume && run.join(STATE).exists());
-    let start = own.map(|run| run.join(LAST)).or_else(|| plan.start().map(Path::to_owned));
+    let start = arguments.begun().map(|run| run.join(LAST)).or_else(|| plan.start().map(Path::to_owned));
     let Some(start) = start else {
         let message = "stage 2 needs a trained point predictor: give --weights FILE, as train-stage1 writes it, or \
                        training.start in the config";
