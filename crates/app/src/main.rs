@@ -7,6 +7,7 @@ mod failure;
 mod interrupt;
 mod memory;
 mod output;
+mod perceptual;
 mod pictures;
 mod progress;
 mod say;
@@ -47,6 +48,8 @@ enum Command {
     /// Train the Gaussian regressor on what a trained point predictor gives.
     #[command(name = "train-stage2")]
     TrainStage2(commands::train::Arguments),
+    /// How alike two pictures are, or two folders of pictures: PSNR, SSIM, LPIPS.
+    Compare(commands::compare::Arguments),
     /// Read checkpoints of Snap-Snap, DUSt3R or CroCo and write one weight file.
     ImportWeights(commands::import_weights::Arguments),
     /// Write random weights for a config.
@@ -83,6 +86,7 @@ fn main() -> ExitCode {
         Command::Prepare(arguments) => commands::prepare::run(&arguments, quiet),
         Command::TrainStage1(arguments) => commands::train::stage1(&arguments, quiet),
         Command::TrainStage2(arguments) => commands::train::stage2(&arguments, quiet),
+        Command::Compare(arguments) => commands::compare::run(&arguments),
         Command::ImportWeights(arguments) => commands::import_weights::run(&arguments, quiet),
         Command::InitWeights(arguments) => commands::init_weights::run(&arguments, quiet),
         Command::ExportWeights(arguments) => commands::export_weights::run(&arguments, quiet),

@@ -1,7 +1,7 @@
 //! LPIPS v0.1 on AlexNet (Zhang et al. 2018, "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric"):
 //! distances between features of two pictures, weighted by learned layers.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use burn::tensor::activation::relu;
 use burn::tensor::module::{conv2d, max_pool2d};
@@ -11,6 +11,11 @@ use snapsnap_net::weights::{Source, WeightsError, not_finite};
 
 /// Least side of a picture: below it nothing is left for the third layer.
 pub const MIN_SIDE: usize = 31;
+
+/// Names under which `cargo xtask fetch-weights` keeps the published files: torchvision's AlexNet and the authors' learned layers.
+pub const PUBLISHED: [&str; 2] = ["alexnet-owt-7be5be79.pth", "lpips-alex-v0.1.pth"];
+/// What the authors' package says with these of the two pictures of [`Lpips::check`] (docs/lpips_reference.py).
+const KNOWN: f64 = 0.093_218_468;
 
 /// What is subtracted from red, green and blue in [−1, 1], and what they are divided by.
 const SHIFT: [f32; 3] = [-0.030, -0.088, -0.188];
@@ -117,6 +122,46 @@ impl Lpips {
         Ok(Self { layers: layers.into() })
     }
 
+    /// Which of the published files are not in a folder.
+    pub fn missing(folder: &Path) -> Vec<PathBuf> {
+        PUBLISHED.map(|name| folder.join(name)).into_iter().filter(|file| !file.exists()).collect()
+    }
+
+    /// The published weights in a folder, their known value checked.
+    ///
+    /// # Errors
+    /// [`WeightsError`] for files that cannot be read, or that are not the published ones.
+    pub fn published(folder: &Path, device: &Device) -> Result<Self, WeightsError> {
+        let files = PUBLISHED.map(|name| folder.join(name));
+        let network = Self::load(&files, device)?;
+        let found = network.check();
+        // Devices differ in rounding, by far less than weights do.
+        if (found - KNOWN).abs() > 1e-4 * KNOWN {
+            let problem =
+                format!("on the check pictures they give {found:.6}, the published ones {KNOWN:.6}");
+            return Err(WeightsError::Tensors { origin: origin(&files), problems: vec![problem] });
+        }
+        Ok(network)
+    }
+
+    /// Distance of two pictures of 64 × 64 pixels that follow from a formula: noise, and half that noise and half another.
+    pub fn check(&self) -> f64 {
+        const SIDE: usize = 64;
+        let device = self.device();
+        let noise = |stream: u32| -> Tensor<4> {
+            let values: Vec<f32> = (0..3 * SIDE * SIDE).map(|place| number(stream, place) as f32).collect();
+            Tensor::from_data(TensorData::new(values, [1, 3, SIDE, SIDE]), &device)
+        };
+        let (a, b) = (noise(100), noise(101));
+        let half = (a.clone() + b) * 0.5;
+        f64::from(self.distance(a, half).into_scalar::<f32>())
+    }
+
+    /// Where its weights are.
+    pub fn device(&self) -> Device {
+        self.layers[0].weight.device()
+    }
+
     /// The same on another device.
     pub fn to_device(&self, device: &Device) -> Self {
         let moved = |layer: &Parameters| Parameters {
@@ -175,6 +220,13 @@ fn unit(x: Tensor<4>) -> Tensor<4> {
     x / (length + EPSILON)
 }
 
+/// Numbers in [0, 1) that any language makes alike.
+fn number(stream: u32, place: usize) -> f64 {
+    let mixed = (place as u32).wrapping_mul(2_654_435_761).wrapping_add(stream.wrapping_mul(40_503_121));
+    let mixed = (mixed ^ (mixed >> 15)).wrapping_mul(2_246_822_519);
+    f64::from(mixed ^ (mixed >> 13)) / 4_294_967_296.0
+}
+
 fn origin(files: &[PathBuf]) -> String {
     files.iter().map(|path| path.display().to_string()).collect::<Vec<_>>().join(", ")
 }
@@ -188,13 +240,6 @@ mod tests {
     use burn::tensor::FloatDType;
 
     use snapsnap_net::weights::write_tensors;
-
-    /// Numbers in [0, 1) that any language makes alike.
-    fn number(stream: u32, place: usize) -> f64 {
-        let mixed = (place as u32).wrapping_mul(2_654_435_761).wrapping_add(stream.wrapping_mul(40_503_121));
-        let mixed = (mixed ^ (mixed >> 15)).wrapping_mul(2_246_822_519);
-        f64::from(mixed ^ (mixed >> 13)) / 4_294_967_296.0
-    }
 
     fn values(stream: u32, count: usize, value: impl Fn(f64) -> f64) -> Vec<f32> {
         (0..count).map(|place| value(number(stream, place)) as f32).collect()

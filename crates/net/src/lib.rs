@@ -14,4 +14,5 @@ pub mod sides;
 pub mod weights;
 
 pub use crop::Window;
+pub use neighbours::Neighbours;
 pub use reconstruct::{Photograph, Reconstruction, Reconstructor};

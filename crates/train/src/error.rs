@@ -1,5 +1,6 @@
 //! What can go wrong in a training.
 
+use snapsnap_eval::EvalError;
 use snapsnap_mesh::FileError;
 use snapsnap_net::weights::WeightsError;
 use snapsnap_splat::SplatError;
@@ -16,6 +17,9 @@ pub enum TrainError {
     /// Rendering.
     #[error(transparent)]
     Splat(#[from] SplatError),
+    /// Comparing with the truth.
+    #[error(transparent)]
+    Eval(#[from] EvalError),
     /// What was asked for does not fit together.
     #[error("{0}")]
     Unsuitable(String),

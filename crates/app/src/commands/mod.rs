@@ -1,5 +1,6 @@
 //! One module per subcommand.
 
+pub mod compare;
 pub mod export_weights;
 pub mod import_weights;
 pub mod init_weights;

@@ -183,7 +183,7 @@ impl GaussianTask {
             let prediction = Prediction { maps: View::ALL.map(map).to_vec(), window: window.clone() };
             let gaussians =
                 gaussians(&config, &networks, &item, prediction, &Phase::new(false, 0), None, &device);
-            sums.add(&item, self.shown(&item, gaussians, &device)?, &device);
+            sums.add(&item, self.shown(&item, gaussians, &device)?, &device)?;
         }
         Ok(*self.billboard.get_or_init(|| sums.mean()))
     }
@@ -295,7 +295,7 @@ impl Task for GaussianTask {
         let mut sums = Scores::default();
         for index in self.validation.indices(self.validation.count) {
             let item = self.validation.get(index)?;
-            sums.add(&item, self.shown(&item, self.whole(networks, &item, &device)?, &device)?, &device);
+            sums.add(&item, self.shown(&item, self.whole(networks, &item, &device)?, &device)?, &device)?;
         }
         let (scores, billboard) = (sums.mean(), self.billboard()?);
         let figures = vec![

@@ -1,13 +1,15 @@
 //! How like the truth rendered pictures are.
 
-use burn::tensor::module::max_pool2d;
-use burn::tensor::ops::MaxPoolOptions;
 use burn::tensor::{Device, Tensor};
 use snapsnap_data::sample::Stage2Item;
+use snapsnap_eval::EvalError;
+use snapsnap_eval::pictures::Picture;
+use snapsnap_eval::region::{Region, margin};
+use snapsnap_eval::similarity::SquaredError;
 use snapsnap_ops::host;
 
 use super::scene::targets;
-use crate::photometric::{Photometric, psnr};
+use crate::photometric::Photometric;
 
 /// How like the truth pictures are, summed or averaged over samples.
 #[derive(Debug, Clone, Copy, Default)]
@@ -20,30 +22,34 @@ pub(super) struct Scores {
     pub ssim: f64,
 }
 
-/// 1 where masks `[V,h,w]` are not 0, and 8 pixels of 1024 around it (EVALUATION.md, protocol `masked`).
-fn around(mask: Tensor<3>) -> Tensor<3> {
-    let reach = (8 * mask.dims()[2]).div_ceil(1024);
-    let inside = mask.greater_elem(0.0).float().unsqueeze_dim(1);
-    let side = 2 * reach + 1;
-    let options = MaxPoolOptions::new([side, side]).with_stride([1, 1]).with_padding([reach, reach]);
-    max_pool2d(inside, options).squeeze_dim(1)
-}
-
 impl Scores {
-    pub fn add(&mut self, item: &Stage2Item, image: Tensor<4>, device: &Device) {
-        let count = item.target_cameras.len();
-        let (target, mask) = targets(item, &(0..count).collect::<Vec<_>>(), device);
-        let inside = around(mask.clone());
-        let there = |from: usize| {
-            let part = |x: &Tensor<4>| x.clone().narrow(0, from, count - from);
-            psnr(part(&image), part(&target), &inside.clone().narrow(0, from, count - from))
-        };
+    pub fn add(&mut self, item: &Stage2Item, image: Tensor<4>, device: &Device) -> Result<(), EvalError> {
+        let (count, side) = (item.target_cameras.len(), item.target_side);
+        let (target, _) = targets(item, &(0..count).collect::<Vec<_>>(), device);
+        // Values beyond what a picture can hold are no error: files and screens cut them.
+        let shown = host(image.clone().clamp(0.0, 1.0));
+        let [mut full, mut masked, mut sides] = [SquaredError::default(); 3];
+        for view in 0..count {
+            let size = [side, side];
+            let of = |values: &[f32]| values[3 * view * side * side..3 * (view + 1) * side * side].to_vec();
+            let shown = Picture::new(of(&shown), size, "render")?;
+            let truth = Picture::new(of(&item.targets), size, "target")?;
+            full.add(&shown, &truth, &Region::all(&truth))?;
+            let mask = &item.target_masks[view * side * side..(view + 1) * side * side];
+            // A view of nobody has only a background.
+            let Ok(person) = Region::masked(mask, size, margin(side)) else { continue };
+            masked.add(&shown, &truth, &person)?;
+            // The sides' views are the last ones.
+            if view >= count - 2 {
+                sides.add(&shown, &truth, &person)?;
+            }
+        }
         self.samples += 1.0;
-        self.masked += there(0);
-        // The sides' views are the last ones.
-        self.sides += there(count - 2);
-        self.full += psnr(image.clone(), target.clone(), &mask.ones_like());
+        self.full += full.psnr();
+        self.masked += masked.psnr();
+        self.sides += sides.psnr();
         self.ssim += f64::from(host(Photometric::new(image, target).ssim)[0]);
+        Ok(())
     }
 
     pub fn mean(self) -> Self {

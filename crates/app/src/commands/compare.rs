@@ -1,0 +1,215 @@
+//! `snapsnap compare`.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use clap::{Args, ValueEnum};
+use serde_json::{Value, json};
+use snapsnap_eval::lpips::Lpips;
+use snapsnap_eval::pictures::Picture;
+use snapsnap_eval::region::{Region, margin};
+use snapsnap_eval::score::Score;
+use snapsnap_eval::similarity::{check_sizes, ssim_of_loss};
+use snapsnap_mesh::picture::{MAX_BYTES, decode};
+
+use crate::failure::Failure;
+use crate::{perceptual, say};
+
+/// Endings of pictures that are looked for in folders.
+const ENDINGS: [&str; 7] = ["png", "jpg", "jpeg", "webp", "bmp", "tif", "tiff"];
+
+#[derive(Args)]
+pub struct Arguments {
+    /// Picture, or folder of pictures, to judge.
+    a: PathBuf,
+    /// The true one; of a folder, pictures of the same name.
+    b: PathBuf,
+    /// Where the person is (any value above 0), or a folder of such pictures.
+    #[arg(long, value_name = "MASK")]
+    mask: Option<PathBuf>,
+    /// Where to compare: everywhere; in the paper's window of 1000 × 500 of 1024 pixels around what is not black in B; or in
+    /// the mask and 8 of 1024 pixels around it.
+    #[arg(long, value_enum, default_value = "all")]
+    window: Window,
+    /// Pixels around the mask instead of 8 of 1024.
+    #[arg(long, value_name = "PIXELS")]
+    margin: Option<usize>,
+    #[command(flatten)]
+    lpips: perceptual::Arguments,
+    /// auto, cpu, ndarray, wgpu, vulkan, cuda or metal: what computes LPIPS.
+    #[arg(long, default_value = "auto")]
+    device: String,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Clone, Copy, PartialEq, ValueEnum)]
+enum Window {
+    All,
+    Paper,
+    Mask,
+}
+
+/// What two pictures give.
+struct Compared {
+    name: String,
+    score: Score,
+    ssim_gaussian: f64,
+    region: Region,
+}
+
+pub fn run(arguments: &Arguments) -> Result<(), Failure> {
+    if arguments.mask.is_some() != (arguments.window == Window::Mask) {
+        return Err(Failure::Input("--window mask and --mask MASK need each other".into()));
+    }
+    if arguments.margin.is_some() && arguments.mask.is_none() {
+        return Err(Failure::Input("--margin needs --mask".into()));
+    }
+    let lpips = arguments.lpips.load(&arguments.device)?;
+    if !arguments.a.is_dir() && !arguments.b.is_dir() {
+        let compared = compare(arguments, &arguments.a, &arguments.b, arguments.mask.as_deref(), &lpips)?;
+        let text = if arguments.json { json_of(&compared).to_string() } else { text_of(&compared, &lpips) };
+        say::out(&text);
+        return Ok(());
+    }
+    folders(arguments, &lpips)
+}
+
+fn folders(arguments: &Arguments, lpips: &Result<Lpips, String>) -> Result<(), Failure> {
+    let Arguments { a, b, mask, .. } = arguments;
+    for path in [Some(a), Some(b), mask.as_ref()].into_iter().flatten() {
+        if !path.is_dir() {
+            let message = "is no folder: compare two pictures, or two folders of equally named pictures";
+            return Err(Failure::Input(format!("{}: {message}", path.display())));
+        }
+    }
+    let (ours, truths) = (pictures_in(a)?, pictures_in(b)?);
+    let mut left_out: Vec<(String, String)> = Vec::new();
+    for (name, folder) in
+        ours.difference(&truths).map(|n| (n, b)).chain(truths.difference(&ours).map(|n| (n, a)))
+    {
+        left_out.push((name.clone(), format!("is not in {}", folder.display())));
+    }
+    let mut compared = Vec::new();
+    for name in ours.intersection(&truths) {
+        let mask = mask.as_ref().map(|folder| folder.join(name));
+        match compare(arguments, &a.join(name), &b.join(name), mask.as_deref(), lpips) {
+            Ok(found) => compared.push(found),
+            Err(failure) => left_out.push((name.clone(), failure.to_string())),
+        }
+    }
+    let scores: Vec<Score> = compared.iter().map(|c| c.score).collect();
+    let mean = Score::mean(&scores);
+    if arguments.json {
+        let named = |c: &Compared| {
+            let mut value = json_of(c);
+            value["name"] = c.name.clone().into();
+            value
+        };
+        let pictures: Vec<Value> = compared.iter().map(named).collect();
+        let left_out: Vec<Value> =
+            left_out.iter().map(|(name, why)| json!({ "name": name, "why": why })).collect();
+        say::out(&json!({ "pictures": pictures, "mean": mean, "left_out": left_out }).to_string());
+    } else {
+        for c in &compared {
+            say::out(&format!("{:<24} {}", c.name, line_of(&c.score)));
+        }
+        if let Some(mean) = mean {
+            say::out(&format!("{:<24} {}", format!("mean of {}", compared.len()), line_of(&mean)));
+        }
+        if let Err(why) = lpips {
+            say::out(&format!("LPIPS: {why}"));
+        }
+        left_out.iter().for_each(|(name, why)| say::err(&format!("left out: {name}: {why}")));
+    }
+    match (compared.len(), left_out.len()) {
+        (0, 0) => Err(Failure::Input(format!("{} and {}: hold no picture", a.display(), b.display()))),
+        (_, 0) => Ok(()),
+        (n, lost) => Err(Failure::Internal(format!("{n} pictures compared, {lost} left out"))),
+    }
+}
+
+/// Names of the pictures of a folder.
+fn pictures_in(folder: &Path) -> Result<BTreeSet<String>, Failure> {
+    let failed = |e| Failure::Input(format!("{}: cannot read this folder: {e}", folder.display()));
+    let mut names = BTreeSet::new();
+    for entry in fs::read_dir(folder).map_err(failed)? {
+        let path = entry.map_err(failed)?.path();
+        let ending = path.extension().map(|e| e.to_string_lossy().to_lowercase()).unwrap_or_default();
+        if ENDINGS.contains(&ending.as_str()) && path.is_file() {
+            names.extend(path.file_name().map(|name| name.to_string_lossy().into_owned()));
+        }
+    }
+    Ok(names)
+}
+
+fn compare(
+    arguments: &Arguments,
+    a: &Path,
+    b: &Path,
+    mask: Option<&Path>,
+    lpips: &Result<Lpips, String>,
+) -> Result<Compared, Failure> {
+    let read = |path: &Path| -> Result<Picture, Failure> {
+        let named = |e| Failure::Input(format!("{}: {e}", path.display()));
+        Picture::from_file(decode(path, MAX_BYTES)?, "picture").map_err(named)
+    };
+    let (image, target) = (read(a)?, read(b)?);
+    let named = |e| Failure::Input(format!("{} and {}: {e}", a.display(), b.display()));
+    check_sizes(&image, &target).map_err(named)?;
+    let region = match (arguments.window, mask) {
+        (Window::Mask, Some(path)) => {
+            let mask = decode(path, MAX_BYTES)?;
+            let found = [mask.height() as usize, mask.width() as usize];
+            if found != [target.height, target.width] {
+                let ([h, w], name) = (found, path.display());
+                let message =
+                    format!("{name}: is {w}×{h}, the pictures are {}×{}", target.width, target.height);
+                return Err(Failure::Input(message));
+            }
+            let mask: Vec<f32> = mask.into_luma16().pixels().map(|p| f32::from(p.0[0])).collect();
+            let margin = arguments.margin.unwrap_or_else(|| margin(target.height));
+            Region::masked(&mask, found, margin)
+                .map_err(|e| Failure::Input(format!("{}: {e}", path.display())))?
+        }
+        (Window::Paper, _) => {
+            Region::paper(&target).map_err(|e| Failure::Input(format!("{}: {e}", b.display())))?
+        }
+        _ => Region::all(&target),
+    };
+    Ok(Compared {
+        name: a.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default(),
+        score: Score::new(&image, &target, &region, lpips.as_ref().ok()).map_err(named)?,
+        ssim_gaussian: ssim_of_loss(&image, &target, &region).map_err(named)?,
+        region,
+    })
+}
+
+fn json_of(compared: &Compared) -> Value {
+    let mut value = json!(compared.score);
+    value["ssim_gaussian"] = json!(compared.ssim_gaussian);
+    value["window"] = json!(compared.region.window);
+    value["pixels"] = json!(compared.region.pixels());
+    value
+}
+
+fn line_of(score: &Score) -> String {
+    let plain = |value: Option<f64>| value.map_or("n/a".into(), |v| format!("{v:.4}"));
+    format!("PSNR {:.3} dB   SSIM {}   LPIPS {}", score.psnr, plain(score.ssim), plain(score.lpips))
+}
+
+fn text_of(compared: &Compared, lpips: &Result<Lpips, String>) -> String {
+    let [x, y, width, height] = compared.region.window;
+    let plain = |value: Option<f64>, why: &str| value.map_or(format!("n/a ({why})"), |v| format!("{v:.6}"));
+    let why = lpips.as_ref().err().map_or("the window is too small", String::as_str);
+    [
+        format!("PSNR           {:.4} dB", compared.score.psnr),
+        format!("SSIM           {} (uniform window)", plain(compared.score.ssim, "the window is too small")),
+        format!("SSIM of loss   {:.6} (Gaussian window)", compared.ssim_gaussian),
+        format!("LPIPS          {}", plain(compared.score.lpips, why)),
+        format!("window         {width}×{height} at {x}, {y}; {} pixels", compared.region.pixels()),
+    ]
+    .join("\n")
+}

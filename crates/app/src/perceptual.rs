@@ -1,0 +1,45 @@
+//! Finding the weights of LPIPS.
+
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use snapsnap_eval::lpips::Lpips;
+
+use crate::device;
+use crate::failure::Failure;
+
+/// Where `cargo xtask fetch-weights` puts them.
+const FOLDER: &str = "weights";
+
+#[derive(Args)]
+pub struct Arguments {
+    /// Folder with the published weights of AlexNet and LPIPS, as `cargo xtask fetch-weights` makes it, or weight files of
+    /// your own [default: weights].
+    #[arg(long, value_name = "DIR|FILE", num_args = 1..)]
+    lpips: Vec<PathBuf>,
+}
+
+impl Arguments {
+    /// The network on the device of this name, which is not looked for in vain; or why there is none.
+    ///
+    /// # Errors
+    /// If weights that were asked for are not there, or those that are there are damaged.
+    pub fn load(&self, device: &str) -> Result<Result<Lpips, String>, Failure> {
+        let folder = match self.lpips.as_slice() {
+            [] => Path::new(FOLDER),
+            [folder] if folder.is_dir() => folder,
+            files => return Ok(Ok(Lpips::load(files, &device::choose(device)?)?)),
+        };
+        let missing: Vec<String> =
+            Lpips::missing(folder).iter().map(|file| file.display().to_string()).collect();
+        if missing.is_empty() {
+            return Ok(Ok(Lpips::published(folder, &device::choose(device)?)?));
+        }
+        let message = format!("weights missing: {}", missing.join(", "));
+        if self.lpips.is_empty() {
+            Ok(Err(message))
+        } else {
+            Err(Failure::Input(format!("--lpips: {message}")))
+        }
+    }
+}

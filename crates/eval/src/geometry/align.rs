@@ -1,0 +1,135 @@
+//! Rigid alignment of meshes that are not in the world frame, by iterated closest points (Besl & McKay 1992).
+
+use glam::{DMat3, DQuat, DVec3};
+
+use super::{check_points, nearest};
+use crate::EvalError;
+
+/// Steps after which it ends in any case.
+const MOST: usize = 100;
+/// It ends when the mean squared distance falls by less than this share.
+const ENOUGH: f64 = 1e-6;
+
+/// x ↦ scale · rotation · x + translation.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Alignment {
+    /// 1 unless it was asked for.
+    pub scale: f64,
+    /// A proper rotation.
+    pub rotation: DQuat,
+    /// In the points' unit.
+    pub translation: DVec3,
+    /// Mean squared distance to the nearest neighbour after it.
+    pub cost: f64,
+    /// Steps.
+    pub steps: usize,
+}
+
+impl Alignment {
+    /// Where a point goes.
+    pub fn apply(&self, point: [f32; 3]) -> [f32; 3] {
+        (self.scale * (self.rotation * double(point)) + self.translation).as_vec3().to_array()
+    }
+}
+
+/// Moves points onto others: each step pairs every point with its nearest neighbour and applies the best rigid motion of those
+/// pairs (with `scale`: the best similarity). It finds the nearest minimum, so the points must lie roughly right: within some
+/// 30° and a quarter of the size.
+///
+/// # Errors
+/// [`EvalError::Empty`] for a set without points or with one that is not finite.
+pub fn icp(points: &[[f32; 3]], onto: &[[f32; 3]], scale: bool) -> Result<Alignment, EvalError> {
+    check_points(points)?;
+    check_points(onto)?;
+    let cost = |moved: &[[f32; 3]]| {
+        let pairs = nearest(moved, onto);
+        let squares = pairs.iter().map(|(_, distance)| distance * distance).sum::<f64>();
+        (pairs, squares / moved.len() as f64)
+    };
+    let start =
+        Alignment { scale: 1.0, rotation: DQuat::IDENTITY, translation: DVec3::ZERO, cost: 0.0, steps: 0 };
+    let (mut pairs, first) = cost(points);
+    let mut best = Alignment { cost: first, ..start };
+    for step in 1..=MOST {
+        let targets: Vec<[f32; 3]> = pairs.iter().map(|(row, _)| onto[*row]).collect();
+        let motion = procrustes(points, &targets, scale);
+        let moved: Vec<[f32; 3]> = points.iter().map(|p| motion.apply(*p)).collect();
+        let (next, after) = cost(&moved);
+        let gain = best.cost - after;
+        if gain > 0.0 {
+            best = Alignment { cost: after, steps: step, ..motion };
+        }
+        if gain <= ENOUGH * after {
+            break;
+        }
+        pairs = next;
+    }
+    Ok(best)
+}
+
+/// The motion that brings points nearest to their partners in the least squares' sense (Horn 1987): the rotation is the
+/// eigenvector, of the largest eigenvalue, of a symmetric matrix made of their covariances.
+fn procrustes(points: &[[f32; 3]], targets: &[[f32; 3]], scale: bool) -> Alignment {
+    let n = points.len() as f64;
+    let centre = |of: &[[f32; 3]]| of.iter().map(|p| double(*p)).sum::<DVec3>() / n;
+    let (from, to) = (centre(points), centre(targets));
+    let mut covariance = DMat3::ZERO;
+    let (mut spread, mut rotated) = (0.0, 0.0);
+    for (p, t) in points.iter().zip(targets) {
+        let (p, t) = (double(*p) - from, double(*t) - to);
+        // Columns: m[c][r] = Σ p_r · t_c.
+        covariance += DMat3::from_cols(p * t.x, p * t.y, p * t.z);
+        spread += p.length_squared();
+    }
+    let m = covariance.to_cols_array_2d();
+    let s = |row: usize, column: usize| m[column][row];
+    let matrix = [
+        [s(0, 0) + s(1, 1) + s(2, 2), s(1, 2) - s(2, 1), s(2, 0) - s(0, 2), s(0, 1) - s(1, 0)],
+        [s(1, 2) - s(2, 1), s(0, 0) - s(1, 1) - s(2, 2), s(0, 1) + s(1, 0), s(2, 0) + s(0, 2)],
+        [s(2, 0) - s(0, 2), s(0, 1) + s(1, 0), s(1, 1) - s(0, 0) - s(2, 2), s(1, 2) + s(2, 1)],
+        [s(0, 1) - s(1, 0), s(2, 0) + s(0, 2), s(1, 2) + s(2, 1), s(2, 2) - s(0, 0) - s(1, 1)],
+    ];
+    let [w, x, y, z] = largest_eigenvector(matrix);
+    let rotation = DQuat::from_xyzw(x, y, z, w).normalize();
+    for (p, t) in points.iter().zip(targets) {
+        rotated += (rotation * (double(*p) - from)).dot(double(*t) - to);
+    }
+    // Points that all lie in one place have no size to change.
+    let scale = if scale && spread > 0.0 && rotated > 0.0 { rotated / spread } else { 1.0 };
+    let translation = to - scale * (rotation * from);
+    Alignment { scale, rotation, translation, cost: 0.0, steps: 0 }
+}
+
+/// By Jacobi rotations.
+fn largest_eigenvector(mut a: [[f64; 4]; 4]) -> [f64; 4] {
+    const SWEEPS: usize = 30;
+    let mut vectors = [[0.0; 4]; 4];
+    (0..4).for_each(|i| vectors[i][i] = 1.0);
+    for _ in 0..SWEEPS {
+        for (p, q) in [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)] {
+            if a[p][q] == 0.0 {
+                continue;
+            }
+            let theta = (a[q][q] - a[p][p]) / (2.0 * a[p][q]);
+            let t = theta.signum() / (theta.abs() + theta.hypot(1.0));
+            let c = 1.0 / t.hypot(1.0);
+            let s = t * c;
+            for row in &mut a {
+                (row[p], row[q]) = (c * row[p] - s * row[q], s * row[p] + c * row[q]);
+            }
+            for column in 0..4 {
+                let (x, y) = (a[p][column], a[q][column]);
+                (a[p][column], a[q][column]) = (c * x - s * y, s * x + c * y);
+            }
+            for row in &mut vectors {
+                (row[p], row[q]) = (c * row[p] - s * row[q], s * row[p] + c * row[q]);
+            }
+        }
+    }
+    let largest = (0..4).max_by(|i, j| a[*i][*i].total_cmp(&a[*j][*j])).expect("four");
+    vectors.map(|row| row[largest])
+}
+
+fn double(p: [f32; 3]) -> DVec3 {
+    DVec3::from_array(p.map(f64::from))
+}

@@ -1,0 +1,133 @@
+//! How far surfaces lie apart. Nothing is aligned unless [`icp`] is called. Lengths are in the unit of the points, metres
+//! throughout this project; reports print centimetres.
+
+mod align;
+mod normals;
+
+use burn::tensor::Tensor;
+use parry3d::math::Vector;
+use parry3d::query::PointQuery;
+use parry3d::shape::TriMesh;
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rayon::prelude::*;
+use snapsnap_mesh::mesh::Mesh;
+use snapsnap_net::Neighbours;
+
+use crate::EvalError;
+pub use align::{Alignment, icp};
+pub use normals::{consistency, normals};
+
+/// Mean distances between two sets of points.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Chamfer {
+    /// From each point of the first to the nearest of the second: how far off what was made is.
+    pub forward: f64,
+    /// From each point of the second to the nearest of the first: how much of it was missed.
+    pub backward: f64,
+}
+
+impl Chamfer {
+    /// The bidirectional mean.
+    pub fn mean(&self) -> f64 {
+        0.5 * (self.forward + self.backward)
+    }
+}
+
+/// Rows of a tensor `[N, 3]`.
+///
+/// # Errors
+/// [`EvalError::Sizes`] for another shape, [`EvalError::Empty`] if there is no row or one is not finite.
+pub fn points(tensor: &Tensor<2>) -> Result<Vec<[f32; 3]>, EvalError> {
+    let [n, columns] = tensor.dims();
+    if columns != 3 {
+        return Err(EvalError::Sizes { found: vec![n, columns], expected: vec![n, 3] });
+    }
+    let rows = snapsnap_ops::host(tensor.clone()).as_chunks::<3>().0.to_vec();
+    check_points(&rows)?;
+    Ok(rows)
+}
+
+fn check_points(points: &[[f32; 3]]) -> Result<(), EvalError> {
+    if points.is_empty() {
+        return Err(EvalError::Empty("there is no point".into()));
+    }
+    match points.iter().position(|p| p.iter().any(|v| !v.is_finite())) {
+        Some(row) => Err(EvalError::Empty(format!("point {row} is not finite"))),
+        None => Ok(()),
+    }
+}
+
+/// Mean Euclidean distances to the nearest neighbour, both ways.
+///
+/// # Errors
+/// [`EvalError::Empty`] for a set without points or with one that is not finite.
+pub fn chamfer(a: &[[f32; 3]], b: &[[f32; 3]]) -> Result<Chamfer, EvalError> {
+    check_points(a)?;
+    check_points(b)?;
+    let one_way = |from: &[[f32; 3]], to: &[[f32; 3]]| {
+        let distances = nearest(from, to).into_iter().map(|(_, distance)| distance);
+        distances.sum::<f64>() / from.len() as f64
+    };
+    Ok(Chamfer { forward: one_way(a, b), backward: one_way(b, a) })
+}
+
+/// For each of the first points the row of the nearest of the second, and how far it is.
+fn nearest(from: &[[f32; 3]], to: &[[f32; 3]]) -> Vec<(usize, f64)> {
+    let rows = Neighbours::new(to).expect("points were checked").nearest(from);
+    let apart = |(p, row): (&[f32; 3], u32)| (row as usize, distance(*p, to[row as usize]));
+    from.iter().zip(rows).map(apart).collect()
+}
+
+fn distance(a: [f32; 3], b: [f32; 3]) -> f64 {
+    let squares = [0, 1, 2].map(|c| (f64::from(a[c]) - f64::from(b[c])).powi(2));
+    squares.iter().sum::<f64>().sqrt()
+}
+
+/// Mean Euclidean distance from points to the nearest place on the triangles of a mesh, one way.
+///
+/// # Errors
+/// [`EvalError::Empty`] without points or with one that is not finite, or for a mesh that has no area.
+pub fn point_to_surface(points: &[[f32; 3]], mesh: &Mesh) -> Result<f64, EvalError> {
+    check_points(points)?;
+    let vertices = mesh.positions.iter().map(|p| Vector::new(p.x, p.y, p.z)).collect();
+    let faces: Vec<[u32; 3]> = mesh.faces.iter().map(|face| face.positions).collect();
+    let surface = TriMesh::new(vertices, faces)
+        .map_err(|e| EvalError::Empty(format!("the mesh has no surface: {e}")))?;
+    let apart = |p: &[f32; 3]| {
+        let on = surface.project_local_point(Vector::new(p[0], p[1], p[2]), false).point;
+        distance(*p, [on.x, on.y, on.z])
+    };
+    let distances: Vec<f64> = points.par_iter().map(apart).collect();
+    Ok(distances.iter().sum::<f64>() / points.len() as f64)
+}
+
+/// Points drawn evenly from the surface of a mesh; the same seed draws the same.
+///
+/// # Errors
+/// [`EvalError::Empty`] for a mesh without area.
+pub fn sampled(mesh: &Mesh, count: usize, seed: u64) -> Result<Vec<[f32; 3]>, EvalError> {
+    let corners = |face: usize| mesh.faces[face].positions.map(|row| mesh.positions[row as usize].as_dvec3());
+    let mut total = 0.0;
+    let areas: Vec<f64> = (0..mesh.faces.len())
+        .map(|face| {
+            let [a, b, c] = corners(face);
+            total += 0.5 * (b - a).cross(c - a).length();
+            total
+        })
+        .collect();
+    if !(total > 0.0 && total.is_finite()) {
+        return Err(EvalError::Empty("the mesh has no area".into()));
+    }
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    let mut one = || {
+        let at = random.random::<f64>() * total;
+        let [a, b, c] = corners(areas.partition_point(|sum| *sum <= at).min(areas.len() - 1));
+        let (mut u, mut v) = (random.random::<f64>(), random.random::<f64>());
+        if u + v > 1.0 {
+            (u, v) = (1.0 - u, 1.0 - v);
+        }
+        (a + u * (b - a) + v * (c - a)).as_vec3().to_array()
+    };
+    Ok((0..count).map(|_| one()).collect())
+}

@@ -1,0 +1,210 @@
+//! Pictures as they are compared: red, green and blue in [0, 1], one plane after the other. There is one way in for every
+//! kind of source, so that neither the range nor the order of colours can be got wrong without a word.
+
+use burn::tensor::{Device, Tensor, TensorData};
+use image::{DynamicImage, Rgb32FImage, RgbImage};
+
+use crate::EvalError;
+
+/// One picture.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Picture {
+    /// Pixels across.
+    pub width: usize,
+    /// Pixels down.
+    pub height: usize,
+    /// `[3, H, W]` in [0, 1].
+    values: Vec<f32>,
+}
+
+impl Picture {
+    /// Red, green and blue planes `[3, H, W]`; `what` names them in errors.
+    ///
+    /// # Errors
+    /// [`EvalError::Value`] for a value that is not finite or not in [0, 1].
+    ///
+    /// # Panics
+    /// If there are not as many values as the size says.
+    pub fn new(values: Vec<f32>, [height, width]: [usize; 2], what: &'static str) -> Result<Self, EvalError> {
+        assert_eq!(values.len(), 3 * height * width, "planes of {width}×{height}");
+        if let Some(at) = values.iter().position(|v| !(0.0..=1.0).contains(v)) {
+            let (row, column) = (at / width % height, at % width);
+            let channel = at / (height * width);
+            return Err(EvalError::Value { what, value: values[at], channel, row, column });
+        }
+        Ok(Self { width, height, values })
+    }
+
+    /// What a renderer gives, `[H, W, 3]`: values beyond what a file or a screen can show are cut.
+    ///
+    /// # Errors
+    /// [`EvalError::Value`] for a value that is not finite.
+    ///
+    /// # Panics
+    /// If there are not as many values as the size says.
+    pub fn rendered(values: &[f32], [height, width]: [usize; 2]) -> Result<Self, EvalError> {
+        assert_eq!(values.len(), 3 * height * width, "pixels of {width}×{height}");
+        let (pixels, _) = values.as_chunks::<3>();
+        let cut = |v: f32| if v.is_finite() { v.clamp(0.0, 1.0) } else { v };
+        let planes = (0..3).flat_map(|c| pixels.iter().map(move |p| cut(p[c]))).collect();
+        Self::new(planes, [height, width], "render")
+    }
+
+    /// 8 bits per channel.
+    pub fn from_rgb8(picture: &RgbImage) -> Self {
+        let plane = |c: usize| picture.pixels().map(move |p| f32::from(p.0[c]) / 255.0);
+        let (width, height) = (picture.width() as usize, picture.height() as usize);
+        Self { width, height, values: (0..3).flat_map(plane).collect() }
+    }
+
+    /// Any file's picture. Grey is red, green and blue alike; where there is alpha, the picture is laid over black, which is
+    /// what the protocols have behind people.
+    ///
+    /// # Errors
+    /// [`EvalError::Value`]: a file of floating-point numbers may hold anything.
+    pub fn from_file(picture: DynamicImage, what: &'static str) -> Result<Self, EvalError> {
+        let (width, height) = (picture.width() as usize, picture.height() as usize);
+        let planes = |values: &Rgb32FImage, share: &dyn Fn(usize) -> f32| -> Vec<f32> {
+            (0..3).flat_map(|c| values.pixels().enumerate().map(move |(i, p)| p.0[c] * share(i))).collect()
+        };
+        let values = if picture.color().has_alpha() {
+            let rgba = picture.into_rgba32f();
+            let alpha: Vec<f32> = rgba.pixels().map(|p| p.0[3]).collect();
+            planes(&DynamicImage::ImageRgba32F(rgba).into_rgb32f(), &|i| alpha[i])
+        } else {
+            planes(&picture.into_rgb32f(), &|_| 1.0)
+        };
+        Self::new(values, [height, width], what)
+    }
+
+    /// A tensor `[1, 3, H, W]` with values in [0, 1].
+    ///
+    /// # Errors
+    /// [`EvalError::Sizes`] for another shape, [`EvalError::Value`] for other values.
+    pub fn from_tensor(tensor: &Tensor<4>, what: &'static str) -> Result<Self, EvalError> {
+        let [b, c, height, width] = tensor.dims();
+        if [b, c] != [1, 3] {
+            let expected = vec![1, 3, height, width];
+            return Err(EvalError::Sizes { found: tensor.dims().to_vec(), expected });
+        }
+        Self::new(snapsnap_ops::host(tensor.clone()), [height, width], what)
+    }
+
+    /// `[1, 3, H, W]`.
+    pub fn tensor(&self, device: &Device) -> Tensor<4> {
+        Tensor::from_data(TensorData::new(self.values.clone(), [1, 3, self.height, self.width]), device)
+    }
+
+    /// The three planes `[3, H, W]`.
+    pub fn values(&self) -> &[f32] {
+        &self.values
+    }
+
+    /// One of the three planes `[H, W]`.
+    pub fn plane(&self, channel: usize) -> &[f32] {
+        &self.values[channel * self.height * self.width..][..self.height * self.width]
+    }
+
+    /// The part of it in `[x, y, width, height]`.
+    ///
+    /// # Panics
+    /// If that is not inside.
+    pub fn cropped(&self, [x, y, width, height]: [usize; 4]) -> Self {
+        assert!(x + width <= self.width && y + height <= self.height, "{width}×{height} at {x}, {y}");
+        let line = |c: usize, row: usize| &self.plane(c)[row * self.width + x..][..width];
+        let lines = (0..3).flat_map(|c| (y..y + height).map(move |row| (c, row)));
+        Self { width, height, values: lines.flat_map(|(c, row)| line(c, row)).copied().collect() }
+    }
+
+    /// The same with black wherever `inside` `[H, W]` is not set.
+    pub fn only(&self, inside: &[bool]) -> Self {
+        let mut picture = self.clone();
+        for plane in picture.values.chunks_exact_mut(inside.len().max(1)) {
+            plane.iter_mut().zip(inside).filter(|(_, set)| !**set).for_each(|(v, _)| *v = 0.0);
+        }
+        picture
+    }
+
+    /// Half the side in both directions: means of 2 × 2 pixels. Pictures of even sides.
+    pub fn halved(&self) -> Self {
+        let (width, height) = (self.width / 2, self.height / 2);
+        let pixel = |c: usize, i: usize| {
+            let (row, column) = (2 * (i / width), 2 * (i % width));
+            let line = |row: usize| &self.plane(c)[row * self.width + column..][..2];
+            let ([a, b], [c, d]) = ([line(row)[0], line(row)[1]], [line(row + 1)[0], line(row + 1)[1]]);
+            ((a + b) + (c + d)) / 4.0
+        };
+        let values = (0..3).flat_map(|c| (0..width * height).map(move |i| (c, i)));
+        Self { width, height, values: values.map(|(c, i)| pixel(c, i)).collect() }
+    }
+
+    /// In 8 bits.
+    pub fn to_rgb8(&self) -> RgbImage {
+        RgbImage::from_fn(self.width as u32, self.height as u32, |x, y| {
+            let at = y as usize * self.width + x as usize;
+            image::Rgb([0, 1, 2].map(|c| (self.plane(c)[at] * 255.0).round() as u8))
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use image::{ImageBuffer, Rgb, Rgba};
+
+    fn colorful() -> RgbImage {
+        RgbImage::from_fn(5, 4, |x, y| Rgb([(40 * x) as u8, (60 * y) as u8, 255 - (10 * x * y) as u8]))
+    }
+
+    #[test]
+    fn eight_and_sixteen_bits_and_floats_of_one_picture_are_equal() {
+        let eight = colorful();
+        let sixteen =
+            ImageBuffer::from_fn(5, 4, |x, y| Rgb(eight.get_pixel(x, y).0.map(|v| u16::from(v) * 257)));
+        let float =
+            ImageBuffer::from_fn(5, 4, |x, y| Rgb(eight.get_pixel(x, y).0.map(|v| f32::from(v) / 255.0)));
+        let expected = Picture::from_rgb8(&eight);
+        for picture in [
+            DynamicImage::ImageRgb8(eight),
+            DynamicImage::ImageRgb16(sixteen),
+            DynamicImage::ImageRgb32F(float),
+        ] {
+            assert_eq!(Picture::from_file(picture, "picture").expect("a picture"), expected);
+        }
+        let tensor = expected.tensor(&Device::flex());
+        assert_eq!(Picture::from_tensor(&tensor, "picture").expect("a picture"), expected);
+        assert_eq!(expected.to_rgb8(), colorful());
+        // Red is the first plane.
+        assert_eq!(expected.plane(0)[3], 120.0 / 255.0);
+    }
+
+    #[test]
+    fn what_is_not_in_0_to_1_is_refused_with_its_place() {
+        let values = |bad: f32| (0..18).map(|i| if i == 16 { bad } else { 0.5 }).collect::<Vec<f32>>();
+        for bad in [255.0, -1e-6, 1.000_001, f32::NAN, f32::INFINITY] {
+            let said = Picture::new(values(bad), [2, 3], "picture").expect_err("refused").to_string();
+            assert!(said.contains("channel 2, row 1, column 1 of the picture"), "{said}");
+        }
+        // Renders are cut, but a NaN is no colour.
+        assert_eq!(Picture::rendered(&values(7.0), [2, 3]).expect("cut").plane(1)[5], 1.0);
+        assert!(Picture::rendered(&values(f32::NAN), [2, 3]).is_err());
+    }
+
+    #[test]
+    fn transparent_pictures_lie_over_black() {
+        let rgba = ImageBuffer::from_pixel(1, 1, Rgba([200_u8, 100, 50, 51]));
+        let picture = Picture::from_file(DynamicImage::ImageRgba8(rgba), "picture").expect("a picture");
+        let expected = [200.0, 100.0, 50.0].map(|v: f32| v / 255.0 * 0.2);
+        assert!(picture.values().iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-7), "{picture:?}");
+    }
+
+    #[test]
+    fn crops_and_halves_keep_pixels_where_they_are() {
+        let values: Vec<f32> = (0..48).map(|i| i as f32 / 48.0).collect();
+        let picture = Picture::new(values, [4, 4], "picture").expect("a picture");
+        let crop = picture.cropped([1, 2, 2, 1]);
+        assert_eq!(crop.values(), [9.0, 10.0, 25.0, 26.0, 41.0, 42.0].map(|v| v / 48.0));
+        let half = picture.halved();
+        assert!((half.plane(0)[1] - 4.5 / 48.0).abs() < 1e-7 && half.values().len() == 12, "{half:?}");
+    }
+}

@@ -1,0 +1,174 @@
+//! Where pictures are compared: everywhere, in the paper's window around the person, or on the person (SNAPSNAP §10).
+
+use crate::EvalError;
+use crate::pictures::Picture;
+
+/// The paper's window, height and width at 1024 pixels.
+const PAPER: [usize; 2] = [1000, 500];
+/// How far around the person's mask the protocol `masked` looks, at 1024 pixels.
+const MARGIN: usize = 8;
+/// The height that both are said for.
+const AT: usize = 1024;
+
+/// Pixels of a picture.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Region {
+    /// Left, top, width, height.
+    pub window: [usize; 4],
+    /// `[height, width]` of the window: which of its pixels count; `None`: all.
+    pub inside: Option<Vec<bool>>,
+}
+
+impl Region {
+    /// The whole picture.
+    pub fn all(picture: &Picture) -> Self {
+        Self { window: [0, 0, picture.width, picture.height], inside: None }
+    }
+
+    /// The paper's: 1000 × 500 of 1024 pixels, scaled to the picture's height, around the middle of the box of all pixels of
+    /// the true picture that are not exactly black, pushed inside. A person who is wider is cut.
+    ///
+    /// # Errors
+    /// [`EvalError::Empty`] for a true picture that is black throughout.
+    pub fn paper(target: &Picture) -> Result<Self, EvalError> {
+        let Picture { width, height, .. } = *target;
+        let seen = |i: usize| (0..3).any(|c| target.plane(c)[i] != 0.0);
+        let Some([left, top, right, bottom]) = bounds(width, height, seen) else {
+            return Err(EvalError::Empty("the true picture is black throughout: there is no person".into()));
+        };
+        let side = |of: usize, most: usize| ((of * height + AT / 2) / AT).clamp(1, most);
+        let [h, w] = [side(PAPER[0], height), side(PAPER[1], width)];
+        let place = |from: usize, to: usize, side: usize, most: usize| {
+            ((from + to) / 2).saturating_sub(side / 2).min(most - side)
+        };
+        let window = [place(left, right, w, width), place(top, bottom, h, height), w, h];
+        Ok(Self { window, inside: None })
+    }
+
+    /// The person's mask `[H, W]` (any value above 0), with [`margin`] pixels around it.
+    ///
+    /// # Errors
+    /// [`EvalError::Empty`] for a mask without a person.
+    pub fn masked(mask: &[f32], [height, width]: [usize; 2], margin: usize) -> Result<Self, EvalError> {
+        let inside = dilated(mask, width, margin);
+        let Some([left, top, right, bottom]) = bounds(width, height, |i| inside[i]) else {
+            return Err(EvalError::Empty("the mask is empty: there is no person".into()));
+        };
+        let window = [left, top, right + 1 - left, bottom + 1 - top];
+        let line = |row: usize| &inside[row * width + left..row * width + right + 1];
+        let inside = (top..=bottom).flat_map(line).copied().collect();
+        Ok(Self { window, inside: Some(inside) })
+    }
+
+    /// Whether a pixel of the window, row by row, counts.
+    pub fn counts(&self, pixel: usize) -> bool {
+        self.inside.as_ref().is_none_or(|inside| inside[pixel])
+    }
+
+    /// Number of pixels.
+    pub fn pixels(&self) -> usize {
+        match &self.inside {
+            Some(inside) => inside.iter().filter(|set| **set).count(),
+            None => self.window[2] * self.window[3],
+        }
+    }
+}
+
+/// How far around masks the protocol `masked` looks in pictures of this height: 8 pixels of 1024.
+pub fn margin(height: usize) -> usize {
+    (MARGIN * height).div_ceil(AT)
+}
+
+/// Where a mask `[H, W]` of this width is above 0 within `margin` pixels, to the sides and up and down.
+fn dilated(mask: &[f32], width: usize, margin: usize) -> Vec<bool> {
+    let inside: Vec<bool> = mask.iter().map(|v| *v > 0.0).collect();
+    let rows = mask.len() / width.max(1);
+    let across = spread(&inside, [rows, width], [width, 1], margin);
+    spread(&across, [width, rows], [1, width], margin)
+}
+
+/// Set pixels reach `margin` further along lines of `length` pixels; lines and pixels lie `strides` apart.
+fn spread(inside: &[bool], [lines, length]: [usize; 2], strides: [usize; 2], margin: usize) -> Vec<bool> {
+    let mut out = vec![false; inside.len()];
+    for line in 0..lines {
+        let at = |i: usize| line * strides[0] + i * strides[1];
+        // One past the last pixel that the last set one reaches.
+        let mut reach = 0;
+        let mut next = 0;
+        for i in 0..length {
+            while next < length && next <= i + margin {
+                if inside[at(next)] {
+                    reach = next + margin + 1;
+                }
+                next += 1;
+            }
+            out[at(i)] = i < reach;
+        }
+    }
+    out
+}
+
+/// First and last column and row of the pixels that `is_set`: left, top, right, bottom.
+fn bounds(width: usize, height: usize, is_set: impl Fn(usize) -> bool) -> Option<[usize; 4]> {
+    let mut found: Option<[usize; 4]> = None;
+    for i in (0..width * height).filter(|i| is_set(*i)) {
+        let (x, y) = (i % width, i / width);
+        let [left, top, right, bottom] = found.get_or_insert([x, y, x, y]);
+        (*left, *top, *right, *bottom) = ((*left).min(x), (*top).min(y), (*right).max(x), (*bottom).max(y));
+    }
+    found
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn picture([height, width]: [usize; 2], lit: &[[usize; 2]]) -> Picture {
+        let mut values = vec![0.0; 3 * height * width];
+        lit.iter().for_each(|[x, y]| values[height * width + y * width + x] = 1.0 / 255.0);
+        Picture::new(values, [height, width], "picture").expect("a picture")
+    }
+
+    #[test]
+    fn the_papers_window_lies_around_the_person_and_inside_the_picture() {
+        let window =
+            |lit: &[[usize; 2]]| Region::paper(&picture([1024, 1024], lit)).expect("a person").window;
+        assert_eq!(window(&[[400, 100], [700, 900]]), [300, 0, 500, 1000]);
+        assert_eq!(window(&[[400, 512], [700, 520]]), [300, 16, 500, 1000]);
+        assert_eq!(window(&[[0, 1000], [10, 1023]]), [0, 24, 500, 1000]);
+        assert_eq!(window(&[[1023, 0]]), [524, 0, 500, 1000]);
+        // Scaled by the height; never larger than the picture.
+        let small = Region::paper(&picture([256, 100], &[[50, 128]])).expect("a person");
+        assert_eq!(small.window, [0, 3, 100, 250]);
+        assert!(Region::paper(&picture([8, 8], &[])).is_err());
+    }
+
+    /// Against the definition, pixel by pixel.
+    #[test]
+    fn masks_grow_by_their_margin_in_all_directions() {
+        let (height, width) = (13, 17);
+        for (seed, margin) in [(1_u32, 0), (2, 1), (3, 2), (4, 5), (5, 40)] {
+            let lit = |i: usize| (i as u32).wrapping_mul(2_654_435_761).rotate_left(seed) % 23 == 0;
+            let mask: Vec<f32> = (0..height * width).map(|i| if lit(i) { 0.1 } else { 0.0 }).collect();
+            let near = |i: usize| {
+                let (x, y) = (i % width, i / width);
+                let lines = y.saturating_sub(margin)..=(y + margin).min(height - 1);
+                lines.into_iter().any(|row| {
+                    (x.saturating_sub(margin)..=(x + margin).min(width - 1)).any(|c| lit(row * width + c))
+                })
+            };
+            let expected: Vec<bool> = (0..height * width).map(near).collect();
+            assert_eq!(dilated(&mask, width, margin), expected, "margin {margin}");
+        }
+        assert_eq!([256, 512, 1000, 1024, 2048].map(margin), [2, 4, 8, 8, 16]);
+    }
+
+    #[test]
+    fn a_masks_region_is_its_box_and_counts_its_pixels() {
+        let mut mask = vec![0.0; 20 * 10];
+        mask[5 * 20 + 7] = 1.0;
+        let region = Region::masked(&mask, [10, 20], 2).expect("a person");
+        assert_eq!((region.window, region.pixels()), ([5, 3, 5, 5], 25));
+        assert!(Region::masked(&[0.0; 200], [10, 20], 2).is_err());
+    }
+}

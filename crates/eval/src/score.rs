@@ -1,0 +1,64 @@
+//! All metrics of a picture and the true one.
+
+use burn::tensor::Device;
+use serde::Serialize;
+
+use crate::EvalError;
+use crate::lpips::{Lpips, MIN_SIDE};
+use crate::pictures::Picture;
+use crate::region::Region;
+use crate::similarity::{psnr, ssim};
+use crate::statistics::number;
+
+/// What is reported of a view, or means of it.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Score {
+    /// dB; ∞ for equal pictures.
+    #[serde(with = "number")]
+    pub psnr: f64,
+    /// Absent where the region holds no whole window.
+    #[serde(with = "number::optional")]
+    pub ssim: Option<f64>,
+    /// Absent without weights, and where the region is too small for the network.
+    #[serde(with = "number::optional")]
+    pub lpips: Option<f64>,
+}
+
+impl Score {
+    /// Compares an image with the true one where `region` says. LPIPS sees the region's box, black where the region's mask is
+    /// not set, in both.
+    ///
+    /// # Errors
+    /// [`EvalError::Sizes`].
+    pub fn new(
+        image: &Picture,
+        target: &Picture,
+        region: &Region,
+        lpips: Option<&Lpips>,
+    ) -> Result<Self, EvalError> {
+        let (psnr, ssim) = (psnr(image, target, region)?, ssim(image, target, region)?);
+        let seen = |picture: &Picture| {
+            let part = picture.cropped(region.window);
+            region.inside.as_ref().map_or(part.clone(), |inside| part.only(inside))
+        };
+        let [.., width, height] = region.window;
+        let lpips = lpips.filter(|_| width.min(height) >= MIN_SIDE).map(|network| {
+            let device: &Device = &network.device();
+            let distance = network.distance(seen(image).tensor(device), seen(target).tensor(device));
+            f64::from(snapsnap_ops::host(distance)[0])
+        });
+        Ok(Self { psnr, ssim, lpips })
+    }
+
+    /// Means, of the figures that all have; `None` without any.
+    pub fn mean(scores: &[Self]) -> Option<Self> {
+        let n = scores.len() as f64;
+        let all =
+            |of: fn(&Self) -> Option<f64>| scores.iter().map(of).sum::<Option<f64>>().map(|sum| sum / n);
+        (!scores.is_empty()).then(|| Self {
+            psnr: scores.iter().map(|score| score.psnr).sum::<f64>() / n,
+            ssim: all(|score| score.ssim),
+            lpips: all(|score| score.lpips),
+        })
+    }
+}

@@ -1,0 +1,226 @@
+//! PSNR and SSIM of two pictures (SNAPSNAP §10).
+
+use burn::tensor::module::conv2d;
+use burn::tensor::ops::ConvOptions;
+use burn::tensor::{Tensor, TensorData};
+use rayon::prelude::*;
+
+use crate::EvalError;
+use crate::pictures::Picture;
+use crate::region::Region;
+
+/// Side of the protocol's uniform window: scikit-image's default.
+pub const UNIFORM: usize = 7;
+/// Side of the loss's Gaussian window.
+const GAUSSIAN: usize = 11;
+/// Its standard deviation in pixels.
+const SIGMA: f64 = 1.5;
+/// Constants of Wang et al. 2004 for values in [0, 1]: (0.01)² and (0.03)².
+const C1: f64 = 1e-4;
+const C2: f64 = 9e-4;
+
+/// Squared differences of pictures, summed over pixels and channels.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct SquaredError {
+    sum: f64,
+    count: usize,
+}
+
+impl SquaredError {
+    /// Adds those of two pictures in a region.
+    ///
+    /// # Errors
+    /// [`EvalError::Sizes`].
+    pub fn add(&mut self, image: &Picture, target: &Picture, region: &Region) -> Result<(), EvalError> {
+        check_sizes(image, target)?;
+        let [x, y, width, height] = region.window;
+        for (channel, row) in (0..3).flat_map(|channel| (0..height).map(move |row| (channel, row))) {
+            let line =
+                |picture: &Picture| (y + row) * picture.width + x..(y + row) * picture.width + x + width;
+            let (a, b) = (&image.plane(channel)[line(image)], &target.plane(channel)[line(target)]);
+            let counts = |column: usize| region.counts(row * width + column);
+            let squares =
+                (0..width).filter(|i| counts(*i)).map(|i| (f64::from(a[i]) - f64::from(b[i])).powi(2));
+            self.sum += squares.sum::<f64>();
+        }
+        self.count += 3 * region.pixels();
+        Ok(())
+    }
+
+    /// Peak signal-to-noise ratio in dB for a peak of 1; ∞ for equal pictures.
+    pub fn psnr(self) -> f64 {
+        -10.0 * (self.sum / self.count as f64).log10()
+    }
+}
+
+/// Peak signal-to-noise ratio in dB over the pixels of a region and the three channels, for a peak of 1; ∞ for equal pictures.
+///
+/// # Errors
+/// [`EvalError::Sizes`].
+pub fn psnr(image: &Picture, target: &Picture, region: &Region) -> Result<f64, EvalError> {
+    let mut error = SquaredError::default();
+    error.add(image, target, region)?;
+    Ok(error.psnr())
+}
+
+/// Pictures that are compared must be of one size.
+///
+/// # Errors
+/// [`EvalError::Sizes`].
+pub fn check_sizes(image: &Picture, target: &Picture) -> Result<(), EvalError> {
+    let size = |p: &Picture| vec![p.height, p.width];
+    if size(image) == size(target) {
+        return Ok(());
+    }
+    Err(EvalError::Sizes { found: size(image), expected: size(target) })
+}
+
+/// Structural similarity as scikit-image's `structural_similarity` computes it by default for values in [0, 1]: uniform window
+/// of 7 × 7 pixels, sample covariances (N − 1), mean over pixels and channels. A region without a mask is a picture of its own:
+/// pixels whose window leaves it are left out, as the protocol does with its crops. Where a region has a mask, the pixels that
+/// count are compared with all that is around them. `None` if no pixel is left.
+///
+/// # Errors
+/// [`EvalError::Sizes`].
+pub fn ssim(image: &Picture, target: &Picture, region: &Region) -> Result<Option<f64>, EvalError> {
+    check_sizes(image, target)?;
+    let half = UNIFORM / 2;
+    let [x, y, w, h] = region.window;
+    let around = if region.inside.is_some() { half } else { 0 };
+    let [left, top] = [x.saturating_sub(around), y.saturating_sub(around)];
+    let [right, bottom] = [(x + w + around).min(image.width), (y + h + around).min(image.height)];
+    let (width, height) = (right - left, bottom - top);
+    if width.min(height) < UNIFORM {
+        return Ok(None);
+    }
+    let [image, target] = [image, target].map(|picture| picture.cropped([left, top, width, height]));
+    let window = Window::uniform();
+    let rows: Vec<(usize, usize)> = (0..3).flat_map(|c| (half..height - half).map(move |y| (c, y))).collect();
+    let line = |(c, row): (usize, usize)| -> [f64; 2] {
+        // Places in the crop as places in the region's window.
+        let inside = |column: usize| {
+            let (row, column) = ((top + row).checked_sub(y), (left + column).checked_sub(x));
+            let place = row.zip(column).filter(|(row, column)| *row < h && *column < w);
+            place.is_some_and(|(row, column)| region.counts(row * w + column))
+        };
+        let similarities = line_of(image.plane(c), target.plane(c), [height, width], row, &window);
+        let counted = similarities.into_iter().enumerate().filter(|(column, _)| inside(column + half));
+        counted.fold([0.0; 2], |[sum, count], (_, s)| [sum + s, count + 1.0])
+    };
+    // Summed in the order of the rows, so that the number of threads changes nothing.
+    let sums: Vec<[f64; 2]> = rows.into_par_iter().map(line).collect();
+    let [sum, count] = sums.iter().fold([0.0; 2], |[a, b], [c, d]| [a + c, b + d]);
+    Ok((count > 0.0).then(|| sum / count))
+}
+
+/// What a pixel's surroundings count.
+struct Window {
+    /// Along rows and along columns; their sum is 1.
+    weights: Vec<f64>,
+    /// What variances are multiplied with.
+    correction: f64,
+    /// Whether there are zeros beyond the border; else pixels whose window reaches it are left out.
+    padded: bool,
+}
+
+impl Window {
+    fn uniform() -> Self {
+        let count = (UNIFORM * UNIFORM) as f64;
+        let weights = vec![1.0 / UNIFORM as f64; UNIFORM];
+        Self { weights, correction: count / (count - 1.0), padded: false }
+    }
+
+    fn gaussian() -> Self {
+        Self { weights: gaussian(), correction: 1.0, padded: true }
+    }
+}
+
+/// Similarities of the pixels of row `y` of two planes `[H, W]`.
+fn line_of(a: &[f32], b: &[f32], [height, width]: [usize; 2], y: usize, window: &Window) -> Vec<f64> {
+    let Window { weights, correction, padded } = window;
+    let half = weights.len() / 2;
+    let border = if *padded { half } else { 0 };
+    // Means over the window's rows, column by column: a, b, a², b², a·b.
+    let mut columns = vec![[0.0_f64; 5]; width + 2 * border];
+    for (weight, row) in weights.iter().zip(y as isize - half as isize..) {
+        let Some(row) = usize::try_from(row).ok().filter(|row| *row < height) else { continue };
+        let lines = a[row * width..][..width].iter().zip(&b[row * width..][..width]);
+        for (sums, (a, b)) in columns[border..].iter_mut().zip(lines) {
+            let (a, b) = (f64::from(*a), f64::from(*b));
+            [a, b, a * a, b * b, a * b].iter().zip(sums).for_each(|(v, sum)| *sum += weight * v);
+        }
+    }
+    let similarity = |columns: &[[f64; 5]]| {
+        let mut means = [0.0; 5];
+        for (weight, column) in weights.iter().zip(columns) {
+            means.iter_mut().zip(column).for_each(|(mean, v)| *mean += weight * v);
+        }
+        let [ma, mb, maa, mbb, mab] = means;
+        // E[a²] − E[a]² is negative by rounding where a picture is flat.
+        let (va, vb) = ((maa - ma * ma).max(0.0), (mbb - mb * mb).max(0.0));
+        let most = (va * vb).sqrt();
+        let (va, vb) = (correction * va, correction * vb);
+        let vab = correction * (mab - ma * mb).clamp(-most, most);
+        let similarity =
+            ((2.0 * ma * mb + C1) * (2.0 * vab + C2)) / ((ma * ma + mb * mb + C1) * (va + vb + C2));
+        // Nothing is more alike than equal; rounding must not say so.
+        similarity.min(1.0)
+    };
+    columns.windows(weights.len()).map(similarity).collect()
+}
+
+/// [`ssim_gaussian`] of two pictures, computed in f64, mean over the pixels of a region and the channels.
+///
+/// # Errors
+/// [`EvalError::Sizes`].
+pub fn ssim_of_loss(image: &Picture, target: &Picture, region: &Region) -> Result<f64, EvalError> {
+    check_sizes(image, target)?;
+    let [x, y, width, height] = region.window;
+    let window = Window::gaussian();
+    let rows: Vec<(usize, usize)> = (0..3).flat_map(|c| (0..height).map(move |row| (c, row))).collect();
+    let line = |(c, row): (usize, usize)| -> f64 {
+        let size = [image.height, image.width];
+        let values = line_of(image.plane(c), target.plane(c), size, y + row, &window);
+        (0..width).filter(|i| region.counts(row * width + i)).map(|i| values[x + i]).sum()
+    };
+    let sums: Vec<f64> = rows.into_par_iter().map(line).collect();
+    Ok(sums.iter().sum::<f64>() / (3 * region.pixels()) as f64)
+}
+
+/// Structural similarity of every pixel and channel of pictures `[B,C,H,W]` with values in [0, 1], `[B,C,H,W]`, as stage 2's
+/// loss takes it: an 11×11 Gaussian window of σ = 1.5, beyond the border zeros, population variances. Differentiable.
+pub fn ssim_gaussian(x: Tensor<4>, y: Tensor<4>) -> Tensor<4> {
+    let mean = |t: Tensor<4>| blur(t);
+    let (mx, my) = (mean(x.clone()), mean(y.clone()));
+    let (mxx, myy, mxy) = (mx.clone().square(), my.clone().square(), mx * my);
+    // E[x²] − E[x]² is negative by rounding where a picture is flat, and would carry the similarity above 1.
+    let variance = |t: Tensor<4>, m: &Tensor<4>| (mean(t.square()) - m.clone()).clamp_min(0.0);
+    let (vx, vy) = (variance(x.clone(), &mxx), variance(y.clone(), &myy));
+    let covariance = mean(x * y) - mxy.clone();
+    let numerator = (mxy * 2.0 + C1) * (covariance * 2.0 + C2);
+    numerator / ((mxx + myy + C1) * (vx + vy + C2))
+}
+
+/// Gaussian means over the window, rows and columns one after the other.
+fn blur(x: Tensor<4>) -> Tensor<4> {
+    let [b, c, h, w] = x.dims();
+    let kernel: Vec<f32> = gaussian().into_iter().map(|weight| weight as f32).collect();
+    let kernel = |shape: [usize; 4]| {
+        Tensor::<4>::from_data(TensorData::new(kernel.clone(), shape), &x.device()).cast(x.dtype())
+    };
+    let (down, across) = (kernel([1, 1, GAUSSIAN, 1]), kernel([1, 1, 1, GAUSSIAN]));
+    let half = GAUSSIAN / 2;
+    let planes = x.reshape([b * c, 1, h, w]);
+    let rows = conv2d(planes, down, None, ConvOptions::new([1, 1], [half, 0], [1, 1], 1));
+    conv2d(rows, across, None, ConvOptions::new([1, 1], [0, half], [1, 1], 1)).reshape([b, c, h, w])
+}
+
+/// Weights of the loss's window.
+fn gaussian() -> Vec<f64> {
+    let weight = |i: usize| {
+        let d = i as f64 - (GAUSSIAN / 2) as f64;
+        (-d * d / (2.0 * SIGMA * SIGMA)).exp()
+    };
+    let sum: f64 = (0..GAUSSIAN).map(weight).sum();
+    (0..GAUSSIAN).map(|i| weight(i) / sum).collect()
+}

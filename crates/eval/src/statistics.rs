@@ -1,0 +1,119 @@
+//! Means over people, and how far they can be trusted; run times.
+
+use rand::Rng;
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use serde::Serialize;
+
+/// Resamples of a bootstrap (EVALUATION.md).
+const RESAMPLES: usize = 2000;
+/// Their seed: equal data give equal intervals.
+const SEED: u64 = 1;
+/// What lies between the bounds.
+const CONFIDENCE: f64 = 0.95;
+
+/// A mean and the bounds between which it lies with 95 % confidence.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Interval {
+    /// Mean over people.
+    #[serde(with = "crate::statistics::number")]
+    pub mean: f64,
+    /// Lower bound.
+    #[serde(with = "crate::statistics::number")]
+    pub low: f64,
+    /// Upper bound.
+    #[serde(with = "crate::statistics::number")]
+    pub high: f64,
+}
+
+/// Mean of one figure per person, with the percentile bootstrap over people; `None` without people. Of paired differences it is
+/// the paired interval. An infinite figure (the PSNR of equal pictures) makes the mean infinite.
+pub fn interval(figures: &[f64]) -> Option<Interval> {
+    let n = figures.len();
+    if n == 0 {
+        return None;
+    }
+    let mean = figures.iter().sum::<f64>() / n as f64;
+    let mut random = ChaCha8Rng::seed_from_u64(SEED);
+    let resampled = |_| (0..n).map(|_| figures[random.random_range(0..n)]).sum::<f64>() / n as f64;
+    let mut means: Vec<f64> = (0..RESAMPLES).map(resampled).collect();
+    means.sort_by(f64::total_cmp);
+    let tail = (1.0 - CONFIDENCE) / 2.0;
+    Some(Interval { mean, low: quantile(&means, tail), high: quantile(&means, 1.0 - tail) })
+}
+
+/// A quantile of sorted values, linear between them.
+///
+/// # Panics
+/// Without values.
+pub fn quantile(sorted: &[f64], share: f64) -> f64 {
+    let at = share * (sorted.len() - 1) as f64;
+    let (below, above) = (sorted[at.floor() as usize], sorted[at.ceil() as usize]);
+    if below == above { below } else { below + (above - below) * at.fract() }
+}
+
+/// Numbers in JSON, which has no infinities: those are written as `"inf"`.
+pub mod number {
+    use serde::{Serialize, Serializer};
+
+    /// As text where it is not finite.
+    ///
+    /// # Errors
+    /// Of the serializer.
+    pub fn serialize<S: Serializer>(value: &f64, serializer: S) -> Result<S::Ok, S::Error> {
+        if value.is_finite() { value.serialize(serializer) } else { value.to_string().serialize(serializer) }
+    }
+
+    /// The same for figures that may be absent.
+    pub mod optional {
+        use serde::Serializer;
+
+        /// `null` where there is none.
+        ///
+        /// # Errors
+        /// Of the serializer.
+        pub fn serialize<S: Serializer>(value: &Option<f64>, serializer: S) -> Result<S::Ok, S::Error> {
+            match value {
+                Some(value) => super::serialize(value, serializer),
+                None => serializer.serialize_none(),
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn quantiles_are_linear_between_values() {
+        let values = [1.0, 2.0, 4.0, 8.0];
+        assert_eq!([0.0, 0.5, 1.0, 1.0 / 6.0].map(|share| quantile(&values, share)), [1.0, 3.0, 8.0, 1.5]);
+    }
+
+    /// Of many normal figures the bounds lie 1.96 standard errors from the mean.
+    #[test]
+    fn the_interval_is_that_of_the_normal_approximation_where_that_holds() {
+        let mut random = ChaCha8Rng::seed_from_u64(7);
+        let normal = |random: &mut ChaCha8Rng| (0..12).map(|_| random.random::<f64>()).sum::<f64>() - 6.0;
+        let figures: Vec<f64> = (0..400).map(|_| 20.0 + 2.0 * normal(&mut random)).collect();
+        let Interval { mean, low, high } = interval(&figures).expect("people");
+        let deviation = figures.iter().map(|f| (f - mean).powi(2)).sum::<f64>() / 399.0;
+        let error = 1.96 * (deviation / 400.0).sqrt();
+        for bound in [mean - low, high - mean] {
+            assert!((bound / error - 1.0).abs() < 0.1, "{low} {mean} {high}, expected ±{error}");
+        }
+        assert_eq!(interval(&figures), interval(&figures));
+    }
+
+    #[test]
+    fn one_person_has_no_spread_and_equal_pictures_are_infinitely_alike() {
+        assert_eq!(interval(&[3.0]), Some(Interval { mean: 3.0, low: 3.0, high: 3.0 }));
+        assert_eq!(interval(&[]), None);
+        let endless = interval(&[f64::INFINITY, f64::INFINITY]).expect("people");
+        assert_eq!(
+            serde_json::to_string(&endless).expect("JSON"),
+            r#"{"mean":"inf","low":"inf","high":"inf"}"#
+        );
+    }
+}
