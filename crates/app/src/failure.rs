@@ -5,6 +5,7 @@ use std::io;
 use std::path::Path;
 use std::process::ExitCode;
 
+use snapsnap_eval::EvalError;
 use snapsnap_mesh::FileError;
 use snapsnap_net::config::ConfigError;
 use snapsnap_net::weights::WeightsError;
@@ -58,6 +59,15 @@ impl From<SplatError> for Failure {
     fn from(e: SplatError) -> Self {
         match e {
             SplatError::Shape { .. } | SplatError::NotFinite { .. } => Self::Internal(e.to_string()),
+            _ => Self::Input(e.to_string()),
+        }
+    }
+}
+
+impl From<EvalError> for Failure {
+    fn from(e: EvalError) -> Self {
+        match e {
+            EvalError::Splat(e) => e.into(),
             _ => Self::Input(e.to_string()),
         }
     }

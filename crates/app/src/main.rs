@@ -10,6 +10,7 @@ mod output;
 mod perceptual;
 mod pictures;
 mod progress;
+mod report;
 mod say;
 mod turntable;
 mod view_folder;
@@ -48,6 +49,8 @@ enum Command {
     /// Train the Gaussian regressor on what a trained point predictor gives.
     #[command(name = "train-stage2")]
     TrainStage2(commands::train::Arguments),
+    /// Judge a model on a data set, beside baselines and others.
+    Evaluate(commands::evaluate::Arguments),
     /// How alike two pictures are, or two folders of pictures: PSNR, SSIM, LPIPS.
     Compare(commands::compare::Arguments),
     /// Read checkpoints of Snap-Snap, DUSt3R or CroCo and write one weight file.
@@ -86,6 +89,7 @@ fn main() -> ExitCode {
         Command::Prepare(arguments) => commands::prepare::run(&arguments, quiet),
         Command::TrainStage1(arguments) => commands::train::stage1(&arguments, quiet),
         Command::TrainStage2(arguments) => commands::train::stage2(&arguments, quiet),
+        Command::Evaluate(arguments) => commands::evaluate::run(&arguments, quiet),
         Command::Compare(arguments) => commands::compare::run(&arguments),
         Command::ImportWeights(arguments) => commands::import_weights::run(&arguments, quiet),
         Command::InitWeights(arguments) => commands::init_weights::run(&arguments, quiet),

@@ -25,8 +25,16 @@ impl Arguments {
     /// # Errors
     /// If weights that were asked for are not there, or those that are there are damaged.
     pub fn load(&self, device: &str) -> Result<Result<Lpips, String>, Failure> {
+        self.load_or(Path::new(FOLDER), device)
+    }
+
+    /// The same with another folder to look in where none is given.
+    ///
+    /// # Errors
+    /// As [`Self::load`].
+    pub fn load_or(&self, default: &Path, device: &str) -> Result<Result<Lpips, String>, Failure> {
         let folder = match self.lpips.as_slice() {
-            [] => Path::new(FOLDER),
+            [] => default,
             [folder] if folder.is_dir() => folder,
             files => return Ok(Ok(Lpips::load(files, &device::choose(device)?)?)),
         };

@@ -1,11 +1,16 @@
 //! How like the truth pictures and surfaces are, and what that costs: metrics, the evaluation of a model on a data set, error
 //! against run time, numerical stability.
 
+pub mod baselines;
 mod error;
+pub mod evaluate;
 pub mod geometry;
 pub mod lpips;
 pub mod pictures;
+pub mod points;
+pub mod preview;
 pub mod region;
+pub mod report;
 pub mod score;
 pub mod similarity;
 pub mod statistics;

@@ -3,6 +3,7 @@
 
 use burn::tensor::{Device, Tensor, TensorData};
 use image::{DynamicImage, Rgb32FImage, RgbImage};
+use rayon::prelude::*;
 
 use crate::EvalError;
 
@@ -35,19 +36,41 @@ impl Picture {
         Ok(Self { width, height, values })
     }
 
-    /// What a renderer gives, `[H, W, 3]`: values beyond what a file or a screen can show are cut.
+    /// What a renderer gives, `[H, W, 3]`, shrunk to means of `times`² pixels: values beyond what a file or a screen can show
+    /// are cut first.
     ///
     /// # Errors
     /// [`EvalError::Value`] for a value that is not finite.
     ///
     /// # Panics
-    /// If there are not as many values as the size says.
-    pub fn rendered(values: &[f32], [height, width]: [usize; 2]) -> Result<Self, EvalError> {
+    /// If there are not as many values as the size says, or the size is no multiple of `times`.
+    pub fn rendered(values: &[f32], [height, width]: [usize; 2], times: usize) -> Result<Self, EvalError> {
         assert_eq!(values.len(), 3 * height * width, "pixels of {width}×{height}");
-        let (pixels, _) = values.as_chunks::<3>();
+        assert!(height % times == 0 && width % times == 0, "{width}×{height} in parts of {times}");
         let cut = |v: f32| if v.is_finite() { v.clamp(0.0, 1.0) } else { v };
-        let planes = (0..3).flat_map(|c| pixels.iter().map(move |p| cut(p[c]))).collect();
-        Self::new(planes, [height, width], "render")
+        let (pixels, _) = values.as_chunks::<3>();
+        let size @ [_, columns] = [height / times, width / times];
+        let mut planes = vec![0.0; 3 * size[0] * columns];
+        let (red, rest) = planes.split_at_mut(size[0] * columns);
+        let (green, blue) = rest.split_at_mut(size[0] * columns);
+        let rows =
+            red.par_chunks_mut(columns).zip(green.par_chunks_mut(columns)).zip(blue.par_chunks_mut(columns));
+        rows.enumerate().for_each(|(row, ((red, green), blue))| {
+            for column in 0..columns {
+                let mut sums = [0.0; 3];
+                for line in 0..times {
+                    let start = (row * times + line) * width + column * times;
+                    for pixel in &pixels[start..start + times] {
+                        sums.iter_mut().zip(pixel).for_each(|(sum, v)| *sum += cut(*v));
+                    }
+                }
+                // Rounding of the mean of ones must not leave [0, 1].
+                let mean =
+                    |sum: f32| if sum.is_nan() { sum } else { (sum / (times * times) as f32).min(1.0) };
+                (red[column], green[column], blue[column]) = (mean(sums[0]), mean(sums[1]), mean(sums[2]));
+            }
+        });
+        Self::new(planes, size, "render")
     }
 
     /// 8 bits per channel.
@@ -125,19 +148,6 @@ impl Picture {
         picture
     }
 
-    /// Half the side in both directions: means of 2 × 2 pixels. Pictures of even sides.
-    pub fn halved(&self) -> Self {
-        let (width, height) = (self.width / 2, self.height / 2);
-        let pixel = |c: usize, i: usize| {
-            let (row, column) = (2 * (i / width), 2 * (i % width));
-            let line = |row: usize| &self.plane(c)[row * self.width + column..][..2];
-            let ([a, b], [c, d]) = ([line(row)[0], line(row)[1]], [line(row + 1)[0], line(row + 1)[1]]);
-            ((a + b) + (c + d)) / 4.0
-        };
-        let values = (0..3).flat_map(|c| (0..width * height).map(move |i| (c, i)));
-        Self { width, height, values: values.map(|(c, i)| pixel(c, i)).collect() }
-    }
-
     /// In 8 bits.
     pub fn to_rgb8(&self) -> RgbImage {
         RgbImage::from_fn(self.width as u32, self.height as u32, |x, y| {
@@ -186,8 +196,8 @@ mod tests {
             assert!(said.contains("channel 2, row 1, column 1 of the picture"), "{said}");
         }
         // Renders are cut, but a NaN is no colour.
-        assert_eq!(Picture::rendered(&values(7.0), [2, 3]).expect("cut").plane(1)[5], 1.0);
-        assert!(Picture::rendered(&values(f32::NAN), [2, 3]).is_err());
+        assert_eq!(Picture::rendered(&values(7.0), [2, 3], 1).expect("cut").plane(1)[5], 1.0);
+        assert!(Picture::rendered(&values(f32::NAN), [2, 3], 1).is_err());
     }
 
     #[test]
@@ -199,12 +209,17 @@ mod tests {
     }
 
     #[test]
-    fn crops_and_halves_keep_pixels_where_they_are() {
+    fn crops_and_shrunk_renders_keep_pixels_where_they_are() {
         let values: Vec<f32> = (0..48).map(|i| i as f32 / 48.0).collect();
         let picture = Picture::new(values, [4, 4], "picture").expect("a picture");
         let crop = picture.cropped([1, 2, 2, 1]);
         assert_eq!(crop.values(), [9.0, 10.0, 25.0, 26.0, 41.0, 42.0].map(|v| v / 48.0));
-        let half = picture.halved();
-        assert!((half.plane(0)[1] - 4.5 / 48.0).abs() < 1e-7 && half.values().len() == 12, "{half:?}");
+        // A render has its colours side by side; red and blue are 0 here, what is over 1 is cut before the mean.
+        let render: Vec<f32> = (0..16).flat_map(|i| [0.0, if i == 6 { 9.0 } else { 0.5 }, 0.0]).collect();
+        let half = Picture::rendered(&render, [4, 4], 2).expect("a picture");
+        assert_eq!(
+            (half.width, half.plane(0), half.plane(1)),
+            (2, &[0.0; 4][..], &[0.5, 0.625, 0.5, 0.5][..])
+        );
     }
 }

@@ -4,7 +4,7 @@ use burn::tensor::{Device, Int, Tensor, TensorData};
 use snapsnap_ops::host;
 use snapsnap_splat::{Gaussians, RigidTransform};
 
-use crate::config::{Config, RegressorStart, RotationFrame};
+use crate::config::{Config, RegressorConfig, RegressorStart, RotationFrame};
 use crate::crop::Window;
 use crate::regressor::{Attributes, FEATURES, Geometry, Regressor, Statistics};
 use crate::sides::{Cloud, EMPTY};
@@ -93,6 +93,26 @@ pub fn regress(network: &Regressor, config: &Config, views: &[Seen], window: &Wi
         });
     }
     parts
+}
+
+/// What the geometry alone gives, without a regressor (LEARNING.md, "A geometric start"): on every valid point of some views
+/// a round Gaussian, 0.3 times as wide as its neighbours are apart, of its pixel's colour; front camera's frame.
+pub fn geometric(views: &[Seen], device: &Device) -> Gaussians {
+    let regressor = RegressorConfig { start: Some(RegressorStart::Geometric), ..RegressorConfig::default() };
+    let config = Config { regressor, ..Config::default() };
+    let part = |view: &Seen| {
+        let side = view.points.dims()[1];
+        let rows = Window::whole(side).indices(view.valid, side);
+        let n = rows.len();
+        let rows = Tensor::<1, Int>::from_data(TensorData::new(rows, [n]), device);
+        Part {
+            features: Tensor::zeros([n, FEATURES], device),
+            points: view.points.clone().reshape([side * side, 3]).select(0, rows),
+            geometry: Some(Geometry::new(view.image, &view.points, view.valid, side)),
+        }
+    };
+    let parts = views.iter().filter(|view| view.valid.contains(&true)).map(part).collect();
+    assemble(&config, parts, device).0
 }
 
 /// Activates and joins the parts: Gaussians in the front camera's frame, and how many were left out because they are not

@@ -12,7 +12,7 @@ use crate::gaussians::{Seen, assemble, placed, regress, side_images};
 use crate::network::{PointMap, PointPredictor, View, activate};
 use crate::regressor::Regressor;
 use crate::resample::shrink;
-use crate::sides::is_finite;
+use crate::sides::{EMPTY, is_finite};
 use crate::weights::{WeightFile, WeightsError};
 
 /// One photograph on its square canvas of `resolution` pixels; row-major, side S.
@@ -38,6 +38,8 @@ pub struct Reconstruction {
     pub side_images: Vec<Vec<f32>>,
     /// The Gaussians, view after view, row-major; means and rotations as the regressor gave them.
     pub gaussians: Gaussians,
+    /// Pixels and Gaussians that were left out because they were not finite.
+    pub lost: usize,
     /// What ran, what was left out and why.
     pub plan: Vec<String>,
     /// Time per module, the device synchronised before and after each.
@@ -67,6 +69,7 @@ pub struct Reconstructor {
     config: Config,
     predictor: PointPredictor,
     regressors: Vec<Regressor>,
+    side_colors: bool,
     device: Device,
 }
 
@@ -80,8 +83,21 @@ impl Reconstructor {
             config: weights.config.clone(),
             predictor: weights.point_predictor(device)?,
             regressors: weights.regressors(device)?,
+            side_colors: true,
             device: device.clone(),
         })
+    }
+
+    /// Leaves the unseen sides out, which scenes of many photographs do not have: their heads, colours and Gaussians.
+    pub fn without_sides(mut self) -> Self {
+        self.predictor.dust3r = self.predictor.dust3r.without_sides();
+        self
+    }
+
+    /// Leaves the colours of the unseen sides out: the regressor sees them as [`EMPTY`] everywhere.
+    pub fn without_side_colors(mut self) -> Self {
+        self.side_colors = false;
+        self
     }
 
     /// The config in force.
@@ -108,7 +124,7 @@ impl Reconstructor {
                 "{name} photograph on a canvas of {side}²"
             );
         }
-        let mut run = Run { model: self, stage, side, plan: Vec::new(), times: Vec::new() };
+        let mut run = Run { model: self, stage, side, lost: 0, plan: Vec::new(), times: Vec::new() };
         run.reconstruct([front, back])
     }
 }
@@ -117,6 +133,8 @@ struct Run<'a> {
     model: &'a Reconstructor,
     stage: &'a dyn Fn(&'static str),
     side: usize,
+    /// Gaussians that are not finite.
+    lost: usize,
     plan: Vec<String>,
     times: Vec<(&'static str, Duration)>,
 }
@@ -166,12 +184,15 @@ impl Run<'_> {
             self.plan.push(format!("{lost} pixels left out: their points are not finite"));
         }
 
-        let side_images = if views.len() > 2 {
+        let side_images = if views.len() > 2 && !self.model.side_colors {
+            self.plan.push("side colours left out, as asked for".into());
+            vec![vec![EMPTY; 3 * area]; views.len() - 2]
+        } else if views.len() > 2 {
             self.timed("side colours", |_| {
                 side_images(photos.map(|photo| photo.rgb.as_slice()), &points, &valid)
             })
         } else {
-            self.plan.push("side colours left out: the network has no side heads".into());
+            self.plan.push("side colours left out: there are no side heads".into());
             Vec::new()
         };
 
@@ -184,7 +205,7 @@ impl Run<'_> {
         };
         let gaussians = self.gaussians(photos, &side_images, &usable, &valid);
         let (plan, times) = (std::mem::take(&mut self.plan), std::mem::take(&mut self.times));
-        Reconstruction { views, maps, valid, side_images, gaussians, plan, times }
+        Reconstruction { views, maps, valid, side_images, gaussians, lost: lost + self.lost, plan, times }
     }
 
     /// Point maps of all views on the canvas `[views, S, S]`, in metres.
@@ -284,6 +305,7 @@ impl Run<'_> {
         self.timed("activations", |run| {
             let (gaussians, lost) = assemble(&run.model.config, parts, &run.model.device);
             run.plan.push(format!("{} Gaussians", gaussians.len()));
+            run.lost = lost;
             if lost > 0 {
                 run.plan.push(format!("{lost} Gaussians left out: their attributes are not finite"));
             }

@@ -15,7 +15,6 @@ pub mod optimizer;
 pub mod photometric;
 pub mod points;
 pub mod precision;
-mod preview;
 mod progress;
 pub mod run;
 pub mod schedule;

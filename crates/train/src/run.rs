@@ -8,6 +8,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use burn::tensor::Device;
+use snapsnap_eval::preview;
 use snapsnap_mesh::FileError;
 use snapsnap_net::weights;
 use snapsnap_splat::file;
@@ -18,7 +19,7 @@ use crate::learner::Learner;
 use crate::log::{Line, Log};
 use crate::networks::Networks;
 use crate::task::{Task, Validation};
-use crate::{TrainError, curves, preview};
+use crate::{TrainError, curves};
 
 /// So many steps in a row may fail before a run gives up.
 const PATIENCE: u64 = 20;

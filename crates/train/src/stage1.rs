@@ -17,8 +17,9 @@ use crate::config::TrainConfig;
 use crate::fixed::{Fixed, check_resolution};
 use crate::networks::Networks;
 use crate::points::{Prediction, losses, predict};
-use crate::preview::{grid, heat, picture};
 use crate::task::{Moment, Part, Task, Validation};
+use snapsnap_eval::points::{Pair, point_errors};
+use snapsnap_eval::preview::{grid, heat, picture};
 
 /// Samples of a preview.
 const PREVIEWS: usize = 2;
@@ -189,41 +190,24 @@ impl Errors {
             .iter()
             .map(|(view, map)| (*view as usize, host(map.points.clone()), host(map.conf.clone())))
             .collect();
-        let off = |view: usize, points: &[f32], i: usize| -> [f64; 3] {
-            let (p, t) = (at(points, i), at(&item.points, view * area + i));
-            [0, 1, 2].map(|c| f64::from(p[c]) - f64::from(t[c]))
-        };
-        let there = |view: usize| (0..area).filter(move |i| item.valid[view * area + i] > 0.5);
-        let (mut shift, mut count) = ([0.0; 3], 0.0);
-        for (view, points, _) in &maps {
-            for i in there(*view) {
-                let off = off(*view, points, i);
-                (0..3).for_each(|c| shift[c] += off[c]);
-                count += 1.0;
-            }
+        let pairs: Vec<Pair> = maps
+            .iter()
+            .map(|(view, points, _)| Pair {
+                view: *view,
+                points,
+                truth: &item.points[3 * view * area..3 * (view + 1) * area],
+                valid: &item.valid[view * area..(view + 1) * area],
+            })
+            .collect();
+        for error in point_errors(&pairs) {
+            let sums = &mut self.views[error.view];
+            [1.0, error.mean, error.centred].iter().zip(sums).for_each(|(v, sum)| *sum += v);
         }
-        let shift = shift.map(|sum| sum / f64::max(count, 1.0));
-        for (view, points, conf) in &maps {
-            let (mut sums, mut count) = ([0.0; 2], 0.0);
-            for i in there(*view) {
-                let off = off(*view, points, i);
-                let length = |v: [f64; 3]| v.iter().map(|x| x * x).sum::<f64>().sqrt();
-                sums[0] += length(off);
-                sums[1] += length([0, 1, 2].map(|c| off[c] - shift[c]));
-                count += 1.0;
-            }
-            if count > 0.0 {
-                let sum = &mut self.views[*view];
-                sum[0] += 1.0;
-                sum[1] += sums[0] / count;
-                sum[2] += sums[1] / count;
-            }
-            if *view > 1 {
-                for (conf, valid) in conf.iter().zip(&item.valid[*view * area..]) {
-                    let (seen, there) = (*conf > threshold, *valid > 0.5);
-                    self.overlap[0] += f64::from(u8::from(seen && there));
-                    self.overlap[1] += f64::from(u8::from(seen || there));
-                }
+        for (view, _, conf) in maps.iter().filter(|(view, ..)| *view > 1) {
+            for (conf, valid) in conf.iter().zip(&item.valid[*view * area..]) {
+                let (seen, there) = (*conf > threshold, *valid > 0.5);
+                self.overlap[0] += f64::from(u8::from(seen && there));
+                self.overlap[1] += f64::from(u8::from(seen || there));
             }
         }
     }

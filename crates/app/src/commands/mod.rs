@@ -1,6 +1,7 @@
 //! One module per subcommand.
 
 pub mod compare;
+pub mod evaluate;
 pub mod export_weights;
 pub mod import_weights;
 pub mod init_weights;

@@ -226,12 +226,8 @@ impl Source {
         Ok(((0..3).flat_map(pixels).collect(), share))
     }
 
-    /// Front and back as the networks see them: `[2,3,H,W]` and their masks `[2,H,W]`.
-    fn photographs(
-        &self,
-        views: [(&RgbImage, &GrayImage); 2],
-        random: &mut impl Rng,
-    ) -> (Vec<f32>, Vec<f32>) {
+    /// Photographs as the networks see them: `[N,3,H,W]` and their masks `[N,H,W]`.
+    fn photographs(&self, views: &[(&RgbImage, &GrayImage)], random: &mut impl Rng) -> (Vec<f32>, Vec<f32>) {
         let (mut images, mut masks) = (Vec::new(), Vec::new());
         for (color, mask) in views {
             let (color, mask) = self.config.augment.apply(color, mask, random);

@@ -75,7 +75,7 @@ impl Stage1 {
         let side = source.folder.description().resolution as usize;
         let (points, valid, pictures) = source.points(subject, &order)?;
         let [front, back] = [0, 1].map(|i| (&pictures[i].0, &pictures[i].1));
-        let (images, masks) = source.photographs([front, back], &mut random);
+        let (images, masks) = source.photographs(&[front, back], &mut random);
         let mut item = Stage1Item { name: String::new(), side, images, masks, points, valid };
         if source.config.augment.mirror && random.random() {
             item.mirror();

@@ -121,7 +121,7 @@ impl Stage2 {
             let stored = folder.camera(*split, subject, view)?.resized(target_side, target_side);
             target_cameras.push(source.camera(&stored));
         }
-        let (images, masks) = source.photographs([(&a.0, &a.1), (&b.0, &b.1)], &mut random);
+        let (images, masks) = source.photographs(&[(&a.0, &a.1), (&b.0, &b.1)], &mut random);
         Ok(Stage2Item {
             name: format!("{}: {subject}, view {first}", folder.root().display()),
             side: description.resolution as usize,

@@ -1,16 +1,15 @@
-//! The test: two opposite photographs of a subject, and every view around it to compare.
+//! The test: some photographs of a subject, and every view around it to compare.
 
 use std::sync::Arc;
 
-use burn::data::dataset::{Dataset, DatasetError};
 use snapsnap_splat::Camera;
 
 use super::{Augment, SampleConfig, Source};
-use crate::dataset::{Folder, Split};
+use crate::dataset::{Folder, Split, unproject};
 use snapsnap_mesh::FileError;
 
-/// Subjects of a test set (SNAPSNAP §5.6): the first view and the opposite one go in, 0 and 15 of the published 30; all
-/// are compared. Each subject comes once, and nothing about it is random.
+/// Subjects of a test set. Which views go in is the caller's choice, the first and the opposite one in the published test, 0
+/// and 15 of 30 (SNAPSNAP §5.6). Nothing about a subject is random.
 #[derive(Debug, Clone)]
 pub struct Test(Source);
 
@@ -21,11 +20,11 @@ pub struct TestItem {
     pub subject: String,
     /// H and W.
     pub side: usize,
-    /// `[2,3,H,W]` front and back in [−1, 1] times the mask.
+    /// `[N,3,H,W]` the photographs that go in, in [−1, 1] times the mask.
     pub images: Vec<f32>,
-    /// `[2,H,W]` 1 where the input masks see the person.
+    /// `[N,H,W]` 1 where the input masks see the person.
     pub masks: Vec<f32>,
-    /// Cameras of all views; those of front and back are the first and the middle one.
+    /// Cameras of all views.
     pub cameras: Vec<Camera>,
 }
 
@@ -33,23 +32,39 @@ impl Test {
     /// The subjects of a split; `None` where they lie in the root itself, as in the authors' test sets.
     ///
     /// # Errors
-    /// [`FileError`] if the split has no subject, the number of views is odd, or the config contradicts itself.
+    /// [`FileError`] if the split has no subject, or the config contradicts itself.
     pub fn new(folder: Arc<Folder>, split: Option<Split>, config: SampleConfig) -> Result<Self, FileError> {
         let config = SampleConfig { repeat: 1, high_resolution: false, augment: Augment::none(), ..config };
-        Source::new(folder, split, config, 2).map(Self)
+        Source::new(folder, split, config, 1).map(Self)
     }
 
-    /// One subject.
+    /// Number of subjects.
+    pub fn len(&self) -> usize {
+        self.0.len()
+    }
+
+    /// Whether there is none; never true.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Name of a subject.
+    pub fn name(&self, index: usize) -> &str {
+        &self.0.subjects[index]
+    }
+
+    /// One subject with the photographs of some of its views.
     ///
     /// # Errors
     /// [`FileError`] for files that are missing or damaged.
-    pub fn sample(&self, index: usize) -> Result<TestItem, FileError> {
+    pub fn sample(&self, index: usize, views: &[usize]) -> Result<TestItem, FileError> {
         let source = &self.0;
         let (subject, mut random) = source.subject(3, index);
         let description = source.folder.description();
-        let picture = |view: usize| source.folder.picture(source.split, subject, view, false);
-        let (front, back) = (picture(0)?, picture(description.views / 2)?);
-        let (images, masks) = source.photographs([(&front.0, &front.1), (&back.0, &back.1)], &mut random);
+        let picture = |view: &usize| source.folder.picture(source.split, subject, *view, false);
+        let pictures = views.iter().map(picture).collect::<Result<Vec<_>, _>>()?;
+        let pairs: Vec<_> = pictures.iter().map(|(color, mask)| (color, mask)).collect();
+        let (images, masks) = source.photographs(&pairs, &mut random);
         let camera = |view: usize| source.folder.camera(source.split, subject, view);
         let cameras = (0..description.views).map(|view| camera(view).map(|stored| source.camera(&stored)));
         Ok(TestItem {
@@ -61,23 +76,35 @@ impl Test {
         })
     }
 
-    /// `[3,H,W]` in [0, 1]: what a view of the subject `index` sees, over `background`. One at a time, for thirty take
-    /// four hundred megabytes.
+    /// What a view of the subject `index` sees, `[3,H,W]` in [0, 1] over `background`, and the share of the person `[H,W]`.
+    /// One at a time, for thirty take four hundred megabytes.
     ///
     /// # Errors
     /// As [`Self::sample`].
-    pub fn target(&self, index: usize, view: usize, background: [f32; 3]) -> Result<Vec<f32>, FileError> {
-        Ok(self.0.target(self.0.subject(3, index).0, view, false, background)?.0)
-    }
-}
-
-impl Dataset<TestItem> for Test {
-    fn get(&self, index: usize) -> Result<TestItem, DatasetError> {
-        assert!(index < self.len(), "sample {index} of {}", self.len());
-        self.sample(index).map_err(DatasetError::new)
+    pub fn target(
+        &self,
+        index: usize,
+        view: usize,
+        background: [f32; 3],
+    ) -> Result<(Vec<f32>, Vec<f32>), FileError> {
+        self.0.target(self.0.subject(3, index).0, view, false, background)
     }
 
-    fn len(&self) -> usize {
-        self.0.len()
+    /// Points that some views of a subject see, `[V,H,W,3]` metres in the first one's frame, and where there are any
+    /// `[V,H,W]`, 0 or 1.
+    ///
+    /// # Errors
+    /// As [`Self::sample`].
+    pub fn points(&self, index: usize, views: &[usize]) -> Result<(Vec<f32>, Vec<f32>), FileError> {
+        let source = &self.0;
+        let (subject, _) = source.subject(3, index);
+        let (mut points, mut valid, mut front) = (Vec::new(), Vec::new(), None);
+        for view in views {
+            let stored = source.folder.depth(source.split, subject, *view)?;
+            let camera = source.camera(&stored.camera);
+            points.extend(unproject(&stored, &camera, front.get_or_insert(camera), 0.0));
+            valid.extend(stored.depth.iter().map(|z| f32::from(u8::from(*z > 0.0))));
+        }
+        Ok((points, valid))
     }
 }

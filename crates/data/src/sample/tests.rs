@@ -335,14 +335,15 @@ fn stage_two_samples_have_cameras_for_what_they_compare() {
 
 /// Thirty views, of which 0 and 15 go in, as in the published test.
 #[test]
-fn test_samples_are_the_first_view_and_the_opposite_one() {
+fn test_samples_are_the_views_that_were_asked_for() {
     for layout in [Layout::Exact, Layout::Authors] {
         let (_temporary, folder) = data_set(&block(), layout, 64, 30, false, 2);
         let refusal = Stage1::new(folder.clone(), TRAIN, SampleConfig::default()).map(drop).expect_err("30");
         assert!(refusal.to_string().contains("has 30 views; front, back and sides need a multiple of 4"));
         let test = Test::new(folder.clone(), TRAIN, SampleConfig::default()).expect("makes samples");
         assert_eq!(test.len(), 2);
-        let item = test.sample(1).expect("reads");
+        assert_eq!(test.name(1), "0001");
+        let item = test.sample(1, &[0, 15]).expect("reads");
         assert_eq!((item.subject.as_str(), item.side, item.cameras.len()), ("0001", 64, 30));
         for (view, yaw) in [(0, 0.0), (7, 84.0), (15, 180.0)] {
             let expected = Camera::orbit_at_yaw_degrees(yaw, 64).centre();
@@ -351,7 +352,8 @@ fn test_samples_are_the_first_view_and_the_opposite_one() {
         // What goes in is what is to be compared, but for the range of values.
         let area = 64 * 64;
         for (place, view) in [(0, 0), (1, 15)] {
-            let target = test.target(1, view, [0.25, 0.5, 0.75]).expect("reads");
+            let (target, share) = test.target(1, view, [0.25, 0.5, 0.75]).expect("reads");
+            assert_eq!(share.len(), area);
             let image = &item.images[place * 3 * area..][..3 * area];
             let mask = &item.masks[place * area..][..area];
             let stored = folder.view(TRAIN, "0001", view).expect("reads");
@@ -366,7 +368,7 @@ fn test_samples_are_the_first_view_and_the_opposite_one() {
             assert!(inside > 500, "{inside}");
             assert_eq!([0, 1, 2].map(|c| target[c * area]), [0.25, 0.5, 0.75], "a corner");
         }
-        assert_eq!(test.target(0, 3, [0.0; 3]).expect("reads").len(), 3 * area);
+        assert_eq!(test.target(0, 3, [0.0; 3]).expect("reads").0.len(), 3 * area);
     }
 }
 

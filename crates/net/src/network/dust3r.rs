@@ -109,6 +109,11 @@ impl Dust3r {
         &self.config
     }
 
+    /// The same network without the heads of the unseen sides, for scenes that have none.
+    pub fn without_sides(self) -> Self {
+        Self { downstream_head3: None, downstream_head4: None, ..self }
+    }
+
     /// Views that have a head.
     pub fn views(&self) -> &'static [View] {
         if self.downstream_head3.is_some() { &View::ALL } else { &View::ALL[..2] }

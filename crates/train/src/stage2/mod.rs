@@ -29,8 +29,8 @@ use crate::fixed::{Fixed, check_resolution};
 use crate::networks::Networks;
 use crate::photometric::Photometric;
 use crate::points::{Prediction, losses};
-use crate::preview::{grid, heat, picture};
 use crate::task::{Moment, Part, Task, Validation};
+use snapsnap_eval::preview::{grid, heat, picture};
 
 use frozen::{Frozen, of_sample};
 pub use scene::needles;

@@ -1,4 +1,4 @@
-//! Pictures of how far a training has come.
+//! Sheets of pictures for people to look at.
 
 use std::io::{Cursor, Write};
 use std::path::Path;
@@ -28,9 +28,12 @@ pub fn grid(rows: &[Vec<RgbImage>]) -> Option<RgbImage> {
 
 /// A picture of `side`² pixels, row-major, from colours in [0, 1].
 pub fn picture(side: usize, color: impl Fn(usize) -> [f32; 3]) -> RgbImage {
-    RgbImage::from_fn(side as u32, side as u32, |x, y| {
-        Rgb(color(y as usize * side + x as usize).map(|c| (c.clamp(0.0, 1.0) * 255.0).round() as u8))
-    })
+    RgbImage::from_fn(side as u32, side as u32, |x, y| self::color(color(y as usize * side + x as usize)))
+}
+
+/// A colour in 8 bits; what is outside [0, 1] is cut.
+pub fn color(color: [f32; 3]) -> Rgb<u8> {
+    Rgb(color.map(|c| (c.clamp(0.0, 1.0) * 255.0).round() as u8))
 }
 
 /// An error from 0 to `most`, from black over red and yellow to white.

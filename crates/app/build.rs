@@ -1,0 +1,20 @@
+//! Tells the program which commit it is built from, which its reports name.
+
+use std::path::Path;
+use std::process::Command;
+
+fn main() {
+    let git = |arguments: &[&str]| -> Option<String> {
+        let output = Command::new("git").args(arguments).output().ok()?;
+        output.status.success().then(|| String::from_utf8_lossy(&output.stdout).trim().to_owned())
+    };
+    let commit = git(&["rev-parse", "--short=10", "HEAD"]).unwrap_or_else(|| "unknown".into());
+    println!("cargo:rustc-env=SNAPSNAP_COMMIT={commit}");
+    // Where HEAD leads: a file that changes with every commit on the branch.
+    for name in ["HEAD".to_owned(), git(&["symbolic-ref", "-q", "HEAD"]).unwrap_or_default()] {
+        let path = git(&["rev-parse", "--git-path", &name]).filter(|path| Path::new(path).is_file());
+        if let Some(path) = path {
+            println!("cargo:rerun-if-changed={path}");
+        }
+    }
+}

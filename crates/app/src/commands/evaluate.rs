@@ -1,0 +1,228 @@
+//! `snapsnap evaluate`.
+
+use std::path::{Path, PathBuf};
+
+use burn::tensor::Device;
+use clap::Args;
+use snapsnap_eval::baselines::MeanPictures;
+use snapsnap_eval::evaluate::config::{Ablation, EvalConfig};
+use snapsnap_eval::evaluate::model::Model;
+use snapsnap_eval::evaluate::person::People;
+use snapsnap_eval::evaluate::{Contestant, LeftOut, evaluate, sheet};
+use snapsnap_eval::report::evaluation::Evaluation;
+use snapsnap_splat::file;
+
+use super::ConfigArguments;
+use crate::failure::Failure;
+use crate::progress::Progress;
+use crate::report::{ReportFolder, header};
+use crate::{device, perceptual, say, weights};
+
+/// Longest config that is read.
+const MOST: u64 = 1 << 20;
+/// What a report consists of.
+const FILES: [&str; 7] =
+    ["report.json", "report.md", "views.csv", "subjects.csv", "people.png", "by_view.svg", "config.toml"];
+
+#[derive(Args)]
+pub struct Arguments {
+    /// What to compare, how and with what, as in configs/eval.toml.
+    #[arg(long, value_name = "TOML")]
+    config: PathBuf,
+    /// Override one config key; may be repeated.
+    #[arg(long, value_name = "SECTION.KEY=VALUE")]
+    set: Vec<String>,
+    /// Data sets [default: data.folders of the config].
+    #[arg(long, value_name = "DATASET", num_args = 1..)]
+    data: Vec<PathBuf>,
+    /// Weights to judge [default: model.weights of the config].
+    #[arg(long, value_name = "FILE|DIR")]
+    weights: Option<PathBuf>,
+    /// Other weights, which are compared with these person by person.
+    #[arg(long, value_name = "FILE|DIR")]
+    against: Option<PathBuf>,
+    #[command(flatten)]
+    lpips: perceptual::Arguments,
+    /// Folder of the report.
+    #[arg(short, long, value_name = "REPORT")]
+    output: PathBuf,
+    /// auto, cpu, ndarray, wgpu, vulkan, cuda or metal [default: model.devices of the config].
+    #[arg(long)]
+    device: Option<String>,
+}
+
+pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
+    let config = config_of(arguments)?;
+    if config.data.folders.is_empty() {
+        let message =
+            "no data: give --data DATASET, made with `snapsnap prepare`, or data.folders in the config";
+        return Err(Failure::Input(message.into()));
+    }
+    let names = match (&arguments.device, config.model.devices.as_slice()) {
+        (Some(name), _) => vec![name.clone()],
+        (None, []) => vec!["auto".to_owned()],
+        (None, names) => names.to_vec(),
+    };
+    let devices = names.iter().map(|name| device::choose(name)).collect::<Result<Vec<_>, _>>()?;
+    let open = |path: &PathBuf| People::open(path, &config.data, &config.views).map_err(Failure::from);
+    let sets = config.data.folders.iter().map(open).collect::<Result<Vec<_>, _>>()?;
+    let inputs: Vec<&Path> =
+        std::iter::once(&arguments.config).chain(&config.model.weights).map(PathBuf::as_path).collect();
+    for set in &sets {
+        outside(&arguments.output, set)?;
+    }
+    let folder = ReportFolder::new(&arguments.output, &FILES, &inputs)?;
+    let lpips = arguments.lpips.load_or(&config.metrics.lpips, &names[0])?;
+    let mut missing = Vec::new();
+    let contestants = contestants(&config, &sets, (&names, &devices), &mut missing)?;
+    if contestants.is_empty() {
+        let whys: Vec<String> = missing.iter().map(|m| format!("{}: {}", m.name, m.why)).collect();
+        return Err(Failure::Input(format!("nothing is left to evaluate: {}", whys.join("; "))));
+    }
+
+    let people = sets.iter().map(|set| set.chosen().len()).sum();
+    let progress = Progress::steps(quiet, people, "people");
+    let done = |done: usize, total: usize| progress.step(done, total, "people");
+    let mut outcome = evaluate(&config, &sets, &contestants, lpips.as_ref().ok(), &done);
+    drop(progress);
+    outcome.left_out.splice(0..0, missing);
+    let report = Evaluation {
+        header: header(&device::describe(&devices[0])),
+        config: &config,
+        outcome: &outcome,
+        no_lpips: lpips.err(),
+    };
+    let shown = contestants.iter().find(|contestant| contestant.networks().is_some());
+    let ranked = report.ranked(config.report.people);
+    let people = match shown.filter(|_| !ranked.is_empty()) {
+        Some(contestant) => sheet(&config, &sets, contestant, &ranked)?,
+        None => None,
+    };
+    let by_view = report.by_view();
+    let pictures: Vec<&str> = [(people.is_some(), "people.png"), (!by_view.is_empty(), "by_view.svg")]
+        .into_iter()
+        .filter_map(|(there, name)| there.then_some(name))
+        .collect();
+    folder.picture("people.png", people.as_ref())?;
+    folder.text("by_view.svg", &by_view)?;
+    folder.text("views.csv", &report.views_csv())?;
+    folder.text("subjects.csv", &report.subjects_csv())?;
+    folder.text("config.toml", &config.to_toml())?;
+    folder.text("report.md", &report.markdown(&pictures))?;
+    folder.json("report.json", &report.json())?;
+    if !quiet {
+        say::out(&summary(&report.json()));
+        say::out(&format!("{}: report.md, report.json, pictures and tables", folder.path().display()));
+    }
+    match outcome.left_out.as_slice() {
+        [] => Ok(()),
+        left_out => {
+            left_out.iter().for_each(|l| say::err(&format!("left out: {}: {}", l.name, l.why)));
+            Err(Failure::Internal(format!("{} left out, the rest was evaluated", left_out.len())))
+        }
+    }
+}
+
+fn config_of(arguments: &Arguments) -> Result<EvalConfig, Failure> {
+    let path = &arguments.config;
+    let text = file::read_text(path, MOST)
+        .map_err(|e| Failure::Input(format!("{}: cannot read the config: {e}", path.display())))?;
+    let mut config = EvalConfig::from_toml(&text, &path.display().to_string(), &arguments.set)?;
+    if !arguments.data.is_empty() {
+        config.data.folders.clone_from(&arguments.data);
+    }
+    if arguments.weights.is_some() {
+        config.model.weights.clone_from(&arguments.weights);
+    }
+    if let Some(against) = &arguments.against {
+        let other = Ablation { weights: Some(against.clone()), ..Ablation::default() };
+        config.ablations.insert("against".into(), other);
+    }
+    Ok(config)
+}
+
+/// Refuses a report in a data set's folder.
+fn outside(output: &Path, set: &People) -> Result<(), Failure> {
+    let whole = std::path::absolute(output).map_err(|e| Failure::cannot_write(output, &e))?;
+    let there = whole.ancestors().find_map(|above| above.canonicalize().ok());
+    let root = set.folder().root().canonicalize().ok();
+    if root.zip(there).is_some_and(|(root, there)| there.starts_with(root)) {
+        return Err(Failure::Input(format!("{}: lies in a data set", output.display())));
+    }
+    Ok(())
+}
+
+/// The model, what it is compared with, and the baselines; what cannot be loaded goes to `missing`.
+fn contestants(
+    config: &EvalConfig,
+    sets: &[People],
+    (names, devices): (&[String], &[Device]),
+    missing: &mut Vec<LeftOut>,
+) -> Result<Vec<Contestant>, Failure> {
+    let mut contestants = Vec::new();
+    let mut left_out = |name: &str, why: String| missing.push(LeftOut { name: name.into(), why });
+    let whole = Ablation::default();
+    let model = |ablation: &Ablation, device: &Device| -> Result<Model, Failure> {
+        let path = ablation.weights.as_deref().or(config.model.weights.as_deref());
+        let set = [config.model.set.clone(), ablation.set.clone()].concat();
+        let weights = weights::open(path, &ConfigArguments { config: None, set })?;
+        Ok(Model::load(&weights, device, ablation.sides && !has_known_sides(config), ablation.side_colors)?)
+    };
+    match model(&whole, &devices[0]) {
+        Ok(model) => contestants.push(Contestant::model("model", model)),
+        Err(e) => left_out("model", e.to_string()),
+    }
+    for (name, device) in names.iter().zip(devices).skip(1) {
+        match model(&whole, device) {
+            Ok(model) => contestants.push(Contestant::other(&format!("on {name}"), model)),
+            Err(e) => left_out(name, e.to_string()),
+        }
+    }
+    for (name, ablation) in &config.ablations {
+        match model(ablation, &devices[0]) {
+            Ok(model) => contestants.push(Contestant::other(name, model)),
+            Err(e) => left_out(name, e.to_string()),
+        }
+    }
+    if config.baselines.billboard {
+        contestants.push(Contestant::billboard(&devices[0]));
+    }
+    if config.baselines.true_points {
+        contestants.push(Contestant::true_points(&devices[0]));
+    }
+    if !config.baselines.mean.is_empty() {
+        match MeanPictures::new(&config.baselines.mean, sets[0].views()) {
+            Ok(pictures) => contestants.push(Contestant::mean(pictures)),
+            Err(e) => left_out("mean_picture", e.to_string()),
+        }
+    }
+    Ok(contestants)
+}
+
+/// Scenes of more than two photographs have no unseen sides.
+fn has_known_sides(config: &EvalConfig) -> bool {
+    config.views.inputs.len() > 2
+}
+
+/// The most important lines.
+fn summary(report: &serde_json::Value) -> String {
+    let mut lines = Vec::new();
+    let mut line = |name: &str, figures: &serde_json::Value| {
+        let figure = |key: &str| match &figures[key]["mean"] {
+            serde_json::Value::Null => "n/a".to_owned(),
+            value => value.as_f64().map_or("inf".into(), |v| format!("{v:.4}")),
+        };
+        let (psnr, ssim, lpips) = (figure("psnr"), figure("ssim"), figure("lpips"));
+        lines.push(format!("{name:<28} PSNR {psnr:>8} dB   SSIM {ssim}   LPIPS {lpips}"));
+    };
+    for (protocol, found) in report["protocols"].as_object().into_iter().flatten() {
+        line(&format!("model, {protocol}"), &found["overall"]);
+        for kind in ["compared", "baselines"] {
+            for (name, found) in report[kind].as_object().into_iter().flatten() {
+                let found = if kind == "compared" { &found["protocols"] } else { found };
+                line(&format!("{name}, {protocol}"), &found[protocol]);
+            }
+        }
+    }
+    lines.join("\n")
+}

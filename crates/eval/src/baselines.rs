@@ -1,0 +1,144 @@
+//! What a model must beat, and what it can at most begin with (EVALUATION.md).
+
+use std::path::Path;
+use std::sync::Arc;
+
+use burn::tensor::{Device, Tensor, TensorData};
+use rayon::prelude::*;
+use snapsnap_data::dataset::{Folder, Split};
+use snapsnap_net::Window;
+use snapsnap_net::config::Config;
+use snapsnap_net::gaussians::{Seen, geometric, placed, side_images};
+use snapsnap_net::network::{View, anchors};
+use snapsnap_ops::{bilinear, host};
+use snapsnap_splat::{Camera, Gaussians};
+
+use crate::EvalError;
+use crate::evaluate::model::joined;
+use crate::evaluate::person::{smaller, test_of};
+use crate::pictures::Picture;
+
+/// Largest side at which mean pictures are kept: they are smooth.
+const MEAN_SIDE: usize = 256;
+
+/// Photographs `[N,3,S,S]` in [−1, 1] as flat cut-outs, each in the upright plane through the body's axis that faces its
+/// camera; world frame. `valid` `[N,S,S]` says which pixels are the person's. `None` if none is.
+pub fn billboard(
+    images: &[f32],
+    valid: &[bool],
+    side: usize,
+    cameras: &[Camera],
+    device: &Device,
+) -> Option<Gaussians> {
+    let area = side * side;
+    let points = anchors(View::Front, side, &Window::whole(side), device);
+    let part = |(place, camera): (usize, &Camera)| {
+        let seen = Seen {
+            image: &images[3 * place * area..3 * (place + 1) * area],
+            points: points.clone(),
+            valid: &valid[place * area..(place + 1) * area],
+        };
+        in_world(geometric(&[seen], device), camera)
+    };
+    some(joined(cameras.iter().enumerate().map(part).collect()))
+}
+
+/// True points `[V,S,S,3]` (metres, first camera's frame) where `valid` `[V,S,S]`, in the colours of the first `photographs`
+/// views' own photographs `[N,3,S,S]` in [−1, 1]; further views are sides, which get the nearest points' colours. World frame.
+/// `None` if nothing is valid.
+pub fn true_points(
+    images: &[f32],
+    photographs: usize,
+    points: &[f32],
+    valid: &[Vec<bool>],
+    side: usize,
+    camera: &Camera,
+    device: &Device,
+) -> Option<Gaussians> {
+    let area = side * side;
+    let photos = |view: usize| &images[3 * view * area..3 * (view + 1) * area];
+    let sides = match (photographs, valid.len()) {
+        (2, 4) => side_images([photos(0), photos(1)], points, valid),
+        _ => Vec::new(),
+    };
+    let seen = |view: usize| {
+        let points =
+            TensorData::new(points[3 * view * area..3 * (view + 1) * area].to_vec(), [1, side, side, 3]);
+        Seen {
+            image: if view < photographs { photos(view) } else { &sides[view - photographs] },
+            points: Tensor::from_data(points, device),
+            valid: &valid[view],
+        }
+    };
+    let views: Vec<Seen> = (0..photographs + sides.len()).map(seen).collect();
+    some(in_world(geometric(&views, device), camera))
+}
+
+fn in_world(gaussians: Gaussians, camera: &Camera) -> Gaussians {
+    placed(&Config::default(), gaussians, &camera.world_to_camera.inverse())
+}
+
+fn some(gaussians: Gaussians) -> Option<Gaussians> {
+    (!gaussians.is_empty()).then_some(gaussians)
+}
+
+/// The mean picture, view by view, of people to train on.
+pub struct MeanPictures {
+    side: usize,
+    /// `[3,S,S]` of each view.
+    views: Vec<Vec<f32>>,
+    /// How many people.
+    pub people: usize,
+}
+
+impl MeanPictures {
+    /// Of the training people of data sets that have `views` views each.
+    ///
+    /// # Errors
+    /// [`EvalError`] for a set with other views or sizes, or a picture that cannot be read.
+    pub fn new(folders: &[impl AsRef<Path>], views: usize) -> Result<Self, EvalError> {
+        let mut sums: Vec<Vec<f64>> = Vec::new();
+        let (mut side, mut people) = (0, 0);
+        for path in folders {
+            let path = path.as_ref();
+            let folder = Arc::new(Folder::open(path)?);
+            let found = folder.description().views;
+            let wrong = |message: String| EvalError::Empty(format!("{}: {message}", path.display()));
+            if found != views {
+                return Err(wrong(format!("has {found} views, the people to evaluate {views}")));
+            }
+            let stored = folder.description().resolution as usize;
+            let factor = (1..=stored).find(|f| stored.is_multiple_of(*f) && stored / f <= MEAN_SIDE);
+            let kept = stored / factor.unwrap_or(1);
+            if side != 0 && kept != side {
+                return Err(wrong(format!("has pictures of {kept}², the sets before it of {side}²")));
+            }
+            side = kept;
+            sums.resize(views, vec![0.0; 3 * side * side]);
+            let test = test_of(&folder, Some(Split::Train))?;
+            // Every view sums its people in their order, so that the number of threads changes nothing.
+            sums.par_iter_mut().enumerate().try_for_each(|(view, sum)| -> Result<(), EvalError> {
+                for row in 0..test.len() {
+                    let (values, _) = test.target(row, view, [0.0; 3])?;
+                    let planes = smaller(values, 3, stored, side);
+                    sum.iter_mut().zip(planes).for_each(|(sum, v)| *sum += f64::from(v));
+                }
+                Ok(())
+            })?;
+            people += test.len();
+        }
+        let mean = |sum: Vec<f64>| sum.into_iter().map(|v| (v / people as f64) as f32).collect();
+        Ok(Self { side, views: sums.into_iter().map(mean).collect(), people })
+    }
+
+    /// The mean picture of a view at a size.
+    ///
+    /// # Errors
+    /// Never; a picture's values are checked.
+    pub fn picture(&self, view: usize, side: usize) -> Result<Picture, EvalError> {
+        let planes = TensorData::new(self.views[view].clone(), [1, 3, self.side, self.side]);
+        let planes = Tensor::<4>::from_data(planes, &Device::flex());
+        let planes = if side == self.side { planes } else { bilinear(planes, [side, side], false) };
+        Picture::new(host(planes.clamp(0.0, 1.0)), [side, side], "mean picture")
+    }
+}

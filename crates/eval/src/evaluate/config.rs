@@ -1,0 +1,252 @@
+//! The TOML schema of an evaluation.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+use serde::{Deserialize, Serialize};
+use snapsnap_data::dataset::Split;
+use snapsnap_net::config::{ConfigError, parse};
+
+/// Everything that decides what an evaluation computes.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct EvalConfig {
+    /// Who is looked at.
+    pub data: DataSection,
+    /// Which views go in and which are compared.
+    pub views: ViewsSection,
+    /// What is judged.
+    pub model: ModelSection,
+    /// How pictures are compared.
+    pub metrics: MetricsSection,
+    /// What it is compared with.
+    pub baselines: BaselineSection,
+    /// The same model otherwise, or another one, by name; each is compared with the model, person by person.
+    pub ablations: BTreeMap<String, Ablation>,
+    /// Lists of subjects that get figures of their own, such as those in loose clothes.
+    pub groups: BTreeMap<String, Group>,
+    /// What is written.
+    pub report: ReportSection,
+}
+
+/// The section `[data]`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct DataSection {
+    /// The data sets; `--data` replaces them.
+    pub folders: Vec<PathBuf>,
+    /// Which people of them; unset: those that lie in the folder itself, as in the authors' test sets.
+    pub split: Option<Split>,
+    /// Only so many of each, the first ones; 0: all.
+    pub subjects: usize,
+    /// Only these; empty: all.
+    pub only: Vec<String>,
+    /// Folder of true meshes, NAME.obj, .ply or .glb, for point-to-surface distances.
+    pub scans: Option<PathBuf>,
+}
+
+impl Default for DataSection {
+    fn default() -> Self {
+        Self { folders: Vec::new(), split: Some(Split::Test), subjects: 0, only: Vec::new(), scans: None }
+    }
+}
+
+/// The section `[views]`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ViewsSection {
+    /// Views that go in; empty: the first and the opposite one. Of more than two, each and the next make a pair of
+    /// photographs of known cameras, around the circle, without unseen sides; what the pairs give is put together.
+    pub inputs: Vec<usize>,
+    /// The same people again with all inputs so many views further: other angles than the person's own front.
+    pub turns: Vec<usize>,
+    /// Side of the pictures that are compared, in pixels; 0: the data set's, else a whole part of it.
+    pub resolution: usize,
+    /// Renders are so many times as large on each side, 1 or 2, and shrunk.
+    pub supersampling: usize,
+}
+
+impl Default for ViewsSection {
+    fn default() -> Self {
+        Self { inputs: Vec::new(), turns: vec![0], resolution: 0, supersampling: 2 }
+    }
+}
+
+/// The section `[model]`.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ModelSection {
+    /// Weight file; `--weights` replaces it.
+    pub weights: Option<PathBuf>,
+    /// Overrides of the config that is stored with the weights, `section.key=value`.
+    pub set: Vec<String>,
+    /// Devices, as `--device` names them; empty: the best there is. The first one makes the figures, each further one is
+    /// compared with it like an ablation.
+    pub devices: Vec<String>,
+}
+
+/// A section `[ablations.NAME]`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Ablation {
+    /// Other weights; unset: the model's.
+    pub weights: Option<PathBuf>,
+    /// Further overrides of the stored config.
+    pub set: Vec<String>,
+    /// Whether the unseen sides are predicted.
+    pub sides: bool,
+    /// Whether their pixels get the colours of the nearest photographed points.
+    pub side_colors: bool,
+}
+
+impl Default for Ablation {
+    fn default() -> Self {
+        Self { weights: None, set: Vec::new(), sides: true, side_colors: true }
+    }
+}
+
+/// A section `[groups.NAME]`.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Group {
+    /// Names of subjects.
+    pub subjects: Vec<String>,
+}
+
+/// Where pictures are compared.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Protocol {
+    /// In the window of 1000 × 500 of 1024 pixels around the person.
+    Paper,
+    /// On the person and 8 of 1024 pixels around.
+    Masked,
+}
+
+impl Protocol {
+    /// As in configs and reports.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Paper => "paper",
+            Self::Masked => "masked",
+        }
+    }
+}
+
+/// The section `[metrics]`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct MetricsSection {
+    /// Where pictures are compared.
+    pub protocols: Vec<Protocol>,
+    /// Folder with the published weights of LPIPS; `--lpips` replaces it.
+    pub lpips: PathBuf,
+    /// Chamfer distance of the Gaussians' centres and agreement of normals.
+    pub geometry: bool,
+    /// Gaussians at least so opaque are surface.
+    pub opaque: f32,
+}
+
+impl Default for MetricsSection {
+    fn default() -> Self {
+        Self {
+            protocols: vec![Protocol::Paper, Protocol::Masked],
+            lpips: "weights".into(),
+            geometry: true,
+            opaque: 0.5,
+        }
+    }
+}
+
+/// The section `[baselines]`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct BaselineSection {
+    /// The photographs as flat cut-outs: who learned nothing beats it by nothing.
+    pub billboard: bool,
+    /// True points in the photographs' colours: the most that the regressor could begin with.
+    pub true_points: bool,
+    /// Data sets of people to train on with the same views, of any size: their mean picture per view knows nobody, but no
+    /// wrong colours either. Empty: left out.
+    pub mean: Vec<PathBuf>,
+}
+
+impl Default for BaselineSection {
+    fn default() -> Self {
+        Self { billboard: true, true_points: true, mean: Vec::new() }
+    }
+}
+
+/// The section `[report]`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ReportSection {
+    /// How many people of each kind are shown: the best, those in the middle, the worst.
+    pub people: usize,
+    /// Views of each that are shown, degrees from the input view.
+    pub degrees: Vec<f64>,
+}
+
+impl Default for ReportSection {
+    fn default() -> Self {
+        Self { people: 2, degrees: vec![0.0, 48.0, 96.0, 132.0, 180.0, 264.0] }
+    }
+}
+
+impl EvalConfig {
+    /// Parses and checks TOML text; `origin` names it in errors, `overrides` are `a.b=c` assignments applied on top.
+    ///
+    /// # Errors
+    /// [`ConfigError`], naming origin, key and allowed values.
+    pub fn from_toml(text: &str, origin: &str, overrides: &[String]) -> Result<Self, ConfigError> {
+        let (config, origin): (Self, String) = parse(text, origin, overrides)?;
+        match config.problem() {
+            Some((key, message)) => Err(ConfigError::Value { origin, key, message }),
+            None => Ok(config),
+        }
+    }
+
+    /// As TOML.
+    ///
+    /// # Panics
+    /// Never: every field is representable in TOML.
+    pub fn to_toml(&self) -> String {
+        toml::to_string_pretty(self).expect("the config has only TOML types")
+    }
+
+    fn problem(&self) -> Option<(&'static str, String)> {
+        let most = snapsnap_data::dataset::MAX_VIEWS;
+        let Self { views, metrics, report, .. } = self;
+        if views.inputs.len() == 1 || views.inputs.len() > 64 {
+            return Some(("views.inputs", "must be empty, or 2 to 64 views".into()));
+        }
+        let mut sorted = views.inputs.clone();
+        sorted.sort_unstable();
+        sorted.dedup();
+        if sorted.len() < views.inputs.len() {
+            return Some(("views.inputs", "names a view twice".into()));
+        }
+        if views.inputs.iter().chain(&views.turns).any(|view| *view >= most) {
+            return Some(("views.inputs", format!("views and turns must be below {most}")));
+        }
+        if views.turns.is_empty() || views.turns.len() > 64 {
+            return Some(("views.turns", "must have 1 to 64 entries".into()));
+        }
+        if ![1, 2].contains(&views.supersampling) {
+            return Some(("views.supersampling", format!("is {}, must be 1 or 2", views.supersampling)));
+        }
+        if metrics.protocols.is_empty() {
+            return Some(("metrics.protocols", "is empty, must name `paper`, `masked` or both".into()));
+        }
+        if !(0.0..=1.0).contains(&metrics.opaque) {
+            return Some(("metrics.opaque", format!("is {}, must be 0 to 1", metrics.opaque)));
+        }
+        if report.people > 20 || report.degrees.len() > 24 {
+            return Some(("report.people", "at most 20 people of each kind and 24 views of each".into()));
+        }
+        if report.degrees.iter().any(|degrees| !degrees.is_finite()) {
+            return Some(("report.degrees", "must be numbers".into()));
+        }
+        None
+    }
+}

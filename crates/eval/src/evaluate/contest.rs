@@ -1,0 +1,198 @@
+//! Who is compared: the model, what it is without something, others, and the baselines.
+
+use std::time::Duration;
+
+use burn::tensor::Device;
+use snapsnap_data::sample::TestItem;
+use snapsnap_splat::Gaussians;
+
+use super::model::Model;
+use super::person::{People, degrees, points};
+use crate::EvalError;
+use crate::baselines::{MeanPictures, billboard, true_points};
+use crate::pictures::Picture;
+use crate::points::{Pair, PointError, point_errors};
+
+/// What a contestant is to a report.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Kind {
+    /// What the report is about.
+    #[default]
+    Model,
+    /// What it is compared with, person by person.
+    Other,
+    /// What anybody can do.
+    Baseline,
+}
+
+/// Somebody who is compared.
+pub struct Contestant {
+    /// In reports.
+    pub name: String,
+    means: Means,
+}
+
+enum Means {
+    Model(Kind, Model),
+    Billboard(Device),
+    TruePoints(Device),
+    Mean(MeanPictures),
+}
+
+/// What a contestant has to show of a person.
+pub struct Shown {
+    /// World frame; none where there are only pictures.
+    pub gaussians: Option<Gaussians>,
+    /// Errors of the predicted points.
+    pub points: Vec<PointError>,
+    /// Pixels and Gaussians that were not finite.
+    pub lost: usize,
+    /// What it took.
+    pub time: Option<Duration>,
+}
+
+impl Shown {
+    /// Whether it is rendered by the processor.
+    pub fn is_on_cpu(&self) -> bool {
+        self.gaussians.as_ref().is_none_or(|gaussians| gaussians.device().identity().is_none())
+    }
+}
+
+impl Contestant {
+    /// What the report is about.
+    pub fn model(name: &str, model: Model) -> Self {
+        Self { name: name.into(), means: Means::Model(Kind::Model, model) }
+    }
+
+    /// What it is compared with.
+    pub fn other(name: &str, model: Model) -> Self {
+        Self { name: name.into(), means: Means::Model(Kind::Other, model) }
+    }
+
+    /// The photographs as cut-outs.
+    pub fn billboard(device: &Device) -> Self {
+        Self { name: "billboard".into(), means: Means::Billboard(device.clone()) }
+    }
+
+    /// True points in the photographs' colours.
+    pub fn true_points(device: &Device) -> Self {
+        Self { name: "true_points".into(), means: Means::TruePoints(device.clone()) }
+    }
+
+    /// The mean picture of people to train on.
+    pub fn mean(pictures: MeanPictures) -> Self {
+        Self { name: "mean_picture".into(), means: Means::Mean(pictures) }
+    }
+
+    /// What it is to the report.
+    pub fn kind(&self) -> Kind {
+        match &self.means {
+            Means::Model(kind, _) => *kind,
+            _ => Kind::Baseline,
+        }
+    }
+
+    /// The networks, where it has some.
+    pub fn networks(&self) -> Option<&Model> {
+        if let Means::Model(_, model) = &self.means { Some(model) } else { None }
+    }
+
+    /// What it makes of a person's photographs.
+    ///
+    /// # Errors
+    /// [`EvalError`] if files cannot be read, or nothing came out.
+    pub(super) fn prepare(
+        &self,
+        people: &People,
+        row: usize,
+        item: &TestItem,
+        inputs: &[usize],
+    ) -> Result<Shown, EvalError> {
+        let nothing = || EvalError::Empty("no Gaussian came out".into());
+        let plain = |gaussians| Shown { gaussians: Some(gaussians), points: Vec::new(), lost: 0, time: None };
+        match &self.means {
+            Means::Model(_, model) => {
+                let made = model.reconstruct(item, inputs);
+                if made.gaussians.is_empty() {
+                    return Err(nothing());
+                }
+                let points = errors(people, row, item, inputs, &made.maps, model.side())?;
+                let (gaussians, lost, time) = (Some(made.gaussians), made.lost, Some(made.time));
+                Ok(Shown { gaussians, points, lost, time })
+            }
+            Means::Billboard(device) => {
+                let valid: Vec<bool> = item.masks.iter().map(|mask| *mask > 0.5).collect();
+                let cameras: Vec<_> = inputs.iter().map(|view| item.cameras[*view]).collect();
+                billboard(&item.images, &valid, item.side, &cameras, device).map(plain).ok_or_else(nothing)
+            }
+            Means::TruePoints(device) => {
+                let mut views = inputs.to_vec();
+                if inputs.len() == 2 {
+                    views.extend(sides(item, inputs[0]).map(|(view, _)| view));
+                }
+                let (points, valid) = people.test().points(row, &views)?;
+                let area = item.side * item.side;
+                let is_valid = |view: usize, i: usize| {
+                    let masked = view >= inputs.len() || item.masks[view * area + i] > 0.5;
+                    valid[view * area + i] > 0.5 && masked
+                };
+                let valid: Vec<Vec<bool>> =
+                    (0..views.len()).map(|view| (0..area).map(|i| is_valid(view, i)).collect()).collect();
+                let front = &item.cameras[inputs[0]];
+                let made = true_points(&item.images, inputs.len(), &points, &valid, item.side, front, device);
+                made.map(plain).ok_or_else(nothing)
+            }
+            Means::Mean(_) => Ok(Shown { gaussians: None, points: Vec::new(), lost: 0, time: None }),
+        }
+    }
+
+    /// A view of what only has pictures.
+    pub(super) fn picture(&self, view: usize, side: usize) -> Result<Picture, EvalError> {
+        match &self.means {
+            Means::Mean(pictures) => pictures.picture(view, side),
+            _ => Err(EvalError::Empty("there is nothing to render".into())),
+        }
+    }
+}
+
+/// The views nearest to 90° (right) and 270° (left) of the first photograph, and how far off they are in degrees.
+fn sides(item: &TestItem, first: usize) -> [(usize, f64); 2] {
+    [90.0, 270.0].map(|wanted: f64| {
+        let off = |view: &usize| (degrees(&item.cameras[*view], &item.cameras[first]) - wanted).abs();
+        let nearest = (0..item.cameras.len()).min_by(|a, b| off(a).total_cmp(&off(b)));
+        let nearest = nearest.expect("there are views");
+        (nearest, off(&nearest))
+    })
+}
+
+/// Errors of predicted maps at the pixels where a view sees true points. A side needs a view at right angles.
+fn errors(
+    people: &People,
+    row: usize,
+    item: &TestItem,
+    inputs: &[usize],
+    maps: &[(usize, Vec<f32>)],
+    side: usize,
+) -> Result<Vec<PointError>, EvalError> {
+    /// Degrees; training cameras stray by as much.
+    const RIGHT: f64 = 5.0;
+    let [right, left] = sides(item, inputs[0]);
+    let there = |place: &usize| match place {
+        2 => (right.1 <= RIGHT).then_some(right.0),
+        3 => (left.1 <= RIGHT).then_some(left.0),
+        _ => inputs.get(*place).copied(),
+    };
+    // The first view's frame is that of the predictions.
+    let (maps, views): (Vec<_>, Vec<usize>) =
+        maps.iter().filter_map(|(place, map)| Some(((*place, map), there(place)?))).unzip();
+    let truth = if views.is_empty() { None } else { points(people.test(), row, &views, item.side, side)? };
+    let Some((truth, valid)) = truth else { return Ok(Vec::new()) };
+    let area = side * side;
+    let pairs = maps.iter().enumerate().map(|(i, (place, map))| Pair {
+        view: *place,
+        points: map,
+        truth: &truth[3 * i * area..3 * (i + 1) * area],
+        valid: &valid[i * area..(i + 1) * area],
+    });
+    Ok(point_errors(&pairs.collect::<Vec<_>>()))
+}

@@ -1,0 +1,1 @@
+//! Meshes of other methods against the true surface.

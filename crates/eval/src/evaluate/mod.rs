@@ -1,0 +1,328 @@
+//! A model, and what it is compared with, on the people of a data set (EVALUATION.md, SNAPSNAP §10).
+
+pub mod config;
+mod contest;
+pub mod meshes;
+pub mod model;
+pub mod person;
+mod surface;
+
+use std::time::Duration;
+
+use image::RgbImage;
+use rayon::prelude::*;
+use snapsnap_data::sample::TestItem;
+use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
+
+use crate::EvalError;
+use crate::lpips::Lpips;
+use crate::pictures::Picture;
+use crate::points::PointError;
+use crate::preview::{color, grid, heat};
+use crate::region::{Region, margin};
+use crate::score::Score;
+
+use config::{EvalConfig, Protocol};
+pub use contest::{Contestant, Kind};
+use person::People;
+pub use surface::Surface;
+
+/// What a view of a person gave.
+#[derive(Debug, Clone)]
+pub struct Row {
+    /// Row of [`Outcome::people`].
+    pub person: usize,
+    /// How many views further the photographs were taken.
+    pub turn: usize,
+    /// The view.
+    pub view: usize,
+    /// Degrees from the first photograph's camera, around the person.
+    pub degrees: f64,
+    /// In the order of the config's protocols.
+    pub scores: Vec<Score>,
+}
+
+/// Everything a contestant gave.
+#[derive(Debug, Clone, Default)]
+pub struct Judged {
+    /// Its name.
+    pub name: String,
+    /// What it is.
+    pub kind: Kind,
+    /// Views.
+    pub rows: Vec<Row>,
+    /// Errors of the predicted points, per person and turn.
+    pub points: Vec<(usize, Vec<PointError>)>,
+    /// The Gaussians as a surface, per person and turn.
+    pub surface: Vec<(usize, Surface)>,
+    /// From the photographs to the Gaussians, per person and turn.
+    pub times: Vec<Duration>,
+    /// Number of Gaussians, likewise.
+    pub gaussians: Vec<usize>,
+}
+
+/// Something that could not be evaluated.
+#[derive(Debug, Clone, serde::Serialize)]
+pub struct LeftOut {
+    /// Person, or person and view, or model.
+    pub name: String,
+    /// The reason.
+    pub why: String,
+}
+
+/// What an evaluation found.
+pub struct Outcome {
+    /// Names of the people.
+    pub people: Vec<String>,
+    /// The model first, if it could be loaded.
+    pub judged: Vec<Judged>,
+    /// What is missing.
+    pub left_out: Vec<LeftOut>,
+}
+
+/// Evaluates contestants on all people; `progress` hears how many are done. What is wrong with single people, views or
+/// contestants is told in the outcome, and the rest is evaluated.
+pub fn evaluate(
+    config: &EvalConfig,
+    sets: &[People],
+    contestants: &[Contestant],
+    lpips: Option<&Lpips>,
+    progress: &dyn Fn(usize, usize),
+) -> Outcome {
+    let total = sets.iter().map(|set| set.chosen().len()).sum();
+    let mut outcome = Outcome { people: Vec::new(), judged: Vec::new(), left_out: Vec::new() };
+    let named = |contestant: &Contestant| Judged {
+        name: contestant.name.clone(),
+        kind: contestant.kind(),
+        ..Judged::default()
+    };
+    outcome.judged = contestants.iter().map(named).collect();
+    for people in sets {
+        for &row in people.chosen() {
+            let person = outcome.people.len();
+            outcome.people.push(name_of(sets, people, row));
+            for &turn in &config.views.turns {
+                let at = Place { people, row, turn, person };
+                one(config, &at, contestants, lpips, &mut outcome);
+            }
+            progress(person + 1, total);
+        }
+    }
+    for name in &config.data.only {
+        if !sets.iter().any(|set| set.chosen().iter().any(|row| set.test().name(*row) == name)) {
+            let why = "data.only names it, no data set has it".into();
+            outcome.left_out.push(LeftOut { name: name.clone(), why });
+        }
+    }
+    outcome
+}
+
+/// A person's name, with the data set's where there are several.
+fn name_of(sets: &[People], people: &People, row: usize) -> String {
+    let name = people.test().name(row);
+    let root = people.folder().root().file_name().unwrap_or_default().to_string_lossy();
+    if sets.len() > 1 { format!("{root}/{name}") } else { name.to_owned() }
+}
+
+/// A person seen from a side.
+struct Place<'a> {
+    people: &'a People,
+    row: usize,
+    turn: usize,
+    /// Row of the outcome's people.
+    person: usize,
+}
+
+impl Place<'_> {
+    fn left_out(&self, outcome: &mut Outcome, what: &str, why: &dyn ToString) {
+        let name = format!("{}{what}", outcome.people[self.person]);
+        outcome.left_out.push(LeftOut { name, why: why.to_string() });
+    }
+}
+
+fn one(
+    config: &EvalConfig,
+    at: &Place,
+    contestants: &[Contestant],
+    lpips: Option<&Lpips>,
+    outcome: &mut Outcome,
+) {
+    let Place { people, row, turn, person } = *at;
+    let inputs = people.inputs(&config.views, turn);
+    let item = match people.test().sample(row, &inputs) {
+        Ok(item) => item,
+        Err(e) => return at.left_out(outcome, "", &e),
+    };
+    let truth = config.metrics.geometry.then(|| Surface::truth(people, row, &item.cameras));
+    let truth = match truth.transpose() {
+        Ok(truth) => truth,
+        Err(e) => {
+            at.left_out(outcome, ", geometry", &e);
+            None
+        }
+    };
+    let mut shown: Vec<Option<contest::Shown>> = Vec::new();
+    for (i, contestant) in contestants.iter().enumerate() {
+        let made = contestant.prepare(people, row, &item, &inputs);
+        let made = match made {
+            Ok(made) => made,
+            Err(e) => {
+                at.left_out(outcome, &format!(", {}", contestant.name), &e);
+                shown.push(None);
+                continue;
+            }
+        };
+        if made.lost > 0 {
+            let why = format!("{} pixels or Gaussians left out: they are not finite", made.lost);
+            at.left_out(outcome, &format!(", {}", contestant.name), &why);
+        }
+        let judged = &mut outcome.judged[i];
+        if !made.points.is_empty() {
+            judged.points.push((person, made.points.clone()));
+        }
+        judged.times.extend(made.time);
+        judged.gaussians.extend(made.gaussians.as_ref().map(Gaussians::len));
+        if let (Some(truth), Some(gaussians)) = (&truth, &made.gaussians) {
+            match Surface::of_gaussians(gaussians, truth, config.metrics.opaque) {
+                Ok(surface) => judged.surface.push((person, surface)),
+                Err(e) => at.left_out(outcome, &format!(", {}, geometry", contestant.name), &e),
+            }
+        }
+        shown.push(Some(made));
+    }
+    let compared: Vec<usize> = (0..people.views()).filter(|view| !inputs.contains(view)).collect();
+    let compare = |view: &usize| compare(config, at, &item, *view, (contestants, &shown), lpips);
+    // A device of its own does one thing at a time.
+    let found: Vec<Result<Vec<Scored>, EvalError>> = if shown.iter().flatten().all(contest::Shown::is_on_cpu)
+    {
+        compared.par_iter().map(compare).collect()
+    } else {
+        compared.iter().map(compare).collect()
+    };
+    for (view, found) in compared.into_iter().zip(found) {
+        let scored = match found {
+            Ok(scored) => scored,
+            Err(e) => {
+                at.left_out(outcome, &format!(", view {view}"), &e);
+                continue;
+            }
+        };
+        let degrees = person::degrees(&item.cameras[view], &item.cameras[inputs[0]]);
+        for (i, scores) in scored {
+            match scores {
+                Ok(scores) => outcome.judged[i].rows.push(Row { person, turn, view, degrees, scores }),
+                Err(e) => at.left_out(outcome, &format!(", {}, view {view}", contestants[i].name), &e),
+            }
+        }
+    }
+}
+
+/// A contestant's place, and its scores by protocol.
+type Scored = (usize, Result<Vec<Score>, EvalError>);
+
+fn compare(
+    config: &EvalConfig,
+    at: &Place,
+    item: &TestItem,
+    view: usize,
+    (contestants, shown): (&[Contestant], &[Option<contest::Shown>]),
+    lpips: Option<&Lpips>,
+) -> Result<Vec<Scored>, EvalError> {
+    let side = at.people.side(&config.views);
+    let (target, mask) = at.people.target(at.row, view, side)?;
+    let region = |protocol: &Protocol| match protocol {
+        Protocol::Paper => Region::paper(&target),
+        Protocol::Masked => Region::masked(&mask, [side, side], margin(side)),
+    };
+    let regions = config.metrics.protocols.iter().map(region).collect::<Result<Vec<_>, _>>()?;
+    let camera = item.cameras[view];
+    let scores = |(place, contestant): (usize, &Contestant)| {
+        let shown = shown[place].as_ref()?;
+        let scores = picture(config, contestant, shown, &camera, view, side).and_then(|image| {
+            regions.iter().map(|region| Score::new(&image, &target, region, lpips)).collect()
+        });
+        Some((place, scores))
+    };
+    Ok(contestants.iter().enumerate().filter_map(scores).collect())
+}
+
+/// What a contestant shows in a view.
+fn picture(
+    config: &EvalConfig,
+    contestant: &Contestant,
+    shown: &contest::Shown,
+    camera: &Camera,
+    view: usize,
+    side: usize,
+) -> Result<Picture, EvalError> {
+    match &shown.gaussians {
+        Some(gaussians) => rendered(gaussians, camera, side, config.views.supersampling),
+        None => contestant.picture(view, side),
+    }
+}
+
+/// Gaussians (world frame) as a camera sees them, before black, `side`² pixels: rendered `times` as large and shrunk.
+///
+/// # Errors
+/// [`EvalError`] for what cannot be rendered.
+pub fn rendered(
+    gaussians: &Gaussians,
+    camera: &Camera,
+    side: usize,
+    times: usize,
+) -> Result<Picture, EvalError> {
+    let large = side * times;
+    let camera = camera.resized(large as u32, large as u32);
+    let color = render(gaussians, std::slice::from_ref(&camera), &RenderOptions::inria())?.color;
+    Picture::rendered(&snapsnap_ops::host(color), [large, large], times)
+}
+
+/// What the best, middle and worst people look like: photographs and, for each view asked for, the model's picture, the true
+/// one and the error.
+///
+/// # Errors
+/// [`EvalError`] for files that cannot be read any more.
+pub fn sheet(
+    config: &EvalConfig,
+    sets: &[People],
+    contestant: &Contestant,
+    persons: &[usize],
+) -> Result<Option<RgbImage>, EvalError> {
+    /// Mean absolute difference of channels that is shown white.
+    const WORST: f32 = 0.5;
+    let places = sets.iter().flat_map(|set| set.chosen().iter().map(move |row| (set, *row)));
+    let places: Vec<(&People, usize)> = places.collect();
+    let mut rows = Vec::new();
+    for person in persons {
+        let (people, row) = places[*person];
+        let inputs = people.inputs(&config.views, config.views.turns[0]);
+        let item = people.test().sample(row, &inputs)?;
+        let shown = contestant.prepare(people, row, &item, &inputs)?;
+        let side = people.side(&config.views);
+        let mut pictures = Vec::new();
+        for view in &inputs[..2] {
+            let (target, _) = people.target(row, *view, side)?;
+            pictures.push(target.cropped(Region::paper(&target)?.window).to_rgb8());
+        }
+        for wanted in &config.report.degrees {
+            let off = |view: &usize| {
+                let apart = person::degrees(&item.cameras[*view], &item.cameras[inputs[0]]) - wanted;
+                apart.rem_euclid(360.0).min((-apart).rem_euclid(360.0))
+            };
+            let near = (0..people.views()).min_by(|a, b| off(a).total_cmp(&off(b)));
+            let view = near.expect("there are views");
+            let image = picture(config, contestant, &shown, &item.cameras[view], view, side)?;
+            let (target, _) = people.target(row, view, side)?;
+            let window = Region::paper(&target)?.window;
+            let [image, target] = [image, target].map(|picture| picture.cropped(window));
+            let error = RgbImage::from_fn(image.width as u32, image.height as u32, |x, y| {
+                let i = y as usize * image.width + x as usize;
+                let apart = |c: usize| (image.plane(c)[i] - target.plane(c)[i]).abs();
+                color(heat((apart(0) + apart(1) + apart(2)) / 3.0, WORST))
+            });
+            pictures.extend([image.to_rgb8(), target.to_rgb8(), error]);
+        }
+        rows.push(pictures);
+    }
+    Ok(grid(&rows))
+}

@@ -1,0 +1,189 @@
+//! One person of a test set, and what a canvas of another size shows of the photographs.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use burn::tensor::{Device, Tensor, TensorData};
+use snapsnap_data::dataset::{Folder, Split};
+use snapsnap_data::sample::{SampleConfig, Test, TestItem};
+use snapsnap_mesh::FileError;
+use snapsnap_net::Photograph;
+use snapsnap_net::config::Downsample;
+use snapsnap_net::resample::shrink;
+use snapsnap_ops::{bilinear, host};
+use snapsnap_splat::Camera;
+
+use super::config::{DataSection, ViewsSection};
+use crate::EvalError;
+use crate::pictures::Picture;
+
+/// The people of one data set.
+pub struct People {
+    test: Test,
+    folder: Arc<Folder>,
+    /// Rows of `test`.
+    chosen: Vec<usize>,
+}
+
+impl People {
+    /// Opens a data set.
+    ///
+    /// # Errors
+    /// [`EvalError`] if it is none, or its views are not what the config asks for.
+    pub fn open(path: &Path, data: &DataSection, views: &ViewsSection) -> Result<Self, EvalError> {
+        let folder = Arc::new(Folder::open(path)?);
+        let test = test_of(&folder, data.split)?;
+        let description = folder.description();
+        let wrong = |message: String| EvalError::File(FileError::unsuitable(path, message));
+        let count = description.views;
+        if views.inputs.is_empty() && !count.is_multiple_of(2) {
+            let message = format!("has {count} views, none opposite the first: say `views.inputs`");
+            return Err(wrong(message));
+        }
+        if let Some(view) = views.inputs.iter().find(|view| **view >= count) {
+            return Err(wrong(format!("has no view {view}, of {count}, which `views.inputs` asks for")));
+        }
+        let side = description.resolution as usize;
+        if views.resolution > 0 && !side.is_multiple_of(views.resolution) {
+            let message = format!(
+                "has views of {side}², of which `views.resolution` = {} is no whole part",
+                views.resolution
+            );
+            return Err(wrong(message));
+        }
+        let is_chosen =
+            |i: &usize| data.only.is_empty() || data.only.iter().any(|name| name == test.name(*i));
+        let most = if data.subjects == 0 { usize::MAX } else { data.subjects };
+        let chosen = (0..test.len()).filter(is_chosen).take(most).collect();
+        Ok(Self { test, folder, chosen })
+    }
+
+    /// The data set.
+    pub fn folder(&self) -> &Folder {
+        &self.folder
+    }
+
+    /// Its people.
+    pub fn test(&self) -> &Test {
+        &self.test
+    }
+
+    /// Rows of those to be looked at.
+    pub fn chosen(&self) -> &[usize] {
+        &self.chosen
+    }
+
+    /// Views of each person.
+    pub fn views(&self) -> usize {
+        self.folder.description().views
+    }
+
+    /// The views that go in, `turn` views further round.
+    pub fn inputs(&self, views: &ViewsSection, turn: usize) -> Vec<usize> {
+        let count = self.views();
+        let first = if views.inputs.is_empty() { vec![0, count / 2] } else { views.inputs.clone() };
+        first.into_iter().map(|view| (view + turn) % count).collect()
+    }
+
+    /// Side of the pictures that are compared.
+    pub fn side(&self, views: &ViewsSection) -> usize {
+        if views.resolution > 0 { views.resolution } else { self.folder.description().resolution as usize }
+    }
+
+    /// What a view shows, over black, and the person's share of each pixel `[S, S]`.
+    ///
+    /// # Errors
+    /// [`EvalError::File`].
+    pub fn target(&self, row: usize, view: usize, side: usize) -> Result<(Picture, Vec<f32>), EvalError> {
+        let (values, mask) = self.test.target(row, view, [0.0; 3])?;
+        let stored = self.folder.description().resolution as usize;
+        let values = smaller(values, 3, stored, side);
+        let picture = Picture::new(values, [side, side], "true picture")?;
+        Ok((picture, smaller(mask, 1, stored, side)))
+    }
+}
+
+/// A split of a data set as it is, nothing changed.
+pub fn test_of(folder: &Arc<Folder>, split: Option<Split>) -> Result<Test, EvalError> {
+    Ok(Test::new(folder.clone(), split, SampleConfig::default())?)
+}
+
+/// Planes `[C, S, S]` shrunk to a whole part of their side.
+pub fn smaller(values: Vec<f32>, channels: usize, from: usize, to: usize) -> Vec<f32> {
+    if from == to {
+        return values;
+    }
+    let planes = TensorData::new(values, [1, channels, from, from]);
+    let planes = Tensor::<4>::from_data(planes, &Device::flex());
+    // Means of values in [0, 1] may leave it by rounding.
+    host(shrink(planes, from / to, Downsample::Area).clamp(0.0, 1.0))
+}
+
+/// One of the photographs that go in, on a canvas of `side` pixels: area means where that is a whole part of its own side,
+/// else interpolated.
+pub fn photograph(item: &TestItem, place: usize, side: usize) -> Photograph {
+    let from = item.side;
+    let area = from * from;
+    let rgb = item.images[3 * place * area..3 * (place + 1) * area].to_vec();
+    let mask = item.masks[place * area..(place + 1) * area].to_vec();
+    let sized = |values: Vec<f32>, channels: usize| {
+        let planes = TensorData::new(values, [1, channels, from, from]);
+        let planes = Tensor::<4>::from_data(planes, &Device::flex());
+        host(match from.is_multiple_of(side) {
+            true => shrink(planes, from / side, Downsample::Area),
+            false => bilinear(planes, [side, side], false),
+        })
+    };
+    let (rgb, mask) = if from == side { (rgb, mask) } else { (sized(rgb, 3), sized(mask, 1)) };
+    let valid = mask.iter().map(|share| *share >= 0.5).collect();
+    Photograph { rgb, mask, valid }
+}
+
+/// Points that some views see, on a canvas of `side` pixels where that is a whole part of the stored side (`None` where it
+/// is not): `[V,S,S,3]` metres in the first view's frame, and where there are any `[V,S,S]`. A pixel of the canvas holds the
+/// mean of the points in it, if there are any in half of it or more.
+pub fn points(
+    test: &Test,
+    row: usize,
+    views: &[usize],
+    stored: usize,
+    side: usize,
+) -> Result<Option<(Vec<f32>, Vec<f32>)>, EvalError> {
+    if !stored.is_multiple_of(side) {
+        return Ok(None);
+    }
+    let (points, valid) = test.points(row, views)?;
+    let factor = stored / side;
+    if factor == 1 {
+        return Ok(Some((points, valid)));
+    }
+    let area = side * side;
+    let mut means = vec![0.0; 3 * views.len() * area];
+    let mut shares = vec![0.0; views.len() * area];
+    for (cell, share) in shares.iter_mut().enumerate() {
+        let (view, at) = (cell / area, cell % area);
+        let corner = view * stored * stored + at / side * factor * stored + at % side * factor;
+        let (mut sum, mut count) = ([0.0_f64; 3], 0_usize);
+        for (y, x) in (0..factor).flat_map(|y| (0..factor).map(move |x| (y, x))) {
+            let i = corner + y * stored + x;
+            if valid[i] > 0.5 {
+                (0..3).for_each(|c| sum[c] += f64::from(points[3 * i + c]));
+                count += 1;
+            }
+        }
+        if 2 * count >= factor * factor {
+            *share = 1.0;
+            (0..3).for_each(|c| means[3 * cell + c] = (sum[c] / count as f64) as f32);
+        }
+    }
+    Ok(Some((means, shares)))
+}
+
+/// Azimuth of a camera around the world's y, degrees from that of `front`, 0 to 360.
+pub fn degrees(camera: &Camera, front: &Camera) -> f64 {
+    let azimuth = |camera: &Camera| {
+        let centre = camera.centre();
+        centre.x.atan2(centre.z).to_degrees()
+    };
+    (azimuth(camera) - azimuth(front)).rem_euclid(360.0)
+}

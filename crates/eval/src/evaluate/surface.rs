@@ -1,0 +1,107 @@
+//! Geometry of a person: true points of all views, and how far what was made lies from them.
+
+use glam::DVec3;
+use rayon::prelude::*;
+use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
+
+use super::person::{People, degrees};
+use crate::EvalError;
+use crate::geometry::{Chamfer, chamfer, consistency, normals, points};
+
+/// True points kept per view, about.
+const PER_VIEW: usize = 4000;
+/// Gaussians compared, about: more say nothing new.
+const MOST: usize = 60_000;
+/// Directions from which normals are compared, degrees from the first view.
+const DIRECTIONS: [f64; 4] = [0.0, 90.0, 180.0, 270.0];
+
+/// Distances of a surface from the true one.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Surface {
+    /// Metres.
+    pub chamfer: Chamfer,
+    /// Mean cosine of normals, from four sides, where both are seen.
+    pub normals: Option<f64>,
+}
+
+/// What is true of a person.
+pub struct Truth {
+    /// World frame, metres.
+    pub points: Vec<[f32; 3]>,
+    /// Views nearest to the four directions, and the normals that they see.
+    pub views: Vec<(Camera, Vec<Option<DVec3>>)>,
+}
+
+impl Surface {
+    /// True points and normals of a person, from the depth maps.
+    ///
+    /// # Errors
+    /// [`EvalError`] for files that cannot be read, or without any point.
+    pub fn truth(people: &People, row: usize, cameras: &[Camera]) -> Result<Truth, EvalError> {
+        let nearest = |wanted: f64| {
+            let off = |view: &usize| {
+                let apart = (degrees(&cameras[*view], &cameras[0]) - wanted).rem_euclid(360.0);
+                apart.min(360.0 - apart)
+            };
+            (0..cameras.len()).min_by(|a, b| off(a).total_cmp(&off(b))).expect("there are views")
+        };
+        let directions = DIRECTIONS.map(nearest);
+        let of_view = |(view, camera): (usize, &Camera)| {
+            let (points, valid) = people.test().points(row, &[view])?;
+            let to_world = camera.world_to_camera.inverse();
+            let there: Vec<usize> = (0..valid.len()).filter(|i| valid[*i] > 0.5).collect();
+            let step = there.len().div_ceil(PER_VIEW).max(1);
+            let point = |i: usize| {
+                DVec3::new(points[3 * i].into(), points[3 * i + 1].into(), points[3 * i + 2].into())
+            };
+            let kept = there.iter().step_by(step).map(|i| to_world.apply(point(*i)).as_vec3().to_array());
+            let kept: Vec<[f32; 3]> = kept.collect();
+            let normals = directions.contains(&view).then(|| {
+                let depth = |i: usize| if valid[i] > 0.5 { points[3 * i + 2] } else { 0.0 };
+                normals(&(0..valid.len()).map(depth).collect::<Vec<f32>>(), camera)
+            });
+            Ok((kept, normals))
+        };
+        let found: Vec<_> = cameras.par_iter().enumerate().map(of_view).collect::<Result<_, EvalError>>()?;
+        let (mut all, mut views) = (Vec::new(), Vec::new());
+        for ((kept, normals), camera) in found.into_iter().zip(cameras) {
+            all.extend(kept);
+            views.extend(normals.map(|normals| (*camera, normals)));
+        }
+        if all.is_empty() {
+            return Err(EvalError::Empty("no view has a depth: there is no true surface".into()));
+        }
+        Ok(Truth { points: all, views })
+    }
+
+    /// Of Gaussians (world frame): the centres of those that are at least so opaque, and their rendered depths.
+    ///
+    /// # Errors
+    /// [`EvalError`] if none is.
+    pub fn of_gaussians(gaussians: &Gaussians, truth: &Truth, opaque: f32) -> Result<Self, EvalError> {
+        let opacities = snapsnap_ops::host(gaussians.opacities.clone());
+        let centres = points(&gaussians.means)?;
+        let there: Vec<[f32; 3]> =
+            centres.into_iter().zip(opacities).filter(|(_, o)| *o >= opaque).map(|(p, _)| p).collect();
+        let step = there.len().div_ceil(MOST).max(1);
+        let there: Vec<[f32; 3]> = there.into_iter().step_by(step).collect();
+        let (mut sum, mut count) = (0.0, 0);
+        for (camera, expected) in &truth.views {
+            let options = RenderOptions { depth: true, ..RenderOptions::inria() };
+            let rendered = render(gaussians, std::slice::from_ref(camera), &options)?;
+            let depth = snapsnap_ops::host(rendered.depth.expect("asked for"));
+            let alpha = snapsnap_ops::host(rendered.alpha);
+            // Depths are weighted by coverage; half of it is a surface.
+            let depth: Vec<f32> =
+                depth.iter().zip(alpha).map(|(z, a)| if a > 0.5 { z / a } else { 0.0 }).collect();
+            if let Some((cosine, pixels)) = consistency(&normals(&depth, camera), expected) {
+                sum += cosine * pixels as f64;
+                count += pixels;
+            }
+        }
+        Ok(Self {
+            chamfer: chamfer(&there, &truth.points)?,
+            normals: (count > 0).then(|| sum / count as f64),
+        })
+    }
+}

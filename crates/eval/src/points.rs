@@ -1,0 +1,83 @@
+//! How far predicted points lie from the true ones, view by view.
+
+/// Names of the views in reports, in their order.
+pub const VIEWS: [&str; 4] = ["front", "back", "right", "left"];
+
+/// A view's predicted and true points.
+#[derive(Debug, Clone, Copy)]
+pub struct Pair<'a> {
+    /// Its place among [`VIEWS`].
+    pub view: usize,
+    /// `[H,W,3]` metres.
+    pub points: &'a [f32],
+    /// `[H,W,3]` metres, same frame.
+    pub truth: &'a [f32],
+    /// `[H,W]` above ½ where there is a true point.
+    pub valid: &'a [f32],
+}
+
+/// Mean distances of one person's points in a view, metres.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PointError {
+    /// Its place among [`VIEWS`].
+    pub view: usize,
+    /// As they are.
+    pub mean: f64,
+    /// After the mean shift of all the person's views together is removed.
+    pub centred: f64,
+}
+
+/// Errors of one person in every view that has a true point.
+pub fn point_errors(pairs: &[Pair]) -> Vec<PointError> {
+    let there = |pair: &Pair| -> Vec<usize> {
+        pair.valid.iter().enumerate().filter(|(_, v)| **v > 0.5).map(|(i, _)| i).collect()
+    };
+    let off = |pair: &Pair, i: usize| -> [f64; 3] {
+        [0, 1, 2].map(|c| f64::from(pair.points[3 * i + c]) - f64::from(pair.truth[3 * i + c]))
+    };
+    let (mut shift, mut count) = ([0.0; 3], 0.0);
+    for pair in pairs {
+        for i in there(pair) {
+            shift.iter_mut().zip(off(pair, i)).for_each(|(sum, v)| *sum += v);
+            count += 1.0;
+        }
+    }
+    let shift = shift.map(|sum| sum / f64::max(count, 1.0));
+    let length = |v: [f64; 3]| v.iter().map(|x| x * x).sum::<f64>().sqrt();
+    let error = |pair: &Pair| {
+        let pixels = there(pair);
+        let sum = |of: &dyn Fn([f64; 3]) -> f64| pixels.iter().map(|i| of(off(pair, *i))).sum::<f64>();
+        let n = pixels.len() as f64;
+        (n > 0.0).then(|| PointError {
+            view: pair.view,
+            mean: sum(&length) / n,
+            centred: sum(&|v| length([0, 1, 2].map(|c| v[c] - shift[c]))) / n,
+        })
+    };
+    pairs.iter().filter_map(error).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn errors_are_mean_distances_with_and_without_the_common_shift() {
+        let truth = [0.0; 9];
+        let pair = |view, points| Pair { view, points, truth: &truth, valid: &[1.0, 0.0, 1.0] };
+        // Two points 5 and 1 off; what is not valid does not count.
+        let front = [3.0, 4.0, 0.0, 100.0, 0.0, 0.0, 1.0, 0.0, 0.0];
+        let [error] = point_errors(&[pair(0, &front)])[..] else { panic!("one view") };
+        let half = (1.0_f64 + 4.0).sqrt();
+        assert!((error.mean - 3.0).abs() < 1e-12 && (error.centred - half).abs() < 1e-12, "{error:?}");
+        // Shells that lie apart stay apart.
+        let (near, far) = ([0.0; 9], [0.0, 0.0, 2.0, 0.0, 0.0, 0.0, 0.0, 0.0, 2.0]);
+        let errors = point_errors(&[pair(0, &near), pair(1, &far)]);
+        assert_eq!(
+            errors.iter().map(|e| (e.view, e.mean, e.centred)).collect::<Vec<_>>(),
+            [(0, 0.0, 1.0), (1, 2.0, 1.0)]
+        );
+        let nobody = Pair { valid: &[0.0; 3], ..pair(2, &near) };
+        assert_eq!(point_errors(&[nobody]), []);
+    }
+}

@@ -1,0 +1,455 @@
+//! The report of an evaluation.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt::Write;
+
+use serde_json::{Map, Value, json};
+
+use super::plot::{Axes, Series, svg};
+use super::{Header, cell, escaped};
+use crate::evaluate::config::{EvalConfig, Protocol};
+use crate::evaluate::{Judged, Kind, Outcome};
+use crate::points::VIEWS;
+use crate::score::Score;
+use crate::statistics::{Interval, interval, quantile};
+
+/// The figures of a score: name, what it is, factor and digits in tables.
+type Figure = (&'static str, fn(&Score) -> Option<f64>, f64, usize);
+const FIGURES: [Figure; 3] =
+    [("psnr", |s| Some(s.psnr), 1.0, 2), ("ssim", |s| s.ssim, 100.0, 2), ("lpips", |s| s.lpips, 100.0, 2)];
+
+/// What a report is made of.
+pub struct Evaluation<'a> {
+    /// Command, commit, device, date.
+    pub header: Header,
+    /// In force.
+    pub config: &'a EvalConfig,
+    /// What was found.
+    pub outcome: &'a Outcome,
+    /// Why there is no LPIPS, if there is none.
+    pub no_lpips: Option<String>,
+}
+
+/// Means of each person's views, by person.
+type People = BTreeMap<usize, Score>;
+
+impl Evaluation<'_> {
+    fn people(&self, judged: &Judged, protocol: usize) -> People {
+        let mut scores: BTreeMap<usize, Vec<Score>> = BTreeMap::new();
+        for row in &judged.rows {
+            scores.entry(row.person).or_default().push(row.scores[protocol]);
+        }
+        scores.into_iter().filter_map(|(person, scores)| Some((person, Score::mean(&scores)?))).collect()
+    }
+
+    /// Intervals over people, by figure.
+    fn overall(people: &People) -> [Option<Interval>; 3] {
+        FIGURES.map(|(_, of, ..)| {
+            let values: Option<Vec<f64>> = people.values().map(of).collect();
+            interval(&values?)
+        })
+    }
+
+    /// Of the people that both have, the one's figures minus the other's.
+    fn difference(one: &People, other: &People) -> [Option<Interval>; 3] {
+        FIGURES.map(|(_, of, ..)| {
+            let both = one.iter().filter_map(|(person, score)| Some((score, other.get(person)?)));
+            let values: Option<Vec<f64>> = both.map(|(a, b)| Some(of(a)? - of(b)?)).collect();
+            interval(&values?)
+        })
+    }
+
+    fn protocols(&self) -> impl Iterator<Item = (usize, Protocol)> {
+        self.config.metrics.protocols.iter().copied().enumerate()
+    }
+
+    fn by_protocol(&self, value: impl Fn(usize) -> Value) -> Value {
+        Value::Object(self.protocols().map(|(i, protocol)| (protocol.name().into(), value(i))).collect())
+    }
+
+    fn of_kind(&self, kind: Kind) -> impl Iterator<Item = &Judged> {
+        self.outcome.judged.iter().filter(move |judged| judged.kind == kind)
+    }
+
+    fn model(&self) -> Option<&Judged> {
+        self.of_kind(Kind::Model).next()
+    }
+
+    /// `report.json`.
+    pub fn json(&self) -> Value {
+        let mut report = self.header.json();
+        report["protocols"] = match self.model() {
+            Some(model) => self.by_protocol(|protocol| self.protocol_json(model, protocol)),
+            None => json!({}),
+        };
+        let plain = |judged: &Judged| {
+            self.by_protocol(|protocol| figures(&Self::overall(&self.people(judged, protocol))))
+        };
+        let named = |kind: Kind, value: &dyn Fn(&Judged) -> Value| -> Value {
+            Value::Object(self.of_kind(kind).map(|judged| (judged.name.clone(), value(judged))).collect())
+        };
+        report["baselines"] = named(Kind::Baseline, &plain);
+        report["compared"] = named(Kind::Other, &|judged| {
+            let difference = |protocol: usize| match self.model() {
+                Some(model) => {
+                    figures(&Self::difference(&self.people(judged, protocol), &self.people(model, protocol)))
+                }
+                None => Value::Null,
+            };
+            json!({
+                "protocols": plain(judged),
+                "difference": self.by_protocol(difference),
+                "points_mm": points_json(judged),
+                "geometry_cm": geometry_json(judged),
+                "seconds": seconds_json(judged),
+            })
+        });
+        report["points_mm"] = self.model().map_or(json!({}), points_json);
+        report["geometry_cm"] = self.model().map_or(Value::Null, geometry_json);
+        report["seconds"] = self.model().map_or(Value::Null, seconds_json);
+        report["groups"] =
+            Value::Object(self.groups().map(|(name, rows)| (name, group_json(&rows))).collect());
+        report["lpips"] = json!(self.lpips());
+        report["left_out"] = json!(self.outcome.left_out);
+        report
+    }
+
+    fn protocol_json(&self, model: &Judged, protocol: usize) -> Value {
+        let people = self.people(model, protocol);
+        let subject = |(person, score): (&usize, &Score)| {
+            let mut value = json!(score);
+            value["name"] = json!(self.outcome.people[*person]);
+            value
+        };
+        json!({
+            "overall": figures(&Self::overall(&people)),
+            "people": people.len(),
+            "views": model.rows.len(),
+            "subjects": people.iter().map(subject).collect::<Vec<_>>(),
+        })
+    }
+
+    /// What stands in the place of LPIPS, or that it is there.
+    fn lpips(&self) -> String {
+        self.no_lpips.as_ref().map_or("published weights".into(), |why| format!("n/a ({why})"))
+    }
+
+    /// Figures of the people of each list, by contestant and protocol.
+    fn groups(&self) -> impl Iterator<Item = (String, Vec<Grouped>)> {
+        self.config.groups.iter().map(|(name, group)| {
+            let inside = |person: &usize| {
+                let full = &self.outcome.people[*person];
+                let short = full.rsplit('/').next().unwrap_or(full);
+                group.subjects.iter().any(|subject| subject == full || subject == short)
+            };
+            let mut rows = Vec::new();
+            for judged in &self.outcome.judged {
+                for (i, protocol) in self.protocols() {
+                    let mut people = self.people(judged, i);
+                    people.retain(|person, _| inside(person));
+                    rows.push(Grouped {
+                        contestant: judged.name.clone(),
+                        protocol,
+                        people: people.len(),
+                        figures: Self::overall(&people),
+                    });
+                }
+            }
+            (name.clone(), rows)
+        })
+    }
+
+    /// `report.md`; `pictures` are files beside it.
+    pub fn markdown(&self, pictures: &[&str]) -> String {
+        let mut text = self.header.markdown("Evaluation");
+        let _ = writeln!(text, "* LPIPS: {}", self.lpips());
+        let people = self.outcome.people.len();
+        let _ = writeln!(
+            text,
+            "* {people} people; intervals: 95 %, bootstrap over people; SSIM and LPIPS × 100\n"
+        );
+        for (i, protocol) in self.protocols() {
+            let _ = writeln!(text, "## Protocol `{}`\n", protocol.name());
+            let _ =
+                writeln!(text, "| | people | views | PSNR, dB | SSIM | LPIPS |\n|---|---|---|---|---|---|");
+            for judged in &self.outcome.judged {
+                let people = self.people(judged, i);
+                let row = table_row(&Self::overall(&people));
+                let (name, n) = (escaped(&judged.name), people.len());
+                let _ = writeln!(text, "| {name} | {n} | {} | {row} |", judged.rows.len());
+            }
+            let others: Vec<&Judged> =
+                self.outcome.judged.iter().filter(|judged| judged.kind != Kind::Model).collect();
+            if let Some(model) = self.model().filter(|_| !others.is_empty()) {
+                let _ = writeln!(
+                    text,
+                    "\nDifferences, person by person, from {}:\n\n| | PSNR, dB | SSIM | LPIPS |\n|---|---|---|---|",
+                    escaped(&model.name)
+                );
+                for judged in others {
+                    let row = table_row(&Self::difference(&self.people(judged, i), &self.people(model, i)));
+                    let _ = writeln!(text, "| {} | {row} |", escaped(&judged.name));
+                }
+            }
+            text.push('\n');
+        }
+        for (name, rows) in self.groups() {
+            let _ = writeln!(
+                text,
+                "## Group `{}`\n\n| | protocol | people | PSNR, dB | SSIM | LPIPS |\n|---|---|---|---|---|---|",
+                escaped(&name)
+            );
+            for Grouped { contestant, protocol, people, figures } in rows {
+                let row = table_row(&figures);
+                let _ =
+                    writeln!(text, "| {} | {} | {people} | {row} |", escaped(&contestant), protocol.name());
+            }
+            text.push('\n');
+        }
+        self.geometry_markdown(&mut text);
+        for picture in pictures {
+            let _ = writeln!(text, "![{picture}]({picture})\n");
+        }
+        if !self.outcome.left_out.is_empty() {
+            let _ = writeln!(text, "## Left out: {}\n", self.outcome.left_out.len());
+            for left_out in &self.outcome.left_out {
+                let _ = writeln!(text, "* {}: {}", escaped(&left_out.name), escaped(&left_out.why));
+            }
+        }
+        text
+    }
+
+    fn geometry_markdown(&self, text: &mut String) {
+        let made: Vec<&Judged> = self.outcome.judged.iter().filter(|j| !j.gaussians.is_empty()).collect();
+        let with_points: Vec<&&Judged> = made.iter().filter(|judged| !judged.points.is_empty()).collect();
+        if !with_points.is_empty() {
+            let _ = writeln!(
+                text,
+                "## Points\n\nMean distance from the true points, mm; in brackets after each person's mean shift is removed.\n\n\
+                 | | front | back | right | left |\n|---|---|---|---|---|"
+            );
+            for judged in with_points {
+                let cells = (0..VIEWS.len()).map(|view| match point_means(judged, view) {
+                    Some([mean, centred]) => format!("{mean:.1} ({centred:.1})"),
+                    None => "n/a".into(),
+                });
+                let _ = writeln!(
+                    text,
+                    "| {} | {} |",
+                    escaped(&judged.name),
+                    cells.collect::<Vec<_>>().join(" | ")
+                );
+            }
+            text.push('\n');
+        }
+        if made.iter().any(|judged| !judged.surface.is_empty()) {
+            let _ = writeln!(
+                text,
+                "## Surface\n\nCentres of the Gaussians at least {} opaque against the true points of all views, in the world as it is \
+                 (nothing is aligned), cm; normals: mean cosine from the views nearest to 0, 90, 180 and 270°.\n\n\
+                 | | to the truth | from the truth | Chamfer | normals |\n|---|---|---|---|---|",
+                self.config.metrics.opaque
+            );
+            for judged in &made {
+                let [forward, backward, mean, normals] = surface_intervals(judged);
+                let cells = [
+                    cell(forward, 1.0, 2),
+                    cell(backward, 1.0, 2),
+                    cell(mean, 1.0, 2),
+                    cell(normals, 1.0, 3),
+                ];
+                let _ = writeln!(text, "| {} | {} |", escaped(&judged.name), cells.join(" | "));
+            }
+            text.push('\n');
+        }
+        let _ =
+            writeln!(text, "## Run time\n\n| | seconds a person, p50 | p95 | Gaussians |\n|---|---|---|---|");
+        for judged in made {
+            let (p50, p95) = seconds(judged)
+                .map_or(("n/a".into(), "n/a".into()), |[a, b]| (format!("{a:.3}"), format!("{b:.3}")));
+            let n = judged.gaussians.iter().sum::<usize>() / judged.gaussians.len();
+            let _ = writeln!(text, "| {} | {p50} | {p95} | {n} |", escaped(&judged.name));
+        }
+        text.push('\n');
+    }
+
+    /// `views.csv`: a line per contestant, person, view and protocol.
+    pub fn views_csv(&self) -> String {
+        let mut table = csv::Writer::from_writer(Vec::new());
+        let header =
+            ["contestant", "protocol", "subject", "turn", "view", "degrees", "psnr", "ssim", "lpips"];
+        write(&mut table, header.map(String::from));
+        for judged in &self.outcome.judged {
+            for row in &judged.rows {
+                for ((_, protocol), score) in self.protocols().zip(&row.scores) {
+                    let [psnr, ssim, lpips] = FIGURES.map(|(_, of, ..)| number(of(score)));
+                    write(
+                        &mut table,
+                        [
+                            judged.name.clone(),
+                            protocol.name().into(),
+                            self.outcome.people[row.person].clone(),
+                            row.turn.to_string(),
+                            row.view.to_string(),
+                            format!("{:.2}", row.degrees),
+                            psnr,
+                            ssim,
+                            lpips,
+                        ],
+                    );
+                }
+            }
+        }
+        text_of(table)
+    }
+
+    /// `subjects.csv`: a line per contestant, person and protocol.
+    pub fn subjects_csv(&self) -> String {
+        let mut table = csv::Writer::from_writer(Vec::new());
+        write(&mut table, ["contestant", "protocol", "subject", "psnr", "ssim", "lpips"].map(String::from));
+        for judged in &self.outcome.judged {
+            for (i, protocol) in self.protocols() {
+                for (person, score) in self.people(judged, i) {
+                    let [psnr, ssim, lpips] = FIGURES.map(|(_, of, ..)| number(of(&score)));
+                    let name = self.outcome.people[person].clone();
+                    write(&mut table, [judged.name.clone(), protocol.name().into(), name, psnr, ssim, lpips]);
+                }
+            }
+        }
+        text_of(table)
+    }
+
+    /// `by_view.svg`: PSNR of the last protocol over the angle from the first photograph.
+    pub fn by_view(&self) -> String {
+        let Some((protocol, name)) = self.protocols().last() else { return String::new() };
+        let series = |judged: &Judged| {
+            let mut sums: BTreeMap<i64, [f64; 2]> = BTreeMap::new();
+            for row in &judged.rows {
+                let [sum, count] = sums.entry(row.degrees.round() as i64).or_default();
+                (*sum, *count) = (*sum + row.scores[protocol].psnr, *count + 1.0);
+            }
+            let points =
+                sums.into_iter().map(|(degrees, [sum, count])| (degrees as f64, sum / count)).collect();
+            Series { name: judged.name.clone(), points, line: true }
+        };
+        let caption = format!("PSNR by view, protocol `{}`, mean over people", name.name());
+        let axes =
+            Axes { caption: &caption, x: "degrees from the first photograph", y: "PSNR, dB", log: false };
+        svg(&axes, &self.outcome.judged.iter().map(series).collect::<Vec<_>>())
+    }
+
+    /// The people whom the model shows best, those in the middle, and the worst, `count` of each and nobody twice: rows of
+    /// the outcome's people, by the last protocol's PSNR.
+    pub fn ranked(&self, count: usize) -> Vec<usize> {
+        let Some((model, (protocol, _))) = self.model().zip(self.protocols().last()) else {
+            return Vec::new();
+        };
+        let mut people: Vec<(usize, f64)> =
+            self.people(model, protocol).into_iter().map(|(person, score)| (person, score.psnr)).collect();
+        people.sort_by(|a, b| b.1.total_cmp(&a.1));
+        let n = people.len();
+        let starts = [0, (n / 2).saturating_sub(count / 2), n.saturating_sub(count)];
+        let places: BTreeSet<usize> =
+            starts.into_iter().flat_map(|from| from..(from + count).min(n)).collect();
+        places.into_iter().map(|place| people[place].0).collect()
+    }
+}
+
+/// A line of a group's table.
+struct Grouped {
+    contestant: String,
+    protocol: Protocol,
+    people: usize,
+    figures: [Option<Interval>; 3],
+}
+
+fn group_json(rows: &[Grouped]) -> Value {
+    let mut value = json!({});
+    for row in rows {
+        let mut entry = figures(&row.figures);
+        entry["people"] = json!(row.people);
+        value[&row.contestant][row.protocol.name()] = entry;
+    }
+    value
+}
+
+fn figures(intervals: &[Option<Interval>; 3]) -> Value {
+    let entries =
+        FIGURES.iter().zip(intervals).map(|((name, ..), interval)| ((*name).to_owned(), json!(interval)));
+    Value::Object(entries.collect::<Map<_, _>>())
+}
+
+fn table_row(intervals: &[Option<Interval>; 3]) -> String {
+    let cells = FIGURES.iter().zip(intervals).map(|((.., times, digits), i)| cell(*i, *times, *digits));
+    cells.collect::<Vec<_>>().join(" | ")
+}
+
+/// Millimetres, as they are and centred: means over people.
+fn point_means(judged: &Judged, view: usize) -> Option<[f64; 2]> {
+    let errors = judged.points.iter().flat_map(|(_, errors)| errors).filter(|error| error.view == view);
+    let errors: Vec<_> = errors.collect();
+    let mean = |of: fn(&crate::points::PointError) -> f64| {
+        1e3 * errors.iter().map(|error| of(error)).sum::<f64>() / errors.len() as f64
+    };
+    (!errors.is_empty()).then(|| [mean(|error| error.mean), mean(|error| error.centred)])
+}
+
+fn points_json(judged: &Judged) -> Value {
+    let view = |(i, name): (usize, &&str)| {
+        let value = point_means(judged, i).map(|[mean, centred]| json!({ "mean": mean, "centred": centred }));
+        ((*name).to_owned(), json!(value))
+    };
+    Value::Object(VIEWS.iter().enumerate().map(view).collect())
+}
+
+/// Centimetres to the truth, from it and both, and cosines, over people.
+fn surface_intervals(judged: &Judged) -> [Option<Interval>; 4] {
+    type Of = fn(&crate::evaluate::Surface) -> Option<f64>;
+    let over = |of: Of| {
+        let mut people: BTreeMap<usize, Vec<f64>> = BTreeMap::new();
+        for (person, surface) in &judged.surface {
+            people.entry(*person).or_default().extend(of(surface));
+        }
+        let means: Vec<f64> = people
+            .values()
+            .filter(|values| !values.is_empty())
+            .map(|values| values.iter().sum::<f64>() / values.len() as f64)
+            .collect();
+        interval(&means)
+    };
+    [
+        over(|s| Some(1e2 * s.chamfer.forward)),
+        over(|s| Some(1e2 * s.chamfer.backward)),
+        over(|s| Some(1e2 * s.chamfer.mean())),
+        over(|s| s.normals),
+    ]
+}
+
+fn geometry_json(judged: &Judged) -> Value {
+    let [forward, backward, mean, normals] = surface_intervals(judged);
+    json!({ "to_truth": forward, "from_truth": backward, "chamfer": mean, "normal_consistency": normals })
+}
+
+/// p50 and p95.
+fn seconds(judged: &Judged) -> Option<[f64; 2]> {
+    let mut times: Vec<f64> = judged.times.iter().map(std::time::Duration::as_secs_f64).collect();
+    times.sort_by(f64::total_cmp);
+    (!times.is_empty()).then(|| [quantile(&times, 0.5), quantile(&times, 0.95)])
+}
+
+fn seconds_json(judged: &Judged) -> Value {
+    json!(seconds(judged).map(|[p50, p95]| json!({ "p50": p50, "p95": p95 })))
+}
+
+fn number(value: Option<f64>) -> String {
+    value.map_or(String::new(), |v| v.to_string())
+}
+
+fn write<const N: usize>(table: &mut csv::Writer<Vec<u8>>, record: [String; N]) {
+    table.write_record(record).expect("memory takes any record of one length");
+}
+
+fn text_of(table: csv::Writer<Vec<u8>>) -> String {
+    let bytes = table.into_inner().expect("memory can be written");
+    String::from_utf8(bytes).expect("made of text")
+}

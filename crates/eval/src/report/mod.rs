@@ -1,0 +1,92 @@
+//! Reports: JSON whose keys stay, Markdown for people, tables and pictures (EVALUATION.md).
+
+pub mod evaluation;
+pub mod plot;
+
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use serde_json::{Value, json};
+
+use crate::statistics::Interval;
+
+/// What every report begins with.
+#[derive(Debug, Clone)]
+pub struct Header {
+    /// The command line.
+    pub command: String,
+    /// Of the program.
+    pub commit: String,
+    /// In words.
+    pub device: String,
+    /// UTC, `YYYY-MM-DD`.
+    pub date: String,
+}
+
+impl Header {
+    /// The four keys, to which a report adds its own.
+    pub fn json(&self) -> Value {
+        json!({ "command": self.command, "commit": self.commit, "device": self.device, "date": self.date })
+    }
+
+    /// The first lines of a Markdown report.
+    pub fn markdown(&self, title: &str) -> String {
+        format!(
+            "# {title}\n\n* Command: `{}`\n* Commit: {}\n* Device: {}\n* Date: {}\n",
+            self.command, self.commit, self.device, self.date
+        )
+    }
+}
+
+/// Today, UTC.
+pub fn today() -> String {
+    let seconds = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs());
+    let (year, month, day) = civil(seconds / 86_400);
+    format!("{year:04}-{month:02}-{day:02}")
+}
+
+/// The date of a day since 1970-01-01: years are counted from March, so that leap days come last.
+fn civil(days: u64) -> (u64, u64, u64) {
+    let days = days + 719_468;
+    let (era, day) = (days / 146_097, days % 146_097);
+    let year = (day - day / 1460 + day / 36_524 - day / 146_096) / 365;
+    let day = day - (365 * year + year / 4 - year / 100);
+    let month = (5 * day + 2) / 153;
+    let day = day - (153 * month + 2) / 5 + 1;
+    let (month, late) = if month < 10 { (month + 3, 0) } else { (month - 9, 1) };
+    (era * 400 + year + late, month, day)
+}
+
+/// A figure with its interval, in a table; `times` scales it.
+pub fn cell(interval: Option<Interval>, times: f64, digits: usize) -> String {
+    match interval {
+        None => "n/a".into(),
+        Some(Interval { mean, .. }) if !mean.is_finite() => "∞".into(),
+        Some(Interval { mean, low, high }) => {
+            let [mean, low, high] = [mean, low, high].map(|v| format!("{:.digits$}", v * times));
+            format!("{mean} [{low}, {high}]")
+        }
+    }
+}
+
+/// Text within a Markdown table.
+pub fn escaped(text: &str) -> String {
+    text.replace('|', "\\|").replace(['\n', '\r'], " ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn days_have_their_dates() {
+        for (days, date) in [
+            (0, (1970, 1, 1)),
+            (59, (1970, 3, 1)),
+            (11_016, (2000, 2, 29)),
+            (19_723, (2024, 1, 1)),
+            (20_779, (2026, 11, 22)),
+        ] {
+            assert_eq!(civil(days), date);
+        }
+    }
+}

@@ -1,0 +1,86 @@
+//! Curves as SVG.
+
+use plotters::prelude::*;
+
+/// Width and height in pixels.
+const SIZE: (u32, u32) = (800, 400);
+
+/// A named line, or points that are not joined.
+pub struct Series {
+    /// In the legend.
+    pub name: String,
+    /// x and y.
+    pub points: Vec<(f64, f64)>,
+    /// Whether the points are joined.
+    pub line: bool,
+}
+
+/// Axes of a picture.
+pub struct Axes<'a> {
+    /// Above it.
+    pub caption: &'a str,
+    /// Below it.
+    pub x: &'a str,
+    /// Beside it.
+    pub y: &'a str,
+    /// Whether x is logarithmic.
+    pub log: bool,
+}
+
+/// An SVG of some series; empty if no point is finite.
+pub fn svg(axes: &Axes, series: &[Series]) -> String {
+    let finite = |(x, y): &(f64, f64)| x.is_finite() && y.is_finite() && (!axes.log || *x > 0.0);
+    let all: Vec<(f64, f64)> = series.iter().flat_map(|s| s.points.iter().copied()).filter(finite).collect();
+    let range = |of: fn(&(f64, f64)) -> f64| {
+        let values = all.iter().map(of);
+        let (low, high) = values.fold((f64::MAX, f64::MIN), |(low, high), v| (low.min(v), high.max(v)));
+        let room = 0.05 * (high - low).max(1e-3 * high.abs()).max(1e-9);
+        (low - room, high + room)
+    };
+    let mut text = String::new();
+    if all.is_empty() {
+        return text;
+    }
+    let ((left, right), (bottom, top)) = (range(|p| p.0), range(|p| p.1));
+    {
+        let area = SVGBackend::with_string(&mut text, SIZE).into_drawing_area();
+        // Drawing into a string cannot fail.
+        let _ = area.fill(&WHITE);
+        let mut builder = ChartBuilder::on(&area);
+        let builder = builder
+            .caption(axes.caption, ("sans-serif", 16))
+            .margin(10)
+            .x_label_area_size(36)
+            .y_label_area_size(60);
+        // One call for each kind of axis, whose types differ.
+        macro_rules! draw {
+            ($x:expr) => {
+                if let Ok(mut chart) = builder.build_cartesian_2d($x, bottom..top) {
+                    let _ = chart.configure_mesh().x_desc(axes.x).y_desc(axes.y).draw();
+                    for (i, s) in series.iter().enumerate() {
+                        let color = Palette99::pick(i).to_rgba();
+                        let points: Vec<_> = s.points.iter().copied().filter(finite).collect();
+                        if s.line {
+                            let _ = chart.draw_series(LineSeries::new(points.iter().copied(), &color));
+                        }
+                        let dots = points.iter().map(|p| Circle::new(*p, 3, color.filled()));
+                        if let Ok(drawn) = chart.draw_series(dots) {
+                            let mark = move |(x, y)| Circle::new((x + 8, y), 3, color.filled());
+                            drawn.label(s.name.clone()).legend(mark);
+                        }
+                    }
+                    let legend = chart.configure_series_labels();
+                    let _ = { legend }.background_style(WHITE.mix(0.8)).border_style(BLACK.mix(0.3)).draw();
+                }
+            };
+        }
+        if axes.log {
+            let least = all.iter().map(|p| p.0).fold(f64::MAX, f64::min);
+            draw!((0.8 * least..1.25 * right).log_scale());
+        } else {
+            draw!(left..right);
+        }
+        let _ = area.present();
+    }
+    text
+}
