@@ -53,6 +53,8 @@ enum Command {
     Evaluate(commands::evaluate::Arguments),
     /// How alike two pictures are, or two folders of pictures: PSNR, SSIM, LPIPS.
     Compare(commands::compare::Arguments),
+    /// Fetch published weights: DUSt3R, and AlexNet and the learned layers of LPIPS.
+    FetchWeights(commands::fetch_weights::Arguments),
     /// Read checkpoints of Snap-Snap, DUSt3R or CroCo and write one weight file.
     ImportWeights(commands::import_weights::Arguments),
     /// Write random weights for a config.
@@ -91,6 +93,7 @@ fn main() -> ExitCode {
         Command::TrainStage2(arguments) => commands::train::stage2(&arguments, quiet),
         Command::Evaluate(arguments) => commands::evaluate::run(&arguments, quiet),
         Command::Compare(arguments) => commands::compare::run(&arguments),
+        Command::FetchWeights(arguments) => commands::fetch_weights::run(&arguments, quiet),
         Command::ImportWeights(arguments) => commands::import_weights::run(&arguments, quiet),
         Command::InitWeights(arguments) => commands::init_weights::run(&arguments, quiet),
         Command::ExportWeights(arguments) => commands::export_weights::run(&arguments, quiet),

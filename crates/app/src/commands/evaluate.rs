@@ -3,12 +3,14 @@
 use std::path::{Path, PathBuf};
 
 use burn::tensor::Device;
-use clap::Args;
+use clap::{Args, ValueEnum};
 use snapsnap_eval::baselines::MeanPictures;
 use snapsnap_eval::evaluate::config::{Ablation, EvalConfig};
+use snapsnap_eval::evaluate::meshes::{Align, evaluate_meshes};
 use snapsnap_eval::evaluate::model::Model;
 use snapsnap_eval::evaluate::person::People;
 use snapsnap_eval::evaluate::{Contestant, LeftOut, evaluate, sheet};
+use snapsnap_eval::report;
 use snapsnap_eval::report::evaluation::Evaluation;
 use snapsnap_splat::file;
 
@@ -41,6 +43,12 @@ pub struct Arguments {
     /// Other weights, which are compared with these person by person.
     #[arg(long, value_name = "FILE|DIR")]
     against: Option<PathBuf>,
+    /// Judge the meshes NAME.obj, .ply or .glb in this folder instead of weights.
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["weights", "against"])]
+    mesh_dir: Option<PathBuf>,
+    /// Move meshes onto the truth first: turned and moved (rigid), or scaled as well (similarity).
+    #[arg(long, value_enum, value_name = "HOW", num_args = 0..=1, default_missing_value = "rigid", requires = "mesh_dir")]
+    icp: Option<Icp>,
     #[command(flatten)]
     lpips: perceptual::Arguments,
     /// Folder of the report.
@@ -51,6 +59,12 @@ pub struct Arguments {
     device: Option<String>,
 }
 
+#[derive(Clone, Copy, ValueEnum)]
+enum Icp {
+    Rigid,
+    Similarity,
+}
+
 pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let config = config_of(arguments)?;
     if config.data.folders.is_empty() {
@@ -58,19 +72,22 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
             "no data: give --data DATASET, made with `snapsnap prepare`, or data.folders in the config";
         return Err(Failure::Input(message.into()));
     }
+    let open = |path: &PathBuf| People::open(path, &config.data, &config.views).map_err(Failure::from);
+    let sets = config.data.folders.iter().map(open).collect::<Result<Vec<_>, _>>()?;
+    for set in &sets {
+        outside(&arguments.output, set)?;
+    }
+    if let Some(meshes) = &arguments.mesh_dir {
+        return judge_meshes(arguments, &config, &sets, meshes, quiet);
+    }
     let names = match (&arguments.device, config.model.devices.as_slice()) {
         (Some(name), _) => vec![name.clone()],
         (None, []) => vec!["auto".to_owned()],
         (None, names) => names.to_vec(),
     };
     let devices = names.iter().map(|name| device::choose(name)).collect::<Result<Vec<_>, _>>()?;
-    let open = |path: &PathBuf| People::open(path, &config.data, &config.views).map_err(Failure::from);
-    let sets = config.data.folders.iter().map(open).collect::<Result<Vec<_>, _>>()?;
     let inputs: Vec<&Path> =
         std::iter::once(&arguments.config).chain(&config.model.weights).map(PathBuf::as_path).collect();
-    for set in &sets {
-        outside(&arguments.output, set)?;
-    }
     let folder = ReportFolder::new(&arguments.output, &FILES, &inputs)?;
     let lpips = arguments.lpips.load_or(&config.metrics.lpips, &names[0])?;
     let mut missing = Vec::new();
@@ -114,13 +131,53 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
         say::out(&summary(&report.json()));
         say::out(&format!("{}: report.md, report.json, pictures and tables", folder.path().display()));
     }
-    match outcome.left_out.as_slice() {
-        [] => Ok(()),
-        left_out => {
-            left_out.iter().for_each(|l| say::err(&format!("left out: {}: {}", l.name, l.why)));
-            Err(Failure::Internal(format!("{} left out, the rest was evaluated", left_out.len())))
+    complete(&outcome.left_out)
+}
+
+/// What is left out is told, and is a failure.
+fn complete(left_out: &[LeftOut]) -> Result<(), Failure> {
+    if left_out.is_empty() {
+        return Ok(());
+    }
+    left_out.iter().for_each(|l| say::err(&format!("left out: {}: {}", l.name, l.why)));
+    Err(Failure::Internal(format!("{} left out, the rest was evaluated", left_out.len())))
+}
+
+fn judge_meshes(
+    arguments: &Arguments,
+    config: &EvalConfig,
+    sets: &[People],
+    meshes: &Path,
+    quiet: bool,
+) -> Result<(), Failure> {
+    if !meshes.is_dir() {
+        return Err(Failure::Input(format!("--mesh-dir {}: is no folder", meshes.display())));
+    }
+    let folder = ReportFolder::new(&arguments.output, &[FILES[0], FILES[1], FILES[6]], &[&arguments.config])?;
+    let (align, said) = match arguments.icp {
+        None => (Align::No, "none: as the meshes are"),
+        Some(Icp::Rigid) => (Align::Rigidly, "rigid, by iterated closest points"),
+        Some(Icp::Similarity) => (Align::Similarly, "rigid and scale, by iterated closest points"),
+    };
+    let total = sets.iter().map(|set| set.chosen().len()).sum();
+    let progress = Progress::steps(quiet, total, "people");
+    let done = |done: usize, total: usize| progress.step(done, total, "people");
+    let (figures, left_out) = evaluate_meshes(config, sets, meshes, align, &done);
+    drop(progress);
+    let header = header("cpu");
+    folder.text("config.toml", &config.to_toml())?;
+    folder.text("report.md", &report::meshes::markdown(&header, &figures, &left_out, said))?;
+    let json = report::meshes::json(&header, &figures, &left_out);
+    folder.json("report.json", &json)?;
+    if !quiet {
+        for (name, figure) in json["geometry_cm"].as_object().into_iter().flatten() {
+            say::out(&format!(
+                "{name:<20} {}",
+                figure["mean"].as_f64().map_or("n/a".into(), |v| format!("{v:.4}"))
+            ));
         }
     }
+    complete(&left_out)
 }
 
 fn config_of(arguments: &Arguments) -> Result<EvalConfig, Failure> {

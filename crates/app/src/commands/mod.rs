@@ -3,6 +3,7 @@
 pub mod compare;
 pub mod evaluate;
 pub mod export_weights;
+pub mod fetch_weights;
 pub mod import_weights;
 pub mod init_weights;
 pub mod prepare;

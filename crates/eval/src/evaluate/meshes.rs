@@ -1,1 +1,149 @@
-//! Meshes of other methods against the true surface.
+//! Meshes, of any method, against the true surfaces of a test set.
+
+use std::path::{Path, PathBuf};
+
+use glam::Vec3;
+use serde::Serialize;
+use snapsnap_mesh::FileError;
+use snapsnap_mesh::import::{self, EXTENSIONS};
+use snapsnap_mesh::mesh::Mesh;
+use snapsnap_mesh::view::{Renderer, ViewOptions};
+
+use super::config::EvalConfig;
+use super::person::People;
+use super::surface::{Surface, Truth};
+use super::{LeftOut, name_of};
+use crate::EvalError;
+use crate::geometry::{Alignment, chamfer, consistency, icp, normals, point_to_surface, sampled};
+
+/// Points drawn from each surface.
+const POINTS: usize = 50_000;
+/// Of them, those that an alignment looks at.
+const ALIGNED: usize = 5_000;
+/// Decides which points are drawn.
+const SEED: u64 = 1;
+
+/// What a person's mesh gave, centimetres.
+#[derive(Debug, Clone, Serialize)]
+pub struct MeshFigures {
+    /// The person.
+    pub name: String,
+    /// From the mesh to the nearest true point.
+    pub to_truth: f64,
+    /// From the true points to the nearest point of the mesh.
+    pub from_truth: f64,
+    /// Mean of both.
+    pub chamfer: f64,
+    /// From the true points to the mesh's triangles.
+    pub truth_to_surface: f64,
+    /// From the mesh's points to the true scan's triangles, where there is a scan.
+    pub surface_to_scan: Option<f64>,
+    /// Mean cosine of normals, from the views nearest to 0, 90, 180 and 270°, where both are seen.
+    pub normal_consistency: Option<f64>,
+    /// Degrees, centimetres and factor by which it was moved, if that was asked for.
+    pub aligned: Option<[f64; 3]>,
+}
+
+/// Whether meshes are moved onto the truth before they are measured.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Align {
+    /// As they are.
+    No,
+    /// Turned and moved.
+    Rigidly,
+    /// Scaled as well.
+    Similarly,
+}
+
+/// Compares the meshes NAME.obj, .ply or .glb in a folder; `progress` hears how many are done.
+pub fn evaluate_meshes(
+    config: &EvalConfig,
+    sets: &[People],
+    folder: &Path,
+    align: Align,
+    progress: &dyn Fn(usize, usize),
+) -> (Vec<MeshFigures>, Vec<LeftOut>) {
+    let total = sets.iter().map(|set| set.chosen().len()).sum();
+    let (mut figures, mut left_out) = (Vec::new(), Vec::new());
+    let people = sets.iter().flat_map(|set| set.chosen().iter().map(move |row| (set, *row)));
+    for (done, (people, row)) in people.enumerate() {
+        let name = name_of(sets, people, row);
+        match one(config, people, row, &name, folder, align) {
+            Ok(found) => figures.push(found),
+            Err(e) => left_out.push(LeftOut { name, why: e.to_string() }),
+        }
+        progress(done + 1, total);
+    }
+    (figures, left_out)
+}
+
+fn one(
+    config: &EvalConfig,
+    people: &People,
+    row: usize,
+    name: &str,
+    folder: &Path,
+    align: Align,
+) -> Result<MeshFigures, EvalError> {
+    let subject = people.test().name(row);
+    let mut mesh = import::read(&find(folder, subject)?)?;
+    let item = people.test().sample(row, &[])?;
+    let Truth { points, views } = Surface::truth(people, row, &item.cameras)?;
+    let scan = match &config.data.scans {
+        Some(scans) => Some(import::read(&find(scans, subject)?)?),
+        None => None,
+    };
+    // A scan knows what no view sees.
+    let truth = match &scan {
+        Some(scan) => sampled(scan, POINTS, SEED)?,
+        None => points,
+    };
+    let mut aligned = None;
+    if align != Align::No {
+        let thinned = truth.iter().step_by(truth.len().div_ceil(10 * ALIGNED)).copied().collect::<Vec<_>>();
+        let motion = icp(&sampled(&mesh, ALIGNED, SEED)?, &thinned, align == Align::Similarly)?;
+        mesh.positions.iter_mut().for_each(|p| *p = Vec3::from_array(motion.apply(p.to_array())));
+        let Alignment { scale, rotation, translation, .. } = motion;
+        let angle = 2.0 * rotation.w.abs().min(1.0).acos();
+        aligned = Some([angle.to_degrees(), 1e2 * translation.length(), scale]);
+    }
+    let surface = sampled(&mesh, POINTS, SEED)?;
+    let apart = chamfer(&surface, &truth)?;
+    let to_scan = scan.map(|scan| point_to_surface(&surface, &scan)).transpose()?;
+    Ok(MeshFigures {
+        name: name.to_owned(),
+        to_truth: 1e2 * apart.forward,
+        from_truth: 1e2 * apart.backward,
+        chamfer: 1e2 * apart.mean(),
+        truth_to_surface: 1e2 * point_to_surface(&truth, &mesh)?,
+        surface_to_scan: to_scan.map(|distance| 1e2 * distance),
+        normal_consistency: normals_of(&mesh, &views)?,
+        aligned,
+    })
+}
+
+fn normals_of(
+    mesh: &Mesh,
+    views: &[(snapsnap_splat::Camera, Vec<Option<glam::DVec3>>)],
+) -> Result<Option<f64>, EvalError> {
+    let renderer = Renderer::new(mesh).map_err(|e| EvalError::Empty(e.to_string()))?;
+    let options = ViewOptions { samples: 1, ..ViewOptions::default() };
+    let (mut sum, mut count) = (0.0, 0);
+    for (camera, truth) in views {
+        let depth = renderer.draw(camera, &options).depth;
+        if let Some((cosine, pixels)) = consistency(&normals(&depth, camera), truth) {
+            sum += cosine * pixels as f64;
+            count += pixels;
+        }
+    }
+    Ok((count > 0).then(|| sum / count as f64))
+}
+
+fn find(folder: &Path, name: &str) -> Result<PathBuf, EvalError> {
+    let files = EXTENSIONS.map(|ending| folder.join(format!("{name}.{ending}")));
+    let found = files.into_iter().find(|file| file.is_file());
+    found.ok_or_else(|| {
+        let message = format!("has no mesh {name}.obj, .ply or .glb");
+        EvalError::File(FileError::unsuitable(folder, message))
+    })
+}

@@ -25,7 +25,7 @@ use crate::score::Score;
 use config::{EvalConfig, Protocol};
 pub use contest::{Contestant, Kind};
 use person::People;
-pub use surface::Surface;
+pub use surface::{Surface, Truth};
 
 /// What a view of a person gave.
 #[derive(Debug, Clone)]

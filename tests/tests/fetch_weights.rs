@@ -1,0 +1,183 @@
+//! `snapsnap fetch-weights` against servers that do what servers do.
+
+use std::fs;
+use std::io::{BufRead, BufReader, Write};
+use std::net::TcpListener;
+use std::path::Path;
+use std::process::{Command, Output};
+use std::sync::{Arc, Mutex};
+
+use snapsnap_tests::{data, refused, snapsnap, succeed};
+
+const FILE: &str = "lpips-alex-v0.1.pth";
+
+fn published() -> Vec<u8> {
+    fs::read(data("lpips").join(FILE)).expect("the learned layers")
+}
+
+/// A server on 127.0.0.1 that answers each request with what `answer` makes of its number and the first byte asked for; the
+/// first bytes asked for are noted.
+fn server(
+    answer: impl Fn(usize, Option<usize>) -> Vec<u8> + Send + 'static,
+) -> (String, Arc<Mutex<Vec<Option<usize>>>>) {
+    let listener = TcpListener::bind("127.0.0.1:0").expect("a port");
+    let address = format!("http://{}/mirror", listener.local_addr().expect("an address"));
+    let asked = Arc::new(Mutex::new(Vec::new()));
+    let noted = asked.clone();
+    std::thread::spawn(move || {
+        for (number, stream) in listener.incoming().enumerate() {
+            let Ok(mut stream) = stream else { return };
+            let mut first = None;
+            let lines = BufReader::new(stream.try_clone().expect("a stream")).lines();
+            let lines = lines.map_while(Result::ok).take_while(|line| !line.is_empty());
+            for (i, line) in lines.enumerate() {
+                assert!(i > 0 || line.starts_with(&format!("GET /mirror/{FILE} ")), "{line}");
+                if let Some(range) = line.to_lowercase().strip_prefix("range: bytes=") {
+                    first = range.trim_end_matches('-').parse().ok();
+                }
+            }
+            noted.lock().expect("unharmed").push(first);
+            let _ = stream.write_all(&answer(number, first));
+        }
+    });
+    (address, asked)
+}
+
+fn whole(status: &str, body: &[u8]) -> Vec<u8> {
+    let head = format!("HTTP/1.1 {status}\r\nContent-Length: {}\r\nConnection: close\r\n\r\n", body.len());
+    [head.as_bytes(), body].concat()
+}
+
+/// What a server that knows ranges says, cut after so many bytes of the body.
+fn ranged(body: &[u8], first: Option<usize>, cut: usize) -> Vec<u8> {
+    let from = first.unwrap_or(0);
+    let rest = &body[from..];
+    let (status, range) = match first {
+        Some(_) => (
+            "206 Partial Content",
+            format!("Content-Range: bytes {from}-{}/{}\r\n", body.len() - 1, body.len()),
+        ),
+        None => ("200 OK", String::new()),
+    };
+    let head =
+        format!("HTTP/1.1 {status}\r\nContent-Length: {}\r\n{range}Connection: close\r\n\r\n", rest.len());
+    [head.as_bytes(), &rest[..cut.min(rest.len())]].concat()
+}
+
+fn fetch(from: &str, folder: &Path) -> Command {
+    let mut command = snapsnap();
+    command.args(["fetch-weights", "lpips", "--from", from, "-o"]).arg(folder);
+    command
+}
+
+fn run(command: &mut Command) -> (Option<i32>, String) {
+    let Output { status, stderr, .. } = command.output().expect("the program starts");
+    (status.code(), String::from_utf8_lossy(&stderr).into_owned())
+}
+
+#[test]
+fn what_is_fetched_is_shown_before_and_checked_after() {
+    let body = published();
+    let (address, asked) = server(move |_, first| ranged(&body, first, usize::MAX));
+    let temporary = tempfile::tempdir().expect("a folder");
+    let folder = temporary.path().join("new/weights");
+    let said = succeed(&mut fetch(&address, &folder));
+    for part in [
+        "6009 bytes",
+        "df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0",
+        "BSD-2-Clause",
+        "sound",
+    ] {
+        assert!(said.contains(part), "{said}");
+    }
+    assert_eq!(fs::read(folder.join(FILE)).expect("fetched"), published());
+    assert_eq!(fs::read_dir(&folder).expect("a folder").count(), 1, "nothing else is left");
+    // What is there and sound is not fetched again; what is there and is not, is not replaced.
+    assert!(succeed(&mut fetch(&address, &folder)).contains("is there, and sound"));
+    fs::write(folder.join(FILE), b"mine").expect("writes");
+    assert!(refused(&mut fetch(&address, &folder)).contains("move it away"));
+    assert_eq!(fs::read(folder.join(FILE)).expect("kept"), b"mine");
+    assert_eq!(asked.lock().expect("unharmed").len(), 1);
+    // --list shows all and fetches nothing.
+    let said = succeed(snapsnap().args(["fetch-weights", "--list"]));
+    for part in
+        ["DUSt3R", "2284790056 bytes", "CC BY-NC-SA", "alexnet-owt", "244408911 bytes", "BSD-3-Clause"]
+    {
+        assert!(said.contains(part), "{said}");
+    }
+}
+
+#[test]
+fn a_connection_that_breaks_is_gone_on_from_where_it_broke() {
+    let body = published();
+    let (address, asked) =
+        server(move |number, first| ranged(&body, first, if number < 2 { 2500 } else { usize::MAX }));
+    let temporary = tempfile::tempdir().expect("a folder");
+    succeed(&mut fetch(&address, temporary.path()));
+    assert_eq!(fs::read(temporary.path().join(FILE)).expect("fetched"), published());
+    assert_eq!(*asked.lock().expect("unharmed"), [None, Some(2500), Some(5000)]);
+}
+
+#[test]
+fn what_an_ended_run_left_is_gone_on_with() {
+    let body = published();
+    let (address, asked) = server(move |_, first| ranged(&body, first, usize::MAX));
+    let temporary = tempfile::tempdir().expect("a folder");
+    fs::write(temporary.path().join(format!("{FILE}.part")), &published()[..4000]).expect("writes");
+    succeed(&mut fetch(&address, temporary.path()));
+    assert_eq!(fs::read(temporary.path().join(FILE)).expect("fetched"), published());
+    assert_eq!(*asked.lock().expect("unharmed"), [Some(4000)]);
+    // A server without ranges sends everything again.
+    let body = published();
+    let (address, _) = server(move |_, _| whole("200 OK", &body));
+    let temporary = tempfile::tempdir().expect("a folder");
+    fs::write(temporary.path().join(format!("{FILE}.part")), vec![7; 4000]).expect("writes");
+    succeed(&mut fetch(&address, temporary.path()));
+    assert_eq!(fs::read(temporary.path().join(FILE)).expect("fetched"), published());
+}
+
+#[test]
+fn what_is_not_the_published_file_is_not_kept() {
+    let mut wrong = published();
+    wrong[3000] ^= 1;
+    let longer = [published(), vec![0; 100_000]].concat();
+    for body in [wrong, longer] {
+        let (address, _) = server(move |_, first| ranged(&body, first, usize::MAX));
+        let temporary = tempfile::tempdir().expect("a folder");
+        let said = refused(&mut fetch(&address, temporary.path()));
+        assert!(said.contains("what came is not") && said.contains("nothing was kept"), "{said}");
+        assert_eq!(fs::read_dir(temporary.path()).expect("a folder").count(), 0);
+    }
+}
+
+#[test]
+fn a_server_that_refuses_or_stays_short_is_told() {
+    let temporary = tempfile::tempdir().expect("a folder");
+    let (address, asked) = server(|_, _| whole("404 Not Found", b"no"));
+    let (code, said) = run(&mut fetch(&address, temporary.path()));
+    assert!(code == Some(1) && said.contains("404"), "{code:?}: {said}");
+    assert_eq!(asked.lock().expect("unharmed").len(), 1, "what is refused is not asked for again");
+    // Never more than half: what came is kept for the next time.
+    let body = published();
+    let (address, _) = server(move |number, first| ranged(&body, first, if number == 0 { 3000 } else { 0 }));
+    let (code, said) = run(&mut fetch(&address, temporary.path()));
+    assert!(code == Some(1) && said.contains("3000 of 6009 bytes are kept"), "{code:?}: {said}");
+    let part = fs::read(temporary.path().join(format!("{FILE}.part"))).expect("kept");
+    assert_eq!(part, published()[..3000]);
+    // Nobody there.
+    let (code, said) = run(&mut fetch("http://127.0.0.1:9", tempfile::tempdir().expect("a folder").path()));
+    assert!(code == Some(1) && said.contains("127.0.0.1"), "{code:?}: {said}");
+}
+
+#[test]
+fn a_folder_is_a_mirror_too() {
+    let temporary = tempfile::tempdir().expect("a folder");
+    let mirror = data("lpips").display().to_string();
+    succeed(&mut fetch(&mirror, temporary.path()));
+    assert_eq!(fs::read(temporary.path().join(FILE)).expect("copied"), published());
+    let empty = tempfile::tempdir().expect("a folder");
+    let said = refused(&mut fetch(&empty.path().display().to_string(), &temporary.path().join("b")));
+    assert!(said.contains(FILE) && said.contains("cannot read"), "{said}");
+    let said = refused(&mut fetch("nowhere", temporary.path()));
+    assert!(said.contains("neither a folder nor an address"), "{said}");
+}
