@@ -51,6 +51,8 @@ enum Command {
     TrainStage2(commands::train::Arguments),
     /// Judge a model on a data set, beside baselines and others.
     Evaluate(commands::evaluate::Arguments),
+    /// Error against run time: a model in different settings.
+    Bench(commands::bench::Arguments),
     /// How alike two pictures are, or two folders of pictures: PSNR, SSIM, LPIPS.
     Compare(commands::compare::Arguments),
     /// Fetch published weights: DUSt3R, and AlexNet and the learned layers of LPIPS.
@@ -92,6 +94,7 @@ fn main() -> ExitCode {
         Command::TrainStage1(arguments) => commands::train::stage1(&arguments, quiet),
         Command::TrainStage2(arguments) => commands::train::stage2(&arguments, quiet),
         Command::Evaluate(arguments) => commands::evaluate::run(&arguments, quiet),
+        Command::Bench(arguments) => commands::bench::run(&arguments, quiet),
         Command::Compare(arguments) => commands::compare::run(&arguments),
         Command::FetchWeights(arguments) => commands::fetch_weights::run(&arguments, quiet),
         Command::ImportWeights(arguments) => commands::import_weights::run(&arguments, quiet),

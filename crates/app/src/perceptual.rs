@@ -38,16 +38,24 @@ impl Arguments {
             [folder] if folder.is_dir() => folder,
             files => return Ok(Ok(Lpips::load(files, &device::choose(device)?)?)),
         };
-        let missing: Vec<String> =
-            Lpips::missing(folder).iter().map(|file| file.display().to_string()).collect();
-        if missing.is_empty() {
-            return Ok(Ok(Lpips::published(folder, &device::choose(device)?)?));
-        }
-        let message = format!("weights missing: {}", missing.join(", "));
-        if self.lpips.is_empty() {
-            Ok(Err(message))
-        } else {
-            Err(Failure::Input(format!("--lpips: {message}")))
+        match missing(folder) {
+            None => Ok(Ok(Lpips::published(folder, &device::choose(device)?)?)),
+            Some(why) if self.lpips.is_empty() => Ok(Err(why)),
+            Some(why) => Err(Failure::Input(format!("--lpips: {why}"))),
         }
     }
+
+    /// Why there is none, if there is none.
+    pub fn missing(&self, default: &Path) -> Option<String> {
+        match self.lpips.as_slice() {
+            [] => missing(default),
+            [folder] if folder.is_dir() => missing(folder),
+            _ => None,
+        }
+    }
+}
+
+fn missing(folder: &Path) -> Option<String> {
+    let files: Vec<String> = Lpips::missing(folder).iter().map(|file| file.display().to_string()).collect();
+    (!files.is_empty()).then(|| format!("weights missing: {}", files.join(", ")))
 }

@@ -2,6 +2,7 @@
 //! against run time, numerical stability.
 
 pub mod baselines;
+pub mod bench;
 mod error;
 pub mod evaluate;
 pub mod geometry;

@@ -7,6 +7,7 @@ mod memory;
 pub mod names;
 mod neighbours;
 pub mod network;
+pub mod precision;
 mod reconstruct;
 pub mod regressor;
 pub mod resample;

@@ -10,6 +10,7 @@ use crate::config::{Config, Downsample, WorldFrame};
 use crate::crop::Window;
 use crate::gaussians::{Seen, assemble, placed, regress, side_images};
 use crate::network::{PointMap, PointPredictor, View, activate};
+use crate::precision::Precision;
 use crate::regressor::Regressor;
 use crate::resample::shrink;
 use crate::sides::{EMPTY, is_finite};
@@ -91,6 +92,12 @@ impl Reconstructor {
     /// Leaves the unseen sides out, which scenes of many photographs do not have: their heads, colours and Gaussians.
     pub fn without_sides(mut self) -> Self {
         self.predictor.dust3r = self.predictor.dust3r.without_sides();
+        self
+    }
+
+    /// Computes the point predictor's layers in another precision.
+    pub fn in_precision(mut self, precision: Precision) -> Self {
+        self.predictor = precision.lower(self.predictor);
         self
     }
 

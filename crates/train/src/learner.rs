@@ -14,7 +14,7 @@ use crate::config::TrainConfig;
 use crate::ema::Average;
 use crate::networks::{Networks, Rows};
 use crate::optimizer::Optimizer;
-use crate::precision::Precision;
+use crate::precision::{Precision, lower};
 use crate::progress::Progress;
 use crate::task::{Moment, Task};
 use crate::{TrainError, gradients};
@@ -206,7 +206,7 @@ fn on_device<T: Task>(
     at: Moment,
     How { precision, scale, share }: How,
 ) -> Result<Made, TrainError> {
-    let parts = task.losses(&precision.lower(networks), items, at)?;
+    let parts = task.losses(&lower(precision, networks), items, at)?;
     if parts.is_empty() {
         return Ok(Made { values: BTreeMap::new(), gradients: Some(Rows::new()) });
     }

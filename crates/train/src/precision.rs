@@ -1,90 +1,16 @@
-//! Steps in 16 bits: the point predictor's matrix products and convolutions, and what they keep for the backward pass. The
-//! regressor, which reads coordinates, is left alone, as are weights, moments, norms, losses and the rasteriser.
+//! Steps in 16 bits: the point predictor's matrix products and convolutions, and what they keep for the backward pass. Weights,
+//! moments and losses are left alone.
 
-use burn::module::{Module, ModuleMapper, Param};
-use burn::tensor::{FloatDType, Tensor};
 use serde::{Deserialize, Serialize};
+pub use snapsnap_net::precision::Precision;
 
 use crate::networks::Networks;
 
-/// What the point predictor computes in.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Precision {
-    /// 24 bits of mantissa.
-    #[default]
-    F32,
-    /// 8 bits of mantissa, the range of f32.
-    Bf16,
-    /// 11 bits of mantissa, up to 65,504: the loss is scaled, so that small gradients do not vanish.
-    F16,
-}
-
-impl Precision {
-    /// As in configs.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::F32 => "f32",
-            Self::Bf16 => "bf16",
-            Self::F16 => "f16",
-        }
-    }
-
-    /// Burn's name.
-    pub fn dtype(self) -> FloatDType {
-        match self {
-            Self::F32 => FloatDType::F32,
-            Self::Bf16 => FloatDType::BF16,
-            Self::F16 => FloatDType::F16,
-        }
-    }
-
-    /// The networks with a predictor in this precision; gradients lead back to the one that was given. Norms, δ and the last
-    /// layers of the heads stay as they are.
-    pub fn lower(self, networks: &Networks) -> Networks {
-        let mut networks = networks.clone();
-        if self != Self::F32 {
-            let mut lower = Lower { dtype: self.dtype(), open: Vec::new() };
-            networks.predictor = networks.predictor.map(|predictor| predictor.map(&mut lower));
-        }
-        networks
-    }
-}
-
-struct Lower {
-    dtype: FloatDType,
-    /// Names and kinds of the open modules.
-    open: Vec<[String; 2]>,
-}
-
-impl Lower {
-    /// Whether the open module is a layer of weights, and none that gives what is activated: points of 2 m would be
-    /// rounded by a centimetre in bf16.
-    fn applies(&self) -> bool {
-        // The innermost entry is the parameter's own.
-        let [.., [name, _], [_, kind]] = self.open.as_slice() else { return false };
-        let is_layer = ["Struct:Linear", "Struct:Conv2d", "Struct:ConvTranspose2d"].contains(&kind.as_str());
-        let in_head = self.open.iter().any(|[name, _]| name.starts_with("downstream_head"));
-        is_layer && !(in_head && ["at_4", "proj"].contains(&name.as_str()))
-    }
-}
-
-impl ModuleMapper for Lower {
-    fn enter_module(&mut self, name: &str, container_type: &str) {
-        self.open.push([name.to_owned(), container_type.to_owned()]);
-    }
-
-    fn exit_module(&mut self, _name: &str, _container_type: &str) {
-        self.open.pop();
-    }
-
-    fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
-        if !self.applies() {
-            return param;
-        }
-        let (id, values, mapper) = param.consume();
-        Param::from_mapped_value(id, values.cast(self.dtype), mapper)
-    }
+/// The networks with a predictor in this precision; gradients lead back to the one that was given.
+pub fn lower(precision: Precision, networks: &Networks) -> Networks {
+    let mut networks = networks.clone();
+    networks.predictor = networks.predictor.map(|predictor| precision.lower(predictor));
+    networks
 }
 
 /// What the loss is multiplied by before it is differentiated, and its gradients are divided by: halved where a gradient

@@ -24,7 +24,7 @@ use snapsnap_train::networks::{Networks, Rows};
 use snapsnap_train::optimizer::MuonSettings;
 use snapsnap_train::photometric::Photometric;
 use snapsnap_train::points::{Prediction, losses};
-use snapsnap_train::precision::{LossScale, Precision};
+use snapsnap_train::precision::{LossScale, Precision, lower};
 use snapsnap_train::run::{Options, Outcome, Watch, train};
 use snapsnap_train::stage1::PointTask;
 use snapsnap_train::stage2::GaussianTask;
@@ -177,7 +177,7 @@ fn sixteen_bits_have_the_same_gradients_but_for_rounding() {
     let networks = Networks { predictor, regressors: Vec::new() };
     let task = PointTask::new(from_ref(&folder), &config, from_ref(&device)).expect("a task");
     let made = |precision: Precision| {
-        let loss = loss(&task, &precision.lower(&networks));
+        let loss = loss(&task, &lower(precision, &networks));
         let value = f64::from(loss.clone().into_scalar::<f32>());
         let rows = gradients::collect(&networks, &mut (loss * LossScale::default().factor).backward());
         (value, rows.into_iter().map(|(name, row)| (name, values(row))).collect::<BTreeMap<_, _>>())

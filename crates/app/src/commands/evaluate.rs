@@ -7,7 +7,7 @@ use clap::{Args, ValueEnum};
 use snapsnap_eval::baselines::MeanPictures;
 use snapsnap_eval::evaluate::config::{Ablation, EvalConfig};
 use snapsnap_eval::evaluate::meshes::{Align, evaluate_meshes};
-use snapsnap_eval::evaluate::model::Model;
+use snapsnap_eval::evaluate::model::{Leave, Model};
 use snapsnap_eval::evaluate::person::People;
 use snapsnap_eval::evaluate::{Contestant, LeftOut, evaluate, sheet};
 use snapsnap_eval::report;
@@ -223,7 +223,9 @@ fn contestants(
         let path = ablation.weights.as_deref().or(config.model.weights.as_deref());
         let set = [config.model.set.clone(), ablation.set.clone()].concat();
         let weights = weights::open(path, &ConfigArguments { config: None, set })?;
-        Ok(Model::load(&weights, device, ablation.sides && !has_known_sides(config), ablation.side_colors)?)
+        let sides = ablation.sides && !has_known_sides(config);
+        let leave = Leave { sides, side_colors: ablation.side_colors, ..Leave::default() };
+        Ok(Model::load(&weights, device, leave)?)
     };
     match model(&whole, &devices[0]) {
         Ok(model) => contestants.push(Contestant::model("model", model)),

@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 use snapsnap_data::dataset::Split;
 use snapsnap_net::config::{ConfigError, parse};
+use snapsnap_splat::RenderOptions;
 
 /// Everything that decides what an evaluation computes.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
@@ -64,12 +65,48 @@ pub struct ViewsSection {
     pub resolution: usize,
     /// Renders are so many times as large on each side, 1 or 2, and shrunk.
     pub supersampling: usize,
+    /// Views that are compared, of those that do not go in; empty: all.
+    pub compared: Vec<usize>,
+    /// Constants of the rasteriser.
+    pub preset: Preset,
+    /// Whether splats smaller than a pixel keep their weight.
+    pub antialiased: bool,
 }
 
 impl Default for ViewsSection {
     fn default() -> Self {
-        Self { inputs: Vec::new(), turns: vec![0], resolution: 0, supersampling: 2 }
+        Self {
+            inputs: Vec::new(),
+            turns: vec![0],
+            resolution: 0,
+            supersampling: 2,
+            compared: Vec::new(),
+            preset: Preset::Inria,
+            antialiased: false,
+        }
     }
+}
+
+impl ViewsSection {
+    /// How pictures are rendered, before black.
+    pub fn render_options(&self) -> RenderOptions {
+        let options = match self.preset {
+            Preset::Inria => RenderOptions::inria(),
+            Preset::Gsplat => RenderOptions::gsplat_1_5(),
+        };
+        RenderOptions { antialiased: self.antialiased, ..options }
+    }
+}
+
+/// Constants of a rasteriser.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Preset {
+    /// The original one; what the published weights were trained with.
+    #[default]
+    Inria,
+    /// gsplat 1.5.
+    Gsplat,
 }
 
 /// The section `[model]`.
@@ -226,7 +263,7 @@ impl EvalConfig {
         if sorted.len() < views.inputs.len() {
             return Some(("views.inputs", "names a view twice".into()));
         }
-        if views.inputs.iter().chain(&views.turns).any(|view| *view >= most) {
+        if views.inputs.iter().chain(&views.turns).chain(&views.compared).any(|view| *view >= most) {
             return Some(("views.inputs", format!("views and turns must be below {most}")));
         }
         if views.turns.is_empty() || views.turns.len() > 64 {

@@ -12,7 +12,7 @@ use std::time::Duration;
 use image::RgbImage;
 use rayon::prelude::*;
 use snapsnap_data::sample::TestItem;
-use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
+use snapsnap_splat::{Camera, Gaussians, render};
 
 use crate::EvalError;
 use crate::lpips::Lpips;
@@ -22,7 +22,7 @@ use crate::preview::{color, grid, heat};
 use crate::region::{Region, margin};
 use crate::score::Score;
 
-use config::{EvalConfig, Protocol};
+use config::{EvalConfig, Protocol, ViewsSection};
 pub use contest::{Contestant, Kind};
 use person::People;
 pub use surface::{Surface, Truth};
@@ -190,7 +190,9 @@ fn one(
         }
         shown.push(Some(made));
     }
-    let compared: Vec<usize> = (0..people.views()).filter(|view| !inputs.contains(view)).collect();
+    let wanted = |view: &usize| config.views.compared.is_empty() || config.views.compared.contains(view);
+    let compared: Vec<usize> =
+        (0..people.views()).filter(|view| wanted(view) && !inputs.contains(view)).collect();
     let compare = |view: &usize| compare(config, at, &item, *view, (contestants, &shown), lpips);
     // A device of its own does one thing at a time.
     let found: Vec<Result<Vec<Scored>, EvalError>> = if shown.iter().flatten().all(contest::Shown::is_on_cpu)
@@ -256,12 +258,12 @@ fn picture(
     side: usize,
 ) -> Result<Picture, EvalError> {
     match &shown.gaussians {
-        Some(gaussians) => rendered(gaussians, camera, side, config.views.supersampling),
+        Some(gaussians) => rendered(gaussians, camera, side, &config.views),
         None => contestant.picture(view, side),
     }
 }
 
-/// Gaussians (world frame) as a camera sees them, before black, `side`² pixels: rendered `times` as large and shrunk.
+/// Gaussians (world frame) as a camera sees them, before black, `side`² pixels, rendered as the config says.
 ///
 /// # Errors
 /// [`EvalError`] for what cannot be rendered.
@@ -269,12 +271,12 @@ pub fn rendered(
     gaussians: &Gaussians,
     camera: &Camera,
     side: usize,
-    times: usize,
+    views: &ViewsSection,
 ) -> Result<Picture, EvalError> {
-    let large = side * times;
+    let large = side * views.supersampling;
     let camera = camera.resized(large as u32, large as u32);
-    let color = render(gaussians, std::slice::from_ref(&camera), &RenderOptions::inria())?.color;
-    Picture::rendered(&snapsnap_ops::host(color), [large, large], times)
+    let color = render(gaussians, std::slice::from_ref(&camera), &views.render_options())?.color;
+    Picture::rendered(&snapsnap_ops::host(color), [large, large], views.supersampling)
 }
 
 /// What the best, middle and worst people look like: photographs and, for each view asked for, the model's picture, the true

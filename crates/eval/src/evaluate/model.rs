@@ -2,10 +2,11 @@
 
 use std::time::{Duration, Instant};
 
-use burn::tensor::{Device, Tensor};
+use burn::tensor::{Device, Int, Tensor, TensorData};
 use snapsnap_data::sample::TestItem;
 use snapsnap_net::config::Config;
 use snapsnap_net::gaussians::placed;
+use snapsnap_net::precision::Precision;
 use snapsnap_net::weights::{WeightFile, WeightsError};
 use snapsnap_net::{Reconstruction, Reconstructor};
 use snapsnap_ops::host;
@@ -13,9 +14,32 @@ use snapsnap_splat::Gaussians;
 
 use super::person::photograph;
 
-/// Networks on a device.
+/// Networks on a device, and what is left out of what they do.
 pub struct Model {
     reconstructor: Reconstructor,
+    leave: Leave,
+}
+
+/// What a model does without.
+#[derive(Debug, Clone, Copy)]
+pub struct Leave {
+    /// Whether the unseen sides are predicted.
+    pub sides: bool,
+    /// Whether their pixels get the colours of the nearest photographed points.
+    pub side_colors: bool,
+    /// Only every so many-th row and column of pixels becomes a Gaussian, so many times as large.
+    pub stride: usize,
+    /// Gaussians less opaque are dropped.
+    pub min_opacity: f32,
+    /// What the point predictor computes in.
+    pub precision: Precision,
+}
+
+impl Default for Leave {
+    /// Nothing.
+    fn default() -> Self {
+        Self { sides: true, side_colors: true, stride: 1, min_opacity: 0.0, precision: Precision::F32 }
+    }
 }
 
 /// What it made of a person.
@@ -29,27 +53,26 @@ pub struct Made {
     pub lost: usize,
     /// From the photographs on their canvas to the Gaussians.
     pub time: Duration,
+    /// Of each module.
+    pub modules: Vec<(&'static str, Duration)>,
+    /// What ran, what was left out and why.
+    pub plan: Vec<String>,
 }
 
 impl Model {
-    /// Loads both networks; `sides` and `side_colors` say what runs.
+    /// Loads both networks.
     ///
     /// # Errors
     /// [`WeightsError`] if a part is absent or a value is not finite.
-    pub fn load(
-        weights: &WeightFile,
-        device: &Device,
-        sides: bool,
-        side_colors: bool,
-    ) -> Result<Self, WeightsError> {
-        let mut reconstructor = Reconstructor::load(weights, device)?;
-        if !sides {
+    pub fn load(weights: &WeightFile, device: &Device, leave: Leave) -> Result<Self, WeightsError> {
+        let mut reconstructor = Reconstructor::load(weights, device)?.in_precision(leave.precision);
+        if !leave.sides {
             reconstructor = reconstructor.without_sides();
         }
-        if !side_colors {
+        if !leave.side_colors {
             reconstructor = reconstructor.without_side_colors();
         }
-        Ok(Self { reconstructor })
+        Ok(Self { reconstructor, leave })
     }
 
     /// The config in force.
@@ -70,17 +93,52 @@ impl Model {
         let start = Instant::now();
         let count = if inputs.len() == 2 { 1 } else { inputs.len() };
         let (mut parts, mut maps, mut lost) = (Vec::new(), Vec::new(), 0);
+        let (mut modules, mut plan) = (Vec::new(), Vec::new());
         for first in 0..count {
             let pair = [&photographs[first], &photographs[(first + 1) % inputs.len()]];
             let made = self.reconstructor.reconstruct(pair[0], pair[1], &|_| ());
             let to_world = item.cameras[inputs[first]].world_to_camera.inverse();
-            parts.push(placed(self.config(), made.gaussians.clone(), &to_world));
+            parts.push(placed(self.config(), self.thinned(&made, side), &to_world));
             lost += made.lost;
+            modules.extend(made.times.iter().copied());
+            plan.extend(made.plan.iter().cloned());
             if count == 1 {
                 maps = maps_of(&made, side);
             }
         }
-        Made { gaussians: joined(parts), maps, lost, time: start.elapsed() }
+        Made { gaussians: joined(parts), maps, lost, time: start.elapsed(), modules, plan }
+    }
+}
+
+impl Model {
+    /// What stride and opacity leave of the Gaussians.
+    fn thinned(&self, made: &Reconstruction, side: usize) -> Gaussians {
+        let Leave { stride, min_opacity, .. } = self.leave;
+        let gaussians = made.gaussians.clone();
+        if stride == 1 && min_opacity <= 0.0 {
+            return gaussians;
+        }
+        let pixels: Vec<usize> =
+            made.valid.iter().flat_map(|valid| (0..valid.len()).filter(|i| valid[*i])).collect();
+        // Where Gaussians were lost, what is left has no known pixels: every so many-th goes on.
+        let on_grid = |row: usize| match pixels.len() == gaussians.len() {
+            true => pixels[row] / side % stride == 0 && pixels[row] % side % stride == 0,
+            false => row % (stride * stride) == 0,
+        };
+        let opacities = host(gaussians.opacities.clone());
+        let keep = (0..gaussians.len()).filter(|row| on_grid(*row) && opacities[*row] >= min_opacity);
+        let keep: Vec<i64> = keep.map(|row| row as i64).collect();
+        let n = keep.len();
+        let keep = Tensor::<1, Int>::from_data(TensorData::new(keep, [n]), &gaussians.device());
+        let rows = |of: Tensor<2>| of.select(0, keep.clone());
+        Gaussians::new(
+            rows(gaussians.means),
+            rows(gaussians.rotations),
+            rows(gaussians.scales) * stride as f64,
+            gaussians.opacities.select(0, keep.clone()),
+            rows(gaussians.colors),
+        )
+        .expect("rows of what fits")
     }
 }
 

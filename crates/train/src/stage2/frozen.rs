@@ -11,7 +11,7 @@ use crate::TrainError;
 use crate::config::TrainConfig;
 use crate::networks::Networks;
 use crate::points::{Prediction, predict, window};
-use crate::precision::Precision;
+use crate::precision::{Precision, lower};
 
 /// A predictor that is not even differentiated.
 pub(super) struct Frozen {
@@ -30,7 +30,7 @@ impl Frozen {
         let maps = maps.map(|folder| Maps::new(folder, &config.networks(), &predictor));
         let precision = config.training.precision;
         let networks = Networks { predictor: Some(predictor), regressors: Vec::new() };
-        let lowered = precision.lower(&networks).predictor.expect("there is one");
+        let lowered = lower(precision, &networks).predictor.expect("there is one");
         let lowered = devices.iter().map(|device| lowered.clone().fork(&device.clone().inner())).collect();
         Self { networks, lowered, precision, maps }
     }

@@ -1,0 +1,267 @@
+//! Error against run time: the same people, reconstructed in different settings (EVALUATION.md).
+
+pub mod config;
+mod oracle;
+pub mod report;
+
+use std::time::{Duration, Instant};
+
+use burn::tensor::Device;
+use serde::{Deserialize, Serialize};
+use snapsnap_net::weights::WeightFile;
+use snapsnap_splat::{Camera, ply};
+
+use crate::EvalError;
+use crate::evaluate::config::{EvalConfig, Protocol};
+use crate::evaluate::model::{Leave, Model};
+use crate::evaluate::person::{People, photograph};
+use crate::evaluate::{Contestant, evaluate, rendered};
+use crate::lpips::Lpips;
+use crate::points::VIEWS;
+use crate::score::Score;
+use crate::statistics::quantile;
+
+use config::{BenchConfig, Setting};
+
+/// What a setting costs and how far off its result is.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct Measured {
+    /// Of the setting.
+    pub name: String,
+    /// What it turns.
+    pub knob: Option<String>,
+    /// In words.
+    pub device: String,
+    /// Reconstructions that were timed.
+    pub runs: usize,
+    /// Seconds from the photographs on their canvas to the Gaussians.
+    pub p50: f64,
+    /// The same.
+    pub p95: f64,
+    /// Seconds of each module, p50; those outside a reconstruction as well.
+    pub modules: Vec<(String, f64)>,
+    /// Bytes of memory of a process that does nothing else, at most, without comparing pictures; `None` where the system does
+    /// not tell. A card's memory is not in it.
+    pub memory: Option<u64>,
+    /// Gaussians of the first person.
+    pub gaussians: usize,
+    /// dB, protocol `masked`, mean over people and views.
+    pub psnr: f64,
+    /// The same.
+    pub ssim: Option<f64>,
+    /// The same.
+    pub lpips: Option<f64>,
+    /// Mean distance of the predicted points from the true ones in the views where there are any, mm.
+    pub points_mm: Option<f64>,
+    /// Largest difference of a colour from the f64 oracle with the same cut-offs.
+    pub splat_error: f64,
+    /// Largest difference that the cut-offs make, between oracles with and without.
+    pub cutoff_error: f64,
+    /// What could not be compared.
+    pub left_out: Vec<String>,
+}
+
+/// Measures one setting in this process; `most_used` tells how much memory it took so far.
+///
+/// # Errors
+/// [`EvalError`] for data and weights that cannot be used.
+pub fn measure(
+    config: &BenchConfig,
+    name: &str,
+    setting: &Setting,
+    weights: &WeightFile,
+    (device, device_name): (&Device, &str),
+    lpips: Option<&Lpips>,
+    most_used: &dyn Fn() -> Option<u64>,
+) -> Result<Measured, EvalError> {
+    let data = crate::evaluate::config::DataSection { subjects: config.bench.people, ..config.data.clone() };
+    let folder =
+        config.data.folders.first().ok_or_else(|| EvalError::Empty("there is no data set".into()))?;
+    let mut eval = EvalConfig { data, ..EvalConfig::default() };
+    eval.views.resolution = config.bench.resolution;
+    eval.views.supersampling = setting.supersampling.unwrap_or(2);
+    eval.views.preset = setting.preset.unwrap_or_default();
+    eval.views.antialiased = setting.antialiased.unwrap_or(false);
+    eval.metrics.protocols = vec![Protocol::Masked];
+    eval.metrics.geometry = false;
+    let people = People::open(folder, &eval.data, &eval.views)?;
+    let count = people.views();
+    eval.views.compared = (0..config.bench.views.min(count))
+        .map(|i| (2 * i + 1) * count / (2 * config.bench.views.min(count)))
+        .collect();
+
+    let mut modules: Vec<(String, f64)> = Vec::new();
+    let start = Instant::now();
+    let leave = Leave {
+        sides: setting.sides.unwrap_or(true),
+        side_colors: setting.side_colors.unwrap_or(true),
+        stride: setting.stride.unwrap_or(1),
+        min_opacity: setting.min_opacity.unwrap_or(0.0),
+        precision: setting.precision.unwrap_or_default(),
+    };
+    let model = Model::load(weights, device, leave)?;
+    sync(device);
+    modules.push(("loading weights".into(), start.elapsed().as_secs_f64()));
+
+    let first = people.chosen().first().copied().ok_or_else(|| EvalError::Empty("there is nobody".into()))?;
+    let inputs = people.inputs(&eval.views, 0);
+    let mut readings = Vec::new();
+    let mut item = people.test().sample(first, &inputs)?;
+    for _ in 0..config.bench.runs.min(5) {
+        let start = Instant::now();
+        item = people.test().sample(first, &inputs)?;
+        let canvases: Vec<_> =
+            (0..inputs.len()).map(|place| photograph(&item, place, model.side())).collect();
+        readings.push(start.elapsed());
+        drop(canvases);
+    }
+    modules.push(("reading photographs".into(), p(&readings, 0.5)));
+
+    for _ in 0..config.bench.warm_up {
+        drop(model.reconstruct(&item, &inputs));
+    }
+    sync(device);
+    let (mut times, mut parts) = (Vec::new(), Vec::<(&'static str, Vec<Duration>)>::new());
+    let mut made = None;
+    for _ in 0..config.bench.runs {
+        let run = model.reconstruct(&item, &inputs);
+        sync(device);
+        times.push(run.time);
+        for (name, time) in &run.modules {
+            match parts.iter_mut().find(|(there, _)| there == name) {
+                Some((_, times)) => times.push(*time),
+                None => parts.push((name, vec![*time])),
+            }
+        }
+        made = Some(run);
+    }
+    let made = made.expect("at least one run");
+    modules.extend(parts.iter().map(|(name, times)| ((*name).to_owned(), p(times, 0.5))));
+    let memory = most_used();
+    if made.gaussians.is_empty() {
+        return Err(EvalError::Empty("no Gaussian came out".into()));
+    }
+    let start = Instant::now();
+    let file = std::env::temp_dir().join(format!("snapsnap-bench-{}.ply", std::process::id()));
+    let written = ply::write(&made.gaussians, &file);
+    modules.push(("writing the PLY".into(), start.elapsed().as_secs_f64()));
+    let _ = std::fs::remove_file(&file);
+    written?;
+    let side = people.side(&eval.views);
+    let camera = item.cameras[eval.views.compared[0]];
+    let mut renders = Vec::new();
+    for _ in 0..config.bench.runs.min(5) {
+        let start = Instant::now();
+        drop(rendered(&made.gaussians, &camera, side, &eval.views)?);
+        renders.push(start.elapsed());
+    }
+    modules.push((format!("rendering a view of {side}²"), p(&renders, 0.5)));
+
+    let options = eval.views.render_options();
+    let patch = patch(&camera.resized(side as u32, side as u32), config.bench.oracle);
+    let (splat_error, cutoff_error) = oracle::errors(&made.gaussians, &patch, &options)?;
+    let gaussians = made.gaussians.len();
+    drop(made);
+    let contestants = [Contestant::model(name, model)];
+    let outcome = evaluate(&eval, std::slice::from_ref(&people), &contestants, lpips, &|_, _| ());
+    let judged = &outcome.judged[0];
+    let scores: Vec<Score> = judged.rows.iter().map(|row| row.scores[0]).collect();
+    let Score { psnr, ssim, lpips } =
+        Score::mean(&scores).ok_or_else(|| EvalError::Empty("no view could be compared".into()))?;
+    let errors: Vec<f64> =
+        judged.points.iter().flat_map(|(_, errors)| errors).map(|error| 1e3 * error.mean).collect();
+    let left_out = outcome.left_out.iter().map(|l| format!("{}: {}", l.name, l.why)).collect();
+    debug_assert!(judged.points.iter().all(|(_, errors)| errors.len() <= VIEWS.len()));
+    Ok(Measured {
+        name: name.into(),
+        knob: setting.knob.clone(),
+        device: device_name.into(),
+        runs: config.bench.runs,
+        p50: p(&times, 0.5),
+        p95: p(&times, 0.95),
+        modules,
+        memory,
+        gaussians,
+        psnr,
+        ssim,
+        lpips,
+        points_mm: (!errors.is_empty()).then(|| errors.iter().sum::<f64>() / errors.len() as f64),
+        splat_error,
+        cutoff_error,
+        left_out,
+    })
+}
+
+/// A quantile of times, seconds.
+fn p(times: &[Duration], share: f64) -> f64 {
+    let mut seconds: Vec<f64> = times.iter().map(Duration::as_secs_f64).collect();
+    seconds.sort_by(f64::total_cmp);
+    quantile(&seconds, share)
+}
+
+fn sync(device: &Device) {
+    device.sync().expect("the device finishes its work");
+}
+
+/// The part of a picture around its middle, as a camera of its own.
+fn patch(camera: &Camera, side: u32) -> Camera {
+    let side = side.min(camera.width).min(camera.height);
+    let corner =
+        glam::DVec2::new(f64::from((camera.width - side) / 2), f64::from((camera.height - side) / 2));
+    Camera { width: side, height: side, principal_point: camera.principal_point - corner, ..*camera }
+}
+
+/// Shares of time and decibels below which a difference is noise.
+const FASTER: f64 = 0.03;
+const BETTER: f64 = 0.02;
+
+/// Which settings others beat: no slower, no worse, and in one of the two better by more than noise. By place, the place of the
+/// best of those that beat it.
+pub fn dominated(measured: &[Measured]) -> Vec<Option<usize>> {
+    let beats = |a: &Measured, b: &Measured| {
+        a.p50 <= b.p50 && a.psnr >= b.psnr && (a.p50 < (1.0 - FASTER) * b.p50 || a.psnr > b.psnr + BETTER)
+    };
+    let by = |b: &Measured| {
+        let better = measured.iter().enumerate().filter(|(_, a)| beats(a, b));
+        better.max_by(|a, b| a.1.psnr.total_cmp(&b.1.psnr)).map(|(place, _)| place)
+    };
+    measured.iter().map(by).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn measured(p50: f64, psnr: f64) -> Measured {
+        Measured {
+            name: String::new(),
+            knob: None,
+            device: String::new(),
+            runs: 1,
+            p50,
+            p95: p50,
+            modules: Vec::new(),
+            memory: None,
+            gaussians: 0,
+            psnr,
+            ssim: None,
+            lpips: None,
+            points_mm: None,
+            splat_error: 0.0,
+            cutoff_error: 0.0,
+            left_out: Vec::new(),
+        }
+    }
+
+    #[test]
+    fn what_is_slower_and_no_better_is_dominated_by_the_best_of_its_betters() {
+        let all = [
+            measured(1.0, 20.0),
+            measured(2.0, 19.0),
+            measured(0.5, 19.5),
+            measured(3.0, 21.0),
+            measured(1.0, 20.0),
+        ];
+        assert_eq!(dominated(&all), [None, Some(4), None, None, None]);
+    }
+}

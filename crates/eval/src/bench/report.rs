@@ -1,0 +1,232 @@
+//! The report of a benchmark.
+
+use std::fmt::Write;
+use std::path::Path;
+
+use serde_json::{Value, json};
+use snapsnap_splat::file;
+
+use super::{Measured, dominated};
+use crate::evaluate::LeftOut;
+use crate::report::plot::{Axes, Series, svg};
+use crate::report::{Header, escaped};
+
+/// Longest log of a training that is read.
+const MOST: u64 = 256 << 20;
+
+/// What a report is made of.
+pub struct Bench<'a> {
+    /// Command, commit, device, date.
+    pub header: Header,
+    /// Settings, the model as it is first.
+    pub measured: &'a [Measured],
+    /// Settings that could not be measured.
+    pub left_out: &'a [LeftOut],
+    /// Why there is no LPIPS, if there is none.
+    pub no_lpips: Option<String>,
+    /// Trainings: name, and seconds and masked PSNR or point error of their validations.
+    pub training: &'a [Training],
+}
+
+/// A training's validations over its time.
+pub struct Training {
+    /// Its folder's name.
+    pub name: String,
+    /// What is validated.
+    pub what: &'static str,
+    /// Seconds, value.
+    pub points: Vec<(f64, f64)>,
+}
+
+impl Training {
+    /// Reads the log of a run.
+    ///
+    /// # Errors
+    /// Why it cannot be read, or that it has no validation.
+    pub fn read(run: &Path) -> Result<Self, String> {
+        let path = run.join("log.jsonl");
+        let wrong = |message: String| format!("{}: {message}", path.display());
+        let text = file::read_text(&path, MOST).map_err(|e| wrong(format!("cannot read: {e}")))?;
+        let lines: Vec<Value> = text.lines().filter_map(|line| serde_json::from_str(line).ok()).collect();
+        let of = |what: &'static str, key: &str| {
+            let point = |line: &Value| Some((line["seconds"].as_f64()?, line["values"][key].as_f64()?));
+            let points: Vec<(f64, f64)> = lines.iter().filter_map(point).collect();
+            let name = run.file_name().unwrap_or_default().to_string_lossy().into_owned();
+            (!points.is_empty()).then_some(Self { name, what, points })
+        };
+        of("masked PSNR, dB", "validation/psnr_masked")
+            .or_else(|| of("point error, mm", "validation/points_mm"))
+            .ok_or_else(|| wrong("has no validation".into()))
+    }
+}
+
+impl Bench<'_> {
+    /// `report.json`.
+    pub fn json(&self) -> Value {
+        let mut report = self.header.json();
+        let by = dominated(self.measured);
+        let setting = |(measured, by): (&Measured, &Option<usize>)| {
+            let mut value = json!(measured);
+            value["modules"] = measured.modules.iter().map(|(name, s)| (name.clone(), json!(s))).collect();
+            value["dominated_by"] = json!(by.map(|place| &self.measured[place].name));
+            value
+        };
+        report["settings"] = self.measured.iter().zip(&by).map(setting).collect();
+        let curve = |t: &Training| json!({ "run": t.name, "what": t.what, "points": t.points });
+        report["training"] = self.training.iter().map(curve).collect();
+        report["lpips"] =
+            json!(self.no_lpips.as_ref().map_or("published weights".into(), |why| format!("n/a ({why})")));
+        report["left_out"] = json!(self.left_out);
+        report
+    }
+
+    /// `report.md`.
+    pub fn markdown(&self, pictures: &[&str]) -> String {
+        let mut text = self.header.markdown("Error against run time");
+        let runs = self.measured.first().map_or(0, |m| m.runs);
+        let _ = writeln!(
+            text,
+            "* {runs} reconstructions each after warm-up, device synchronised, each setting in a process of its own\n\
+             * Errors: protocol `masked`; LPIPS: {}\n\
+             * Splat error: largest difference of a colour from the f64 oracle; by cut-offs: what skipping α < 1/255, closing pixels and \
+             the largest α change of it\n             * Dominated: another is no slower and no worse, and better by 3 % of the time or 0.02 dB\n",
+            self.no_lpips.as_ref().map_or("published weights".into(), |why| format!("n/a ({why})"))
+        );
+        let _ = writeln!(
+            text,
+            "| knob | setting | PSNR, dB | SSIM ×100 | LPIPS ×100 | points, mm | p50, ms | p95, ms | memory, MB | Gaussians | splat error | by cut-offs | dominated by |\n\
+             |---|---|---|---|---|---|---|---|---|---|---|---|---|"
+        );
+        let by = dominated(self.measured);
+        let optional =
+            |value: Option<f64>, times: f64| value.map_or("n/a".into(), |v| format!("{:.2}", v * times));
+        for (m, by) in self.measured.iter().zip(&by) {
+            let _ = writeln!(
+                text,
+                "| {} | {} | {:.2} | {} | {} | {} | {:.1} | {:.1} | {} | {} | {:.1e} | {:.1e} | {} |",
+                escaped(m.knob.as_deref().unwrap_or_default()),
+                escaped(&m.name),
+                m.psnr,
+                optional(m.ssim, 100.0),
+                optional(m.lpips, 100.0),
+                optional(m.points_mm, 1.0),
+                1e3 * m.p50,
+                1e3 * m.p95,
+                m.memory.map_or("n/a".into(), |bytes| (bytes / 1_000_000).to_string()),
+                m.gaussians,
+                m.splat_error,
+                m.cutoff_error,
+                by.map_or(String::new(), |place| escaped(&self.measured[place].name)),
+            );
+        }
+        self.modules(&mut text);
+        for picture in pictures {
+            let _ = writeln!(text, "\n![{picture}]({picture})");
+        }
+        let partly = self.measured.iter().flat_map(|m| m.left_out.iter().map(move |why| (&m.name, why)));
+        let whole = self.left_out.iter().map(|l| (&l.name, &l.why));
+        let all: Vec<_> = whole.chain(partly).collect();
+        if !all.is_empty() {
+            let _ = writeln!(text, "\n## Left out: {}\n", all.len());
+            for (name, why) in all {
+                let _ = writeln!(text, "* {}: {}", escaped(name), escaped(why));
+            }
+        }
+        text
+    }
+
+    fn modules(&self, text: &mut String) {
+        let mut names: Vec<&String> = Vec::new();
+        for (name, _) in self.measured.iter().flat_map(|m| &m.modules) {
+            if !names.contains(&name) {
+                names.push(name);
+            }
+        }
+        let _ = writeln!(text, "\n## By module\n\nMilliseconds, p50.\n");
+        let heads: Vec<String> = names.iter().map(|name| escaped(name)).collect();
+        let _ = writeln!(text, "| setting | {} |\n|---|{}", heads.join(" | "), "---|".repeat(names.len()));
+        for m in self.measured {
+            let time = |name: &&String| {
+                let found = m.modules.iter().find(|(there, _)| there == *name);
+                found.map_or(String::new(), |(_, seconds)| format!("{:.1}", 1e3 * seconds))
+            };
+            let times: Vec<String> = names.iter().map(time).collect();
+            let _ = writeln!(text, "| {} | {} |", escaped(&m.name), times.join(" | "));
+        }
+    }
+
+    /// `settings.csv`.
+    pub fn csv(&self) -> String {
+        let mut table = csv::Writer::from_writer(Vec::new());
+        let header = [
+            "setting",
+            "knob",
+            "device",
+            "psnr",
+            "ssim",
+            "lpips",
+            "points_mm",
+            "p50_s",
+            "p95_s",
+            "memory_bytes",
+            "gaussians",
+            "splat_error",
+            "cutoff_error",
+            "dominated_by",
+        ];
+        table.write_record(header).expect("memory takes any record");
+        let number = |value: Option<f64>| value.map_or(String::new(), |v| v.to_string());
+        for (m, by) in self.measured.iter().zip(dominated(self.measured)) {
+            let record = [
+                m.name.clone(),
+                m.knob.clone().unwrap_or_default(),
+                m.device.clone(),
+                m.psnr.to_string(),
+                number(m.ssim),
+                number(m.lpips),
+                number(m.points_mm),
+                m.p50.to_string(),
+                m.p95.to_string(),
+                m.memory.map_or(String::new(), |bytes| bytes.to_string()),
+                m.gaussians.to_string(),
+                m.splat_error.to_string(),
+                m.cutoff_error.to_string(),
+                by.map_or(String::new(), |place| self.measured[place].name.clone()),
+            ];
+            table.write_record(record).expect("memory takes any record of one length");
+        }
+        let bytes = table.into_inner().expect("memory can be written");
+        String::from_utf8(bytes).expect("made of text")
+    }
+
+    /// `pareto.svg`: PSNR over run time, the front joined.
+    pub fn pareto(&self) -> String {
+        let at = |m: &Measured| (1e3 * m.p50, m.psnr);
+        let by = dominated(self.measured);
+        let mut front: Vec<(f64, f64)> =
+            self.measured.iter().zip(&by).filter(|(_, by)| by.is_none()).map(|(m, _)| at(m)).collect();
+        front.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let mut series = vec![Series { name: "Pareto front".into(), points: front, line: true }];
+        for m in self.measured {
+            series.push(Series { name: m.name.clone(), points: vec![at(m)], line: false });
+        }
+        let axes = Axes { caption: "Error against run time", x: "p50, ms", y: "PSNR, masked, dB", log: true };
+        svg(&axes, &series)
+    }
+
+    /// `training.svg`: validation over wall-clock time, of what the first run validates.
+    pub fn training_svg(&self) -> String {
+        let Some(first) = self.training.first() else { return String::new() };
+        let alike = self.training.iter().filter(|t| t.what == first.what);
+        let series: Vec<Series> = alike
+            .map(|t| Series {
+                name: t.name.clone(),
+                points: t.points.iter().map(|(s, v)| (s / 60.0, *v)).collect(),
+                line: true,
+            })
+            .collect();
+        let axes =
+            Axes { caption: "Validation against wall-clock time", x: "minutes", y: first.what, log: false };
+        svg(&axes, &series)
+    }
+}
