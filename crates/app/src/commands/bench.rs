@@ -20,8 +20,15 @@ use crate::{device, memory, perceptual, say, weights};
 /// Longest config that is read.
 const MOST: u64 = 1 << 20;
 /// What a report consists of.
-const FILES: [&str; 6] =
-    ["report.json", "report.md", "settings.csv", "pareto.svg", "training.svg", "config.toml"];
+const FILES: [&str; 7] = [
+    "report.json",
+    "report.md",
+    "settings.csv",
+    "pareto.svg",
+    "training_points.svg",
+    "training_pictures.svg",
+    "config.toml",
+];
 /// What a process that measures one setting prints before its figures.
 const MARK: &str = "measured ";
 
@@ -104,12 +111,11 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
         no_lpips,
         training: &training,
     };
-    let (pareto, curve) = (report.pareto(), report.training_svg());
-    let pictures = [(&pareto, "pareto.svg"), (&curve, "training.svg")];
-    let there: Vec<&str> =
-        pictures.iter().filter(|(text, _)| !text.is_empty()).map(|(_, name)| *name).collect();
-    folder.text("pareto.svg", &pareto)?;
-    folder.text("training.svg", &curve)?;
+    let plots = report.plots();
+    let there: Vec<&str> = plots.iter().filter(|(_, text)| !text.is_empty()).map(|(name, _)| *name).collect();
+    for (name, text) in &plots {
+        folder.text(name, text)?;
+    }
     folder.text("settings.csv", &report.csv())?;
     folder.text("config.toml", &config.to_toml())?;
     folder.text("report.md", &report.markdown(&there))?;

@@ -9,7 +9,7 @@ use snapsnap_eval::evaluate::config::{Ablation, EvalConfig};
 use snapsnap_eval::evaluate::meshes::{Align, evaluate_meshes};
 use snapsnap_eval::evaluate::model::{Leave, Model};
 use snapsnap_eval::evaluate::person::People;
-use snapsnap_eval::evaluate::{Contestant, LeftOut, evaluate, sheet};
+use snapsnap_eval::evaluate::{Contestant, LeftOut, Outcome, evaluate, sheet};
 use snapsnap_eval::report;
 use snapsnap_eval::report::evaluation::Evaluation;
 use snapsnap_splat::file;
@@ -47,7 +47,7 @@ pub struct Arguments {
     #[arg(long, value_name = "DIR", conflicts_with_all = ["weights", "against"])]
     mesh_dir: Option<PathBuf>,
     /// Move meshes onto the truth first: turned and moved (rigid), or scaled as well (similarity).
-    #[arg(long, value_enum, value_name = "HOW", num_args = 0..=1, default_missing_value = "rigid", requires = "mesh_dir")]
+    #[arg(long, value_enum, value_name = "HOW", num_args = 0..=1, default_missing_value = "rigid")]
     icp: Option<Icp>,
     #[command(flatten)]
     lpips: perceptual::Arguments,
@@ -66,6 +66,9 @@ enum Icp {
 }
 
 pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
+    if arguments.icp.is_some() && arguments.mesh_dir.is_none() {
+        return Err(Failure::Input("--icp needs --mesh-dir: only meshes are moved".into()));
+    }
     let config = config_of(arguments)?;
     if config.data.folders.is_empty() {
         let message =
@@ -88,7 +91,6 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let devices = names.iter().map(|name| device::choose(name)).collect::<Result<Vec<_>, _>>()?;
     let inputs: Vec<&Path> =
         std::iter::once(&arguments.config).chain(&config.model.weights).map(PathBuf::as_path).collect();
-    let folder = ReportFolder::new(&arguments.output, &FILES, &inputs)?;
     let lpips = arguments.lpips.load_or(&config.metrics.lpips, &names[0])?;
     let mut missing = Vec::new();
     let contestants = contestants(&config, &sets, (&names, &devices), &mut missing)?;
@@ -96,6 +98,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
         let whys: Vec<String> = missing.iter().map(|m| format!("{}: {}", m.name, m.why)).collect();
         return Err(Failure::Input(format!("nothing is left to evaluate: {}", whys.join("; "))));
     }
+    let folder = ReportFolder::new(&arguments.output, &FILES, &inputs)?;
 
     let people = sets.iter().map(|set| set.chosen().len()).sum();
     let progress = Progress::steps(quiet, people, "people");
@@ -103,18 +106,17 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let mut outcome = evaluate(&config, &sets, &contestants, lpips.as_ref().ok(), &done);
     drop(progress);
     outcome.left_out.splice(0..0, missing);
-    let report = Evaluation {
-        header: header(&device::describe(&devices[0])),
-        config: &config,
-        outcome: &outcome,
-        no_lpips: lpips.err(),
-    };
+    let no_lpips = lpips.as_ref().err();
+    let named = device::describe(&devices[0]);
     let shown = contestants.iter().find(|contestant| contestant.networks().is_some());
-    let ranked = report.ranked(config.report.people);
-    let people = match shown.filter(|_| !ranked.is_empty()) {
-        Some(contestant) => sheet(&config, &sets, contestant, &ranked)?,
-        None => None,
-    };
+    let ranked = report_of(&named, &config, &outcome, no_lpips).ranked(config.report.people);
+    let mut people = None;
+    if let Some(contestant) = shown.filter(|_| !ranked.is_empty()) {
+        let (picture, mut left_out) = sheet(&config, &sets, contestant, &ranked);
+        people = picture;
+        outcome.left_out.append(&mut left_out);
+    }
+    let report = report_of(&named, &config, &outcome, no_lpips);
     let by_view = report.by_view();
     let pictures: Vec<&str> = [(people.is_some(), "people.png"), (!by_view.is_empty(), "by_view.svg")]
         .into_iter()
@@ -132,6 +134,15 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
         say::out(&format!("{}: report.md, report.json, pictures and tables", folder.path().display()));
     }
     complete(&outcome.left_out)
+}
+
+fn report_of<'a>(
+    device: &str,
+    config: &'a EvalConfig,
+    outcome: &'a Outcome,
+    no_lpips: Option<&String>,
+) -> Evaluation<'a> {
+    Evaluation { header: header(device), config, outcome, no_lpips: no_lpips.cloned() }
 }
 
 /// What is left out is told, and is a failure.

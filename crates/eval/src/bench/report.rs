@@ -14,6 +14,10 @@ use crate::report::{Header, escaped};
 /// Longest log of a training that is read.
 const MOST: u64 = 256 << 20;
 
+/// What validations of the two stages tell.
+const POINTS: &str = "point error, mm";
+const PICTURES: &str = "masked PSNR, dB";
+
 /// What a report is made of.
 pub struct Bench<'a> {
     /// Command, commit, device, date.
@@ -54,8 +58,8 @@ impl Training {
             let name = run.file_name().unwrap_or_default().to_string_lossy().into_owned();
             (!points.is_empty()).then_some(Self { name, what, points })
         };
-        of("masked PSNR, dB", "validation/psnr_masked")
-            .or_else(|| of("point error, mm", "validation/points_mm"))
+        of(PICTURES, "validation/psnr_masked")
+            .or_else(|| of(POINTS, "validation/points_mm"))
             .ok_or_else(|| wrong("has no validation".into()))
     }
 }
@@ -199,8 +203,8 @@ impl Bench<'_> {
         String::from_utf8(bytes).expect("made of text")
     }
 
-    /// `pareto.svg`: PSNR over run time, the front joined.
-    pub fn pareto(&self) -> String {
+    /// PSNR over run time, the front joined.
+    fn pareto(&self) -> String {
         let at = |m: &Measured| (1e3 * m.p50, m.psnr);
         let by = dominated(self.measured);
         let mut front: Vec<(f64, f64)> =
@@ -214,10 +218,9 @@ impl Bench<'_> {
         svg(&axes, &series)
     }
 
-    /// `training.svg`: validation over wall-clock time, of what the first run validates.
-    pub fn training_svg(&self) -> String {
-        let Some(first) = self.training.first() else { return String::new() };
-        let alike = self.training.iter().filter(|t| t.what == first.what);
+    /// Validations of one kind over wall-clock time.
+    fn curves(&self, what: &str) -> String {
+        let alike = self.training.iter().filter(|t| t.what == what);
         let series: Vec<Series> = alike
             .map(|t| Series {
                 name: t.name.clone(),
@@ -225,8 +228,16 @@ impl Bench<'_> {
                 line: true,
             })
             .collect();
-        let axes =
-            Axes { caption: "Validation against wall-clock time", x: "minutes", y: first.what, log: false };
+        let axes = Axes { caption: "Validation against wall-clock time", x: "minutes", y: what, log: false };
         svg(&axes, &series)
+    }
+
+    /// The plots by their names, empty where there is nothing to draw.
+    pub fn plots(&self) -> [(&'static str, String); 3] {
+        [
+            ("pareto.svg", self.pareto()),
+            ("training_points.svg", self.curves(POINTS)),
+            ("training_pictures.svg", self.curves(PICTURES)),
+        ]
     }
 }

@@ -279,52 +279,64 @@ pub fn rendered(
     Picture::rendered(&snapsnap_ops::host(color), [large, large], views.supersampling)
 }
 
-/// What the best, middle and worst people look like: photographs and, for each view asked for, the model's picture, the true
-/// one and the error.
-///
-/// # Errors
-/// [`EvalError`] for files that cannot be read any more.
+/// What some people (rows of the outcome's) look like: photographs and, for each view asked for, the model's picture, the true one
+/// and the error; and who cannot be shown.
 pub fn sheet(
     config: &EvalConfig,
     sets: &[People],
     contestant: &Contestant,
     persons: &[usize],
-) -> Result<Option<RgbImage>, EvalError> {
+) -> (Option<RgbImage>, Vec<LeftOut>) {
+    let places: Vec<(&People, usize)> =
+        sets.iter().flat_map(|set| set.chosen().iter().map(move |row| (set, *row))).collect();
+    let (mut rows, mut left_out) = (Vec::new(), Vec::new());
+    for (people, row) in persons.iter().map(|person| places[*person]) {
+        match pictures(config, people, row, contestant) {
+            Ok(pictures) => rows.push(pictures),
+            Err(e) => {
+                let name = format!("{}, pictures", name_of(sets, people, row));
+                left_out.push(LeftOut { name, why: e.to_string() });
+            }
+        }
+    }
+    (grid(&rows), left_out)
+}
+
+/// A row of the sheet.
+fn pictures(
+    config: &EvalConfig,
+    people: &People,
+    row: usize,
+    contestant: &Contestant,
+) -> Result<Vec<RgbImage>, EvalError> {
     /// Mean absolute difference of channels that is shown white.
     const WORST: f32 = 0.5;
-    let places = sets.iter().flat_map(|set| set.chosen().iter().map(move |row| (set, *row)));
-    let places: Vec<(&People, usize)> = places.collect();
-    let mut rows = Vec::new();
-    for person in persons {
-        let (people, row) = places[*person];
-        let inputs = people.inputs(&config.views, config.views.turns[0]);
-        let item = people.test().sample(row, &inputs)?;
-        let shown = contestant.prepare(people, row, &item, &inputs)?;
-        let side = people.side(&config.views);
-        let mut pictures = Vec::new();
-        for view in &inputs[..2] {
-            let (target, _) = people.target(row, *view, side)?;
-            pictures.push(target.cropped(Region::paper(&target)?.window).to_rgb8());
-        }
-        for wanted in &config.report.degrees {
-            let off = |view: &usize| {
-                let apart = person::degrees(&item.cameras[*view], &item.cameras[inputs[0]]) - wanted;
-                apart.rem_euclid(360.0).min((-apart).rem_euclid(360.0))
-            };
-            let near = (0..people.views()).min_by(|a, b| off(a).total_cmp(&off(b)));
-            let view = near.expect("there are views");
-            let image = picture(config, contestant, &shown, &item.cameras[view], view, side)?;
-            let (target, _) = people.target(row, view, side)?;
-            let window = Region::paper(&target)?.window;
-            let [image, target] = [image, target].map(|picture| picture.cropped(window));
-            let error = RgbImage::from_fn(image.width as u32, image.height as u32, |x, y| {
-                let i = y as usize * image.width + x as usize;
-                let apart = |c: usize| (image.plane(c)[i] - target.plane(c)[i]).abs();
-                color(heat((apart(0) + apart(1) + apart(2)) / 3.0, WORST))
-            });
-            pictures.extend([image.to_rgb8(), target.to_rgb8(), error]);
-        }
-        rows.push(pictures);
+    let inputs = people.inputs(&config.views, config.views.turns[0]);
+    let item = people.test().sample(row, &inputs)?;
+    let shown = contestant.prepare(people, row, &item, &inputs)?;
+    let side = people.side(&config.views);
+    let mut pictures = Vec::new();
+    for view in &inputs[..2] {
+        let (target, _) = people.target(row, *view, side)?;
+        pictures.push(target.cropped(Region::paper(&target)?.window).to_rgb8());
     }
-    Ok(grid(&rows))
+    for wanted in &config.report.degrees {
+        let off = |view: &usize| {
+            let apart = person::degrees(&item.cameras[*view], &item.cameras[inputs[0]]) - wanted;
+            apart.rem_euclid(360.0).min((-apart).rem_euclid(360.0))
+        };
+        let near = (0..people.views()).min_by(|a, b| off(a).total_cmp(&off(b)));
+        let view = near.expect("there are views");
+        let image = picture(config, contestant, &shown, &item.cameras[view], view, side)?;
+        let (target, _) = people.target(row, view, side)?;
+        let window = Region::paper(&target)?.window;
+        let [image, target] = [image, target].map(|picture| picture.cropped(window));
+        let error = RgbImage::from_fn(image.width as u32, image.height as u32, |x, y| {
+            let i = y as usize * image.width + x as usize;
+            let apart = |c: usize| (image.plane(c)[i] - target.plane(c)[i]).abs();
+            color(heat((apart(0) + apart(1) + apart(2)) / 3.0, WORST))
+        });
+        pictures.extend([image.to_rgb8(), target.to_rgb8(), error]);
+    }
+    Ok(pictures)
 }

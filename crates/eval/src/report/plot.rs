@@ -76,9 +76,10 @@ pub fn svg(axes: &Axes, series: &[Series]) -> String {
         }
         if axes.log {
             let least = all.iter().map(|p| p.0).fold(f64::MAX, f64::min);
-            draw!((0.8 * least..1.25 * right).log_scale());
+            // Room for the legend.
+            draw!((0.8 * least..5.0 * right).log_scale());
         } else {
-            draw!(left..right);
+            draw!(left..right + 0.3 * (right - left));
         }
         let _ = area.present();
     }

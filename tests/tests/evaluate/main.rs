@@ -1,0 +1,93 @@
+//! `snapsnap evaluate`, `bench` and `compare` as a user types them: what they report, that reports follow from their inputs, and
+//! what happens where something is missing or damaged.
+
+mod bench;
+mod compare;
+mod meshes;
+mod people;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+use std::sync::OnceLock;
+
+use serde_json::Value;
+use snapsnap_tests::{TRAINING, snapsnap, succeed};
+
+/// Two people to test on, eight views of 64², and two to learn from; made once.
+fn people() -> &'static Path {
+    static PEOPLE: OnceLock<PathBuf> = OnceLock::new();
+    PEOPLE.get_or_init(|| {
+        let folder =
+            PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("tested-{}", std::process::id()));
+        for split in ["test", "train"] {
+            let mut command = snapsnap();
+            command.args([
+                "prepare",
+                "synth",
+                "--seed",
+                "5",
+                "--subjects",
+                "2",
+                "--split",
+                split,
+                "--save-scans",
+            ]);
+            command.args(["--set", "views.count=8", "--set", "views.resolution=64", "-o"]).arg(&folder);
+            succeed(&mut command);
+        }
+        folder
+    })
+}
+
+/// A copy to be damaged.
+fn copied(to: &Path) -> PathBuf {
+    let folder = to.join("people");
+    let status = Command::new("cp").arg("-r").arg(people()).arg(&folder).status().expect("cp");
+    assert!(status.success());
+    folder
+}
+
+/// Random weights of small networks.
+fn weights(seed: u32) -> PathBuf {
+    static LOCK: std::sync::Mutex<()> = std::sync::Mutex::new(());
+    let _lock = LOCK.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+    let folder = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
+    let file = folder.join(format!("tested-{}-{seed}.safetensors", std::process::id()));
+    if !file.exists() {
+        let config = folder.join(format!("tested-{}.toml", std::process::id()));
+        let networks = TRAINING.split("[samples]").next().expect("sections");
+        fs::write(&config, networks.replace("conf_threshold", "")).expect("writes");
+        let mut command = snapsnap();
+        command.args(["init-weights", "--seed", &seed.to_string(), "--config"]).arg(&config);
+        succeed(command.args(["--set", "network.conf_threshold=0.4", "-o"]).arg(&file));
+    }
+    file
+}
+
+/// An evaluation on the CPU with random weights, unless `arguments` say otherwise.
+fn evaluate(data: &Path, report: &Path, arguments: &[&str]) -> Command {
+    let mut command = snapsnap();
+    command.args(["--quiet", "evaluate", "--config"]).arg(snapsnap_tests::root().join("configs/eval.toml"));
+    command.arg("--data").arg(data).args(arguments).arg("-o").arg(report);
+    if !arguments.contains(&"--weights") {
+        command.arg("--weights").arg(weights(1));
+    }
+    if !arguments.contains(&"--device") {
+        command.args(["--device", "cpu"]);
+    }
+    command
+}
+
+fn json(report: &Path) -> Value {
+    let text = fs::read_to_string(report.join("report.json")).expect("a report");
+    serde_json::from_str(&text).expect("JSON")
+}
+
+/// Exit code, and what was said on stderr.
+fn ended(command: &mut Command) -> (Option<i32>, String) {
+    let Output { status, stderr, .. } = command.output().expect("the program starts");
+    let said = String::from_utf8_lossy(&stderr).into_owned();
+    assert!(!said.contains("panicked"), "{said}");
+    (status.code(), said)
+}

@@ -1,0 +1,237 @@
+//! Evaluations.
+
+use std::collections::BTreeMap;
+use std::fs;
+
+use serde_json::Value;
+use snapsnap_tests::{refused, snapsnap, succeed};
+
+use super::{copied, ended, evaluate, json, people, weights};
+
+#[test]
+fn a_report_has_its_keys_and_follows_from_its_tables() {
+    let temporary = tempfile::tempdir().expect("a folder");
+    let report = temporary.path().join("new/report");
+    let mean = format!("baselines.mean=[{:?}]", people().display().to_string());
+    let other = weights(2).display().to_string();
+    let groups = "groups.loose.subjects=[\"0001\"]";
+    let ablation = "ablations.sideless.sides=false";
+    let arguments =
+        ["--set", mean.as_str(), "--against", &other, "--set", groups, "--set", "views.turns=[0, 3]"];
+    succeed(evaluate(people(), &report, &arguments).args(["--set", ablation]));
+    let found = json(&report);
+    for key in
+        ["command", "commit", "device", "date", "protocols", "baselines", "points_mm", "left_out", "lpips"]
+    {
+        assert!(!found[key].is_null(), "{key}");
+    }
+    assert_eq!(found["device"], "cpu (flex)");
+    assert_eq!(found["left_out"], Value::Array(Vec::new()));
+    assert!(
+        found["lpips"].as_str().is_some_and(|said| said.contains("n/a (weights missing: ")),
+        "{}",
+        found["lpips"]
+    );
+    assert!(found["command"].as_str().is_some_and(|said| said.contains("evaluate --config")));
+    // Means over each person's views, then over people, from the table of views.
+    let table = fs::read_to_string(report.join("views.csv")).expect("a table");
+    let mut sums: BTreeMap<[&str; 3], [f64; 3]> = BTreeMap::new();
+    for line in table.lines().skip(1) {
+        let cells: Vec<&str> = line.split(',').collect();
+        let sum = sums.entry([cells[0], cells[1], cells[2]]).or_default();
+        let number = |i: usize| cells[i].parse::<f64>().expect("a number");
+        [1.0, number(6), number(7)].iter().zip(sum).for_each(|(v, sum)| *sum += v);
+    }
+    let mean = |contestant: &str, protocol: &str, figure: usize| {
+        let people = ["0000", "0001"].map(|name| {
+            let sum = sums[&[contestant, protocol, name]];
+            // Six views from two sides.
+            assert_eq!(sum[0], 12.0);
+            sum[figure] / sum[0]
+        });
+        (people[0] + people[1]) / 2.0
+    };
+    for protocol in ["paper", "masked"] {
+        let of = &found["protocols"][protocol];
+        assert_eq!((of["people"].as_u64(), of["views"].as_u64()), (Some(2), Some(24)));
+        assert_eq!(of["subjects"].as_array().map(Vec::len), Some(2));
+        assert!(of["overall"]["lpips"].is_null() && of["subjects"][0]["lpips"].is_null());
+        for (figure, name) in [(1, "psnr"), (2, "ssim")] {
+            let check = |value: &Value, contestant: &str| {
+                let [mean_of, low, high] = ["mean", "low", "high"].map(|key| {
+                    value[name][key].as_f64().unwrap_or_else(|| panic!("{contestant}, {protocol}: {value}"))
+                });
+                assert!(
+                    (mean_of - mean(contestant, protocol, figure)).abs() < 1e-9,
+                    "{contestant}: {mean_of}"
+                );
+                assert!(low <= mean_of && mean_of <= high, "{contestant}: {low} {mean_of} {high}");
+            };
+            check(&of["overall"], "model");
+            for baseline in ["billboard", "true_points", "mean_picture"] {
+                check(&found["baselines"][baseline][protocol], baseline);
+            }
+            for other in ["against", "sideless"] {
+                check(&found["compared"][other]["protocols"][protocol], other);
+                let difference = found["compared"][other]["difference"][protocol][name]["mean"].as_f64();
+                let expected = mean(other, protocol, figure) - mean("model", protocol, figure);
+                assert!((difference.expect("a number") - expected).abs() < 1e-9, "{other}: {difference:?}");
+            }
+        }
+        let group = &found["groups"]["loose"]["model"][protocol];
+        let subject = &of["subjects"][1];
+        assert_eq!((group["people"].as_u64(), &group["psnr"]["mean"]), (Some(1), &subject["psnr"]));
+    }
+    // True points in the photographs' colours are nearer the truth than what random weights make of it.
+    let psnr = |value: &Value| value["masked"]["psnr"]["mean"].as_f64().expect("a number");
+    assert!(psnr(&found["baselines"]["true_points"]) > psnr(&found["baselines"]["billboard"]) + 2.0);
+    assert!(found["points_mm"]["front"]["mean"].as_f64().is_some_and(|mm| mm > 0.0));
+    for name in ["report.md", "people.png", "by_view.svg", "subjects.csv", "config.toml"] {
+        assert!(fs::metadata(report.join(name)).is_ok_and(|file| file.len() > 100), "{name}");
+    }
+    // Again, into the same folder: the same figures.
+    succeed(evaluate(people(), &report, &arguments).args(["--set", ablation]));
+    assert_eq!(fs::read_to_string(report.join("views.csv")).expect("a table"), table);
+}
+
+/// Pairs of photographs of known cameras: no unseen side, five shells.
+#[test]
+fn five_photographs_have_no_unseen_sides() {
+    let temporary = tempfile::tempdir().expect("a folder");
+    let report = temporary.path().join("report");
+    succeed(&mut evaluate(people(), &report, &["--set", "views.inputs=[0, 2, 3, 5, 6]"]));
+    let found = json(&report);
+    assert_eq!(found["protocols"]["masked"]["views"].as_u64(), Some(6));
+    assert!(found["points_mm"]["front"].is_null(), "pairs have no one frame");
+    let text = fs::read_to_string(report.join("report.md")).expect("a report");
+    assert!(text.contains("| model | 2 | 6 |"), "{text}");
+}
+
+#[test]
+fn what_is_missing_or_damaged_is_named_and_the_rest_evaluated() {
+    let temporary = tempfile::tempdir().expect("a folder");
+    let report = temporary.path().join("report");
+    let left_out = |found: &Value| -> Vec<String> {
+        let entries = found["left_out"].as_array().expect("a list").iter();
+        entries
+            .map(|e| format!("{}: {}", e["name"].as_str().unwrap_or(""), e["why"].as_str().unwrap_or("")))
+            .collect()
+    };
+    // A person who is not there, weights that are not there.
+    let (code, said) = ended(&mut evaluate(
+        people(),
+        &report,
+        &["--set", "data.only=[\"0001\", \"0815\"]", "--against", "nowhere.safetensors"],
+    ));
+    assert_eq!(code, Some(1), "{said}");
+    let found = json(&report);
+    assert_eq!(found["protocols"]["paper"]["people"].as_u64(), Some(1));
+    let all = left_out(&found);
+    assert_eq!(all.len(), 2, "{all:?}");
+    assert!(all[0].starts_with("against: nowhere.safetensors") && all[1].starts_with("0815: "), "{all:?}");
+    assert!(said.contains("0815") && said.contains("nowhere.safetensors"), "{said}");
+
+    // A picture cut short, a view without its camera, a picture of another size.
+    let data = copied(temporary.path());
+    let png = data.join("test/img/0000/3.png");
+    let bytes = fs::read(&png).expect("a picture");
+    fs::write(&png, &bytes[..bytes.len() / 2]).expect("writes");
+    let other = image::RgbaImage::new(32, 32);
+    other.save(data.join("test/img/0000/5.png")).expect("writes");
+    let cameras = data.join("test/cameras/0001.json");
+    let list: Vec<Value> =
+        serde_json::from_str(&fs::read_to_string(&cameras).expect("cameras")).expect("JSON");
+    fs::write(&cameras, serde_json::to_string(&list[..7]).expect("JSON")).expect("writes");
+    let (code, said) = ended(&mut evaluate(&data, &report, &["--set", "metrics.geometry=false"]));
+    assert_eq!(code, Some(1), "{said}");
+    let found = json(&report);
+    assert_eq!(
+        (found["protocols"]["paper"]["people"].as_u64(), found["protocols"]["paper"]["views"].as_u64()),
+        (Some(1), Some(4))
+    );
+    let all = left_out(&found);
+    assert_eq!(all.len(), 4, "{all:?}");
+    for (entry, parts) in all.iter().zip([
+        ["0000, view 3", "3.png"],
+        ["0000, view 5", "32×32"],
+        ["0001", "7 cameras"],
+        ["0000, pictures", "3.png"],
+    ]) {
+        assert!(parts.iter().all(|part| entry.contains(part)), "{entry}");
+    }
+
+    // No weights at all: the baselines are still worth something.
+    let (code, said) = ended(&mut evaluate(people(), &report, &["--weights", "nowhere.safetensors"]));
+    assert!(code == Some(1) && said.contains("nowhere.safetensors"), "{said}");
+    let found = json(&report);
+    assert_eq!(found["protocols"], serde_json::json!({}));
+    assert!(found["baselines"]["billboard"]["paper"]["psnr"]["mean"].is_number());
+    assert!(!report.join("people.png").exists(), "pictures of an older report are gone");
+}
+
+/// Points that are not finite give no Gaussians: that is counted, and what is left is judged.
+#[test]
+fn a_prediction_that_is_not_finite_is_counted() {
+    let temporary = tempfile::tempdir().expect("a folder");
+    let report = temporary.path().join("report");
+    // δ is the first tensor of the file that is written: metres per unit, here more than f32 holds once multiplied.
+    let huge = ["--set", "network.anchor=none", "--set", "network.conf_threshold=0.0"];
+    let config = temporary.path().join("networks.toml");
+    let networks = snapsnap_tests::TRAINING
+        .split("[samples]")
+        .next()
+        .expect("sections")
+        .replace("delta = 0.2", "delta = 3e38");
+    fs::write(&config, networks).expect("writes");
+    let file = temporary.path().join("huge.safetensors");
+    succeed(
+        snapsnap()
+            .args(["init-weights", "--seed", "1", "--config"])
+            .arg(&config)
+            .args(huge)
+            .arg("-o")
+            .arg(&file),
+    );
+    let file = file.display().to_string();
+    let arguments = ["--set", "metrics.geometry=false", "--weights", file.as_str()];
+    let (code, said) = ended(&mut evaluate(people(), &report, &arguments));
+    assert_eq!(code, Some(1), "{said}");
+    assert!(said.contains("not finite") || said.contains("no Gaussian came out"), "{said}");
+    assert!(json(&report)["baselines"]["billboard"]["paper"]["psnr"]["mean"].is_number());
+}
+
+#[test]
+fn what_cannot_be_evaluated_is_refused_by_name() {
+    let temporary = tempfile::tempdir().expect("a folder");
+    let report = temporary.path().join("report");
+    let wrong = |arguments: &[&str], expected: &[&str]| {
+        let said = refused(&mut evaluate(people(), &report, arguments));
+        assert!(expected.iter().all(|part| said.contains(part)), "{arguments:?}: {said}");
+        assert!(!report.exists());
+    };
+    wrong(&["--set", "views.input=[0]"], &["unknown field", "input"]);
+    wrong(&["--set", "views.inputs=[0]"], &["views.inputs", "2 to 64"]);
+    wrong(&["--set", "views.inputs=[0, 99]"], &["no view 99, of 8"]);
+    wrong(&["--set", "views.inputs=[1, 1]"], &["twice"]);
+    wrong(&["--set", "views.resolution=48"], &["64", "48"]);
+    wrong(&["--set", "views.supersampling=3"], &["views.supersampling"]);
+    wrong(&["--set", "metrics.protocols=[]"], &["metrics.protocols"]);
+    wrong(&["--set", "metrics.protocols=[\"best\"]"], &["unknown variant", "paper"]);
+    wrong(&["--set", "data.split=\"val\""], &["val"]);
+    wrong(&["--device", "abacus"], &["abacus", "Here there are"]);
+    wrong(&["--lpips", "nowhere.pth"], &["nowhere.pth"]);
+    wrong(&["--icp"], &["--mesh-dir"]);
+    let said = refused(&mut evaluate(people(), &people().join("report"), &[]));
+    assert!(said.contains("lies in a data set"), "{said}");
+    let said = refused(&mut evaluate(temporary.path(), &report, &[]));
+    assert!(said.contains("is no data set"), "{said}");
+    // A report does not replace what it is made of.
+    fs::create_dir(&report).expect("a folder");
+    let config = report.join("config.toml");
+    fs::write(&config, "[views]\n").expect("writes");
+    let mut command = snapsnap();
+    command.args(["evaluate", "--config"]).arg(&config).arg("--data").arg(people()).arg("-o").arg(&report);
+    let said = refused(&mut command);
+    assert!(said.contains("would be overwritten"), "{said}");
+    assert_eq!(fs::read_to_string(&config).expect("kept"), "[views]\n");
+}
