@@ -34,6 +34,13 @@ pub fn choose(name: &str) -> Result<Device, Failure> {
     }
 }
 
+/// Every device there is: both CPU backends, and of every kind that is compiled in the first card, or the software adapter where
+/// that bears it.
+pub fn all() -> Vec<Device> {
+    let gpus = gpus().into_iter().filter_map(|(name, _)| choose(name).ok());
+    [Device::flex(), ndarray()].into_iter().chain(gpus).collect()
+}
+
 /// Kinds of GPU devices that are compiled in, best first.
 fn gpus() -> Vec<(&'static str, DeviceType)> {
     vec![

@@ -53,6 +53,8 @@ enum Command {
     Evaluate(commands::evaluate::Arguments),
     /// Error against run time: a model in different settings.
     Bench(commands::bench::Arguments),
+    /// Extreme and degenerate inputs on every device, and what must hold of them.
+    Stability(commands::stability::Arguments),
     /// How alike two pictures are, or two folders of pictures: PSNR, SSIM, LPIPS.
     Compare(commands::compare::Arguments),
     /// Fetch published weights: DUSt3R, and AlexNet and the learned layers of LPIPS.
@@ -95,6 +97,7 @@ fn main() -> ExitCode {
         Command::TrainStage2(arguments) => commands::train::stage2(&arguments, quiet),
         Command::Evaluate(arguments) => commands::evaluate::run(&arguments, quiet),
         Command::Bench(arguments) => commands::bench::run(&arguments, quiet),
+        Command::Stability(arguments) => commands::stability::run(&arguments, quiet),
         Command::Compare(arguments) => commands::compare::run(&arguments),
         Command::FetchWeights(arguments) => commands::fetch_weights::run(&arguments, quiet),
         Command::ImportWeights(arguments) => commands::import_weights::run(&arguments, quiet),

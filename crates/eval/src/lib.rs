@@ -14,6 +14,7 @@ pub mod region;
 pub mod report;
 pub mod score;
 pub mod similarity;
+pub mod stability;
 pub mod statistics;
 
 pub use error::EvalError;

@@ -18,6 +18,7 @@ pub mod precision;
 mod progress;
 pub mod run;
 pub mod schedule;
+pub mod stability;
 pub mod stage1;
 pub mod stage2;
 pub mod task;

@@ -97,7 +97,7 @@ impl OptimizerConfig {
 /// What an optimiser remembers of a parameter.
 #[derive(Clone)]
 #[allow(clippy::large_enum_variant, reason = "what it points at is larger by far")]
-enum State {
+pub(crate) enum State {
     AdamW { time: u64, mean: Tensor<1>, squares: Tensor<1> },
     Muon { velocity: Tensor<1> },
 }
@@ -177,7 +177,7 @@ impl Optimizer {
 
     /// AdamW (Loshchilov and Hutter). Burn's corrects the moments' bias in f32, which makes the second step 1.5e-5 too long
     /// or too short; the published steps cannot be followed with it.
-    fn adamw(
+    pub(crate) fn adamw(
         &self,
         share: f64,
         decays: bool,

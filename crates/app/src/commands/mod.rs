@@ -10,6 +10,7 @@ pub mod init_weights;
 pub mod prepare;
 pub mod reconstruct;
 pub mod render;
+pub mod stability;
 pub mod train;
 
 use std::path::{Path, PathBuf};

@@ -1,0 +1,214 @@
+//! Networks at the ends of what numbers hold.
+
+use burn::tensor::{DType, Device, Tensor, TensorData};
+use snapsnap_net::config::{Anchor, ConfMode, NetworkConfig, RegressorConfig};
+use snapsnap_net::network::activate;
+use snapsnap_net::regressor::{Attributes, Regressor, Statistics};
+use snapsnap_ops::{Rope, host, rotary_attention};
+
+use super::{Case, Found};
+
+/// All cases of EVALUATION.md but those of the trained default in 16 bits, which need its weights.
+pub fn cases() -> Vec<Case> {
+    let mut cases = Vec::new();
+    for norm in [0.0_f32, 1e-12, 0.29, 0.31, 20.0, 88.0, 1e4] {
+        cases.push(Case {
+            area: "Networks",
+            input: format!("exponential depth at raw norm {norm:?}"),
+            holds: "p = r/‖r‖·(e^‖r‖ − 1) relative to f64 as far as f32 reaches (e^88), finite beyond; gradient finite".into(),
+            value_limit: 1e-5,
+            gradient_limit: 1e-4,
+            once: false,
+            run: Box::new(move |device| exponential_depth(norm, device)),
+        });
+    }
+    for (mode, name) in [(ConfMode::Sigmoid, "sigmoid"), (ConfMode::Exp, "exp")] {
+        cases.push(Case {
+            area: "Networks",
+            input: format!("confidences ({name}) at ±1e4 and ±88"),
+            holds: "finite, in range, gradient finite".into(),
+            value_limit: 1e-6,
+            gradient_limit: 0.0,
+            once: false,
+            run: Box::new(move |device| confidences(mode, device)),
+        });
+    }
+    cases.push(Case {
+        area: "Networks",
+        input: "the regressor's 14 channels at ±1e4".into(),
+        holds: "attributes finite and in range, gradient finite".into(),
+        value_limit: 0.0,
+        gradient_limit: 0.0,
+        once: false,
+        run: Box::new(attributes),
+    });
+    for (size, name) in
+        [(1.0_f32, "identical tokens"), (1e4, "identical tokens of 1e4"), (1e18, "tokens of 1e18")]
+    {
+        cases.push(Case {
+            area: "Networks",
+            input: format!("attention with {name}"),
+            holds: "the mean of equal values, relative; finite, gradient finite".into(),
+            value_limit: 1e-5,
+            gradient_limit: 0.0,
+            once: false,
+            run: Box::new(move |device| attention(size, device)),
+        });
+    }
+    cases.push(Case {
+        area: "Networks",
+        input: "the regressor on constant channels (no variance to divide by)".into(),
+        holds: "features finite and equal wherever padding does not reach, gradient finite".into(),
+        value_limit: 1e-4,
+        gradient_limit: 0.0,
+        once: false,
+        run: Box::new(constant_channels),
+    });
+    cases
+}
+
+fn tensor<const D: usize>(values: Vec<f32>, shape: [usize; D], device: &Device) -> Tensor<D> {
+    Tensor::from_data(TensorData::new(values, shape), &device.clone().autodiff()).require_grad()
+}
+
+fn all_finite(values: &[f32]) -> bool {
+    values.iter().all(|v| v.is_finite())
+}
+
+/// Raw points of one norm in several directions; f64's values and derivatives beside them.
+fn exponential_depth(norm: f32, device: &Device) -> Found {
+    let directions: [[f64; 3]; 3] = [[1.0, 0.0, 0.0], [0.6, 0.0, -0.8], [-0.48, 0.6, 0.64]];
+    let raw: Vec<f32> = (0..4)
+        .flat_map(|c| directions.map(|d| if c < 3 { (d[c] * f64::from(norm)) as f32 } else { 0.0 }))
+        .collect();
+    let config = NetworkConfig { anchor: Anchor::None, ..NetworkConfig::default() };
+    let x = tensor(raw.clone(), [1, 4, 1, 3], device);
+    let points = activate(x.clone(), &config).points;
+    let gradients = points.clone().sum().backward();
+    let gradient = host(x.grad(&gradients).expect("tracked"));
+    let got = host(points);
+    let (mut value, mut slope) = (0.0_f64, 0.0_f64);
+    for i in 0..3 {
+        let r = [0, 1, 2].map(|c| f64::from(raw[3 * c + i]));
+        let length = r.iter().map(|v| v * v).sum::<f64>().sqrt();
+        // p = r·f(n) with f = (eⁿ − 1)/n, whose derivative is f' = (eⁿ − f)/n.
+        let f = if length > 0.0 { length.exp_m1() / length } else { 1.0 };
+        let df = if length > 1e-4 { (length.exp() - f) / length } else { 0.5 };
+        let size = length * f;
+        let sum: f64 = r.iter().sum();
+        for c in 0..3 {
+            let expected = r[c] * f;
+            if expected.is_finite() && size < f64::from(f32::MAX) && size > 0.0 {
+                value = value.max((f64::from(got[3 * i + c]) - expected).abs() / size);
+            }
+            // d(Σ p)/d r_c = f + f'·(r_c/n)·Σ r
+            let expected = f + if length > 0.0 { df * r[c] / length * sum } else { 0.0 };
+            let scale = f + df.abs() * length;
+            if scale < 1e38 {
+                slope = slope.max((f64::from(gradient[3 * c + i]) - expected).abs() / scale);
+            }
+        }
+    }
+    Found { value: Some(value), gradient: Some(slope), ..Found::default() }
+        .must(all_finite(&got), "a point is not finite")
+        .must(all_finite(&gradient), "a gradient is not finite")
+}
+
+fn confidences(mode: ConfMode, device: &Device) -> Found {
+    let logits = [-1e4_f32, -88.0, 0.0, 88.0, 1e4];
+    let config = NetworkConfig { conf_mode: mode, ..NetworkConfig::default() };
+    let raw: Vec<f32> = (0..4).flat_map(|c| logits.map(|v| if c == 3 { v } else { 0.1 })).collect();
+    let x = tensor(raw, [1, 4, 1, 5], device);
+    let conf = activate(x.clone(), &config).conf;
+    let gradient = host(x.grad(&conf.clone().sum().backward()).expect("tracked"));
+    let got = host(conf);
+    let expected = |x: f64| match mode {
+        ConfMode::Sigmoid => 1.0 / (1.0 + (-x).exp()),
+        ConfMode::Exp => 1.0 + x.exp(),
+    };
+    let mut worst = 0.0_f64;
+    for (x, got) in logits.iter().zip(&got) {
+        let expected = expected(f64::from(*x));
+        if expected < f64::from(f32::MAX) {
+            worst = worst.max((f64::from(*got) - expected).abs() / expected.max(1.0));
+        }
+    }
+    let inside = got.iter().all(|c| match mode {
+        ConfMode::Sigmoid => (0.0..=1.0).contains(c),
+        ConfMode::Exp => *c >= 1.0,
+    });
+    Found { value: Some(worst), ..Found::default() }
+        .must(all_finite(&got), "a confidence is not finite")
+        .must(inside, "a confidence is out of range")
+        .must(all_finite(&gradient), "a gradient is not finite")
+}
+
+fn attributes(device: &Device) -> Found {
+    let rows: Vec<f32> = [1e4_f32, -1e4]
+        .iter()
+        .flat_map(|v| (0..14).map(move |i| if i % 2 == 0 { *v } else { -*v }))
+        .collect();
+    let x = tensor(rows, [2, 14], device);
+    let made = Attributes::new(&RegressorConfig::default(), x.clone(), None);
+    let parts = [made.opacity, made.scale, made.rotation, made.color, made.offset];
+    let sum = parts.iter().map(|part| part.clone().sum()).reduce(|a, b| a + b).expect("five parts");
+    let gradient = host(x.grad(&sum.backward()).expect("tracked"));
+    let [opacity, scale, rotation, color, offset] = parts.map(host);
+    let unit = rotation.chunks_exact(4).all(|q| (q.iter().map(|v| v * v).sum::<f32>() - 1.0).abs() < 1e-5);
+    Found::default()
+        .must(
+            [&opacity, &scale, &rotation, &color, &offset].into_iter().all(|v| all_finite(v)),
+            "an attribute is not finite",
+        )
+        .must(opacity.iter().all(|o| (0.0..=1.0).contains(o)), "an opacity is out of range")
+        .must(scale.iter().all(|s| *s >= 0.0), "a scale is negative")
+        .must(unit, "a quaternion is not of length 1")
+        .must(color.iter().all(|c| c.abs() <= 1.0), "a colour is out of range")
+        .must(all_finite(&gradient), "a gradient is not finite")
+}
+
+/// Twelve tokens, all alike: whatever the weights are, the answer is the value itself.
+fn attention(size: f32, device: &Device) -> Found {
+    let (tokens, channels, heads) = (12, 32, 2);
+    let row: Vec<f32> = (0..channels).map(|c| size * (0.2 + 0.03 * c as f32)).collect();
+    let all: Vec<f32> = (0..tokens).flat_map(|_| row.clone()).collect();
+    let shape = [1, tokens, channels];
+    let [q, k, v] = [(); 3].map(|()| tensor(all.clone(), shape, device));
+    let rope = Rope::new(3, 4, channels / heads, 100.0, &device.clone().autodiff());
+    let out = rotary_attention(q.clone(), k.clone(), v.clone(), &rope, heads);
+    let gradients = out.clone().sum().backward();
+    let gradient: Vec<f32> =
+        [&q, &k, &v].iter().flat_map(|t| host(t.grad(&gradients).expect("tracked"))).collect();
+    let got = host(out);
+    let mut worst = 0.0_f64;
+    for token in got.chunks_exact(channels) {
+        for (got, expected) in token.iter().zip(&row) {
+            worst = worst.max(((f64::from(*got) - f64::from(*expected)) / f64::from(*expected)).abs());
+        }
+    }
+    Found { value: Some(if worst.is_nan() { f64::INFINITY } else { worst }), ..Found::default() }
+        .must(all_finite(&got), "an output is not finite")
+        .must(all_finite(&gradient), "a gradient is not finite")
+}
+
+fn constant_channels(device: &Device) -> Found {
+    let side = 64;
+    let config = snapsnap_net::config::Config::default();
+    let network: Regressor = snapsnap_net::weights::random_regressors(&config, 1, device).remove(0);
+    let values: Vec<f32> =
+        (0..6).flat_map(|c| vec![[0.5, -1.0, 0.25, 0.0, 2.0, 1e3][c]; side * side]).collect();
+    let x = tensor(values, [1, 6, side, side], device);
+    let network = burn::module::Module::fork(network, &device.clone().autodiff());
+    let features = network.forward(x.clone(), &mut Statistics::measured());
+    let gradient = host(x.grad(&features.clone().sum().backward()).expect("tracked"));
+    let got = host(features.cast(DType::F32));
+    let width = got.len() / (side * side);
+    let at = |row: usize, column: usize| &got[(row * side + column) * width..][..width];
+    // The two pixels in the middle see the same but for the padding, which the normalisation hides.
+    let (a, b) = (at(side / 2, side / 2), at(side / 2 + 4, side / 2 + 4));
+    let most = got.iter().fold(0.0_f32, |most, v| most.max(v.abs()));
+    let apart = a.iter().zip(b).map(|(a, b)| f64::from((a - b).abs() / most.max(1e-20))).fold(0.0, f64::max);
+    Found { note: format!("features up to {most:.1e}; middle pixels {apart:.1e} apart"), ..Found::default() }
+        .must(all_finite(&got), "a feature is not finite")
+        .must(all_finite(&gradient), "a gradient is not finite")
+}

@@ -1,0 +1,356 @@
+//! The rasteriser against the f64 oracle.
+
+use burn::tensor::{Device, Tensor, TensorData};
+use glam::{DMat3, DVec2, DVec3};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use snapsnap_ops::host;
+use snapsnap_splat::reference::{self, Cutoff, Scene};
+use snapsnap_splat::{Camera, Gaussians, MAX_SIDE, RenderOptions, RigidTransform, SplatError, render};
+
+use super::{Case, Found};
+
+/// Mean, rotation (w first), scales, opacity, colour.
+type Row = [f32; 14];
+
+/// What is allowed where nothing else is said: f32's rounding, blended. (The tests of the operation allow 2e-5 and 1e-3.)
+const VALUES: f64 = 2e-5;
+const GRADIENTS: f64 = 1e-3;
+
+/// All cases of EVALUATION.md.
+pub fn cases() -> Vec<Case> {
+    let mut cases = Vec::new();
+    let camera = camera(32, 24, 30.0);
+    let mut add = |input: String, holds: &str, rows: Vec<Row>, camera: Camera, limits: [f64; 2]| {
+        cases.push(Case {
+            area: "Splats",
+            input,
+            holds: holds.into(),
+            value_limit: limits[0],
+            gradient_limit: limits[1],
+            once: false,
+            run: Box::new(move |device| against_oracle(&rows, &camera, device)),
+        });
+    };
+    let usual = [VALUES, GRADIENTS];
+    let equal = "as the oracle, forward and backward";
+    for ratio in [1e2_f32, 1e3, 1e5, 1e7] {
+        let shape = |long: [bool; 3]| long.map(|long| if long { 0.3 } else { 0.3 / ratio });
+        add(format!("needles 1:{ratio:.0e}"), equal, shaped(shape([true, false, false])), camera, usual);
+        add(format!("discs 1:{ratio:.0e}"), equal, shaped(shape([true, true, false])), camera, usual);
+    }
+    for scale in [1e-8_f32, 1e-4, 1.0, 1e2, 1e4] {
+        add(format!("all scales {scale:.0e} m"), equal, shaped([scale; 3]), camera, usual);
+    }
+    for opacity in [0.0_f32, 1e-7, 1.0 - 1e-7, 1.0] {
+        let rows = changed(|row| row[10] = opacity);
+        add(format!("opacity {opacity:?}"), equal, rows, camera, usual);
+    }
+    for (name, factor) in [("0", 0.0_f32), ("1e-20", 1e-20), ("1e20", 1e20), ("−1 (signs flipped)", -1.0)] {
+        let rows = changed(|row| row[3..7].iter_mut().for_each(|q| *q *= factor));
+        let holds = if factor == 0.0 { "left out; the others as the oracle without it" } else { equal };
+        add(format!("quaternion of norm {name}"), holds, rows, camera, usual);
+    }
+    for (name, z) in [
+        ("at", 0.2_f32),
+        ("just before", 0.2 - 1e-6),
+        ("just behind", 0.2 + 1e-6),
+        ("behind the camera", -1.0),
+    ] {
+        let rows = changed(|row| row[2] = z);
+        add(format!("{name} the near plane"), "left out where the oracle leaves it out", rows, camera, usual);
+    }
+    for distance in [1e-3_f32, 1.0, 1e3, 1e6] {
+        // As large in the picture, wherever it is.
+        let far = |row: &mut Row| {
+            row[2] = distance;
+            row[7..10].iter_mut().for_each(|s| *s *= distance / 2.0);
+        };
+        add(format!("{distance:.0e} m away"), equal, changed(far), camera, usual);
+    }
+    for focal in [1.0, 30.0, 1e4, 1e6] {
+        let holds = "as the oracle: the picture's size on the sensor does not matter";
+        // Seen under the same angle from further away, so that the picture stays full.
+        let rows = changed_all(|row| {
+            let factor = (focal / 30.0) as f32;
+            row[2] *= factor.max(0.2);
+        });
+        add(format!("focal length {focal:.0e} px"), holds, rows, self::camera(32, 24, focal), usual);
+    }
+    add("image of 1×1".into(), equal, people(), self::camera(1, 1, 1.0), usual);
+    cases.push(far_from_the_origin());
+    cases.push(many_on_one_pixel());
+    cases.push(largest_image());
+    cases
+}
+
+fn camera(width: u32, height: u32, focal: f64) -> Camera {
+    Camera {
+        width,
+        height,
+        focal: DVec2::splat(focal),
+        principal_point: DVec2::new(f64::from(width) / 2.0, f64::from(height) / 2.0),
+        world_to_camera: RigidTransform { rotation: DMat3::IDENTITY, translation: DVec3::ZERO },
+    }
+}
+
+/// Six Gaussians two metres before the camera.
+fn people() -> Vec<Row> {
+    let mut random = ChaCha8Rng::seed_from_u64(11);
+    let mut one = || {
+        let mut between = |low: f32, high: f32| random.random_range(low..high);
+        let mut row = [0.0; 14];
+        row[..3].copy_from_slice(&[between(-0.6, 0.6), between(-0.5, 0.5), between(1.5, 2.5)]);
+        row[3..7].copy_from_slice(&[(); 4].map(|()| between(-1.0, 1.0)));
+        row[7..10].copy_from_slice(&[(); 3].map(|()| between(0.1, 0.3)));
+        row[10] = between(0.4, 0.9);
+        row[11..].copy_from_slice(&[(); 3].map(|()| between(0.0, 1.0)));
+        row
+    };
+    (0..6).map(|_| one()).collect()
+}
+
+/// Those, one of which is changed.
+fn changed(change: impl Fn(&mut Row)) -> Vec<Row> {
+    let mut rows = people();
+    change(&mut rows[2]);
+    rows
+}
+
+fn changed_all(change: impl Fn(&mut Row)) -> Vec<Row> {
+    let mut rows = people();
+    rows.iter_mut().for_each(change);
+    rows
+}
+
+/// Two of them are of this shape.
+fn shaped(scales: [f32; 3]) -> Vec<Row> {
+    let mut rows = people();
+    for row in &mut rows[1..3] {
+        row[7..10].copy_from_slice(&scales);
+    }
+    rows
+}
+
+/// Tracked tensors of a scene.
+struct Tracked {
+    parts: [Tensor<2>; 4],
+    opacities: Tensor<1>,
+}
+
+impl Tracked {
+    fn new(rows: &[Row], device: &Device) -> Self {
+        let device = device.clone().autodiff();
+        let part = |from: usize, width: usize| {
+            let values: Vec<f32> = rows.iter().flat_map(|row| row[from..from + width].to_vec()).collect();
+            Tensor::<2>::from_data(TensorData::new(values, [rows.len(), width]), &device).require_grad()
+        };
+        let opacities: Vec<f32> = rows.iter().map(|row| row[10]).collect();
+        let opacities = TensorData::new(opacities, [rows.len()]);
+        Self {
+            parts: [part(0, 3), part(3, 4), part(7, 3), part(11, 3)],
+            opacities: Tensor::<1>::from_data(opacities, &device).require_grad(),
+        }
+    }
+
+    fn gaussians(&self) -> Gaussians {
+        let [means, rotations, scales, colors] = self.parts.clone();
+        Gaussians::new(means, rotations, scales, self.opacities.clone(), colors).expect("rows of one number")
+    }
+}
+
+fn double(rows: &[Row]) -> Scene<f64> {
+    Scene { gaussians: rows.iter().map(|row| row.map(f64::from)).collect(), background: [0.0; 3] }
+}
+
+/// Renders and differentiates a scene and compares both with the oracle. A Gaussian that has no direction is left out of the
+/// oracle too, for which it would be 0/0.
+fn against_oracle(rows: &[Row], camera: &Camera, device: &Device) -> Found {
+    let options = RenderOptions { depth: true, ..RenderOptions::inria() };
+    let kept: Vec<usize> = (0..rows.len()).filter(|i| rows[*i][3..7].iter().any(|q| *q != 0.0)).collect();
+    let scene = double(&kept.iter().map(|i| rows[*i]).collect::<Vec<_>>());
+    let expected = reference::render(&scene, camera, &options, Cutoff::Hard);
+    let banded = reference::banded(&scene, camera, &options);
+    let mut random = ChaCha8Rng::seed_from_u64(3);
+    let mut upstream: Vec<[f64; 5]> = (0..expected.len())
+        .map(|_| [(); 5].map(|()| f64::from(random.random_range(-1.0_f32..1.0))))
+        .collect();
+    // Where f32 may decide a cut-off otherwise, nothing is compared.
+    upstream.iter_mut().zip(&banded).filter(|(_, banded)| **banded).for_each(|(u, _)| *u = [0.0; 5]);
+
+    let tracked = Tracked::new(rows, device);
+    let rendered = match render(&tracked.gaussians(), std::slice::from_ref(camera), &options) {
+        Ok(rendered) => rendered,
+        Err(e) => return Found { broken: Some(format!("refused: {e}")), ..Found::default() },
+    };
+    let depth = rendered.depth.clone().expect("asked for");
+    let parts = [rendered.color.clone(), rendered.alpha.clone().unsqueeze_dim(3), depth.unsqueeze_dim(3)];
+    let image = Tensor::cat(parts.to_vec(), 3);
+    let weights: Vec<f32> = upstream.iter().flatten().map(|u| *u as f32).collect();
+    let weights = Tensor::<4>::from_data(TensorData::new(weights, image.dims()), &image.device());
+    let gradients = (image.clone() * weights).sum().backward();
+    let got = host(image);
+    // Depths are as large as the scene is far.
+    let reach = scene.gaussians.iter().map(|g| g[2].abs()).fold(1.0, f64::max);
+    let mut worst = 0.0_f64;
+    for (pixel, (found, expected)) in got.chunks_exact(5).zip(&expected).enumerate() {
+        for (c, (f, e)) in found.iter().zip(expected.channels()).enumerate() {
+            let size = if c == 4 { reach } else { 1.0 };
+            if !banded[pixel] {
+                worst = worst.max(nan_is_worst((f64::from(*f) - e).abs() / size));
+            }
+        }
+    }
+    let of_oracle = reference::gradient(&scene, camera, &options, Cutoff::Hard, &upstream).gaussians;
+    let mut gradient = 0.0_f64;
+    let ranges = [0..3, 3..7, 7..10, 11..14, 10..11];
+    for (part, range) in ranges.into_iter().enumerate() {
+        let found = match part {
+            4 => tracked.opacities.grad(&gradients).map(host),
+            _ => tracked.parts[part].grad(&gradients).map(host),
+        };
+        let Some(found) = found else {
+            return Found { broken: Some("no gradient".into()), ..Found::default() };
+        };
+        let width = range.len();
+        let (mut off, mut size) = (0.0, 0.0);
+        for (row, values) in found.chunks_exact(width).enumerate() {
+            let place = kept.iter().position(|k| *k == row);
+            for (value, i) in values.iter().zip(range.clone()) {
+                let expected = place.map_or(0.0, |place| of_oracle[place][i]);
+                off += nan_is_worst((f64::from(*value) - expected).powi(2));
+                size += expected * expected;
+            }
+        }
+        if size > 0.0 || off > 0.0 {
+            gradient = gradient.max((off / size.max(f64::MIN_POSITIVE)).sqrt());
+        }
+    }
+    let share = banded.iter().filter(|b| **b).count();
+    let note = if share > 0 {
+        format!("{share} of {} pixels lie at a cut-off and are not compared", banded.len())
+    } else {
+        String::new()
+    };
+    Found { value: Some(worst), gradient: Some(gradient), note, ..Found::default() }
+        .must(share < banded.len() || banded.len() == 1, "nothing could be compared")
+}
+
+fn nan_is_worst(v: f64) -> f64 {
+    if v.is_nan() { f64::INFINITY } else { v }
+}
+
+/// The same scene and camera 10⁵ m from the origin, where f32 has steps of 8 mm.
+fn far_from_the_origin() -> Case {
+    const FAR: f32 = 1e5;
+    Case {
+        area: "Splats",
+        input: "scene and camera 1e5 m from the origin".into(),
+        holds: "as the oracle: positions are what f32 holds there (8 mm apart), nothing is lost beyond that"
+            .into(),
+        value_limit: VALUES,
+        gradient_limit: GRADIENTS,
+        once: false,
+        run: Box::new(|device| {
+            let mut camera = camera(32, 24, 30.0);
+            camera.world_to_camera.translation = DVec3::new(-f64::from(FAR), 0.0, 0.0);
+            against_oracle(&changed_all(|row| row[0] += FAR), &camera, device)
+        }),
+    }
+}
+
+/// Ten thousand nearly opaque Gaussians, one behind the other.
+fn many_on_one_pixel() -> Case {
+    Case {
+        area: "Splats",
+        input: "10,000 opaque Gaussians on one pixel".into(),
+        holds: "as the oracle; gradients finite, and zero behind the closed pixel".into(),
+        value_limit: VALUES,
+        gradient_limit: 0.0,
+        once: false,
+        run: Box::new(|device| {
+            let mut random = ChaCha8Rng::seed_from_u64(5);
+            let rows: Vec<Row> = (0..10_000)
+                .map(|i| {
+                    let mut row = [0.0; 14];
+                    row[2] = 1.0 + i as f32 * 1e-3;
+                    (row[3], row[10]) = (1.0, 1.0);
+                    row[7..10].fill(0.05);
+                    row[11..].copy_from_slice(&[(); 3].map(|()| random.random::<f32>()));
+                    row
+                })
+                .collect();
+            let camera = camera(9, 9, 10.0);
+            let options = RenderOptions::inria();
+            let tracked = Tracked::new(&rows, device);
+            let rendered = match render(&tracked.gaussians(), std::slice::from_ref(&camera), &options) {
+                Ok(rendered) => rendered,
+                Err(e) => return Found { broken: Some(format!("refused: {e}")), ..Found::default() },
+            };
+            let gradients = rendered.color.clone().sum().backward();
+            let got = host(rendered.color);
+            let scene = double(&rows);
+            let expected = reference::render(&scene, &camera, &options, Cutoff::Hard);
+            let banded = reference::banded(&scene, &camera, &options);
+            let apart = |(pixel, e): (usize, &reference::Pixel<f64>)| -> f64 {
+                (0..3).map(|c| (f64::from(got[3 * pixel + c]) - e.color[c]).abs()).fold(0.0, f64::max)
+            };
+            let open = expected.iter().enumerate().filter(|(pixel, _)| !banded[*pixel]);
+            let worst = open.map(apart).map(nan_is_worst).fold(0.0, f64::max);
+            let means = host(tracked.parts[0].grad(&gradients).expect("tracked"));
+            let last = means[3 * 9_000..].iter().fold(0.0_f32, |most, v| most.max(v.abs()));
+            Found { value: Some(worst), gradient: Some(f64::from(last)), ..Found::default() }
+                .must(means.iter().all(|v| v.is_finite()), "a gradient is not finite")
+        }),
+    }
+}
+
+/// The largest image that is accepted, compared in a patch; one pixel more is refused.
+fn largest_image() -> Case {
+    Case {
+        area: "Splats",
+        input: "image of 8192×8192, and beyond the largest side".into(),
+        holds:
+            "as the oracle in a patch, or refused for want of memory; more than the largest side is refused"
+                .into(),
+        value_limit: VALUES,
+        gradient_limit: 0.0,
+        once: false,
+        run: Box::new(|device| {
+            let options = RenderOptions::inria();
+            let rows = people();
+            let tracked = Tracked::new(&rows, device);
+            let plain = |t: &Tensor<2>| t.clone().detach().inner();
+            let [means, rotations, scales, colors] = tracked.parts.each_ref().map(plain);
+            let opacities = tracked.opacities.clone().detach().inner();
+            let gaussians = Gaussians::new(means, rotations, scales, opacities, colors).expect("fits");
+            let beyond = camera(MAX_SIDE + 1, 8, 30.0);
+            let refused = render(&gaussians, &[beyond], &options).is_err();
+            let large = camera(8192, 8192, 8000.0);
+            let (x, y) = (4300_u32, 4000_u32);
+            let color = match render(&gaussians, &[large], &options) {
+                Ok(rendered) => rendered.color,
+                Err(e @ (SplatError::Memory { .. } | SplatError::TooManyIntersections { .. })) => {
+                    return Found { skipped: Some(format!("refused: {e}")), ..Found::default() };
+                }
+                Err(e) => return Found { broken: Some(format!("refused: {e}")), ..Found::default() },
+            };
+            const SIDE: u32 = 12;
+            let part = color.narrow(1, y as usize, SIDE as usize).narrow(2, x as usize, SIDE as usize);
+            let got = host(part);
+            let mut patch = camera(SIDE, SIDE, 8000.0);
+            patch.principal_point = large.principal_point - DVec2::new(f64::from(x), f64::from(y));
+            let scene = double(&rows);
+            let expected = reference::render(&scene, &patch, &options, Cutoff::Hard);
+            let banded = reference::banded(&scene, &patch, &options);
+            let mut worst = 0.0_f64;
+            for (pixel, e) in expected.iter().enumerate().filter(|(pixel, _)| !banded[*pixel]) {
+                for c in 0..3 {
+                    worst = worst.max(nan_is_worst((f64::from(got[3 * pixel + c]) - e.color[c]).abs()));
+                }
+            }
+            Found { value: Some(worst), ..Found::default() }
+                .must(refused, "a side beyond the largest was accepted")
+        }),
+    }
+}
