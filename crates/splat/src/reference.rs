@@ -204,6 +204,17 @@ pub fn render<T: Number>(
     options: &RenderOptions,
     cutoff: Cutoff,
 ) -> Vec<Pixel<T>> {
+    pixels(scene, camera, options, cutoff, 0..camera.width * camera.height)
+}
+
+/// The same for some pixels, numbered row by row.
+pub fn pixels<T: Number>(
+    scene: &Scene<T>,
+    camera: &Camera,
+    options: &RenderOptions,
+    cutoff: Cutoff,
+    which: impl Iterator<Item = u32>,
+) -> Vec<Pixel<T>> {
     let mut splats: Vec<Splat<T>> =
         scene.gaussians.iter().filter_map(|g| splat(g, camera, options)).collect();
     // A stable sort: ties stay in input order.
@@ -213,7 +224,7 @@ pub fn render<T: Number>(
         let y = f64::from(at / camera.width) + 0.5;
         composite(&splats, [x, y], scene.background, options, cutoff)
     };
-    (0..camera.width * camera.height).map(pixel).collect()
+    which.map(pixel).collect()
 }
 
 /// Pixels so close to a cut-off (α = 1/255, T = 1e-4, α_max) that f32 may decide otherwise.

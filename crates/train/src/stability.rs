@@ -90,14 +90,21 @@ pub fn cases(many_steps: u64) -> Vec<Case> {
             run: Box::new(move |device| point_loss(count, device)),
         });
     }
-    for (name, a, b) in
-        [("equal", 0.3_f32, 0.3_f32), ("0 and 1", 0.0, 1.0), ("black", 0.0, 0.0), ("1 and 1", 1.0, 1.0)]
-    {
+    for (name, a, b) in [
+        ("equal", 0.3_f32, 0.3_f32),
+        ("0 and 1", 0.0, 1.0),
+        ("black", 0.0, 0.0),
+        ("1 and 1", 1.0, 1.0),
+        ("0.9 and 0.9", 0.9, 0.9),
+    ] {
         cases.push(Case {
             area: "Losses and optimiser",
             input: format!("SSIM and L1 of constant pictures, {name}"),
-            holds: "(2ab + C₁)/(a² + b² + C₁) away from the border, never above 1; gradient finite".into(),
-            value_limit: 2e-5,
+            // f32 keeps 6e-8 of E[x²] − E[x]², which is 1.3e-4 of C₂ for values near 1.
+            holds: "(2ab + C₁)/(a² + b² + C₁) away from the border but for f32's rounding of variances, 1.3e-4; never above 1; \
+                    gradient finite"
+                .into(),
+            value_limit: 1.3e-4,
             gradient_limit: 0.0,
             once: false,
             run: Box::new(move |device| constant_pictures(a, b, device)),
@@ -115,8 +122,9 @@ pub fn cases(many_steps: u64) -> Vec<Case> {
     cases.push(Case {
         area: "Losses and optimiser",
         input: "zero gradients, 1000 steps of AdamW and of Muon".into(),
-        holds: "weights finite, changed by their decay alone".into(),
-        value_limit: 1e-5,
+        // A rounding of the product in each of the steps.
+        holds: "weights finite, changed by their decay alone, but for 1000 roundings of f32".into(),
+        value_limit: 6e-5,
         gradient_limit: 0.0,
         once: false,
         run: Box::new(zero_gradients),
@@ -124,8 +132,9 @@ pub fn cases(many_steps: u64) -> Vec<Case> {
     cases.push(Case {
         area: "Losses and optimiser",
         input: format!("{many_steps} AdamW steps with gradients of 1e-12, 1e-20, 1e-30 and 1e3"),
-        holds: "weights as f64's, relative".into(),
-        value_limit: 2e-3,
+        // Adding a 10⁶th of a weight to it is rounded to 24 bits each time; the steps themselves are right.
+        holds: "weights as f64's, relative, but for the rounding of a million sums in f32: 1 %".into(),
+        value_limit: 1e-2,
         gradient_limit: 0.0,
         once: true,
         run: Box::new(move |_| many_adamw_steps(many_steps)),

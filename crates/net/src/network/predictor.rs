@@ -31,37 +31,38 @@ impl PointMap {
     }
 }
 
+/// Exponents beyond this leave f32's range; what a network says there is no depth, but must stay a number.
+const MAX_EXPONENT: f64 = 88.0;
+
 /// Raw x, y, z, confidence `[B, 4, H, W]` → point map: p = r / ‖r‖ · (e^‖r‖ − 1) (SNAPSNAP §2.2), or p = r where points are
 /// measured from anchors.
 pub fn activate(raw: Tensor<4>, config: &NetworkConfig) -> PointMap {
-    /// Below this ‖r‖ the direction is numerically meaningless.
-    const MIN_NORM: f64 = 1e-8;
     let [b, _, h, w] = raw.dims();
     let xyz = raw.clone().narrow(1, 0, 3).permute([0, 2, 3, 1]);
     let points = match config.anchor {
         Anchor::None => {
-            // The square root has no gradient at 0; below f32's reach of 1 nothing changes.
+            // The square root has no gradient at 0, where the factor beside r is 1.
             const MIN_SQUARE: f64 = 1e-30;
             let norm = xyz.clone().square().sum_dim(3).clamp_min(MIN_SQUARE).sqrt();
-            xyz / norm.clone().clamp_min(MIN_NORM) * expm1(norm)
+            xyz * growth(norm)
         }
         Anchor::Ray => xyz,
     };
     let conf = raw.narrow(1, 3, 1).reshape([b, h, w]);
     let conf = match config.conf_mode {
         ConfMode::Sigmoid => sigmoid(conf),
-        ConfMode::Exp => conf.exp() + 1.0,
+        ConfMode::Exp => conf.clamp_max(MAX_EXPONENT).exp() + 1.0,
     };
     PointMap { points, conf }
 }
 
-/// e^x − 1 for x ≥ 0, without the cancellation of `exp(x) − 1` near 0: a series for small x.
-fn expm1(x: Tensor<4>) -> Tensor<4> {
-    /// Where the series hands over: the first term left out, x⁷/5040, is 2e-7 of the sum here.
+/// (e^x − 1) / x for x > 0, without the cancellation of `exp(x) − 1` near 0: a series for small x.
+fn growth(x: Tensor<4>) -> Tensor<4> {
+    /// Where the series hands over: the first term left out, x⁶/5040, is 2e-7 of the sum here.
     const SMALL: f64 = 0.3;
-    let terms = [1.0 / 720.0, 1.0 / 120.0, 1.0 / 24.0, 1.0 / 6.0, 0.5, 1.0];
-    let series = terms.iter().fold(x.zeros_like(), |sum, &term| (sum + term) * x.clone());
-    let direct = x.clone().exp() - 1.0;
+    let terms = [1.0 / 720.0, 1.0 / 120.0, 1.0 / 24.0, 1.0 / 6.0, 0.5];
+    let series = terms.iter().fold(x.zeros_like(), |sum, &term| (sum + term) * x.clone()) + 1.0;
+    let direct = (x.clone().clamp_max(MAX_EXPONENT).exp() - 1.0) / x.clone().clamp_min(SMALL);
     direct.mask_where(x.lower_elem(SMALL), series)
 }
 
