@@ -95,6 +95,26 @@ pub struct Setting {
     pub preset: Option<Preset>,
     /// Whether splats smaller than a pixel keep their weight.
     pub antialiased: Option<bool>,
+    /// A scene: settings of one scene are compared with the one of them that leaves nothing out.
+    pub scene: Option<String>,
+    /// What is left out, for people; unset: nothing.
+    pub omits: Option<String>,
+    /// Only these people; unset: the first ones.
+    pub only: Option<Vec<String>>,
+    /// Views that go in, as in an evaluation.
+    pub inputs: Option<Vec<usize>>,
+    /// Fit the Gaussians to the photographs afterwards.
+    pub tune: Option<Tune>,
+}
+
+/// What is fitted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Tune {
+    /// Every parameter.
+    All,
+    /// Colours alone.
+    Colors,
 }
 
 impl Setting {
@@ -114,6 +134,11 @@ impl Setting {
             supersampling: self.supersampling.or(base.supersampling),
             preset: self.preset.or(base.preset),
             antialiased: self.antialiased.or(base.antialiased),
+            scene: self.scene.or(base.scene),
+            omits: self.omits.or(base.omits),
+            only: self.only.or(base.only),
+            inputs: self.inputs.or(base.inputs),
+            tune: self.tune.or(base.tune),
         }
     }
 }
@@ -145,7 +170,8 @@ impl BenchConfig {
     /// Names of all settings in the order of the report, the model as it is first.
     pub fn names(&self) -> Vec<String> {
         let mut named: Vec<(&String, &Setting)> = self.settings.iter().collect();
-        named.sort_by_key(|(name, setting)| (setting.knob.clone(), (*name).clone()));
+        let nothing = |setting: &Setting| (setting.scene.clone(), setting.omits.is_some());
+        named.sort_by_key(|(name, setting)| (nothing(setting), setting.knob.clone(), (*name).clone()));
         std::iter::once(AS_IT_IS.to_owned()).chain(named.into_iter().map(|(name, _)| name.clone())).collect()
     }
 

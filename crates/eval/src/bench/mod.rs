@@ -3,6 +3,7 @@
 pub mod config;
 mod oracle;
 pub mod report;
+mod tune;
 
 use std::time::{Duration, Instant};
 
@@ -12,7 +13,7 @@ use snapsnap_net::weights::WeightFile;
 use snapsnap_splat::{Camera, ply};
 
 use crate::EvalError;
-use crate::evaluate::config::{EvalConfig, Protocol};
+use crate::evaluate::config::{DataSection, EvalConfig, Protocol};
 use crate::evaluate::model::{Leave, Model};
 use crate::evaluate::person::{People, photograph};
 use crate::evaluate::{Contestant, evaluate, rendered};
@@ -30,6 +31,14 @@ pub struct Measured {
     pub name: String,
     /// What it turns.
     pub knob: Option<String>,
+    /// The scene that it belongs to, if it is about one.
+    pub scene: Option<String>,
+    /// What is left out.
+    pub omits: Option<String>,
+    /// What ran, what was left out and why, in its own words.
+    pub plan: Vec<String>,
+    /// Seconds of a step of fitting the Gaussians to the photographs, p50.
+    pub tuning: Option<f64>,
     /// In words.
     pub device: String,
     /// Reconstructions that were timed.
@@ -74,10 +83,12 @@ pub fn measure(
     lpips: Option<&Lpips>,
     most_used: &dyn Fn() -> Option<u64>,
 ) -> Result<Measured, EvalError> {
-    let data = crate::evaluate::config::DataSection { subjects: config.bench.people, ..config.data.clone() };
+    let mut data = DataSection { subjects: config.bench.people, ..config.data.clone() };
+    data.only.extend(setting.only.clone().unwrap_or_default());
     let folder =
         config.data.folders.first().ok_or_else(|| EvalError::Empty("there is no data set".into()))?;
     let mut eval = EvalConfig { data, ..EvalConfig::default() };
+    eval.views.inputs = setting.inputs.clone().unwrap_or_default();
     eval.views.resolution = config.bench.resolution;
     eval.views.supersampling = setting.supersampling.unwrap_or(2);
     eval.views.preset = setting.preset.unwrap_or_default();
@@ -93,7 +104,8 @@ pub fn measure(
     let mut modules: Vec<(String, f64)> = Vec::new();
     let start = Instant::now();
     let leave = Leave {
-        sides: setting.sides.unwrap_or(true),
+        // Scenes of more than two photographs have no unseen sides.
+        sides: setting.sides.unwrap_or(eval.views.inputs.len() <= 2),
         side_colors: setting.side_colors.unwrap_or(true),
         stride: setting.stride.unwrap_or(1),
         min_opacity: setting.min_opacity.unwrap_or(0.0),
@@ -135,12 +147,19 @@ pub fn measure(
         }
         made = Some(run);
     }
-    let made = made.expect("at least one run");
+    let mut made = made.expect("at least one run");
     modules.extend(parts.iter().map(|(name, times)| ((*name).to_owned(), p(times, 0.5))));
-    let memory = most_used();
     if made.gaussians.is_empty() {
         return Err(EvalError::Empty("no Gaussian came out".into()));
     }
+    let mut tuning = None;
+    if let Some(what) = setting.tune {
+        let steps = tune::STEPS.min(20 * config.bench.runs);
+        let (tuned, times) = tune::fit(&made.gaussians, &people, (first, &inputs, &item), what, steps)?;
+        made.gaussians = tuned;
+        tuning = Some(p(&times, 0.5));
+    }
+    let memory = most_used();
     let start = Instant::now();
     let file = std::env::temp_dir().join(format!("snapsnap-bench-{}.ply", std::process::id()));
     let written = ply::write(&made.gaussians, &file);
@@ -160,9 +179,11 @@ pub fn measure(
     let options = eval.views.render_options();
     let patch = patch(&camera.resized(side as u32, side as u32), config.bench.oracle);
     let (splat_error, cutoff_error) = oracle::errors(&made.gaussians, &patch, &options)?;
-    let gaussians = made.gaussians.len();
-    drop(made);
-    let contestants = [Contestant::model(name, model)];
+    let (gaussians, plan) = (made.gaussians.len(), made.plan);
+    let contestants = match setting.tune {
+        Some(_) => [Contestant::fixed(name, made.gaussians)],
+        None => [Contestant::model(name, model)],
+    };
     let outcome = evaluate(&eval, std::slice::from_ref(&people), &contestants, lpips, &|_, _| ());
     let judged = &outcome.judged[0];
     let scores: Vec<Score> = judged.rows.iter().map(|row| row.scores[0]).collect();
@@ -175,6 +196,10 @@ pub fn measure(
     Ok(Measured {
         name: name.into(),
         knob: setting.knob.clone(),
+        scene: setting.scene.clone(),
+        omits: setting.omits.clone(),
+        plan,
+        tuning,
         device: device_name.into(),
         runs: config.bench.runs,
         p50: p(&times, 0.5),
@@ -236,6 +261,10 @@ mod tests {
         Measured {
             name: String::new(),
             knob: None,
+            scene: None,
+            omits: None,
+            plan: Vec::new(),
+            tuning: None,
             device: String::new(),
             runs: 1,
             p50,

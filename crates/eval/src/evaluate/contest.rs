@@ -37,6 +37,7 @@ enum Means {
     Billboard(Device),
     TruePoints(Device),
     Mean(MeanPictures),
+    Fixed(Gaussians),
 }
 
 /// What a contestant has to show of a person.
@@ -82,6 +83,11 @@ impl Contestant {
     /// The mean picture of people to train on.
     pub fn mean(pictures: MeanPictures) -> Self {
         Self { name: "mean_picture".into(), means: Means::Mean(pictures) }
+    }
+
+    /// Gaussians of one person (world frame), whoever is looked at.
+    pub fn fixed(name: &str, gaussians: Gaussians) -> Self {
+        Self { name: name.into(), means: Means::Fixed(gaussians) }
     }
 
     /// What it is to the report.
@@ -142,6 +148,7 @@ impl Contestant {
                 let made = true_points(&item.images, inputs.len(), &points, &valid, item.side, front, device);
                 made.map(plain).ok_or_else(nothing)
             }
+            Means::Fixed(gaussians) => Ok(plain(gaussians.clone())),
             Means::Mean(_) => Ok(Shown { gaussians: None, points: Vec::new(), lost: 0, time: None }),
         }
     }
