@@ -5,6 +5,7 @@ mod bench;
 mod compare;
 mod meshes;
 mod people;
+mod stability;
 
 use std::fs;
 use std::path::{Path, PathBuf};

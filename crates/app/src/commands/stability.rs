@@ -1,16 +1,21 @@
 //! `snapsnap stability`.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use burn::tensor::Device;
 use clap::Args;
 use snapsnap_eval::stability::{Case, Row, networks, report, run as run_case, splats};
+use snapsnap_mesh::view::{Renderer, ViewOptions};
+use snapsnap_net::Photograph;
+use snapsnap_people::synth;
+use snapsnap_splat::Camera;
 use snapsnap_train::stability as training;
 
+use super::ConfigArguments;
 use crate::failure::Failure;
 use crate::progress::Progress;
 use crate::report::{ReportFolder, header};
-use crate::{device, say};
+use crate::{device, say, weights};
 
 /// What a report consists of.
 const FILES: [&str; 2] = ["report.json", "report.md"];
@@ -23,6 +28,9 @@ pub struct Arguments {
     /// Devices to try [default: every one there is].
     #[arg(long, value_name = "DEVICE", num_args = 1..)]
     device: Vec<String>,
+    /// Also compare what these weights give in 16 bits with what they give in 32.
+    #[arg(long, value_name = "FILE|DIR")]
+    weights: Option<PathBuf>,
     /// Only cases with this in their area or input.
     #[arg(long, value_name = "TEXT")]
     only: Option<String>,
@@ -34,6 +42,23 @@ pub struct Arguments {
     output: PathBuf,
 }
 
+/// A made person from the front and the back, on a canvas of so many pixels.
+fn photographs(side: usize) -> [Photograph; 2] {
+    let mesh = synth::person("stability");
+    let renderer = Renderer::new(&mesh).expect("a made person can be drawn");
+    [0.0, 180.0].map(|yaw| {
+        let view = renderer.draw(&Camera::orbit_at_yaw_degrees(yaw, side as u32), &ViewOptions::default());
+        // Colours come multiplied by coverage; networks see [−1, 1] times the mask.
+        let rgb = (0..3)
+            .flat_map(|c| {
+                view.color.iter().zip(&view.alpha).map(move |(color, alpha)| 2.0 * color[c] - alpha)
+            })
+            .collect();
+        let valid = view.alpha.iter().map(|alpha| *alpha >= 0.5).collect();
+        Photograph { rgb, mask: view.alpha, valid }
+    })
+}
+
 pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let devices = match arguments.device.as_slice() {
         [] => device::all(),
@@ -41,6 +66,11 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     };
     let mut cases = splats::cases();
     cases.extend(networks::cases());
+    if let Some(path) = &arguments.weights {
+        let weights = weights::open(Some(path), &ConfigArguments { config: None, set: Vec::new() })?;
+        let photographs = photographs(weights.config.network.resolution);
+        cases.extend(networks::sixteen_bits(weights, photographs));
+    }
     cases.extend(training::cases(if arguments.quick { FEW } else { MANY }));
     if let Some(text) = &arguments.only {
         cases.retain(|case| case.area.contains(text) || case.input.contains(text));
@@ -49,7 +79,8 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
         let text = arguments.only.as_deref().unwrap_or_default();
         return Err(Failure::Input(format!("--only {text}: no case has that in its area or input")));
     }
-    let folder = ReportFolder::new(&arguments.output, &FILES, &[])?;
+    let inputs: Vec<&Path> = arguments.weights.iter().map(PathBuf::as_path).collect();
+    let folder = ReportFolder::new(&arguments.output, &FILES, &inputs)?;
     let rounds: Vec<(&Case, &Device)> = cases
         .iter()
         .flat_map(|case| {

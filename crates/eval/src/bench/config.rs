@@ -99,6 +99,8 @@ pub struct Setting {
     pub scene: Option<String>,
     /// What is left out, for people; unset: nothing.
     pub omits: Option<String>,
+    /// Another data set.
+    pub data: Option<PathBuf>,
     /// Only these people; unset: the first ones.
     pub only: Option<Vec<String>>,
     /// Views that go in, as in an evaluation.
@@ -136,6 +138,7 @@ impl Setting {
             antialiased: self.antialiased.or(base.antialiased),
             scene: self.scene.or(base.scene),
             omits: self.omits.or(base.omits),
+            data: self.data.or(base.data),
             only: self.only.or(base.only),
             inputs: self.inputs.or(base.inputs),
             tune: self.tune.or(base.tune),

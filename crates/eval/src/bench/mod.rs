@@ -243,8 +243,13 @@ const BETTER: f64 = 0.02;
 /// Which settings others beat: no slower, no worse, and in one of the two better by more than noise. By place, the place of the
 /// best of those that beat it.
 pub fn dominated(measured: &[Measured]) -> Vec<Option<usize>> {
+    // Scenes are other people, whose errors are not to be compared.
     let beats = |a: &Measured, b: &Measured| {
-        a.p50 <= b.p50 && a.psnr >= b.psnr && (a.p50 < (1.0 - FASTER) * b.p50 || a.psnr > b.psnr + BETTER)
+        a.scene.is_none()
+            && b.scene.is_none()
+            && a.p50 <= b.p50
+            && a.psnr >= b.psnr
+            && (a.p50 < (1.0 - FASTER) * b.p50 || a.psnr > b.psnr + BETTER)
     };
     let by = |b: &Measured| {
         let better = measured.iter().enumerate().filter(|(_, a)| beats(a, b));

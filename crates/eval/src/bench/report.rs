@@ -123,6 +123,7 @@ impl Bench<'_> {
                 by.map_or(String::new(), |place| escaped(&self.measured[place].name)),
             );
         }
+        self.scenes(&mut text);
         self.modules(&mut text);
         for picture in pictures {
             let _ = writeln!(text, "\n![{picture}]({picture})");
@@ -137,6 +138,55 @@ impl Bench<'_> {
             }
         }
         text
+    }
+
+    /// What each omission saves and costs, beside the setting of its scene that leaves nothing out.
+    fn scenes(&self, text: &mut String) {
+        let mut scenes: Vec<&String> = self.measured.iter().filter_map(|m| m.scene.as_ref()).collect();
+        scenes.dedup();
+        for scene in scenes {
+            let of_scene = || self.measured.iter().filter(|m| m.scene.as_ref() == Some(scene));
+            let Some(whole) = of_scene().find(|m| m.omits.is_none()) else { continue };
+            let _ = writeln!(
+                text,
+                "\n## Scene: {}\n\n| left out | time, ms | saved | memory, MB | saved | PSNR, dB | lost | points, mm | more | Gaussians |\n\
+                 |---|---|---|---|---|---|---|---|---|---|",
+                escaped(scene)
+            );
+            // Where something is fitted, a step of that is what takes time.
+            let time = |m: &Measured| 1e3 * m.tuning.unwrap_or(m.p50);
+            let share = |now: f64, before: f64| format!("{:.0} %", 100.0 * (1.0 - now / before));
+            let megabytes = |m: &Measured| m.memory.map(|bytes| bytes as f64 / 1e6);
+            for m in of_scene() {
+                let is_whole = m.omits.is_none();
+                let or_nothing = |text: String| if is_whole { String::new() } else { text };
+                let memory = megabytes(m).zip(megabytes(whole));
+                let points = m.points_mm.zip(whole.points_mm);
+                let _ = writeln!(
+                    text,
+                    "| {} | {:.1} | {} | {} | {} | {:.2} | {} | {} | {} | {} |",
+                    escaped(m.omits.as_deref().unwrap_or("nothing")),
+                    time(m),
+                    or_nothing(share(time(m), time(whole))),
+                    memory.map_or("n/a".into(), |(now, _)| format!("{now:.0}")),
+                    or_nothing(memory.map_or("n/a".into(), |(now, before)| share(now, before))),
+                    m.psnr,
+                    or_nothing(format!("{:.2}", whole.psnr - m.psnr)),
+                    points.map_or("n/a".into(), |(now, _)| format!("{now:.1}")),
+                    or_nothing(points.map_or("n/a".into(), |(now, before)| format!("{:.1}", now - before))),
+                    m.gaussians
+                );
+            }
+            for m in of_scene() {
+                let omits = m.omits.as_deref().unwrap_or("nothing");
+                let _ = writeln!(
+                    text,
+                    "\nWhat ran with {} left out: {}.",
+                    escaped(omits),
+                    escaped(&m.plan.join("; "))
+                );
+            }
+        }
     }
 
     fn modules(&self, text: &mut String) {
@@ -211,7 +261,7 @@ impl Bench<'_> {
             self.measured.iter().zip(&by).filter(|(_, by)| by.is_none()).map(|(m, _)| at(m)).collect();
         front.sort_by(|a, b| a.0.total_cmp(&b.0));
         let mut series = vec![Series { name: "Pareto front".into(), points: front, line: true }];
-        for m in self.measured {
+        for m in self.measured.iter().filter(|m| m.scene.is_none()) {
             series.push(Series { name: m.name.clone(), points: vec![at(m)], line: false });
         }
         let axes = Axes { caption: "Error against run time", x: "p50, ms", y: "PSNR, masked, dB", log: true };

@@ -101,10 +101,16 @@ impl Model {
             parts.push(placed(self.config(), self.thinned(&made, side), &to_world));
             lost += made.lost;
             modules.extend(made.times.iter().copied());
-            plan.extend(made.plan.iter().cloned());
+            // All pairs are treated alike.
+            if first == 0 {
+                plan.clone_from(&made.plan);
+            }
             if count == 1 {
                 maps = maps_of(&made, side);
             }
+        }
+        if count > 1 {
+            plan.insert(0, format!("{count} pairs of photographs, the first one"));
         }
         Made { gaussians: joined(parts), maps, lost, time: start.elapsed(), modules, plan }
     }

@@ -1,9 +1,14 @@
 //! Networks at the ends of what numbers hold.
 
+use std::sync::Arc;
+
 use burn::tensor::{DType, Device, Tensor, TensorData};
 use snapsnap_net::config::{Anchor, ConfMode, NetworkConfig, RegressorConfig};
 use snapsnap_net::network::activate;
+use snapsnap_net::precision::Precision;
 use snapsnap_net::regressor::{Attributes, Regressor, Statistics};
+use snapsnap_net::weights::WeightFile;
+use snapsnap_net::{Photograph, Reconstructor};
 use snapsnap_ops::{Rope, host, rotary_attention};
 
 use super::{Case, Found};
@@ -65,6 +70,67 @@ pub fn cases() -> Vec<Case> {
         run: Box::new(constant_channels),
     });
     cases
+}
+
+/// What a trained predictor makes of a person in 16 bits beside what it makes in 32: `photographs` are on its canvas. Fails where
+/// a tenth of the points are further off than a tenth of what such networks err by (docs/training.md: 30 mm).
+pub fn sixteen_bits(weights: WeightFile, photographs: [Photograph; 2]) -> Vec<Case> {
+    let shared = Arc::new((weights, photographs));
+    let case = |precision: Precision| {
+        let shared = shared.clone();
+        Case {
+            area: "Networks",
+            input: format!("the given weights in {} beside f32", precision.name()),
+            holds: "nine tenths of the front's and the back's points within 3 mm (values: metres); finite"
+                .into(),
+            value_limit: 3e-3,
+            gradient_limit: 0.0,
+            once: false,
+            run: Box::new(move |device| in_precision(&shared, precision, device)),
+        }
+    };
+    [Precision::F16, Precision::Bf16].map(case).into()
+}
+
+fn in_precision(
+    (weights, [front, back]): &(WeightFile, [Photograph; 2]),
+    precision: Precision,
+    device: &Device,
+) -> Found {
+    if !device.supports_dtype(precision.dtype()) {
+        let skipped = Some(format!("the device does not compute in {}", precision.name()));
+        return Found { skipped, ..Found::default() };
+    }
+    let maps = |precision: Precision| -> Result<(Vec<f32>, Vec<Vec<bool>>), Found> {
+        let model = Reconstructor::load(weights, device)
+            .map_err(|e| Found { broken: Some(e.to_string()), ..Found::default() })?;
+        let made = model.in_precision(precision).reconstruct(front, back, &|_| ());
+        Ok((host(made.maps.points), made.valid))
+    };
+    let (whole, half) = match (maps(Precision::F32), maps(precision)) {
+        (Ok(whole), Ok(half)) => (whole, half.0),
+        (Err(found), _) | (_, Err(found)) => return found,
+    };
+    let (whole, valid) = whole;
+    let mut apart: Vec<f64> = (0..2)
+        .flat_map(|view| {
+            let area = valid[view].len();
+            let there = (0..area).filter(|i| valid[view][*i]).map(move |i| 3 * (view * area + i));
+            there.collect::<Vec<_>>()
+        })
+        .map(|at| {
+            let squares = (at..at + 3).map(|i| (f64::from(whole[i]) - f64::from(half[i])).powi(2));
+            squares.sum::<f64>().sqrt()
+        })
+        .collect();
+    apart.sort_by(f64::total_cmp);
+    let (Some(last), false) = (apart.last().copied(), apart.is_empty()) else {
+        return Found { broken: Some("no pixel is valid".into()), ..Found::default() };
+    };
+    let median = crate::statistics::quantile(&apart, 0.5);
+    let note = format!("median {:.2} mm, at most {:.2} mm", 1e3 * median, 1e3 * last);
+    Found { value: Some(crate::statistics::quantile(&apart, 0.9)), note, ..Found::default() }
+        .must(last.is_finite(), "a point is not finite")
 }
 
 fn tensor<const D: usize>(values: Vec<f32>, shape: [usize; D], device: &Device) -> Tensor<D> {
