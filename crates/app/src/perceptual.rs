@@ -44,14 +44,14 @@ impl Arguments {
             Some(why) => Err(Failure::Input(format!("--lpips: {why}"))),
         }
     }
+}
 
-    /// Why there is none, if there is none.
-    pub fn missing(&self, default: &Path) -> Option<String> {
-        match self.lpips.as_slice() {
-            [] => missing(default),
-            [folder] if folder.is_dir() => missing(folder),
-            _ => None,
-        }
+/// What LPIPS is computed with, or why there is none, for reports.
+pub fn describe(lpips: &Result<Lpips, String>) -> String {
+    match lpips {
+        Ok(network) if network.is_published() => "published weights".into(),
+        Ok(_) => "other weights than the published ones: not to be compared with other reports".into(),
+        Err(why) => format!("n/a ({why})"),
     }
 }
 

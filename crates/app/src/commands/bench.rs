@@ -102,13 +102,13 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
         let whys: Vec<String> = left_out.iter().map(|l| format!("{}: {}", l.name, l.why)).collect();
         return Err(Failure::Input(format!("nothing could be measured: {}", whys.join("; "))));
     }
-    let no_lpips = arguments.lpips.missing(&config.bench.lpips);
+    let lpips = measured[0].lpips_weights.clone();
     let device = measured[0].device.clone();
     let report = Bench {
         header: header(&device),
         measured: &measured,
         left_out: &left_out,
-        no_lpips,
+        lpips,
         training: &training,
     };
     let plots = report.plots();
@@ -190,7 +190,7 @@ fn one(arguments: &Arguments, config: &BenchConfig, name: &str) -> Result<(), Fa
         &setting,
         &weights,
         (&device, &described),
-        lpips.as_ref().ok(),
+        (lpips.as_ref().ok(), &perceptual::describe(&lpips)),
         &memory::most_used,
     )?;
     let value: Value = serde_json::to_value(measured).expect("a value");

@@ -106,17 +106,17 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let mut outcome = evaluate(&config, &sets, &contestants, lpips.as_ref().ok(), &done);
     drop(progress);
     outcome.left_out.splice(0..0, missing);
-    let no_lpips = lpips.as_ref().err();
+    let described = perceptual::describe(&lpips);
     let named = device::describe(&devices[0]);
     let shown = contestants.iter().find(|contestant| contestant.networks().is_some());
-    let ranked = report_of(&named, &config, &outcome, no_lpips).ranked(config.report.people);
+    let ranked = report_of(&named, &config, &outcome, &described).ranked(config.report.people);
     let mut people = None;
     if let Some(contestant) = shown.filter(|_| !ranked.is_empty()) {
         let (picture, mut left_out) = sheet(&config, &sets, contestant, &ranked);
         people = picture;
         outcome.left_out.append(&mut left_out);
     }
-    let report = report_of(&named, &config, &outcome, no_lpips);
+    let report = report_of(&named, &config, &outcome, &described);
     let by_view = report.by_view();
     let pictures: Vec<&str> = [(people.is_some(), "people.png"), (!by_view.is_empty(), "by_view.svg")]
         .into_iter()
@@ -136,13 +136,8 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     complete(&outcome.left_out)
 }
 
-fn report_of<'a>(
-    device: &str,
-    config: &'a EvalConfig,
-    outcome: &'a Outcome,
-    no_lpips: Option<&String>,
-) -> Evaluation<'a> {
-    Evaluation { header: header(device), config, outcome, no_lpips: no_lpips.cloned() }
+fn report_of<'a>(device: &str, config: &'a EvalConfig, outcome: &'a Outcome, lpips: &str) -> Evaluation<'a> {
+    Evaluation { header: header(device), config, outcome, lpips: lpips.into() }
 }
 
 /// What is left out is told, and is a failure.

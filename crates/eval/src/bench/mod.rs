@@ -60,6 +60,8 @@ pub struct Measured {
     pub ssim: Option<f64>,
     /// The same.
     pub lpips: Option<f64>,
+    /// What it was computed with, or why there is none.
+    pub lpips_weights: String,
     /// Mean distance of the predicted points from the true ones in the views where there are any, mm.
     pub points_mm: Option<f64>,
     /// Largest difference of a colour from the f64 oracle with the same cut-offs.
@@ -80,7 +82,7 @@ pub fn measure(
     setting: &Setting,
     weights: &WeightFile,
     (device, device_name): (&Device, &str),
-    lpips: Option<&Lpips>,
+    (lpips, lpips_weights): (Option<&Lpips>, &str),
     most_used: &dyn Fn() -> Option<u64>,
 ) -> Result<Measured, EvalError> {
     let mut data = DataSection { subjects: config.bench.people, ..config.data.clone() };
@@ -210,6 +212,7 @@ pub fn measure(
         psnr,
         ssim,
         lpips,
+        lpips_weights: lpips_weights.into(),
         points_mm: (!errors.is_empty()).then(|| errors.iter().sum::<f64>() / errors.len() as f64),
         splat_error,
         cutoff_error,
@@ -280,6 +283,7 @@ mod tests {
             psnr,
             ssim: None,
             lpips: None,
+            lpips_weights: String::new(),
             points_mm: None,
             splat_error: 0.0,
             cutoff_error: 0.0,

@@ -26,8 +26,8 @@ pub struct Bench<'a> {
     pub measured: &'a [Measured],
     /// Settings that could not be measured.
     pub left_out: &'a [LeftOut],
-    /// Why there is no LPIPS, if there is none.
-    pub no_lpips: Option<String>,
+    /// What LPIPS was computed with, or why there is none.
+    pub lpips: String,
     /// Trainings: name, and seconds and masked PSNR or point error of their validations.
     pub training: &'a [Training],
 }
@@ -78,8 +78,7 @@ impl Bench<'_> {
         report["settings"] = self.measured.iter().zip(&by).map(setting).collect();
         let curve = |t: &Training| json!({ "run": t.name, "what": t.what, "points": t.points });
         report["training"] = self.training.iter().map(curve).collect();
-        report["lpips"] =
-            json!(self.no_lpips.as_ref().map_or("published weights".into(), |why| format!("n/a ({why})")));
+        report["lpips"] = json!(self.lpips);
         report["left_out"] = json!(self.left_out);
         report
     }
@@ -94,7 +93,7 @@ impl Bench<'_> {
              * Errors: protocol `masked`; LPIPS: {}\n\
              * Splat error: largest difference of a colour from the f64 oracle; by cut-offs: what skipping α < 1/255, closing pixels and \
              the largest α change of it\n             * Dominated: another is no slower and no worse, and better by 3 % of the time or 0.02 dB\n",
-            self.no_lpips.as_ref().map_or("published weights".into(), |why| format!("n/a ({why})"))
+            self.lpips
         );
         let _ = writeln!(
             text,

@@ -7,7 +7,7 @@ use snapsnap_data::sample::TestItem;
 use snapsnap_splat::Gaussians;
 
 use super::model::Model;
-use super::person::{People, degrees, points};
+use super::person::{People, degrees, photograph, points};
 use crate::EvalError;
 use crate::baselines::{MeanPictures, billboard, true_points};
 use crate::pictures::Picture;
@@ -103,7 +103,7 @@ impl Contestant {
         if let Means::Model(_, model) = &self.means { Some(model) } else { None }
     }
 
-    /// What it makes of a person's photographs.
+    /// What it makes of a person's photographs; baselines have a canvas of so many pixels on each side.
     ///
     /// # Errors
     /// [`EvalError`] if files cannot be read, or nothing came out.
@@ -113,6 +113,7 @@ impl Contestant {
         row: usize,
         item: &TestItem,
         inputs: &[usize],
+        canvas: usize,
     ) -> Result<Shown, EvalError> {
         let nothing = || EvalError::Empty("no Gaussian came out".into());
         let plain = |gaussians| Shown { gaussians: Some(gaussians), points: Vec::new(), lost: 0, time: None };
@@ -127,25 +128,26 @@ impl Contestant {
                 Ok(Shown { gaussians, points, lost, time })
             }
             Means::Billboard(device) => {
-                let valid: Vec<bool> = item.masks.iter().map(|mask| *mask > 0.5).collect();
+                let (images, valid) = on_canvas(item, inputs.len(), canvas);
                 let cameras: Vec<_> = inputs.iter().map(|view| item.cameras[*view]).collect();
-                billboard(&item.images, &valid, item.side, &cameras, device).map(plain).ok_or_else(nothing)
+                billboard(&images, &valid.concat(), canvas, &cameras, device).map(plain).ok_or_else(nothing)
             }
             Means::TruePoints(device) => {
                 let mut views = inputs.to_vec();
                 if inputs.len() == 2 {
                     views.extend(sides(item, inputs[0]).map(|(view, _)| view));
                 }
-                let (points, valid) = people.test().points(row, &views)?;
-                let area = item.side * item.side;
-                let is_valid = |view: usize, i: usize| {
-                    let masked = view >= inputs.len() || item.masks[view * area + i] > 0.5;
-                    valid[view * area + i] > 0.5 && masked
+                let Some((points, there)) = points(people.test(), row, &views, item.side, canvas)? else {
+                    let message = format!("views of {}² give no points on a canvas of {canvas}²", item.side);
+                    return Err(EvalError::Empty(message));
                 };
-                let valid: Vec<Vec<bool>> =
-                    (0..views.len()).map(|view| (0..area).map(|i| is_valid(view, i)).collect()).collect();
+                let (images, mut valid) = on_canvas(item, inputs.len(), canvas);
+                valid.resize(views.len(), vec![true; canvas * canvas]);
+                for (valid, there) in valid.iter_mut().flatten().zip(there) {
+                    *valid &= there > 0.5;
+                }
                 let front = &item.cameras[inputs[0]];
-                let made = true_points(&item.images, inputs.len(), &points, &valid, item.side, front, device);
+                let made = true_points(&images, inputs.len(), &points, &valid, canvas, front, device);
                 made.map(plain).ok_or_else(nothing)
             }
             Means::Fixed(gaussians) => Ok(plain(gaussians.clone())),
@@ -160,6 +162,13 @@ impl Contestant {
             _ => Err(EvalError::Empty("there is nothing to render".into())),
         }
     }
+}
+
+/// The photographs `[N,3,S,S]` on a canvas, and which of its pixels are the person's.
+fn on_canvas(item: &TestItem, count: usize, side: usize) -> (Vec<f32>, Vec<Vec<bool>>) {
+    let photographs = (0..count).map(|place| photograph(item, place, side));
+    let (images, valid): (Vec<_>, Vec<_>) = photographs.map(|photo| (photo.rgb, photo.valid)).unzip();
+    (images.concat(), valid)
 }
 
 /// The views nearest to 90° (right) and 270° (left) of the first photograph, and how far off they are in degrees.

@@ -163,7 +163,7 @@ fn one(
     };
     let mut shown: Vec<Option<contest::Shown>> = Vec::new();
     for (i, contestant) in contestants.iter().enumerate() {
-        let made = contestant.prepare(people, row, &item, &inputs);
+        let made = contestant.prepare(people, row, &item, &inputs, people.side(&config.views));
         let made = match made {
             Ok(made) => made,
             Err(e) => {
@@ -313,8 +313,8 @@ fn pictures(
     const WORST: f32 = 0.5;
     let inputs = people.inputs(&config.views, config.views.turns[0]);
     let item = people.test().sample(row, &inputs)?;
-    let shown = contestant.prepare(people, row, &item, &inputs)?;
     let side = people.side(&config.views);
+    let shown = contestant.prepare(people, row, &item, &inputs, side)?;
     let mut pictures = Vec::new();
     for view in &inputs[..2] {
         let (target, _) = people.target(row, *view, side)?;

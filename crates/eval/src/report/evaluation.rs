@@ -26,8 +26,8 @@ pub struct Evaluation<'a> {
     pub config: &'a EvalConfig,
     /// What was found.
     pub outcome: &'a Outcome,
-    /// Why there is no LPIPS, if there is none.
-    pub no_lpips: Option<String>,
+    /// What LPIPS was computed with, or why there is none.
+    pub lpips: String,
 }
 
 /// Means of each person's views, by person.
@@ -109,7 +109,7 @@ impl Evaluation<'_> {
         report["seconds"] = self.model().map_or(Value::Null, seconds_json);
         report["groups"] =
             Value::Object(self.groups().map(|(name, rows)| (name, group_json(&rows))).collect());
-        report["lpips"] = json!(self.lpips());
+        report["lpips"] = json!(self.lpips);
         report["left_out"] = json!(self.outcome.left_out);
         report
     }
@@ -127,11 +127,6 @@ impl Evaluation<'_> {
             "views": model.rows.len(),
             "subjects": people.iter().map(subject).collect::<Vec<_>>(),
         })
-    }
-
-    /// What stands in the place of LPIPS, or that it is there.
-    fn lpips(&self) -> String {
-        self.no_lpips.as_ref().map_or("published weights".into(), |why| format!("n/a ({why})"))
     }
 
     /// Figures of the people of each list, by contestant and protocol.
@@ -162,7 +157,7 @@ impl Evaluation<'_> {
     /// `report.md`; `pictures` are files beside it.
     pub fn markdown(&self, pictures: &[&str]) -> String {
         let mut text = self.header.markdown("Evaluation");
-        let _ = writeln!(text, "* LPIPS: {}", self.lpips());
+        let _ = writeln!(text, "* LPIPS: {}", self.lpips);
         let people = self.outcome.people.len();
         let _ = writeln!(
             text,
