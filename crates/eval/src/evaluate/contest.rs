@@ -33,11 +33,11 @@ pub struct Contestant {
 }
 
 enum Means {
-    Model(Kind, Model),
+    Model(Kind, Box<Model>),
     Billboard(Device),
     TruePoints(Device),
     Mean(MeanPictures),
-    Fixed(Gaussians),
+    Fixed(Box<Gaussians>),
 }
 
 /// What a contestant has to show of a person.
@@ -62,12 +62,12 @@ impl Shown {
 impl Contestant {
     /// What the report is about.
     pub fn model(name: &str, model: Model) -> Self {
-        Self { name: name.into(), means: Means::Model(Kind::Model, model) }
+        Self { name: name.into(), means: Means::Model(Kind::Model, Box::new(model)) }
     }
 
     /// What it is compared with.
     pub fn other(name: &str, model: Model) -> Self {
-        Self { name: name.into(), means: Means::Model(Kind::Other, model) }
+        Self { name: name.into(), means: Means::Model(Kind::Other, Box::new(model)) }
     }
 
     /// The photographs as cut-outs.
@@ -87,7 +87,7 @@ impl Contestant {
 
     /// Gaussians of one person (world frame), whoever is looked at.
     pub fn fixed(name: &str, gaussians: Gaussians) -> Self {
-        Self { name: name.into(), means: Means::Fixed(gaussians) }
+        Self { name: name.into(), means: Means::Fixed(Box::new(gaussians)) }
     }
 
     /// What it is to the report.
@@ -150,7 +150,7 @@ impl Contestant {
                 let made = true_points(&images, inputs.len(), &points, &valid, canvas, front, device);
                 made.map(plain).ok_or_else(nothing)
             }
-            Means::Fixed(gaussians) => Ok(plain(gaussians.clone())),
+            Means::Fixed(gaussians) => Ok(plain(gaussians.as_ref().clone())),
             Means::Mean(_) => Ok(Shown { gaussians: None, points: Vec::new(), lost: 0, time: None }),
         }
     }

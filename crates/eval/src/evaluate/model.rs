@@ -128,8 +128,8 @@ impl Model {
             made.valid.iter().flat_map(|valid| (0..valid.len()).filter(|i| valid[*i])).collect();
         // Where Gaussians were lost, what is left has no known pixels: every so many-th goes on.
         let on_grid = |row: usize| match pixels.len() == gaussians.len() {
-            true => pixels[row] / side % stride == 0 && pixels[row] % side % stride == 0,
-            false => row % (stride * stride) == 0,
+            true => [pixels[row] / side, pixels[row] % side].iter().all(|at| at.is_multiple_of(stride)),
+            false => row.is_multiple_of(stride * stride),
         };
         let opacities = host(gaussians.opacities.clone());
         let keep = (0..gaussians.len()).filter(|row| on_grid(*row) && opacities[*row] >= min_opacity);

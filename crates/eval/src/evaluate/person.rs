@@ -139,6 +139,9 @@ pub fn photograph(item: &TestItem, place: usize, side: usize) -> Photograph {
     Photograph { rgb, mask, valid }
 }
 
+/// Points `[V,S,S,3]` and where there are any `[V,S,S]`.
+pub type Points = (Vec<f32>, Vec<f32>);
+
 /// Points that some views see, on a canvas of `side` pixels where that is a whole part of the stored side (`None` where it
 /// is not): `[V,S,S,3]` metres in the first view's frame, and where there are any `[V,S,S]`. A pixel of the canvas holds the
 /// mean of the points in it, if there are any in half of it or more.
@@ -148,7 +151,7 @@ pub fn points(
     views: &[usize],
     stored: usize,
     side: usize,
-) -> Result<Option<(Vec<f32>, Vec<f32>)>, EvalError> {
+) -> Result<Option<Points>, EvalError> {
     if !stored.is_multiple_of(side) {
         return Ok(None);
     }

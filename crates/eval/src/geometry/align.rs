@@ -117,9 +117,9 @@ fn largest_eigenvector(mut a: [[f64; 4]; 4]) -> [f64; 4] {
             for row in &mut a {
                 (row[p], row[q]) = (c * row[p] - s * row[q], s * row[p] + c * row[q]);
             }
-            for column in 0..4 {
-                let (x, y) = (a[p][column], a[q][column]);
-                (a[p][column], a[q][column]) = (c * x - s * y, s * x + c * y);
+            let (rows, others) = a.split_at_mut(q);
+            for (x, y) in rows[p].iter_mut().zip(&mut others[0]) {
+                (*x, *y) = (c * *x - s * *y, s * *x + c * *y);
             }
             for row in &mut vectors {
                 (row[p], row[q]) = (c * row[p] - s * row[q], s * row[p] + c * row[q]);
