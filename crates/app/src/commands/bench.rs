@@ -11,7 +11,7 @@ use snapsnap_eval::bench::{Measured, dominated, measure};
 use snapsnap_eval::evaluate::LeftOut;
 use snapsnap_splat::file;
 
-use super::ConfigArguments;
+use super::{ConfigArguments, outside_data};
 use crate::failure::Failure;
 use crate::progress::Progress;
 use crate::report::{ReportFolder, header};
@@ -76,6 +76,8 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
         return one(arguments, &config, name);
     }
     let output = arguments.output.as_deref().expect("clap asks for it");
+    let own = config.settings.values().filter_map(|setting| setting.data.as_ref());
+    outside_data(output, config.data.folders.iter().chain(own).map(PathBuf::as_path))?;
     let inputs: Vec<&Path> =
         std::iter::once(&arguments.config).chain(&config.model.weights).map(PathBuf::as_path).collect();
     let folder = ReportFolder::new(output, &FILES, &inputs)?;

@@ -14,11 +14,11 @@ use snapsnap_eval::report;
 use snapsnap_eval::report::evaluation::Evaluation;
 use snapsnap_splat::file;
 
-use super::ConfigArguments;
+use super::{ConfigArguments, outside_data};
 use crate::failure::Failure;
 use crate::progress::Progress;
 use crate::report::{ReportFolder, header};
-use crate::{device, perceptual, say, weights};
+use crate::{device, memory, perceptual, say, weights};
 
 /// Longest config that is read.
 const MOST: u64 = 1 << 20;
@@ -77,9 +77,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     }
     let open = |path: &PathBuf| People::open(path, &config.data, &config.views).map_err(Failure::from);
     let sets = config.data.folders.iter().map(open).collect::<Result<Vec<_>, _>>()?;
-    for set in &sets {
-        outside(&arguments.output, set)?;
-    }
+    outside_data(&arguments.output, sets.iter().map(|set| set.folder().root()))?;
     if let Some(meshes) = &arguments.mesh_dir {
         return judge_meshes(arguments, &config, &sets, meshes, quiet);
     }
@@ -204,17 +202,6 @@ fn config_of(arguments: &Arguments) -> Result<EvalConfig, Failure> {
     Ok(config)
 }
 
-/// Refuses a report in a data set's folder.
-fn outside(output: &Path, set: &People) -> Result<(), Failure> {
-    let whole = std::path::absolute(output).map_err(|e| Failure::cannot_write(output, &e))?;
-    let there = whole.ancestors().find_map(|above| above.canonicalize().ok());
-    let root = set.folder().root().canonicalize().ok();
-    if root.zip(there).is_some_and(|(root, there)| there.starts_with(root)) {
-        return Err(Failure::Input(format!("{}: lies in a data set", output.display())));
-    }
-    Ok(())
-}
-
 /// The model, what it is compared with, and the baselines; what cannot be loaded goes to `missing`.
 fn contestants(
     config: &EvalConfig,
@@ -229,6 +216,11 @@ fn contestants(
         let path = ablation.weights.as_deref().or(config.model.weights.as_deref());
         let set = [config.model.set.clone(), ablation.set.clone()].concat();
         let weights = weights::open(path, &ConfigArguments { config: None, set })?;
+        if device::is_cpu(device) {
+            let (config, parameters) = (&weights.config, weights.parameters());
+            let what = format!("a canvas of {0}×{0} pixels", config.network.resolution);
+            memory::check(&what, config.memory_needed(parameters), "choose a smaller `network.resolution`")?;
+        }
         let sides = ablation.sides && !has_known_sides(config);
         let leave = Leave { sides, side_colors: ablation.side_colors, ..Leave::default() };
         Ok(Model::load(&weights, device, leave)?)

@@ -62,6 +62,20 @@ pub fn check_outputs(outputs: &[&Path], inputs: &[&Path]) -> Result<(), Failure>
     Ok(())
 }
 
+/// Refuses a folder to write into that lies in a data set (roots), before it is made: an empty folder among a data set's would be
+/// a subject without pictures.
+pub fn outside_data<'a>(path: &Path, roots: impl IntoIterator<Item = &'a Path>) -> Result<(), Failure> {
+    let whole = std::path::absolute(path).map_err(|e| Failure::cannot_write(path, &e))?;
+    let there = whole.ancestors().find_map(|above| above.canonicalize().ok());
+    for root in roots {
+        let root = root.canonicalize().ok();
+        if root.zip(there.as_ref()).is_some_and(|(root, there)| there.starts_with(root)) {
+            return Err(Failure::Input(format!("{}: lies in a data set", path.display())));
+        }
+    }
+    Ok(())
+}
+
 /// Where a file is or will be, however its path is spelled.
 fn place(path: &Path) -> PathBuf {
     let path = file::target_of(path);

@@ -195,12 +195,13 @@ fn one(
         (0..people.views()).filter(|view| wanted(view) && !inputs.contains(view)).collect();
     let compare = |view: &usize| compare(config, at, &item, *view, (contestants, &shown), lpips);
     // A device of its own does one thing at a time.
-    let found: Vec<Result<Vec<Scored>, EvalError>> = if shown.iter().flatten().all(contest::Shown::is_on_cpu)
-    {
-        compared.par_iter().map(compare).collect()
-    } else {
-        compared.iter().map(compare).collect()
-    };
+    let is_on_cpu = shown.iter().flatten().all(contest::Shown::is_on_cpu);
+    let most = if is_on_cpu { at_once(people.side(&config.views) * config.views.supersampling) } else { 1 };
+    let found = compared.chunks(most).flat_map(|views| match views {
+        [view] => vec![compare(view)],
+        views => views.par_iter().map(compare).collect(),
+    });
+    let found: Vec<Result<Vec<Scored>, EvalError>> = found.collect();
     for (view, found) in compared.into_iter().zip(found) {
         let scored = match found {
             Ok(scored) => scored,
@@ -217,6 +218,12 @@ fn one(
             }
         }
     }
+}
+
+/// How many pictures of this side are worked on at once, so that memory stays flat: 64 million pixels, some 3 GB.
+pub(crate) fn at_once(side: usize) -> usize {
+    const PIXELS: usize = 1 << 26;
+    (PIXELS / (side * side).max(1)).clamp(1, rayon::current_num_threads())
 }
 
 /// A contestant's place, and its scores by protocol.

@@ -4,6 +4,7 @@ use glam::DVec3;
 use rayon::prelude::*;
 use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
 
+use super::at_once;
 use super::person::{People, degrees};
 use crate::EvalError;
 use crate::geometry::{Chamfer, chamfer, consistency, normals, points};
@@ -62,7 +63,12 @@ impl Surface {
             });
             Ok((kept, normals))
         };
-        let found: Vec<_> = cameras.par_iter().enumerate().map(of_view).collect::<Result<_, EvalError>>()?;
+        let numbered: Vec<(usize, &Camera)> = cameras.iter().enumerate().collect();
+        let mut found = Vec::new();
+        for views in numbered.chunks(at_once(people.folder().description().resolution as usize)) {
+            let part: Result<Vec<_>, EvalError> = views.par_iter().map(|view| of_view(*view)).collect();
+            found.extend(part?);
+        }
         let (mut all, mut views) = (Vec::new(), Vec::new());
         for ((kept, normals), camera) in found.into_iter().zip(cameras) {
             all.extend(kept);

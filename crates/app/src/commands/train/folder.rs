@@ -9,6 +9,7 @@ use snapsnap_splat::file;
 use snapsnap_train::config::TrainConfig;
 use snapsnap_train::run::{BEST, CONFIG, LAST, STATE};
 
+use super::super::outside_data;
 use super::Arguments;
 use crate::failure::Failure;
 
@@ -51,20 +52,6 @@ fn read(path: &Path, overrides: &[String]) -> Result<TrainConfig, Failure> {
     Ok(TrainConfig::from_toml(&text, &path.display().to_string(), overrides)?)
 }
 
-/// Refuses a folder to write into that lies in a data set, before it is made: an empty folder among a data set's would be a
-/// subject without pictures.
-pub fn outside(path: &Path, data: &[Arc<Folder>]) -> Result<(), Failure> {
-    let whole = std::path::absolute(path).map_err(|e| Failure::cannot_write(path, &e))?;
-    let there = whole.ancestors().find_map(|above| above.canonicalize().ok());
-    for folder in data {
-        let root = folder.root().canonicalize().ok();
-        if root.zip(there.as_ref()).is_some_and(|(root, there)| there.starts_with(root)) {
-            return Err(Failure::Input(format!("{}: lies in a data set", path.display())));
-        }
-    }
-    Ok(())
-}
-
 /// The folder of a run, which nobody else writes into.
 pub struct RunFolder {
     path: PathBuf,
@@ -84,7 +71,7 @@ impl RunFolder {
         data: &[Arc<Folder>],
     ) -> Result<Self, Failure> {
         let wrong = |message: &str| Failure::Input(format!("{}: {message}", path.display()));
-        outside(path, data)?;
+        outside_data(path, data.iter().map(|folder| folder.root()))?;
         fs::create_dir_all(path).map_err(|e| Failure::cannot_write(path, &e))?;
         let lock = path.join("lock");
         let file = OpenOptions::new().create(true).truncate(false).write(true).open(&lock);

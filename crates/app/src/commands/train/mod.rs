@@ -19,6 +19,7 @@ use snapsnap_train::stage1::PointTask;
 use snapsnap_train::stage2::GaussianTask;
 use snapsnap_train::task::Task;
 
+use super::outside_data;
 use crate::failure::Failure;
 use crate::{device, interrupt, memory, say};
 
@@ -100,7 +101,7 @@ pub fn stage2(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     };
     let weights = open(&start, &plan.config)?;
     if let Some(maps) = &plan.config.stage2.maps {
-        folder::outside(maps, &plan.folders)?;
+        outside_data(maps, plan.folders.iter().map(|folder| folder.root()))?;
     }
     let joint = plan.config.stage2.points > 0.0;
     let frozen = (!joint).then(|| weights.point_predictor(&plan.devices[0].clone().inner())).transpose()?;
