@@ -131,6 +131,13 @@ fn what_is_missing_or_damaged_is_named_and_the_rest_evaluated() {
     assert!(all[0].starts_with("against: nowhere.safetensors") && all[1].starts_with("0815: "), "{all:?}");
     assert!(said.contains("0815") && said.contains("nowhere.safetensors"), "{said}");
 
+    // A list that names nobody, and views that are none.
+    let (code, said) =
+        ended(&mut evaluate(people(), &report, &["--set", "groups.loose.subjects=[\"0815\"]"]));
+    assert!(code == Some(1) && said.contains("groups.loose"), "{said}");
+    let (code, said) = ended(&mut evaluate(people(), &report, &["--set", "views.compared=[0, 4]"]));
+    assert!(code == Some(1) && said.contains("no view is left"), "{said}");
+
     // A picture cut short, a view without its camera, a picture of another size.
     let data = copied(temporary.path());
     let png = data.join("test/img/0000/3.png");
@@ -214,6 +221,9 @@ fn what_cannot_be_evaluated_is_refused_by_name() {
     wrong(&["--set", "views.inputs=[0, 99]"], &["no view 99, of 8"]);
     wrong(&["--set", "views.inputs=[1, 1]"], &["twice"]);
     wrong(&["--set", "views.resolution=48"], &["64", "48"]);
+    wrong(&["--set", "ablations.model.sides=false"], &["`model`", "something else"]);
+    wrong(&["--set", "model.devices=[\"cpu\", \"cpu\"]"], &["on cpu", "twice"]);
+    wrong(&["--set", "report.people=9"], &["report.people"]);
     wrong(&["--set", "views.supersampling=3"], &["views.supersampling"]);
     wrong(&["--set", "metrics.protocols=[]"], &["metrics.protocols"]);
     wrong(&["--set", "metrics.protocols=[\"best\"]"], &["unknown variant", "paper"]);

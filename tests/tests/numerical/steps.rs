@@ -3,11 +3,9 @@
 use std::collections::BTreeMap;
 use std::slice::from_ref;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 
 use burn::data::dataset::Dataset;
 use burn::tensor::{DType, Device, Tensor, TensorData};
-use glam::Vec3;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use snapsnap_data::dataset::{Folder, Split};
@@ -17,18 +15,15 @@ use snapsnap_net::network::{PointMap, View, activate};
 use snapsnap_net::weights::{random_predictor, random_regressors};
 use snapsnap_people::synth;
 use snapsnap_tests::{TRAINING, device, device_name, is_software, relative_error, values};
-use snapsnap_train::config::{TrainConfig, TrainingConfig};
+use snapsnap_train::config::TrainConfig;
 use snapsnap_train::gradients;
-use snapsnap_train::log::Line;
 use snapsnap_train::networks::{Networks, Rows};
-use snapsnap_train::optimizer::MuonSettings;
 use snapsnap_train::photometric::Photometric;
 use snapsnap_train::points::{Prediction, losses};
 use snapsnap_train::precision::{LossScale, Precision, lower};
-use snapsnap_train::run::{Options, Outcome, Watch, train};
 use snapsnap_train::stage1::PointTask;
 use snapsnap_train::stage2::GaussianTask;
-use snapsnap_train::task::{Moment, Task, Validation};
+use snapsnap_train::task::{Moment, Task};
 
 fn config() -> TrainConfig {
     // Resized, so that interpolation is in it; confidences of random weights are near one half.
@@ -275,87 +270,4 @@ fn gradients_of_the_losses_are_finite_differences() {
 
     let needle = |scales: Tensor<2>| snapsnap_train::stage2::needles(&scales, 2.0);
     check("needles", &random(&[6, 3], 0.01..1.0, 6), [6, 3], needle);
-}
-
-/// A training of a few steps: what it ended with.
-fn trained<T: Task>(task: &T, config: &TrainConfig, networks: Networks, devices: &[Device]) -> Outcome {
-    struct Silent;
-    impl Watch for Silent {
-        fn step(&mut self, line: &Line, _: u64, _: u64) {
-            assert!(line.values.values().all(|value| value.is_finite()), "{line:?}");
-        }
-        fn validated(&mut self, _: u64, _: &Validation) {}
-        fn note(&mut self, message: &str) {
-            println!("{message}");
-        }
-    }
-    let temporary = tempfile::tempdir().expect("temporary folder");
-    let stop = AtomicBool::new(false);
-    let options = Options { folder: temporary.path(), devices, limit: None, stop: &stop };
-    train(task, config, networks, &options, &mut Silent).expect("trains")
-}
-
-/// EVALUATION.md, "Stiff training": a tenfold and a tenth of the rate; people who are nearly black, over-exposed, 1 % and
-/// all of the frame.
-#[test]
-fn stiff_settings_train_without_a_step_that_is_not_finite() {
-    if device_name() != "flex" {
-        println!("SKIPPED: on the CPU's default device alone");
-        return;
-    }
-    let temporary = tempfile::tempdir().expect("temporary folder");
-    let mut data = DataConfig::default();
-    (data.views.count, data.views.resolution) = (4, 64);
-    let folder = Folder::create(&temporary.path().join("people"), data.description("test")).expect("makes");
-    let person = synth::person("steps/stiff");
-    let lit = |factor: f32| {
-        let mut mesh = person.clone();
-        mesh.materials.iter_mut().for_each(|material| material.color *= factor);
-        mesh
-    };
-    let sized = |factor: f32| {
-        let mut mesh = person.clone();
-        let middle = Vec3::new(0.0, 0.85, 0.0);
-        mesh.positions.iter_mut().for_each(|p| *p = middle + (*p - middle) * factor);
-        mesh
-    };
-    // A ball that the cameras, two metres away, see nothing beside.
-    let mut ball = sized(1.0);
-    let middle = Vec3::new(0.0, 0.85, 0.0);
-    ball.positions.iter_mut().for_each(|p| *p = middle + (*p - middle).normalize_or(Vec3::Y) * 1.45);
-    for (name, mesh) in [("0000", lit(0.01)), ("0001", lit(40.0)), ("0002", sized(0.33)), ("0003", ball)] {
-        data.add(&folder, &Subject::plain(Split::Train, name), &mesh).expect("adds");
-    }
-    let folder = Arc::new(folder);
-    let share = |subject: &str| {
-        let (_, mask) = folder.picture(Some(Split::Train), subject, 0, false).expect("reads");
-        mask.as_raw().iter().filter(|m| **m > 127).count() as f64 / 4096.0
-    };
-    println!("shares of the frame: {:.3} and {:.3}", share("0002"), share("0003"));
-    assert!(share("0002") < 0.02 && share("0003") > 0.95);
-    let device = [Device::flex().autodiff()];
-    for rate in [1e-2, 1e-4] {
-        let mut config = config();
-        config.training = TrainingConfig {
-            steps: 24,
-            log_every: 1,
-            average: 0.9,
-            validation_samples: 0,
-            ..Default::default()
-        };
-        config.optimizer.rate = rate;
-        config.optimizer.muon = Some(MuonSettings { rate, ..MuonSettings::default() });
-        config.stage2.points = 1.0;
-        let networks = config.networks();
-        let predictor = |device: &Device| random_predictor(&networks, 3, device);
-        let stage1 = PointTask::new(from_ref(&folder), &config, &device).expect("a task");
-        let fresh = Networks { predictor: Some(predictor(&device[0])), regressors: Vec::new() };
-        let one = trained(&stage1, &config, fresh, &device);
-        let frozen = predictor(&device[0].clone().inner());
-        let stage2 = GaussianTask::new(from_ref(&folder), &config, Some(frozen), &device).expect("a task");
-        let regressors = random_regressors(&networks, 4, &device[0]);
-        let fresh = Networks { predictor: Some(predictor(&device[0])), regressors };
-        let two = trained(&stage2, &config, fresh, &device);
-        assert_eq!((one.skipped, two.skipped, one.step, two.step), (0, 0, 24, 24), "rate {rate}");
-    }
 }

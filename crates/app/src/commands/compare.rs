@@ -11,11 +11,13 @@ use snapsnap_eval::pictures::Picture;
 use snapsnap_eval::region::{Region, margin};
 use snapsnap_eval::score::Score;
 use snapsnap_eval::similarity::{check_sizes, ssim_of_loss};
-use snapsnap_mesh::picture::{MAX_BYTES, decode};
+use snapsnap_mesh::picture::{self, MAX_BYTES, decode};
 
 use crate::failure::Failure;
-use crate::{perceptual, say};
+use crate::{memory, perceptual, say};
 
+/// Bytes per pixel of two pictures that are compared: as they are decoded, as planes, and the parts that are looked at.
+const BYTES: u64 = 100;
 /// Endings of pictures that are looked for in folders.
 const ENDINGS: [&str; 7] = ["png", "jpg", "jpeg", "webp", "bmp", "tif", "tiff"];
 
@@ -153,6 +155,9 @@ fn compare(
     lpips: &Result<Lpips, String>,
 ) -> Result<Compared, Failure> {
     let read = |path: &Path| -> Result<Picture, Failure> {
+        let [width, height] = picture::size(path)?;
+        let bytes = BYTES * u64::from(width) * u64::from(height);
+        memory::check(&format!("{}, {width}×{height},", path.display()), bytes, "make the pictures smaller")?;
         let named = |e| Failure::Input(format!("{}: {e}", path.display()));
         Picture::from_file(decode(path, MAX_BYTES)?, "picture").map_err(named)
     };

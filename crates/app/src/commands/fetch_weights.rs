@@ -8,6 +8,7 @@ use std::time::Duration;
 use clap::{Args, ValueEnum};
 use sha2::{Digest, Sha256};
 use snapsnap_eval::lpips;
+use snapsnap_splat::file;
 use ureq::Agent;
 use ureq::http::StatusCode;
 
@@ -168,7 +169,7 @@ fn fetch(item: &Item, origin: &Origin, folder: &Path, quiet: bool) -> Result<(),
     match origin {
         Origin::Folder(from) => {
             let from = from.join(item.file);
-            let mut source = File::open(&from).map_err(|e| {
+            let mut source = file::open(&from).map_err(|e| {
                 let _ = fs::remove_file(&part);
                 Failure::Input(format!("{}: cannot read: {e}", from.display()))
             })?;

@@ -252,8 +252,19 @@ impl EvalConfig {
     }
 
     fn problem(&self) -> Option<(&'static str, String)> {
+        /// Names that reports have for others.
+        const TAKEN: [&str; 5] = ["model", "against", "billboard", "true_points", "mean_picture"];
         let most = snapsnap_data::dataset::MAX_VIEWS;
-        let Self { views, metrics, report, .. } = self;
+        let Self { views, metrics, report, ablations, model, .. } = self;
+        let devices = model.devices.iter().map(|name| format!("on {name}"));
+        let mut names: Vec<String> = ablations.keys().cloned().chain(devices).collect();
+        names.sort_unstable();
+        if let Some(name) = names.iter().find(|name| TAKEN.contains(&name.as_str())) {
+            return Some(("ablations", format!("`{name}` is the name of something else in reports")));
+        }
+        if let Some(pair) = names.windows(2).find(|pair| pair[0] == pair[1]) {
+            return Some(("ablations", format!("`{}` is there twice, as an ablation or a device", pair[0])));
+        }
         if views.inputs.len() == 1 || views.inputs.len() > 64 {
             return Some(("views.inputs", "must be empty, or 2 to 64 views".into()));
         }
@@ -278,8 +289,8 @@ impl EvalConfig {
         if !(0.0..=1.0).contains(&metrics.opaque) {
             return Some(("metrics.opaque", format!("is {}, must be 0 to 1", metrics.opaque)));
         }
-        if report.people > 20 || report.degrees.len() > 24 {
-            return Some(("report.people", "at most 20 people of each kind and 24 views of each".into()));
+        if report.people > 5 || report.degrees.len() > 12 {
+            return Some(("report.people", "at most 5 people of each kind and 12 views of each".into()));
         }
         if report.degrees.iter().any(|degrees| !degrees.is_finite()) {
             return Some(("report.degrees", "must be numbers".into()));

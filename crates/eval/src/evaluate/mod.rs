@@ -108,6 +108,19 @@ pub fn evaluate(
             progress(person + 1, total);
         }
     }
+    for (group, subjects) in &config.groups {
+        let is_there = |name: &&String| outcome.people.iter().any(|person| is_named(person, name));
+        let missing: Vec<&String> = subjects.subjects.iter().filter(|name| !is_there(name)).collect();
+        for name in missing {
+            let why = format!("groups.{group} names it, it is not among the people");
+            outcome.left_out.push(LeftOut { name: name.clone(), why });
+        }
+    }
+    if outcome.left_out.is_empty() && outcome.judged.iter().all(|judged| judged.rows.is_empty()) {
+        let why =
+            "no view is left to compare: there is nobody, or every view of views.compared goes in".into();
+        outcome.left_out.push(LeftOut { name: "everything".into(), why });
+    }
     for name in &config.data.only {
         if !sets.iter().any(|set| set.chosen().iter().any(|row| set.test().name(*row) == name)) {
             let why = "data.only names it, no data set has it".into();
@@ -115,6 +128,11 @@ pub fn evaluate(
         }
     }
     outcome
+}
+
+/// Whether a person is called so, with the data set's name before it or without.
+pub(crate) fn is_named(person: &str, name: &str) -> bool {
+    person == name || person.rsplit('/').next() == Some(name)
 }
 
 /// A person's name, with the data set's where there are several.

@@ -8,7 +8,7 @@ use serde_json::{Map, Value, json};
 use super::plot::{Axes, Series, svg};
 use super::{Header, cell, escaped};
 use crate::evaluate::config::{EvalConfig, Protocol};
-use crate::evaluate::{Judged, Kind, Outcome};
+use crate::evaluate::{Judged, Kind, Outcome, is_named};
 use crate::points::VIEWS;
 use crate::score::Score;
 use crate::statistics::{Interval, interval, quantile};
@@ -133,9 +133,7 @@ impl Evaluation<'_> {
     fn groups(&self) -> impl Iterator<Item = (String, Vec<Grouped>)> {
         self.config.groups.iter().map(|(name, group)| {
             let inside = |person: &usize| {
-                let full = &self.outcome.people[*person];
-                let short = full.rsplit('/').next().unwrap_or(full);
-                group.subjects.iter().any(|subject| subject == full || subject == short)
+                group.subjects.iter().any(|subject| is_named(&self.outcome.people[*person], subject))
             };
             let mut rows = Vec::new();
             for judged in &self.outcome.judged {
