@@ -8,10 +8,10 @@ torchvision and lpips from PyPI; nothing is downloaded.
 import json
 from pathlib import Path
 
-import lpips
 import numpy as np
 import torch
 import trimesh
+from lpips_reference import formula, numbers
 from PIL import Image
 from scipy import ndimage
 from scipy.spatial import cKDTree
@@ -19,14 +19,6 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 ROOT = Path(__file__).parent.parent
 OUT = ROOT / "tests/data/metrics"
-
-
-def numbers(stream, count):
-    mask = np.uint64(0xFFFFFFFF)
-    mixed = np.arange(count, dtype=np.uint64) * np.uint64(2654435761) + np.uint64(stream * 40503121 % 2**32)
-    mixed &= mask
-    mixed = ((mixed ^ (mixed >> np.uint64(15))) * np.uint64(2246822519)) & mask
-    return (mixed ^ (mixed >> np.uint64(13))).astype(np.float64) / 2**32
 
 
 def noise(stream, h, w):
@@ -41,21 +33,6 @@ def slope(h, w):
 def people(x, y, w, h):
     """A part of the sheet of people, which is in the repository."""
     return np.asarray(Image.open(ROOT / "docs/people-synth.png").convert("RGB"))[y : y + h, x : x + w]
-
-
-def random_lpips():
-    metric = lpips.LPIPS(net="alex", version="0.1", pretrained=False, pnet_rand=True, eval_mode=True, verbose=False)
-    convolutions = [m for m in metric.net.modules() if isinstance(m, torch.nn.Conv2d)]
-    tensor = lambda v, shape: torch.tensor(v.astype(np.float32)).reshape(shape)
-    with torch.no_grad():
-        for i, (convolution, linear) in enumerate(zip(convolutions, metric.lins)):
-            shape = convolution.weight.shape
-            fan_in = shape[1] * shape[2] * shape[3]
-            bound = np.sqrt(6.0 / fan_in)
-            convolution.weight.copy_(tensor((2 * numbers(3 * i, shape[0] * fan_in) - 1) * bound, shape))
-            convolution.bias.copy_(tensor(0.1 * (numbers(3 * i + 1, shape[0]) - 0.5), [shape[0]]))
-            linear.model[1].weight.copy_(tensor(numbers(3 * i + 2, shape[0]), [1, shape[0], 1, 1]))
-    return metric
 
 
 def figures(a, b, inside=None):
@@ -73,7 +50,7 @@ def figures(a, b, inside=None):
     return psnr, ssim
 
 
-metric = random_lpips()
+metric = formula()
 h, w = 256, 160
 cases = {
     "noise": (noise(1, h, w), noise(2, h, w)),
