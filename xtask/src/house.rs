@@ -12,7 +12,7 @@ const FLOORS: [(&str, &[&str]); 9] = [
     ("net", &["splat", "ops"]),
     ("people", &["mesh"]),
     ("data", &["people", "mesh", "splat"]),
-    ("eval", &["net", "data", "people", "ops", "mesh", "splat"]),
+    ("eval", &["net", "data", "ops", "mesh", "splat"]),
     ("train", &["eval", "data", "people", "net", "ops", "mesh", "splat"]),
     ("app", &["train", "eval", "data", "people", "net", "ops", "mesh", "splat"]),
 ];

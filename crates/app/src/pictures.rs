@@ -1,12 +1,13 @@
 //! Rendered views as picture files.
 
 use std::fs;
-use std::io::Cursor;
 use std::path::Path;
 
 use burn::tensor::Tensor;
 use image::codecs::gif::{GifEncoder, Repeat};
-use image::{Delay, Frame, ImageFormat, RgbImage, RgbaImage, imageops};
+use image::{Delay, Frame, RgbImage, RgbaImage, imageops};
+
+use snapsnap_eval::preview;
 
 use crate::failure::Failure;
 use crate::output::write;
@@ -31,9 +32,7 @@ pub fn read_back<const D: usize>(tensor: Tensor<D>) -> Result<Vec<f32>, Failure>
 
 /// Writes a PNG, whole or not at all.
 pub fn write_png(path: &Path, picture: &RgbImage) -> Result<(), Failure> {
-    let mut bytes = Cursor::new(Vec::new());
-    picture.write_to(&mut bytes, ImageFormat::Png).map_err(|e| failed(path, &e))?;
-    write(path, &bytes.into_inner())
+    Ok(preview::write_png(path, picture)?)
 }
 
 /// Writes an endless animation, whole or not at all.

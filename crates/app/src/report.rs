@@ -5,13 +5,12 @@ use std::path::{Path, PathBuf};
 
 use image::RgbImage;
 use serde_json::Value;
-use snapsnap_eval::preview;
 use snapsnap_eval::report::{Header, today};
 
 use crate::commands::check_outputs;
 use crate::failure::Failure;
 use crate::output;
-use crate::pictures::make_folder;
+use crate::pictures::{make_folder, write_png};
 
 /// Files of one report.
 pub struct ReportFolder {
@@ -57,7 +56,7 @@ impl ReportFolder {
     /// Writes a picture, or removes an older report's.
     pub fn picture(&self, name: &str, picture: Option<&RgbImage>) -> Result<(), Failure> {
         match picture {
-            Some(picture) => Ok(preview::write_png(&self.path.join(name), picture)?),
+            Some(picture) => write_png(&self.path.join(name), picture),
             None => self.none(name),
         }
     }

@@ -140,12 +140,11 @@ impl Picture {
     }
 
     /// The same with black wherever `inside` `[H, W]` is not set.
-    pub fn only(&self, inside: &[bool]) -> Self {
-        let mut picture = self.clone();
-        for plane in picture.values.chunks_exact_mut(inside.len().max(1)) {
+    pub fn only(mut self, inside: &[bool]) -> Self {
+        for plane in self.values.chunks_exact_mut(inside.len().max(1)) {
             plane.iter_mut().zip(inside).filter(|(_, set)| !**set).for_each(|(v, _)| *v = 0.0);
         }
-        picture
+        self
     }
 
     /// In 8 bits.

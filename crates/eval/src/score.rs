@@ -39,7 +39,10 @@ impl Score {
         let (psnr, ssim) = (psnr(image, target, region)?, ssim(image, target, region)?);
         let seen = |picture: &Picture| {
             let part = picture.cropped(region.window);
-            region.inside.as_ref().map_or(part.clone(), |inside| part.only(inside))
+            match &region.inside {
+                Some(inside) => part.only(inside),
+                None => part,
+            }
         };
         let [.., width, height] = region.window;
         let lpips = lpips.filter(|_| width.min(height) >= MIN_SIDE).map(|network| {

@@ -67,6 +67,9 @@ fn every_setting_is_measured_and_what_it_leaves_out_shows() {
         ended(&mut bench(&["--set", "settings.odd.set=[\"network.resolution=100\"]", "--runs", "nowhere"]));
     assert!(code == Some(1) && said.contains("odd") && said.contains("nowhere"), "{said}");
     assert_eq!(json(&report)["settings"].as_array().map(Vec::len), Some(3));
+    // A setting's own data set is the one that is looked at.
+    let (code, said) = ended(&mut bench(&["--set", "settings.elsewhere.data=\"no/people\""]));
+    assert!(code == Some(1) && said.contains("elsewhere") && said.contains("no/people"), "{said}");
     assert!(refused(&mut bench(&["--set", "bench.runs=0"])).contains("bench.runs"));
     assert!(refused(&mut bench(&["--set", "settings.a.stride=0"])).contains("stride"));
     let said = refused(&mut bench(&["--weights", "nowhere.safetensors"]));

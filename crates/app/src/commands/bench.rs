@@ -9,16 +9,13 @@ use snapsnap_eval::bench::config::BenchConfig;
 use snapsnap_eval::bench::report::{Bench, Training};
 use snapsnap_eval::bench::{Measured, dominated, measure};
 use snapsnap_eval::evaluate::LeftOut;
-use snapsnap_splat::file;
 
-use super::{ConfigArguments, outside_data};
+use super::{ConfigArguments, outside_data, read_config};
 use crate::failure::Failure;
 use crate::progress::Progress;
 use crate::report::{ReportFolder, header};
 use crate::{device, memory, perceptual, say, weights};
 
-/// Longest config that is read.
-const MOST: u64 = 1 << 20;
 /// What a report consists of.
 const FILES: [&str; 7] = [
     "report.json",
@@ -140,8 +137,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
 
 fn config_of(arguments: &Arguments) -> Result<BenchConfig, Failure> {
     let path = &arguments.config;
-    let text = file::read_text(path, MOST)
-        .map_err(|e| Failure::Input(format!("{}: cannot read the config: {e}", path.display())))?;
+    let text = read_config(path)?;
     let mut config = BenchConfig::from_toml(&text, &path.display().to_string(), &arguments.set)?;
     if let Some(data) = &arguments.data {
         config.data.folders = vec![data.clone()];

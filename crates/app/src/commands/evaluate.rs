@@ -12,16 +12,13 @@ use snapsnap_eval::evaluate::person::People;
 use snapsnap_eval::evaluate::{Contestant, LeftOut, Outcome, evaluate, sheet};
 use snapsnap_eval::report;
 use snapsnap_eval::report::evaluation::Evaluation;
-use snapsnap_splat::file;
 
-use super::{ConfigArguments, outside_data};
+use super::{ConfigArguments, outside_data, read_config};
 use crate::failure::Failure;
 use crate::progress::Progress;
 use crate::report::{ReportFolder, header};
 use crate::{device, memory, perceptual, say, weights};
 
-/// Longest config that is read.
-const MOST: u64 = 1 << 20;
 /// What a report consists of.
 const FILES: [&str; 7] =
     ["report.json", "report.md", "views.csv", "subjects.csv", "people.png", "by_view.svg", "config.toml"];
@@ -126,9 +123,10 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     folder.text("subjects.csv", &report.subjects_csv())?;
     folder.text("config.toml", &config.to_toml())?;
     folder.text("report.md", &report.markdown(&pictures))?;
-    folder.json("report.json", &report.json())?;
+    let json = report.json();
+    folder.json("report.json", &json)?;
     if !quiet {
-        say::out(&summary(&report.json()));
+        say::out(&summary(&json));
         say::out(&format!("{}: report.md, report.json, pictures and tables", folder.path().display()));
     }
     complete(&outcome.left_out)
@@ -186,8 +184,7 @@ fn judge_meshes(
 
 fn config_of(arguments: &Arguments) -> Result<EvalConfig, Failure> {
     let path = &arguments.config;
-    let text = file::read_text(path, MOST)
-        .map_err(|e| Failure::Input(format!("{}: cannot read the config: {e}", path.display())))?;
+    let text = read_config(path)?;
     let mut config = EvalConfig::from_toml(&text, &path.display().to_string(), &arguments.set)?;
     if !arguments.data.is_empty() {
         config.data.folders.clone_from(&arguments.data);

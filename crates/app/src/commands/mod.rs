@@ -47,6 +47,14 @@ impl ConfigArguments {
     }
 }
 
+/// The text of a config.
+pub fn read_config(path: &Path) -> Result<String, Failure> {
+    /// Longest config that is read.
+    const MOST: u64 = 1 << 20;
+    file::read_text(path, MOST)
+        .map_err(|e| Failure::Input(format!("{}: cannot read the config: {e}", path.display())))
+}
+
 /// Refuses output paths that could not be written in the end, that are one another, or that are an input.
 pub fn check_outputs(outputs: &[&Path], inputs: &[&Path]) -> Result<(), Failure> {
     for (i, output) in outputs.iter().enumerate() {

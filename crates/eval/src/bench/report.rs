@@ -9,7 +9,7 @@ use snapsnap_splat::file;
 use super::{Measured, dominated};
 use crate::evaluate::LeftOut;
 use crate::report::plot::{Axes, Series, svg};
-use crate::report::{Header, escaped};
+use crate::report::{Header, escaped, table};
 
 /// Longest log of a training that is read.
 const MOST: u64 = 256 << 20;
@@ -92,7 +92,8 @@ impl Bench<'_> {
             "* {runs} reconstructions each after warm-up, device synchronised, each setting in a process of its own\n\
              * Errors: protocol `masked`; LPIPS: {}\n\
              * Splat error: largest difference of a colour from the f64 oracle; by cut-offs: what skipping α < 1/255, closing pixels and \
-             the largest α change of it\n             * Dominated: another is no slower and no worse, and better by 3 % of the time or 0.02 dB\n",
+             the largest α change of it\n\
+             * Dominated: another is no slower and no worse, and better by 3 % of the time or 0.02 dB\n",
             self.lpips
         );
         let _ = writeln!(
@@ -210,7 +211,6 @@ impl Bench<'_> {
 
     /// `settings.csv`.
     pub fn csv(&self) -> String {
-        let mut table = csv::Writer::from_writer(Vec::new());
         let header = [
             "setting",
             "knob",
@@ -227,10 +227,9 @@ impl Bench<'_> {
             "cutoff_error",
             "dominated_by",
         ];
-        table.write_record(header).expect("memory takes any record");
         let number = |value: Option<f64>| value.map_or(String::new(), |v| v.to_string());
-        for (m, by) in self.measured.iter().zip(dominated(self.measured)) {
-            let record = [
+        let row = |(m, by): (&Measured, Option<usize>)| {
+            vec![
                 m.name.clone(),
                 m.knob.clone().unwrap_or_default(),
                 m.device.clone(),
@@ -245,22 +244,20 @@ impl Bench<'_> {
                 m.splat_error.to_string(),
                 m.cutoff_error.to_string(),
                 by.map_or(String::new(), |place| self.measured[place].name.clone()),
-            ];
-            table.write_record(record).expect("memory takes any record of one length");
-        }
-        let bytes = table.into_inner().expect("memory can be written");
-        String::from_utf8(bytes).expect("made of text")
+            ]
+        };
+        table(&header, self.measured.iter().zip(dominated(self.measured)).map(row))
     }
 
     /// PSNR over run time, the front joined.
     fn pareto(&self) -> String {
         let at = |m: &Measured| (1e3 * m.p50, m.psnr);
         let by = dominated(self.measured);
-        let mut front: Vec<(f64, f64)> =
-            self.measured.iter().zip(&by).filter(|(_, by)| by.is_none()).map(|(m, _)| at(m)).collect();
+        let plain = || self.measured.iter().zip(&by).filter(|(m, _)| m.scene.is_none());
+        let mut front: Vec<(f64, f64)> = plain().filter(|(_, by)| by.is_none()).map(|(m, _)| at(m)).collect();
         front.sort_by(|a, b| a.0.total_cmp(&b.0));
         let mut series = vec![Series { name: "Pareto front".into(), points: front, line: true }];
-        for m in self.measured.iter().filter(|m| m.scene.is_none()) {
+        for (m, _) in plain() {
             series.push(Series { name: m.name.clone(), points: vec![at(m)], line: false });
         }
         let axes = Axes { caption: "Error against run time", x: "p50, ms", y: "PSNR, masked, dB", log: true };

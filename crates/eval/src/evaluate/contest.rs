@@ -7,7 +7,7 @@ use snapsnap_data::sample::TestItem;
 use snapsnap_splat::Gaussians;
 
 use super::model::Model;
-use super::person::{People, degrees, photograph, points};
+use super::person::{People, nearest_view, photograph, points};
 use crate::EvalError;
 use crate::baselines::{MeanPictures, billboard, true_points};
 use crate::pictures::Picture;
@@ -173,12 +173,7 @@ fn on_canvas(item: &TestItem, count: usize, side: usize) -> (Vec<f32>, Vec<Vec<b
 
 /// The views nearest to 90° (right) and 270° (left) of the first photograph, and how far off they are in degrees.
 fn sides(item: &TestItem, first: usize) -> [(usize, f64); 2] {
-    [90.0, 270.0].map(|wanted: f64| {
-        let off = |view: &usize| (degrees(&item.cameras[*view], &item.cameras[first]) - wanted).abs();
-        let nearest = (0..item.cameras.len()).min_by(|a, b| off(a).total_cmp(&off(b)));
-        let nearest = nearest.expect("there are views");
-        (nearest, off(&nearest))
-    })
+    [90.0, 270.0].map(|wanted| nearest_view(&item.cameras, first, wanted))
 }
 
 /// Errors of predicted maps at the pixels where a view sees true points. A side needs a view at right angles.

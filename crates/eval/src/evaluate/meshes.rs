@@ -6,15 +6,14 @@ use glam::Vec3;
 use serde::Serialize;
 use snapsnap_mesh::FileError;
 use snapsnap_mesh::import::{self, EXTENSIONS};
-use snapsnap_mesh::mesh::Mesh;
 use snapsnap_mesh::view::{Renderer, ViewOptions};
 
 use super::config::EvalConfig;
 use super::person::People;
-use super::surface::{Surface, Truth};
+use super::surface::truth as truth_of;
 use super::{LeftOut, name_of};
 use crate::EvalError;
-use crate::geometry::{Alignment, chamfer, consistency, icp, normals, point_to_surface, sampled};
+use crate::geometry::{Alignment, chamfer, icp, point_to_surface, sampled};
 
 /// Points drawn from each surface.
 const POINTS: usize = 50_000;
@@ -87,8 +86,7 @@ fn one(
 ) -> Result<MeshFigures, EvalError> {
     let subject = people.test().name(row);
     let mut mesh = import::read(&find(folder, subject)?)?;
-    let item = people.test().sample(row, &[])?;
-    let Truth { points, views } = Surface::truth(people, row, &item.cameras)?;
+    let seen = truth_of(people, row)?;
     let scan = match &config.data.scans {
         Some(scans) => Some(import::read(&find(scans, subject)?)?),
         None => None,
@@ -96,7 +94,7 @@ fn one(
     // A scan knows what no view sees.
     let truth = match &scan {
         Some(scan) => sampled(scan, POINTS, SEED)?,
-        None => points,
+        None => seen.points.clone(),
     };
     let mut aligned = None;
     if align != Align::No {
@@ -107,6 +105,8 @@ fn one(
         let angle = 2.0 * rotation.w.abs().min(1.0).acos();
         aligned = Some([angle.to_degrees(), 1e2 * translation.length(), scale]);
     }
+    let renderer = Renderer::new(&mesh).map_err(|e| EvalError::Empty(e.to_string()))?;
+    let options = ViewOptions { samples: 1, ..ViewOptions::default() };
     let surface = sampled(&mesh, POINTS, SEED)?;
     let apart = chamfer(&surface, &truth)?;
     let to_scan = scan.map(|scan| point_to_surface(&surface, &scan)).transpose()?;
@@ -117,26 +117,9 @@ fn one(
         chamfer: 1e2 * apart.mean(),
         truth_to_surface: 1e2 * point_to_surface(&truth, &mesh)?,
         surface_to_scan: to_scan.map(|distance| 1e2 * distance),
-        normal_consistency: normals_of(&mesh, &views)?,
+        normal_consistency: seen.agreement(|camera| Ok(renderer.draw(camera, &options).depth))?,
         aligned,
     })
-}
-
-fn normals_of(
-    mesh: &Mesh,
-    views: &[(snapsnap_splat::Camera, Vec<Option<glam::DVec3>>)],
-) -> Result<Option<f64>, EvalError> {
-    let renderer = Renderer::new(mesh).map_err(|e| EvalError::Empty(e.to_string()))?;
-    let options = ViewOptions { samples: 1, ..ViewOptions::default() };
-    let (mut sum, mut count) = (0.0, 0);
-    for (camera, truth) in views {
-        let depth = renderer.draw(camera, &options).depth;
-        if let Some((cosine, pixels)) = consistency(&normals(&depth, camera), truth) {
-            sum += cosine * pixels as f64;
-            count += pixels;
-        }
-    }
-    Ok((count > 0).then(|| sum / count as f64))
 }
 
 fn find(folder: &Path, name: &str) -> Result<PathBuf, EvalError> {

@@ -25,7 +25,7 @@ use crate::score::Score;
 use config::{EvalConfig, Protocol, ViewsSection};
 pub use contest::{Contestant, Kind};
 use person::People;
-pub use surface::{Surface, Truth};
+pub use surface::{Surface, Truth, truth};
 
 /// What a view of a person gave.
 #[derive(Debug, Clone)]
@@ -101,9 +101,15 @@ pub fn evaluate(
         for &row in people.chosen() {
             let person = outcome.people.len();
             outcome.people.push(name_of(sets, people, row));
+            let truth = config.metrics.geometry.then(|| truth(people, row)).transpose();
+            let truth = truth.unwrap_or_else(|e| {
+                let name = format!("{}, geometry", outcome.people[person]);
+                outcome.left_out.push(LeftOut { name, why: e.to_string() });
+                None
+            });
             for &turn in &config.views.turns {
                 let at = Place { people, row, turn, person };
-                one(config, &at, contestants, lpips, &mut outcome);
+                one(config, &at, truth.as_ref(), contestants, lpips, &mut outcome);
             }
             progress(person + 1, total);
         }
@@ -161,6 +167,7 @@ impl Place<'_> {
 fn one(
     config: &EvalConfig,
     at: &Place,
+    truth: Option<&Truth>,
     contestants: &[Contestant],
     lpips: Option<&Lpips>,
     outcome: &mut Outcome,
@@ -170,14 +177,6 @@ fn one(
     let item = match people.test().sample(row, &inputs) {
         Ok(item) => item,
         Err(e) => return at.left_out(outcome, "", &e),
-    };
-    let truth = config.metrics.geometry.then(|| Surface::truth(people, row, &item.cameras));
-    let truth = match truth.transpose() {
-        Ok(truth) => truth,
-        Err(e) => {
-            at.left_out(outcome, ", geometry", &e);
-            None
-        }
     };
     let mut shown: Vec<Option<contest::Shown>> = Vec::new();
     for (i, contestant) in contestants.iter().enumerate() {
@@ -200,7 +199,7 @@ fn one(
         }
         judged.times.extend(made.time);
         judged.gaussians.extend(made.gaussians.as_ref().map(Gaussians::len));
-        if let (Some(truth), Some(gaussians)) = (&truth, &made.gaussians) {
+        if let (Some(truth), Some(gaussians)) = (truth, &made.gaussians) {
             match Surface::of_gaussians(gaussians, truth, config.metrics.opaque) {
                 Ok(surface) => judged.surface.push((person, surface)),
                 Err(e) => at.left_out(outcome, &format!(", {}, geometry", contestant.name), &e),
@@ -346,12 +345,7 @@ fn pictures(
         pictures.push(target.cropped(Region::paper(&target)?.window).to_rgb8());
     }
     for wanted in &config.report.degrees {
-        let off = |view: &usize| {
-            let apart = person::degrees(&item.cameras[*view], &item.cameras[inputs[0]]) - wanted;
-            apart.rem_euclid(360.0).min((-apart).rem_euclid(360.0))
-        };
-        let near = (0..people.views()).min_by(|a, b| off(a).total_cmp(&off(b)));
-        let view = near.expect("there are views");
+        let (view, _) = person::nearest_view(&item.cameras, inputs[0], *wanted);
         let image = picture(config, contestant, &shown, &item.cameras[view], view, side)?;
         let (target, _) = people.target(row, view, side)?;
         let window = Region::paper(&target)?.window;

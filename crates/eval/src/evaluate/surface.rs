@@ -5,7 +5,7 @@ use rayon::prelude::*;
 use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
 
 use super::at_once;
-use super::person::{People, degrees};
+use super::person::{People, nearest_view};
 use crate::EvalError;
 use crate::geometry::{Chamfer, chamfer, consistency, normals, points};
 
@@ -33,53 +33,66 @@ pub struct Truth {
     pub views: Vec<(Camera, Vec<Option<DVec3>>)>,
 }
 
-impl Surface {
-    /// True points and normals of a person, from the depth maps.
+/// What is true of a person, from the depth maps.
+///
+/// # Errors
+/// [`EvalError`] for files that cannot be read, or without any point.
+pub fn truth(people: &People, row: usize) -> Result<Truth, EvalError> {
+    let cameras = people.test().sample(row, &[])?.cameras;
+    let directions = DIRECTIONS.map(|wanted| nearest_view(&cameras, 0, wanted).0);
+    let of_view = |(view, camera): (usize, &Camera)| {
+        let (points, valid) = people.test().points(row, &[view])?;
+        let to_world = camera.world_to_camera.inverse();
+        let there: Vec<usize> = (0..valid.len()).filter(|i| valid[*i] > 0.5).collect();
+        let step = there.len().div_ceil(PER_VIEW).max(1);
+        let point =
+            |i: usize| DVec3::new(points[3 * i].into(), points[3 * i + 1].into(), points[3 * i + 2].into());
+        let kept = there.iter().step_by(step).map(|i| to_world.apply(point(*i)).as_vec3().to_array());
+        let kept: Vec<[f32; 3]> = kept.collect();
+        let normals = directions.contains(&view).then(|| {
+            let depth = |i: usize| if valid[i] > 0.5 { points[3 * i + 2] } else { 0.0 };
+            normals(&(0..valid.len()).map(depth).collect::<Vec<f32>>(), camera)
+        });
+        Ok((kept, normals))
+    };
+    let numbered: Vec<(usize, &Camera)> = cameras.iter().enumerate().collect();
+    let mut found = Vec::new();
+    for views in numbered.chunks(at_once(people.folder().description().resolution as usize)) {
+        let part: Result<Vec<_>, EvalError> = views.par_iter().map(|view| of_view(*view)).collect();
+        found.extend(part?);
+    }
+    let (mut all, mut views) = (Vec::new(), Vec::new());
+    for ((kept, normals), camera) in found.into_iter().zip(cameras) {
+        all.extend(kept);
+        views.extend(normals.map(|normals| (camera, normals)));
+    }
+    if all.is_empty() {
+        return Err(EvalError::Empty("no view has a depth: there is no true surface".into()));
+    }
+    Ok(Truth { points: all, views })
+}
+
+impl Truth {
+    /// Mean cosine between the true normals and those of the depths that `depth` gives of a camera, where both are seen.
     ///
     /// # Errors
-    /// [`EvalError`] for files that cannot be read, or without any point.
-    pub fn truth(people: &People, row: usize, cameras: &[Camera]) -> Result<Truth, EvalError> {
-        let nearest = |wanted: f64| {
-            let off = |view: &usize| {
-                let apart = (degrees(&cameras[*view], &cameras[0]) - wanted).rem_euclid(360.0);
-                apart.min(360.0 - apart)
-            };
-            (0..cameras.len()).min_by(|a, b| off(a).total_cmp(&off(b))).expect("there are views")
-        };
-        let directions = DIRECTIONS.map(nearest);
-        let of_view = |(view, camera): (usize, &Camera)| {
-            let (points, valid) = people.test().points(row, &[view])?;
-            let to_world = camera.world_to_camera.inverse();
-            let there: Vec<usize> = (0..valid.len()).filter(|i| valid[*i] > 0.5).collect();
-            let step = there.len().div_ceil(PER_VIEW).max(1);
-            let point = |i: usize| {
-                DVec3::new(points[3 * i].into(), points[3 * i + 1].into(), points[3 * i + 2].into())
-            };
-            let kept = there.iter().step_by(step).map(|i| to_world.apply(point(*i)).as_vec3().to_array());
-            let kept: Vec<[f32; 3]> = kept.collect();
-            let normals = directions.contains(&view).then(|| {
-                let depth = |i: usize| if valid[i] > 0.5 { points[3 * i + 2] } else { 0.0 };
-                normals(&(0..valid.len()).map(depth).collect::<Vec<f32>>(), camera)
-            });
-            Ok((kept, normals))
-        };
-        let numbered: Vec<(usize, &Camera)> = cameras.iter().enumerate().collect();
-        let mut found = Vec::new();
-        for views in numbered.chunks(at_once(people.folder().description().resolution as usize)) {
-            let part: Result<Vec<_>, EvalError> = views.par_iter().map(|view| of_view(*view)).collect();
-            found.extend(part?);
+    /// Those of `depth`.
+    pub fn agreement(
+        &self,
+        depth: impl Fn(&Camera) -> Result<Vec<f32>, EvalError>,
+    ) -> Result<Option<f64>, EvalError> {
+        let (mut sum, mut count) = (0.0, 0);
+        for (camera, expected) in &self.views {
+            if let Some((cosine, pixels)) = consistency(&normals(&depth(camera)?, camera), expected) {
+                sum += cosine * pixels as f64;
+                count += pixels;
+            }
         }
-        let (mut all, mut views) = (Vec::new(), Vec::new());
-        for ((kept, normals), camera) in found.into_iter().zip(cameras) {
-            all.extend(kept);
-            views.extend(normals.map(|normals| (*camera, normals)));
-        }
-        if all.is_empty() {
-            return Err(EvalError::Empty("no view has a depth: there is no true surface".into()));
-        }
-        Ok(Truth { points: all, views })
+        Ok((count > 0).then(|| sum / count as f64))
     }
+}
 
+impl Surface {
     /// Of Gaussians (world frame): the centres of those that are at least so opaque, and their rendered depths.
     ///
     /// # Errors
@@ -91,23 +104,14 @@ impl Surface {
             centres.into_iter().zip(opacities).filter(|(_, o)| *o >= opaque).map(|(p, _)| p).collect();
         let step = there.len().div_ceil(MOST).max(1);
         let there: Vec<[f32; 3]> = there.into_iter().step_by(step).collect();
-        let (mut sum, mut count) = (0.0, 0);
-        for (camera, expected) in &truth.views {
+        let depth = |camera: &Camera| {
             let options = RenderOptions { depth: true, ..RenderOptions::inria() };
             let rendered = render(gaussians, std::slice::from_ref(camera), &options)?;
             let depth = snapsnap_ops::host(rendered.depth.expect("asked for"));
             let alpha = snapsnap_ops::host(rendered.alpha);
             // Depths are weighted by coverage; half of it is a surface.
-            let depth: Vec<f32> =
-                depth.iter().zip(alpha).map(|(z, a)| if a > 0.5 { z / a } else { 0.0 }).collect();
-            if let Some((cosine, pixels)) = consistency(&normals(&depth, camera), expected) {
-                sum += cosine * pixels as f64;
-                count += pixels;
-            }
-        }
-        Ok(Self {
-            chamfer: chamfer(&there, &truth.points)?,
-            normals: (count > 0).then(|| sum / count as f64),
-        })
+            Ok(depth.iter().zip(alpha).map(|(z, a)| if a > 0.5 { z / a } else { 0.0 }).collect())
+        };
+        Ok(Self { chamfer: chamfer(&there, &truth.points)?, normals: truth.agreement(depth)? })
     }
 }

@@ -6,7 +6,7 @@ use std::fmt::Write;
 use serde_json::{Map, Value, json};
 
 use super::plot::{Axes, Series, svg};
-use super::{Header, cell, escaped};
+use super::{Header, cell, escaped, table};
 use crate::evaluate::config::{EvalConfig, Protocol};
 use crate::evaluate::{Judged, Kind, Outcome, is_named};
 use crate::points::VIEWS;
@@ -268,48 +268,36 @@ impl Evaluation<'_> {
 
     /// `views.csv`: a line per contestant, person, view and protocol.
     pub fn views_csv(&self) -> String {
-        let mut table = csv::Writer::from_writer(Vec::new());
-        let header =
+        const HEADER: [&str; 9] =
             ["contestant", "protocol", "subject", "turn", "view", "degrees", "psnr", "ssim", "lpips"];
-        write(&mut table, header.map(String::from));
-        for judged in &self.outcome.judged {
-            for row in &judged.rows {
-                for ((_, protocol), score) in self.protocols().zip(&row.scores) {
-                    let [psnr, ssim, lpips] = FIGURES.map(|(_, of, ..)| number(of(score)));
-                    write(
-                        &mut table,
-                        [
-                            judged.name.clone(),
-                            protocol.name().into(),
-                            self.outcome.people[row.person].clone(),
-                            row.turn.to_string(),
-                            row.view.to_string(),
-                            format!("{:.2}", row.degrees),
-                            psnr,
-                            ssim,
-                            lpips,
-                        ],
-                    );
-                }
+        let mut rows = Vec::new();
+        for (judged, row) in self.outcome.judged.iter().flat_map(|j| j.rows.iter().map(move |row| (j, row))) {
+            for ((_, protocol), score) in self.protocols().zip(&row.scores) {
+                let person = self.outcome.people[row.person].clone();
+                let mut cells = vec![judged.name.clone(), protocol.name().into(), person];
+                cells.extend([row.turn.to_string(), row.view.to_string(), format!("{:.2}", row.degrees)]);
+                cells.extend(numbers(score));
+                rows.push(cells);
             }
         }
-        text_of(table)
+        table(&HEADER, rows.into_iter())
     }
 
     /// `subjects.csv`: a line per contestant, person and protocol.
     pub fn subjects_csv(&self) -> String {
-        let mut table = csv::Writer::from_writer(Vec::new());
-        write(&mut table, ["contestant", "protocol", "subject", "psnr", "ssim", "lpips"].map(String::from));
+        const HEADER: [&str; 6] = ["contestant", "protocol", "subject", "psnr", "ssim", "lpips"];
+        let mut rows = Vec::new();
         for judged in &self.outcome.judged {
             for (i, protocol) in self.protocols() {
                 for (person, score) in self.people(judged, i) {
-                    let [psnr, ssim, lpips] = FIGURES.map(|(_, of, ..)| number(of(&score)));
-                    let name = self.outcome.people[person].clone();
-                    write(&mut table, [judged.name.clone(), protocol.name().into(), name, psnr, ssim, lpips]);
+                    let person = self.outcome.people[person].clone();
+                    let mut cells = vec![judged.name.clone(), protocol.name().into(), person];
+                    cells.extend(numbers(&score));
+                    rows.push(cells);
                 }
             }
         }
-        text_of(table)
+        table(&HEADER, rows.into_iter())
     }
 
     /// `by_view.svg`: PSNR of the last protocol over the angle from the first photograph.
@@ -434,15 +422,7 @@ fn seconds_json(judged: &Judged) -> Value {
     json!(seconds(judged).map(|[p50, p95]| json!({ "p50": p50, "p95": p95 })))
 }
 
-fn number(value: Option<f64>) -> String {
-    value.map_or(String::new(), |v| v.to_string())
-}
-
-fn write<const N: usize>(table: &mut csv::Writer<Vec<u8>>, record: [String; N]) {
-    table.write_record(record).expect("memory takes any record of one length");
-}
-
-fn text_of(table: csv::Writer<Vec<u8>>) -> String {
-    let bytes = table.into_inner().expect("memory can be written");
-    String::from_utf8(bytes).expect("made of text")
+/// The figures of a score in a table; empty where there is none.
+fn numbers(score: &Score) -> [String; 3] {
+    FIGURES.map(|(_, of, ..)| of(score).map_or(String::new(), |v| v.to_string()))
 }

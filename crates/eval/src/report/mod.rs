@@ -69,6 +69,18 @@ pub fn cell(interval: Option<Interval>, times: f64, digits: usize) -> String {
     }
 }
 
+/// A table as CSV.
+///
+/// # Panics
+/// If a row is not as long as the header.
+pub fn table(header: &[&str], rows: impl Iterator<Item = Vec<String>>) -> String {
+    let mut table = csv::Writer::from_writer(Vec::new());
+    table.write_record(header).expect("memory takes any record");
+    rows.for_each(|row| table.write_record(row).expect("as long as the header"));
+    let bytes = table.into_inner().expect("memory can be written");
+    String::from_utf8(bytes).expect("made of text")
+}
+
 /// Text within a Markdown table.
 pub fn escaped(text: &str) -> String {
     text.replace('|', "\\|").replace(['\n', '\r'], " ")

@@ -21,8 +21,9 @@ pub fn cases() -> Vec<Case> {
             area: "Networks",
             input: format!("exponential depth at raw norm {norm:?}"),
             holds: "p = r/‖r‖·(e^‖r‖ − 1) relative to f64 as far as f32 reaches (e^88), finite beyond; gradient finite".into(),
-            value_limit: 1e-5,
-            gradient_limit: 1e-4,
+            // Seen: 2.0e-6 (lavapipe, at 88) and 7e-7.
+            value_limit: 5e-6,
+            gradient_limit: 5e-6,
             once: false,
             run: Box::new(move |device| exponential_depth(norm, device)),
         });
@@ -64,7 +65,8 @@ pub fn cases() -> Vec<Case> {
         area: "Networks",
         input: "the regressor on constant channels (no variance to divide by)".into(),
         holds: "features finite and equal wherever padding does not reach, gradient finite".into(),
-        value_limit: 1e-4,
+        // Of the largest feature; seen: 8.1e-7.
+        value_limit: 1e-5,
         gradient_limit: 0.0,
         once: false,
         run: Box::new(constant_channels),
@@ -274,7 +276,7 @@ fn constant_channels(device: &Device) -> Found {
     let (a, b) = (at(side / 2, side / 2), at(side / 2 + 4, side / 2 + 4));
     let most = got.iter().fold(0.0_f32, |most, v| most.max(v.abs()));
     let apart = a.iter().zip(b).map(|(a, b)| f64::from((a - b).abs() / most.max(1e-20))).fold(0.0, f64::max);
-    Found { note: format!("features up to {most:.1e}; middle pixels {apart:.1e} apart"), ..Found::default() }
+    Found { value: Some(apart), note: format!("features up to {most:.1e}"), ..Found::default() }
         .must(all_finite(&got), "a feature is not finite")
         .must(all_finite(&gradient), "a gradient is not finite")
 }

@@ -40,8 +40,8 @@ pub fn markdown(header: &Header, rows: &[Row]) -> String {
             );
         }
         let error = |error: Option<f64>, limit: f64| match error {
-            Some(0.0) => format!("0 ({limit:.0e})"),
-            Some(error) => format!("{error:.1e} ({limit:.0e})"),
+            Some(0.0) => format!("0 ({limit:.1e})"),
+            Some(error) => format!("{error:.1e} ({limit:.1e})"),
             None => String::new(),
         };
         let _ = writeln!(

@@ -20,14 +20,13 @@ use snapsnap_net::config::parse;
 use snapsnap_people::random::stream;
 use snapsnap_splat::file;
 
+use super::read_config;
 use crate::failure::Failure;
 use crate::progress::Progress;
 use crate::{output, say};
 
 /// Name of the config in force, beside the data.
 const CONFIG: &str = "prepare.config.toml";
-/// Largest config that is read.
-const MAX_CONFIG: u64 = 1 << 20;
 /// Most people of one call: subjects have four digits, or a few more.
 const MAX_SUBJECTS: usize = 1_000_000;
 
@@ -109,13 +108,7 @@ impl Common {
 
     fn config(&self) -> Result<DataConfig, Failure> {
         let (text, origin) = match &self.config {
-            Some(path) => {
-                let wrong = |e: &dyn std::fmt::Display| {
-                    Failure::Input(format!("{}: cannot read the config: {e}", path.display()))
-                };
-                let text = file::read_text(path, MAX_CONFIG).map_err(|e| wrong(&e))?;
-                (text, path.display().to_string())
-            }
+            Some(path) => (read_config(path)?, path.display().to_string()),
             None => (String::new(), "the built-in config".to_owned()),
         };
         let (config, origin): (DataConfig, String) = parse(&text, &origin, &self.set)?;

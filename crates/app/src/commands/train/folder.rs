@@ -5,16 +5,12 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use snapsnap_data::dataset::Folder;
-use snapsnap_splat::file;
 use snapsnap_train::config::TrainConfig;
 use snapsnap_train::run::{BEST, CONFIG, LAST, STATE};
 
-use super::super::outside_data;
+use super::super::{outside_data, read_config};
 use super::Arguments;
 use crate::failure::Failure;
-
-/// Longest config that is read.
-const MOST: u64 = 1 << 20;
 
 /// The config of a run: of --config, or of the run that goes on, with what the command line says on top.
 pub fn config(arguments: &Arguments) -> Result<TrainConfig, Failure> {
@@ -47,8 +43,7 @@ pub fn config(arguments: &Arguments) -> Result<TrainConfig, Failure> {
 }
 
 fn read(path: &Path, overrides: &[String]) -> Result<TrainConfig, Failure> {
-    let text = file::read_text(path, MOST)
-        .map_err(|e| Failure::Input(format!("{}: cannot read the config: {e}", path.display())))?;
+    let text = read_config(path)?;
     Ok(TrainConfig::from_toml(&text, &path.display().to_string(), overrides)?)
 }
 

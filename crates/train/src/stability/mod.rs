@@ -1,37 +1,23 @@
 //! Cases of the stability table (EVALUATION.md) that need losses, an optimiser or a training.
 
-use std::slice::from_ref;
-use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+mod trainings;
 
 use burn::tensor::{Device, Tensor, TensorData};
-use glam::Vec3;
-use image::RgbImage;
-use snapsnap_data::dataset::{Folder, Split};
-use snapsnap_data::prepare::{DataConfig, Subject};
-use snapsnap_data::sample::{Joined, Stage1Item};
 use snapsnap_eval::pictures::Picture;
 use snapsnap_eval::region::Region;
 use snapsnap_eval::similarity::{psnr, ssim};
 use snapsnap_eval::stability::{Case, Found};
 use snapsnap_net::Window;
 use snapsnap_net::network::{PointMap, View};
-use snapsnap_net::weights::{random_predictor, random_regressors};
+use snapsnap_net::weights::random_predictor;
 use snapsnap_ops::host;
-use snapsnap_people::synth;
 
-use crate::TrainError;
 use crate::config::TrainConfig;
-use crate::log::Line;
 use crate::networks::{Networks, Rows};
 use crate::optimizer::{MuonSettings, OptimizerConfig};
 use crate::photometric::Photometric;
 use crate::points::{Prediction, losses};
-use crate::run::{Options, Outcome, Watch, train};
 use crate::schedule::Schedule;
-use crate::stage1::PointTask;
-use crate::stage2::GaussianTask;
-use crate::task::{Moment, Part, Task, Validation};
 
 /// Networks of thousands of parameters on pictures of 64²: attention, all kinds of convolutions, resizing, windows and
 /// anchors are in them.
@@ -148,33 +134,8 @@ pub fn cases(many_steps: u64) -> Vec<Case> {
         once: true,
         run: Box::new(|_| ends_of_the_rate()),
     });
-    cases.push(Case {
-        area: "Stiff training",
-        input: "one sample whose loss is NaN".into(),
-        holds: "its step is skipped and counted, training goes on, weights finite".into(),
-        value_limit: 0.0,
-        gradient_limit: 0.0,
-        once: true,
-        run: Box::new(|_| told(poisoned())),
-    });
-    for (name, factor) in [("×10", 10.0), ("÷10", 0.1)] {
-        cases.push(Case {
-            area: "Stiff training",
-            input: format!(
-                "rate {name}, people nearly black, over-exposed, filling 1 % and 99 % of the frame; 24 steps of either stage"
-            ),
-            holds: "no step skipped, every logged number finite".into(),
-            value_limit: 0.0,
-            gradient_limit: 0.0,
-            once: true,
-            run: Box::new(move |_| told(stiff(factor))),
-        });
-    }
+    cases.extend(trainings::cases());
     cases
-}
-
-fn told(found: Result<Found, TrainError>) -> Found {
-    found.unwrap_or_else(|e| Found { broken: Some(e.to_string()), ..Found::default() })
 }
 
 fn finite(values: &[f32]) -> bool {
@@ -242,7 +203,7 @@ fn identical_pictures() -> Found {
 /// Two rows of weights, one of a matrix that Muon takes.
 fn zero_gradients(device: &Device) -> Found {
     const STEPS: usize = 1000;
-    let config = TrainConfig::from_toml(SMALL, "the small networks", &[]).expect("a config");
+    let config = config(&[]);
     let networks = config.networks();
     let predictor = random_predictor(&networks, 1, &device.clone().autodiff());
     let mut trained = Networks { predictor: Some(predictor), regressors: Vec::new() };
@@ -329,164 +290,6 @@ fn ends_of_the_rate() -> Found {
     Found { value: Some(worst), ..Found::default() }.must(sound, "a rate is negative, too high or not finite")
 }
 
-struct Silent {
-    finite: bool,
-}
-
-impl Watch for Silent {
-    fn step(&mut self, line: &Line, _: u64, _: u64) {
-        self.finite &= line.values.values().all(|value| value.is_finite());
-    }
-
-    fn validated(&mut self, _: u64, _: &Validation) {}
-
-    fn note(&mut self, _: &str) {}
-}
-
-/// A short training in a folder that goes with it.
-fn trained<T: Task>(
-    task: &T,
-    config: &TrainConfig,
-    networks: Networks,
-    devices: &[Device],
-) -> Result<(Outcome, bool), TrainError> {
-    let folder = temporary("run")?;
-    let stop = AtomicBool::new(false);
-    let options = Options { folder: &folder.0, devices, limit: None, stop: &stop };
-    let mut watch = Silent { finite: true };
-    let outcome =
-        crate::run::on_best_thread(devices, || train(task, config, networks, &options, &mut watch))?;
-    Ok((outcome, watch.finite))
-}
-
-/// A folder that is removed with its value.
-struct Temporary(std::path::PathBuf);
-
-impl Drop for Temporary {
-    fn drop(&mut self) {
-        let _ = std::fs::remove_dir_all(&self.0);
-    }
-}
-
-fn temporary(name: &str) -> Result<Temporary, TrainError> {
-    use std::sync::atomic::{AtomicU64, Ordering};
-    static COUNT: AtomicU64 = AtomicU64::new(0);
-    let number = COUNT.fetch_add(1, Ordering::Relaxed);
-    let path =
-        std::env::temp_dir().join(format!("snapsnap-stability-{}-{number}-{name}", std::process::id()));
-    std::fs::create_dir_all(&path)
-        .map_err(|e| TrainError::Unsuitable(format!("{}: cannot make this folder: {e}", path.display())))?;
-    Ok(Temporary(path))
-}
-
-/// A data set of people as they should not be photographed: nearly black, over-exposed, 1 % and nearly all of the frame.
-fn extreme_people(root: &std::path::Path) -> Result<Arc<Folder>, TrainError> {
-    let mut data = DataConfig::default();
-    (data.views.count, data.views.resolution) = (4, 64);
-    let folder = Folder::create(&root.join("people"), data.description("stability"))?;
-    let person = synth::person("stability");
-    let lit = |factor: f32| {
-        let mut mesh = person.clone();
-        mesh.materials.iter_mut().for_each(|material| material.color *= factor);
-        mesh
-    };
-    let middle = Vec3::new(0.0, 0.85, 0.0);
-    let mut small = person.clone();
-    small.positions.iter_mut().for_each(|p| *p = middle + (*p - middle) * 0.33);
-    // A ball that the cameras, two metres away, see nothing beside.
-    let mut ball = person.clone();
-    ball.positions.iter_mut().for_each(|p| *p = middle + (*p - middle).normalize_or(Vec3::Y) * 1.45);
-    for (name, mesh) in [("0000", lit(0.01)), ("0001", lit(40.0)), ("0002", small), ("0003", ball)] {
-        data.add(&folder, &Subject::plain(Split::Train, name), &mesh)?;
-    }
-    Ok(Arc::new(folder))
-}
-
 fn config(overrides: &[String]) -> TrainConfig {
     TrainConfig::from_toml(SMALL, "the small networks", overrides).expect("a config")
-}
-
-fn stiff(factor: f64) -> Result<Found, TrainError> {
-    let temporary = temporary("people")?;
-    let folder = extreme_people(&temporary.0)?;
-    let share = |subject: &str| -> Result<f64, TrainError> {
-        let (_, mask) = folder.picture(Some(Split::Train), subject, 0, false)?;
-        Ok(mask.as_raw().iter().filter(|m| **m > 127).count() as f64 / 4096.0)
-    };
-    let (small, large) = (share("0002")?, share("0003")?);
-    let rate = 1e-3 * factor;
-    let config = config(&[format!("optimizer.rate={rate}"), format!("optimizer.muon.rate={rate}")]);
-    let (networks, device) = (config.networks(), [Device::flex().autodiff()]);
-    let predictor = |device: &Device| random_predictor(&networks, 3, device);
-    let stage1 = PointTask::new(from_ref(&folder), &config, &device)?;
-    let fresh = Networks { predictor: Some(predictor(&device[0])), regressors: Vec::new() };
-    let (one, one_finite) = trained(&stage1, &config, fresh, &device)?;
-    let stage2 = GaussianTask::new(from_ref(&folder), &config, None, &device)?;
-    let regressors = random_regressors(&networks, 4, &device[0]);
-    let fresh = Networks { predictor: Some(predictor(&device[0])), regressors };
-    let (two, two_finite) = trained(&stage2, &config, fresh, &device)?;
-    let note = format!(
-        "{:.1} % and {:.1} % of the frame; {} and {} skipped",
-        100.0 * small,
-        100.0 * large,
-        one.skipped,
-        two.skipped
-    );
-    Ok(Found { note, ..Found::default() }
-        .must(small < 0.02 && large > 0.95, "the people do not fill the frame as they should")
-        .must(one.step == 24 && two.step == 24, "the training ended early")
-        .must(one.skipped == 0 && two.skipped == 0, "steps were skipped")
-        .must(one_finite && two_finite, "a logged number is not finite"))
-}
-
-/// Stage 1, in whose fourth step the loss is NaN.
-struct Poisoned(PointTask);
-
-impl Task for Poisoned {
-    type Item = Stage1Item;
-    const STAGE: u32 = 1;
-
-    fn samples(&self, pass: u64) -> Joined<Stage1Item> {
-        self.0.samples(pass)
-    }
-
-    fn name(item: &Stage1Item) -> &str {
-        PointTask::name(item)
-    }
-
-    fn losses(
-        &self,
-        networks: &Networks,
-        items: Vec<Stage1Item>,
-        at: Moment,
-    ) -> Result<Vec<Part>, TrainError> {
-        let mut parts = self.0.losses(networks, items, at)?;
-        if at.step == 3 {
-            parts.iter_mut().for_each(|part| part.value = part.value.clone() * f64::NAN);
-        }
-        Ok(parts)
-    }
-
-    fn validate(&self, networks: &Networks) -> Result<Option<Validation>, TrainError> {
-        self.0.validate(networks)
-    }
-
-    fn preview(&self, networks: &Networks) -> Result<Option<RgbImage>, TrainError> {
-        self.0.preview(networks)
-    }
-}
-
-fn poisoned() -> Result<Found, TrainError> {
-    let temporary = temporary("people")?;
-    let folder = extreme_people(&temporary.0)?;
-    let config = config(&["training.steps=8".into()]);
-    let (networks, device) = (config.networks(), [Device::flex().autodiff()]);
-    let task = Poisoned(PointTask::new(from_ref(&folder), &config, &device)?);
-    let fresh =
-        Networks { predictor: Some(random_predictor(&networks, 3, &device[0])), regressors: Vec::new() };
-    let (outcome, all_finite) = trained(&task, &config, fresh, &device)?;
-    Ok(Found { note: format!("{} of {} steps skipped", outcome.skipped, outcome.step), ..Found::default() }
-        .must(outcome.skipped == 1, "not one step was skipped")
-        .must(outcome.finished && outcome.step == 8, "the training ended early")
-        .must(all_finite, "a logged number is not finite"))
 }
