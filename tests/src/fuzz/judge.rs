@@ -27,8 +27,10 @@ pub fn problems(
     most_memory: u64,
 ) -> Vec<String> {
     let mut problems = Vec::new();
+    let done = is_done(format, ran);
     match ran.ended {
-        Ended::Code(0 | 2) => {}
+        Ended::Code(2) => {}
+        _ if done => {}
         Ended::Code(code) => problems.push(format!("exit code {code}")),
         Ended::Signal(signal) => problems.push(format!("ended by signal {signal}")),
         Ended::Never => problems.push(format!("no end within {} s", LONGEST.as_secs())),
@@ -38,7 +40,7 @@ pub fn problems(
     }
     problems.extend(about_words(ran));
     problems.extend(about_files(format, ran, before, after));
-    if ran.ended == Ended::Code(0) {
+    if done {
         let whole = catch_unwind(AssertUnwindSafe(|| (format.whole)(work)));
         match whole {
             Ok(Ok(())) => {}
@@ -47,6 +49,11 @@ pub fn problems(
         }
     }
     problems
+}
+
+/// Whether the command did what it was for, or what it could of it.
+fn is_done(format: &Format, ran: &Ran) -> bool {
+    ran.ended == Ended::Code(0) || format.partial && ran.ended == Ended::Code(1)
 }
 
 fn about_words(ran: &Ran) -> Vec<String> {
@@ -76,14 +83,15 @@ fn about_words(ran: &Ran) -> Vec<String> {
         let start = (0..=at.saturating_sub(QUOTED / 2)).rev().find(|at| line.is_char_boundary(*at));
         problems.push(format!("prints control characters: `{}`", short(&line[start.unwrap_or(0)..])));
     }
-    if ran.ended == Ended::Code(2) && text.trim().is_empty() {
-        problems.push("refuses without a word".into());
+    if ran.ended != Ended::Code(0) && text.trim().is_empty() {
+        problems.push("fails without a word".into());
     }
     problems
 }
 
 fn about_files(format: &Format, ran: &Ran, before: &Tree, after: &Tree) -> Vec<String> {
     let mut problems = Vec::new();
+    let done = is_done(format, ran);
     let is_input = |path: &Path| {
         let first = path.components().next();
         // The folder of inputs may have another name that begins the same.
@@ -95,7 +103,7 @@ fn about_files(format: &Format, ran: &Ran, before: &Tree, after: &Tree) -> Vec<S
         let what = if is_input(path) { "input" } else { "output of before" };
         match after.get(path) {
             // A success replaces its output.
-            _ if ran.ended == Ended::Code(0) && !is_input(path) => {}
+            _ if done && !is_input(path) => {}
             None => problems.push(format!("{what} {name} is gone")),
             Some(now) if now != entry => problems.push(format!("{what} {name} was changed")),
             Some(_) => {}
@@ -108,7 +116,7 @@ fn about_files(format: &Format, ran: &Ran, before: &Tree, after: &Tree) -> Vec<S
             problems.push(format!("left {name} unfinished"));
         } else if is_input(path) {
             problems.push(format!("wrote {name} among its inputs"));
-        } else if ran.ended != Ended::Code(0) && *entry != Entry::Folder && !is_left(path) {
+        } else if !done && *entry != Entry::Folder && !is_left(path) {
             problems.push(format!("wrote {name} though it failed"));
         }
     }

@@ -43,6 +43,8 @@ pub struct Format {
     pub command: &'static str,
     /// The file that the command writes, if it is one: one of that name may be there already.
     pub file: Option<&'static str>,
+    /// Whether the command does what it can without the parts that it cannot read, names those, and ends with code 1.
+    pub partial: bool,
     /// Files that may be left though the input is refused.
     pub kept: &'static [&'static str],
     /// Whether what a successful command wrote into this folder is whole; else what is wrong.

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::fs;
 
 use serde_json::Value;
-use snapsnap_tests::{refused, snapsnap, succeed};
+use snapsnap_tests::{refused, root, snapsnap, succeed};
 
 use super::{copied, ended, evaluate, json, people, weights};
 
@@ -92,6 +92,31 @@ fn a_report_has_its_keys_and_follows_from_its_tables() {
     // Again, into the same folder: the same figures.
     succeed(evaluate(people(), &report, &arguments).args(["--set", ablation]));
     assert_eq!(fs::read_to_string(report.join("views.csv")).expect("a table"), table);
+}
+
+/// Where no camera stood at right angles, what it would have seen is put together from what its neighbours saw.
+#[test]
+fn true_points_of_a_side_do_not_depend_on_where_the_cameras_stood() {
+    let temporary = tempfile::tempdir().expect("a folder");
+    let points = |views: usize| {
+        let data = temporary.path().join(format!("{views} views"));
+        let mut command = snapsnap();
+        command.args(["prepare", "synth", "--seed", "5", "--subjects", "1", "--split", "test", "--config"]);
+        command.arg(root().join("configs/data/evaluation.toml"));
+        command.args(["--set", "views.resolution=64", "--set", &format!("views.count={views}"), "-o"]);
+        succeed(command.arg(&data));
+        let report = temporary.path().join(format!("report of {views}"));
+        succeed(&mut evaluate(&data, &report, &["--set", "metrics.geometry=false"]));
+        json(&report)["points_mm"].clone()
+    };
+    // Every 30°, of which one is the side's own, and every 36°: 72° and 108° are its neighbours.
+    let (exact, neighbours) = (points(12), points(10));
+    println!("{exact}\n{neighbours}");
+    for view in ["front", "back", "right", "left"] {
+        let [exact, neighbours] =
+            [&exact, &neighbours].map(|points| points[view]["mean"].as_f64().expect("millimetres"));
+        assert!((exact - neighbours).abs() < 0.02 * exact, "{view}: {exact} and {neighbours} mm");
+    }
 }
 
 /// Pairs of photographs of known cameras: no unseen side, five shells.

@@ -7,11 +7,15 @@ use snapsnap_data::sample::TestItem;
 use snapsnap_splat::Gaussians;
 
 use super::model::Model;
-use super::person::{People, nearest_view, photograph, points};
+use super::person::{People, Points, nearest_view, photograph, points};
+use super::sides::side_points;
 use crate::EvalError;
 use crate::baselines::{MeanPictures, billboard, true_points};
 use crate::pictures::Picture;
 use crate::points::{Pair, PointError, point_errors};
+
+/// Azimuths of the right and the left side, degrees from the first photograph.
+const SIDES: [f64; 2] = [90.0, 270.0];
 
 /// What a contestant is to a report.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -135,7 +139,7 @@ impl Contestant {
             Means::TruePoints(device) => {
                 let mut views = inputs.to_vec();
                 if inputs.len() == 2 {
-                    views.extend(sides(item, inputs[0]).map(|(view, _)| view));
+                    views.extend(SIDES.map(|azimuth| nearest_view(&item.cameras, inputs[0], azimuth)));
                 }
                 let Some((points, there)) = points(people.test(), row, &views, item.side, canvas)? else {
                     let message = format!("views of {}² give no points on a canvas of {canvas}²", item.side);
@@ -171,12 +175,7 @@ fn on_canvas(item: &TestItem, count: usize, side: usize) -> (Vec<f32>, Vec<Vec<b
     (images.concat(), valid)
 }
 
-/// The views nearest to 90° (right) and 270° (left) of the first photograph, and how far off they are in degrees.
-fn sides(item: &TestItem, first: usize) -> [(usize, f64); 2] {
-    [90.0, 270.0].map(|wanted| nearest_view(&item.cameras, first, wanted))
-}
-
-/// Errors of predicted maps at the pixels where a view sees true points. A side needs a view at right angles.
+/// Errors of predicted maps, by their places among [`crate::points::VIEWS`], at the pixels that have a true point.
 fn errors(
     people: &People,
     row: usize,
@@ -185,25 +184,20 @@ fn errors(
     maps: &[(usize, Vec<f32>)],
     side: usize,
 ) -> Result<Vec<PointError>, EvalError> {
-    /// Degrees; training cameras stray by as much.
-    const RIGHT: f64 = 5.0;
-    let [right, left] = sides(item, inputs[0]);
-    let there = |place: &usize| match place {
-        2 => (right.1 <= RIGHT).then_some(right.0),
-        3 => (left.1 <= RIGHT).then_some(left.0),
-        _ => inputs.get(*place).copied(),
+    // More than two photographs are pairs, which have no one frame.
+    if maps.is_empty() {
+        return Ok(Vec::new());
+    }
+    let Some((photographed, there)) = points(people.test(), row, inputs, item.side, side)? else {
+        return Ok(Vec::new());
     };
-    // The first view's frame is that of the predictions.
-    let (maps, views): (Vec<_>, Vec<usize>) =
-        maps.iter().filter_map(|(place, map)| Some(((*place, map), there(place)?))).unzip();
-    let truth = if views.is_empty() { None } else { points(people.test(), row, &views, item.side, side)? };
-    let Some((truth, valid)) = truth else { return Ok(Vec::new()) };
-    let area = side * side;
-    let pairs = maps.iter().enumerate().map(|(i, (place, map))| Pair {
-        view: *place,
-        points: map,
-        truth: &truth[3 * i * area..3 * (i + 1) * area],
-        valid: &valid[i * area..(i + 1) * area],
-    });
+    let of_inputs = photographed.chunks_exact(3 * side * side).zip(there.chunks_exact(side * side));
+    let mut truths: Vec<Points> =
+        of_inputs.map(|(points, valid)| (points.to_vec(), valid.to_vec())).collect();
+    for azimuth in SIDES {
+        truths.push(side_points(people.test(), row, item, inputs[0], azimuth, side)?);
+    }
+    let with_truth = maps.iter().map(|(view, points)| (*view, points, &truths[*view]));
+    let pairs = with_truth.map(|(view, points, (truth, valid))| Pair { view, points, truth, valid });
     Ok(point_errors(&pairs.collect::<Vec<_>>()))
 }

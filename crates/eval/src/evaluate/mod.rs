@@ -5,6 +5,7 @@ mod contest;
 pub mod meshes;
 pub mod model;
 pub mod person;
+mod sides;
 mod surface;
 
 use std::time::Duration;
@@ -345,7 +346,7 @@ fn pictures(
         pictures.push(target.cropped(Region::paper(&target)?.window).to_rgb8());
     }
     for wanted in &config.report.degrees {
-        let (view, _) = person::nearest_view(&item.cameras, inputs[0], *wanted);
+        let view = person::nearest_view(&item.cameras, inputs[0], *wanted);
         let image = picture(config, contestant, &shown, &item.cameras[view], view, side)?;
         let (target, _) = people.target(row, view, side)?;
         let window = Region::paper(&target)?.window;

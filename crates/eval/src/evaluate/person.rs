@@ -182,14 +182,16 @@ pub fn points(
     Ok(Some((means, shares)))
 }
 
-/// The view whose camera is nearest to so many degrees around the person from the view `first`, and how far off it is.
-pub fn nearest_view(cameras: &[Camera], first: usize, wanted: f64) -> (usize, f64) {
-    let off = |view: usize| {
-        let apart = (degrees(&cameras[view], &cameras[first]) - wanted).rem_euclid(360.0);
-        apart.min(360.0 - apart)
-    };
-    let views = (0..cameras.len()).map(|view| (view, off(view)));
-    views.min_by(|a, b| a.1.total_cmp(&b.1)).expect("there are views")
+/// The view whose camera is nearest to so many degrees around the person from the view `first`.
+pub fn nearest_view(cameras: &[Camera], first: usize, wanted: f64) -> usize {
+    let off = |view: &usize| off(&cameras[*view], &cameras[first], wanted);
+    (0..cameras.len()).min_by(|a, b| off(a).total_cmp(&off(b))).expect("there are views")
+}
+
+/// How far a camera is from `wanted` degrees around the person from `front`, 0° to 180°.
+pub fn off(camera: &Camera, front: &Camera, wanted: f64) -> f64 {
+    let apart = (degrees(camera, front) - wanted).rem_euclid(360.0);
+    apart.min(360.0 - apart)
 }
 
 /// Azimuth of a camera around the world's y, degrees from that of `front`, 0 to 360.

@@ -39,7 +39,7 @@ pub struct Truth {
 /// [`EvalError`] for files that cannot be read, or without any point.
 pub fn truth(people: &People, row: usize) -> Result<Truth, EvalError> {
     let cameras = people.test().sample(row, &[])?.cameras;
-    let directions = DIRECTIONS.map(|wanted| nearest_view(&cameras, 0, wanted).0);
+    let directions = DIRECTIONS.map(|wanted| nearest_view(&cameras, 0, wanted));
     let of_view = |(view, camera): (usize, &Camera)| {
         let (points, valid) = people.test().points(row, &[view])?;
         let to_world = camera.world_to_camera.inverse();

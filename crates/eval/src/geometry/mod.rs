@@ -91,7 +91,11 @@ fn distance(a: [f32; 3], b: [f32; 3]) -> f64 {
 pub fn point_to_surface(points: &[[f32; 3]], mesh: &Mesh) -> Result<f64, EvalError> {
     check_points(points)?;
     let vertices = mesh.positions.iter().map(|p| Vector::new(p.x, p.y, p.z)).collect();
-    let faces: Vec<[u32; 3]> = mesh.faces.iter().map(|face| face.positions).collect();
+    let mut faces: Vec<[u32; 3]> = mesh.faces.iter().map(|face| face.positions).collect();
+    // Every copy of a nearest face would be looked at: a damaged file may have thousands.
+    faces.iter_mut().for_each(|corners| corners.sort_unstable());
+    faces.sort_unstable();
+    faces.dedup();
     let surface = TriMesh::new(vertices, faces)
         .map_err(|e| EvalError::Empty(format!("the mesh has no surface: {e}")))?;
     let apart = |p: &[f32; 3]| {

@@ -15,6 +15,7 @@ const CHECK: Format = Format {
     changed: &[],
     command: "",
     file: None,
+    partial: false,
     kept: &[],
     whole: nothing,
     share: 56,

@@ -16,6 +16,7 @@ const RENDER: Format = Format {
     changed: &["h.ply"],
     command: "render in/h.ply --orbit 2 --size 16x24 --device cpu -o out --raw out.safetensors",
     file: Some("out.safetensors"),
+    partial: false,
     kept: &[],
     whole: pictures,
     share: 28,

@@ -13,6 +13,7 @@ pub const FORMATS: &[Format] = &[Format {
     changed: &["base.obj", ".mhskel", ".mhw", ".target"],
     command: "prepare makehuman in --subjects 1 -o out --set views.count=2 --set views.resolution=16 --set views.samples=1",
     file: None,
+    partial: false,
     kept: scans::DESCRIPTIONS,
     whole: scans::data_set,
     share: 8,

@@ -1,6 +1,7 @@
 //! Every format that the program reads: how a small sound sample is made, and which command reads it.
 
 mod datasets;
+mod evaluation;
 mod gaussians;
 mod makehuman;
 mod pickle;
@@ -24,6 +25,7 @@ pub fn all() -> impl Iterator<Item = &'static Format> {
         datasets::FORMATS,
         makehuman::FORMATS,
         training::FORMATS,
+        evaluation::FORMATS,
     ];
     groups.into_iter().flatten()
 }

@@ -20,6 +20,7 @@ const PICTURE: Format = Format {
     changed: &[],
     command: "",
     file: Some("out.ply"),
+    partial: false,
     kept: &[],
     whole: gaussians::reconstruction,
     share: 24,
@@ -99,7 +100,7 @@ const MASKED: &str = "reconstruct in/front.jpg in/back.jpg --masks in/mask.png i
                       --weights in/w.safetensors --device cpu -v -o out.ply";
 
 /// A standing ellipse of many colours before nothing.
-fn picture() -> RgbaImage {
+pub fn picture() -> RgbaImage {
     RgbaImage::from_fn(SIDE, SIDE, |x, y| {
         let [u, v] = [x, y].map(|at| at as f32 / SIDE as f32 - 0.5);
         let inside = (u / 0.3).powi(2) + (v / 0.45).powi(2) < 1.0;
@@ -107,7 +108,7 @@ fn picture() -> RgbaImage {
     })
 }
 
-fn encoded(picture: &DynamicImage, format: ImageFormat) -> Vec<u8> {
+pub fn encoded(picture: &DynamicImage, format: ImageFormat) -> Vec<u8> {
     let mut bytes = Cursor::new(Vec::new());
     picture.write_to(&mut bytes, format).expect("encodes");
     bytes.into_inner()

@@ -23,6 +23,7 @@ const SCAN: Format = Format {
     changed: &[],
     command: "",
     file: None,
+    partial: false,
     kept: DESCRIPTIONS,
     whole: data_set,
     share: 28,
@@ -205,7 +206,7 @@ fn png() -> Vec<u8> {
     bytes.into_inner()
 }
 
-fn obj(folder: &Path, name: &str) {
+pub fn obj(folder: &Path, name: &str) {
     export::write_obj(&person(), &folder.join(format!("{name}.obj"))).expect("written");
 }
 

@@ -71,6 +71,7 @@ const REHEARSAL: Format = Format {
               --set training.batch=1 --set training.accumulate=1 \
               --set training.workers=1 --set training.validation_samples=1",
     file: None,
+    partial: false,
     kept: &[],
     whole: nothing,
     share: 20,

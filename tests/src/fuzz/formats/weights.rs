@@ -45,6 +45,7 @@ const WEIGHTS: Format = Format {
     changed: &[],
     command: "",
     file: Some("out.safetensors"),
+    partial: false,
     kept: &[],
     whole: weights,
     share: 28,

@@ -1,0 +1,189 @@
+//! Configs of evaluations and benchmarks, and what both read: test sets, meshes, pictures, LPIPS's layers.
+
+use std::fs;
+use std::path::Path;
+
+use image::{DynamicImage, GrayImage, ImageFormat, Luma};
+use snapsnap_data::dataset::{Folder, Layout, Split};
+use snapsnap_data::prepare::{DataConfig, Subject, ViewsConfig};
+
+use super::super::Format;
+use super::{nothing, pictures, put, scans, weights};
+
+/// Every kind of key of an evaluation, but ablations that would each take as long as the model.
+const EVALUATION: &str = r#"
+[data]
+folders = ["in/set"]
+split = "test"
+subjects = 1
+only = ["0000"]
+scans = "in/scans"
+
+[views]
+inputs = [0, 2]
+turns = [0]
+resolution = 32
+supersampling = 1
+
+[model]
+set = ["network.conf_threshold=0.4"]
+
+[metrics]
+protocols = ["paper", "masked"]
+lpips = "in/none"
+geometry = true
+opaque = 0.1
+
+[baselines]
+billboard = true
+true_points = true
+mean = ["in/set"]
+
+[ablations.sideless]
+sides = false
+
+[groups.loose]
+subjects = ["0000"]
+
+[report]
+people = 1
+degrees = [0.0, 90.0]
+"#;
+
+/// Every kind of key of a benchmark.
+const BENCH: &str = r#"
+[data]
+folders = ["in/set"]
+split = "test"
+
+[bench]
+runs = 2
+warm_up = 1
+people = 1
+views = 2
+resolution = 32
+oracle = 4
+lpips = "in/none"
+
+[model]
+supersampling = 1
+
+[settings."no sides"]
+scene = "standing"
+omits = "the sides"
+sides = false
+side_colors = false
+stride = 2
+min_opacity = 0.1
+only = ["0000"]
+inputs = [0, 2]
+
+[settings.tuned]
+knob = "Gaussians"
+tune = "colors"
+set = ["network.conf_threshold=0.4"]
+preset = "gsplat"
+antialiased = true
+precision = "f32"
+supersampling = 1
+"#;
+
+/// What all have in common.
+const REPORT: Format = Format {
+    name: "",
+    sample: |_| (),
+    changed: &[],
+    command: "",
+    file: None,
+    partial: true,
+    kept: &[],
+    whole: |work| report(work, "protocols"),
+    share: 16,
+};
+
+pub const FORMATS: &[Format] = &[
+    Format {
+        name: "evaluation-config",
+        sample,
+        changed: &["e.toml"],
+        command: "evaluate --config in/e.toml --weights in/w.safetensors --device cpu -o out",
+        ..REPORT
+    },
+    Format {
+        name: "evaluation-set",
+        sample,
+        // Pictures are all that is read of those to learn from.
+        changed: &[
+            "dataset.toml",
+            "0000/1.png",
+            "0000/2.png",
+            "test/depth/0000/1.npz",
+            "test/cameras/0000.json",
+        ],
+        command: "evaluate --config in/e.toml --weights in/w.safetensors --device cpu -o out",
+        ..REPORT
+    },
+    Format {
+        name: "evaluation-mesh",
+        sample,
+        changed: &["0000.obj"],
+        command: "evaluate --config in/e.toml --mesh-dir in/scans --icp similarity -o out",
+        whole: |work| report(work, "geometry_cm"),
+        ..REPORT
+    },
+    Format {
+        name: "bench-config",
+        sample,
+        changed: &["b.toml"],
+        command: "bench --config in/b.toml --quick --weights in/w.safetensors --device cpu -o out",
+        whole: |work| report(work, "settings"),
+        ..REPORT
+    },
+    Format {
+        name: "compare",
+        sample: compared,
+        changed: &["a.png", "b.tiff", "m.png"],
+        command: "compare in/a.png in/b.tiff --mask in/m.png --window mask --json",
+        whole: nothing,
+        ..REPORT
+    },
+];
+
+/// A person to test on with a scan and one to learn from, four views of each; weights, and both configs.
+fn sample(folder: &Path) {
+    let views =
+        ViewsConfig { count: 4, resolution: 64, high_resolution: false, samples: 1, layout: Layout::Exact };
+    let config = DataConfig { views, ..DataConfig::default() };
+    let set = Folder::create(&folder.join("set"), config.description("for tests")).expect("created");
+    for split in [Split::Test, Split::Train] {
+        config.add(&set, &Subject::plain(split, "0000"), &scans::person()).expect("written");
+    }
+    set.tidy();
+    weights::write(folder);
+    fs::create_dir(folder.join("scans")).expect("a folder");
+    scans::obj(folder, "scans/0000");
+    put(folder, "e.toml", EVALUATION);
+    put(folder, "b.toml", BENCH);
+}
+
+/// Two pictures and a mask.
+fn compared(folder: &Path) {
+    let picture = DynamicImage::from(pictures::picture());
+    put(folder, "a.png", pictures::encoded(&picture, ImageFormat::Png));
+    let float = DynamicImage::ImageRgb32F(picture.to_rgb32f());
+    put(folder, "b.tiff", pictures::encoded(&float, ImageFormat::Tiff));
+    let mask =
+        GrayImage::from_fn(picture.width(), picture.height(), |x, _| Luma([if x < 40 { 255 } else { 0 }]));
+    put(folder, "m.png", pictures::encoded(&DynamicImage::from(mask), ImageFormat::Png));
+}
+
+/// Whether there is a report with such a key.
+fn report(work: &Path, key: &str) -> Result<(), String> {
+    let text = fs::read_to_string(work.join("out/report.json")).map_err(|e| format!("report.json: {e}"))?;
+    let report: serde_json::Value = serde_json::from_str(&text).map_err(|e| format!("report.json: {e}"))?;
+    let is_missing = |key: &&str| report[*key].is_null();
+    match ["command", "left_out", key].iter().find(|key| is_missing(key)) {
+        Some(key) => Err(format!("report.json has no `{key}`")),
+        None => Ok(()),
+    }
+}
