@@ -4,12 +4,11 @@ use std::path::Path;
 use std::sync::Arc;
 
 use burn::tensor::{Device, Tensor, TensorData};
+use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 use snapsnap_data::dataset::{Folder, Split};
-use snapsnap_net::Window;
 use snapsnap_net::config::Config;
 use snapsnap_net::gaussians::{Seen, geometric, placed, side_images};
-use snapsnap_net::network::{View, anchors};
 use snapsnap_ops::{bilinear, host};
 use snapsnap_splat::{Camera, Gaussians};
 
@@ -31,16 +30,30 @@ pub fn billboard(
     device: &Device,
 ) -> Option<Gaussians> {
     let area = side * side;
-    let points = anchors(View::Front, side, &Window::whole(side), device);
     let part = |(place, camera): (usize, &Camera)| {
         let seen = Seen {
             image: &images[3 * place * area..3 * (place + 1) * area],
-            points: points.clone(),
+            points: Tensor::from_data(TensorData::new(upright(camera, side), [1, side, side, 3]), device),
             valid: &valid[place * area..(place + 1) * area],
         };
         in_world(geometric(&[seen], device), camera)
     };
     some(joined(cameras.iter().enumerate().map(part).collect()))
+}
+
+/// Where the rays of a camera's pixels meet the upright plane through the world's y axis that faces it: `[S,S,3]` metres in the
+/// camera's frame.
+fn upright(camera: &Camera, side: usize) -> Vec<f32> {
+    let camera = camera.resized(side as u32, side as u32);
+    let centre = camera.centre();
+    let facing = camera.world_to_camera.rotation * DVec3::new(centre.x, 0.0, centre.z).normalize_or(DVec3::Z);
+    let from_axis = facing.dot(camera.world_to_camera.translation);
+    let point = |pixel: usize| {
+        let at = DVec2::new((pixel % side) as f64, (pixel / side) as f64) + 0.5;
+        let ray = ((at - camera.principal_point) / camera.focal).extend(1.0);
+        (from_axis / facing.dot(ray) * ray).as_vec3().to_array()
+    };
+    (0..side * side).flat_map(point).collect()
 }
 
 /// True points `[V,S,S,3]` (metres, first camera's frame) where `valid` `[V,S,S]`, in the colours of the first `photographs`
@@ -140,5 +153,29 @@ impl MeanPictures {
         let planes = Tensor::<4>::from_data(planes, &Device::flex());
         let planes = if side == self.side { planes } else { bilinear(planes, [side, side], false) };
         Picture::new(host(planes.clamp(0.0, 1.0)), [side, side], "mean picture")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use snapsnap_splat::Orbit;
+
+    /// Points of a cut-out lie in a plane through the body's axis, and their camera sees them where their pixels are.
+    #[test]
+    fn a_cut_out_stands_upright_before_any_camera() {
+        let orbit =
+            Orbit { radius: 2.7, yaw_degrees: 70.0, pitch_degrees: -4.0, focal: 0.9, ..Orbit::default() };
+        let camera = orbit.camera(64);
+        let points = upright(&camera, 32);
+        let (small, to_world) = (camera.resized(32, 32), camera.world_to_camera.inverse());
+        let facing = camera.centre() * DVec3::new(1.0, 0.0, 1.0);
+        for (pixel, point) in points.as_chunks::<3>().0.iter().enumerate() {
+            let world = to_world.apply(DVec3::from(point.map(f64::from)));
+            assert!(world.dot(facing).abs() < 1e-5, "pixel {pixel}: {world}");
+            let (at, depth) = small.project(world).expect("in front");
+            let expected = DVec2::new((pixel % 32) as f64, (pixel / 32) as f64) + 0.5;
+            assert!((at - expected).length() < 1e-4 && depth > 2.0, "pixel {pixel}: {at}, {depth} m");
+        }
     }
 }

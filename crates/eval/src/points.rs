@@ -23,20 +23,26 @@ pub struct PointError {
     pub view: usize,
     /// As they are.
     pub mean: f64,
-    /// After the mean shift of all the person's views together is removed.
+    /// After the mean shift of the person's photographed views together is removed.
     pub centred: f64,
+    /// Share of the true points at whose pixels nothing was predicted, which are in neither: outside of the predictor's window,
+    /// or not finite.
+    pub missed: f64,
 }
 
-/// Errors of one person in every view that has a true point.
+/// Errors of one person in every view that has a true point and predicts some.
 pub fn point_errors(pairs: &[Pair]) -> Vec<PointError> {
+    // No point lies in the first camera itself: that is what pixels outside of the predictor's window hold.
+    let is_predicted = |p: &[f32]| p.iter().all(|v| v.is_finite()) && p.iter().any(|v| *v != 0.0);
     let there = |pair: &Pair| -> Vec<usize> {
-        pair.valid.iter().enumerate().filter(|(_, v)| **v > 0.5).map(|(i, _)| i).collect()
+        let is_there = |i: &usize| pair.valid[*i] > 0.5 && is_predicted(&pair.points[3 * i..3 * i + 3]);
+        (0..pair.valid.len()).filter(is_there).collect()
     };
     let off = |pair: &Pair, i: usize| -> [f64; 3] {
         [0, 1, 2].map(|c| f64::from(pair.points[3 * i + c]) - f64::from(pair.truth[3 * i + c]))
     };
     let (mut shift, mut count) = ([0.0; 3], 0.0);
-    for pair in pairs {
+    for pair in pairs.iter().filter(|pair| pair.view < 2) {
         for i in there(pair) {
             shift.iter_mut().zip(off(pair, i)).for_each(|(sum, v)| *sum += v);
             count += 1.0;
@@ -52,6 +58,7 @@ pub fn point_errors(pairs: &[Pair]) -> Vec<PointError> {
             view: pair.view,
             mean: sum(&length) / n,
             centred: sum(&|v| length([0, 1, 2].map(|c| v[c] - shift[c]))) / n,
+            missed: 1.0 - n / pair.valid.iter().filter(|v| **v > 0.5).count() as f64,
         })
     };
     pairs.iter().filter_map(error).collect()
@@ -63,21 +70,29 @@ mod tests {
 
     #[test]
     fn errors_are_mean_distances_with_and_without_the_common_shift() {
-        let truth = [0.0; 9];
+        let truth = [1.0; 9];
         let pair = |view, points| Pair { view, points, truth: &truth, valid: &[1.0, 0.0, 1.0] };
         // Two points 5 and 1 off; what is not valid does not count.
-        let front = [3.0, 4.0, 0.0, 100.0, 0.0, 0.0, 1.0, 0.0, 0.0];
+        let front = [4.0, 5.0, 1.0, 100.0, 0.0, 0.0, 2.0, 1.0, 1.0];
         let [error] = point_errors(&[pair(0, &front)])[..] else { panic!("one view") };
         let half = (1.0_f64 + 4.0).sqrt();
         assert!((error.mean - 3.0).abs() < 1e-12 && (error.centred - half).abs() < 1e-12, "{error:?}");
-        // Shells that lie apart stay apart.
-        let (near, far) = ([0.0; 9], [0.0, 0.0, 2.0, 0.0, 0.0, 0.0, 0.0, 0.0, 2.0]);
-        let errors = point_errors(&[pair(0, &near), pair(1, &far)]);
-        assert_eq!(
-            errors.iter().map(|e| (e.view, e.mean, e.centred)).collect::<Vec<_>>(),
-            [(0, 0.0, 1.0), (1, 2.0, 1.0)]
-        );
+        // Shells that lie apart stay apart, and sides have no say in the shift.
+        let (near, far) = ([1.0; 9], [1.0, 1.0, 3.0, 1.0, 1.0, 1.0, 1.0, 1.0, 3.0]);
+        let errors = point_errors(&[pair(0, &near), pair(1, &far), pair(2, &far)]);
+        let found: Vec<_> = errors.iter().map(|e| (e.view, e.mean, e.centred)).collect();
+        assert_eq!(found, [(0, 0.0, 1.0), (1, 2.0, 1.0), (2, 2.0, 1.0)]);
         let nobody = Pair { valid: &[0.0; 3], ..pair(2, &near) };
         assert_eq!(point_errors(&[nobody]), []);
+    }
+
+    #[test]
+    fn what_is_not_predicted_is_missed_and_no_error() {
+        let truth = [1.0; 12];
+        let points = [1.0, 1.0, 2.0, 0.0, 0.0, 0.0, f32::NAN, 1.0, 1.0, 5.0, 5.0, 5.0];
+        let pair = Pair { view: 1, points: &points, truth: &truth, valid: &[1.0, 1.0, 1.0, 0.0] };
+        let [error] = point_errors(&[pair])[..] else { panic!("one view") };
+        assert_eq!((error.mean, error.centred), (1.0, 0.0));
+        assert!((error.missed - 2.0 / 3.0).abs() < 1e-12, "{error:?}");
     }
 }

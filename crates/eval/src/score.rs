@@ -1,6 +1,7 @@
 //! All metrics of a picture and the true one.
 
 use burn::tensor::Device;
+use burn::tensor::ops::PadMode;
 use serde::Serialize;
 
 use crate::EvalError;
@@ -19,14 +20,14 @@ pub struct Score {
     /// Absent where the region holds no whole window.
     #[serde(with = "number::optional")]
     pub ssim: Option<f64>,
-    /// Absent without weights, and where the region is too small for the network.
+    /// Absent without weights, and where a window is too small for the network.
     #[serde(with = "number::optional")]
     pub lpips: Option<f64>,
 }
 
 impl Score {
     /// Compares an image with the true one where `region` says. LPIPS sees the region's box, black where the region's mask is
-    /// not set, in both.
+    /// not set, in both, and on to the network's least size.
     ///
     /// # Errors
     /// [`EvalError::Sizes`].
@@ -45,9 +46,14 @@ impl Score {
             }
         };
         let [.., width, height] = region.window;
-        let lpips = lpips.filter(|_| width.min(height) >= MIN_SIDE).map(|network| {
+        // Black around a mask may as well go on to the network's least size.
+        let short = [width, height].map(|side| MIN_SIDE.saturating_sub(side));
+        let lpips = lpips.filter(|_| short == [0, 0] || region.inside.is_some()).map(|network| {
             let device: &Device = &network.device();
-            let distance = network.distance(seen(image).tensor(device), seen(target).tensor(device));
+            let tensor = |picture| {
+                seen(picture).tensor(device).pad((0, short[0], 0, short[1]), PadMode::Constant(0.0))
+            };
+            let distance = network.distance(tensor(image), tensor(target));
             f64::from(snapsnap_ops::host(distance)[0])
         });
         Ok(Self { psnr, ssim, lpips })

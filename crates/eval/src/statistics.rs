@@ -54,7 +54,8 @@ pub fn quantile(sorted: &[f64], share: f64) -> f64 {
 
 /// Numbers in JSON, which has no infinities: those are written as `"inf"`.
 pub mod number {
-    use serde::{Serialize, Serializer};
+    use serde::de::Error;
+    use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
     /// As text where it is not finite.
     ///
@@ -62,6 +63,23 @@ pub mod number {
     /// Of the serializer.
     pub fn serialize<S: Serializer>(value: &f64, serializer: S) -> Result<S::Ok, S::Error> {
         if value.is_finite() { value.serialize(serializer) } else { value.to_string().serialize(serializer) }
+    }
+
+    /// Either.
+    ///
+    /// # Errors
+    /// Of the deserializer, and for text that is no number.
+    pub fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
+        #[derive(Deserialize)]
+        #[serde(untagged)]
+        enum Written {
+            Number(f64),
+            Text(String),
+        }
+        match Written::deserialize(deserializer)? {
+            Written::Number(value) => Ok(value),
+            Written::Text(text) => text.parse().map_err(D::Error::custom),
+        }
     }
 
     /// The same for figures that may be absent.

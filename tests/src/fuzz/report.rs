@@ -12,8 +12,9 @@ use super::child::Ended;
 /// What the numbers of a report mean.
 const MEANING: &str = "\
 Each is a sound sample, changed at random, read as a user would. It must end with exit code 0 and whole output or with 2 and
-none (evaluations also with 1, where a part could not be read: the rest is whole), within 20 s and with at most 300 MB, and 50 bytes for each byte that it became longer, beyond what the sound sample
-takes; without a panic, without control characters on the terminal, and with its inputs as they were.
+none (evaluations may end with 1 where a part cannot be read: the rest is whole), within 20 s and with at most 300 MB, and 50
+bytes for each byte that it became longer, beyond what the sound sample takes; without a panic, without control characters on
+the terminal, and with its inputs as they were.
 ";
 /// What the columns of its table are called.
 const HEADER: &str =

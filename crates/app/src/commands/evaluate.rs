@@ -245,7 +245,16 @@ fn contestants(
         contestants.push(Contestant::true_points(&devices[0]));
     }
     if !config.baselines.mean.is_empty() {
-        match MeanPictures::new(&config.baselines.mean, sets[0].views()) {
+        let views = sets[0].views();
+        let mean = match sets.iter().find(|set| set.views() != views) {
+            Some(set) => Err(snapsnap_eval::EvalError::Empty(format!(
+                "{} has {} views, the data set before it {views}: no one picture is the mean of a view",
+                set.folder().root().display(),
+                set.views()
+            ))),
+            None => MeanPictures::new(&config.baselines.mean, views),
+        };
+        match mean {
             Ok(pictures) => contestants.push(Contestant::mean(pictures)),
             Err(e) => left_out("mean_picture", e.to_string()),
         }

@@ -19,7 +19,7 @@ use crate::evaluate::person::{People, photograph};
 use crate::evaluate::{Contestant, evaluate, rendered};
 use crate::lpips::Lpips;
 use crate::score::Score;
-use crate::statistics::quantile;
+use crate::statistics::{Interval, interval, quantile};
 
 use config::{BenchConfig, Setting};
 
@@ -51,24 +51,48 @@ pub struct Measured {
     /// Bytes of memory of a process that does nothing else, at most, without comparing pictures; `None` where the system does
     /// not tell. A card's memory is not in it.
     pub memory: Option<u64>,
+    /// Seconds to render a view, p50.
+    pub render: f64,
     /// Gaussians of the first person.
     pub gaussians: usize,
     /// dB, protocol `masked`, mean over people and views.
+    #[serde(with = "crate::statistics::number")]
     pub psnr: f64,
+    /// The same of each person.
+    pub people: Vec<PersonScore>,
     /// The same.
     pub ssim: Option<f64>,
     /// The same.
     pub lpips: Option<f64>,
     /// What it was computed with, or why there is none.
     pub lpips_weights: String,
-    /// Mean distance of the predicted points from the true ones in the views where there are any, mm.
+    /// Mean distance of the predicted points from the true ones, mm: front and back.
     pub points_mm: Option<f64>,
+    /// The same of the sides.
+    pub sides_mm: Option<f64>,
     /// Largest difference of a colour from the f64 oracle with the same cut-offs.
     pub splat_error: f64,
     /// Largest difference that the cut-offs make, between oracles with and without.
     pub cutoff_error: f64,
     /// What could not be compared.
     pub left_out: Vec<String>,
+}
+
+/// What one person's pictures gave.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct PersonScore {
+    /// The person.
+    pub name: String,
+    /// dB, protocol `masked`, mean over views.
+    #[serde(with = "crate::statistics::number")]
+    pub psnr: f64,
+}
+
+impl Measured {
+    /// Seconds from the photographs on their canvas to a picture of another view.
+    pub fn time(&self) -> f64 {
+        self.p50 + self.render
+    }
 }
 
 /// Measures one setting in this process; `most_used` tells how much memory it took so far.
@@ -85,7 +109,13 @@ pub fn measure(
     most_used: &dyn Fn() -> Option<u64>,
 ) -> Result<Measured, EvalError> {
     let mut data = DataSection { subjects: config.bench.people, ..config.data.clone() };
-    data.only.extend(setting.only.clone().unwrap_or_default());
+    if let Some(only) = &setting.only {
+        data.only.clone_from(only);
+    }
+    // What is fitted is the first person's.
+    if setting.tune.is_some() {
+        data.subjects = 1;
+    }
     let folder = setting.data.as_ref().or(config.data.folders.first());
     let folder = folder.ok_or_else(|| EvalError::Empty("there is no data set".into()))?;
     let mut eval = EvalConfig { data, ..EvalConfig::default() };
@@ -140,8 +170,13 @@ pub fn measure(
         let run = model.reconstruct(&item, &inputs);
         sync(device);
         times.push(run.time);
+        // Several pairs of photographs go through each module one after another.
+        let mut seen: Vec<&str> = Vec::new();
         for (name, time) in &run.modules {
+            let again = seen.contains(name);
+            seen.push(name);
             match parts.iter_mut().find(|(there, _)| there == name) {
+                Some((_, times)) if again => *times.last_mut().expect("of this run") += *time,
                 Some((_, times)) => times.push(*time),
                 None => parts.push((name, vec![*time])),
             }
@@ -175,7 +210,8 @@ pub fn measure(
         drop(rendered(&made.gaussians, &camera, side, &eval.views)?);
         renders.push(start.elapsed());
     }
-    modules.push((format!("rendering a view of {side}²"), p(&renders, 0.5)));
+    let render = p(&renders, 0.5);
+    modules.push((format!("rendering a view of {side}²"), render));
 
     let options = eval.views.render_options();
     let patch = patch(&camera.resized(side as u32, side as u32), config.bench.oracle);
@@ -190,8 +226,17 @@ pub fn measure(
     let scores: Vec<Score> = judged.rows.iter().map(|row| row.scores[0]).collect();
     let Score { psnr, ssim, lpips } =
         Score::mean(&scores).ok_or_else(|| EvalError::Empty("no view could be compared".into()))?;
-    let errors: Vec<f64> =
-        judged.points.iter().flat_map(|(_, errors)| errors).map(|error| 1e3 * error.mean).collect();
+    let points = |sides: bool| {
+        let errors = judged.points.iter().flat_map(|(_, errors)| errors);
+        let errors: Vec<f64> =
+            errors.filter(|error| (error.view > 1) == sides).map(|error| 1e3 * error.mean).collect();
+        (!errors.is_empty()).then(|| errors.iter().sum::<f64>() / errors.len() as f64)
+    };
+    let of_person = |(row, name): (usize, &String)| {
+        let rows = judged.rows.iter().filter(|r| r.person == row);
+        let scores: Vec<Score> = rows.map(|r| r.scores[0]).collect();
+        Some(PersonScore { name: name.clone(), psnr: Score::mean(&scores)?.psnr })
+    };
     let left_out = outcome.left_out.iter().map(|l| format!("{}: {}", l.name, l.why)).collect();
     Ok(Measured {
         name: name.into(),
@@ -206,12 +251,15 @@ pub fn measure(
         p95: p(&times, 0.95),
         modules,
         memory,
+        render,
         gaussians,
         psnr,
+        people: outcome.people.iter().enumerate().filter_map(of_person).collect(),
         ssim,
         lpips,
         lpips_weights: lpips_weights.into(),
-        points_mm: (!errors.is_empty()).then(|| errors.iter().sum::<f64>() / errors.len() as f64),
+        points_mm: points(false),
+        sides_mm: points(true),
         splat_error,
         cutoff_error,
         left_out,
@@ -237,23 +285,28 @@ fn patch(camera: &Camera, side: u32) -> Camera {
     Camera { width: side, height: side, principal_point: camera.principal_point - corner, ..*camera }
 }
 
-/// Shares of time and decibels below which a difference is noise.
+/// Share of time below which a difference is noise.
 const FASTER: f64 = 0.03;
-const BETTER: f64 = 0.02;
 
-/// Which settings others beat: no slower, no worse, and in one of the two better by more than noise. By place, the place of the
-/// best of those that beat it.
+/// Which settings others beat: clearly better pictures (the paired interval over people is above 0) in no more time, or as good
+/// ones in clearly less time. Time is that of a reconstruction and a view. By place, the place of the best of those that beat
+/// it. Scenes, tuned Gaussians and other people are not compared.
 pub fn dominated(measured: &[Measured]) -> Vec<Option<usize>> {
-    // Scenes are other people, whose errors are not to be compared.
+    let names = |m: &Measured| m.people.iter().map(|person| person.name.clone()).collect::<Vec<_>>();
+    let is_alike = |a: &Measured, b: &Measured| {
+        [a, b].iter().all(|m| m.scene.is_none() && m.tuning.is_none()) && names(a) == names(b)
+    };
     let beats = |a: &Measured, b: &Measured| {
-        a.scene.is_none()
-            && b.scene.is_none()
-            && a.p50 <= b.p50
-            && a.psnr >= b.psnr
-            && (a.p50 < (1.0 - FASTER) * b.p50 || a.psnr > b.psnr + BETTER)
+        // Equal pictures, even where both are infinitely good.
+        let apart =
+            |(a, b): (&PersonScore, &PersonScore)| if a.psnr == b.psnr { 0.0 } else { a.psnr - b.psnr };
+        let differences: Vec<f64> = a.people.iter().zip(&b.people).map(apart).collect();
+        let Some(Interval { mean, low, .. }) = interval(&differences) else { return false };
+        let time = a.time() / b.time();
+        low > 0.0 && time < 1.0 + FASTER || mean >= 0.0 && time < 1.0 - FASTER
     };
     let by = |b: &Measured| {
-        let better = measured.iter().enumerate().filter(|(_, a)| beats(a, b));
+        let better = measured.iter().enumerate().filter(|(_, a)| is_alike(a, b) && beats(a, b));
         better.max_by(|a, b| a.1.psnr.total_cmp(&b.1.psnr)).map(|(place, _)| place)
     };
     measured.iter().map(by).collect()
@@ -263,7 +316,9 @@ pub fn dominated(measured: &[Measured]) -> Vec<Option<usize>> {
 mod tests {
     use super::*;
 
+    /// Reconstructs in that time and renders in a second; a person's PSNR and that of another, who is 2 dB better.
     fn measured(p50: f64, psnr: f64) -> Measured {
+        let person = |name: &str, psnr| PersonScore { name: name.into(), psnr };
         Measured {
             name: String::new(),
             knob: None,
@@ -277,12 +332,15 @@ mod tests {
             p95: p50,
             modules: Vec::new(),
             memory: None,
+            render: 1.0,
             gaussians: 0,
-            psnr,
+            psnr: psnr + 1.0,
+            people: vec![person("a", psnr), person("b", psnr + 2.0)],
             ssim: None,
             lpips: None,
             lpips_weights: String::new(),
             points_mm: None,
+            sides_mm: None,
             splat_error: 0.0,
             cutoff_error: 0.0,
             left_out: Vec::new(),
@@ -291,12 +349,32 @@ mod tests {
 
     #[test]
     fn what_is_slower_and_no_better_is_dominated_by_the_best_of_its_betters() {
-        let all = [(1.0, 20.0), (2.0, 19.0), (0.5, 19.5), (3.0, 21.0), (1.02, 20.0), (3.05, 20.99)];
+        let all = [(10.0, 20.0), (20.0, 19.0), (5.0, 19.5), (30.0, 21.0), (10.2, 20.0)];
         let mut all = all.map(|(p50, psnr)| measured(p50, psnr));
-        // The last two are worse by less than noise.
-        assert_eq!(dominated(&all), [None, Some(4), None, None, None, None]);
-        // A scene is of other people.
-        all[4].scene = Some("another".into());
-        assert_eq!(dominated(&all), [None, Some(0), None, None, None, None]);
+        // The last one is slower by less than noise.
+        assert_eq!(dominated(&all), [None, Some(4), None, None, None]);
+        // Better of one person, worse of the other: not clearly better, though in the mean.
+        all[4].people[0].psnr -= 1.0;
+        all[4].people[1].psnr += 1.5;
+        assert_eq!(dominated(&all), [None, Some(4), None, None, None]);
+        // What renders slowly is slow.
+        all[4].render = 20.0;
+        assert_eq!(dominated(&all), [None, Some(0), None, None, None]);
+        all[4].render = 1.0;
+        // Scenes, fitted Gaussians and other people are not compared.
+        let others: [fn(&mut Measured); 3] =
+            [|m| m.scene = Some("another".into()), |m| m.tuning = Some(1.0), |m| m.people[1].name.push('c')];
+        for other in others {
+            let mut all = all.clone();
+            [0, 4].into_iter().for_each(|place| other(&mut all[place]));
+            assert_eq!(dominated(&all)[1], Some(2));
+        }
+    }
+
+    #[test]
+    fn equal_pictures_travel_between_processes() {
+        let text = serde_json::to_string(&measured(1.0, f64::INFINITY)).expect("JSON");
+        let back: Measured = serde_json::from_str(&text).expect("the same");
+        assert!(back.psnr == f64::INFINITY && back.people[0].psnr == f64::INFINITY, "{text}");
     }
 }

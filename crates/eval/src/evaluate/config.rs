@@ -1,6 +1,6 @@
 //! The TOML schema of an evaluation.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
@@ -268,14 +268,18 @@ impl EvalConfig {
         if views.inputs.len() == 1 || views.inputs.len() > 64 {
             return Some(("views.inputs", "must be empty, or 2 to 64 views".into()));
         }
-        let mut sorted = views.inputs.clone();
-        sorted.sort_unstable();
-        sorted.dedup();
-        if sorted.len() < views.inputs.len() {
-            return Some(("views.inputs", "names a view twice".into()));
-        }
-        if views.inputs.iter().chain(&views.turns).chain(&views.compared).any(|view| *view >= most) {
-            return Some(("views.inputs", format!("views and turns must be below {most}")));
+        let lists = [
+            ("views.inputs", &views.inputs),
+            ("views.turns", &views.turns),
+            ("views.compared", &views.compared),
+        ];
+        for (key, list) in lists {
+            if list.iter().collect::<BTreeSet<_>>().len() < list.len() {
+                return Some((key, "names a view twice".into()));
+            }
+            if list.iter().any(|view| *view >= most) {
+                return Some((key, format!("must be below {most}")));
+            }
         }
         if views.turns.is_empty() || views.turns.len() > 64 {
             return Some(("views.turns", "must have 1 to 64 entries".into()));

@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use burn::tensor::Device;
 use snapsnap_data::sample::TestItem;
+use snapsnap_net::Photograph;
 use snapsnap_splat::Gaussians;
 
 use super::model::Model;
@@ -168,10 +169,18 @@ impl Contestant {
     }
 }
 
-/// The photographs `[N,3,S,S]` on a canvas, and which of its pixels are the person's.
+/// The photographs `[N,3,S,S]` on a canvas, in the person's own colours where its pixels are half hers or more, and which are.
 fn on_canvas(item: &TestItem, count: usize, side: usize) -> (Vec<f32>, Vec<Vec<bool>>) {
+    // Networks see colours times the mask, and may have learned to undo that; baselines have not.
+    let own = |photo: Photograph| {
+        let Photograph { mut rgb, mask, valid } = photo;
+        for plane in rgb.chunks_exact_mut(mask.len()) {
+            plane.iter_mut().zip(&mask).for_each(|(v, m)| *v = (*v / m.max(0.5)).clamp(-1.0, 1.0));
+        }
+        (rgb, valid)
+    };
     let photographs = (0..count).map(|place| photograph(item, place, side));
-    let (images, valid): (Vec<_>, Vec<_>) = photographs.map(|photo| (photo.rgb, photo.valid)).unzip();
+    let (images, valid): (Vec<_>, Vec<_>) = photographs.map(own).unzip();
     (images.concat(), valid)
 }
 

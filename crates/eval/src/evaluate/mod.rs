@@ -79,6 +79,8 @@ pub struct Outcome {
     pub judged: Vec<Judged>,
     /// What is missing.
     pub left_out: Vec<LeftOut>,
+    /// Size of what is compared, and how it is rendered, in words.
+    pub pictures: String,
 }
 
 /// Evaluates contestants on all people; `progress` hears how many are done. What is wrong with single people, views or
@@ -91,7 +93,11 @@ pub fn evaluate(
     progress: &dyn Fn(usize, usize),
 ) -> Outcome {
     let total = sets.iter().map(|set| set.chosen().len()).sum();
-    let mut outcome = Outcome { people: Vec::new(), judged: Vec::new(), left_out: Vec::new() };
+    let mut sides: Vec<String> = sets.iter().map(|set| format!("{}²", set.side(&config.views))).collect();
+    sides.dedup();
+    let pictures =
+        format!("pictures of {} pixels, rendered at {}×", sides.join(" and "), config.views.supersampling);
+    let mut outcome = Outcome { people: Vec::new(), judged: Vec::new(), left_out: Vec::new(), pictures };
     let named = |contestant: &Contestant| Judged {
         name: contestant.name.clone(),
         kind: contestant.kind(),

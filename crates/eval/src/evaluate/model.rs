@@ -112,7 +112,9 @@ impl Model {
         if count > 1 {
             plan.insert(0, format!("{count} pairs of photographs, the first one"));
         }
-        Made { gaussians: joined(parts), maps, lost, time: start.elapsed(), modules, plan }
+        let gaussians = joined(parts);
+        gaussians.device().sync().expect("the device finishes its work");
+        Made { gaussians, maps, lost, time: start.elapsed(), modules, plan }
     }
 }
 

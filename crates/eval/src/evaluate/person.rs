@@ -40,8 +40,11 @@ impl People {
             let message = format!("has {count} views, none opposite the first: say `views.inputs`");
             return Err(wrong(message));
         }
-        if let Some(view) = views.inputs.iter().find(|view| **view >= count) {
-            return Err(wrong(format!("has no view {view}, of {count}, which `views.inputs` asks for")));
+        let lists = [("inputs", &views.inputs), ("turns", &views.turns), ("compared", &views.compared)];
+        for (key, list) in lists {
+            if let Some(view) = list.iter().find(|view| **view >= count) {
+                return Err(wrong(format!("has no view {view}, of {count}, which `views.{key}` asks for")));
+            }
         }
         let side = description.resolution as usize;
         if views.resolution > 0 && !side.is_multiple_of(views.resolution) {

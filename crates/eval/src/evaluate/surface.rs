@@ -9,9 +9,9 @@ use super::person::{People, nearest_view};
 use crate::EvalError;
 use crate::geometry::{Chamfer, chamfer, consistency, normals, points};
 
-/// True points kept per view, about.
+/// True points kept per view, at most.
 const PER_VIEW: usize = 4000;
-/// Gaussians compared, about: more say nothing new.
+/// Gaussians compared, at most: more say nothing new.
 const MOST: usize = 60_000;
 /// Directions from which normals are compared, degrees from the first view.
 const DIRECTIONS: [f64; 4] = [0.0, 90.0, 180.0, 270.0];
@@ -44,10 +44,10 @@ pub fn truth(people: &People, row: usize) -> Result<Truth, EvalError> {
         let (points, valid) = people.test().points(row, &[view])?;
         let to_world = camera.world_to_camera.inverse();
         let there: Vec<usize> = (0..valid.len()).filter(|i| valid[*i] > 0.5).collect();
-        let step = there.len().div_ceil(PER_VIEW).max(1);
         let point =
             |i: usize| DVec3::new(points[3 * i].into(), points[3 * i + 1].into(), points[3 * i + 2].into());
-        let kept = there.iter().step_by(step).map(|i| to_world.apply(point(*i)).as_vec3().to_array());
+        let there = thinned(there, PER_VIEW).into_iter();
+        let kept = there.map(|i| to_world.apply(point(i)).as_vec3().to_array());
         let kept: Vec<[f32; 3]> = kept.collect();
         let normals = directions.contains(&view).then(|| {
             let depth = |i: usize| if valid[i] > 0.5 { points[3 * i + 2] } else { 0.0 };
@@ -92,6 +92,14 @@ impl Truth {
     }
 }
 
+/// So many of a list at most, evenly.
+pub(super) fn thinned<T: Copy>(all: Vec<T>, most: usize) -> Vec<T> {
+    if all.len() <= most {
+        return all;
+    }
+    (0..most).map(|i| all[i * all.len() / most]).collect()
+}
+
 impl Surface {
     /// Of Gaussians (world frame): the centres of those that are at least so opaque, and their rendered depths.
     ///
@@ -102,8 +110,7 @@ impl Surface {
         let centres = points(&gaussians.means)?;
         let there: Vec<[f32; 3]> =
             centres.into_iter().zip(opacities).filter(|(_, o)| *o >= opaque).map(|(p, _)| p).collect();
-        let step = there.len().div_ceil(MOST).max(1);
-        let there: Vec<[f32; 3]> = there.into_iter().step_by(step).collect();
+        let there = thinned(there, MOST);
         let depth = |camera: &Camera| {
             let options = RenderOptions { depth: true, ..RenderOptions::inria() };
             let rendered = render(gaussians, std::slice::from_ref(camera), &options)?;

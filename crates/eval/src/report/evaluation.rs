@@ -8,7 +8,7 @@ use serde_json::{Map, Value, json};
 use super::plot::{Axes, Series, svg};
 use super::{Header, cell, escaped, table};
 use crate::evaluate::config::{EvalConfig, Protocol};
-use crate::evaluate::{Judged, Kind, Outcome, is_named};
+use crate::evaluate::{Judged, Kind, Outcome, Row, is_named};
 use crate::points::VIEWS;
 use crate::score::Score;
 use crate::statistics::{Interval, interval, quantile};
@@ -35,11 +35,7 @@ type People = BTreeMap<usize, Score>;
 
 impl Evaluation<'_> {
     fn people(&self, judged: &Judged, protocol: usize) -> People {
-        let mut scores: BTreeMap<usize, Vec<Score>> = BTreeMap::new();
-        for row in &judged.rows {
-            scores.entry(row.person).or_default().push(row.scores[protocol]);
-        }
-        scores.into_iter().filter_map(|(person, scores)| Some((person, Score::mean(&scores)?))).collect()
+        means(judged.rows.iter(), protocol)
     }
 
     /// Intervals over people, by figure.
@@ -50,11 +46,17 @@ impl Evaluation<'_> {
         })
     }
 
-    /// Of the people that both have, the one's figures minus the other's.
-    fn difference(one: &People, other: &People) -> [Option<Interval>; 3] {
+    /// Of the views that both have, the one's figures minus the other's, person by person.
+    fn difference(one: &Judged, other: &Judged, protocol: usize) -> [Option<Interval>; 3] {
+        let place = |row: &Row| (row.person, row.turn, row.view);
+        let both: BTreeSet<_> = one.rows.iter().map(place).collect();
+        let both: BTreeSet<_> = other.rows.iter().map(place).filter(|row| both.contains(row)).collect();
+        let [one, other] = [one, other]
+            .map(|judged| means(judged.rows.iter().filter(|row| both.contains(&place(row))), protocol));
         FIGURES.map(|(_, of, ..)| {
-            let both = one.iter().filter_map(|(person, score)| Some((score, other.get(person)?)));
-            let values: Option<Vec<f64>> = both.map(|(a, b)| Some(of(a)? - of(b)?)).collect();
+            let apart = |(a, b): (f64, f64)| if a == b { 0.0 } else { a - b };
+            let pairs = one.values().zip(other.values());
+            let values: Option<Vec<f64>> = pairs.map(|(a, b)| Some(apart((of(a)?, of(b)?)))).collect();
             interval(&values?)
         })
     }
@@ -91,9 +93,7 @@ impl Evaluation<'_> {
         report["baselines"] = named(Kind::Baseline, &plain);
         report["compared"] = named(Kind::Other, &|judged| {
             let difference = |protocol: usize| match self.model() {
-                Some(model) => {
-                    figures(&Self::difference(&self.people(judged, protocol), &self.people(model, protocol)))
-                }
+                Some(model) => figures(&Self::difference(judged, model, protocol)),
                 None => Value::Null,
             };
             json!({
@@ -159,7 +159,8 @@ impl Evaluation<'_> {
         let people = self.outcome.people.len();
         let _ = writeln!(
             text,
-            "* {people} people; intervals: 95 %, bootstrap over people; SSIM and LPIPS × 100\n"
+            "* {people} people; {}; intervals: 95 %, bootstrap over people; SSIM and LPIPS × 100\n",
+            self.outcome.pictures
         );
         for (i, protocol) in self.protocols() {
             let _ = writeln!(text, "## Protocol `{}`\n", protocol.name());
@@ -180,7 +181,7 @@ impl Evaluation<'_> {
                     escaped(&model.name)
                 );
                 for judged in others {
-                    let row = table_row(&Self::difference(&self.people(judged, i), &self.people(model, i)));
+                    let row = table_row(&Self::difference(judged, model, i));
                     let _ = writeln!(text, "| {} | {row} |", escaped(&judged.name));
                 }
             }
@@ -218,12 +219,15 @@ impl Evaluation<'_> {
         if !with_points.is_empty() {
             let _ = writeln!(
                 text,
-                "## Points\n\nMean distance from the true points, mm; in brackets after each person's mean shift is removed.\n\n\
+                "## Points\n\nMean distance from the true points, mm; in brackets after the mean shift of each person's front and back is \
+                 removed; then the share of points where nothing was predicted.\n\n\
                  | | front | back | right | left |\n|---|---|---|---|---|"
             );
             for judged in with_points {
                 let cells = (0..VIEWS.len()).map(|view| match point_means(judged, view) {
-                    Some([mean, centred]) => format!("{mean:.1} ({centred:.1})"),
+                    Some([mean, centred, missed]) => {
+                        format!("{mean:.1} ({centred:.1}), {:.1} %", 100.0 * missed)
+                    }
                     None => "n/a".into(),
                 });
                 let _ = writeln!(
@@ -255,8 +259,10 @@ impl Evaluation<'_> {
             }
             text.push('\n');
         }
-        let _ =
-            writeln!(text, "## Run time\n\n| | seconds a person, p50 | p95 | Gaussians |\n|---|---|---|---|");
+        let _ = writeln!(
+            text,
+            "## Run time\n\nIn turn with all that is compared; `bench` measures.\n\n| | seconds a person, p50 | p95 | Gaussians |\n|---|---|---|---|"
+        );
         for judged in made {
             let (p50, p95) = seconds(judged)
                 .map_or(("n/a".into(), "n/a".into()), |[a, b]| (format!("{a:.3}"), format!("{b:.3}")));
@@ -336,6 +342,15 @@ impl Evaluation<'_> {
     }
 }
 
+/// Means of each person's views.
+fn means<'a>(rows: impl Iterator<Item = &'a Row>, protocol: usize) -> People {
+    let mut scores: BTreeMap<usize, Vec<Score>> = BTreeMap::new();
+    for row in rows {
+        scores.entry(row.person).or_default().push(row.scores[protocol]);
+    }
+    scores.into_iter().filter_map(|(person, scores)| Some((person, Score::mean(&scores)?))).collect()
+}
+
 /// A line of a group's table.
 struct Grouped {
     contestant: String,
@@ -365,19 +380,20 @@ fn table_row(intervals: &[Option<Interval>; 3]) -> String {
     cells.collect::<Vec<_>>().join(" | ")
 }
 
-/// Millimetres, as they are and centred: means over people.
-fn point_means(judged: &Judged, view: usize) -> Option<[f64; 2]> {
+/// Millimetres, as they are and centred, and the share missed: means over people and turns.
+fn point_means(judged: &Judged, view: usize) -> Option<[f64; 3]> {
     let errors = judged.points.iter().flat_map(|(_, errors)| errors).filter(|error| error.view == view);
     let errors: Vec<_> = errors.collect();
     let mean = |of: fn(&crate::points::PointError) -> f64| {
-        1e3 * errors.iter().map(|error| of(error)).sum::<f64>() / errors.len() as f64
+        errors.iter().map(|error| of(error)).sum::<f64>() / errors.len() as f64
     };
-    (!errors.is_empty()).then(|| [mean(|error| error.mean), mean(|error| error.centred)])
+    (!errors.is_empty()).then(|| [mean(|e| 1e3 * e.mean), mean(|e| 1e3 * e.centred), mean(|e| e.missed)])
 }
 
 fn points_json(judged: &Judged) -> Value {
     let view = |(i, name): (usize, &&str)| {
-        let value = point_means(judged, i).map(|[mean, centred]| json!({ "mean": mean, "centred": centred }));
+        let value = point_means(judged, i)
+            .map(|[mean, centred, missed]| json!({ "mean": mean, "centred": centred, "missed": missed }));
         ((*name).to_owned(), json!(value))
     };
     Value::Object(VIEWS.iter().enumerate().map(view).collect())

@@ -61,7 +61,10 @@ fn civil(days: u64) -> (u64, u64, u64) {
 pub fn cell(interval: Option<Interval>, times: f64, digits: usize) -> String {
     match interval {
         None => "n/a".into(),
-        Some(Interval { mean, .. }) if !mean.is_finite() => "∞".into(),
+        Some(Interval { mean, .. }) if mean.is_nan() => "n/a".into(),
+        Some(Interval { mean, .. }) if mean.is_infinite() => if mean > 0.0 { "∞" } else { "−∞" }.into(),
+        // One person.
+        Some(Interval { mean, low, high }) if low == high => format!("{:.digits$}", mean * times),
         Some(Interval { mean, low, high }) => {
             let [mean, low, high] = [mean, low, high].map(|v| format!("{:.digits$}", v * times));
             format!("{mean} [{low}, {high}]")

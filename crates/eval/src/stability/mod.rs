@@ -54,6 +54,11 @@ impl Found {
     }
 }
 
+/// An error, ∞ for NaN: a largest of several would not see it.
+fn nan_is_worst(v: f64) -> f64 {
+    if v.is_nan() { f64::INFINITY } else { v }
+}
+
 /// A row of the table.
 #[derive(Debug, Clone, Serialize)]
 pub struct Row {

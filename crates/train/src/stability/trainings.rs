@@ -12,7 +12,7 @@ use snapsnap_data::dataset::{Folder, Split};
 use snapsnap_data::prepare::{DataConfig, Subject};
 use snapsnap_data::sample::{Joined, Stage1Item};
 use snapsnap_eval::stability::{Case, Found};
-use snapsnap_net::weights::{random_predictor, random_regressors};
+use snapsnap_net::weights::{Source, random_predictor, random_regressors};
 use snapsnap_people::synth;
 use tempfile::TempDir;
 
@@ -88,6 +88,10 @@ fn trained<T: Task>(
     let options = Options { folder: folder.path(), devices, limit: None, stop: &stop };
     let mut watch = Silent { finite: true };
     let outcome = on_best_thread(devices, || train(task, config, networks, &options, &mut watch))?;
+    let weights = Source::open(&folder.path().join("last.safetensors"))?;
+    for name in weights.tensors().keys() {
+        watch.finite &= weights.read_f32(name)?.iter().all(|v| v.is_finite());
+    }
     Ok((outcome, watch.finite))
 }
 
@@ -144,7 +148,7 @@ fn stiff(factor: f64) -> Result<Found, TrainError> {
         .must(small < 0.02 && large > 0.95, "the people do not fill the frame as they should")
         .must(one.step == 24 && two.step == 24, "the training ended early")
         .must(one.skipped == 0 && two.skipped == 0, "steps were skipped")
-        .must(one_finite && two_finite, "a logged number is not finite"))
+        .must(one_finite && two_finite, "a logged number or a weight is not finite"))
 }
 
 /// Stage 1, in whose fourth step the loss is NaN.
@@ -196,5 +200,5 @@ fn poisoned() -> Result<Found, TrainError> {
     Ok(Found { note: format!("{} of {} steps skipped", outcome.skipped, outcome.step), ..Found::default() }
         .must(outcome.skipped == 1, "not one step was skipped")
         .must(outcome.finished && outcome.step == 8, "the training ended early")
-        .must(all_finite, "a logged number is not finite"))
+        .must(all_finite, "a logged number or a weight is not finite"))
 }
