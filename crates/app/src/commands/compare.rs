@@ -31,9 +31,9 @@ pub struct Arguments {
     #[arg(long, value_name = "MASK")]
     mask: Option<PathBuf>,
     /// Where to compare: everywhere; in the paper's window of 1000 × 500 of 1024 pixels around what is not black in B; or in
-    /// the mask and 8 of 1024 pixels around it.
-    #[arg(long, value_enum, default_value = "all")]
-    window: Window,
+    /// the mask and 8 of 1024 pixels around it. Default: the mask where one is given, else everywhere.
+    #[arg(long, value_enum)]
+    window: Option<Window>,
     /// Pixels around the mask instead of 8 of 1024.
     #[arg(long, value_name = "PIXELS")]
     margin: Option<usize>,
@@ -63,8 +63,12 @@ struct Compared {
 }
 
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
-    if arguments.mask.is_some() != (arguments.window == Window::Mask) {
-        return Err(Failure::Input("--window mask and --mask MASK need each other".into()));
+    match (arguments.window, &arguments.mask) {
+        (Some(Window::Mask), None) => return Err(Failure::Input("--window mask needs --mask MASK".into())),
+        (Some(Window::All | Window::Paper), Some(_)) => {
+            return Err(Failure::Input("--mask goes with --window mask alone".into()));
+        }
+        _ => {}
     }
     if arguments.margin.is_some() && arguments.mask.is_none() {
         return Err(Failure::Input("--margin needs --mask".into()));
@@ -165,7 +169,7 @@ fn compare(
     let named = |e| Failure::Input(format!("{} and {}: {e}", a.display(), b.display()));
     check_sizes(&image, &target).map_err(named)?;
     let region = match (arguments.window, mask) {
-        (Window::Mask, Some(path)) => {
+        (_, Some(path)) => {
             let mask = decode(path, MAX_BYTES)?;
             let found = [mask.height() as usize, mask.width() as usize];
             if found != [target.height, target.width] {
@@ -179,7 +183,7 @@ fn compare(
             Region::masked(&mask, found, margin)
                 .map_err(|e| Failure::Input(format!("{}: {e}", path.display())))?
         }
-        (Window::Paper, _) => {
+        (Some(Window::Paper), _) => {
             Region::paper(&target).map_err(|e| Failure::Input(format!("{}: {e}", b.display())))?
         }
         _ => Region::all(&target),

@@ -8,9 +8,10 @@ mod tune;
 use std::time::{Duration, Instant};
 
 use burn::tensor::Device;
+use glam::{DVec2, DVec3};
 use serde::{Deserialize, Serialize};
 use snapsnap_net::weights::WeightFile;
-use snapsnap_splat::{Camera, ply};
+use snapsnap_splat::{Camera, Gaussians, ply};
 
 use crate::EvalError;
 use crate::evaluate::config::{DataSection, EvalConfig, Protocol};
@@ -214,7 +215,7 @@ pub fn measure(
     modules.push((format!("rendering a view of {side}²"), render));
 
     let options = eval.views.render_options();
-    let patch = patch(&camera.resized(side as u32, side as u32), config.bench.oracle);
+    let patch = patch(&made.gaussians, &camera.resized(side as u32, side as u32), config.bench.oracle);
     let (splat_error, cutoff_error) = oracle::errors(&made.gaussians, &patch, &options)?;
     let (gaussians, plan) = (made.gaussians.len(), made.plan);
     let contestants = match setting.tune {
@@ -277,11 +278,14 @@ fn sync(device: &Device) {
     device.sync().expect("the device finishes its work");
 }
 
-/// The part of a picture around its middle, as a camera of its own.
-fn patch(camera: &Camera, side: u32) -> Camera {
+/// The part of a picture around the middle of what it shows, as a camera of its own.
+fn patch(shown: &Gaussians, camera: &Camera, side: u32) -> Camera {
     let side = side.min(camera.width).min(camera.height);
-    let corner =
-        glam::DVec2::new(f64::from((camera.width - side) / 2), f64::from((camera.height - side) / 2));
+    let mean = snapsnap_ops::host(shown.means.clone().mean_dim(0));
+    let middle = DVec3::new(mean[0].into(), mean[1].into(), mean[2].into());
+    let middle = camera.project(middle).map_or(camera.principal_point, |(at, _)| at);
+    let most = DVec2::new(f64::from(camera.width - side), f64::from(camera.height - side));
+    let corner = (middle - 0.5 * f64::from(side)).round().clamp(DVec2::ZERO, most);
     Camera { width: side, height: side, principal_point: camera.principal_point - corner, ..*camera }
 }
 

@@ -89,7 +89,8 @@ impl Bench<'_> {
         let runs = self.measured.first().map_or(0, |m| m.runs);
         let _ = writeln!(
             text,
-            "* {runs} reconstructions each after warm-up, device synchronised, each setting in a process of its own\n\
+            "* {runs} reconstructions each after warm-up, device synchronised, each setting in a process of its own, whose largest memory \
+             is told (without comparing pictures)\n\
              * Errors: protocol `masked`; LPIPS: {}\n\
              * Splat error: largest difference of a colour from the f64 oracle, not supersampled (where rounding takes a splat over a \
              cut-off, up to 1/255 and what it hides); by cut-offs: what skipping α < 1/255, closing pixels and \

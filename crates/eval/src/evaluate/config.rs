@@ -37,6 +37,7 @@ pub struct DataSection {
     /// The data sets; `--data` replaces them.
     pub folders: Vec<PathBuf>,
     /// Which people of them; unset: those that lie in the folder itself, as in the authors' test sets.
+    #[serde(with = "split")]
     pub split: Option<Split>,
     /// Only so many of each, the first ones; 0: all.
     pub subjects: usize,
@@ -44,6 +45,31 @@ pub struct DataSection {
     pub only: Vec<String>,
     /// Folder of true meshes, NAME.obj, .ply or .glb, for point-to-surface distances.
     pub scans: Option<PathBuf>,
+}
+
+/// `"none"` for people in the folder itself.
+mod split {
+    use serde::{Deserialize, Deserializer, Serialize, Serializer};
+    use snapsnap_data::dataset::Split;
+
+    #[derive(Serialize, Deserialize)]
+    #[serde(rename_all = "lowercase")]
+    enum Named {
+        None,
+        #[serde(untagged)]
+        Some(Split),
+    }
+
+    pub fn serialize<S: Serializer>(split: &Option<Split>, serializer: S) -> Result<S::Ok, S::Error> {
+        split.map_or(Named::None, Named::Some).serialize(serializer)
+    }
+
+    pub fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<Split>, D::Error> {
+        match Named::deserialize(deserializer)? {
+            Named::None => Ok(None),
+            Named::Some(split) => Ok(Some(split)),
+        }
+    }
 }
 
 impl Default for DataSection {

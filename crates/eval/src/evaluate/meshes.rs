@@ -3,7 +3,9 @@
 use std::path::{Path, PathBuf};
 
 use glam::{DVec3, Vec3};
+use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
+use snapsnap_data::scan::{Collection, normalise};
 use snapsnap_mesh::FileError;
 use snapsnap_mesh::import::{self, EXTENSIONS};
 use snapsnap_mesh::view::{Renderer, ViewOptions};
@@ -88,7 +90,14 @@ fn one(
     let mut mesh = import::read(&find(folder, subject)?)?;
     let seen = truth_of(people, row)?;
     let scan = match &config.data.scans {
-        Some(scans) => Some(import::read(&find(scans, subject)?)?),
+        Some(scans) => {
+            let path = find(scans, subject)?;
+            let mut scan = import::read(&path)?;
+            // As `prepare` stood it up; people to test on are not moved from the middle. What stands so already stays.
+            normalise(&mut scan, Collection::Other, None::<&mut ChaCha8Rng>)
+                .map_err(|e| FileError::unsuitable(&path, e.to_string()))?;
+            Some(scan)
+        }
         None => None,
     };
     // A scan knows what no view sees.
@@ -129,10 +138,13 @@ fn one(
 }
 
 fn find(folder: &Path, name: &str) -> Result<PathBuf, EvalError> {
-    let files = EXTENSIONS.map(|ending| folder.join(format!("{name}.{ending}")));
-    let found = files.into_iter().find(|file| file.is_file());
+    // Collections of scans have a folder for each.
+    let folders = [folder.to_owned(), folder.join(name)];
+    let files =
+        folders.iter().flat_map(|folder| EXTENSIONS.map(|ending| folder.join(format!("{name}.{ending}"))));
+    let found = { files }.find(|file| file.is_file());
     found.ok_or_else(|| {
-        let message = format!("has no mesh {name}.obj, .ply or .glb");
+        let message = format!("has no mesh {name}.obj, .ply or .glb, nor {name}/{name}.…");
         EvalError::File(FileError::unsuitable(folder, message))
     })
 }

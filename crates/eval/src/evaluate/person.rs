@@ -159,16 +159,23 @@ pub fn points(
         return Ok(None);
     }
     let (points, valid) = test.points(row, views)?;
+    let area = stored * stored;
+    let views = points.chunks_exact(3 * area).zip(valid.chunks_exact(area));
+    let (points, valid): (Vec<_>, Vec<_>) = views.map(|(p, v)| means(p, v, stored, side)).unzip();
+    Ok(Some((points.concat(), valid.concat())))
+}
+
+/// One view's points, on `side`² pixels instead of `stored`², of which that is a whole part: means where there are points in half
+/// of a pixel or more.
+pub(super) fn means(points: &[f32], valid: &[f32], stored: usize, side: usize) -> Points {
     let factor = stored / side;
     if factor == 1 {
-        return Ok(Some((points, valid)));
+        return (points.to_vec(), valid.to_vec());
     }
-    let area = side * side;
-    let mut means = vec![0.0; 3 * views.len() * area];
-    let mut shares = vec![0.0; views.len() * area];
+    let mut means = vec![0.0; 3 * side * side];
+    let mut shares = vec![0.0; side * side];
     for (cell, share) in shares.iter_mut().enumerate() {
-        let (view, at) = (cell / area, cell % area);
-        let corner = view * stored * stored + at / side * factor * stored + at % side * factor;
+        let corner = cell / side * factor * stored + cell % side * factor;
         let (mut sum, mut count) = ([0.0_f64; 3], 0_usize);
         for (y, x) in (0..factor).flat_map(|y| (0..factor).map(move |x| (y, x))) {
             let i = corner + y * stored + x;
@@ -182,7 +189,7 @@ pub fn points(
             (0..3).for_each(|c| means[3 * cell + c] = (sum[c] / count as f64) as f32);
         }
     }
-    Ok(Some((means, shares)))
+    (means, shares)
 }
 
 /// The view whose camera is nearest to so many degrees around the person from the view `first`.

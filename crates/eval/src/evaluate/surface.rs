@@ -5,7 +5,7 @@ use rayon::prelude::*;
 use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
 
 use super::at_once;
-use super::person::{People, nearest_view};
+use super::person::{People, means, nearest_view};
 use crate::EvalError;
 use crate::geometry::{Chamfer, chamfer, consistency, normals, points};
 
@@ -13,6 +13,8 @@ use crate::geometry::{Chamfer, chamfer, consistency, normals, points};
 const PER_VIEW: usize = 4000;
 /// Gaussians compared, at most: more say nothing new.
 const MOST: usize = 60_000;
+/// Normals are compared in maps of this side at most, where a pixel is about a centimetre wide: finer, they tell of roughness.
+const NORMALS: usize = 256;
 /// Directions from which normals are compared, degrees from the first view.
 const DIRECTIONS: [f64; 4] = [0.0, 90.0, 180.0, 270.0];
 
@@ -29,7 +31,7 @@ pub struct Surface {
 pub struct Truth {
     /// World frame, metres.
     pub points: Vec<[f32; 3]>,
-    /// Views nearest to the four directions, and the normals that they see.
+    /// Views nearest to the four directions, in pictures of 256² pixels at most, and the normals that they see.
     pub views: Vec<(Camera, Vec<Option<DVec3>>)>,
 }
 
@@ -50,8 +52,13 @@ pub fn truth(people: &People, row: usize) -> Result<Truth, EvalError> {
         let kept = there.map(|i| to_world.apply(point(i)).as_vec3().to_array());
         let kept: Vec<[f32; 3]> = kept.collect();
         let normals = directions.contains(&view).then(|| {
+            let stored = camera.width as usize;
+            let side = (1..=stored).find(|f| stored.is_multiple_of(*f) && stored / f <= NORMALS).unwrap_or(1);
+            let side = stored / side;
+            let (points, valid) = means(&points, &valid, stored, side);
+            let camera = camera.resized(side as u32, side as u32);
             let depth = |i: usize| if valid[i] > 0.5 { points[3 * i + 2] } else { 0.0 };
-            normals(&(0..valid.len()).map(depth).collect::<Vec<f32>>(), camera)
+            (camera, normals(&(0..valid.len()).map(depth).collect::<Vec<f32>>(), &camera))
         });
         Ok((kept, normals))
     };
@@ -62,9 +69,9 @@ pub fn truth(people: &People, row: usize) -> Result<Truth, EvalError> {
         found.extend(part?);
     }
     let (mut all, mut views) = (Vec::new(), Vec::new());
-    for ((kept, normals), camera) in found.into_iter().zip(cameras) {
+    for (kept, normals) in found {
         all.extend(kept);
-        views.extend(normals.map(|normals| (camera, normals)));
+        views.extend(normals);
     }
     if all.is_empty() {
         return Err(EvalError::Empty("no view has a depth: there is no true surface".into()));

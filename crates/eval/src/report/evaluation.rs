@@ -91,6 +91,7 @@ impl Evaluation<'_> {
             Value::Object(self.of_kind(kind).map(|judged| (judged.name.clone(), value(judged))).collect())
         };
         report["baselines"] = named(Kind::Baseline, &plain);
+        report["baselines_geometry_cm"] = named(Kind::Baseline, &geometry_json);
         report["compared"] = named(Kind::Other, &|judged| {
             let difference = |protocol: usize| match self.model() {
                 Some(model) => figures(&Self::difference(judged, model, protocol)),
@@ -204,6 +205,21 @@ impl Evaluation<'_> {
         for picture in pictures {
             let _ = writeln!(text, "![{picture}]({picture})\n");
         }
+        let shown: Vec<String> = self
+            .ranked(self.config.report.people)
+            .iter()
+            .map(|row| escaped(&self.outcome.people[*row]))
+            .collect();
+        if !shown.is_empty() && !pictures.is_empty() {
+            let degrees: Vec<String> = self.config.report.degrees.iter().map(|d| format!("{d}°")).collect();
+            let _ = writeln!(
+                text,
+                "Pictures: {}, from the best to the worst. Both photographs, then at {} what the model shows, what is true, and their \
+                 mean absolute difference from 0 (black) to ½ (white), in the paper's window.\n",
+                shown.join(", "),
+                degrees.join(", ")
+            );
+        }
         if !self.outcome.left_out.is_empty() {
             let _ = writeln!(text, "## Left out: {}\n", self.outcome.left_out.len());
             for left_out in &self.outcome.left_out {
@@ -243,7 +259,7 @@ impl Evaluation<'_> {
             let _ = writeln!(
                 text,
                 "## Surface\n\nCentres of the Gaussians at least {} opaque against the true points of all views, in the world as it is \
-                 (nothing is aligned), cm; normals: mean cosine from the views nearest to 0, 90, 180 and 270°.\n\n\
+                 (nothing is aligned), cm; normals: mean cosine from the views nearest to 0, 90, 180 and 270°, in maps of 256² at most.\n\n\
                  | | to the truth | from the truth | Chamfer | normals |\n|---|---|---|---|---|",
                 self.config.metrics.opaque
             );
@@ -261,7 +277,7 @@ impl Evaluation<'_> {
         }
         let _ = writeln!(
             text,
-            "## Run time\n\nIn turn with all that is compared; `bench` measures.\n\n| | seconds a person, p50 | p95 | Gaussians |\n|---|---|---|---|"
+            "## Run time\n\nFrom the photographs on their canvas to the Gaussians, without rendering, in turn with all that is compared; `bench` measures.\n\n| | seconds a person, p50 | p95 | Gaussians |\n|---|---|---|---|"
         );
         for judged in made {
             let (p50, p95) = seconds(judged)

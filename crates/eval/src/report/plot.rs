@@ -3,7 +3,11 @@
 use plotters::prelude::*;
 
 /// Width and height in pixels.
-const SIZE: (u32, u32) = (800, 400);
+const SIZE: (u32, u32) = (1000, 460);
+/// Of which the names of the series take so many columns,
+const NAMES: u32 = 220;
+/// and each so many rows.
+const ROW: i32 = 18;
 
 /// A named line, or points that are not joined.
 pub struct Series {
@@ -46,7 +50,8 @@ pub fn svg(axes: &Axes, series: &[Series]) -> String {
         let area = SVGBackend::with_string(&mut text, SIZE).into_drawing_area();
         // Drawing into a string cannot fail.
         let _ = area.fill(&WHITE);
-        let mut builder = ChartBuilder::on(&area);
+        let (plot, names) = area.split_horizontally(SIZE.0 - NAMES);
+        let mut builder = ChartBuilder::on(&plot);
         let builder = builder
             .caption(axes.caption, ("sans-serif", 16))
             .margin(10)
@@ -64,22 +69,19 @@ pub fn svg(axes: &Axes, series: &[Series]) -> String {
                             let _ = chart.draw_series(LineSeries::new(points.iter().copied(), &color));
                         }
                         let dots = points.iter().map(|p| Circle::new(*p, 3, color.filled()));
-                        if let Ok(drawn) = chart.draw_series(dots) {
-                            let mark = move |(x, y)| Circle::new((x + 8, y), 3, color.filled());
-                            drawn.label(s.name.clone()).legend(mark);
-                        }
+                        let _ = chart.draw_series(dots);
+                        let row = 30 + ROW * i as i32;
+                        let _ = names.draw(&Circle::new((8, row), 3, color.filled()));
+                        let _ = names.draw(&Text::new(s.name.clone(), (18, row - 6), ("sans-serif", 13)));
                     }
-                    let legend = chart.configure_series_labels();
-                    let _ = { legend }.background_style(WHITE.mix(0.8)).border_style(BLACK.mix(0.3)).draw();
                 }
             };
         }
         if axes.log {
             let least = all.iter().map(|p| p.0).fold(f64::MAX, f64::min);
-            // Room for the legend.
-            draw!((0.8 * least..5.0 * right).log_scale());
+            draw!((0.8 * least..1.2 * right).log_scale());
         } else {
-            draw!(left..right + 0.3 * (right - left));
+            draw!(left..right);
         }
         let _ = area.present();
     }
