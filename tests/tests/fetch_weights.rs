@@ -169,6 +169,42 @@ fn a_server_that_refuses_or_stays_short_is_told() {
     assert!(code == Some(1) && said.contains("127.0.0.1"), "{code:?}: {said}");
 }
 
+/// What a server says to a range must be that range; one that never does is left, whatever it sends.
+#[test]
+fn a_server_that_goes_round_in_circles_is_left() {
+    let temporary = tempfile::tempdir().expect("a folder");
+    let (address, asked) = server(|_, first| match first {
+        None => whole("200 OK", &published()[..100]),
+        Some(_) => whole("416 Range Not Satisfiable", b""),
+    });
+    let (code, said) = run(&mut fetch(&address, temporary.path()));
+    assert!(code == Some(1) && said.contains("of 6009 bytes are kept"), "{code:?}: {said}");
+    assert!(asked.lock().expect("unharmed").len() < 12, "{asked:?}");
+}
+
+#[cfg(unix)]
+#[test]
+fn what_has_the_name_of_an_unfinished_download_and_is_none_stays() {
+    let temporary = tempfile::tempdir().expect("a folder");
+    let (victim, part) = (temporary.path().join("victim"), temporary.path().join(format!("{FILE}.part")));
+    fs::write(&victim, "mine").expect("writes");
+    let (address, _) = server(|_, first| ranged(&published(), first, usize::MAX));
+    for link in [
+        |from: &Path, to: &Path| std::os::unix::fs::symlink(from, to),
+        |from: &Path, to: &Path| fs::hard_link(from, to),
+    ] {
+        link(&victim, &part).expect("links");
+        assert!(refused(&mut fetch(&address, temporary.path())).contains("is no unfinished download"));
+        assert_eq!(fs::read_to_string(&victim).expect("kept"), "mine");
+        fs::remove_file(&part).expect("removes");
+    }
+    // A folder that has not got the file takes nothing of a download.
+    fs::write(&part, "a beginning").expect("writes");
+    let empty = tempfile::tempdir().expect("a folder");
+    refused(&mut fetch(&empty.path().display().to_string(), temporary.path()));
+    assert_eq!(fs::read_to_string(&part).expect("kept"), "a beginning");
+}
+
 #[test]
 fn a_folder_is_a_mirror_too() {
     let temporary = tempfile::tempdir().expect("a folder");

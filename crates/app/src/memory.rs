@@ -2,8 +2,11 @@
 
 use std::fs;
 
+use burn::tensor::Device;
+use snapsnap_net::weights::WeightFile;
 use sysinfo::{MemoryRefreshKind, RefreshKind, System};
 
+use crate::device;
 use crate::failure::Failure;
 
 /// Refuses work on the CPU that needs more bytes than this process can ever get; `what` and `mend` say what it is and
@@ -20,6 +23,15 @@ pub fn check(what: &str, needed: u64, mend: &str) -> Result<(), Failure> {
         gigabytes(there)
     );
     Err(Failure::Input(message))
+}
+
+/// Refuses networks whose canvas this process can never compute on the CPU.
+pub fn check_networks(weights: &WeightFile, device: &Device) -> Result<(), Failure> {
+    if !device::is_cpu(device) {
+        return Ok(());
+    }
+    let what = format!("a canvas of {0}×{0} pixels", weights.config.network.resolution);
+    check(&what, weights.config.memory_needed(weights.parameters()), "choose a smaller `network.resolution`")
 }
 
 /// Bytes that the machine has, or, where that is less, that this process is allowed.

@@ -20,6 +20,11 @@ pub struct Arguments {
 }
 
 impl Arguments {
+    /// Files that are given.
+    pub fn files(&self) -> &[PathBuf] {
+        &self.lpips
+    }
+
     /// The network on the device of this name, which is not looked for in vain; or why there is none.
     ///
     /// # Errors
@@ -52,6 +57,14 @@ pub fn describe(lpips: &Result<Lpips, String>) -> String {
         Ok(network) if network.is_published() => "published weights".into(),
         Ok(_) => "other weights than the published ones: not to be compared with other reports".into(),
         Err(why) => format!("n/a ({why})"),
+    }
+}
+
+/// What is said behind a distance with other weights.
+pub fn mark(lpips: &Result<Lpips, String>) -> &'static str {
+    match lpips {
+        Ok(network) if !network.is_published() => " (not with the published weights)",
+        _ => "",
     }
 }
 

@@ -1,39 +1,65 @@
 //! The folder that a report is written into, and what stands on top of it.
 
+use std::cell::RefCell;
 use std::fs;
+use std::io;
 use std::path::{Path, PathBuf};
 
 use image::RgbImage;
 use serde_json::Value;
 use snapsnap_eval::report::{Header, today};
+use snapsnap_splat::file;
 
 use crate::commands::check_outputs;
 use crate::failure::Failure;
 use crate::output;
 use crate::pictures::{make_folder, write_png};
 
+/// Files that reports have, of whatever command.
+const FILES: [&str; 11] = [
+    "report.md",
+    "config.toml",
+    "people.png",
+    "by_view.svg",
+    "views.csv",
+    "subjects.csv",
+    "settings.csv",
+    "pareto.svg",
+    "training_points.svg",
+    "training_pictures.svg",
+    REPORT,
+];
+/// By which a report is known; written last.
+const REPORT: &str = "report.json";
+/// Longest one that is looked into.
+const MOST: u64 = 256 << 20;
+
 /// Files of one report.
 pub struct ReportFolder {
     path: PathBuf,
+    is_new: bool,
+    written: RefCell<Vec<String>>,
 }
 
 impl ReportFolder {
-    /// Refuses a folder into which `files` cannot be written, or where they would replace one of the `inputs`; makes it.
-    pub fn new(path: &Path, files: &[&str], inputs: &[&Path]) -> Result<Self, Failure> {
+    /// Makes the folder. Refuses one that has files and is no report's, and where a report's files cannot be written or would
+    /// replace one of the `inputs`.
+    pub fn new(path: &Path, inputs: &[&Path]) -> Result<Self, Failure> {
         if path.exists() && !path.is_dir() {
             return Err(Failure::Input(format!("{}: exists and is no folder", path.display())));
         }
         let is_new = !path.exists();
         make_folder(path)?;
-        let outputs: Vec<PathBuf> = files.iter().map(|name| path.join(name)).collect();
-        let outputs: Vec<&Path> = outputs.iter().map(PathBuf::as_path).collect();
-        if let Err(failure) = check_outputs(&outputs, inputs) {
-            if is_new {
-                let _ = fs::remove_dir(path);
-            }
-            return Err(failure);
+        let folder = Self { path: path.to_owned(), is_new, written: RefCell::default() };
+        let entries = fs::read_dir(path).map_err(|e| Failure::cannot_write(path, &e))?;
+        if entries.count() > 0 && !is_report(path) {
+            let message = "has files, and is no report's folder: give a new one";
+            return Err(Failure::Input(format!("{}: {message}", path.display())));
         }
-        Ok(Self { path: path.to_owned() })
+        let outputs: Vec<PathBuf> = FILES.iter().map(|name| path.join(name)).collect();
+        let outputs: Vec<&Path> = outputs.iter().map(PathBuf::as_path).collect();
+        check_outputs(&outputs, inputs)?;
+        Ok(folder)
     }
 
     /// Where it is.
@@ -41,33 +67,58 @@ impl ReportFolder {
         &self.path
     }
 
-    /// Writes text, or removes an older report's where there is none.
+    /// Writes text, if there is any.
     pub fn text(&self, name: &str, text: &str) -> Result<(), Failure> {
-        let path = self.path.join(name);
-        if text.is_empty() { self.none(name) } else { output::write(&path, text.as_bytes()) }
+        if text.is_empty() {
+            return Ok(());
+        }
+        output::write(&self.file(name), text.as_bytes())
     }
 
-    /// Writes JSON.
-    pub fn json(&self, name: &str, value: &Value) -> Result<(), Failure> {
-        let text = serde_json::to_string_pretty(value).expect("a value") + "\n";
-        self.text(name, &text)
-    }
-
-    /// Writes a picture, or removes an older report's.
+    /// Writes a picture, if there is one.
     pub fn picture(&self, name: &str, picture: Option<&RgbImage>) -> Result<(), Failure> {
-        match picture {
-            Some(picture) => write_png(&self.path.join(name), picture),
-            None => self.none(name),
-        }
+        picture.map_or(Ok(()), |picture| write_png(&self.file(name), picture))
     }
 
-    fn none(&self, name: &str) -> Result<(), Failure> {
-        let path = self.path.join(name);
-        match fs::remove_file(&path) {
-            Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(Failure::cannot_write(&path, &e)),
-            _ => Ok(()),
+    /// Writes the report's JSON, and removes what an older report had and this one has not.
+    pub fn finish(&self, value: &Value) -> Result<(), Failure> {
+        let text = serde_json::to_string_pretty(value).expect("a value") + "\n";
+        self.text(REPORT, &text)?;
+        let written = self.written.borrow();
+        for name in FILES.iter().filter(|name| !written.iter().any(|there| there == *name)) {
+            let path = self.path.join(name);
+            match fs::remove_file(&path) {
+                Err(e) if e.kind() != io::ErrorKind::NotFound => {
+                    return Err(Failure::cannot_write(&path, &e));
+                }
+                _ => {}
+            }
+        }
+        Ok(())
+    }
+
+    fn file(&self, name: &str) -> PathBuf {
+        debug_assert!(FILES.contains(&name), "{name}");
+        self.written.borrow_mut().push(name.to_owned());
+        self.path.join(name)
+    }
+}
+
+impl Drop for ReportFolder {
+    /// An empty folder is nothing to leave behind.
+    fn drop(&mut self) {
+        if self.is_new {
+            let _ = fs::remove_dir(&self.path);
         }
     }
+}
+
+/// Whether a folder holds a report of ours.
+fn is_report(folder: &Path) -> bool {
+    let text = file::read_text(&folder.join(REPORT), MOST).unwrap_or_default();
+    let report: Value = serde_json::from_str(&text).unwrap_or_default();
+    report["command"].as_str().is_some_and(|command| command.starts_with("snapsnap "))
+        && !report["commit"].is_null()
 }
 
 /// The command line as it was typed, program and all.

@@ -127,13 +127,15 @@ impl MeanPictures {
                 return Err(wrong(format!("has pictures of {kept}², the sets before it of {side}²")));
             }
             side = kept;
-            sums.resize(views, vec![0.0; 3 * side * side]);
+            // Filled by the first picture: memory follows pictures, and not what a data set says of itself.
+            sums.resize(views, Vec::new());
             let test = test_of(&folder, Some(Split::Train))?;
             // Every view sums its people in their order, so that the number of threads changes nothing.
             sums.par_iter_mut().enumerate().try_for_each(|(view, sum)| -> Result<(), EvalError> {
                 for row in 0..test.len() {
                     let (values, _) = test.target(row, view, [0.0; 3])?;
                     let planes = smaller(values, 3, stored, side);
+                    sum.resize(planes.len(), 0.0);
                     sum.iter_mut().zip(planes).for_each(|(sum, v)| *sum += f64::from(v));
                 }
                 Ok(())

@@ -96,9 +96,9 @@ fn spread(inside: &[bool], [lines, length]: [usize; 2], strides: [usize; 2], mar
         let mut reach = 0;
         let mut next = 0;
         for i in 0..length {
-            while next < length && next <= i + margin {
+            while next < length && next <= i.saturating_add(margin) {
                 if inside[at(next)] {
-                    reach = next + margin + 1;
+                    reach = next.saturating_add(margin).saturating_add(1);
                 }
                 next += 1;
             }
@@ -147,14 +147,15 @@ mod tests {
     #[test]
     fn masks_grow_by_their_margin_in_all_directions() {
         let (height, width) = (13, 17);
-        for (seed, margin) in [(1_u32, 0), (2, 1), (3, 2), (4, 5), (5, 40)] {
+        for (seed, margin) in [(1_u32, 0), (2, 1), (3, 2), (4, 5), (5, 40), (6, usize::MAX)] {
             let lit = |i: usize| (i as u32).wrapping_mul(2_654_435_761).rotate_left(seed) % 23 == 0;
             let mask: Vec<f32> = (0..height * width).map(|i| if lit(i) { 0.1 } else { 0.0 }).collect();
             let near = |i: usize| {
                 let (x, y) = (i % width, i / width);
-                let lines = y.saturating_sub(margin)..=(y + margin).min(height - 1);
+                let lines = y.saturating_sub(margin)..=y.saturating_add(margin).min(height - 1);
                 lines.into_iter().any(|row| {
-                    (x.saturating_sub(margin)..=(x + margin).min(width - 1)).any(|c| lit(row * width + c))
+                    (x.saturating_sub(margin)..=x.saturating_add(margin).min(width - 1))
+                        .any(|c| lit(row * width + c))
                 })
             };
             let expected: Vec<bool> = (0..height * width).map(near).collect();

@@ -72,6 +72,7 @@ fn every_setting_is_measured_and_what_it_leaves_out_shows() {
     assert!(code == Some(1) && said.contains("elsewhere") && said.contains("no/people"), "{said}");
     assert!(refused(&mut bench(&["--set", "bench.runs=0"])).contains("bench.runs"));
     assert!(refused(&mut bench(&["--set", "settings.a.stride=0"])).contains("stride"));
+    assert!(refused(&mut bench(&["--set", "settings.a.inputs=[0]"])).contains("settings.*.inputs"));
     let said = refused(&mut bench(&["--weights", "nowhere.safetensors"]));
     assert!(said.contains("nowhere.safetensors"), "{said}");
 }

@@ -140,6 +140,10 @@ fn what_cannot_be_compared_is_refused() {
     assert!(said("black.png", "nowhere.png", &[]).contains("nowhere.png"));
     assert!(said("black.png", "black.png", &["--window", "mask"]).contains("--mask"));
     let mask = path("other.png").display().to_string();
+    assert!(
+        said("black.png", "black.png", &["--window", "all", "--mask", &mask]).contains("--window mask alone")
+    );
+    assert!(said("black.png", "black.png", &["--mask", &mask]).contains("10×20"), "a mask is a window");
     assert!(said("black.png", "black.png", &["--window", "mask", "--mask", &mask]).contains("10×20"));
     let mask = path("black.png").display().to_string();
     assert!(said("black.png", "black.png", &["--window", "mask", "--mask", &mask]).contains("mask is empty"));

@@ -192,6 +192,25 @@ fn what_is_missing_or_damaged_is_named_and_the_rest_evaluated() {
         assert!(parts.iter().all(|part| entry.contains(part)), "{entry}");
     }
 
+    // A camera that mirrors, and a view without depth: its pictures count.
+    let data = temporary.path().join("mirrored");
+    fs::create_dir(&data).expect("a folder");
+    let data = copied(&data);
+    let cameras = data.join("test/cameras/0001.json");
+    let mut list: Vec<Value> =
+        serde_json::from_str(&fs::read_to_string(&cameras).expect("cameras")).expect("JSON");
+    let rows = list[2]["world_to_camera"].as_array_mut().expect("a matrix");
+    for value in rows[0].as_array_mut().expect("a row") {
+        *value = (-value.as_f64().expect("a number")).into();
+    }
+    fs::write(&cameras, serde_json::to_string(&list).expect("JSON")).expect("writes");
+    fs::remove_file(data.join("test/depth/0000/0.npz")).expect("removes");
+    let (code, said) = ended(&mut evaluate(&data, &report, &["--set", "metrics.geometry=false"]));
+    assert!(code == Some(1) && said.contains("the camera of view 2 is a reflection"), "{said}");
+    let found = json(&report);
+    assert_eq!(found["protocols"]["masked"]["views"].as_u64(), Some(6), "{said}");
+    assert!(left_out(&found).iter().any(|entry| entry.starts_with("0000, model, points: ")), "{said}");
+
     // No weights at all: the baselines are still worth something.
     let (code, said) = ended(&mut evaluate(people(), &report, &["--weights", "nowhere.safetensors"]));
     assert!(code == Some(1) && said.contains("nowhere.safetensors"), "{said}");
@@ -260,8 +279,35 @@ fn what_cannot_be_evaluated_is_refused_by_name() {
     assert!(said.contains("lies in a data set"), "{said}");
     let said = refused(&mut evaluate(temporary.path(), &report, &[]));
     assert!(said.contains("is no data set"), "{said}");
+    wrong(&["--set", "metrics.protocols=[\"paper\", \"paper\"]"], &["metrics.protocols", "twice"]);
+    wrong(&["--set", "views.turns=[0, 0]"], &["views.turns", "twice"]);
+    wrong(&["--set", "views.compared=[1, 99]"], &["no view 99, of 8", "views.compared"]);
+    let again = format!(
+        "data.folders=[{:?}, {:?}]",
+        people().display(),
+        people().join("../").join(people()).display()
+    );
+    let mut command = snapsnap();
+    command
+        .args(["evaluate", "--config"])
+        .arg(root().join("configs/eval.toml"))
+        .args(["--set", &again, "-o"]);
+    let said = refused(command.arg(&report));
+    assert!(said.contains("data.folders") && said.contains("twice"), "{said}");
+    // `..` behind what is not there yet.
+    let said = refused(&mut evaluate(people(), &people().join("no/../report"), &[]));
+    assert!(said.contains("lies in a data set") && !people().join("no").exists(), "{said}");
+    // Nor does it go where something else is.
+    let training = temporary.path().join("training");
+    fs::create_dir(&training).expect("a folder");
+    fs::write(training.join("log.jsonl"), "{}").expect("writes");
+    let said = refused(&mut evaluate(people(), &training, &[]));
+    assert!(said.contains("is no report's folder"), "{said}");
+    assert_eq!(fs::read_dir(&training).expect("there").count(), 1);
     // A report does not replace what it is made of.
     fs::create_dir(&report).expect("a folder");
+    fs::write(report.join("report.json"), "{\"command\": \"snapsnap evaluate\", \"commit\": \"0\"}")
+        .expect("writes");
     let config = report.join("config.toml");
     fs::write(&config, "[views]\n").expect("writes");
     let mut command = snapsnap();

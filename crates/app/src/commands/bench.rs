@@ -16,16 +16,6 @@ use crate::progress::Progress;
 use crate::report::{ReportFolder, header};
 use crate::{device, memory, perceptual, say, weights};
 
-/// What a report consists of.
-const FILES: [&str; 7] = [
-    "report.json",
-    "report.md",
-    "settings.csv",
-    "pareto.svg",
-    "training_points.svg",
-    "training_pictures.svg",
-    "config.toml",
-];
 /// What a process that measures one setting prints before its figures.
 const MARK: &str = "measured ";
 
@@ -73,11 +63,20 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
         return one(arguments, &config, name);
     }
     let output = arguments.output.as_deref().expect("clap asks for it");
-    let own = config.settings.values().filter_map(|setting| setting.data.as_ref());
+    let settings = || config.settings.values().chain([&config.model]);
+    let own = settings().filter_map(|setting| setting.data.as_ref());
     outside_data(output, config.data.folders.iter().chain(own).map(PathBuf::as_path))?;
-    let inputs: Vec<&Path> =
-        std::iter::once(&arguments.config).chain(&config.model.weights).map(PathBuf::as_path).collect();
-    let folder = ReportFolder::new(output, &FILES, &inputs)?;
+    let inputs: Vec<&Path> = std::iter::once(&arguments.config)
+        .chain(settings().filter_map(|setting| setting.weights.as_ref()))
+        .chain(arguments.lpips.files())
+        .map(PathBuf::as_path)
+        .collect();
+    // Asked before every setting says so.
+    if let Some(Err(e)) = config.model.weights.as_deref().map(std::fs::metadata) {
+        let path = config.model.weights.as_deref().unwrap_or(Path::new("")).display();
+        return Err(Failure::Input(format!("{path}: cannot read: {e}")));
+    }
+    let folder = ReportFolder::new(output, &inputs)?;
     let mut left_out = Vec::new();
     let mut training = Vec::new();
     for run in &config.training.runs {
@@ -118,7 +117,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     folder.text("settings.csv", &report.csv())?;
     folder.text("config.toml", &config.to_toml())?;
     folder.text("report.md", &report.markdown(&there))?;
-    folder.json("report.json", &report.json())?;
+    folder.finish(&report.json())?;
     if !quiet {
         for (m, by) in measured.iter().zip(dominated(&measured)) {
             let by =
@@ -127,12 +126,13 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
         }
         say::out(&format!("{}: report.md, report.json, plots and a table", folder.path().display()));
     }
-    let partly: usize = measured.iter().map(|m| m.left_out.len()).sum();
-    if left_out.is_empty() && partly == 0 {
+    let partly = measured.iter().flat_map(|m| m.left_out.iter().map(|why| (&m.name, why)));
+    let left_out: Vec<_> = left_out.iter().map(|l| (&l.name, &l.why)).chain(partly).collect();
+    if left_out.is_empty() {
         return Ok(());
     }
-    left_out.iter().for_each(|l| say::err(&format!("left out: {}: {}", l.name, l.why)));
-    Err(Failure::Internal(format!("{} left out, the rest was measured", left_out.len() + partly)))
+    left_out.iter().for_each(|(name, why)| say::err(&format!("left out: {name}: {why}")));
+    Err(Failure::Internal(format!("{} left out, the rest was measured", left_out.len())))
 }
 
 fn config_of(arguments: &Arguments) -> Result<BenchConfig, Failure> {
@@ -169,9 +169,12 @@ fn in_process(name: &str) -> Result<Measured, String> {
         return serde_json::from_str(figures).map_err(|e| format!("its figures cannot be read: {e}"));
     }
     let said = String::from_utf8_lossy(&output.stderr);
-    let last = said.lines().rev().find(|line| line.starts_with("error: ")).or_else(|| said.lines().last());
-    Err(last
-        .map_or(format!("ended with {}", output.status), |line| line.trim_start_matches("error: ").into()))
+    // All lines of the error.
+    let start = said.rfind("\nerror: ").map_or(0, |at| at + 1);
+    match said[start..].trim().trim_start_matches("error: ") {
+        "" => Err(format!("ended with {}", output.status)),
+        message => Err(message.replace('\n', " ")),
+    }
 }
 
 fn one(arguments: &Arguments, config: &BenchConfig, name: &str) -> Result<(), Failure> {
@@ -180,6 +183,7 @@ fn one(arguments: &Arguments, config: &BenchConfig, name: &str) -> Result<(), Fa
     let device = device::choose(&chosen)?;
     let arguments_of = ConfigArguments { config: None, set: setting.set.clone() };
     let weights = weights::open(setting.weights.as_deref(), &arguments_of)?;
+    memory::check_networks(&weights, &device)?;
     let lpips = arguments.lpips.load_or(&config.bench.lpips, &chosen)?;
     let described = device::describe(&device);
     let measured = measure(

@@ -17,7 +17,7 @@ use crate::failure::Failure;
 use crate::{memory, perceptual, say};
 
 /// Bytes per pixel of two pictures that are compared: as they are decoded, as planes, and the parts that are looked at.
-const BYTES: u64 = 100;
+const BYTES: u64 = 160;
 /// Endings of pictures that are looked for in folders.
 const ENDINGS: [&str; 7] = ["png", "jpg", "jpeg", "webp", "bmp", "tif", "tiff"];
 
@@ -76,7 +76,12 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let lpips = arguments.lpips.load(&arguments.device)?;
     if !arguments.a.is_dir() && !arguments.b.is_dir() {
         let compared = compare(arguments, &arguments.a, &arguments.b, arguments.mask.as_deref(), &lpips)?;
-        let text = if arguments.json { json_of(&compared).to_string() } else { text_of(&compared, &lpips) };
+        let json = || {
+            let mut value = json_of(&compared);
+            value["lpips_weights"] = perceptual::describe(&lpips).into();
+            value.to_string()
+        };
+        let text = if arguments.json { json() } else { text_of(&compared, &lpips) };
         say::out(&text);
         return Ok(());
     }
@@ -117,7 +122,9 @@ fn folders(arguments: &Arguments, lpips: &Result<Lpips, String>) -> Result<(), F
         let pictures: Vec<Value> = compared.iter().map(named).collect();
         let left_out: Vec<Value> =
             left_out.iter().map(|(name, why)| json!({ "name": name, "why": why })).collect();
-        say::out(&json!({ "pictures": pictures, "mean": mean, "left_out": left_out }).to_string());
+        say::out(&json!({
+            "pictures": pictures, "mean": mean, "left_out": left_out, "lpips_weights": perceptual::describe(lpips),
+        }).to_string());
     } else {
         for c in &compared {
             say::out(&format!("{:<24} {}", c.name, line_of(&c.score)));
@@ -125,9 +132,7 @@ fn folders(arguments: &Arguments, lpips: &Result<Lpips, String>) -> Result<(), F
         if let Some(mean) = mean {
             say::out(&format!("{:<24} {}", format!("mean of {}", compared.len()), line_of(&mean)));
         }
-        if let Err(why) = lpips {
-            say::out(&format!("LPIPS: {why}"));
-        }
+        say::out(&format!("LPIPS: {}", perceptual::describe(lpips)));
         left_out.iter().for_each(|(name, why)| say::err(&format!("left out: {name}: {why}")));
     }
     match (compared.len(), left_out.len()) {
@@ -217,7 +222,7 @@ fn text_of(compared: &Compared, lpips: &Result<Lpips, String>) -> String {
         format!("PSNR           {:.4} dB", compared.score.psnr),
         format!("SSIM           {} (uniform window)", plain(compared.score.ssim, "the window is too small")),
         format!("SSIM of loss   {:.6} (Gaussian window)", compared.ssim_gaussian),
-        format!("LPIPS          {}", plain(compared.score.lpips, why)),
+        format!("LPIPS          {}{}", plain(compared.score.lpips, why), perceptual::mark(lpips)),
         format!("window         {width}×{height} at {x}, {y}; {} pixels", compared.region.pixels()),
     ]
     .join("\n")

@@ -19,10 +19,6 @@ use crate::progress::Progress;
 use crate::report::{ReportFolder, header};
 use crate::{device, memory, perceptual, say, weights};
 
-/// What a report consists of.
-const FILES: [&str; 7] =
-    ["report.json", "report.md", "views.csv", "subjects.csv", "people.png", "by_view.svg", "config.toml"];
-
 #[derive(Args)]
 pub struct Arguments {
     /// What to compare, how and with what, as in configs/eval.toml.
@@ -72,11 +68,32 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
             "no data: give --data DATASET, made with `snapsnap prepare`, or data.folders in the config";
         return Err(Failure::Input(message.into()));
     }
-    let open = |path: &PathBuf| People::open(path, &config.data, &config.views).map_err(Failure::from);
-    let sets = config.data.folders.iter().map(open).collect::<Result<Vec<_>, _>>()?;
-    outside_data(&arguments.output, sets.iter().map(|set| set.folder().root()))?;
+    let folders = &config.data.folders;
+    let same = |a: &PathBuf, b: &PathBuf| {
+        a == b || a.canonicalize().ok().is_some_and(|a| b.canonicalize().is_ok_and(|b| a == b))
+    };
+    if let Some((_, again)) =
+        folders.iter().enumerate().find(|(i, a)| folders[..*i].iter().any(|b| same(a, b)))
+    {
+        return Err(Failure::Input(format!("data.folders: {} is there twice", again.display())));
+    }
+    let (mut sets, mut missing, mut first) = (Vec::new(), Vec::new(), None);
+    for path in folders {
+        match People::open(path, &config.data, &config.views) {
+            Ok(set) => sets.push(set),
+            Err(e) => {
+                missing.push(LeftOut { name: path.display().to_string(), why: e.to_string() });
+                first.get_or_insert(e);
+            }
+        }
+    }
+    if let (true, Some(e)) = (sets.is_empty(), first) {
+        return Err(e.into());
+    }
+    let roots = sets.iter().map(|set| set.folder().root());
+    outside_data(&arguments.output, roots.chain(config.baselines.mean.iter().map(PathBuf::as_path)))?;
     if let Some(meshes) = &arguments.mesh_dir {
-        return judge_meshes(arguments, &config, &sets, meshes, quiet);
+        return judge_meshes(arguments, &config, &sets, meshes, missing, quiet);
     }
     let names = match (&arguments.device, config.model.devices.as_slice()) {
         (Some(name), _) => vec![name.clone()],
@@ -84,16 +101,20 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
         (None, names) => names.to_vec(),
     };
     let devices = names.iter().map(|name| device::choose(name)).collect::<Result<Vec<_>, _>>()?;
-    let inputs: Vec<&Path> =
-        std::iter::once(&arguments.config).chain(&config.model.weights).map(PathBuf::as_path).collect();
+    let others = config.ablations.values().filter_map(|ablation| ablation.weights.as_ref());
+    let inputs: Vec<&Path> = std::iter::once(&arguments.config)
+        .chain(&config.model.weights)
+        .chain(others)
+        .chain(arguments.lpips.files())
+        .map(PathBuf::as_path)
+        .collect();
     let lpips = arguments.lpips.load_or(&config.metrics.lpips, &names[0])?;
-    let mut missing = Vec::new();
     let contestants = contestants(&config, &sets, (&names, &devices), &mut missing)?;
     if contestants.is_empty() {
         let whys: Vec<String> = missing.iter().map(|m| format!("{}: {}", m.name, m.why)).collect();
         return Err(Failure::Input(format!("nothing is left to evaluate: {}", whys.join("; "))));
     }
-    let folder = ReportFolder::new(&arguments.output, &FILES, &inputs)?;
+    let folder = ReportFolder::new(&arguments.output, &inputs)?;
 
     let people = sets.iter().map(|set| set.chosen().len()).sum();
     let progress = Progress::steps(quiet, people, "people");
@@ -124,7 +145,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     folder.text("config.toml", &config.to_toml())?;
     folder.text("report.md", &report.markdown(&pictures))?;
     let json = report.json();
-    folder.json("report.json", &json)?;
+    folder.finish(&json)?;
     if !quiet {
         say::out(&summary(&json));
         say::out(&format!("{}: report.md, report.json, pictures and tables", folder.path().display()));
@@ -142,7 +163,7 @@ fn complete(left_out: &[LeftOut]) -> Result<(), Failure> {
         return Ok(());
     }
     left_out.iter().for_each(|l| say::err(&format!("left out: {}: {}", l.name, l.why)));
-    Err(Failure::Internal(format!("{} left out, the rest was evaluated", left_out.len())))
+    Err(Failure::Internal(format!("{} left out, the rest, if there is any, was evaluated", left_out.len())))
 }
 
 fn judge_meshes(
@@ -150,12 +171,13 @@ fn judge_meshes(
     config: &EvalConfig,
     sets: &[People],
     meshes: &Path,
+    missing: Vec<LeftOut>,
     quiet: bool,
 ) -> Result<(), Failure> {
     if !meshes.is_dir() {
         return Err(Failure::Input(format!("--mesh-dir {}: is no folder", meshes.display())));
     }
-    let folder = ReportFolder::new(&arguments.output, &[FILES[0], FILES[1], FILES[6]], &[&arguments.config])?;
+    let folder = ReportFolder::new(&arguments.output, &[&arguments.config])?;
     let (align, said) = match arguments.icp {
         None => (Align::No, "none: as the meshes are"),
         Some(Icp::Rigid) => (Align::Rigidly, "rigid, by iterated closest points"),
@@ -164,18 +186,20 @@ fn judge_meshes(
     let total = sets.iter().map(|set| set.chosen().len()).sum();
     let progress = Progress::steps(quiet, total, "people");
     let done = |done: usize, total: usize| progress.step(done, total, "people");
-    let (figures, left_out) = evaluate_meshes(config, sets, meshes, align, &done);
+    let (figures, mut left_out) = evaluate_meshes(config, sets, meshes, align, &done);
     drop(progress);
+    left_out.splice(0..0, missing);
     let header = header("cpu");
     folder.text("config.toml", &config.to_toml())?;
     folder.text("report.md", &report::meshes::markdown(&header, &figures, &left_out, said))?;
     let json = report::meshes::json(&header, &figures, &left_out);
-    folder.json("report.json", &json)?;
+    folder.finish(&json)?;
     if !quiet {
         for (name, figure) in json["geometry_cm"].as_object().into_iter().flatten() {
             say::out(&format!(
-                "{name:<20} {}",
-                figure["mean"].as_f64().map_or("n/a".into(), |v| format!("{v:.4}"))
+                "{name:<20} {}{}",
+                figure["mean"].as_f64().map_or("n/a".into(), |v| format!("{v:.4}")),
+                if name == "normal_consistency" { "" } else { " cm" }
             ));
         }
     }
@@ -213,11 +237,7 @@ fn contestants(
         let path = ablation.weights.as_deref().or(config.model.weights.as_deref());
         let set = [config.model.set.clone(), ablation.set.clone()].concat();
         let weights = weights::open(path, &ConfigArguments { config: None, set })?;
-        if device::is_cpu(device) {
-            let (config, parameters) = (&weights.config, weights.parameters());
-            let what = format!("a canvas of {0}×{0} pixels", config.network.resolution);
-            memory::check(&what, config.memory_needed(parameters), "choose a smaller `network.resolution`")?;
-        }
+        memory::check_networks(&weights, device)?;
         let sides = ablation.sides && !has_known_sides(config);
         let leave = Leave { sides, side_colors: ablation.side_colors, ..Leave::default() };
         Ok(Model::load(&weights, device, leave)?)

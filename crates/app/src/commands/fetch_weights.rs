@@ -19,8 +19,8 @@ use crate::say;
 
 /// Attempts in a row that bring nothing, after which it ends.
 const ATTEMPTS: u32 = 4;
-/// Longest time for one attempt; what it brought is kept and the next one goes on from there.
-const ATTEMPT: Duration = Duration::from_secs(20 * 60);
+/// Longest time for the first attempt, and for any: what it brought is kept and the next one, twice as long, goes on from there.
+const ATTEMPT: [Duration; 2] = [Duration::from_secs(60), Duration::from_secs(20 * 60)];
 /// Longest silence before an answer begins.
 const SILENCE: Duration = Duration::from_secs(60);
 /// Bytes read at a time.
@@ -148,8 +148,9 @@ impl Origin {
 fn fetch(item: &Item, origin: &Origin, folder: &Path, quiet: bool) -> Result<(), Failure> {
     let path = folder.join(item.file);
     let failed = |e: &io::Error| Failure::cannot_write(&path, e);
-    if path.exists() {
-        let mut there = File::open(&path).map_err(|e| failed(&e))?;
+    if path.symlink_metadata().is_ok() {
+        let unreadable = |e| Failure::Input(format!("{}: is there, and cannot be read: {e}", path.display()));
+        let mut there = file::open(&path).map_err(unreadable)?;
         let is_sound = there.metadata().is_ok_and(|m| m.len() == item.bytes)
             && sum_of(&mut there).map_err(|e| failed(&e))? == item.sha256;
         if is_sound {
@@ -159,25 +160,23 @@ fn fetch(item: &Item, origin: &Origin, folder: &Path, quiet: bool) -> Result<(),
         let message = "is there, but is not the published file; move it away to fetch it";
         return Err(Failure::Input(format!("{}: {message}", path.display())));
     }
+    let address = match origin {
+        Origin::Folder(from) => return copy(item, &from.join(item.file), &path, quiet),
+        Origin::Address(address) => address,
+    };
     let part = folder.join(format!("{}.part", item.file));
+    // What else has that name is not ours to fill.
+    if part.symlink_metadata().is_ok_and(|there| !there.is_file() || is_shared(&there)) {
+        let message = "is no unfinished download: a link, or no regular file; move it away";
+        return Err(Failure::Input(format!("{}: {message}", part.display())));
+    }
     let file = OpenOptions::new().create(true).truncate(false).read(true).write(true).open(&part);
     let mut file = file.map_err(|e| failed(&e))?;
     if matches!(file.try_lock(), Err(TryLockError::WouldBlock)) {
         return Err(Failure::Input(format!("{}: is being fetched by another process", part.display())));
     }
     let progress = Progress::bytes(quiet);
-    match origin {
-        Origin::Folder(from) => {
-            let from = from.join(item.file);
-            let mut source = file::open(&from).map_err(|e| {
-                let _ = fs::remove_file(&part);
-                Failure::Input(format!("{}: cannot read: {e}", from.display()))
-            })?;
-            file.set_len(0).map_err(|e| failed(&e))?;
-            take(&mut source, &mut file, 0, item, &progress).map_err(|e| failed(&e))?;
-        }
-        Origin::Address(address) => download(address, &mut file, item, &progress, &part)?,
-    }
+    download(address, &mut file, item, &progress, &part)?;
     drop(progress);
     file.seek(SeekFrom::Start(0)).map_err(|e| failed(&e))?;
     let (found, length) =
@@ -185,16 +184,47 @@ fn fetch(item: &Item, origin: &Origin, folder: &Path, quiet: bool) -> Result<(),
     if found != item.sha256 || length != item.bytes {
         // Nothing of it can be trusted, so nothing is gone on from.
         let _ = fs::remove_file(&part);
-        return Err(Failure::Input(format!(
-            "{}: what came is not {}: {length} bytes with SHA-256 {found}; nothing was kept",
-            origin.describe(),
-            item.file
-        )));
+        return Err(Failure::Input(other(&origin.describe(), item, length, &found)));
     }
     file.sync_all().map_err(|e| failed(&e))?;
     fs::rename(&part, &path).map_err(|e| failed(&e))?;
     say::out(&format!("{}: fetched, and sound", path.display()));
     Ok(())
+}
+
+/// Takes a file from a folder, whole or not at all.
+fn copy(item: &Item, from: &Path, path: &Path, quiet: bool) -> Result<(), Failure> {
+    let mut source =
+        file::open(from).map_err(|e| Failure::Input(format!("{}: cannot read: {e}", from.display())))?;
+    let (found, length) = (sum_of(&mut source), source.metadata().map_or(0, |m| m.len()));
+    let found = found.map_err(|e| Failure::Input(format!("{}: cannot read: {e}", from.display())))?;
+    if found != item.sha256 || length != item.bytes {
+        return Err(Failure::Input(other(&from.display().to_string(), item, length, &found)));
+    }
+    let progress = Progress::bytes(quiet);
+    let written = file::write_whole(path, |out| {
+        source.seek(SeekFrom::Start(0))?;
+        take(&mut source, out, 0, item, &progress).map(drop)
+    });
+    written.map_err(|e: io::Error| Failure::cannot_write(path, &e))?;
+    drop(progress);
+    say::out(&format!("{}: fetched, and sound", path.display()));
+    Ok(())
+}
+
+fn other(origin: &str, item: &Item, length: u64, found: &str) -> String {
+    format!("{origin}: what came is not {}: {length} bytes with SHA-256 {found}; nothing was kept", item.file)
+}
+
+/// Whether a file has another name as well.
+#[cfg(unix)]
+fn is_shared(file: &fs::Metadata) -> bool {
+    std::os::unix::fs::MetadataExt::nlink(file) > 1
+}
+
+#[cfg(not(unix))]
+fn is_shared(_: &fs::Metadata) -> bool {
+    false
 }
 
 /// SHA-256 of the rest of a file, in hexadecimal digits.
@@ -213,7 +243,7 @@ fn sum_of(file: &mut File) -> io::Result<String> {
 /// Copies until the source ends or there is one byte too many; returns how many bytes there are then.
 fn take(
     source: &mut dyn Read,
-    file: &mut File,
+    file: &mut dyn Write,
     from: u64,
     item: &Item,
     progress: &Progress,
@@ -241,15 +271,17 @@ fn download(
     progress: &Progress,
     part: &Path,
 ) -> Result<(), Failure> {
-    let agent: Agent = Agent::config_builder()
-        .timeout_connect(Some(SILENCE))
-        .timeout_recv_response(Some(SILENCE))
-        .timeout_recv_body(Some(ATTEMPT))
-        .http_status_as_error(false)
-        .build()
-        .into();
+    let agent = |time: Duration| -> Agent {
+        let config = Agent::config_builder()
+            .timeout_connect(Some(SILENCE))
+            .timeout_recv_response(Some(SILENCE))
+            .timeout_recv_body(Some(time))
+            .http_status_as_error(false);
+        config.build().into()
+    };
     let cannot_write = |e: io::Error| Failure::cannot_write(part, &e);
-    let mut fruitless = 0;
+    // The most that there ever was: a server that makes us begin again brings nothing.
+    let (mut fruitless, mut most, mut time) = (0, 0, ATTEMPT[0]);
     loop {
         let before = file.seek(SeekFrom::End(0)).map_err(cannot_write)?;
         if before == item.bytes {
@@ -259,7 +291,8 @@ fn download(
             file.set_len(0).map_err(cannot_write)?;
             continue;
         }
-        let why = match attempt(&agent, address, file, before, item, progress) {
+        most = most.max(before);
+        let why = match attempt(&agent(time), address, file, before, item, progress) {
             Ok(()) => "the connection ended early".to_owned(),
             Err(Broken::Refused(message)) => {
                 return Err(Failure::Internal(format!("{address}: {message}")));
@@ -271,7 +304,8 @@ fn download(
         if after >= item.bytes {
             return Ok(());
         }
-        fruitless = if after > before { 0 } else { fruitless + 1 };
+        (fruitless, time) =
+            if after > most { (0, ATTEMPT[1].min(2 * time)) } else { (fruitless + 1, ATTEMPT[0]) };
         if fruitless == ATTEMPTS {
             if after == 0 {
                 let _ = fs::remove_file(part);

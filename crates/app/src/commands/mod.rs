@@ -13,7 +13,7 @@ pub mod render;
 pub mod stability;
 pub mod train;
 
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 
 use clap::Args;
 use snapsnap_net::config::Config;
@@ -74,10 +74,18 @@ pub fn check_outputs(outputs: &[&Path], inputs: &[&Path]) -> Result<(), Failure>
 /// a subject without pictures.
 pub fn outside_data<'a>(path: &Path, roots: impl IntoIterator<Item = &'a Path>) -> Result<(), Failure> {
     let whole = std::path::absolute(path).map_err(|e| Failure::cannot_write(path, &e))?;
-    let there = whole.ancestors().find_map(|above| above.canonicalize().ok());
+    // Links are followed as far as there are any; `..` behind what is not there yet is taken literally.
+    let mut there = PathBuf::new();
+    for part in whole.components() {
+        match part {
+            Component::ParentDir => drop(there.pop()),
+            part => there.push(part),
+        }
+        there = there.canonicalize().unwrap_or(there);
+    }
     for root in roots {
         let root = root.canonicalize().ok();
-        if root.zip(there.as_ref()).is_some_and(|(root, there)| there.starts_with(root)) {
+        if root.is_some_and(|root| there.starts_with(root)) {
             return Err(Failure::Input(format!("{}: lies in a data set", path.display())));
         }
     }

@@ -17,8 +17,6 @@ use crate::progress::Progress;
 use crate::report::{ReportFolder, header};
 use crate::{device, say, weights};
 
-/// What a report consists of.
-const FILES: [&str; 2] = ["report.json", "report.md"];
 /// AdamW steps that EVALUATION.md asks for, and those of a quick look.
 const MANY: u64 = 1_000_000;
 const FEW: u64 = 10_000;
@@ -80,7 +78,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
         return Err(Failure::Input(format!("--only {text}: no case has that in its area or input")));
     }
     let inputs: Vec<&Path> = arguments.weights.iter().map(PathBuf::as_path).collect();
-    let folder = ReportFolder::new(&arguments.output, &FILES, &inputs)?;
+    let folder = ReportFolder::new(&arguments.output, &inputs)?;
     let rounds: Vec<(&Case, &Device)> = cases
         .iter()
         .flat_map(|case| {
@@ -101,7 +99,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let names: Vec<String> = devices.iter().map(device::describe).collect();
     let header = header(&names.join(", "));
     folder.text("report.md", &report::markdown(&header, &rows))?;
-    folder.json("report.json", &report::json(&header, &rows))?;
+    folder.finish(&report::json(&header, &rows))?;
     let failed: Vec<&Row> = rows.iter().filter(|row| row.verdict == "fails").collect();
     if !quiet {
         let count = |verdict: &str| rows.iter().filter(|row| row.verdict == verdict).count();

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use snapsnap_net::config::{ConfigError, parse};
 use snapsnap_net::precision::Precision;
 
-use crate::evaluate::config::{DataSection, Preset};
+use crate::evaluate::config::{DataSection, Preset, views_problem};
 
 /// Everything that decides what a benchmark computes.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
@@ -203,7 +203,17 @@ impl BenchConfig {
         if self.settings.contains_key(AS_IT_IS) {
             return Some(("settings", format!("`{AS_IT_IS}` is the model's own name")));
         }
+        let name = self
+            .settings
+            .iter()
+            .flat_map(|(name, s)| [Some(name), s.scene.as_ref(), s.omits.as_ref(), s.knob.as_ref()]);
+        if name.flatten().any(|name| name.contains(char::is_control)) {
+            return Some(("settings", "a name has control characters".into()));
+        }
         for setting in self.settings.values().chain([&self.model]) {
+            if let Some(problem) = setting.inputs.as_ref().and_then(|inputs| views_problem(inputs)) {
+                return Some(("settings.*.inputs", problem));
+            }
             if setting.stride.is_some_and(|stride| !(1..=64).contains(&stride)) {
                 return Some(("settings.*.stride", "must be 1 to 64".into()));
             }

@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 use burn::tensor::Device;
 use glam::{DVec2, DVec3};
 use serde::{Deserialize, Serialize};
+use snapsnap_mesh::FileError;
 use snapsnap_net::weights::WeightFile;
 use snapsnap_splat::{Camera, Gaussians, ply};
 
@@ -150,10 +151,10 @@ pub fn measure(
     let first = people.chosen().first().copied().ok_or_else(|| EvalError::Empty("there is nobody".into()))?;
     let inputs = people.inputs(&eval.views, 0);
     let mut readings = Vec::new();
-    let mut item = people.test().sample(first, &inputs)?;
+    let mut item = people.item(first, &inputs)?;
     for _ in 0..config.bench.runs.min(5) {
         let start = Instant::now();
-        item = people.test().sample(first, &inputs)?;
+        item = people.item(first, &inputs)?;
         let canvases: Vec<_> =
             (0..inputs.len()).map(|place| photograph(&item, place, model.side())).collect();
         readings.push(start.elapsed());
@@ -198,11 +199,9 @@ pub fn measure(
     }
     let memory = most_used();
     let start = Instant::now();
-    let file = std::env::temp_dir().join(format!("snapsnap-bench-{}.ply", std::process::id()));
-    let written = ply::write(&made.gaussians, &file);
+    let folder = tempfile::tempdir().map_err(FileError::write(&std::env::temp_dir()))?;
+    ply::write(&made.gaussians, &folder.path().join("human.ply"))?;
     modules.push(("writing the PLY".into(), start.elapsed().as_secs_f64()));
-    let _ = std::fs::remove_file(&file);
-    written?;
     let side = people.side(&eval.views);
     let camera = item.cameras[eval.views.compared[0]];
     let mut renders = Vec::new();

@@ -256,6 +256,15 @@ impl Default for ReportSection {
     }
 }
 
+/// What is wrong with a list of views that go in.
+pub(crate) fn views_problem(inputs: &[usize]) -> Option<String> {
+    if inputs.len() == 1 || inputs.len() > 64 {
+        return Some("must be empty, or 2 to 64 views".into());
+    }
+    let is_twice = inputs.iter().collect::<BTreeSet<_>>().len() < inputs.len();
+    is_twice.then(|| "names a view twice".into())
+}
+
 impl EvalConfig {
     /// Parses and checks TOML text; `origin` names it in errors, `overrides` are `a.b=c` assignments applied on top.
     ///
@@ -280,7 +289,6 @@ impl EvalConfig {
     fn problem(&self) -> Option<(&'static str, String)> {
         /// Names that reports have for others.
         const TAKEN: [&str; 5] = ["model", "against", "billboard", "true_points", "mean_picture"];
-        let most = snapsnap_data::dataset::MAX_VIEWS;
         let Self { views, metrics, report, ablations, model, .. } = self;
         let devices = model.devices.iter().map(|name| format!("on {name}"));
         let mut names: Vec<String> = ablations.keys().cloned().chain(devices).collect();
@@ -291,20 +299,16 @@ impl EvalConfig {
         if let Some(pair) = names.windows(2).find(|pair| pair[0] == pair[1]) {
             return Some(("ablations", format!("`{}` is there twice, as an ablation or a device", pair[0])));
         }
-        if views.inputs.len() == 1 || views.inputs.len() > 64 {
-            return Some(("views.inputs", "must be empty, or 2 to 64 views".into()));
+        if names.iter().chain(self.groups.keys()).any(|name| name.contains(char::is_control)) {
+            return Some(("ablations", "the name of one, or of a group, has control characters".into()));
         }
-        let lists = [
-            ("views.inputs", &views.inputs),
-            ("views.turns", &views.turns),
-            ("views.compared", &views.compared),
-        ];
+        if let Some(problem) = views_problem(&views.inputs) {
+            return Some(("views.inputs", problem));
+        }
+        let lists = [("views.turns", &views.turns), ("views.compared", &views.compared)];
         for (key, list) in lists {
             if list.iter().collect::<BTreeSet<_>>().len() < list.len() {
                 return Some((key, "names a view twice".into()));
-            }
-            if list.iter().any(|view| *view >= most) {
-                return Some((key, format!("must be below {most}")));
             }
         }
         if views.turns.is_empty() || views.turns.len() > 64 {
@@ -315,6 +319,9 @@ impl EvalConfig {
         }
         if metrics.protocols.is_empty() {
             return Some(("metrics.protocols", "is empty, must name `paper`, `masked` or both".into()));
+        }
+        if metrics.protocols.len() > 2 || metrics.protocols.get(1) == metrics.protocols.first() {
+            return Some(("metrics.protocols", "names a protocol twice".into()));
         }
         if !(0.0..=1.0).contains(&metrics.opaque) {
             return Some(("metrics.opaque", format!("is {}, must be 0 to 1", metrics.opaque)));

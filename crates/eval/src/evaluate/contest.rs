@@ -46,11 +46,14 @@ enum Means {
 }
 
 /// What a contestant has to show of a person.
+#[derive(Default)]
 pub struct Shown {
     /// World frame; none where there are only pictures.
     pub gaussians: Option<Gaussians>,
     /// Errors of the predicted points.
     pub points: Vec<PointError>,
+    /// Why there are none, where there could be.
+    pub no_points: Option<String>,
     /// Pixels and Gaussians that were not finite.
     pub lost: usize,
     /// What it took.
@@ -121,16 +124,20 @@ impl Contestant {
         canvas: usize,
     ) -> Result<Shown, EvalError> {
         let nothing = || EvalError::Empty("no Gaussian came out".into());
-        let plain = |gaussians| Shown { gaussians: Some(gaussians), points: Vec::new(), lost: 0, time: None };
+        let plain = |gaussians| Shown { gaussians: Some(gaussians), ..Shown::default() };
         match &self.means {
             Means::Model(_, model) => {
                 let made = model.reconstruct(item, inputs);
                 if made.gaussians.is_empty() {
                     return Err(nothing());
                 }
-                let points = errors(people, row, item, inputs, &made.maps, model.side())?;
+                // Pictures can be compared without them.
+                let (points, no_points) = match errors(people, row, item, inputs, &made.maps, model.side()) {
+                    Ok(points) => (points, None),
+                    Err(e) => (Vec::new(), Some(e.to_string())),
+                };
                 let (gaussians, lost, time) = (Some(made.gaussians), made.lost, Some(made.time));
-                Ok(Shown { gaussians, points, lost, time })
+                Ok(Shown { gaussians, points, no_points, lost, time })
             }
             Means::Billboard(device) => {
                 let (images, valid) = on_canvas(item, inputs.len(), canvas);
@@ -156,7 +163,7 @@ impl Contestant {
                 made.map(plain).ok_or_else(nothing)
             }
             Means::Fixed(gaussians) => Ok(plain(gaussians.as_ref().clone())),
-            Means::Mean(_) => Ok(Shown { gaussians: None, points: Vec::new(), lost: 0, time: None }),
+            Means::Mean(_) => Ok(Shown::default()),
         }
     }
 

@@ -13,7 +13,7 @@ use snapsnap_mesh::view::{Renderer, ViewOptions};
 use super::config::EvalConfig;
 use super::person::People;
 use super::surface::{thinned, truth as truth_of};
-use super::{LeftOut, name_of};
+use super::{LeftOut, name_of, nobody};
 use crate::EvalError;
 use crate::geometry::{Alignment, chamfer, icp, point_to_surface, sampled};
 
@@ -75,6 +75,7 @@ pub fn evaluate_meshes(
         }
         progress(done + 1, total);
     }
+    left_out.extend(nobody(config, sets));
     (figures, left_out)
 }
 

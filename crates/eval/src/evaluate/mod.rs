@@ -129,18 +129,23 @@ pub fn evaluate(
             outcome.left_out.push(LeftOut { name: name.clone(), why });
         }
     }
-    if outcome.left_out.is_empty() && outcome.judged.iter().all(|judged| judged.rows.is_empty()) {
-        let why =
-            "no view is left to compare: there is nobody, or every view of views.compared goes in".into();
-        outcome.left_out.push(LeftOut { name: "everything".into(), why });
-    }
-    for name in &config.data.only {
-        if !sets.iter().any(|set| set.chosen().iter().any(|row| set.test().name(*row) == name)) {
-            let why = "data.only names it, no data set has it".into();
-            outcome.left_out.push(LeftOut { name: name.clone(), why });
-        }
-    }
+    outcome.left_out.extend(nobody(config, sets));
     outcome
+}
+
+/// Who is asked for and not there.
+pub(crate) fn nobody(config: &EvalConfig, sets: &[People]) -> Vec<LeftOut> {
+    let is_there = |name: &&String| {
+        !sets.iter().any(|set| set.chosen().iter().any(|row| set.test().name(*row) == name.as_str()))
+    };
+    let missing = config.data.only.iter().filter(is_there);
+    let why = "data.only names it, no data set has it, or not among its first ones".to_owned();
+    let mut left_out: Vec<LeftOut> =
+        missing.map(|name| LeftOut { name: name.clone(), why: why.clone() }).collect();
+    if left_out.is_empty() && sets.iter().all(|set| set.chosen().is_empty()) {
+        left_out.push(LeftOut { name: "everything".into(), why: "there is nobody".into() });
+    }
+    left_out
 }
 
 /// Whether a person is called so, with the data set's name before it or without.
@@ -151,8 +156,19 @@ pub(crate) fn is_named(person: &str, name: &str) -> bool {
 /// A person's name, with the data set's where there are several.
 fn name_of(sets: &[People], people: &People, row: usize) -> String {
     let name = people.test().name(row);
-    let root = people.folder().root().file_name().unwrap_or_default().to_string_lossy();
-    if sets.len() > 1 { format!("{root}/{name}") } else { name.to_owned() }
+    if sets.len() < 2 {
+        return name.to_owned();
+    }
+    let called = |set: &People| {
+        let root = set.folder().root();
+        let root = root.canonicalize().unwrap_or_else(|_| root.to_owned());
+        root.file_name().unwrap_or_default().to_string_lossy().into_owned()
+    };
+    let own = called(people);
+    match sets.iter().filter(|set| called(set) == own).count() {
+        1 => format!("{own}/{name}"),
+        _ => format!("{}/{name}", people.folder().root().display()),
+    }
 }
 
 /// A person seen from a side.
@@ -181,7 +197,7 @@ fn one(
 ) {
     let Place { people, row, turn, person } = *at;
     let inputs = people.inputs(&config.views, turn);
-    let item = match people.test().sample(row, &inputs) {
+    let item = match people.item(row, &inputs) {
         Ok(item) => item,
         Err(e) => return at.left_out(outcome, "", &e),
     };
@@ -196,6 +212,9 @@ fn one(
                 continue;
             }
         };
+        if let Some(why) = &made.no_points {
+            at.left_out(outcome, &format!(", {}, points", contestant.name), why);
+        }
         if made.lost > 0 {
             let why = format!("{} pixels or Gaussians left out: they are not finite", made.lost);
             at.left_out(outcome, &format!(", {}", contestant.name), &why);
@@ -217,6 +236,13 @@ fn one(
     let wanted = |view: &usize| config.views.compared.is_empty() || config.views.compared.contains(view);
     let compared: Vec<usize> =
         (0..people.views()).filter(|view| wanted(view) && !inputs.contains(view)).collect();
+    if compared.is_empty() {
+        at.left_out(
+            outcome,
+            "",
+            &"no view is left to compare: every one, or every one of views.compared, goes in",
+        );
+    }
     let compare = |view: &usize| compare(config, at, &item, *view, (contestants, &shown), lpips);
     // A device of its own does one thing at a time.
     let is_on_cpu = shown.iter().flatten().all(contest::Shown::is_on_cpu);
@@ -343,7 +369,7 @@ fn pictures(
     /// Mean absolute difference of channels that is shown white.
     const WORST: f32 = 0.5;
     let inputs = people.inputs(&config.views, config.views.turns[0]);
-    let item = people.test().sample(row, &inputs)?;
+    let item = people.item(row, &inputs)?;
     let side = people.side(&config.views);
     let shown = contestant.prepare(people, row, &item, &inputs, side)?;
     let mut pictures = Vec::new();

@@ -93,6 +93,23 @@ impl People {
         if views.resolution > 0 { views.resolution } else { self.folder.description().resolution as usize }
     }
 
+    /// A person's photographs, masks and cameras.
+    ///
+    /// # Errors
+    /// [`EvalError::File`]; also for a camera that mirrors, whose world has no Gaussians: no quaternion turns them so.
+    pub fn item(&self, row: usize, inputs: &[usize]) -> Result<TestItem, EvalError> {
+        let item = self.test.sample(row, inputs)?;
+        let mirrors = |camera: &Camera| camera.world_to_camera.rotation.determinant() < 0.0;
+        match item.cameras.iter().position(mirrors) {
+            None => Ok(item),
+            Some(view) => {
+                let name = self.test.name(row);
+                let message = format!("{name}: the camera of view {view} is a reflection, no rotation");
+                Err(EvalError::File(FileError::unsuitable(self.folder.root(), message)))
+            }
+        }
+    }
+
     /// What a view shows, over black, and the person's share of each pixel `[S, S]`.
     ///
     /// # Errors

@@ -18,6 +18,9 @@ use crate::EvalError;
 pub use align::{Alignment, icp};
 pub use normals::{consistency, normals};
 
+/// Points farther away than this, metres, are refused: f32 has no squares of their distances.
+const FARTHEST: f32 = 1e15;
+
 /// Mean distances between two sets of points.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Chamfer {
@@ -52,8 +55,9 @@ fn check_points(points: &[[f32; 3]]) -> Result<(), EvalError> {
     if points.is_empty() {
         return Err(EvalError::Empty("there is no point".into()));
     }
-    match points.iter().position(|p| p.iter().any(|v| !v.is_finite())) {
-        Some(row) => Err(EvalError::Empty(format!("point {row} is not finite"))),
+    // Written so that a NaN fails as well.
+    match points.iter().position(|p| !p.iter().all(|v| v.abs() <= FARTHEST)) {
+        Some(row) => Err(EvalError::Empty(format!("point {row} is not finite, or beyond {FARTHEST:e} m"))),
         None => Ok(()),
     }
 }
@@ -90,6 +94,7 @@ fn distance(a: [f32; 3], b: [f32; 3]) -> f64 {
 /// [`EvalError::Empty`] without points or with one that is not finite, or for a mesh that has no area.
 pub fn point_to_surface(points: &[[f32; 3]], mesh: &Mesh) -> Result<f64, EvalError> {
     check_points(points)?;
+    check_points(&mesh.positions.iter().map(|p| p.to_array()).collect::<Vec<_>>())?;
     let vertices = mesh.positions.iter().map(|p| Vector::new(p.x, p.y, p.z)).collect();
     let mut faces: Vec<[u32; 3]> = mesh.faces.iter().map(|face| face.positions).collect();
     // Every copy of a nearest face would be looked at: a damaged file may have thousands.

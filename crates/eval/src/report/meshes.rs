@@ -19,8 +19,9 @@ const FIGURES: [Figure; 6] = [
     ("normal_consistency", "normals, mean cosine", |f| f.normal_consistency),
 ];
 
+/// Over the people who have it.
 fn overall(figures: &[MeshFigures], of: fn(&MeshFigures) -> Option<f64>) -> Option<Interval> {
-    interval(&figures.iter().map(of).collect::<Option<Vec<f64>>>()?)
+    interval(&figures.iter().filter_map(of).collect::<Vec<f64>>())
 }
 
 /// `report.json`.

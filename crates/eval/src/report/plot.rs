@@ -33,7 +33,9 @@ pub struct Axes<'a> {
 
 /// An SVG of some series; empty if no point is finite.
 pub fn svg(axes: &Axes, series: &[Series]) -> String {
-    let finite = |(x, y): &(f64, f64)| x.is_finite() && y.is_finite() && (!axes.log || *x > 0.0);
+    // Beyond that, ranges have no differences and axes no ticks.
+    let drawn = |v: f64| v.abs() < 1e15;
+    let finite = |(x, y): &(f64, f64)| drawn(*x) && drawn(*y) && (!axes.log || *x > 0.0);
     let all: Vec<(f64, f64)> = series.iter().flat_map(|s| s.points.iter().copied()).filter(finite).collect();
     let range = |of: fn(&(f64, f64)) -> f64| {
         let values = all.iter().map(of);
@@ -86,4 +88,21 @@ pub fn svg(axes: &Axes, series: &[Series]) -> String {
         let _ = area.present();
     }
     text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_cannot_be_drawn_is_left_out() {
+        let axes = Axes { caption: "c", x: "x", y: "y", log: false };
+        let series = |points: Vec<(f64, f64)>| [Series { name: "a < b".into(), points, line: true }];
+        let drawn =
+            svg(&axes, &series(vec![(0.0, 1.0), (1.0, -1e308), (2.0, 1e308), (3.0, f64::NAN), (4.0, 2.0)]));
+        // The mark beside the name is one more.
+        assert_eq!(drawn.matches("<circle").count(), 3, "{drawn}");
+        assert!(drawn.contains("a &lt; b"));
+        assert_eq!(svg(&axes, &series(vec![(f64::INFINITY, 1.0)])), "");
+    }
 }
