@@ -39,8 +39,8 @@ pub struct Arguments {
     #[command(flatten)]
     lpips: perceptual::Arguments,
     /// Folder of the report.
-    #[arg(short, long, value_name = "REPORT", required_unless_present = "one")]
-    output: Option<PathBuf>,
+    #[arg(short, long, value_name = "REPORT")]
+    output: PathBuf,
     /// auto, cpu, ndarray, wgpu, vulkan, cuda or metal [default: model.device of the config].
     #[arg(long)]
     device: Option<String>,
@@ -62,7 +62,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     if let Some(name) = &arguments.one {
         return one(arguments, &config, name);
     }
-    let output = arguments.output.as_deref().expect("clap asks for it");
+    let output = arguments.output.as_path();
     let settings = || config.settings.values().chain([&config.model]);
     let own = settings().filter_map(|setting| setting.data.as_ref());
     outside_data(output, config.data.folders.iter().chain(own).map(PathBuf::as_path))?;

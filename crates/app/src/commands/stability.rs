@@ -71,7 +71,8 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     }
     cases.extend(training::cases(if arguments.quick { FEW } else { MANY }));
     if let Some(text) = &arguments.only {
-        cases.retain(|case| case.area.contains(text) || case.input.contains(text));
+        let text = text.to_lowercase();
+        cases.retain(|case| [case.area, &case.input].iter().any(|name| name.to_lowercase().contains(&text)));
     }
     if cases.is_empty() {
         let text = arguments.only.as_deref().unwrap_or_default();

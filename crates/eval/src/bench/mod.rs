@@ -148,7 +148,11 @@ pub fn measure(
     sync(device);
     modules.push(("loading weights".into(), start.elapsed().as_secs_f64()));
 
-    let first = people.chosen().first().copied().ok_or_else(|| EvalError::Empty("there is nobody".into()))?;
+    let nobody = || match eval.data.only.as_slice() {
+        [] => EvalError::Empty(format!("{}: there is nobody", folder.display())),
+        only => EvalError::Empty(format!("{}: has nobody called {}", folder.display(), only.join(", "))),
+    };
+    let first = people.chosen().first().copied().ok_or_else(nobody)?;
     let inputs = people.inputs(&eval.views, 0);
     let mut readings = Vec::new();
     let mut item = people.item(first, &inputs)?;

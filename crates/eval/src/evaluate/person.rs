@@ -125,6 +125,10 @@ impl People {
 
 /// A split of a data set as it is, nothing changed.
 pub fn test_of(folder: &Arc<Folder>, split: Option<Split>) -> Result<Test, EvalError> {
+    if let Some(split) = split.filter(|split| !folder.root().join(split.name()).is_dir()) {
+        let message = format!("has no split `{split}`: see data.split");
+        return Err(EvalError::File(FileError::unsuitable(folder.root(), message)));
+    }
     Ok(Test::new(folder.clone(), split, SampleConfig::default())?)
 }
 
