@@ -267,7 +267,7 @@ impl Bench<'_> {
         table(&header, self.measured.iter().zip(dominated(self.measured)).map(row))
     }
 
-    /// PSNR over run time, the front joined.
+    /// PSNR over run time, the front joined; empty where there is nothing to choose from.
     fn pareto(&self) -> String {
         let at = |m: &Measured| (1e3 * m.time(), m.psnr);
         let by = dominated(self.measured);
@@ -275,6 +275,9 @@ impl Bench<'_> {
             let alike = |m: &Measured| m.scene.is_none() && m.tuning.is_none();
             self.measured.iter().zip(&by).filter(move |(m, _)| alike(m))
         };
+        if plain().count() < 2 {
+            return String::new();
+        }
         let mut front: Vec<(f64, f64)> = plain().filter(|(_, by)| by.is_none()).map(|(m, _)| at(m)).collect();
         front.sort_by(|a, b| a.0.total_cmp(&b.0));
         let mut series = vec![Series { name: "Pareto front".into(), points: front, line: true }];
