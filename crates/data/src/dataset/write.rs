@@ -124,7 +124,7 @@ impl Folder {
             let path = folder.join(kind);
             fs::create_dir_all(&path).map_err(FileError::write(&path))?;
         }
-        cameras.par_iter().enumerate().try_for_each(|(view, camera)| {
+        let views = cameras.par_iter().enumerate().map(|(view, camera)| {
             let drawn = draw(&self.exact_camera(camera));
             if drawn.depth.iter().all(|z| *z == 0.0) {
                 return Err(FileError::unsuitable(origin, format!("view {view} sees nothing of {subject}")));
@@ -154,7 +154,9 @@ impl Folder {
                 }
                 Layout::Exact => files::write_depth(&at("depth"), &drawn),
             }
-        })?;
+        });
+        // The first view's problem is told, whichever was found first.
+        views.collect::<Vec<_>>().into_iter().collect::<Result<(), _>>()?;
         if self.description.layout == Layout::Exact {
             let path = folder.join("cameras").join(format!("{subject}.json"));
             cameras::write(cameras, &path).map_err(|e| FileError::splat(&path, e))?;
