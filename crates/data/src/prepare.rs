@@ -3,11 +3,14 @@
 use std::path::Path;
 use std::str::FromStr;
 
+use rand::Rng;
 use serde::{Deserialize, Serialize};
 use snapsnap_splat::{Camera, Orbit};
 
 use crate::JitterConfig;
-use crate::dataset::{Description, Drawn, Folder, Layout, MAX_RESOLUTION, MAX_VIEWS, Made, Split};
+use crate::dataset::{
+    Arrangement, Description, Drawn, Folder, Layout, MAX_RESOLUTION, MAX_VIEWS, Made, Split,
+};
 use crate::sample::SampleConfig;
 use snapsnap_mesh::FileError;
 use snapsnap_mesh::mesh::Mesh;
@@ -30,8 +33,12 @@ pub struct DataConfig {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ViewsConfig {
-    /// Views of each subject, evenly around it.
+    /// Views of each subject.
     pub count: usize,
+    /// Evenly around it, or in fours of front, back and both sides.
+    pub arrangement: Arrangement,
+    /// In groups: how far from the subject's own front, in degrees, their fronts are.
+    pub front_within_degrees: f64,
     /// Side in pixels.
     pub resolution: u32,
     /// Whether each view is drawn at twice the side as well, for stage 2's supervision.
@@ -45,16 +52,36 @@ pub struct ViewsConfig {
 impl Default for ViewsConfig {
     /// The published cameras in our exact layout.
     fn default() -> Self {
-        Self { count: 24, resolution: 1024, high_resolution: false, samples: 3, layout: Layout::Exact }
+        Self {
+            count: 24,
+            arrangement: Arrangement::Ring,
+            front_within_degrees: 30.0,
+            resolution: 1024,
+            high_resolution: false,
+            samples: 3,
+            layout: Layout::Exact,
+        }
     }
 }
 
 impl DataConfig {
     /// The first key that makes no sense, and why.
     pub fn problem(&self) -> Option<(String, String)> {
-        let ViewsConfig { count, resolution, samples, .. } = self.views;
+        let ViewsConfig { count, arrangement, front_within_degrees, resolution, samples, layout, .. } =
+            self.views;
         if count == 0 || count > MAX_VIEWS {
             return Some(("views.count".into(), format!("is {count}, must be 1 to {MAX_VIEWS}")));
+        }
+        if arrangement == Arrangement::Groups && !count.is_multiple_of(4) {
+            return Some(("views.count".into(), format!("is {count}, must be a multiple of 4 in groups")));
+        }
+        if arrangement == Arrangement::Groups && layout == Layout::Authors {
+            let message = "is \"groups\", which the authors' layout has no place for".into();
+            return Some(("views.arrangement".into(), message));
+        }
+        if !(0.0..=180.0).contains(&front_within_degrees) {
+            let message = format!("is {front_within_degrees}, must be 0 to 180");
+            return Some(("views.front_within_degrees".into(), message));
         }
         let most = if self.views.high_resolution { MAX_RESOLUTION / 2 } else { MAX_RESOLUTION };
         if resolution == 0 || resolution > most {
@@ -77,10 +104,11 @@ impl DataConfig {
 
     /// What a data set made with this config says of itself.
     pub fn description(&self, source: &str) -> Description {
-        let ViewsConfig { count, resolution, high_resolution, layout, .. } = self.views;
+        let ViewsConfig { count, arrangement, resolution, high_resolution, layout, .. } = self.views;
         Description {
             layout,
             views: count,
+            arrangement,
             resolution,
             high_resolution,
             pixel_centre: if layout == Layout::Authors { 0.0 } else { 0.5 },
@@ -92,6 +120,9 @@ impl DataConfig {
     /// The cameras of a subject that faces `yaw_degrees` (SNAPSNAP §5.3), straying as `name` decides.
     pub fn cameras(&self, yaw_degrees: f64, name: &str) -> Vec<Camera> {
         let mut random = stream(&format!("cameras/{name}"));
+        if self.views.arrangement == Arrangement::Groups {
+            return (0..self.views.count / 4).flat_map(|_| self.group(yaw_degrees, &mut random)).collect();
+        }
         let mut rig = Orbit { yaw_degrees, ..Orbit::default() };
         self.jitter.rig.apply(&mut rig, &mut random);
         (0..self.views.count)
@@ -102,6 +133,18 @@ impl DataConfig {
                 orbit.camera(self.views.resolution)
             })
             .collect()
+    }
+
+    /// Cameras of a front photograph, of one of the back, and of both sides as the front's own would see them from there.
+    fn group(&self, yaw_degrees: f64, random: &mut impl Rng) -> [Camera; 4] {
+        let ViewsConfig { front_within_degrees, resolution, .. } = self.views;
+        let mut front = Orbit { yaw_degrees, ..Orbit::default() };
+        front.yaw_degrees += front_within_degrees * random.random_range(-1.0..1.0);
+        self.jitter.rig.apply(&mut front, random);
+        let mut back = Orbit { yaw_degrees: front.yaw_degrees + 180.0, ..front };
+        self.jitter.view.apply(&mut back, random);
+        let front = front.camera(resolution);
+        [front, back.camera(resolution), front.turned(90.0), front.turned(270.0)]
     }
 
     /// Draws and adds a subject. `mesh` stands on the floor at the origin.
@@ -183,6 +226,33 @@ mod tests {
         assert_eq!(cameras.len(), 24);
         assert_eq!(cameras[0], Camera::orbit_at_yaw_degrees(30.0, 1024));
         assert_eq!(cameras[12], Camera::orbit_at_yaw_degrees(210.0, 1024));
+    }
+
+    #[test]
+    fn sides_of_a_group_are_the_fronts_own_camera_a_quarter_turn_on() {
+        let mut config = DataConfig::default();
+        (config.views.arrangement, config.views.count) = (Arrangement::Groups, 12);
+        config.jitter.rig = Jitter { pitch: 6.0, distance: 0.1, roll: 2.0, ..Jitter::default() };
+        config.jitter.view = Jitter { yaw: 5.0, pitch: 3.0, ..Jitter::default() };
+        assert_eq!(config.problem(), None);
+        let cameras = config.cameras(40.0, "a");
+        let yaw = |camera: &Camera| camera.centre().x.atan2(camera.centre().z).to_degrees();
+        let apart = |a: f64, b: f64| (a - b + 540.0).rem_euclid(360.0) - 180.0;
+        assert_eq!(cameras.len(), 12);
+        for group in cameras.chunks(4) {
+            let front = yaw(&group[0]);
+            assert!(apart(front, 40.0).abs() < 30.1, "{front}");
+            assert!(apart(yaw(&group[1]), front + 180.0).abs() < 8.0 && yaw(&group[1]) != front + 180.0);
+            for (side, degrees) in [(&group[2], 90.0), (&group[3], 270.0)] {
+                assert!(apart(yaw(side), front + degrees).abs() < 1e-9);
+                assert!((side.centre().y - group[0].centre().y).abs() < 1e-12);
+            }
+        }
+        assert!(cameras[0] != cameras[4] && cameras[4] != cameras[8]);
+        config.views.count = 6;
+        assert_eq!(config.problem().expect("a problem").0, "views.count");
+        (config.views.count, config.views.layout) = (8, Layout::Authors);
+        assert_eq!(config.problem().expect("a problem").0, "views.arrangement");
     }
 
     #[test]

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use burn::tensor::{Device, Tensor, TensorData};
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
-use snapsnap_data::dataset::{Folder, Split};
+use snapsnap_data::dataset::{Arrangement, Folder, Split};
 use snapsnap_net::config::Config;
 use snapsnap_net::gaussians::{Seen, geometric, placed, side_images};
 use snapsnap_ops::{bilinear, host};
@@ -119,6 +119,11 @@ impl MeanPictures {
             let wrong = |message: String| EvalError::Empty(format!("{}: {message}", path.display()));
             if found != views {
                 return Err(wrong(format!("has {found} views, the people to evaluate {views}")));
+            }
+            if folder.description().arrangement != Arrangement::Ring {
+                return Err(wrong(
+                    "is arranged in groups: its views are not those of the people to evaluate".into(),
+                ));
             }
             let stored = folder.description().resolution as usize;
             let factor = (1..=stored).find(|f| stored.is_multiple_of(*f) && stored / f <= MEAN_SIDE);

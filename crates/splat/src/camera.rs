@@ -127,6 +127,13 @@ impl Camera {
         Self { width, height, focal, principal_point, ..*self }
     }
 
+    /// The same camera after a walk of so many degrees around the world's y axis, as [`Orbit::yaw_degrees`] counts them.
+    pub fn turned(&self, degrees: f64) -> Self {
+        let RigidTransform { rotation, translation } = self.world_to_camera;
+        let rotation = rotation * DMat3::from_rotation_y(-degrees.to_radians());
+        Self { world_to_camera: RigidTransform { rotation, translation }, ..*self }
+    }
+
     /// Where the camera stands in the world, metres. By the true inverse: a matrix from a file may be orthonormal to a few
     /// digits only.
     pub fn centre(&self) -> DVec3 {
@@ -181,6 +188,16 @@ impl Camera {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_camera_walks_around_the_axis_as_on_its_orbit() {
+        let orbit =
+            |yaw_degrees| Orbit { yaw_degrees, pitch_degrees: 3.0, roll_degrees: 2.0, ..Orbit::default() };
+        let (walked, expected) = (orbit(30.0).camera(64).turned(90.0), orbit(120.0).camera(64));
+        let point = DVec3::new(0.3, 1.1, -0.2);
+        let [a, b] = [walked, expected].map(|camera| camera.project(point).expect("in front"));
+        assert!((a.0 - b.0).length() < 1e-9 && (a.1 - b.1).abs() < 1e-12, "{a:?} {b:?}");
+    }
 
     /// Check values of SNAPSNAP §5.3 and §13.4.
     #[test]

@@ -85,10 +85,9 @@ impl Seen {
     }
 }
 
-/// Pairs of views, a quarter turn or more apart, that do not fit one another: a camera or a depth map of theirs is wrong.
-pub fn disagreements(views: &[Option<Seen>]) -> impl Iterator<Item = String> {
+/// Pairs of views, `step` places apart, that do not fit one another: a camera or a depth map of theirs is wrong.
+pub fn disagreements(views: &[Option<Seen>], step: usize) -> impl Iterator<Item = String> {
     let count = views.len();
-    let step = (count / 4).max(1);
     let pairs = if count > 2 { count } else { count.saturating_sub(1) };
     (0..pairs).filter_map(move |a| {
         let b = (a + step) % count;

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 
 use super::agree::{LEAST_SIDE, Seen, disagreements};
 use super::write::UNFINISHED;
-use super::{Description, Folder, Layout, Split, split_alpha};
+use super::{Arrangement, Description, Folder, Layout, Split, split_alpha};
 use snapsnap_mesh::FileError;
 
 /// Share of the person that may have no depth: scans have gaps that are narrower than a pixel.
@@ -63,7 +63,12 @@ pub fn check(root: &Path, mut progress: impl FnMut(usize, usize)) -> Result<Chec
         let mut said = HashSet::new();
         checked.problems.extend(problems.into_iter().flatten().filter(|p| said.insert(p.clone())));
         let at = folder.path(*split, "img", subject);
-        checked.problems.extend(disagreements(&seen).map(|p| format!("{}: {p}", at.display())));
+        // A quarter turn on; in groups, from a photograph to a side.
+        let step = match folder.description().arrangement {
+            Arrangement::Ring => (seen.len() / 4).max(1),
+            Arrangement::Groups => 2,
+        };
+        checked.problems.extend(disagreements(&seen, step).map(|p| format!("{}: {p}", at.display())));
     }
     progress(all.len(), all.len());
     Ok(checked)

@@ -29,6 +29,33 @@ pub enum Layout {
     Exact,
 }
 
+/// How the views of a subject lie around it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Arrangement {
+    /// Evenly around the subject, each straying by itself: any may be the front, the opposite one is its back.
+    #[default]
+    Ring,
+    /// In fours: a front photograph, one of the back that strays, and the right and left sides exactly a quarter turn from the
+    /// front's own camera, so that what the sides see follows from the front (LEARNING.md, "Targets").
+    Groups,
+}
+
+impl Arrangement {
+    #[allow(clippy::trivially_copy_pass_by_ref, reason = "serde's signature")]
+    fn is_ring(&self) -> bool {
+        *self == Self::Ring
+    }
+
+    /// The views of a sample whose front is `first`, of `count` views: front, back, right, left.
+    pub fn four(self, first: usize, count: usize) -> [usize; 4] {
+        match self {
+            Self::Ring => [0, 2, 1, 3].map(|quarter| (first + quarter * count / 4) % count),
+            Self::Groups => [0, 1, 2, 3].map(|place| first + place),
+        }
+    }
+}
+
 /// What a data set is kept for. Subjects of different splits are different people.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -67,8 +94,11 @@ impl fmt::Display for Split {
 pub struct Description {
     /// How views are stored.
     pub layout: Layout,
-    /// Views of each subject, evenly around it.
+    /// Views of each subject.
     pub views: usize,
+    /// How they lie around it.
+    #[serde(default, skip_serializing_if = "Arrangement::is_ring")]
+    pub arrangement: Arrangement,
     /// Side of a view in pixels.
     pub resolution: u32,
     /// Whether each view is there at twice the side as well.
@@ -97,6 +127,12 @@ impl Description {
     pub(super) fn problem(&self) -> Option<String> {
         if self.views == 0 || self.views > MAX_VIEWS {
             return Some(format!("`views` is {}, must be 1 to {MAX_VIEWS}", self.views));
+        }
+        if self.arrangement == Arrangement::Groups && !self.views.is_multiple_of(4) {
+            return Some(format!(
+                "`views` is {}, must be a multiple of 4 for `arrangement` = \"groups\"",
+                self.views
+            ));
         }
         if self.resolution == 0 || self.resolution > MAX_RESOLUTION {
             return Some(format!("`resolution` is {}, must be 1 to {MAX_RESOLUTION}", self.resolution));

@@ -33,7 +33,7 @@ use snapsnap_splat::{Camera, cameras, file};
 
 pub use check::{Checked, check};
 use description::DESCRIPTION;
-pub use description::{Description, Drawn, Layout, MAX_RESOLUTION, MAX_VIEWS, Split};
+pub use description::{Arrangement, Description, Drawn, Layout, MAX_RESOLUTION, MAX_VIEWS, Split};
 use snapsnap_mesh::FileError;
 use snapsnap_mesh::open;
 use snapsnap_mesh::picture::{MAX_BYTES, decode};
@@ -70,6 +70,7 @@ impl Folder {
             description: Description {
                 layout: Layout::Authors,
                 views,
+                arrangement: Arrangement::Ring,
                 resolution: 1,
                 high_resolution: false,
                 pixel_centre: 0.0,

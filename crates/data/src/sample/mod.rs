@@ -18,7 +18,7 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use snapsnap_splat::Camera;
 
-use crate::dataset::{Folder, Layout, Split, StoredView, unproject};
+use crate::dataset::{Arrangement, Folder, Layout, Split, StoredView, unproject};
 pub use augment::Augment;
 pub use joined::Joined;
 pub use loader::{Batches, Loader};
@@ -127,6 +127,11 @@ impl Source {
             let who = if parts == 4 { "front, back and sides" } else { "front and back" };
             return Err(wrong(format!("has {views} views; {who} need a multiple of {parts}")));
         }
+        if config.compat && folder.description().arrangement != Arrangement::Ring {
+            return Err(wrong(
+                "is arranged in groups, which the published loader (`compat`) does not know".into(),
+            ));
+        }
         if config.high_resolution && !folder.description().high_resolution {
             return Err(wrong("has no views at twice the side, which `high_resolution` asks for".into()));
         }
@@ -148,9 +153,12 @@ impl Source {
         (subject, random)
     }
 
-    /// A view for the front photograph.
+    /// A view for the front photograph; of groups any group's, which lie as they were prepared.
     fn front(&self, random: &mut impl Rng) -> usize {
         let count = self.folder.description().views;
+        if self.folder.description().arrangement == Arrangement::Groups {
+            return 4 * random.random_range(0..count / 4);
+        }
         // View 0 is the subject's own front, and the views go round evenly.
         let reach = (f64::from(self.config.front_within_degrees) * count as f64 / 360.0 + 1e-6) as usize;
         if 2 * reach >= count {

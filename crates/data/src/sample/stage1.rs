@@ -71,7 +71,7 @@ impl Stage1 {
         let count = source.folder.description().views;
         let first = source.front(&mut random);
         // Front, back, and the sides at +90° and +270° (SNAPSNAP §5.6).
-        let order = [0, 2, 1, 3].map(|quarter| (first + quarter * count / 4) % count);
+        let order = source.folder.description().arrangement.four(first, count);
         let side = source.folder.description().resolution as usize;
         let (points, valid, pictures) = source.points(subject, &order)?;
         let [front, back] = [0, 1].map(|i| (&pictures[i].0, &pictures[i].1));

@@ -96,7 +96,7 @@ impl Stage2 {
         let description = folder.description();
         let count = description.views;
         let first = if config.compat { 0 } else { source.front(&mut random) };
-        let [front, right, back, left] = [0, 1, 2, 3].map(|quarter| (first + quarter * count / 4) % count);
+        let [front, back, right, left] = description.arrangement.four(first, count);
         let (points, valid, pictures) = if config.points {
             source.points(subject, &[front, back, right, left])?
         } else {

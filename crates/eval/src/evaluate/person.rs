@@ -4,7 +4,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use burn::tensor::{Device, Tensor, TensorData};
-use snapsnap_data::dataset::{Folder, Split};
+use snapsnap_data::dataset::{Arrangement, Folder, Split};
 use snapsnap_data::sample::{SampleConfig, Test, TestItem};
 use snapsnap_mesh::FileError;
 use snapsnap_net::Photograph;
@@ -36,6 +36,11 @@ impl People {
         let description = folder.description();
         let wrong = |message: String| EvalError::File(FileError::unsuitable(path, message));
         let count = description.views;
+        if description.arrangement != Arrangement::Ring {
+            return Err(wrong(
+                "is arranged in groups, to train on: people to test are seen from all around".into(),
+            ));
+        }
         if views.inputs.is_empty() && !count.is_multiple_of(2) {
             let message = format!("has {count} views, none opposite the first: say `views.inputs`");
             return Err(wrong(message));

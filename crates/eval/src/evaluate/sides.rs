@@ -1,8 +1,8 @@
 //! True points of the two sides that nobody photographed.
 
-use glam::{DMat3, DVec2, DVec3};
+use glam::{DVec2, DVec3};
 use snapsnap_data::sample::{Test, TestItem};
-use snapsnap_splat::{Camera, RigidTransform};
+use snapsnap_splat::Camera;
 
 use super::person::{Points, off};
 use crate::EvalError;
@@ -49,17 +49,10 @@ pub fn side_points(
     }
     let canvas = u32::try_from(side).expect("the side of a canvas");
     let seen: Vec<DVec3> = seen.into_iter().map(DVec3::from).collect();
-    let nearest = visible(&seen, &turned(front, azimuth).resized(canvas, canvas));
+    let nearest = visible(&seen, &front.turned(azimuth).resized(canvas, canvas));
     let valid = nearest.iter().map(|point| f32::from(u8::from(point.is_some()))).collect();
     let in_front = |i: usize| front.world_to_camera.apply(seen[i]).as_vec3().to_array();
     Ok((nearest.into_iter().flat_map(|point| point.map_or([0.0; 3], in_front)).collect(), valid))
-}
-
-/// The camera as it stands after a walk of so many degrees around the world's y axis.
-fn turned(camera: &Camera, degrees: f64) -> Camera {
-    let RigidTransform { rotation, translation } = camera.world_to_camera;
-    let rotation = rotation * DMat3::from_rotation_y(-degrees.to_radians());
-    Camera { world_to_camera: RigidTransform { rotation, translation }, ..*camera }
 }
 
 /// Of each pixel `[H,W]` the point (world frame) that is nearest to its centre, of those on the surface in front.
@@ -110,13 +103,13 @@ mod tests {
             Some(camera.centre() + at * along)
         };
         let all = |camera: Camera| (0..camera.width * camera.height).map(move |cell| cast(&camera, cell));
-        let canvas = turned(&Camera::orbit_at_yaw_degrees(20.0, 128), 90.0);
+        let canvas = Camera::orbit_at_yaw_degrees(20.0, 128).turned(90.0);
         let exact: Vec<Option<DVec3>> = all(canvas).collect();
         let own: Vec<DVec3> = exact.iter().copied().flatten().collect();
         let found = visible(&own, &canvas).into_iter().map(|i| i.map(|i| own[i]));
         assert!(found.eq(exact.iter().copied()), "its own points");
 
-        let stored = |yaw: f64| turned(&Camera::orbit_at_yaw_degrees(20.0, 256), yaw);
+        let stored = |yaw: f64| Camera::orbit_at_yaw_degrees(20.0, 256).turned(yaw);
         let seen: Vec<DVec3> = [78.0, 102.0].iter().flat_map(|yaw| all(stored(*yaw)).flatten()).collect();
         let found = visible(&seen, &canvas);
         let pairs = || found.iter().zip(&exact).map(|(i, exact)| (i.map(|i| seen[i]), *exact));

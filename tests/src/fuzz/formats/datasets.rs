@@ -40,7 +40,14 @@ pub const FORMATS: &[Format] = &[
 
 /// One subject of two views.
 fn write(root: &Path, layout: Layout) {
-    let views = ViewsConfig { count: 2, resolution: 16, high_resolution: false, samples: 1, layout };
+    let views = ViewsConfig {
+        count: 2,
+        resolution: 16,
+        high_resolution: false,
+        samples: 1,
+        layout,
+        ..ViewsConfig::default()
+    };
     let config = DataConfig { views, ..DataConfig::default() };
     let folder = Folder::create(root, config.description("for tests")).expect("created");
     config.add(&folder, &Subject::plain(Split::Train, "0000"), &scans::person()).expect("written");

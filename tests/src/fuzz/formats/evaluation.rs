@@ -151,8 +151,14 @@ pub const FORMATS: &[Format] = &[
 
 /// A person to test on with a scan and one to learn from, four views of each; weights, and both configs.
 fn sample(folder: &Path) {
-    let views =
-        ViewsConfig { count: 4, resolution: 64, high_resolution: false, samples: 1, layout: Layout::Exact };
+    let views = ViewsConfig {
+        count: 4,
+        resolution: 64,
+        high_resolution: false,
+        samples: 1,
+        layout: Layout::Exact,
+        ..ViewsConfig::default()
+    };
     let config = DataConfig { views, ..DataConfig::default() };
     let set = Folder::create(&folder.join("set"), config.description("for tests")).expect("created");
     for split in [Split::Test, Split::Train] {

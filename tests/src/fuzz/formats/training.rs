@@ -90,8 +90,14 @@ pub const FORMATS: &[Format] = &[
 
 /// One subject of four views, weights, and a config.
 fn sample(folder: &Path) {
-    let views =
-        ViewsConfig { count: 4, resolution: 64, high_resolution: false, samples: 1, layout: Layout::Exact };
+    let views = ViewsConfig {
+        count: 4,
+        resolution: 64,
+        high_resolution: false,
+        samples: 1,
+        layout: Layout::Exact,
+        ..ViewsConfig::default()
+    };
     let config = DataConfig { views, ..DataConfig::default() };
     let set = Folder::create(&folder.join("set"), config.description("for tests")).expect("created");
     config.add(&set, &Subject::plain(Split::Train, "0000"), &scans::person()).expect("written");
