@@ -42,8 +42,8 @@ pub struct ReportFolder {
 }
 
 impl ReportFolder {
-    /// Makes the folder. Refuses one that has files and is no report's, and where a report's files cannot be written or would
-    /// replace one of the `inputs`.
+    /// Makes the folder. Refuses one where a report's files cannot be written, or would replace one of the `inputs` or anything
+    /// but an older report's.
     pub fn new(path: &Path, inputs: &[&Path]) -> Result<Self, Failure> {
         if path.exists() && !path.is_dir() {
             return Err(Failure::Input(format!("{}: exists and is no folder", path.display())));
@@ -51,12 +51,12 @@ impl ReportFolder {
         let is_new = !path.exists();
         make_folder(path)?;
         let folder = Self { path: path.to_owned(), is_new, written: RefCell::default() };
-        let entries = fs::read_dir(path).map_err(|e| Failure::cannot_write(path, &e))?;
-        if entries.count() > 0 && !is_report(path) {
-            let message = "has files, and is no report's folder: give a new one";
-            return Err(Failure::Input(format!("{}: {message}", path.display())));
-        }
         let outputs: Vec<PathBuf> = FILES.iter().map(|name| path.join(name)).collect();
+        let there = outputs.iter().find(|file| file.symlink_metadata().is_ok());
+        if let Some(file) = there.filter(|_| !is_report(path)) {
+            let message = "is there, and not a report's of ours: give another folder";
+            return Err(Failure::Input(format!("{}: {message}", file.display())));
+        }
         let outputs: Vec<&Path> = outputs.iter().map(PathBuf::as_path).collect();
         check_outputs(&outputs, inputs)?;
         Ok(folder)

@@ -300,9 +300,9 @@ fn what_cannot_be_evaluated_is_refused_by_name() {
     // Nor does it go where something else is.
     let training = temporary.path().join("training");
     fs::create_dir(&training).expect("a folder");
-    fs::write(training.join("log.jsonl"), "{}").expect("writes");
+    fs::write(training.join("config.toml"), "[training]").expect("writes");
     let said = refused(&mut evaluate(people(), &training, &[]));
-    assert!(said.contains("is no report's folder"), "{said}");
+    assert!(said.contains("config.toml") && said.contains("not a report's"), "{said}");
     assert_eq!(fs::read_dir(&training).expect("there").count(), 1);
     // A report does not replace what it is made of.
     fs::create_dir(&report).expect("a folder");
