@@ -271,7 +271,9 @@ fn what_cannot_be_evaluated_is_refused_by_name() {
     wrong(&["--set", "views.supersampling=3"], &["views.supersampling"]);
     wrong(&["--set", "metrics.protocols=[]"], &["metrics.protocols"]);
     wrong(&["--set", "metrics.protocols=[\"best\"]"], &["unknown variant", "paper"]);
-    wrong(&["--set", "data.split=\"val\""], &["val"]);
+    wrong(&["--set", "data.split=\"val\""], &["has no split `val`"]);
+    wrong(&["--set", "data.split=\"all\""], &["unknown variant `all`", "`train`", "`none`"]);
+    wrong(&["--set", "data.split=\"none\""], &["img", "cannot read"]);
     wrong(&["--device", "abacus"], &["abacus", "Here there are"]);
     wrong(&["--lpips", "nowhere.pth"], &["nowhere.pth"]);
     wrong(&["--icp"], &["--mesh-dir"]);

@@ -49,26 +49,23 @@ pub struct DataSection {
 
 /// `"none"` for people in the folder itself.
 mod split {
+    use serde::de::Error;
     use serde::{Deserialize, Deserializer, Serialize, Serializer};
     use snapsnap_data::dataset::Split;
 
-    #[derive(Serialize, Deserialize)]
-    #[serde(rename_all = "lowercase")]
-    enum Named {
-        None,
-        #[serde(untagged)]
-        Some(Split),
-    }
+    const NONE: &str = "none";
 
     pub fn serialize<S: Serializer>(split: &Option<Split>, serializer: S) -> Result<S::Ok, S::Error> {
-        split.map_or(Named::None, Named::Some).serialize(serializer)
+        split.map_or(NONE, Split::name).serialize(serializer)
     }
 
     pub fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<Split>, D::Error> {
-        match Named::deserialize(deserializer)? {
-            Named::None => Ok(None),
-            Named::Some(split) => Ok(Some(split)),
+        let name = String::deserialize(deserializer)?;
+        let split = Split::ALL.into_iter().find(|split| split.name() == name);
+        if split.is_none() && name != NONE {
+            return Err(D::Error::unknown_variant(&name, &["train", "val", "test", NONE]));
         }
+        Ok(split)
     }
 }
 

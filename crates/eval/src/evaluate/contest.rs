@@ -176,7 +176,7 @@ impl Contestant {
     }
 }
 
-/// The photographs `[N,3,S,S]` on a canvas, in the person's own colours where its pixels are half hers or more, and which are.
+/// The photographs `[N,3,S,S]` on a canvas, and which pixels are at least half the person's: those have the person's own colour.
 fn on_canvas(item: &TestItem, count: usize, side: usize) -> (Vec<f32>, Vec<Vec<bool>>) {
     // Networks see colours times the mask, and may have learned to undo that; baselines have not.
     let own = |photo: Photograph| {

@@ -135,10 +135,10 @@ pub fn evaluate(
 
 /// Who is asked for and not there.
 pub(crate) fn nobody(config: &EvalConfig, sets: &[People]) -> Vec<LeftOut> {
-    let is_there = |name: &&String| {
+    let is_missing = |name: &&String| {
         !sets.iter().any(|set| set.chosen().iter().any(|row| set.test().name(*row) == name.as_str()))
     };
-    let missing = config.data.only.iter().filter(is_there);
+    let missing = config.data.only.iter().filter(is_missing);
     let why = "data.only names it, no data set has it, or not among its first ones".to_owned();
     let mut left_out: Vec<LeftOut> =
         missing.map(|name| LeftOut { name: name.clone(), why: why.clone() }).collect();
