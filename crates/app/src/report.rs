@@ -98,7 +98,7 @@ impl ReportFolder {
     }
 
     fn file(&self, name: &str) -> PathBuf {
-        debug_assert!(FILES.contains(&name), "{name}");
+        assert!(FILES.contains(&name), "{name}");
         self.written.borrow_mut().push(name.to_owned());
         self.path.join(name)
     }

@@ -14,7 +14,7 @@ use snapsnap_splat::{Camera, Gaussians};
 
 use crate::EvalError;
 use crate::evaluate::model::joined;
-use crate::evaluate::person::{smaller, test_of};
+use crate::evaluate::person::{part_of, smaller, test_of};
 use crate::pictures::Picture;
 
 /// Largest side at which mean pictures are kept: they are smooth.
@@ -126,8 +126,7 @@ impl MeanPictures {
                 ));
             }
             let stored = folder.description().resolution as usize;
-            let factor = (1..=stored).find(|f| stored.is_multiple_of(*f) && stored / f <= MEAN_SIDE);
-            let kept = stored / factor.unwrap_or(1);
+            let kept = part_of(stored, MEAN_SIDE);
             if side != 0 && kept != side {
                 return Err(wrong(format!("has pictures of {kept}², the sets before it of {side}²")));
             }

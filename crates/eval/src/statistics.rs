@@ -42,6 +42,11 @@ pub fn interval(figures: &[f64]) -> Option<Interval> {
     Some(Interval { mean, low: quantile(&means, tail), high: quantile(&means, 1.0 - tail) })
 }
 
+/// By how much a figure is larger than another: nothing where they are equal, even if both are infinite.
+pub fn difference(a: f64, b: f64) -> f64 {
+    if a == b { 0.0 } else { a - b }
+}
+
 /// A quantile of sorted values, linear between them.
 ///
 /// # Panics

@@ -72,9 +72,10 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
         .map(PathBuf::as_path)
         .collect();
     // Asked before every setting says so.
-    if let Some(Err(e)) = config.model.weights.as_deref().map(std::fs::metadata) {
-        let path = config.model.weights.as_deref().unwrap_or(Path::new("")).display();
-        return Err(Failure::Input(format!("{path}: cannot read: {e}")));
+    if let Some(path) = &config.model.weights
+        && let Err(e) = path.metadata()
+    {
+        return Err(Failure::Input(format!("{}: cannot read: {e}", path.display())));
     }
     let folder = ReportFolder::new(output, &inputs)?;
     let mut left_out = Vec::new();

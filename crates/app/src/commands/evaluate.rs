@@ -1,6 +1,8 @@
 //! `snapsnap evaluate`.
 
+use std::collections::HashSet;
 use std::path::{Path, PathBuf};
+use std::time::Instant;
 
 use burn::tensor::Device;
 use clap::{Args, ValueEnum};
@@ -11,7 +13,7 @@ use snapsnap_eval::evaluate::model::{Leave, Model};
 use snapsnap_eval::evaluate::person::People;
 use snapsnap_eval::evaluate::{Contestant, LeftOut, Outcome, evaluate, sheet};
 use snapsnap_eval::report;
-use snapsnap_eval::report::evaluation::Evaluation;
+use snapsnap_eval::report::evaluation::{Cost, Evaluation};
 
 use super::{ConfigArguments, outside_data, read_config};
 use crate::failure::Failure;
@@ -69,12 +71,8 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
         return Err(Failure::Input(message.into()));
     }
     let folders = &config.data.folders;
-    let same = |a: &PathBuf, b: &PathBuf| {
-        a == b || a.canonicalize().ok().is_some_and(|a| b.canonicalize().is_ok_and(|b| a == b))
-    };
-    if let Some((_, again)) =
-        folders.iter().enumerate().find(|(i, a)| folders[..*i].iter().any(|b| same(a, b)))
-    {
+    let mut known = HashSet::new();
+    if let Some(again) = folders.iter().find(|f| !known.insert(f.canonicalize().unwrap_or((*f).clone()))) {
         return Err(Failure::Input(format!("data.folders: {} is there twice", again.display())));
     }
     let (mut sets, mut missing, mut first) = (Vec::new(), Vec::new(), None);
@@ -119,20 +117,22 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let people = sets.iter().map(|set| set.chosen().len()).sum();
     let progress = Progress::steps(quiet, people, "people");
     let done = |done: usize, total: usize| progress.step(done, total, "people");
+    let start = Instant::now();
     let mut outcome = evaluate(&config, &sets, &contestants, lpips.as_ref().ok(), &done);
+    let cost = Cost { seconds: start.elapsed().as_secs_f64(), memory: memory::most_used() };
     drop(progress);
     outcome.left_out.splice(0..0, missing);
     let described = perceptual::describe(&lpips);
     let named = device::describe(&devices[0]);
     let shown = contestants.iter().find(|contestant| contestant.networks().is_some());
-    let ranked = report_of(&named, &config, &outcome, &described).ranked(config.report.people);
+    let ranked = report_of(&named, &config, &outcome, &described, cost).ranked(config.report.people);
     let mut people = None;
     if let Some(contestant) = shown.filter(|_| !ranked.is_empty()) {
         let (picture, mut left_out) = sheet(&config, &sets, contestant, &ranked);
         people = picture;
         outcome.left_out.append(&mut left_out);
     }
-    let report = report_of(&named, &config, &outcome, &described);
+    let report = report_of(&named, &config, &outcome, &described, cost);
     let by_view = report.by_view();
     let pictures: Vec<&str> = [(people.is_some(), "people.png"), (!by_view.is_empty(), "by_view.svg")]
         .into_iter()
@@ -153,8 +153,14 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     complete(&outcome.left_out)
 }
 
-fn report_of<'a>(device: &str, config: &'a EvalConfig, outcome: &'a Outcome, lpips: &str) -> Evaluation<'a> {
-    Evaluation { header: header(device), config, outcome, lpips: lpips.into() }
+fn report_of<'a>(
+    device: &str,
+    config: &'a EvalConfig,
+    outcome: &'a Outcome,
+    lpips: &str,
+    cost: Cost,
+) -> Evaluation<'a> {
+    Evaluation { header: header(device), config, outcome, lpips: lpips.into(), cost }
 }
 
 /// What is left out is told, and is a failure.

@@ -196,17 +196,24 @@ fn fetch(item: &Item, origin: &Origin, folder: &Path, quiet: bool) -> Result<(),
 fn copy(item: &Item, from: &Path, path: &Path, quiet: bool) -> Result<(), Failure> {
     let mut source =
         file::open(from).map_err(|e| Failure::Input(format!("{}: cannot read: {e}", from.display())))?;
-    let (found, length) = (sum_of(&mut source), source.metadata().map_or(0, |m| m.len()));
-    let found = found.map_err(|e| Failure::Input(format!("{}: cannot read: {e}", from.display())))?;
-    if found != item.sha256 || length != item.bytes {
-        return Err(Failure::Input(other(&from.display().to_string(), item, length, &found)));
-    }
     let progress = Progress::bytes(quiet);
+    // What is written is what was summed, though the source change meanwhile.
     let written = file::write_whole(path, |out| {
-        source.seek(SeekFrom::Start(0))?;
-        take(&mut source, out, 0, item, &progress).map(drop)
+        let mut out = Summed { out, hasher: Sha256::new() };
+        let length = take(&mut source, &mut out, 0, item, &progress)?;
+        let found = hexadecimal(out.hasher);
+        match found == item.sha256 && length == item.bytes {
+            true => Ok(()),
+            false => Err(io::Error::new(
+                io::ErrorKind::InvalidData,
+                other(&from.display().to_string(), item, length, &found),
+            )),
+        }
     });
-    written.map_err(|e: io::Error| Failure::cannot_write(path, &e))?;
+    written.map_err(|e: io::Error| match e.kind() {
+        io::ErrorKind::InvalidData => Failure::Input(e.to_string()),
+        _ => Failure::cannot_write(path, &e),
+    })?;
     drop(progress);
     say::out(&format!("{}: fetched, and sound", path.display()));
     Ok(())
@@ -214,6 +221,24 @@ fn copy(item: &Item, from: &Path, path: &Path, quiet: bool) -> Result<(), Failur
 
 fn other(origin: &str, item: &Item, length: u64, found: &str) -> String {
     format!("{origin}: what came is not {}: {length} bytes with SHA-256 {found}; nothing was kept", item.file)
+}
+
+/// Sums what it writes.
+struct Summed<'a, W> {
+    out: &'a mut W,
+    hasher: Sha256,
+}
+
+impl<W: Write> Write for Summed<'_, W> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let n = self.out.write(bytes)?;
+        self.hasher.update(&bytes[..n]);
+        Ok(n)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.out.flush()
+    }
 }
 
 /// Whether a file has another name as well.
@@ -237,7 +262,11 @@ fn sum_of(file: &mut File) -> io::Result<String> {
             n => hasher.update(&chunk[..n]),
         }
     }
-    Ok(hasher.finalize().iter().map(|byte| format!("{byte:02x}")).collect())
+    Ok(hexadecimal(hasher))
+}
+
+fn hexadecimal(hasher: Sha256) -> String {
+    hasher.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 /// Copies until the source ends or there is one byte too many; returns how many bytes there are then.

@@ -21,7 +21,7 @@ use crate::evaluate::person::{People, photograph};
 use crate::evaluate::{Contestant, evaluate, rendered};
 use crate::lpips::Lpips;
 use crate::score::Score;
-use crate::statistics::{Interval, interval, quantile};
+use crate::statistics::{Interval, difference, interval, quantile};
 
 use config::{BenchConfig, Setting};
 
@@ -145,7 +145,7 @@ pub fn measure(
         precision: setting.precision.unwrap_or_default(),
     };
     let model = Model::load(weights, device, leave)?;
-    sync(device);
+    device.sync().expect("the device finishes its work");
     modules.push(("loading weights".into(), start.elapsed().as_secs_f64()));
 
     let nobody = || match eval.data.only.as_slice() {
@@ -169,12 +169,10 @@ pub fn measure(
     for _ in 0..config.bench.warm_up {
         drop(model.reconstruct(&item, &inputs));
     }
-    sync(device);
     let (mut times, mut parts) = (Vec::new(), Vec::<(&'static str, Vec<Duration>)>::new());
     let mut made = None;
     for _ in 0..config.bench.runs {
         let run = model.reconstruct(&item, &inputs);
-        sync(device);
         times.push(run.time);
         // Several pairs of photographs go through each module one after another.
         let mut seen: Vec<&str> = Vec::new();
@@ -202,9 +200,9 @@ pub fn measure(
         tuning = Some(p(&times, 0.5));
     }
     let memory = most_used();
+    let temporary = tempfile::tempdir().map_err(FileError::write(&std::env::temp_dir()))?;
     let start = Instant::now();
-    let folder = tempfile::tempdir().map_err(FileError::write(&std::env::temp_dir()))?;
-    ply::write(&made.gaussians, &folder.path().join("human.ply"))?;
+    ply::write(&made.gaussians, &temporary.path().join("human.ply"))?;
     modules.push(("writing the PLY".into(), start.elapsed().as_secs_f64()));
     let side = people.side(&eval.views);
     let camera = item.cameras[eval.views.compared[0]];
@@ -277,10 +275,6 @@ fn p(times: &[Duration], share: f64) -> f64 {
     quantile(&seconds, share)
 }
 
-fn sync(device: &Device) {
-    device.sync().expect("the device finishes its work");
-}
-
 /// The part of a picture around the middle of what it shows, as a camera of its own.
 fn patch(shown: &Gaussians, camera: &Camera, side: u32) -> Camera {
     let side = side.min(camera.width).min(camera.height);
@@ -304,10 +298,8 @@ pub fn dominated(measured: &[Measured]) -> Vec<Option<usize>> {
         [a, b].iter().all(|m| m.scene.is_none() && m.tuning.is_none()) && names(a) == names(b)
     };
     let beats = |a: &Measured, b: &Measured| {
-        // Equal pictures, even where both are infinitely good.
-        let apart =
-            |(a, b): (&PersonScore, &PersonScore)| if a.psnr == b.psnr { 0.0 } else { a.psnr - b.psnr };
-        let differences: Vec<f64> = a.people.iter().zip(&b.people).map(apart).collect();
+        let pairs = a.people.iter().zip(&b.people);
+        let differences: Vec<f64> = pairs.map(|(a, b)| difference(a.psnr, b.psnr)).collect();
         let Some(Interval { mean, low, .. }) = interval(&differences) else { return false };
         let time = a.time() / b.time();
         low > 0.0 && time < 1.0 + FASTER || mean >= 0.0 && time < 1.0 - FASTER

@@ -109,7 +109,7 @@ fn one(
     let mut aligned = None;
     if align != Align::No {
         let points = sampled(&mesh, ALIGNED, SEEDS[0])?;
-        let motion = icp(&points, &thinned(truth.clone(), 10 * ALIGNED), align == Align::Similarly)?;
+        let motion = icp(&points, &thinned(&truth, 10 * ALIGNED), align == Align::Similarly)?;
         mesh.positions.iter_mut().for_each(|p| *p = Vec3::from_array(motion.apply(p.to_array())));
         let Alignment { scale, rotation, .. } = motion;
         let angle = 2.0 * rotation.w.abs().min(1.0).acos();

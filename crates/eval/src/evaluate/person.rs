@@ -137,6 +137,11 @@ pub fn test_of(folder: &Arc<Folder>, split: Option<Split>) -> Result<Test, EvalE
     Ok(Test::new(folder.clone(), split, SampleConfig::default())?)
 }
 
+/// The largest whole part of a side that is no longer than `most`.
+pub fn part_of(side: usize, most: usize) -> usize {
+    (1..=side).find(|f| side.is_multiple_of(*f) && side / f <= most).map_or(side, |factor| side / factor)
+}
+
 /// Planes `[C, S, S]` shrunk to a whole part of their side.
 pub fn smaller(values: Vec<f32>, channels: usize, from: usize, to: usize) -> Vec<f32> {
     if from == to {
@@ -185,6 +190,9 @@ pub fn points(
         return Ok(None);
     }
     let (points, valid) = test.points(row, views)?;
+    if stored == side {
+        return Ok(Some((points, valid)));
+    }
     let area = stored * stored;
     let views = points.chunks_exact(3 * area).zip(valid.chunks_exact(area));
     let (points, valid): (Vec<_>, Vec<_>) = views.map(|(p, v)| means(p, v, stored, side)).unzip();
@@ -195,9 +203,6 @@ pub fn points(
 /// of a pixel or more.
 pub(super) fn means(points: &[f32], valid: &[f32], stored: usize, side: usize) -> Points {
     let factor = stored / side;
-    if factor == 1 {
-        return (points.to_vec(), valid.to_vec());
-    }
     let mut means = vec![0.0; 3 * side * side];
     let mut shares = vec![0.0; side * side];
     for (cell, share) in shares.iter_mut().enumerate() {

@@ -43,12 +43,9 @@ pub fn side_points(
         let (points, valid) = test.points(row, &[view])?;
         let to_world = item.cameras[view].world_to_camera.inverse();
         let there = points.chunks_exact(3).zip(valid).filter(|(_, valid)| *valid > 0.5);
-        seen.extend(
-            there.map(|(p, _)| to_world.apply(DVec3::new(p[0].into(), p[1].into(), p[2].into())).as_vec3()),
-        );
+        seen.extend(there.map(|(p, _)| to_world.apply(DVec3::new(p[0].into(), p[1].into(), p[2].into()))));
     }
     let canvas = u32::try_from(side).expect("the side of a canvas");
-    let seen: Vec<DVec3> = seen.into_iter().map(DVec3::from).collect();
     let nearest = visible(&seen, &front.turned(azimuth).resized(canvas, canvas));
     let valid = nearest.iter().map(|point| f32::from(u8::from(point.is_some()))).collect();
     let in_front = |i: usize| front.world_to_camera.apply(seen[i]).as_vec3().to_array();

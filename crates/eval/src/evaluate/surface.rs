@@ -5,7 +5,7 @@ use rayon::prelude::*;
 use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
 
 use super::at_once;
-use super::person::{People, means, nearest_view};
+use super::person::{People, means, nearest_view, part_of};
 use crate::EvalError;
 use crate::geometry::{Chamfer, chamfer, consistency, normals, points};
 
@@ -48,13 +48,12 @@ pub fn truth(people: &People, row: usize) -> Result<Truth, EvalError> {
         let there: Vec<usize> = (0..valid.len()).filter(|i| valid[*i] > 0.5).collect();
         let point =
             |i: usize| DVec3::new(points[3 * i].into(), points[3 * i + 1].into(), points[3 * i + 2].into());
-        let there = thinned(there, PER_VIEW).into_iter();
+        let there = thinned(&there, PER_VIEW).into_iter();
         let kept = there.map(|i| to_world.apply(point(i)).as_vec3().to_array());
         let kept: Vec<[f32; 3]> = kept.collect();
         let normals = directions.contains(&view).then(|| {
             let stored = camera.width as usize;
-            let side = (1..=stored).find(|f| stored.is_multiple_of(*f) && stored / f <= NORMALS).unwrap_or(1);
-            let side = stored / side;
+            let side = part_of(stored, NORMALS);
             let (points, valid) = means(&points, &valid, stored, side);
             let camera = camera.resized(side as u32, side as u32);
             let depth = |i: usize| if valid[i] > 0.5 { points[3 * i + 2] } else { 0.0 };
@@ -100,11 +99,9 @@ impl Truth {
 }
 
 /// So many of a list at most, evenly.
-pub(super) fn thinned<T: Copy>(all: Vec<T>, most: usize) -> Vec<T> {
-    if all.len() <= most {
-        return all;
-    }
-    (0..most).map(|i| all[i * all.len() / most]).collect()
+pub(super) fn thinned<T: Copy>(all: &[T], most: usize) -> Vec<T> {
+    let kept = all.len().min(most);
+    (0..kept).map(|i| all[i * all.len() / kept]).collect()
 }
 
 impl Surface {
@@ -117,7 +114,7 @@ impl Surface {
         let centres = points(&gaussians.means)?;
         let there: Vec<[f32; 3]> =
             centres.into_iter().zip(opacities).filter(|(_, o)| *o >= opaque).map(|(p, _)| p).collect();
-        let there = thinned(there, MOST);
+        let there = thinned(&there, MOST);
         let depth = |camera: &Camera| {
             let options = RenderOptions { depth: true, ..RenderOptions::inria() };
             let rendered = render(gaussians, std::slice::from_ref(camera), &options)?;

@@ -40,16 +40,19 @@ pub const FORMATS: &[Format] = &[
 
 /// One subject of two views.
 fn write(root: &Path, layout: Layout) {
-    let views = ViewsConfig {
-        count: 2,
-        resolution: 16,
-        high_resolution: false,
-        samples: 1,
-        layout,
-        ..ViewsConfig::default()
-    };
-    let config = DataConfig { views, ..DataConfig::default() };
+    people(root, &[Split::Train], ViewsConfig { count: 2, resolution: 16, layout, ..ViewsConfig::default() });
+}
+
+/// One subject of four views in each split.
+pub fn four_views(root: &Path, splits: &[Split]) {
+    people(root, splits, ViewsConfig { count: 4, resolution: 64, ..ViewsConfig::default() });
+}
+
+fn people(root: &Path, splits: &[Split], views: ViewsConfig) {
+    let config = DataConfig { views: ViewsConfig { samples: 1, ..views }, ..DataConfig::default() };
     let folder = Folder::create(root, config.description("for tests")).expect("created");
-    config.add(&folder, &Subject::plain(Split::Train, "0000"), &scans::person()).expect("written");
+    for split in splits {
+        config.add(&folder, &Subject::plain(*split, "0000"), &scans::person()).expect("written");
+    }
     folder.tidy();
 }

@@ -4,11 +4,10 @@ use std::fs;
 use std::path::Path;
 
 use image::{DynamicImage, GrayImage, ImageFormat, Luma};
-use snapsnap_data::dataset::{Folder, Layout, Split};
-use snapsnap_data::prepare::{DataConfig, Subject, ViewsConfig};
+use snapsnap_data::dataset::Split;
 
 use super::super::Format;
-use super::{nothing, pictures, put, scans, weights};
+use super::{datasets, nothing, pictures, put, scans, weights};
 
 /// Every kind of key of an evaluation, but ablations that would each take as long as the model.
 const EVALUATION: &str = r#"
@@ -151,20 +150,7 @@ pub const FORMATS: &[Format] = &[
 
 /// A person to test on with a scan and one to learn from, four views of each; weights, and both configs.
 fn sample(folder: &Path) {
-    let views = ViewsConfig {
-        count: 4,
-        resolution: 64,
-        high_resolution: false,
-        samples: 1,
-        layout: Layout::Exact,
-        ..ViewsConfig::default()
-    };
-    let config = DataConfig { views, ..DataConfig::default() };
-    let set = Folder::create(&folder.join("set"), config.description("for tests")).expect("created");
-    for split in [Split::Test, Split::Train] {
-        config.add(&set, &Subject::plain(split, "0000"), &scans::person()).expect("written");
-    }
-    set.tidy();
+    datasets::four_views(&folder.join("set"), &[Split::Test, Split::Train]);
     weights::write(folder);
     fs::create_dir(folder.join("scans")).expect("a folder");
     scans::obj(folder, "scans/0000");

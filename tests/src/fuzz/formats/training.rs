@@ -2,11 +2,10 @@
 
 use std::path::Path;
 
-use snapsnap_data::dataset::{Folder, Layout, Split};
-use snapsnap_data::prepare::{DataConfig, Subject, ViewsConfig};
+use snapsnap_data::dataset::Split;
 
 use super::super::Format;
-use super::{nothing, put, scans, weights};
+use super::{datasets, nothing, put, weights};
 
 /// Every kind of key, beside those of the networks.
 const TRAINING: &str = r#"
@@ -90,18 +89,7 @@ pub const FORMATS: &[Format] = &[
 
 /// One subject of four views, weights, and a config.
 fn sample(folder: &Path) {
-    let views = ViewsConfig {
-        count: 4,
-        resolution: 64,
-        high_resolution: false,
-        samples: 1,
-        layout: Layout::Exact,
-        ..ViewsConfig::default()
-    };
-    let config = DataConfig { views, ..DataConfig::default() };
-    let set = Folder::create(&folder.join("set"), config.description("for tests")).expect("created");
-    config.add(&set, &Subject::plain(Split::Train, "0000"), &scans::person()).expect("written");
-    set.tidy();
+    datasets::four_views(&folder.join("set"), &[Split::Train]);
     weights::write(folder);
     put(folder, "t.toml", format!("{}{TRAINING}", weights::CONFIG));
 }

@@ -2,7 +2,7 @@
 
 use std::fmt::Write;
 
-use super::{Evaluation, FIGURES, Grouped, point_means, seconds, surface_intervals};
+use super::{Cost, Evaluation, FIGURES, Grouped, point_means, seconds, surface_intervals};
 use crate::evaluate::{Judged, Kind};
 use crate::points::VIEWS;
 use crate::report::{cell, escaped};
@@ -85,6 +85,17 @@ impl Evaluation<'_> {
         text
     }
 
+    fn cost_markdown(&self) -> String {
+        let views = self.outcome.judged.iter().map(|judged| judged.rows.len()).max().unwrap_or(0);
+        let Cost { seconds, memory } = self.cost;
+        let memory =
+            memory.map_or(String::new(), |bytes| format!(", {} MB of memory at most", bytes / 1_000_000));
+        format!(
+            "All of it: {seconds:.1} s, {:.3} s a person and view{memory}.",
+            seconds / views.max(1) as f64
+        )
+    }
+
     fn geometry_markdown(&self, text: &mut String) {
         let made: Vec<&Judged> = self.outcome.judged.iter().filter(|j| !j.gaussians.is_empty()).collect();
         let with_points: Vec<&&Judged> = made.iter().filter(|judged| !judged.points.is_empty()).collect();
@@ -133,7 +144,8 @@ impl Evaluation<'_> {
         }
         let _ = writeln!(
             text,
-            "## Run time\n\nFrom the photographs on their canvas to the Gaussians, without rendering, in turn with all that is compared; `bench` measures.\n\n| | seconds a person, p50 | p95 | Gaussians |\n|---|---|---|---|"
+            "## Run time\n\n{}\n\nBy model: from the photographs on their canvas to the Gaussians, without rendering, in turn with all that is compared; `bench` measures.\n\n| | seconds a person, p50 | p95 | Gaussians |\n|---|---|---|---|",
+            self.cost_markdown()
         );
         for judged in made {
             let (p50, p95) = seconds(judged)

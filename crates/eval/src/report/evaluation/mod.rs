@@ -4,6 +4,7 @@ mod markdown;
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use serde::Serialize;
 use serde_json::{Map, Value, json};
 
 use super::plot::{Axes, Series, svg};
@@ -12,7 +13,7 @@ use crate::evaluate::config::{EvalConfig, Protocol};
 use crate::evaluate::{Judged, Kind, Outcome, Row, is_named};
 use crate::points::VIEWS;
 use crate::score::Score;
-use crate::statistics::{Interval, interval, quantile};
+use crate::statistics::{Interval, difference, interval, quantile};
 
 /// The figures of a score: name, what it is, factor and digits in tables.
 type Figure = (&'static str, fn(&Score) -> Option<f64>, f64, usize);
@@ -29,6 +30,17 @@ pub struct Evaluation<'a> {
     pub outcome: &'a Outcome,
     /// What LPIPS was computed with, or why there is none.
     pub lpips: String,
+    /// What all of it took.
+    pub cost: Cost,
+}
+
+/// What an evaluation takes.
+#[derive(Debug, Clone, Copy, Serialize)]
+pub struct Cost {
+    /// From the first photograph to the last figure.
+    pub seconds: f64,
+    /// Bytes of memory of the process at most; `None` where the system does not tell.
+    pub memory: Option<u64>,
 }
 
 /// Means of each person's views, by person.
@@ -55,9 +67,8 @@ impl Evaluation<'_> {
         let [one, other] = [one, other]
             .map(|judged| means(judged.rows.iter().filter(|row| both.contains(&place(row))), protocol));
         FIGURES.map(|(_, of, ..)| {
-            let apart = |(a, b): (f64, f64)| if a == b { 0.0 } else { a - b };
             let pairs = one.values().zip(other.values());
-            let values: Option<Vec<f64>> = pairs.map(|(a, b)| Some(apart((of(a)?, of(b)?)))).collect();
+            let values: Option<Vec<f64>> = pairs.map(|(a, b)| Some(difference(of(a)?, of(b)?))).collect();
             interval(&values?)
         })
     }
@@ -112,6 +123,7 @@ impl Evaluation<'_> {
         report["groups"] =
             Value::Object(self.groups().map(|(name, rows)| (name, group_json(&rows))).collect());
         report["lpips"] = json!(self.lpips);
+        report["cost"] = json!(self.cost);
         report["left_out"] = json!(self.outcome.left_out);
         report
     }
