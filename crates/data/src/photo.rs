@@ -5,6 +5,7 @@ mod tests;
 
 use std::path::Path;
 
+use glam::DVec2;
 use image::{DynamicImage, GrayImage, RgbImage};
 
 use crate::resize::{Filter, resize};
@@ -201,24 +202,69 @@ fn on_canvas(rgb: &RgbImage, mask: &GrayImage, side: usize, report: String) -> C
     Canvas { rgb: values, mask, valid, report }
 }
 
+/// Where a photograph's pixels come to lie on a canvas, both with pixel centres at +½.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Mapping {
+    /// Canvas pixels per pixel of the photograph, across and down.
+    pub scale: DVec2,
+    /// Where the photograph's origin lies on the canvas.
+    pub origin: DVec2,
+}
+
+impl Mapping {
+    /// Of a photograph that is the canvas.
+    pub const AS_IT_IS: Self = Self { scale: DVec2::ONE, origin: DVec2::ZERO };
+
+    /// The place on the photograph of a place on the canvas.
+    pub fn source(&self, canvas: DVec2) -> DVec2 {
+        (canvas - self.origin) / self.scale
+    }
+}
+
+/// The person's box on a canvas.
+struct Fit {
+    scale: f32,
+    is_limited: bool,
+    left: usize,
+    top: usize,
+    width: usize,
+    height: usize,
+}
+
+impl Fit {
+    fn new(person: Rect, [height, side]: [usize; 2]) -> Self {
+        let canvas = side as f32;
+        let by_height = height as f32 / REFERENCE_SIDE * canvas / person.height as f32;
+        // Somebody with outstretched arms may be wider than high.
+        let scale = by_height.min(canvas / person.width as f32);
+        let size = |length: u32| ((length as f32 * scale).round() as usize).clamp(1, side);
+        let (width, height) = (size(person.width), size(person.height));
+        let left = (side - width) / 2;
+        let centre = TRAINING_CENTRE / REFERENCE_SIDE * canvas;
+        let top = ((centre - height as f32 / 2.0).round().max(0.0) as usize).min(side - height);
+        Self { scale, is_limited: scale < by_height, left, top, width, height }
+    }
+
+    fn mapping(&self, person: Rect) -> Mapping {
+        let size = |width: u32, height: u32| DVec2::new(f64::from(width), f64::from(height));
+        let scale = DVec2::new(self.width as f64, self.height as f64) / size(person.width, person.height);
+        let corner = DVec2::new(self.left as f64, self.top as f64);
+        Mapping { scale, origin: corner - size(person.x, person.y) * scale }
+    }
+}
+
+/// Puts a photograph on a canvas of `side` pixels as [`Placement::Training`] does; `None` if the mask shows nobody.
+pub fn place(rgb: &RgbImage, mask: &GrayImage, height: usize, side: usize) -> Option<(Canvas, Mapping)> {
+    let person = Rect::around(mask, u8::MAX.div_ceil(2))?;
+    let mapping = Fit::new(person, [height, side]).mapping(person);
+    Some((placed(rgb, mask, person, [height, side], ""), mapping))
+}
+
 /// The person's box at the size and place of the training subjects; what of a soft edge lies outside the box comes
 /// along.
-fn placed(
-    rgb: &RgbImage,
-    mask: &GrayImage,
-    person: Rect,
-    [height, side]: [usize; 2],
-    source: &str,
-) -> Canvas {
-    let canvas = side as f32;
-    let by_height = height as f32 / REFERENCE_SIDE * canvas / person.height as f32;
-    // Somebody with outstretched arms may be wider than high.
-    let scale = by_height.min(canvas / person.width as f32);
-    let size = |length: u32| ((length as f32 * scale).round() as usize).clamp(1, side);
-    let (width, height) = (size(person.width), size(person.height));
-    let left = (side - width) / 2;
-    let centre = TRAINING_CENTRE / REFERENCE_SIDE * canvas;
-    let top = ((centre - height as f32 / 2.0).round().max(0.0) as usize).min(side - height);
+fn placed(rgb: &RgbImage, mask: &GrayImage, person: Rect, size: [usize; 2], source: &str) -> Canvas {
+    let (side, canvas) = (size[1], size[1] as f32);
+    let Fit { scale, is_limited, left, top, width, height } = Fit::new(person, size);
 
     // Everything the mask touches and the canvas can hold, and where it comes to lie relative to the person's box. A
     // speck far away must not be enlarged with a small person.
@@ -249,7 +295,7 @@ fn placed(
         }
     }
     let valid = on_canvas.iter().map(|m| *m >= THRESHOLD).collect();
-    let limited = if scale < by_height { " (limited by the width)" } else { "" };
+    let limited = if is_limited { " (limited by the width)" } else { "" };
     let report = format!(
         "{source}, scaled by {scale:.4}{limited} to {width}×{height} at ({left}, {top}) of {side}×{side}"
     );

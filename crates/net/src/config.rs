@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 use snapsnap_splat::file;
 
 pub use modes::{
-    Anchor, ConfMode, Downsample, Fusion, HeadKind, RegressorStart, RotationFrame, Upsample, WorldFrame,
+    Anchor, Body, ConfMode, Downsample, Fusion, HeadKind, RegressorStart, RotationFrame, Upsample, WorldFrame,
 };
 
 /// How far from an output pixel of the regressor an input pixel can matter, statistics aside: the reach of the 3×3 convolutions on the
@@ -39,6 +39,10 @@ pub struct Config {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct NetworkConfig {
+    /// What lies between photographs and raw points. A `convolution` takes of the sizes below those of the encoder, whose
+    /// tokens lie where it is coarsest, of the decoder, which are the sides', `mlp_ratio`, `patch` (8 or 16), `rope_base`,
+    /// `layer_dims`, the channels at 1, 2, 4 and 8 times the finest pixel, and `last_dim`.
+    pub body: Body,
     /// Channels of an encoder token.
     pub enc_dim: usize,
     /// Encoder blocks.
@@ -90,11 +94,20 @@ pub struct NetworkConfig {
     pub anchor: Anchor,
     /// Whether the predictor sees only the window of the canvas that holds the person (LEARNING.md).
     pub window: bool,
+    /// Whether the predictor sees each pixel's share of the person as a channel of its own.
+    pub mask_channel: bool,
+    /// Whether the predictor sees where each pixel lies on the canvas, as the direction of its ray, in two channels.
+    pub ray_channels: bool,
+    /// Whether the back photograph is seen in a mirror, so that both show a limb at the same place.
+    pub mirror: bool,
+    /// Whether a transformer's tokens without a person in either photograph are left out.
+    pub drop_empty: bool,
 }
 
 impl Default for NetworkConfig {
     fn default() -> Self {
         Self {
+            body: Body::Transformer,
             enc_dim: 1024,
             enc_depth: 24,
             enc_heads: 16,
@@ -119,11 +132,20 @@ impl Default for NetworkConfig {
             delta: 5.0,
             anchor: Anchor::None,
             window: false,
+            mask_channel: false,
+            ray_channels: false,
+            mirror: false,
+            drop_empty: false,
         }
     }
 }
 
 impl NetworkConfig {
+    /// Channels of a photograph as the network sees it: colours, and what else the config adds.
+    pub fn input_channels(&self) -> usize {
+        3 + usize::from(self.mask_channel) + 2 * usize::from(self.ray_channels)
+    }
+
     /// Channels of the four token maps that feed the DPT branches.
     pub fn hook_widths(&self) -> [usize; 4] {
         self.hooks.map(|hook| if hook == 0 { self.enc_dim } else { self.dec_dim })

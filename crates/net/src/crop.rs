@@ -45,7 +45,14 @@ impl Window {
         let side = config.network.resolution;
         let person = if config.network.window { Self::around(masks, side) } else { None };
         let cell = config.network.patch * config.upsample_factor();
-        person.map_or_else(|| Self::whole(side), |person| person.in_cells(cell, side))
+        let window = person.map_or_else(|| Self::whole(side), |person| person.in_cells(cell, side));
+        if config.network.mirror { window.symmetric(side) } else { window }
+    }
+
+    /// Grown until a mirror image of the canvas has it at the same place.
+    fn symmetric(&self, side: usize) -> Self {
+        let start = self.columns.start.min(side - self.columns.end);
+        Self { rows: self.rows.clone(), columns: start..side - start }
     }
 
     /// Grown by `margin` pixels to aligned edges inside the canvas (whose side is a multiple of 4). By the regressor's

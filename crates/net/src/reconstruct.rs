@@ -9,10 +9,9 @@ use snapsnap_splat::{Camera, Gaussians, RigidTransform};
 use crate::config::{Config, Downsample, WorldFrame};
 use crate::crop::Window;
 use crate::gaussians::{Seen, assemble, placed, regress, side_images};
-use crate::network::{PointMap, PointPredictor, View, activate};
+use crate::network::{Input, PointMap, PointPredictor, View};
 use crate::precision::Precision;
 use crate::regressor::Regressor;
-use crate::resample::shrink;
 use crate::sides::{EMPTY, is_finite};
 use crate::weights::{WeightFile, WeightsError};
 
@@ -91,7 +90,7 @@ impl Reconstructor {
 
     /// Leaves the unseen sides out, which scenes of many photographs do not have: their heads, colours and Gaussians.
     pub fn without_sides(mut self) -> Self {
-        self.predictor.dust3r = self.predictor.dust3r.without_sides();
+        self.predictor = self.predictor.without_sides();
         self
     }
 
@@ -159,7 +158,7 @@ impl Run<'_> {
 
     fn reconstruct(&mut self, photos: [&Photograph; 2]) -> Reconstruction {
         let maps = self.point_maps(photos);
-        let views: Vec<View> = self.model.predictor.dust3r.views().to_vec();
+        let views: Vec<View> = self.model.predictor.views().to_vec();
         let (points, conf) =
             self.timed("reading back", |_| (host(maps.points.clone()), host(maps.conf.clone())));
         let area = self.side * self.side;
@@ -226,32 +225,33 @@ impl Run<'_> {
             )
         };
         let window = self.predictor_window(photos);
-        let images = self.timed("input", |_| {
+        let input = self.timed("input", |_| {
             let images = Tensor::cat(photos.map(|p| upload(&p.rgb, 3)).to_vec(), 0);
-            shrink(window.cut(images), factor, config.downsample())
+            let masks = Tensor::cat(photos.map(|p| upload(&p.mask, 1)).to_vec(), 0);
+            Input::new(config, images, masks, &window)
         });
-        let [_, _, height, width] = images.dims();
-        let grid = net.dust3r.grid([height, width]);
+        let [_, channels, height, width] = input.images.dims();
         self.plan.push(format!(
-            "point predictor: 2 photographs of {width}×{height} ({} of {window}{}), {} tokens each",
+            "point predictor: 2 photographs of {width}×{height} ({} of {window}{}), {} tokens each, {channels} channels",
             match config.downsample() {
                 _ if factor == 1 => "as they are instead",
                 Downsample::Area => "area means",
                 Downsample::Nearest => "every first pixel",
             },
             if window == Window::whole(side) { "" } else { ", the person's window" },
-            grid[0] * grid[1],
+            input.grid.tokens(),
         ));
-        let tokens = self.timed("encoder", |_| net.dust3r.encode(images));
-        let (front, back) = (tokens.clone().narrow(0, 0, 1), tokens.narrow(0, 1, 1));
-        let tokens = self.timed("decoders", |_| net.dust3r.decode(front, back, grid));
-        let heads = if net.dust3r.views().len() == 4 { "heads (4)" } else { "heads (2)" };
-        let maps = self.timed(heads, |_| {
-            let map = |&view: &View| activate(net.dust3r.raw_points(view, &tokens, grid), &config.network);
-            net.dust3r.views().iter().map(map).collect::<Vec<_>>()
-        });
+        if input.grid.kept.is_some() {
+            let all: usize = input.grid.size.iter().product();
+            self.plan
+                .push(format!("{} of {all} tokens left out: they show nobody", all - input.grid.tokens()));
+        }
+        let encoded = self.timed("encoder", |_| net.encode(input));
+        let decoded = self.timed("decoders", |_| net.decode(encoded));
+        let heads = if net.views().len() == 4 { "heads (4)" } else { "heads (2)" };
+        let maps = self.timed(heads, |_| net.heads(&decoded));
         self.timed("up-sampling", |_| {
-            let on_canvas = net.dust3r.views().iter().zip(maps).map(|(&view, map)| {
+            let on_canvas = maps.into_iter().map(|(view, map)| {
                 let mask = photos.get(view as usize).map(|photo| upload(&photo.mask, 1));
                 net.finished(config, view, map, &window, mask).on_canvas(&window, side)
             });

@@ -12,7 +12,7 @@ use crate::op::{self, Kept, Kernel};
 use crate::train::{
     Conv1x1, Conv3x3, Enlarge, Gradients, LayerNorm, Linear, Patches, Statistics, Unfolded, Wanted,
 };
-use crate::{in_f32, is_trained_fast};
+use crate::{in_f32, is_fast, is_trained_fast};
 
 /// What one step needed, the next one needs again.
 pub(crate) static BUFFERS: Buffers = Buffers::new();
@@ -51,7 +51,7 @@ pub fn layer_norm(layer: &nn::LayerNorm, epsilon: f64, x: Tensor<3>) -> Tensor<3
 pub fn conv2d(layer: &Conv2d, x: Tensor<4>, rectified: bool) -> Tensor<4> {
     let ([batch, inputs, height, width], [outputs, _, rows, columns]) = (x.dims(), layer.weight.dims());
     let (weight, bias) = (layer.weight.val(), layer.bias.as_ref());
-    let plain = layer.groups == 1 && layer.dilation == [1, 1] && is_trained_fast(&x);
+    let plain = layer.groups == 1 && layer.dilation == [1, 1] && (is_trained_fast(&x) || is_fast(&x));
     match (plain, [rows, columns], layer.stride) {
         (true, [3, 3], [1, 1]) => {
             let sizes = Conv3x3 { batch, inputs, outputs, height, width, rectified };

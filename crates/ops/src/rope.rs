@@ -19,23 +19,17 @@ impl Rope {
     ///
     /// The angles are computed in f64: token positions reach the hundreds on large canvases.
     pub fn new(rows: usize, columns: usize, head_dim: usize, base: f64, device: &Device) -> Self {
-        Self::with_origin([0, 0], rows, columns, head_dim, base, device)
+        let positions: Vec<_> = (0..rows * columns).map(|token| [token / columns, token % columns]).collect();
+        Self::at(&positions, head_dim, base, device)
     }
 
-    /// As [`Rope::new`], with the first token at `origin` (row, column) instead of (0, 0).
-    pub fn with_origin(
-        origin: [usize; 2],
-        rows: usize,
-        columns: usize,
-        head_dim: usize,
-        base: f64,
-        device: &Device,
-    ) -> Self {
+    /// As [`Rope::new`], for tokens at these positions (row, column).
+    pub fn at(positions: &[[usize; 2]], head_dim: usize, base: f64, device: &Device) -> Self {
         assert_eq!(head_dim % 4, 0, "head_dim {head_dim} must be a multiple of 4");
         let pairs = head_dim / 4;
         let (mut cos, mut sin) = (Vec::new(), Vec::new());
-        for token in 0..rows * columns {
-            for position in [origin[0] + token / columns, origin[1] + token % columns] {
+        for token in positions {
+            for position in *token {
                 let angles = (0..pairs).map(|k| position as f64 * base.powf(-(k as f64) / pairs as f64));
                 let (s, c): (Vec<f32>, Vec<f32>) =
                     angles.map(f64::sin_cos).map(|(s, c)| (s as f32, c as f32)).unzip();
@@ -44,7 +38,7 @@ impl Rope {
                 sin.extend(s);
             }
         }
-        let tensor = |values| Tensor::from_data(TensorData::new(values, [rows * columns, head_dim]), device);
+        let tensor = |values| Tensor::from_data(TensorData::new(values, [positions.len(), head_dim]), device);
         Self { cos: tensor(cos), sin: tensor(sin) }
     }
 

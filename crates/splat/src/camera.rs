@@ -22,6 +22,11 @@ impl RigidTransform {
         self.rotation * point + self.translation
     }
 
+    /// This transform, then another.
+    pub fn then(&self, next: &Self) -> Self {
+        Self { rotation: next.rotation * self.rotation, translation: next.apply(self.translation) }
+    }
+
     /// The transform that undoes this one.
     pub fn inverse(&self) -> Self {
         let rotation = self.rotation.transpose();

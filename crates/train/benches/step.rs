@@ -99,13 +99,13 @@ fn run(seconds: f64, side: usize, batch: usize) {
             continue;
         }
         let predictor = frozen(predictor.clone(), &trained.split(',').collect::<Vec<_>>());
-        let net = &predictor.dust3r;
+        let net = predictor.transformer();
         let grid = net.grid([side, side]);
         let time = measure(seconds, || {
             let start = Instant::now();
-            let tokens = net.encode(images.clone());
-            let maps = net.decode(tokens.clone().narrow(0, 0, batch), tokens.narrow(0, batch, batch), grid);
-            let raw = View::ALL.map(|view| net.raw_points(view, &maps, grid).square().mean());
+            let tokens = net.encode(images.clone(), &grid);
+            let maps = net.decode(tokens.clone().narrow(0, 0, batch), tokens.narrow(0, batch, batch), &grid);
+            let raw = View::ALL.map(|view| net.raw_points(view, &maps, &grid).square().mean());
             let loss = Tensor::cat(raw.to_vec(), 0).sum();
             let forward = start.elapsed();
             if trained != "nothing" {

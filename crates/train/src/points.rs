@@ -3,8 +3,7 @@
 use burn::tensor::Tensor;
 use snapsnap_net::Window;
 use snapsnap_net::config::Config;
-use snapsnap_net::network::{PointMap, PointPredictor, View, activate};
-use snapsnap_net::resample::shrink;
+use snapsnap_net::network::{Input, PointMap, PointPredictor, View};
 use snapsnap_ops::host;
 
 /// Squares of distances below this have no gradient: the direction of so small an error is noise.
@@ -55,23 +54,15 @@ pub fn predict(
     let [b, _, channels, side, _] = images.dims();
     let window =
         if config.network.window { window(config, &host(masks.clone()), side) } else { Window::whole(side) };
-    let factor = config.upsample_factor();
-    let photograph = |i: usize| {
-        let image = images.clone().narrow(1, i, 1).reshape([b, channels, side, side]);
-        shrink(window.cut(image), factor, config.downsample())
-    };
-    let net = &predictor.dust3r;
-    let photographs = Tensor::cat(vec![photograph(0), photograph(1)], 0);
-    let [_, _, height, width] = photographs.dims();
-    let grid = net.grid([height, width]);
-    let tokens = net.encode(photographs);
-    let maps = net.decode(tokens.clone().narrow(0, 0, b), tokens.narrow(0, b, b), grid);
-    let map = |&view: &View| {
-        let map = activate(net.raw_points(view, &maps, grid), &config.network);
+    // All fronts, then all backs.
+    let photographs = images.swap_dims(0, 1).reshape([2 * b, channels, side, side]);
+    let of_input = masks.clone().swap_dims(0, 1).reshape([2 * b, 1, side, side]);
+    let finished = |(view, map): (View, PointMap)| {
         let mask = ((view as usize) < 2).then(|| masks.clone().narrow(1, view as usize, 1));
         (view, predictor.finished(config, view, map, &window, mask))
     };
-    let maps = net.views().iter().map(map).collect();
+    let maps = predictor.forward(Input::new(config, photographs, of_input, &window));
+    let maps = maps.into_iter().map(finished).collect();
     Prediction { window, maps }
 }
 

@@ -1,6 +1,7 @@
 //! What must be right on every device: parity with reference numbers, properties of the networks, the splatting operation.
 //! One program, so that it can be taken to a machine that cannot build it (`cargo xtask bundle`).
 
+mod bodies;
 mod networks;
 mod pipeline;
 mod properties;

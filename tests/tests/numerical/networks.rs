@@ -51,8 +51,8 @@ fn network(name: &str) {
     let image = |i: usize| io.tensor::<4>(&format!("image{i}"), &device);
     let (front, back) = (image(1), image(2));
     let [b, _, h, w] = front.dims();
-    let grid = net.dust3r.grid([h, w]);
-    let tokens = net.dust3r.encode(Tensor::cat(vec![front, back], 0));
+    let grid = net.transformer().grid([h, w]);
+    let tokens = net.transformer().encode(Tensor::cat(vec![front, back], 0), &grid);
     let halves = [tokens.clone().narrow(0, 0, b), tokens.narrow(0, b, b)];
     for (i, half) in halves.iter().enumerate() {
         assert_close(
@@ -63,7 +63,7 @@ fn network(name: &str) {
         );
     }
     let [front, back] = halves;
-    let maps = net.dust3r.decode(front, back, grid);
+    let maps = net.transformer().decode(front, back, &grid);
     for (side, maps) in maps.iter().enumerate() {
         for (layer, tokens) in maps.iter().enumerate().skip(1) {
             let key = format!("dec{}.{layer}", side + 1);
@@ -71,12 +71,12 @@ fn network(name: &str) {
         }
     }
     let mut compared = 0;
-    for &view in net.dust3r.views() {
+    for &view in net.views() {
         let k = view as usize + 1;
         if !io.has(&format!("points.{k}")) {
             continue;
         }
-        let map = activate(net.dust3r.raw_points(view, &maps, grid), &config.network);
+        let map = activate(net.transformer().raw_points(view, &maps, &grid), &config.network);
         let what = format!("{name} {}", view.name());
         assert_close(&format!("{what} points"), map.points, &io.f32(&format!("points.{k}")), POINTS);
         assert_close(&format!("{what} conf"), map.conf, &io.f32(&format!("conf.{k}")), POINTS);

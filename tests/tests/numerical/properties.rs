@@ -2,7 +2,7 @@
 
 use burn::tensor::{Device, Tensor, TensorData};
 use snapsnap_net::config::{Config, Downsample, NetworkConfig, Upsample};
-use snapsnap_net::network::{PointMap, PointPredictor, View, activate};
+use snapsnap_net::network::{Grid, Input, PointMap, PointPredictor, View, activate};
 use snapsnap_net::regressor::{RECEPTIVE_RADIUS, Statistics};
 use snapsnap_net::resample::shrink;
 use snapsnap_net::weights::{WeightFile, init};
@@ -10,13 +10,13 @@ use snapsnap_net::{Photograph, Reconstruction, Reconstructor, Window};
 use snapsnap_ops::{Rope, bilinear};
 use snapsnap_tests::{device, relative_error, root, values};
 
-fn config(overrides: &[&str]) -> Config {
+pub(crate) fn config(overrides: &[&str]) -> Config {
     let path = root().join("configs/tiny.toml");
     let overrides: Vec<String> = overrides.iter().map(|s| (*s).to_owned()).collect();
     Config::from_file(&path, &overrides).expect("tiny.toml")
 }
 
-fn weights(config: &Config, seed: u64) -> (tempfile::NamedTempFile, WeightFile) {
+pub(crate) fn weights(config: &Config, seed: u64) -> (tempfile::NamedTempFile, WeightFile) {
     let file = tempfile::NamedTempFile::new().expect("temporary file");
     init(config, seed, file.path(), &|_, _| ()).expect("written");
     let weights = WeightFile::open(file.path(), None).expect("our file");
@@ -24,7 +24,7 @@ fn weights(config: &Config, seed: u64) -> (tempfile::NamedTempFile, WeightFile) 
 }
 
 /// Numbers in ±1 that depend on the index only.
-fn noise(n: usize, seed: u32) -> Vec<f32> {
+pub(crate) fn noise(n: usize, seed: u32) -> Vec<f32> {
     let mut state = seed.wrapping_mul(0x9e37_79b9) | 1;
     let mut next = || {
         state ^= state << 13;
@@ -36,7 +36,7 @@ fn noise(n: usize, seed: u32) -> Vec<f32> {
 }
 
 /// A photograph of noise with an upright ellipse as the person.
-fn photograph(side: usize, seed: u32) -> Photograph {
+pub(crate) fn photograph(side: usize, seed: u32) -> Photograph {
     let inside = |i: usize| {
         let (x, y) = ((i % side) as f32 / side as f32 - 0.5, (i / side) as f32 / side as f32 - 0.5);
         (x / 0.2).powi(2) + (y / 0.4).powi(2) < 1.0
@@ -48,12 +48,12 @@ fn photograph(side: usize, seed: u32) -> Photograph {
 }
 
 /// Equal but for f32 rounding: on GPUs, kernels are chosen by trial during the first runs.
-fn assert_same(what: &str, a: &[f32], b: &[f32]) {
+pub(crate) fn assert_same(what: &str, a: &[f32], b: &[f32]) {
     let error = relative_error(a, b);
     assert!(error < 1e-5, "{what}: relative error {error:e}");
 }
 
-fn assert_different(what: &str, a: &[f32], b: &[f32]) {
+pub(crate) fn assert_different(what: &str, a: &[f32], b: &[f32]) {
     let error = relative_error(a, b);
     assert!(error > 1e-3, "{what}: relative error {error:e}");
 }
@@ -78,7 +78,9 @@ fn rope_depends_on_relative_positions_only() {
         &device,
     );
     let scores = |origin: [usize; 2]| {
-        let rope = Rope::with_origin(origin, rows, columns, d, 100.0, &device);
+        let positions: Vec<_> =
+            (0..rows * columns).map(|i| [origin[0] + i / columns, origin[1] + i % columns]).collect();
+        let rope = Rope::at(&positions, d, 100.0, &device);
         values(rope.apply(q.clone()).matmul(rope.apply(k.clone()).swap_dims(2, 3)))
     };
     let error = relative_error(&scores([5, 11]), &scores([0, 0]));
@@ -185,7 +187,7 @@ fn concatenation_puts_the_front_first() {
     let maps = |x: Tensor<3>| vec![x; dec_depth + 1];
     let zero = || Tensor::<3>::zeros([1, 4, width], &device);
     let right = |front: Tensor<3>, back: Tensor<3>| {
-        net.dust3r.raw_points(View::Right, &[maps(front), maps(back)], [2, 2])
+        net.transformer().raw_points(View::Right, &[maps(front), maps(back)], &Grid::whole([2, 2]))
     };
     // A linear head is affine: the two halves' contributions add up, and they are different matrices.
     let both = values(right(tokens(1), tokens(2)) + right(zero(), zero()));
@@ -247,7 +249,7 @@ fn swapping_two_heads_weights_swaps_their_outputs() {
         |seed| Tensor::<4>::from_data(TensorData::new(noise(3 * 64 * 64, seed), [1, 3, 64, 64]), &device);
     let points = |weights: &WeightFile| {
         let net = weights.point_predictor(&device).expect("weights");
-        let maps = net.forward(image(1), image(2));
+        let maps = net.forward(pair(image(1), image(2)));
         maps.into_iter().map(|(_, map)| values(map.points)).collect::<Vec<_>>()
     };
     let before = points(&weights);
@@ -257,6 +259,12 @@ fn swapping_two_heads_weights_swaps_their_outputs() {
     assert_same("right", &before[view(View::Right)], &after[view(View::Left)]);
     assert_same("left", &before[view(View::Left)], &after[view(View::Right)]);
     assert_same("front", &before[view(View::Front)], &after[view(View::Front)]);
+}
+
+/// Two photographs without channels of their own beside the colours, for patches of 16 pixels.
+fn pair(front: Tensor<4>, back: Tensor<4>) -> Input {
+    let [_, _, h, w] = front.dims();
+    Input { images: Tensor::cat(vec![front, back], 0), grid: Grid::whole([h / 16, w / 16]) }
 }
 
 #[test]
@@ -270,7 +278,7 @@ fn every_fusion_head_and_view_count_runs_on_sizes_that_are_no_squares() {
             let config = config(&[&format!("network.head={head}"), &format!("network.fusion={fusion}")]);
             let (_file, weights) = weights(&config, 2);
             let net = weights.point_predictor(&device).expect("weights");
-            let maps = net.forward(image(1), image(2));
+            let maps = net.forward(pair(image(1), image(2)));
             assert_eq!(maps.len(), 4);
             let right = values(maps[2].1.points.clone());
             assert_eq!(maps[2].1.points.dims(), [1, 48, 80, 3]);
@@ -281,7 +289,7 @@ fn every_fusion_head_and_view_count_runs_on_sizes_that_are_no_squares() {
         let config = config(&[&format!("network.head={head}"), "network.side_heads=false"]);
         let (_file, weights) = weights(&config, 2);
         let net = weights.point_predictor(&device).expect("weights");
-        assert_eq!(net.forward(image(1), image(2)).len(), 2);
+        assert_eq!(net.forward(pair(image(1), image(2))).len(), 2);
     }
 }
 
@@ -299,7 +307,11 @@ fn mirror_mean_undoes_a_mirror_image() {
     let mirrored = front.clone().reshape([1, rows, columns, width]).flip([2]).reshape([1, 15, width]);
     let maps = |x: &Tensor<3>| vec![x.clone(); dec_depth + 1];
     let right = |net: &PointPredictor, back: &Tensor<3>| {
-        values(net.dust3r.raw_points(View::Right, &[maps(&front), maps(back)], [rows, columns]))
+        values(net.transformer().raw_points(
+            View::Right,
+            &[maps(&front), maps(back)],
+            &Grid::whole([rows, columns]),
+        ))
     };
     let (mirror_mean, mean) = (net("mirror-mean"), net("mean"));
     assert_same("mirrored twice", &right(&mirror_mean, &mirrored), &right(&mean, &front));

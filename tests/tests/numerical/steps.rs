@@ -11,6 +11,7 @@ use rand_chacha::ChaCha8Rng;
 use snapsnap_data::dataset::{Folder, Split};
 use snapsnap_data::prepare::{DataConfig, Subject};
 use snapsnap_net::Window;
+use snapsnap_net::config::{Body, NetworkConfig};
 use snapsnap_net::network::{PointMap, View, activate};
 use snapsnap_net::weights::{random_predictor, random_regressors};
 use snapsnap_people::synth;
@@ -113,6 +114,13 @@ fn compare(stage: &str, on: impl Fn(&Device) -> (f64, Rows, Networks), device: &
     }
 }
 
+/// As it is: a transformer that sees colours.
+const TRANSFORMER: fn(&mut NetworkConfig) = |_| {};
+const CONVOLUTION: fn(&mut NetworkConfig) = |network| {
+    network.body = Body::Convolution;
+    (network.mask_channel, network.ray_channels, network.mirror) = (true, true, true);
+};
+
 #[test]
 fn a_step_of_stage_1_is_the_same_on_every_device() {
     let Some(device) = other_device() else { return };
@@ -121,13 +129,17 @@ fn a_step_of_stage_1_is_the_same_on_every_device() {
         return;
     }
     let temporary = tempfile::tempdir().expect("temporary folder");
-    let (folder, config) = (people(temporary.path()), config());
-    let on = |device: &Device| {
-        let task = PointTask::new(from_ref(&folder), &config, from_ref(device)).expect("a task");
-        let predictor = Some(random_predictor(&config.networks(), 3, device));
-        step(&task, Networks { predictor, regressors: Vec::new() })
-    };
-    compare("stage 1", on, &device);
+    let folder = people(temporary.path());
+    for (body, change) in [("transformer", TRANSFORMER), ("convolution", CONVOLUTION)] {
+        let mut config = config();
+        change(&mut config.network);
+        let on = |device: &Device| {
+            let task = PointTask::new(from_ref(&folder), &config, from_ref(device)).expect("a task");
+            let predictor = Some(random_predictor(&config.networks(), 3, device));
+            step(&task, Networks { predictor, regressors: Vec::new() })
+        };
+        compare(&format!("stage 1, {body}"), on, &device);
+    }
 }
 
 #[test]

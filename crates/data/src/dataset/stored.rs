@@ -21,16 +21,13 @@ pub struct StoredView {
 /// moved along its ray to the stored depth. Where there is no depth it is taken for `far`.
 pub fn unproject(view: &StoredView, camera: &Camera, to: &Camera, far: f32) -> Vec<f32> {
     let width = camera.width as usize;
-    // From the camera's frame to the other's.
-    let back = camera.world_to_camera.inverse();
-    let rotation = to.world_to_camera.rotation * back.rotation;
-    let shift = to.world_to_camera.apply(back.translation);
+    let there = camera.world_to_camera.inverse().then(&to.world_to_camera);
     let (f, c) = (camera.focal, camera.principal_point);
     let mut points = Vec::with_capacity(3 * view.depth.len());
     for (pixel, z) in view.depth.iter().enumerate() {
         let z = f64::from(if *z > 0.0 { *z } else { far });
         let (x, y) = ((pixel % width) as f64 + 0.5, (pixel / width) as f64 + 0.5);
-        let point = rotation * (z * DVec3::new((x - c.x) / f.x, (y - c.y) / f.y, 1.0)) + shift;
+        let point = there.apply(z * DVec3::new((x - c.x) / f.x, (y - c.y) / f.y, 1.0));
         points.extend(point.as_vec3().to_array());
     }
     points

@@ -3,6 +3,7 @@
 mod augment;
 mod joined;
 mod loader;
+mod place;
 mod stage1;
 mod stage2;
 mod test_set;
@@ -18,7 +19,8 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use snapsnap_splat::Camera;
 
-use crate::dataset::{Arrangement, Folder, Layout, Split, StoredView, unproject};
+use crate::dataset::{Arrangement, Folder, Layout, Split, StoredView};
+use crate::photo::{Mapping, place};
 pub use augment::Augment;
 pub use joined::Joined;
 pub use loader::{Batches, Loader};
@@ -28,8 +30,6 @@ pub use stage1::{Stage1, Stage1Batch, Stage1Batcher, Stage1Item};
 pub use stage2::{Stage2, Stage2Batch, Stage2Batcher, Stage2Item};
 pub use test_set::{Test, TestItem};
 
-/// Depth that the published code gives the background: 1/(0 + 10⁻⁸).
-const COMPAT_FAR: f32 = 1e8;
 /// Coverage from which a pixel belongs to the person, in 8 bits.
 const INSIDE: u8 = 128;
 
@@ -50,6 +50,10 @@ pub struct SampleConfig {
     pub high_resolution: bool,
     /// Stage 2: also the points that four views see, for the point loss.
     pub points: bool,
+    /// Whether photographs are put on their canvas as a user's are, and points moved to where the nominal cameras see them.
+    pub place: bool,
+    /// With `place`, the person's height in pixels of a canvas of 1024, as `mode.person_height`.
+    pub person_height: usize,
     /// Decides everything that is random.
     pub seed: u64,
     /// Changes to the two input photographs.
@@ -66,6 +70,8 @@ impl Default for SampleConfig {
             supervision: 3,
             high_resolution: false,
             points: false,
+            place: false,
+            person_height: 739,
             seed: 1,
             augment: Augment::default(),
         }
@@ -95,6 +101,12 @@ impl SampleConfig {
         }
         if self.compat && self.augment != Augment::none() {
             return Some(("augment".into(), "must be off beside `compat = true`".into()));
+        }
+        if self.compat && self.place {
+            return Some(("place".into(), "must be false beside `compat = true`".into()));
+        }
+        if !(16..=1024).contains(&self.person_height) {
+            return Some(("person_height".into(), format!("is {}, must be 16 to 1024", self.person_height)));
         }
         self.augment.problem().map(|(key, message)| (format!("augment.{key}"), message))
     }
@@ -182,35 +194,6 @@ impl Source {
         if self.config.compat { *stored } else { self.folder.exact_camera(stored) }
     }
 
-    /// Points that views see, `[V,H,W,3]` metres in the first one's frame, and where there are any `[V,H,W]`; and the
-    /// pictures and masks of the first two.
-    #[allow(clippy::type_complexity, reason = "two arrays and the pictures")]
-    fn points(
-        &self,
-        subject: &str,
-        views: &[usize],
-    ) -> Result<(Vec<f32>, Vec<f32>, Vec<(RgbImage, GrayImage)>), FileError> {
-        let compat = self.config.compat;
-        let area = (self.folder.description().resolution as usize).pow(2);
-        let mut points = Vec::with_capacity(3 * views.len() * area);
-        let mut valid = Vec::with_capacity(views.len() * area);
-        let (mut pictures, mut front) = (Vec::new(), None);
-        for (place, view) in views.iter().enumerate() {
-            let stored = self.view_for(subject, *view, place < 2 || compat)?;
-            let camera = self.camera(&stored.camera);
-            let front = *front.get_or_insert(camera);
-            points.extend(unproject(&stored, &camera, &front, if compat { COMPAT_FAR } else { 0.0 }));
-            valid.extend(stored.depth.iter().enumerate().map(|(pixel, z)| {
-                let there = if compat { stored.mask.as_raw()[pixel] >= INSIDE } else { *z > 0.0 };
-                f32::from(u8::from(there))
-            }));
-            if place < 2 {
-                pictures.push((stored.color, stored.mask));
-            }
-        }
-        Ok((points, valid, pictures))
-    }
-
     /// What a view sees, to be compared with: `[3,h,w]` in [0, 1], over a colour, and the share of the person `[h,w]`.
     fn target(
         &self,
@@ -234,22 +217,39 @@ impl Source {
         Ok(((0..3).flat_map(pixels).collect(), share))
     }
 
-    /// Photographs as the networks see them: `[N,3,H,W]` and their masks `[N,H,W]`.
-    fn photographs(&self, views: &[(&RgbImage, &GrayImage)], random: &mut impl Rng) -> (Vec<f32>, Vec<f32>) {
-        let (mut images, mut masks) = (Vec::new(), Vec::new());
-        for (color, mask) in views {
-            let (color, mask) = self.config.augment.apply(color, mask, random);
-            // Channels first; the background is 0 (SNAPSNAP §5.7).
-            for channel in 0..3 {
-                let pixels = color.pixels().zip(mask.pixels());
-                images.extend(pixels.map(|(c, m)| {
-                    (2.0 * f32::from(c.0[channel]) / 255.0 - 1.0) * (f32::from(m.0[0]) / 255.0)
-                }));
+    /// A photograph as the networks see it, `[3,H,W]`, its mask `[H,W]`, and where its pixels come from.
+    fn photograph(&self, view: (&RgbImage, &GrayImage), random: &mut impl Rng) -> Photograph {
+        let (color, mask) = self.config.augment.apply(view.0, view.1, random);
+        let inside = |share: f32| f32::from(u8::from(share >= f32::from(INSIDE) / 255.0));
+        if self.config.place {
+            let side = color.width() as usize;
+            if let Some((canvas, mapping)) = place(&color, &mask, self.config.person_height, side) {
+                let mask = canvas.mask.iter().map(|share| inside(*share)).collect();
+                return Photograph { image: canvas.rgb, mask, mapping };
             }
-            masks.extend(mask.as_raw().iter().map(|m| if *m >= INSIDE { 1.0 } else { 0.0 }));
         }
-        (images, masks)
+        // Channels first; the background is 0 (SNAPSNAP §5.7).
+        let channel = |channel: usize| {
+            let pixels = color.pixels().zip(mask.pixels());
+            pixels.map(move |(c, m)| {
+                (2.0 * f32::from(c.0[channel]) / 255.0 - 1.0) * (f32::from(m.0[0]) / 255.0)
+            })
+        };
+        Photograph {
+            image: (0..3).flat_map(channel).collect(),
+            mask: mask.as_raw().iter().map(|m| inside(f32::from(*m) / 255.0)).collect(),
+            mapping: Mapping::AS_IT_IS,
+        }
     }
+}
+
+/// A photograph on its canvas.
+struct Photograph {
+    /// `[3,H,W]` in [−1, 1] times the mask.
+    image: Vec<f32>,
+    /// `[H,W]` 1 where the mask sees the person.
+    mask: Vec<f32>,
+    mapping: Mapping,
 }
 
 /// One field of all items of a batch, as one tensor.

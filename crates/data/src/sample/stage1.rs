@@ -7,6 +7,7 @@ use burn::data::dataset::{Dataset, DatasetError};
 use burn::tensor::{Device, Tensor};
 use rand::Rng;
 
+use super::place::Four;
 use super::{SampleConfig, Source, together};
 use crate::dataset::{Folder, Split};
 use snapsnap_mesh::FileError;
@@ -73,9 +74,7 @@ impl Stage1 {
         // Front, back, and the sides at +90° and +270° (SNAPSNAP §5.6).
         let order = source.folder.description().arrangement.four(first, count);
         let side = source.folder.description().resolution as usize;
-        let (points, valid, pictures) = source.points(subject, &order)?;
-        let [front, back] = [0, 1].map(|i| (&pictures[i].0, &pictures[i].1));
-        let (images, masks) = source.photographs(&[front, back], &mut random);
+        let Four { images, masks, points, valid, .. } = source.four(subject, &order, &mut random)?;
         let mut item = Stage1Item { name: String::new(), side, images, masks, points, valid };
         if source.config.augment.mirror && random.random() {
             item.mirror();

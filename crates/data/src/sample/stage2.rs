@@ -8,6 +8,7 @@ use burn::tensor::{Device, Tensor};
 use rand::Rng;
 use snapsnap_splat::Camera;
 
+use super::place::Four;
 use super::{SampleConfig, Source, together};
 use crate::dataset::{Folder, Layout, Split};
 use snapsnap_mesh::FileError;
@@ -28,7 +29,7 @@ pub struct Stage2Item {
     pub images: Vec<f32>,
     /// `[2,H,W]` 1 where the input masks see the person.
     pub masks: Vec<f32>,
-    /// Cameras of front, back, right and left, side H.
+    /// Cameras of front, back, right and left, side H; the front's where its points were moved to, with `place`.
     pub cameras: [Camera; 4],
     /// `[4,H,W,3]` points that they see, metres in the front camera's frame; empty unless the config asks for them.
     pub points: Vec<f32>,
@@ -97,16 +98,9 @@ impl Stage2 {
         let count = description.views;
         let first = if config.compat { 0 } else { source.front(&mut random) };
         let [front, back, right, left] = description.arrangement.four(first, count);
-        let (points, valid, pictures) = if config.points {
-            source.points(subject, &[front, back, right, left])?
-        } else {
-            let picture = |view: usize| folder.picture(*split, subject, view, false);
-            (Vec::new(), Vec::new(), vec![picture(front)?, picture(back)?])
-        };
-        let [a, b] = [0, 1].map(|i| &pictures[i]);
+        let order = [front, back, right, left];
         let camera = |view: usize| folder.camera(*split, subject, view).map(|stored| source.camera(&stored));
-        let cameras = [camera(front)?, camera(back)?, camera(right)?, camera(left)?];
-
+        let mut cameras = [camera(front)?, camera(back)?, camera(right)?, camera(left)?];
         let random_views = (0..config.supervision).map(|_| random.random_range(0..count)).collect::<Vec<_>>();
         let background =
             if config.augment.background_color { [(); 3].map(|()| random.random()) } else { [0.0; 3] };
@@ -121,7 +115,16 @@ impl Stage2 {
             let stored = folder.camera(*split, subject, view)?.resized(target_side, target_side);
             target_cameras.push(source.camera(&stored));
         }
-        let (images, masks) = source.photographs(&[(&a.0, &a.1), (&b.0, &b.1)], &mut random);
+        let (images, masks, points, valid) = if config.points || config.place {
+            let Four { images, masks, points, valid, front } = source.four(subject, &order, &mut random)?;
+            cameras[0] = front;
+            let (points, valid) = if config.points { (points, valid) } else { Default::default() };
+            (images, masks, points, valid)
+        } else {
+            let picture = |view: usize| folder.picture(*split, subject, view, false);
+            let (images, masks) = source.two([&picture(front)?, &picture(back)?], &mut random);
+            (images, masks, Vec::new(), Vec::new())
+        };
         Ok(Stage2Item {
             name: format!("{}: {subject}, view {first}", folder.root().display()),
             side: description.resolution as usize,

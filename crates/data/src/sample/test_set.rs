@@ -63,15 +63,15 @@ impl Test {
         let description = source.folder.description();
         let picture = |view: &usize| source.folder.picture(source.split, subject, *view, false);
         let pictures = views.iter().map(picture).collect::<Result<Vec<_>, _>>()?;
-        let pairs: Vec<_> = pictures.iter().map(|(color, mask)| (color, mask)).collect();
-        let (images, masks) = source.photographs(&pairs, &mut random);
+        let photographs: Vec<_> =
+            pictures.iter().map(|(color, mask)| source.photograph((color, mask), &mut random)).collect();
         let camera = |view: usize| source.folder.camera(source.split, subject, view);
         let cameras = (0..description.views).map(|view| camera(view).map(|stored| source.camera(&stored)));
         Ok(TestItem {
             subject: subject.to_owned(),
             side: description.resolution as usize,
-            images,
-            masks,
+            images: photographs.iter().flat_map(|photograph| photograph.image.iter().copied()).collect(),
+            masks: photographs.iter().flat_map(|photograph| photograph.mask.iter().copied()).collect(),
             cameras: cameras.collect::<Result<_, _>>()?,
         })
     }

@@ -2,7 +2,9 @@
 
 use crate::weights::schema::{self, TensorSpec};
 
-use super::{Anchor, Config, Downsample, HeadKind, RegressorStart, RotationFrame, Upsample, WorldFrame};
+use super::{
+    Anchor, Body, Config, Downsample, HeadKind, RegressorStart, RotationFrame, Upsample, WorldFrame,
+};
 
 /// Seven times the published size; 16 GB of f32. Beyond, a slip of the finger is likelier than a wish.
 const MAX_PARAMETERS: usize = 4_000_000_000;
@@ -51,10 +53,22 @@ impl Config {
         if !n.feature_dim.is_multiple_of(2) {
             return Some(("network.feature_dim", format!("is {}, must be even", n.feature_dim)));
         }
-        if let Some(hook) = n.hooks.into_iter().find(|&h| h > n.dec_depth) {
+        let hooked = (n.body == Body::Transformer).then_some(n.hooks);
+        if let Some(hook) = hooked.into_iter().flatten().find(|&h| h > n.dec_depth) {
             return Some(("network.hooks", format!("{hook} is beyond the last layer {}", n.dec_depth)));
         }
-        if n.head == HeadKind::Dpt && n.patch != 16 {
+        if n.body == Body::Convolution {
+            if ![8, 16].contains(&n.patch) {
+                let message = format!("is {}, a convolution has 8 or 16", n.patch);
+                return Some(("network.patch", message));
+            }
+            if n.drop_empty {
+                return Some((
+                    "network.drop_empty",
+                    "is a transformer's: a convolution has no tokens to drop".into(),
+                ));
+            }
+        } else if n.head == HeadKind::Dpt && n.patch != 16 {
             return Some((
                 "network.patch",
                 format!("is {}; the DPT head is built for patches of 16 pixels", n.patch),
@@ -130,6 +144,11 @@ impl Config {
             ("network.upsample", self.upsample() == Upsample::Bilinear, "\"bilinear\""),
             ("network.anchor", self.network.anchor == Anchor::None, "\"none\""),
             ("network.window", !self.network.window, "false"),
+            ("network.body", self.network.body == Body::Transformer, "\"transformer\""),
+            ("network.mask_channel", !self.network.mask_channel, "false"),
+            ("network.ray_channels", !self.network.ray_channels, "false"),
+            ("network.mirror", !self.network.mirror, "false"),
+            ("network.drop_empty", !self.network.drop_empty, "false"),
             ("regressor.start", self.regressor.start() == RegressorStart::Published, "\"published\""),
             ("mode.rotation_frame", self.rotation_frame() == RotationFrame::World, "\"world\""),
             ("mode.downsample", self.downsample() == Downsample::Nearest, "\"nearest\""),

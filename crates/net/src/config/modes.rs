@@ -20,6 +20,15 @@ names! {
     }
 }
 names! {
+    /// What lies between photographs and raw points.
+    Body {
+        /// DUSt3R: encoder, two decoders, a head per view (SNAPSNAP §1).
+        Transformer = "transformer",
+        /// A U-shaped convolutional network over both photographs at once with attention where it is coarsest (LEARNING.md).
+        Convolution = "convolution",
+    }
+}
+names! {
     /// What predicted points are measured from (LEARNING.md).
     Anchor {
         /// The front camera: direction and exponential distance, as published.

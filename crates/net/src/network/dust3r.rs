@@ -5,14 +5,15 @@
 use burn::module::Module;
 use burn::nn::conv::{Conv2d, Conv2dConfig};
 use burn::nn::{LayerNorm, Linear, LinearConfig, PaddingConfig2d};
-use burn::tensor::{Device, Tensor};
+use burn::tensor::{Device, IndexingUpdateOp, Int, Tensor, TensorData};
 
 use super::block::{DecoderBlock, EncoderBlock, layer_norm, normalise};
 use super::dpt::DptHead;
 use super::linear::LinearHead;
-use crate::config::{Fusion, HeadKind, NetworkConfig};
+use crate::config::{Downsample, Fusion, HeadKind, NetworkConfig};
+use crate::resample::shrink;
 use snapsnap_ops::layers::{linear, patches};
-use snapsnap_ops::{Rope, as_weight};
+use snapsnap_ops::{Rope, as_weight, host};
 
 /// One side of the person. The sides are named as seen in the front picture.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -47,6 +48,74 @@ struct PatchEmbed {
 enum Head {
     Dpt(DptHead),
     Linear(LinearHead),
+}
+
+/// Which tokens an image has: all of a grid, or those of it where somebody is.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Grid {
+    /// Rows and columns.
+    pub size: [usize; 2],
+    /// The tokens there are, by their place in the grid, row by row; all of them without this.
+    pub kept: Option<Vec<usize>>,
+}
+
+impl Grid {
+    /// All tokens.
+    pub fn whole(size: [usize; 2]) -> Self {
+        Self { size, kept: None }
+    }
+
+    /// The tokens of which some patch of `patch`² pixels has a mask `[N, 1, H, W]` above 0; all of them if nobody is seen.
+    pub fn of_persons(masks: &Tensor<4>, patch: usize) -> Self {
+        let [_, _, h, w] = masks.dims();
+        let size = [h / patch, w / patch];
+        let covered = host(shrink(masks.clone(), patch, Downsample::Area));
+        let area = size[0] * size[1];
+        let kept: Vec<usize> = (0..area)
+            .filter(|token| covered.iter().skip(*token).step_by(area).any(|mask| *mask > 0.0))
+            .collect();
+        Self { size, kept: (!kept.is_empty() && kept.len() < area).then_some(kept) }
+    }
+
+    /// Number of tokens.
+    pub fn tokens(&self) -> usize {
+        self.kept.as_ref().map_or(self.size[0] * self.size[1], Vec::len)
+    }
+
+    /// Rotary tables for the tokens there are.
+    fn rope(&self, head_dim: usize, base: f64, device: &Device) -> Rope {
+        let [rows, columns] = self.size;
+        match &self.kept {
+            None => Rope::new(rows, columns, head_dim, base, device),
+            Some(kept) => {
+                let positions: Vec<_> = kept.iter().map(|token| [token / columns, token % columns]).collect();
+                Rope::at(&positions, head_dim, base, device)
+            }
+        }
+    }
+
+    fn index(&self, device: &Device) -> Option<Tensor<1, Int>> {
+        let kept: Vec<i64> = self.kept.as_ref()?.iter().map(|token| *token as i64).collect();
+        let count = kept.len();
+        Some(Tensor::from_data(TensorData::new(kept, [count]), device))
+    }
+
+    /// The tokens there are of all of a grid's.
+    fn pick(&self, tokens: Tensor<3>) -> Tensor<3> {
+        match self.index(&tokens.device()) {
+            Some(index) => tokens.select(1, index),
+            None => tokens,
+        }
+    }
+
+    /// All of a grid's tokens, 0 where there is none.
+    fn spread(&self, tokens: Tensor<3>) -> Tensor<3> {
+        let device = tokens.device();
+        let Some(index) = self.index(&device) else { return tokens };
+        let [b, _, c] = tokens.dims();
+        let all = Tensor::<3>::zeros([b, self.size[0] * self.size[1], c], &device).cast(tokens.dtype());
+        all.select_assign(1, index, tokens, IndexingUpdateOp::Add)
+    }
 }
 
 /// Token maps of one photograph: entry 0 is the encoder's output, entry l the l-th decoder layer's, all `[B, N, C]`.
@@ -85,7 +154,7 @@ impl Dust3r {
         };
         Self {
             patch_embed: PatchEmbed {
-                proj: Conv2dConfig::new([3, c.enc_dim], patch)
+                proj: Conv2dConfig::new([c.input_channels(), c.enc_dim], patch)
                     .with_stride(patch)
                     .with_padding(PaddingConfig2d::Valid)
                     .init(device),
@@ -104,42 +173,35 @@ impl Dust3r {
         }
     }
 
-    /// Its sizes and modes.
-    pub fn config(&self) -> &NetworkConfig {
-        &self.config
-    }
-
     /// The same network without the heads of the unseen sides, for scenes that have none.
     pub fn without_sides(self) -> Self {
         Self { downstream_head3: None, downstream_head4: None, ..self }
     }
 
-    /// Views that have a head.
-    pub fn views(&self) -> &'static [View] {
-        if self.downstream_head3.is_some() { &View::ALL } else { &View::ALL[..2] }
+    /// Whether it has heads for the unseen sides.
+    pub fn has_sides(&self) -> bool {
+        self.downstream_head3.is_some()
     }
 
-    /// Rows and columns of the token grid of an image of `height` × `width` pixels.
+    /// All tokens of an image of `height` × `width` pixels.
     ///
     /// # Panics
     /// If a side is no multiple of the patch.
-    pub fn grid(&self, [height, width]: [usize; 2]) -> [usize; 2] {
+    pub fn grid(&self, [height, width]: [usize; 2]) -> Grid {
         let patch = self.config.patch;
         assert!(
             height % patch == 0 && width % patch == 0 && height * width > 0,
             "image {height}×{width}: both sides must be positive multiples of the patch {patch}"
         );
-        [height / patch, width / patch]
+        Grid::whole([height / patch, width / patch])
     }
 
-    /// Images `[B, 3, H, W]` in [−1, 1] → normalised encoder tokens `[B, N, enc_dim]`.
-    pub fn encode(&self, images: Tensor<4>) -> Tensor<3> {
+    /// Images `[B, C, H, W]`, colours in [−1, 1] first → normalised encoder tokens `[B, N, enc_dim]`.
+    pub fn encode(&self, images: Tensor<4>, grid: &Grid) -> Tensor<3> {
         let c = &self.config;
-        let [_, _, h, w] = images.dims();
-        let [rows, columns] = self.grid([h, w]);
-        let rope = Rope::new(rows, columns, c.enc_dim / c.enc_heads, c.rope_base, &images.device());
+        let rope = grid.rope(c.enc_dim / c.enc_heads, c.rope_base, &images.device());
         let proj = &self.patch_embed.proj;
-        let tokens = patches(proj, as_weight(images, &proj.weight));
+        let tokens = grid.pick(patches(proj, as_weight(images, &proj.weight)));
         let tokens = self.enc_blocks.iter().fold(tokens, |x, block| block.forward(x, &rope));
         normalise(&self.enc_norm, tokens)
     }
@@ -147,9 +209,9 @@ impl Dust3r {
     /// Encoder tokens of the two photographs `[B, N, enc_dim]` → all token maps of each.
     ///
     /// Both decoders read the other's tokens of the *previous* layer.
-    pub fn decode(&self, front: Tensor<3>, back: Tensor<3>, [rows, columns]: [usize; 2]) -> [TokenMaps; 2] {
+    pub fn decode(&self, front: Tensor<3>, back: Tensor<3>, grid: &Grid) -> [TokenMaps; 2] {
         let c = &self.config;
-        let rope = Rope::new(rows, columns, c.dec_dim / c.dec_heads, c.rope_base, &front.device());
+        let rope = grid.rope(c.dec_dim / c.dec_heads, c.rope_base, &front.device());
         let mut x = linear(&self.decoder_embed, front.clone());
         let mut y = linear(&self.decoder_embed, back.clone());
         let (mut front, mut back) = (vec![front], vec![back]);
@@ -169,21 +231,22 @@ impl Dust3r {
     ///
     /// # Panics
     /// If the network has no head for `view`.
-    pub fn raw_points(&self, view: View, [front, back]: &[TokenMaps; 2], grid: [usize; 2]) -> Tensor<4> {
+    pub fn raw_points(&self, view: View, [front, back]: &[TokenMaps; 2], grid: &Grid) -> Tensor<4> {
         let head = match view {
             View::Front => &self.downstream_head1,
             View::Back => &self.downstream_head2,
             View::Right => self.downstream_head3.as_ref().expect("a network with side heads"),
             View::Left => self.downstream_head4.as_ref().expect("a network with side heads"),
         };
+        let all = |tokens: &Tensor<3>| grid.spread(tokens.clone());
         let tokens = |i: usize| match view {
-            View::Front => front[i].clone(),
-            View::Back => back[i].clone(),
-            View::Right | View::Left => self.fuse(front[i].clone(), back[i].clone(), grid),
+            View::Front => all(&front[i]),
+            View::Back => all(&back[i]),
+            View::Right | View::Left => self.fuse(all(&front[i]), all(&back[i]), grid.size),
         };
         match head {
-            Head::Linear(head) => head.forward(tokens(self.config.dec_depth), grid),
-            Head::Dpt(head) => head.forward(self.config.hooks.map(tokens), grid),
+            Head::Linear(head) => head.forward(tokens(self.config.dec_depth), grid.size),
+            Head::Dpt(head) => head.forward(self.config.hooks.map(tokens), grid.size),
         }
     }
 

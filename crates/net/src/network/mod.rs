@@ -3,11 +3,17 @@
 mod anchor;
 mod attention;
 mod block;
+mod convolution;
 mod dpt;
 mod dust3r;
+mod input;
 mod linear;
 mod predictor;
 
 pub use anchor::anchors;
-pub use dust3r::{Dust3r, TokenMaps, View};
-pub use predictor::{PointMap, PointPredictor, activate};
+pub use convolution::{Levels, PointUNet};
+pub use dust3r::{Dust3r, Grid, TokenMaps, View};
+pub use input::Input;
+pub use predictor::{Decoded, Encoded, PointMap, PointPredictor, activate};
+
+pub(crate) use convolution::LEVELS;

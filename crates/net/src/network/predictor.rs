@@ -5,8 +5,10 @@ use burn::tensor::activation::sigmoid;
 use burn::tensor::{Device, Tensor};
 
 use super::anchor::anchors;
-use super::dust3r::{Dust3r, View};
-use crate::config::{Anchor, ConfMode, Config, Downsample, NetworkConfig, Upsample};
+use super::convolution::{Levels, PointUNet};
+use super::dust3r::{Dust3r, Grid, TokenMaps, View};
+use super::input::Input;
+use crate::config::{Anchor, Body, ConfMode, Config, Downsample, NetworkConfig, Upsample};
 use crate::crop::Window;
 use crate::resample::shrink;
 use snapsnap_ops::bilinear;
@@ -66,20 +68,73 @@ fn growth(x: Tensor<4>) -> Tensor<4> {
     direct.mask_where(x.lower_elem(SMALL), series)
 }
 
-/// Two-view network and global scale δ.
+/// What the encoder of a predictor gives.
+#[derive(Debug, Clone)]
+pub enum Encoded {
+    /// Tokens `[2·B, N, enc_dim]` of all fronts, then all backs.
+    Tokens(Tensor<3>, Grid),
+    /// Both photographs' together.
+    Levels(Levels),
+}
+
+/// What the heads of a predictor begin with.
+#[derive(Debug, Clone)]
+pub enum Decoded {
+    /// Both photographs' token maps.
+    Tokens([TokenMaps; 2], Grid),
+    /// Both photographs' together.
+    Levels(Levels),
+}
+
+/// A network for both photographs and global scale δ.
 #[derive(Module, Debug)]
 pub struct PointPredictor {
     /// δ `[1]`: metres per network unit.
     scale: Param<Tensor<1>>,
-    /// The network.
-    pub dust3r: Dust3r,
+    dust3r: Option<Dust3r>,
+    unet: Option<PointUNet>,
+    #[module(skip)]
+    config: NetworkConfig,
 }
 
 impl PointPredictor {
     /// A predictor whose parameters wait to be loaded.
     pub fn new(config: &NetworkConfig, device: &Device) -> Self {
         let scale = Param::from_tensor(Tensor::full([1], config.delta, device));
-        Self { scale, dust3r: Dust3r::new(config, device) }
+        let body = |body: Body| config.body == body;
+        Self {
+            scale,
+            dust3r: body(Body::Transformer).then(|| Dust3r::new(config, device)),
+            unet: body(Body::Convolution).then(|| PointUNet::new(config, device)),
+            config: config.clone(),
+        }
+    }
+
+    /// The transformer that it is.
+    ///
+    /// # Panics
+    /// If it is a convolution.
+    pub fn transformer(&self) -> &Dust3r {
+        self.dust3r.as_ref().expect("a transformer")
+    }
+
+    fn convolution(&self) -> &PointUNet {
+        self.unet.as_ref().expect("what is no transformer is a convolution")
+    }
+
+    /// The same network without what makes the unseen sides, for scenes that have none.
+    pub fn without_sides(self) -> Self {
+        Self {
+            dust3r: self.dust3r.map(Dust3r::without_sides),
+            unet: self.unet.map(PointUNet::without_sides),
+            ..self
+        }
+    }
+
+    /// Views of which it gives maps.
+    pub fn views(&self) -> &'static [View] {
+        let sides = self.dust3r.as_ref().map_or_else(|| self.convolution().has_sides(), Dust3r::has_sides);
+        if sides { &View::ALL } else { &View::ALL[..2] }
     }
 
     /// δ `[1]`.
@@ -123,7 +178,7 @@ impl PointPredictor {
 
     /// The map of a view on a window of the canvas, measured from the anchors in force.
     pub fn anchored(&self, view: View, map: PointMap, window: &Window) -> PointMap {
-        let config = self.dust3r.config();
+        let config = &self.config;
         match config.anchor {
             Anchor::None => map,
             Anchor::Ray => {
@@ -155,15 +210,53 @@ impl PointPredictor {
         self.anchored(view, self.to_canvas(map, factor, method, weights), window)
     }
 
-    /// Point maps of all views in one call, at network resolution and without δ: photographs `[B, 3, H, W]` in
-    /// [−1, 1], both sides multiples of the patch.
-    pub fn forward(&self, front: Tensor<4>, back: Tensor<4>) -> Vec<(View, PointMap)> {
-        let [b, _, h, w] = front.dims();
-        let grid = self.dust3r.grid([h, w]);
-        let tokens = self.dust3r.encode(Tensor::cat(vec![front, back], 0));
-        let maps = self.dust3r.decode(tokens.clone().narrow(0, 0, b), tokens.narrow(0, b, b), grid);
-        let activated =
-            |&view| (view, activate(self.dust3r.raw_points(view, &maps, grid), self.dust3r.config()));
-        self.dust3r.views().iter().map(activated).collect()
+    /// What each photograph shows.
+    pub fn encode(&self, Input { images, grid }: Input) -> Encoded {
+        match &self.dust3r {
+            Some(dust3r) => Encoded::Tokens(dust3r.encode(images, &grid), grid),
+            None => {
+                let b = images.dims()[0] / 2;
+                let (front, back) = (images.clone().narrow(0, 0, b), images.narrow(0, b, b));
+                Encoded::Levels(self.convolution().encode(front, back))
+            }
+        }
+    }
+
+    /// What they show together.
+    pub fn decode(&self, encoded: Encoded) -> Decoded {
+        match encoded {
+            Encoded::Tokens(tokens, grid) => {
+                let b = tokens.dims()[0] / 2;
+                let (front, back) = (tokens.clone().narrow(0, 0, b), tokens.narrow(0, b, b));
+                Decoded::Tokens(self.transformer().decode(front, back, &grid), grid)
+            }
+            Encoded::Levels(levels) => Decoded::Levels(levels),
+        }
+    }
+
+    /// Point maps of all views at network resolution and without δ.
+    pub fn heads(&self, decoded: &Decoded) -> Vec<(View, PointMap)> {
+        let raw: Vec<Tensor<4>> = match decoded {
+            Decoded::Tokens(maps, grid) => {
+                let net = self.transformer();
+                self.views().iter().map(|view| net.raw_points(*view, maps, grid)).collect()
+            }
+            Decoded::Levels(levels) => {
+                let net = self.convolution();
+                let sides = net.has_sides().then(|| net.sides(levels));
+                net.photographed(levels).into_iter().chain(sides.into_iter().flatten()).collect()
+            }
+        };
+        let map = |(&view, raw): (&View, Tensor<4>)| {
+            // What was seen in a mirror lies in a mirror.
+            let raw = if self.config.mirror && view == View::Back { raw.flip([3]) } else { raw };
+            (view, activate(raw, &self.config))
+        };
+        self.views().iter().zip(raw).map(map).collect()
+    }
+
+    /// Point maps of all views at network resolution and without δ.
+    pub fn forward(&self, input: Input) -> Vec<(View, PointMap)> {
+        self.heads(&self.decode(self.encode(input)))
     }
 }

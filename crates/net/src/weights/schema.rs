@@ -1,6 +1,7 @@
 //! Names, shapes and initial distributions of every tensor of a checkpoint, from the config alone (SNAPSNAP §3.1, §8.2).
 
-use crate::config::{Config, Fusion, HeadKind, NetworkConfig, RegressorConfig, RegressorStart};
+use crate::config::{Body, Config, Fusion, HeadKind, NetworkConfig, RegressorConfig, RegressorStart};
+use crate::network::LEVELS;
 use crate::regressor::{FEATURES, INPUT_CHANNELS};
 
 /// What of a checkpoint a tensor belongs to.
@@ -45,6 +46,8 @@ impl TensorSpec {
 pub const SCALE: &str = "scale";
 /// Prefix of the two-view network's keys.
 pub const DUST3R: &str = "dust3r.";
+/// Prefix of the convolutional network's keys.
+pub const UNET: &str = "unet.";
 /// Prefix of the second regressor's keys (`regressor.networks = 2`), which sees the side views.
 pub const SIDE: &str = "side.";
 
@@ -52,7 +55,10 @@ pub const SIDE: &str = "side.";
 pub fn tensors(config: &Config) -> Vec<TensorSpec> {
     let mut list = List { tensors: Vec::new(), part: Part::PointPredictor };
     list.push(SCALE.into(), &[], Init::Constant(config.network.delta as f32));
-    point_predictor(&config.network, &mut list);
+    match config.network.body {
+        Body::Transformer => point_predictor(&config.network, &mut list),
+        Body::Convolution => point_unet(&config.network, &mut list),
+    }
     list.part = Part::Regressor;
     regressor(&config.regressor, "", &mut list);
     if config.regressor.networks == 2 {
@@ -109,21 +115,64 @@ impl List {
         self.xavier(&format!("{key}.fc2"), &[dim, ratio * dim]);
     }
 
+    /// Blocks of self-attention and MLP.
+    fn encoder_blocks(&mut self, key: &str, depth: usize, dim: usize, ratio: usize) {
+        for n in 0..depth {
+            self.norm(&format!("{key}.{n}.norm1"), dim);
+            self.self_attention(&format!("{key}.{n}.attn"), dim);
+            self.norm(&format!("{key}.{n}.norm2"), dim);
+            self.mlp(&format!("{key}.{n}.mlp"), dim, ratio);
+        }
+    }
+
+    /// A residual unit of two convolutions of each width.
+    fn units(&mut self, key: &str, widths: &[usize]) {
+        for (level, width) in widths.iter().enumerate() {
+            (1..=2).for_each(|n| self.conv(&format!("{key}.{level}.conv{n}"), *width, *width, 3));
+        }
+    }
+
     fn self_attention(&mut self, key: &str, dim: usize) {
         self.xavier(&format!("{key}.qkv"), &[3 * dim, dim]);
         self.xavier(&format!("{key}.proj"), &[dim, dim]);
     }
 }
 
-fn point_predictor(c: &NetworkConfig, list: &mut List) {
-    list.xavier(&format!("{DUST3R}patch_embed.proj"), &[c.enc_dim, 3, c.patch, c.patch]);
-    for n in 0..c.enc_depth {
-        let key = format!("{DUST3R}enc_blocks.{n}");
-        list.norm(&format!("{key}.norm1"), c.enc_dim);
-        list.self_attention(&format!("{key}.attn"), c.enc_dim);
-        list.norm(&format!("{key}.norm2"), c.enc_dim);
-        list.mlp(&format!("{key}.mlp"), c.enc_dim, c.mlp_ratio);
+/// Layers of the convolutional body.
+fn point_unet(c: &NetworkConfig, list: &mut List) {
+    let (widths, coarsest) = (c.layer_dims, c.layer_dims[LEVELS - 1]);
+    list.conv(&format!("{UNET}conv_in"), 2 * c.input_channels(), widths[0], 3);
+    list.units(&format!("{UNET}units"), &widths);
+    for level in 1..LEVELS {
+        list.conv(&format!("{UNET}down.{}", level - 1), widths[level - 1], widths[level], 3);
     }
+    let attention = |list: &mut List, key: &str, [from, dim, depth]: [usize; 3]| {
+        let key = format!("{UNET}{key}");
+        list.xavier(&format!("{key}.embed"), &[dim, from]);
+        list.encoder_blocks(&format!("{key}.blocks"), depth, dim, c.mlp_ratio);
+        list.norm(&format!("{key}.norm"), dim);
+        list.xavier(&format!("{key}.proj"), &[coarsest, dim]);
+    };
+    let decoder = |list: &mut List, key: &str| {
+        let key = format!("{UNET}{key}");
+        list.units(&format!("{key}.units"), &widths);
+        for level in 1..LEVELS {
+            list.conv(&format!("{key}.up.{}", level - 1), widths[level], widths[level - 1], 1);
+        }
+        list.conv(&format!("{key}.conv_mid"), widths[0], c.last_dim, 3);
+        list.conv(&format!("{key}.conv_out"), c.last_dim, 8, 1);
+    };
+    attention(list, "attention", [coarsest, c.enc_dim, c.enc_depth]);
+    decoder(list, "decoder");
+    if c.side_heads {
+        attention(list, "side_attention", [c.enc_dim, c.dec_dim, c.dec_depth]);
+        decoder(list, "side_decoder");
+    }
+}
+
+fn point_predictor(c: &NetworkConfig, list: &mut List) {
+    list.xavier(&format!("{DUST3R}patch_embed.proj"), &[c.enc_dim, c.input_channels(), c.patch, c.patch]);
+    list.encoder_blocks(&format!("{DUST3R}enc_blocks"), c.enc_depth, c.enc_dim, c.mlp_ratio);
     list.norm(&format!("{DUST3R}enc_norm"), c.enc_dim);
     list.xavier(&format!("{DUST3R}decoder_embed"), &[c.dec_dim, c.enc_dim]);
     for stack in ["dec_blocks", "dec_blocks2"] {

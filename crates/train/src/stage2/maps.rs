@@ -42,7 +42,7 @@ impl Maps {
             hash.update(name);
             update(&mut hash, &values);
         }
-        Self { folder: root.join(name(hash)), views: predictor.dust3r.views().to_vec() }
+        Self { folder: root.join(name(hash)), views: predictor.views().to_vec() }
     }
 
     /// The point maps of a sample's photographs, computed in `precision` on `device`: those that are there, or else what

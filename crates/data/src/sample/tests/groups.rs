@@ -51,3 +51,64 @@ fn sides_of_groups_are_seen_from_where_the_front_says() {
     assert!(apart.length() < 1e-9, "{apart}");
     assert!(Stage1::new(folder, TRAIN, SampleConfig::compat()).is_err());
 }
+
+/// Photographs are put where a user's are; the points of the front project where its pixels lie, those of the sides where the
+/// nominal cameras see them; and the front's camera, moved with them, still tells where they are in the world.
+#[test]
+fn placed_samples_lie_where_the_nominal_cameras_see_them() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let mut config = DataConfig::default();
+    (config.views.count, config.views.resolution) = (4, 128);
+    config.views.arrangement = Arrangement::Groups;
+    config.jitter.rig = Jitter { distance: 0.3, look_at: 0.03, pitch: 2.0, ..Jitter::default() };
+    let folder = Folder::create(temporary.path(), config.description("a test")).expect("makes the folder");
+    config.add(&folder, &Subject::plain(Split::Train, "0000"), person()).expect("adds a subject");
+    let folder = Arc::new(Folder::open(folder.root()).expect("opens"));
+    let samples = SampleConfig {
+        place: true,
+        person_height: 700,
+        points: true,
+        repeat: 1,
+        augment: Augment::none(),
+        ..SampleConfig::default()
+    };
+    let item =
+        Stage2::new(folder.clone(), TRAIN, samples.clone()).expect("samples").sample(0).expect("a sample");
+    let first = Stage1::new(folder.clone(), TRAIN, samples).expect("samples").sample(0).expect("a sample");
+    assert_eq!((&first.points, &first.images), (&item.points, &item.images));
+    let side = 128;
+    let rows = |mask: &[f32]| mask.chunks(side).filter(|row| row.contains(&1.0)).count();
+    for mask in item.masks.chunks(side * side) {
+        assert_eq!(rows(mask), (700.0 / 1024.0 * side as f32).round() as usize);
+    }
+    let around = Camera::orbit_at_yaw_degrees(0.0, side as u32).world_to_camera.inverse();
+    // The front's points keep the perspective of their own distance; in a side, of pixels at an edge one may be taken for the
+    // next. Where nothing was moved, it is twenty pixels.
+    for (view, degrees) in [(0, 0.0), (2, 90.0), (3, 270.0)] {
+        let camera = Camera::orbit_at_yaw_degrees(degrees, side as u32);
+        let (mut sum, mut most, mut seen) = (0.0, 0.0_f64, 0);
+        for pixel in (0..side * side).filter(|pixel| item.valid[view * side * side + pixel] > 0.5) {
+            let at = 3 * (view * side * side + pixel);
+            let point = Vec3::from_slice(&item.points[at..at + 3]).as_dvec3();
+            let (place, _) = camera.project(around.apply(point)).expect("in front");
+            let centre = DVec2::new((pixel % side) as f64, (pixel / side) as f64) + 0.5;
+            (sum, most, seen) =
+                (sum + (place - centre).length(), most.max((place - centre).length()), seen + 1);
+        }
+        let mean = sum / f64::from(seen);
+        assert!(seen > 300 && mean < 0.5 && most < 6.0, "view {view}: {seen} points, {mean}, {most} px");
+    }
+    // A point of the front's in the world lies on the surface that the stored depths tell of.
+    let stored = folder.depth(TRAIN, "0000", 0).expect("reads");
+    let to_world = item.cameras[0].world_to_camera.inverse();
+    let mut off = Vec::new();
+    for pixel in (0..side * side).filter(|pixel| item.valid[*pixel] > 0.5) {
+        let point = to_world.apply(Vec3::from_slice(&item.points[3 * pixel..3 * pixel + 3]).as_dvec3());
+        let (place, depth) = stored.camera.project(point).expect("in front");
+        let there = stored.depth[place.y as usize * side + place.x as usize];
+        off.push((f64::from(there) - depth).abs());
+    }
+    // Some lie on the very edge between two pixels.
+    let wrong = off.iter().filter(|off| **off > 1e-4).count();
+    assert!(wrong * 20 < off.len(), "{wrong} of {} points", off.len());
+}

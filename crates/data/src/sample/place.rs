@@ -1,0 +1,174 @@
+//! Photographs to learn from on their canvas as a user's are put there (LEARNING.md, "Targets"), and the points that belong to
+//! them. A person is then always as high and in the same place, and how far away the camera stood, which no picture tells, is
+//! no part of what is learned: points are moved, all of a sample's alike, until those of the front project in the nominal
+//! camera where its pixels lie.
+
+use glam::{DMat3, DVec2, DVec3};
+use image::{GrayImage, RgbImage};
+use rand::Rng;
+use snapsnap_mesh::FileError;
+use snapsnap_splat::Camera;
+
+use super::{INSIDE, Photograph, Source};
+use crate::dataset::{StoredView, unproject};
+use crate::photo::Mapping;
+
+/// Depth that the published code gives the background: 1/(0 + 10⁻⁸).
+const COMPAT_FAR: f32 = 1e8;
+/// How often a side pixel's depth is looked up where its last one leads.
+const LOOKUPS: usize = 3;
+
+/// Two photographs and what four views see.
+pub(super) struct Four {
+    /// `[2,3,H,W]` front and back in [−1, 1] times the mask.
+    pub images: Vec<f32>,
+    /// `[2,H,W]` 1 where the input masks see the person.
+    pub masks: Vec<f32>,
+    /// `[4,H,W,3]` metres in the front's frame, and where there are any `[4,H,W]`.
+    pub points: Vec<f32>,
+    pub valid: Vec<f32>,
+    /// The front's camera, in whose frame the points are: where they were moved, it was moved with them.
+    pub front: Camera,
+}
+
+impl Source {
+    /// Front, back, right and left of a subject.
+    pub(super) fn four(
+        &self,
+        subject: &str,
+        order: &[usize; 4],
+        random: &mut impl Rng,
+    ) -> Result<Four, FileError> {
+        let compat = self.config.compat;
+        let views = (0..4).map(|i| self.view_for(subject, order[i], i < 2 || compat));
+        let views: Vec<StoredView> = views.collect::<Result<_, _>>()?;
+        let cameras: Vec<Camera> = views.iter().map(|view| self.camera(&view.camera)).collect();
+        let photographs = [0, 1].map(|i| self.photograph((&views[i].color, &views[i].mask), random));
+        let mut front = cameras[0];
+        let (mut points, mut valid) = (Vec::new(), Vec::new());
+        let sights = views.iter().zip(&cameras).map(|(view, camera)| Sight { view, camera });
+        if !self.config.place {
+            for Sight { view, camera } in sights {
+                points.extend(unproject(view, camera, &front, if compat { COMPAT_FAR } else { 0.0 }));
+                let there = |pixel: usize| match compat {
+                    true => view.mask.as_raw()[pixel] >= INSIDE,
+                    false => view.depth[pixel] > 0.0,
+                };
+                valid.extend((0..view.depth.len()).map(|pixel| f32::from(u8::from(there(pixel)))));
+            }
+        } else {
+            let sights: Vec<Sight> = sights.collect();
+            front.world_to_camera.translation +=
+                shift(&sights[0].through(&photographs[0].mapping, &front), front.width);
+            let [front_seen, back_seen] = [0, 1].map(|i| sights[i].through(&photographs[i].mapping, &front));
+            let [right, left] =
+                [(2, 90.0), (3, 270.0)].map(|(i, degrees)| sights[i].from_nominal(&front, degrees));
+            for seen in [front_seen, back_seen, right, left].into_iter().flatten() {
+                points.extend(seen.unwrap_or_default().as_vec3().to_array());
+                valid.push(f32::from(u8::from(seen.is_some())));
+            }
+        }
+        let [Photograph { image, mask, .. }, back] = photographs;
+        Ok(Four {
+            images: [image, back.image].concat(),
+            masks: [mask, back.mask].concat(),
+            points,
+            valid,
+            front,
+        })
+    }
+
+    /// The pictures of front and back alone, where no points are asked for and none are needed.
+    pub(super) fn two(
+        &self,
+        pictures: [&(RgbImage, GrayImage); 2],
+        random: &mut impl Rng,
+    ) -> (Vec<f32>, Vec<f32>) {
+        let [front, back] = pictures.map(|(color, mask)| self.photograph((color, mask), random));
+        ([front.image, back.image].concat(), [front.mask, back.mask].concat())
+    }
+}
+
+/// Points of a canvas's pixels, row by row, in the front's frame, where there are any.
+type Seen = Vec<Option<DVec3>>;
+
+/// A view and its camera.
+#[derive(Clone, Copy)]
+struct Sight<'a> {
+    view: &'a StoredView,
+    camera: &'a Camera,
+}
+
+impl Sight<'_> {
+    /// The point at a place of the view, in the camera's frame: that of its pixel's depth.
+    fn point(&self, place: DVec2) -> Option<DVec3> {
+        let side = self.camera.width as usize;
+        let (column, row) = (place.x.floor(), place.y.floor());
+        if column < 0.0 || row < 0.0 || column as usize >= side || row as usize >= side {
+            return None;
+        }
+        let z = self.view.depth[row as usize * side + column as usize];
+        let ray = (place - self.camera.principal_point) / self.camera.focal;
+        (z > 0.0).then(|| f64::from(z) * ray.extend(1.0))
+    }
+
+    /// What the view sees at the pixels of a canvas that it was put on.
+    fn through(&self, mapping: &Mapping, front: &Camera) -> Seen {
+        let to_front = self.camera.world_to_camera.inverse().then(&front.world_to_camera);
+        let seen = |place| self.point(mapping.source(place)).map(|p| to_front.apply(p));
+        centres(self.camera.width).map(seen).collect()
+    }
+
+    /// What the nominal camera `degrees` around the body's axis from the front's sees, as it would stand in the frame of
+    /// `front`: points that the view saw, each at the pixel that it projects to.
+    fn from_nominal(&self, front: &Camera, degrees: f64) -> Seen {
+        let [nominal, nominal_front] =
+            [degrees, 0.0].map(|yaw| Camera::orbit_at_yaw_degrees(yaw, self.camera.width));
+        let to_front = nominal.world_to_camera.inverse().then(&nominal_front.world_to_camera);
+        let to_view = to_front.then(&front.world_to_camera.inverse()).then(&self.camera.world_to_camera);
+        let from_view = to_view.inverse();
+        let all = centres(self.camera.width).filter_map(|place| self.point(place));
+        let (sum, count) = all.fold((0.0, 0.0), |(sum, count), p| (sum + from_view.apply(p).z, count + 1.0));
+        if count == 0.0 {
+            return vec![None; self.view.depth.len()];
+        }
+        let seen = |place: DVec2| {
+            let ray = ((place - nominal.principal_point) / nominal.focal).extend(1.0);
+            let mut found = DVec3::new(0.0, 0.0, sum / count);
+            for _ in 0..LOOKUPS {
+                let there = to_view.apply(found.z * ray);
+                if there.z <= 0.0 {
+                    return None;
+                }
+                let pixel = self.camera.focal * there.truncate() / there.z + self.camera.principal_point;
+                found = from_view.apply(self.point(pixel)?);
+            }
+            Some(to_front.apply(found))
+        };
+        centres(self.camera.width).map(seen).collect()
+    }
+}
+
+/// Centres of a square picture's pixels, row by row.
+fn centres(side: u32) -> impl Iterator<Item = DVec2> {
+    (0..side).flat_map(move |row| (0..side).map(move |column| DVec2::new(column.into(), row.into()) + 0.5))
+}
+
+/// The shift t, in metres, after which points p of a canvas's pixels project there best in the nominal camera: the least
+/// squares of f·t_x − (u − c_x)·t_z = (u − c_x)·z − f·x and the same downwards.
+fn shift(seen: &Seen, side: u32) -> DVec3 {
+    let nominal = Camera::orbit_at_yaw_degrees(0.0, side);
+    let (mut matrix, mut right) = (DMat3::ZERO, DVec3::ZERO);
+    for (place, point) in centres(side).zip(seen).filter_map(|(place, point)| Some((place, (*point)?))) {
+        let ray = (place - nominal.principal_point) / nominal.focal;
+        for (row, value) in [
+            (DVec3::new(1.0, 0.0, -ray.x), ray.x * point.z - point.x),
+            (DVec3::new(0.0, 1.0, -ray.y), ray.y * point.z - point.y),
+        ] {
+            matrix += DMat3::from_cols(row * row.x, row * row.y, row * row.z);
+            right += row * value;
+        }
+    }
+    // A single point, or none, tells no distance.
+    if matrix.determinant().abs() < 1e-9 { DVec3::ZERO } else { matrix.inverse() * right }
+}

@@ -1,0 +1,69 @@
+//! Photographs on their canvas → what the point predictor sees of them.
+
+use burn::tensor::{Device, Tensor, TensorData};
+
+use super::{Grid, View};
+use crate::config::Config;
+use crate::crop::Window;
+use crate::resample::shrink;
+
+/// What the point predictor sees of B pairs of photographs.
+#[derive(Debug, Clone)]
+pub struct Input {
+    /// `[2·B, C, h, w]`, all fronts, then all backs: colours in [−1, 1] times the mask, then what else the config adds.
+    pub images: Tensor<4>,
+    /// Which tokens a transformer has of them.
+    pub grid: Grid,
+}
+
+impl Input {
+    /// Of photographs `[2·B, 3, S, S]` on their canvas, all fronts, then all backs, and their masks `[2·B, 1, S, S]`, the
+    /// window of `config`.
+    pub fn new(config: &Config, photographs: Tensor<4>, masks: Tensor<4>, window: &Window) -> Self {
+        let n = &config.network;
+        let small = |x: Tensor<4>| shrink(window.cut(x), config.upsample_factor(), config.downsample());
+        let mut parts = vec![small(photographs)];
+        let masks = (n.mask_channel || n.drop_empty).then(|| small(masks));
+        if let (true, Some(masks)) = (n.mask_channel, &masks) {
+            parts.push(masks.clone());
+        }
+        let [count, _, height, width] = parts[0].dims();
+        if n.ray_channels {
+            let device = parts[0].device();
+            let of = |view| rays(config, view, window, &device).expand([count / 2, 2, height, width]);
+            parts.push(Tensor::cat(vec![of(View::Front), of(View::Back)], 0));
+        }
+        let images = if parts.len() > 1 { Tensor::cat(parts, 1) } else { parts.remove(0) };
+        let seen = |x: Tensor<4>| if n.mirror { mirrored_backs(x) } else { x };
+        let grid = match masks.filter(|_| n.drop_empty) {
+            Some(masks) => Grid::of_persons(&seen(masks), n.patch),
+            None => Grid::whole([height / n.patch, width / n.patch]),
+        };
+        Self { images: seen(images), grid }
+    }
+}
+
+/// The second half of a batch flipped.
+fn mirrored_backs(x: Tensor<4>) -> Tensor<4> {
+    let half = x.dims()[0] / 2;
+    Tensor::cat(vec![x.clone().narrow(0, 0, half), x.narrow(0, half, half).flip([3])], 0)
+}
+
+/// Where a photograph's network pixels lie in the plane through the body's axis, over its distance from the camera: the
+/// front's x/z and y/z, to which a back opposite has −x/z `[1, 2, h, w]`.
+fn rays(config: &Config, view: View, window: &Window, device: &Device) -> Tensor<4> {
+    /// Focal length of the nominal cameras, of the canvas (SNAPSNAP §5.3).
+    const FOCAL: f32 = 0.8;
+    let (factor, side) = (config.upsample_factor(), config.network.resolution as f32);
+    let (height, width) = (window.rows.len() / factor, window.columns.len() / factor);
+    let direction = |start: usize, i: usize| {
+        let pixel = start as f32 + (i as f32 + 0.5) * factor as f32;
+        (pixel / side - 0.5) / FOCAL
+    };
+    let sign = if view == View::Back { -1.0 } else { 1.0 };
+    let across =
+        (0..height).flat_map(|_| (0..width).map(|column| sign * direction(window.columns.start, column)));
+    let down = (0..height).flat_map(|row| (0..width).map(move |_| direction(window.rows.start, row)));
+    let values: Vec<f32> = across.chain(down).collect();
+    Tensor::from_data(TensorData::new(values, [1, 2, height, width]), device)
+}

@@ -1,0 +1,206 @@
+//! What a point predictor sees, and the convolutional one: the same on every device, and what each key says.
+
+use burn::tensor::{Device, Tensor, TensorData};
+use snapsnap_net::config::Config;
+use snapsnap_net::network::{Grid, Input, PointPredictor, View};
+use snapsnap_net::weights::random_predictor;
+use snapsnap_net::{Reconstructor, Window};
+use snapsnap_tests::{device, is_software, relative_error, values};
+
+use crate::properties::{assert_different, assert_same, config, noise, photograph, weights};
+
+const CONVOLUTION: [&str; 4] = [
+    "network.body=convolution",
+    "network.dec_depth=1",
+    "network.mask_channel=true",
+    "network.ray_channels=true",
+];
+
+/// The device, unless it is one where kernels are compiled for minutes: what a key says is the same everywhere.
+fn real_device() -> Option<Device> {
+    let device = device()?;
+    if is_software(&device) {
+        println!("SKIPPED: on a software adapter this takes minutes");
+        return None;
+    }
+    Some(device)
+}
+
+fn images([h, w]: [usize; 2], channels: usize, seed: u32, device: &Device) -> Tensor<4> {
+    Tensor::from_data(TensorData::new(noise(2 * channels * h * w, seed), [2, channels, h, w]), device)
+}
+
+/// Points and confidences of all views.
+fn maps(net: &PointPredictor, input: Input) -> Vec<(View, Vec<f32>)> {
+    let maps = net.forward(input).into_iter();
+    maps.map(|(view, map)| (view, [values(map.points), values(map.conf)].concat())).collect()
+}
+
+fn whole(config: &Config, images: Tensor<4>) -> Input {
+    let [_, _, h, w] = images.dims();
+    Input { images, grid: Grid::whole([h / config.network.patch, w / config.network.patch]) }
+}
+
+#[test]
+fn a_convolution_is_the_same_on_every_device_and_for_every_patch() {
+    let Some(device) = device() else { return };
+    for patch in [8, 16] {
+        let config = config(&[&CONVOLUTION[..], &[&format!("network.patch={patch}")]].concat());
+        let on = |device: &Device| {
+            let net = random_predictor(&config, 5, device);
+            assert_eq!(net.views().len(), 4);
+            maps(&net, whole(&config, images([48, 32], 6, 1, device)))
+        };
+        let (got, expected) = (on(&device), on(&Device::flex()));
+        for ((view, got), (_, expected)) in got.iter().zip(&expected) {
+            assert_eq!(got.len(), 48 * 32 * 4);
+            let error = relative_error(got, expected);
+            assert!(error < 1e-4, "patch {patch}, {view:?}: {error:e}");
+        }
+        // No two views are the same network's.
+        (0..4).for_each(|i| assert_different("views", &expected[i].1, &expected[(i + 1) % 4].1));
+    }
+    let config = config(&[&CONVOLUTION[..], &["network.side_heads=false"]].concat());
+    let two = maps(&random_predictor(&config, 5, &device), whole(&config, images([48, 32], 6, 1, &device)));
+    assert_eq!(two.iter().map(|(view, _)| *view).collect::<Vec<_>>(), [View::Front, View::Back]);
+}
+
+#[test]
+fn every_view_depends_on_both_photographs() {
+    let Some(device) = real_device() else { return };
+    let config = config(&CONVOLUTION);
+    let net = random_predictor(&config, 5, &device);
+    let plain = images([32, 32], 6, 1, &device);
+    let before = maps(&net, whole(&config, plain.clone()));
+    for photograph in 0..2 {
+        let other = plain.clone().slice_assign(
+            [photograph..photograph + 1, 0..6, 0..32, 0..32],
+            images([32, 32], 6, 9, &device).narrow(0, photograph, 1),
+        );
+        let after = maps(&net, whole(&config, other));
+        for ((view, a), (_, b)) in before.iter().zip(&after) {
+            assert_different(&format!("{view:?} of photograph {photograph}"), a, b);
+        }
+    }
+}
+
+/// Whoever sees the back in a mirror sees what another sees of a back that is mirrored.
+#[test]
+fn a_mirrored_back_is_the_back_of_a_mirrored_photograph() {
+    let Some(device) = real_device() else { return };
+    for body in [&CONVOLUTION[..], &["network.mask_channel=true", "network.ray_channels=true"]] {
+        let plain = config(body);
+        let mirrored = config(&[body, &["network.mirror=true"]].concat());
+        let side = plain.network.resolution;
+        let window = Window { rows: 0..side, columns: side / 4..3 * side / 4 };
+        let colors = images([side; 2], 3, 1, &device);
+        let masks = (images([side; 2], 1, 2, &device) + 1.0) * 0.5;
+        let half = |x: &Tensor<4>, i: usize| x.clone().narrow(0, i, 1);
+        let flipped = |x: &Tensor<4>| Tensor::cat(vec![half(x, 0), half(x, 1).flip([3])], 0);
+        let seen = Input::new(&mirrored, colors.clone(), masks.clone(), &window);
+        let mut other = Input::new(&plain, flipped(&colors), flipped(&masks), &window);
+        // Where a pixel lies the back's own camera knows: in front's directions the mirror image of what it would be.
+        let rays = other.images.clone().narrow(1, 4, 1);
+        let rays = Tensor::cat(vec![half(&rays, 0), -half(&rays, 1)], 0);
+        let [_, _, h, w] = other.images.dims();
+        other.images = other.images.slice_assign([0..2, 4..5, 0..h, 0..w], rays);
+        assert_same("what is seen", &values(seen.images.clone()), &values(other.images.clone()));
+        let net = |config: &Config| random_predictor(config, 5, &device);
+        let (a, b) = (net(&mirrored).forward(seen), net(&plain).forward(other));
+        for ((view, a), (_, b)) in a.into_iter().zip(b) {
+            let b = if view == View::Back { b.points.flip([2]) } else { b.points };
+            assert_same(view.name(), &values(a.points), &values(b));
+        }
+    }
+}
+
+/// The nominal cameras' focal length is 0.8 of the canvas: its right edge is 0.625 to the right.
+#[test]
+fn channels_say_how_much_of_a_pixel_is_the_person_and_where_it_lies() {
+    let device = Device::flex();
+    let config = config(&["network.mask_channel=true", "network.ray_channels=true"]);
+    let side = config.network.resolution;
+    let window = Window { rows: 32..96, columns: 64..128 };
+    let mask = Tensor::<4>::ones([2, 1, side, side], &device);
+    let mask = mask.slice_assign([0..2, 0..1, 0..side, 0..65], Tensor::zeros([2, 1, side, 65], &device));
+    let input = Input::new(&config, Tensor::zeros([2, 3, side, side], &device), mask, &window);
+    assert_eq!(input.images.dims(), [2, 6, 32, 32]);
+    let at = |photograph: usize, channel: usize, row: usize, column: usize| {
+        values(input.images.clone())[((photograph * 6 + channel) * 32 + row) * 32 + column]
+    };
+    // Two canvas pixels to one, of which one column is the person's.
+    assert_eq!((at(0, 3, 0, 0), at(0, 3, 31, 1)), (0.5, 1.0));
+    let near = |a: f32, b: f32| assert!((a - b).abs() < 1e-6, "{a} {b}");
+    near(at(0, 4, 5, 31), (127.0 / 128.0 - 0.5) / 0.8);
+    near(at(1, 4, 5, 31), -(127.0 / 128.0 - 0.5) / 0.8);
+    near(at(0, 5, 0, 7), (33.0 / 128.0 - 0.5) / 0.8);
+    near(at(1, 5, 0, 7), (33.0 / 128.0 - 0.5) / 0.8);
+}
+
+/// What the left-out tokens would have shown does not matter, and where none is left out nothing changes.
+#[test]
+fn tokens_that_show_nobody_are_left_out() {
+    let Some(device) = real_device() else { return };
+    let dropping = config(&["network.drop_empty=true"]);
+    let (side, patch) = (dropping.network.net_resolution, dropping.network.patch);
+    let net = random_predictor(&dropping, 5, &device);
+    let grid = side / patch;
+    // Somebody in all of the first photograph's tokens but the first column's, and in one pixel of that of the second's.
+    let mut masks = vec![0.0; 2 * side * side];
+    for row in 0..side {
+        masks[row * side + patch..(row + 1) * side].fill(1.0);
+    }
+    masks[side * side + (patch + 3) * side + 2] = 0.5;
+    let masks = Tensor::<4>::from_data(TensorData::new(masks, [2, 1, side, side]), &device);
+    let kept = Grid::of_persons(&masks, patch);
+    let expected: Vec<usize> = (0..grid * grid).filter(|t| t % grid > 0 || *t == grid).collect();
+    assert_eq!((kept.size, kept.kept.as_ref(), kept.tokens()), ([grid; 2], Some(&expected), expected.len()));
+    let one = images([side; 2], 3, 1, &device);
+    let other = one.clone().slice_assign([0..2, 0..3, 0..patch, 0..patch], images([patch; 2], 3, 9, &device));
+    let with =
+        |images: &Tensor<4>, grid: &Grid| maps(&net, Input { images: images.clone(), grid: grid.clone() });
+    let whole = Grid::whole([grid; 2]);
+    for (((view, a), (_, b)), ((_, c), (_, d))) in with(&one, &kept)
+        .iter()
+        .zip(&with(&other, &kept))
+        .zip(with(&one, &whole).iter().zip(&with(&other, &whole)))
+    {
+        assert_same(&format!("{view:?} without them"), a, b);
+        assert_different(&format!("{view:?} with them"), c, d);
+        assert_different(&format!("{view:?} with and without"), a, c);
+    }
+    let everybody = Tensor::<4>::ones([2, 1, side, side], &device);
+    assert_eq!(Grid::of_persons(&everybody, patch), whole);
+    assert_eq!(Grid::of_persons(&Tensor::<4>::zeros([2, 1, side, side], &device), patch), whole);
+    // Every token of the grid by its number is the whole grid.
+    let all = Grid { kept: Some((0..grid * grid).collect()), ..whole.clone() };
+    for ((view, a), (_, b)) in with(&one, &all).iter().zip(&with(&one, &whole)) {
+        assert_same(&format!("{view:?} with all"), a, b);
+    }
+}
+
+/// The plan says what was left out, and all of it gives Gaussians.
+#[test]
+fn a_reconstruction_with_every_key_says_what_it_left_out() {
+    let Some(device) = device() else { return };
+    for (body, said) in [
+        (&["network.drop_empty=true", "network.head=linear", "network.patch=8"][..], "tokens left out"),
+        (&["network.body=convolution", "network.dec_depth=1"], "channels"),
+    ] {
+        let keys = [
+            "network.window=true",
+            "network.mask_channel=true",
+            "network.ray_channels=true",
+            "network.mirror=true",
+            "network.anchor=ray",
+            "network.conf_threshold=0.4",
+        ];
+        let config = config(&[&keys[..], body].concat());
+        let (_file, weights) = weights(&config, 4);
+        let model = Reconstructor::load(&weights, &device).expect("weights");
+        let side = config.network.resolution;
+        let made = model.reconstruct(&photograph(side, 1), &photograph(side, 2), &|_| ());
+        assert!(made.gaussians.len() > 500, "{:?}", made.plan);
+        assert!(made.plan.iter().any(|line| line.contains(said)), "{:?}", made.plan);
+    }
+}
