@@ -7,11 +7,11 @@ use safetensors::Dtype;
 use safetensors::tensor::TensorView;
 use snapsnap_net::config::Config;
 use snapsnap_net::weights::{
-    ImportOptions, SideHeads, Source, WeightFile, WeightsError, export, import, init, schema,
+    Float, ImportOptions, SideHeads, Source, WeightFile, WeightsError, export, import, init, schema,
 };
 use snapsnap_tests::{data, fixture, root};
 
-const OPTIONS: ImportOptions = ImportOptions { side_heads: SideHeads::Seed, seed: 3 };
+const OPTIONS: ImportOptions = ImportOptions { side_heads: SideHeads::Seed, seed: 3, float: Float::F32 };
 
 fn tiny() -> Config {
     Config::from_file(&root().join("configs/tiny.toml"), &[]).expect("tiny.toml")
@@ -127,7 +127,7 @@ fn a_dust3r_pickle_gets_delta_and_side_heads_and_says_so() {
     let Some(folder) = fixture("full_size_keys.json").map(|p| p.with_file_name("pipeline")) else { return };
     let to = place.path("out.safetensors");
     let with = |side_heads| {
-        let options = ImportOptions { side_heads, seed: 5 };
+        let options = ImportOptions { side_heads, seed: 5, float: Float::F32 };
         let report =
             import(&[folder.join("dust3r.pth")], &place.config, options, &to, &|_, _| ()).expect("imports");
         (read(&to), report.notes.join("\n"))

@@ -15,7 +15,7 @@ const USAGE: &str = "usage: cargo xtask test [FILTERâ€¦] | lint | fuzz [OPTIONâ€
   fuzz     damaged files of every format that the program reads; see cargo xtask fuzz --help
   bundle   [--features vulkan] [-o FILE.tar.xz]: program, tests, benchmark and a script that runs them and writes a
            report, for a machine without cargo
-  COMMAND  a snapsnap command with its arguments, for example: cargo xtask reconstruct --help";
+  COMMAND  a snapsnap command with its arguments, for example: cargo xtask demo";
 
 /// Devices beside the default one that the numerical tests run on.
 const FURTHER_DEVICES: [&str; 2] = ["ndarray", "wgpu"];

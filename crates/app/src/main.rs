@@ -37,6 +37,8 @@ struct Arguments {
 
 #[derive(Subcommand)]
 enum Command {
+    /// The sample pair that comes with the program: Gaussians, pictures and a report.
+    Demo(commands::demo::Arguments),
     /// Turn a front and a back photograph into a Gaussian PLY.
     Reconstruct(commands::reconstruct::Arguments),
     /// Render a Gaussian PLY into pictures.
@@ -90,6 +92,7 @@ fn main() -> ExitCode {
         }
     };
     let result = match command {
+        Command::Demo(arguments) => commands::demo::run(&arguments, quiet),
         Command::Reconstruct(arguments) => commands::reconstruct::run(&arguments, quiet),
         Command::Render(arguments) => commands::render::run(&arguments, quiet),
         Command::Prepare(arguments) => commands::prepare::run(&arguments, quiet),

@@ -15,8 +15,8 @@ use crate::failure::Failure;
 use crate::output;
 use crate::pictures::{make_folder, write_png};
 
-/// Files that reports have, of whatever command.
-const FILES: [&str; 11] = [
+/// Files that reports on figures have, of whatever command.
+const FILES: &[&str] = &[
     "report.md",
     "config.toml",
     "people.png",
@@ -30,13 +30,15 @@ const FILES: [&str; 11] = [
     REPORT,
 ];
 /// By which a report is known; written last.
-const REPORT: &str = "report.json";
+pub const REPORT: &str = "report.json";
 /// Longest one that is looked into.
 const MOST: u64 = 256 << 20;
 
 /// Files of one report.
 pub struct ReportFolder {
     path: PathBuf,
+    /// All that there can be.
+    files: &'static [&'static str],
     is_new: bool,
     written: RefCell<Vec<String>>,
 }
@@ -45,13 +47,18 @@ impl ReportFolder {
     /// Makes the folder. Refuses one where a report's files cannot be written, or would replace one of the `inputs` or anything
     /// but an older report's.
     pub fn new(path: &Path, inputs: &[&Path]) -> Result<Self, Failure> {
+        Self::of(path, FILES, inputs)
+    }
+
+    /// The same for a report with files of its own; the last is [`REPORT`].
+    pub fn of(path: &Path, files: &'static [&'static str], inputs: &[&Path]) -> Result<Self, Failure> {
         if path.exists() && !path.is_dir() {
             return Err(Failure::Input(format!("{}: exists and is no folder", path.display())));
         }
         let is_new = !path.exists();
         make_folder(path)?;
-        let folder = Self { path: path.to_owned(), is_new, written: RefCell::default() };
-        let outputs: Vec<PathBuf> = FILES.iter().map(|name| path.join(name)).collect();
+        let folder = Self { path: path.to_owned(), files, is_new, written: RefCell::default() };
+        let outputs: Vec<PathBuf> = files.iter().map(|name| path.join(name)).collect();
         let there = outputs.iter().find(|file| file.symlink_metadata().is_ok());
         if let Some(file) = there.filter(|_| !is_report(path)) {
             let message = "is there, and not a report's of ours: give another folder";
@@ -85,7 +92,7 @@ impl ReportFolder {
         let text = serde_json::to_string_pretty(value).expect("a value") + "\n";
         self.text(REPORT, &text)?;
         let written = self.written.borrow();
-        for name in FILES.iter().filter(|name| !written.iter().any(|there| there == *name)) {
+        for name in self.files.iter().filter(|name| !written.iter().any(|there| there == *name)) {
             let path = self.path.join(name);
             match fs::remove_file(&path) {
                 Err(e) if e.kind() != io::ErrorKind::NotFound => {
@@ -97,8 +104,9 @@ impl ReportFolder {
         Ok(())
     }
 
-    fn file(&self, name: &str) -> PathBuf {
-        assert!(FILES.contains(&name), "{name}");
+    /// A file that the caller writes.
+    pub fn file(&self, name: &str) -> PathBuf {
+        assert!(self.files.contains(&name), "{name}");
         self.written.borrow_mut().push(name.to_owned());
         self.path.join(name)
     }

@@ -10,23 +10,28 @@ use crate::failure::Failure;
 
 /// File name of the weights in a folder.
 const IN_FOLDER: &str = "weights.safetensors";
+/// What is used where no weights are given: trained on made people (docs/weights.md).
+const DEFAULT: &[u8] = include_bytes!("../../../assets/weights/default.safetensors");
+/// What stands for their path.
+pub const DEFAULT_NAME: &str = "the default weights";
 
-/// Opens a weight file, or `weights.safetensors` in a folder; --config and --set win over the config stored with it.
+/// Opens a weight file, or `weights.safetensors` in a folder, or, without a path, the default weights; --config and --set win
+/// over the config stored with it.
 pub fn open(path: Option<&Path>, arguments: &ConfigArguments) -> Result<WeightFile, Failure> {
-    let Some(path) = path else {
-        let message = "no weights: give --weights FILE; make one with `import-weights` from the authors' checkpoints, \
-                       or with `init-weights` (random) to try things out";
-        return Err(Failure::Input(message.into()));
+    let path: Option<PathBuf> =
+        path.map(|path| if path.is_dir() { path.join(IN_FOLDER) } else { path.to_owned() });
+    let opened = |config: Option<Config>| match &path {
+        Some(path) => WeightFile::open(path, config),
+        None => WeightFile::embedded(DEFAULT_NAME, DEFAULT, config),
     };
-    let path: PathBuf = if path.is_dir() { path.join(IN_FOLDER) } else { path.to_owned() };
     if arguments.config.is_some() {
-        return Ok(WeightFile::open(&path, Some(arguments.resolve(("", ""))?))?);
+        return Ok(opened(Some(arguments.resolve(("", ""))?))?);
     }
-    let file = WeightFile::open(&path, None)?;
+    let file = opened(None)?;
     if arguments.set.is_empty() {
         return Ok(file);
     }
-    let stored = (format!("{} (metadata)", path.display()), file.config.to_toml());
+    let stored = (format!("{} (metadata)", file.path().display()), file.config.to_toml());
     let config = Config::from_toml(&stored.1, &stored.0, &arguments.set)?;
-    Ok(WeightFile::open(&path, Some(config))?)
+    Ok(opened(Some(config))?)
 }

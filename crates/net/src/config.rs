@@ -12,7 +12,8 @@ use serde::{Deserialize, Serialize};
 use snapsnap_splat::file;
 
 pub use modes::{
-    Anchor, Body, ConfMode, Downsample, Fusion, HeadKind, RegressorStart, RotationFrame, Upsample, WorldFrame,
+    Anchor, Body, ConfMode, Downsample, Fusion, HeadKind, RegressorColor, RegressorStart, RotationFrame,
+    Upsample, WorldFrame,
 };
 
 /// How far from an output pixel of the regressor an input pixel can matter, statistics aside: the reach of the 3×3 convolutions on the
@@ -100,6 +101,10 @@ pub struct NetworkConfig {
     pub ray_channels: bool,
     /// Whether the back photograph is seen in a mirror, so that both show a limb at the same place.
     pub mirror: bool,
+    /// How far, in pixels of a canvas of 1024, a point of an unseen side may lie outside of the photographs' silhouettes; what
+    /// lies further outside is left out. Unset: sides are taken as they are.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub hull_margin: Option<usize>,
     /// Whether a transformer's tokens without a person in either photograph are left out.
     pub drop_empty: bool,
 }
@@ -135,6 +140,7 @@ impl Default for NetworkConfig {
             mask_channel: false,
             ray_channels: false,
             mirror: false,
+            hull_margin: None,
             drop_empty: false,
         }
     }
@@ -165,6 +171,9 @@ pub struct RegressorConfig {
     /// What the network's output is measured from; unset: as published.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub start: Option<RegressorStart>,
+    /// Where a Gaussian's colour comes from; unset: the pixel's with a geometric start, else the network's own.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub color: Option<RegressorColor>,
     /// With `mode.crop`, pixels around the person's box that the network sees; unset: as far as any pixel of the person can
     /// be reached from. What is trained with less does with less.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -181,11 +190,19 @@ impl RegressorConfig {
     pub fn start(&self) -> RegressorStart {
         self.start.unwrap_or(RegressorStart::Published)
     }
+
+    /// Where a Gaussian's colour comes from.
+    pub fn color(&self) -> RegressorColor {
+        self.color.unwrap_or(match self.start() {
+            RegressorStart::Published => RegressorColor::Free,
+            RegressorStart::Geometric => RegressorColor::Residual,
+        })
+    }
 }
 
 impl Default for RegressorConfig {
     fn default() -> Self {
-        Self { networks: 1, channels: 16, groups: 16, start: None, margin: None }
+        Self { networks: 1, channels: 16, groups: 16, start: None, color: None, margin: None }
     }
 }
 
@@ -277,6 +294,7 @@ impl Config {
         let mut config = self.clone();
         config.network.upsample = Some(self.upsample());
         config.regressor.start = Some(self.regressor.start());
+        config.regressor.color = Some(self.regressor.color());
         config.regressor.margin = self.crop().then(|| self.regressor.margin());
         config.mode = ModeConfig {
             compat: self.mode.compat,

@@ -4,10 +4,11 @@ use burn::tensor::{Device, Int, Tensor, TensorData};
 use snapsnap_ops::host;
 use snapsnap_splat::{Gaussians, RigidTransform};
 
-use crate::config::{Config, RegressorConfig, RegressorStart, RotationFrame};
+use crate::config::{Config, NetworkConfig, RegressorConfig, RegressorStart, RotationFrame};
 use crate::crop::Window;
+use crate::hull::Hull;
 use crate::regressor::{Attributes, FEATURES, Geometry, Regressor, Statistics};
-use crate::sides::{Cloud, EMPTY};
+use crate::sides::{Cloud, EMPTY, is_finite};
 
 /// One view on its square canvas of side S.
 pub struct Seen<'a> {
@@ -24,6 +25,48 @@ pub struct Part {
     features: Tensor<2>,
     points: Tensor<2>,
     geometry: Option<Geometry>,
+}
+
+/// Which pixels of each view become Gaussians.
+pub struct Chosen {
+    /// `[S, S]` of every view.
+    pub valid: Vec<Vec<bool>>,
+    /// Pixels left out because their points are not finite.
+    pub lost: usize,
+    /// Pixels of the sides left out because the photographs show that nobody is there.
+    pub outside: usize,
+}
+
+impl Chosen {
+    /// Photographs' pixels by their masks `[S, S]`, those of the sides by their confidences `[V, S, S]` and by where the points
+    /// `[V, S, S, 3]` lie, in metres, front camera's frame.
+    pub fn new(config: &NetworkConfig, masks: [&[bool]; 2], points: &[f32], conf: &[f32]) -> Self {
+        let (side, area) = (config.resolution, config.resolution * config.resolution);
+        let views = conf.len() / area;
+        let hull = config.hull_margin.filter(|_| views > 2);
+        let hull = hull.map(|margin| Hull::new(masks, side, margin * side / 1024));
+        let (mut lost, mut outside) = (0, 0);
+        let mut keep = |view: usize, i: usize| {
+            let at = view * area + i;
+            let is_chosen = match masks.get(view) {
+                Some(mask) => mask[i],
+                None => conf[at] > config.conf_threshold,
+            };
+            if !is_chosen {
+                return false;
+            }
+            let point = [points[3 * at], points[3 * at + 1], points[3 * at + 2]];
+            if !is_finite(&point) {
+                lost += 1;
+                return false;
+            }
+            let is_inside = view < 2 || hull.as_ref().is_none_or(|hull| hull.contains(point));
+            outside += usize::from(!is_inside);
+            is_inside
+        };
+        let valid = (0..views).map(|view| (0..area).map(|i| keep(view, i)).collect()).collect();
+        Self { valid, lost, outside }
+    }
 }
 
 /// Pseudo images of the right and the left `[3, S, S]`: every valid pixel has the colour of the nearest valid point of the
@@ -84,7 +127,7 @@ pub fn regress(network: &Regressor, config: &Config, views: &[Seen], window: &Wi
         let n = rows.len();
         let rows = Tensor::<1, Int>::from_data(TensorData::new(rows, [n]), &device);
         let pick = |x: Tensor<4>, c: usize| x.narrow(0, i, 1).reshape([h * w, c]).select(0, rows.clone());
-        let geometry = (config.regressor.start() == RegressorStart::Geometric)
+        let geometry = Geometry::is_needed(&config.regressor)
             .then(|| Geometry::new(view.image, &view.points, view.valid, side));
         parts.push(Part {
             features: pick(features.clone(), FEATURES),

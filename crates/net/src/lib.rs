@@ -3,6 +3,7 @@
 pub mod config;
 mod crop;
 pub mod gaussians;
+mod hull;
 mod memory;
 pub mod names;
 mod neighbours;

@@ -8,11 +8,11 @@ use snapsnap_splat::{Camera, Gaussians, RigidTransform};
 
 use crate::config::{Config, Downsample, WorldFrame};
 use crate::crop::Window;
-use crate::gaussians::{Seen, assemble, placed, regress, side_images};
+use crate::gaussians::{Chosen, Seen, assemble, placed, regress, side_images};
 use crate::network::{Input, PointMap, PointPredictor, View};
 use crate::precision::Precision;
 use crate::regressor::Regressor;
-use crate::sides::{EMPTY, is_finite};
+use crate::sides::EMPTY;
 use crate::weights::{WeightFile, WeightsError};
 
 /// One photograph on its square canvas of `resolution` pixels; row-major, side S.
@@ -162,32 +162,18 @@ impl Run<'_> {
         let (points, conf) =
             self.timed("reading back", |_| (host(maps.points.clone()), host(maps.conf.clone())));
         let area = self.side * self.side;
-        let point = |view: usize, i: usize| -> [f32; 3] {
-            let at = 3 * (view * area + i);
-            [points[at], points[at + 1], points[at + 2]]
-        };
-        let threshold = self.model.config.network.conf_threshold;
-        let mut lost = 0;
-        let mut valid: Vec<Vec<bool>> = Vec::new();
-        for view in 0..views.len() {
-            let chosen = |i: usize| match photos.get(view) {
-                Some(photo) => photo.valid[i],
-                None => conf[view * area + i] > threshold,
-            };
-            let mut mask: Vec<bool> = (0..area).map(chosen).collect();
-            for (i, keep) in mask.iter_mut().enumerate() {
-                if *keep && !is_finite(&point(view, i)) {
-                    (*keep, lost) = (false, lost + 1);
-                }
-            }
-            valid.push(mask);
-        }
+        let masks = photos.map(|photo| photo.valid.as_slice());
+        let Chosen { valid, lost, outside } = Chosen::new(&self.model.config.network, masks, &points, &conf);
         for (view, mask) in views.iter().zip(&valid) {
             let n = count(mask);
             self.plan.push(format!("{}: {n} of {area} pixels become Gaussians", view.name()));
         }
         if lost > 0 {
             self.plan.push(format!("{lost} pixels left out: their points are not finite"));
+        }
+        if outside > 0 {
+            self.plan
+                .push(format!("{outside} pixels of the sides left out: no photograph shows anybody there"));
         }
 
         let side_images = if views.len() > 2 && !self.model.side_colors {

@@ -8,7 +8,7 @@ use burn::tensor::{Device, Tensor};
 use snapsnap_net::config::{ConfMode, Config, HeadKind};
 use snapsnap_net::network::{PointPredictor, View, activate};
 use snapsnap_net::regressor::{Attributes, Statistics};
-use snapsnap_net::weights::{ImportOptions, SideHeads, WeightFile, import};
+use snapsnap_net::weights::{Float, ImportOptions, SideHeads, WeightFile, import};
 use snapsnap_tests::{Numbers, assert_close, device, fixture};
 
 const TOKENS: f64 = 1e-5;
@@ -34,7 +34,7 @@ fn config(folder: &Path) -> Config {
 
 fn predictor(folder: &Path, config: &Config, device: &Device) -> PointPredictor {
     let file = tempfile::NamedTempFile::new().expect("temporary file");
-    let options = ImportOptions { side_heads: SideHeads::Seed, seed: 0 };
+    let options = ImportOptions { side_heads: SideHeads::Seed, seed: 0, float: Float::F32 };
     let names = ["weights.safetensors", "stage1.pth"];
     let weights =
         names.map(|name| folder.join(name)).into_iter().find(|path| path.exists()).expect("weights");
@@ -110,7 +110,7 @@ fn gaussian_regressor_and_its_activations() {
     let Some(folder) = fixture("unet") else { return };
     let Some(device) = device() else { return };
     let file = tempfile::NamedTempFile::new().expect("temporary file");
-    let options = ImportOptions { side_heads: SideHeads::Seed, seed: 0 };
+    let options = ImportOptions { side_heads: SideHeads::Seed, seed: 0, float: Float::F32 };
     import(&[folder.join("weights.safetensors")], &Config::default(), options, file.path(), &|_, _| ())
         .expect("import");
     let regressors =

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use burn::tensor::{Device, Tensor, TensorData};
 use snapsnap_net::config::Config;
 use snapsnap_net::regressor::Statistics;
-use snapsnap_net::weights::{ImportOptions, SideHeads, WeightFile, import};
+use snapsnap_net::weights::{Float, ImportOptions, SideHeads, WeightFile, import};
 use snapsnap_tests::{Numbers, data, device, fixture, is_software, relative_error, values};
 use snapsnap_train::networks::{Networks, Rows};
 use snapsnap_train::optimizer::OptimizerConfig;
@@ -24,7 +24,7 @@ fn predictor(device: &Device) -> (Config, Networks) {
     let folder = tempfile::tempdir().expect("temporary folder");
     let config = Config::from_toml(CONFIG, "the fixture's config", &[]).expect("a config");
     let path = folder.path().join("weights.safetensors");
-    let options = ImportOptions { side_heads: SideHeads::Seed, seed: 0 };
+    let options = ImportOptions { side_heads: SideHeads::Seed, seed: 0, float: Float::F32 };
     import(&[data("pipeline/stage1.pth")], &config, options, &path, &|_, _| ()).expect("imports");
     let weights = WeightFile::open(&path, None).expect("opens");
     let predictor = weights.point_predictor(&device.clone().autodiff()).expect("loads");

@@ -32,7 +32,7 @@ pub struct Arguments {
     /// Data sets [default: data.folders of the config].
     #[arg(long, value_name = "DATASET", num_args = 1..)]
     data: Vec<PathBuf>,
-    /// Weights to judge [default: model.weights of the config].
+    /// Weights to judge [default: model.weights of the config, else those that come with the program].
     #[arg(long, value_name = "FILE|DIR")]
     weights: Option<PathBuf>,
     /// Other weights, which are compared with these person by person.

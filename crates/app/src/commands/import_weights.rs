@@ -3,7 +3,8 @@
 use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
-use snapsnap_net::weights::{self, ImportOptions, SideHeads};
+use snapsnap_net::config::Config;
+use snapsnap_net::weights::{self, Float, ImportOptions, SideHeads};
 
 use super::{ConfigArguments, check_outputs};
 use crate::failure::Failure;
@@ -12,7 +13,7 @@ use crate::say;
 
 #[derive(Args)]
 pub struct Arguments {
-    /// Checkpoints: DUSt3R or CroCo (`.safetensors`, `.pth`), Snap-Snap stage 1 and stage 2 (`.pth`).
+    /// Checkpoints: DUSt3R or CroCo (`.safetensors`, `.pth`), Snap-Snap stage 1 and stage 2 (`.pth`), or weight files of ours.
     #[arg(required = true)]
     sources: Vec<PathBuf>,
     #[command(flatten)]
@@ -23,6 +24,9 @@ pub struct Arguments {
     /// Seed of whatever no checkpoint has.
     #[arg(long, default_value_t = 0)]
     seed: u64,
+    /// Write 16 bits per value: half the size, each value to the nearest of them.
+    #[arg(long)]
+    half: bool,
     /// Weight file to write.
     #[arg(short, long, value_name = "FILE.safetensors")]
     output: PathBuf,
@@ -37,8 +41,7 @@ enum Sides {
 }
 
 pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
-    // The only published weights of this size were trained with every quirk of the published code.
-    let config = arguments.config.resolve(("the published size", "[mode]\ncompat = true\n"))?;
+    let config = config(arguments)?;
     let inputs: Vec<&Path> =
         arguments.sources.iter().map(PathBuf::as_path).chain(arguments.config.file()).collect();
     check_outputs(&[&arguments.output], &inputs)?;
@@ -47,7 +50,8 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
         Sides::Seed => SideHeads::Seed,
         Sides::Copy => SideHeads::Copy,
     };
-    let options = ImportOptions { side_heads, seed: arguments.seed };
+    let float = if arguments.half { Float::F16 } else { Float::F32 };
+    let options = ImportOptions { side_heads, seed: arguments.seed, float };
     let report = weights::import(&arguments.sources, &config, options, &arguments.output, &|done, total| {
         progress.advance(done, total);
     })?;
@@ -64,4 +68,21 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
         ));
     }
     Ok(())
+}
+
+/// What was asked for, else what a file of ours says of itself, else the published size: the only published weights of it were
+/// trained with every quirk of the published code.
+fn config(arguments: &Arguments) -> Result<Config, Failure> {
+    if arguments.config.config.is_none() {
+        // A pickle has no place for a config.
+        for path in
+            arguments.sources.iter().filter(|path| path.extension().is_some_and(|e| e == "safetensors"))
+        {
+            if let Some(stored) = weights::stored_config(path)? {
+                let origin = format!("{} (metadata)", path.display());
+                return Ok(Config::from_toml(&stored.to_toml(), &origin, &arguments.config.set)?);
+            }
+        }
+    }
+    arguments.config.resolve(("the published size", "[mode]\ncompat = true\n"))
 }

@@ -2,6 +2,7 @@
 
 pub mod bench;
 pub mod compare;
+pub mod demo;
 pub mod evaluate;
 pub mod export_weights;
 pub mod fetch_weights;

@@ -32,7 +32,7 @@ pub struct Arguments {
     /// The pictures already are the canvas: no box, no scaling, no centring.
     #[arg(long)]
     as_is: bool,
-    /// Weight file, or a folder that holds `weights.safetensors`.
+    /// Weight file, or a folder that holds `weights.safetensors` [default: those that come with the program].
     #[arg(long, value_name = "FILE|DIR")]
     weights: Option<PathBuf>,
     #[command(flatten)]

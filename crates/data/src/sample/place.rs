@@ -62,7 +62,7 @@ impl Source {
                 shift(&sights[0].through(&photographs[0].mapping, &front), front.width);
             let [front_seen, back_seen] = [0, 1].map(|i| sights[i].through(&photographs[i].mapping, &front));
             let [right, left] =
-                [(2, 90.0), (3, 270.0)].map(|(i, degrees)| sights[i].from_nominal(&front, degrees));
+                [(2, 90.0), (3, 270.0)].map(|(i, degrees)| sights[i].as_nominal(&front, degrees));
             for seen in [front_seen, back_seen, right, left].into_iter().flatten() {
                 points.extend(seen.unwrap_or_default().as_vec3().to_array());
                 valid.push(f32::from(u8::from(seen.is_some())));
@@ -121,7 +121,7 @@ impl Sight<'_> {
 
     /// What the nominal camera `degrees` around the body's axis from the front's sees, as it would stand in the frame of
     /// `front`: points that the view saw, each at the pixel that it projects to.
-    fn from_nominal(&self, front: &Camera, degrees: f64) -> Seen {
+    fn as_nominal(&self, front: &Camera, degrees: f64) -> Seen {
         let [nominal, nominal_front] =
             [degrees, 0.0].map(|yaw| Camera::orbit_at_yaw_degrees(yaw, self.camera.width));
         let to_front = nominal.world_to_camera.inverse().then(&nominal_front.world_to_camera);

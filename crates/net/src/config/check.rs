@@ -3,7 +3,8 @@
 use crate::weights::schema::{self, TensorSpec};
 
 use super::{
-    Anchor, Body, Config, Downsample, HeadKind, RegressorStart, RotationFrame, Upsample, WorldFrame,
+    Anchor, Body, Config, Downsample, HeadKind, RegressorColor, RegressorStart, RotationFrame, Upsample,
+    WorldFrame,
 };
 
 /// Seven times the published size; 16 GB of f32. Beyond, a slip of the finger is likelier than a wish.
@@ -85,6 +86,9 @@ impl Config {
             );
             return Some(("network.resolution", message));
         }
+        if n.hull_margin.is_some_and(|margin| margin > 1024) {
+            return Some(("network.hull_margin", "must be at most 1024 (of a canvas of 1024)".into()));
+        }
         if n.conf_threshold.is_nan() {
             return Some(("network.conf_threshold", "is not a number".into()));
         }
@@ -148,8 +152,10 @@ impl Config {
             ("network.mask_channel", !self.network.mask_channel, "false"),
             ("network.ray_channels", !self.network.ray_channels, "false"),
             ("network.mirror", !self.network.mirror, "false"),
+            ("network.hull_margin", self.network.hull_margin.is_none(), "unset"),
             ("network.drop_empty", !self.network.drop_empty, "false"),
             ("regressor.start", self.regressor.start() == RegressorStart::Published, "\"published\""),
+            ("regressor.color", self.regressor.color() == RegressorColor::Free, "\"free\""),
             ("mode.rotation_frame", self.rotation_frame() == RotationFrame::World, "\"world\""),
             ("mode.downsample", self.downsample() == Downsample::Nearest, "\"nearest\""),
             ("mode.world_frame", self.world_frame() == WorldFrame::Mirrored, "\"mirrored\""),

@@ -77,6 +77,15 @@ names! {
     }
 }
 names! {
+    /// Where a Gaussian's colour comes from (LEARNING.md).
+    RegressorColor {
+        /// The network's own.
+        Free = "free",
+        /// The pixel's, which the network corrects.
+        Residual = "residual",
+    }
+}
+names! {
     /// Axes that predicted quaternions refer to.
     RotationFrame {
         /// The front camera's; rotated into the world with the means (SNAPSNAP §13.3 fix 1).

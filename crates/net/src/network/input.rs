@@ -1,6 +1,7 @@
 //! Photographs on their canvas → what the point predictor sees of them.
 
 use burn::tensor::{Device, Tensor, TensorData};
+use snapsnap_splat::Camera;
 
 use super::{Grid, View};
 use crate::config::Config;
@@ -49,21 +50,19 @@ fn mirrored_backs(x: Tensor<4>) -> Tensor<4> {
     Tensor::cat(vec![x.clone().narrow(0, 0, half), x.narrow(0, half, half).flip([3])], 0)
 }
 
-/// Where a photograph's network pixels lie in the plane through the body's axis, over its distance from the camera: the
-/// front's x/z and y/z, to which a back opposite has −x/z `[1, 2, h, w]`.
+/// Directions of a photograph's network pixels as the front's nominal camera has them, x/z and y/z, of which a back opposite
+/// has −x/z: `[1, 2, h, w]`.
 fn rays(config: &Config, view: View, window: &Window, device: &Device) -> Tensor<4> {
-    /// Focal length of the nominal cameras, of the canvas (SNAPSNAP §5.3).
-    const FOCAL: f32 = 0.8;
-    let (factor, side) = (config.upsample_factor(), config.network.resolution as f32);
+    let camera = Camera::orbit_at_yaw_degrees(0.0, config.network.resolution as u32);
+    let factor = config.upsample_factor();
     let (height, width) = (window.rows.len() / factor, window.columns.len() / factor);
-    let direction = |start: usize, i: usize| {
-        let pixel = start as f32 + (i as f32 + 0.5) * factor as f32;
-        (pixel / side - 0.5) / FOCAL
-    };
+    let middle = |start: usize, i: usize| start as f64 + (i as f64 + 0.5) * factor as f64;
     let sign = if view == View::Back { -1.0 } else { 1.0 };
-    let across =
-        (0..height).flat_map(|_| (0..width).map(|column| sign * direction(window.columns.start, column)));
-    let down = (0..height).flat_map(|row| (0..width).map(move |_| direction(window.rows.start, row)));
-    let values: Vec<f32> = across.chain(down).collect();
+    let x =
+        |column| sign * (middle(window.columns.start, column) - camera.principal_point.x) / camera.focal.x;
+    let y = |row| (middle(window.rows.start, row) - camera.principal_point.y) / camera.focal.y;
+    let across = (0..height).flat_map(|_| (0..width).map(x));
+    let down = (0..height).flat_map(|row| (0..width).map(move |_| y(row)));
+    let values: Vec<f32> = across.chain(down).map(|v| v as f32).collect();
     Tensor::from_data(TensorData::new(values, [1, 2, height, width]), device)
 }

@@ -79,6 +79,7 @@ pub enum Encoded {
 
 /// What the heads of a predictor begin with.
 #[derive(Debug, Clone)]
+#[allow(clippy::large_enum_variant, reason = "there is one at a time")]
 pub enum Decoded {
     /// Both photographs' token maps.
     Tokens([TokenMaps; 2], Grid),

@@ -5,7 +5,7 @@ use burn::tensor::{Tensor, TensorData};
 
 use snapsnap_ops::host;
 
-use crate::config::{RegressorConfig, RegressorStart};
+use crate::config::{RegressorColor, RegressorConfig, RegressorStart};
 
 /// Gaussian attributes of N pixels.
 #[derive(Debug, Clone)]
@@ -42,6 +42,11 @@ const LOG_SCALE: f64 = 2.0;
 const MOST_SPACING: f32 = 3.0;
 
 impl Geometry {
+    /// Whether a config measures anything from it.
+    pub fn is_needed(config: &RegressorConfig) -> bool {
+        config.start() == RegressorStart::Geometric || config.color() == RegressorColor::Residual
+    }
+
     /// Of the valid pixels of a view on a canvas of `side`² pixels, row by row: colours `[3, S, S]` and points
     /// `[1, S, S, 3]`.
     pub fn new(image: &[f32], points: &Tensor<4>, valid: &[bool], side: usize) -> Self {
@@ -78,24 +83,24 @@ impl Geometry {
 }
 
 impl Attributes {
-    /// Features `[N, 14]`, measured from what the config says; `geometry` is needed where it says `geometric`.
+    /// Features `[N, 14]`, measured from what the config says; `geometry` where it asks for it.
     pub fn new(config: &RegressorConfig, features: Tensor<2>, geometry: Option<Geometry>) -> Self {
-        match (config.start(), geometry) {
-            (RegressorStart::Geometric, Some(geometry)) => Self::corrections(features, geometry),
-            _ => Self::from_features(features),
+        let mut attributes = Self::from_features(features.clone());
+        let Some(Geometry { spacing, colors }) = geometry else { return attributes };
+        if config.color() == RegressorColor::Residual {
+            attributes.color = colors + attributes.color;
         }
-    }
-
-    /// Corrections of what the geometry gives.
-    fn corrections(features: Tensor<2>, Geometry { spacing, colors }: Geometry) -> Self {
+        if config.start() == RegressorStart::Published {
+            return attributes;
+        }
         let part = |from: usize, width: usize| features.clone().narrow(1, from, width);
         let upright = Tensor::from_data([[1.0, 0.0, 0.0, 0.0]], &features.device());
         Self {
             opacity: sigmoid(part(0, 1) + START_OPACITY),
             scale: (part(1, 3).tanh() * LOG_SCALE).exp() * (spacing.clone() * START_SCALE),
             rotation: unit(part(4, 4) + upright),
-            color: colors + part(8, 3).tanh(),
             offset: part(11, 3) * spacing,
+            ..attributes
         }
     }
 
@@ -158,6 +163,32 @@ mod tests {
         for (g, e) in got.iter().zip(expected) {
             assert!((g - e).abs() <= 1e-6 * e.abs().max(1e-3), "{got:?}");
         }
+    }
+
+    /// At zero output: grey or the pixel's colour, whatever the rest begins with.
+    #[test]
+    fn colours_are_the_networks_or_corrections_of_the_pixels() {
+        let device = Device::flex();
+        let geometry = Geometry {
+            spacing: Tensor::from_data([[0.01]], &device),
+            colors: Tensor::from_data([[0.5, -0.25, 1.0]], &device),
+        };
+        let of = |start, color| {
+            let config = RegressorConfig { start, color, ..RegressorConfig::default() };
+            let geometry = Geometry::is_needed(&config).then(|| geometry.clone());
+            let made = Attributes::new(&config, Tensor::zeros([1, 14], &device), geometry);
+            (values(made.color), values(made.scale)[0])
+        };
+        let (geometric, published) = (Some(RegressorStart::Geometric), Some(RegressorStart::Published));
+        let (free, residual) = (Some(RegressorColor::Free), Some(RegressorColor::Residual));
+        let (pixel, grey) = (vec![0.5, -0.25, 1.0], vec![0.0; 3]);
+        assert_eq!(of(geometric, None), of(geometric, residual));
+        assert_eq!(of(None, None), of(published, free));
+        assert_eq!((of(geometric, residual).0, of(geometric, free).0), (pixel.clone(), grey.clone()));
+        assert_eq!((of(published, residual).0, of(published, free).0), (pixel, grey));
+        assert_eq!(of(geometric, free).1, of(geometric, residual).1);
+        assert_eq!(of(published, free).1, of(published, residual).1);
+        assert_ne!(of(published, free).1, of(geometric, free).1);
     }
 
     #[test]

@@ -5,13 +5,12 @@ use std::io::{self, Write};
 use std::path::Path;
 
 use rayon::prelude::*;
-use safetensors::Dtype;
 use safetensors::tensor::{Metadata, TensorInfo};
 use snapsnap_splat::file::write_whole;
 
 use super::WeightsError;
 use super::schema::{self, Part, TensorSpec};
-use super::source::{Entry, Source, is_readable};
+use super::source::{Entry, Float, Source, is_readable};
 use crate::config::Config;
 
 /// Metadata key under which the config (TOML) is stored.
@@ -22,8 +21,6 @@ pub type Progress<'a> = &'a dyn Fn(u64, u64);
 
 /// Values per task: a second-level cache holds them.
 const CHUNK: usize = 1 << 16;
-/// Bytes of an f32.
-const F32: usize = 4;
 
 /// Writes `tensors` in order, asking `values` for one at a time, so that never more than one is in memory. All that are not
 /// finite are named at the end, as `origin`'s, and nothing is written.
@@ -32,13 +29,14 @@ pub(super) fn write(
     origin: &str,
     config: &Config,
     tensors: &[TensorSpec],
+    float: Float,
     mut values: impl FnMut(&TensorSpec) -> Result<Vec<f32>, WeightsError>,
     progress: Progress,
 ) -> Result<(), WeightsError> {
     let infos = tensors.iter().map(|t| (t.name.clone(), t.shape.clone()));
     // One entry only: the header lists metadata in no fixed order, and the same seed must give the same bytes.
     let metadata = HashMap::from([(CONFIG_KEY.into(), config.to_toml())]);
-    write_tensors(path, origin, metadata, infos.collect(), |i| values(&tensors[i]), progress)
+    write_floats(path, origin, metadata, infos.collect(), float, |i| values(&tensors[i]), progress)
 }
 
 /// Writes f32 tensors, names and shapes, in order, asking `values` for one at a time; `metadata` of more than one entry comes
@@ -52,6 +50,19 @@ pub fn write_tensors(
     origin: &str,
     metadata: HashMap<String, String>,
     tensors: Vec<(String, Vec<usize>)>,
+    values: impl FnMut(usize) -> Result<Vec<f32>, WeightsError>,
+    progress: Progress,
+) -> Result<(), WeightsError> {
+    write_floats(path, origin, metadata, tensors, Float::F32, values, progress)
+}
+
+/// [`write_tensors`] in a type of numbers, to the nearest of which values are rounded.
+fn write_floats(
+    path: &Path,
+    origin: &str,
+    metadata: HashMap<String, String>,
+    tensors: Vec<(String, Vec<usize>)>,
+    float: Float,
     mut values: impl FnMut(usize) -> Result<Vec<f32>, WeightsError>,
     progress: Progress,
 ) -> Result<(), WeightsError> {
@@ -59,8 +70,8 @@ pub fn write_tensors(
     let mut at = 0;
     let infos = tensors.into_iter().map(|(name, shape)| {
         let from = at;
-        at += shape.iter().product::<usize>() * F32;
-        (name, TensorInfo { dtype: Dtype::F32, shape, data_offsets: (from, at) })
+        at += shape.iter().product::<usize>() * float.size();
+        (name, TensorInfo { dtype: float.dtype(), shape, data_offsets: (from, at) })
     });
     let header = Metadata::new(Some(metadata), infos.collect()).expect("consecutive, exactly sized tensors");
     let mut header = serde_json::to_vec(&header).expect("the header has only JSON types");
@@ -83,9 +94,10 @@ pub fn write_tensors(
         let mut written = 0;
         let mut problems = Vec::new();
         for (i, name) in names.iter().enumerate() {
-            let values = values(i).map_err(Failure::Weights)?;
+            // What is beyond the range of 16 bits becomes infinite.
+            let values = float.rounded(values(i).map_err(Failure::Weights)?);
             problems.extend(not_finite(name, &values));
-            let bytes: Vec<u8> = values.iter().flat_map(|v| v.to_le_bytes()).collect();
+            let bytes = float.bytes(&values);
             out.write_all(&bytes)?;
             written += bytes.len();
             progress(written as u64, at as u64);
@@ -117,7 +129,7 @@ pub fn save(config: &Config, values: &BTreeMap<String, Vec<f32>>, path: &Path) -
         assert_eq!(values.len(), spec.elements(), "{}", spec.name);
         Ok(values.clone())
     };
-    write(path, &path.display().to_string(), config, &tensors, read, &|_, _| ())
+    write(path, &path.display().to_string(), config, &tensors, Float::F32, read, &|_, _| ())
 }
 
 /// A line for a tensor with values that are not finite.
@@ -141,10 +153,22 @@ impl WeightFile {
     /// # Errors
     /// [`WeightsError`], naming every tensor that is missing, unused, mis-shaped or of the wrong type.
     pub fn open(path: &Path, config: Option<Config>) -> Result<Self, WeightsError> {
-        let source = Source::open(path)?;
+        Self::checked(Source::open(path)?, config)
+    }
+
+    /// The same of a safetensors file that is part of the program; `name` stands for its path.
+    ///
+    /// # Errors
+    /// As [`Self::open`].
+    pub fn embedded(name: &str, bytes: &'static [u8], config: Option<Config>) -> Result<Self, WeightsError> {
+        Self::checked(Source::embedded(name, bytes)?, config)
+    }
+
+    fn checked(source: Source, config: Option<Config>) -> Result<Self, WeightsError> {
+        let path = source.path();
         let config = match config {
             Some(config) => config,
-            None => stored_config(&source)?,
+            None => source.config()?,
         };
         let mut problems = Vec::new();
         let parts = parts_of(source.tensors().keys());
@@ -159,10 +183,11 @@ impl WeightFile {
         let names: BTreeSet<_> = expected.iter().map(|t| t.name.as_str()).collect();
         let unused = source.tensors().keys().filter(|k| !names.contains(k.as_str()));
         problems.extend(unused.map(|k| format!("not part of the configured networks: {}", k.escape_debug())));
+        let origin = path.display().to_string();
         if problems.is_empty() {
             return Ok(Self { source, config });
         }
-        Err(WeightsError::Tensors { origin: path.display().to_string(), problems })
+        Err(WeightsError::Tensors { origin, problems })
     }
 
     /// The file.
@@ -187,7 +212,7 @@ impl WeightFile {
         }
         let message = match part {
             Part::PointPredictor => {
-                "has no point predictor (`dust3r.*`): import a stage-1 checkpoint as well"
+                "has no point predictor (`dust3r.*`, `unet.*`): import a stage-1 checkpoint as well"
             }
             Part::Regressor => {
                 "has no Gaussian regressor (`pred_unet.*`, `gs_conv.*`): import a stage-2 checkpoint as well"
@@ -195,17 +220,6 @@ impl WeightFile {
         };
         Err(WeightsError::format(self.path(), message))
     }
-}
-
-/// The config in a file's metadata.
-fn stored_config(source: &Source) -> Result<Config, WeightsError> {
-    let text = source.metadata.get(CONFIG_KEY).ok_or_else(|| {
-        WeightsError::format(
-            source.path(),
-            "has no config in its metadata; give one with --config, or import it first",
-        )
-    })?;
-    Ok(Config::from_toml(text, &format!("{} (metadata {CONFIG_KEY})", source.path().display()), &[])?)
 }
 
 /// Which parts a set of keys touches.

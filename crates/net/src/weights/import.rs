@@ -4,10 +4,10 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use super::WeightsError;
-use super::file::{Progress, mismatch, parts_of, write};
+use super::file::{CONFIG_KEY, Progress, mismatch, parts_of, write};
 use super::init::{SideHeads, draw};
-use super::schema::{self, DUST3R, SCALE, SIDE, TensorSpec};
-use super::source::{Source, is_readable};
+use super::schema::{self, DUST3R, SCALE, SIDE, TensorSpec, UNET};
+use super::source::{Float, Source, is_readable};
 use crate::config::Config;
 
 /// Choices an import leaves to the user.
@@ -17,6 +17,17 @@ pub struct ImportOptions {
     pub side_heads: SideHeads,
     /// Seed of what is drawn.
     pub seed: u64,
+    /// What the file is written in.
+    pub float: Float,
+}
+
+/// The config stored in a weight file of ours; `None` for a checkpoint of somebody else's.
+///
+/// # Errors
+/// [`WeightsError`] for a file that is no checkpoint, or whose config makes no sense.
+pub fn stored_config(path: &Path) -> Result<Option<Config>, WeightsError> {
+    let source = Source::open(path)?;
+    source.metadata.contains_key(CONFIG_KEY).then(|| source.config()).transpose()
 }
 
 /// What an import did.
@@ -53,7 +64,7 @@ pub(super) fn alias_of(name: &str) -> Option<String> {
 /// The name we keep for a key of the authors' files: prefix added, alias replaced.
 fn canonical(key: &str) -> String {
     let bare = key.strip_prefix(DUST3R).unwrap_or(key);
-    if bare == SCALE || ["pred_unet.", "gs_conv.", SIDE].iter().any(|p| bare.starts_with(p)) {
+    if bare == SCALE || ["pred_unet.", "gs_conv.", SIDE, UNET].iter().any(|p| bare.starts_with(p)) {
         return bare.to_owned();
     }
     if let Some((head, tail)) = bare.split_once("scratch.layer_rn.")
@@ -99,7 +110,7 @@ pub fn import(
         Origin::Drawn => Ok(draw(spec, options.seed)),
         Origin::File(source, key) => source.read_f32(key),
     };
-    write(to, &origin, config, &specs, values, progress)?;
+    write(to, &origin, config, &specs, options.float, values, progress)?;
     report.tensors = specs.len();
     report.parameters = specs.iter().map(TensorSpec::elements).sum();
     Ok(report)

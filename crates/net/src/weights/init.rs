@@ -9,6 +9,7 @@ use rand_chacha::ChaCha8Rng;
 use super::WeightsError;
 use super::file::{Progress, write};
 use super::schema::{self, Init, TensorSpec};
+use super::source::Float;
 use crate::config::Config;
 
 /// Where the side heads come from when a checkpoint has none.
@@ -47,7 +48,7 @@ fn fnv1a(text: &str) -> u64 {
 /// [`WeightsError::Write`].
 pub fn init(config: &Config, seed: u64, path: &Path, progress: Progress) -> Result<usize, WeightsError> {
     let tensors = schema::tensors(config);
-    write(path, "random weights", config, &tensors, |spec| Ok(draw(spec, seed)), progress)?;
+    write(path, "random weights", config, &tensors, Float::F32, |spec| Ok(draw(spec, seed)), progress)?;
     Ok(tensors.iter().map(TensorSpec::elements).sum())
 }
 

@@ -16,10 +16,10 @@ use std::path::{Path, PathBuf};
 pub use crate::names::{NamedMapper, NamedVisitor, map_named, visit_named};
 pub use export::export;
 pub use file::{CONFIG_KEY, Progress, WeightFile, not_finite, save, write_tensors};
-pub use import::{ImportOptions, ImportReport, import};
+pub use import::{ImportOptions, ImportReport, import, stored_config};
 pub use init::{SideHeads, init};
 pub use load::{random_predictor, random_regressors};
-pub use source::{Entry, Source};
+pub use source::{Entry, Float, Source};
 
 /// What can be wrong with weights.
 #[derive(Debug, thiserror::Error)]

@@ -8,10 +8,13 @@ use std::path::{Path, PathBuf};
 use burn::tensor::{bf16, f16};
 use pytorch_reader::PytorchReader;
 use rayon::prelude::*;
+use safetensors::Dtype;
 use safetensors::tensor::Metadata;
 use snapsnap_splat::file;
 
 use super::WeightsError;
+use super::file::CONFIG_KEY;
+use crate::config::Config;
 
 /// A checkpoint whose tensors can be read by name.
 pub struct Source {
@@ -37,6 +40,8 @@ pub struct Entry {
 
 enum Reader {
     Safetensors(File),
+    /// A safetensors file in memory.
+    Embedded(&'static [u8]),
     Pytorch(BTreeMap<String, pytorch_reader::Tensor>),
 }
 
@@ -67,15 +72,34 @@ impl Source {
         Self::pytorch(path)
     }
 
+    /// A safetensors file that is part of the program; `name` stands for its path.
+    ///
+    /// # Errors
+    /// [`WeightsError`] if it is none.
+    pub fn embedded(name: &str, bytes: &'static [u8]) -> Result<Self, WeightsError> {
+        let path = Path::new(name);
+        let Some((start, rest)) = bytes.split_first_chunk::<8>() else {
+            return Err(WeightsError::format(path, "not a safetensors file (no header)"));
+        };
+        let header = u64::from_le_bytes(*start);
+        let text = &rest[..rest.len().min(usize::try_from(header).unwrap_or(usize::MAX))];
+        Self::described(path, text, bytes.len() as u64, Reader::Embedded(bytes))
+    }
+
     fn safetensors(path: &Path, mut file: File, header: u64) -> Result<Self, WeightsError> {
         let read = |source| WeightsError::Read { path: path.to_owned(), source };
         let size = file.metadata().map_err(read)?.len();
         let mut text = vec![b'{'; 1];
         (&mut file).take(header - 1).read_to_end(&mut text).map_err(read)?;
-        let metadata: Metadata = serde_json::from_slice(&text).map_err(|e| {
+        Self::described(path, &text, size, Reader::Safetensors(file))
+    }
+
+    /// A safetensors file of `size` bytes with this header.
+    fn described(path: &Path, text: &[u8], size: u64, reader: Reader) -> Result<Self, WeightsError> {
+        let metadata: Metadata = serde_json::from_slice(text).map_err(|e| {
             WeightsError::format(path, &format!("damaged or truncated safetensors header: {e}"))
         })?;
-        let data = 8 + header;
+        let data = 8 + text.len() as u64;
         let expected = data + metadata.data_len() as u64;
         if size != expected {
             let message = format!("truncated or damaged: {size} bytes, the header promises {expected}");
@@ -89,7 +113,7 @@ impl Source {
         Ok(Self {
             path: path.to_owned(),
             tensors: tensors.collect(),
-            reader: Reader::Safetensors(file),
+            reader,
             metadata: metadata.metadata().iter().flatten().map(|(k, v)| (k.clone(), v.clone())).collect(),
         })
     }
@@ -125,6 +149,18 @@ impl Source {
         &self.path
     }
 
+    /// The config in the file's metadata.
+    ///
+    /// # Errors
+    /// [`WeightsError`] if there is none, or none that makes sense.
+    pub(super) fn config(&self) -> Result<Config, WeightsError> {
+        let text = self.metadata.get(CONFIG_KEY).ok_or_else(|| {
+            let message = "has no config in its metadata; give one with --config, or import it first";
+            WeightsError::format(&self.path, message)
+        })?;
+        Ok(Config::from_toml(text, &format!("{} (metadata {CONFIG_KEY})", self.path.display()), &[])?)
+    }
+
     /// All tensors by name.
     pub fn tensors(&self) -> &BTreeMap<String, Entry> {
         &self.tensors
@@ -144,11 +180,11 @@ impl Source {
         })?;
         let values = match &self.reader {
             Reader::Safetensors(file) => read_values(file, entry, kind),
-            Reader::Pytorch(tensors) => tensors[name].read().map(|bytes| {
-                let mut values = vec![0.0; bytes.len() / kind.size()];
-                kind.widen(&bytes, &mut values);
-                values
-            }),
+            Reader::Embedded(bytes) => {
+                let start = usize::try_from(entry.start).expect("checked against the size");
+                Ok(kind.widened(&bytes[start..start + entry.len]))
+            }
+            Reader::Pytorch(tensors) => tensors[name].read().map(|bytes| kind.widened(&bytes)),
         };
         values.map_err(|source| WeightsError::Read { path: self.path.clone(), source })
     }
@@ -160,10 +196,13 @@ pub fn is_readable(dtype: &str) -> bool {
 }
 
 /// Types of numbers that f32 holds without loss.
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum Float {
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Float {
+    /// 32 bits.
     F32,
+    /// 16 bits, IEEE.
     F16,
+    /// The upper 16 bits of f32.
     Bf16,
 }
 
@@ -177,8 +216,42 @@ impl Float {
         }
     }
 
+    /// What a safetensors file calls it.
+    pub(super) fn dtype(self) -> Dtype {
+        match self {
+            Self::F32 => Dtype::F32,
+            Self::F16 => Dtype::F16,
+            Self::Bf16 => Dtype::BF16,
+        }
+    }
+
+    /// The nearest numbers of this type.
+    pub(super) fn rounded(self, values: Vec<f32>) -> Vec<f32> {
+        let round = match self {
+            Self::F32 => return values,
+            Self::F16 => |v: f32| f16::from_f32(v).to_f32(),
+            Self::Bf16 => |v: f32| bf16::from_f32(v).to_f32(),
+        };
+        values.into_iter().map(round).collect()
+    }
+
+    /// Numbers of this type, little-endian.
+    pub(super) fn bytes(self, values: &[f32]) -> Vec<u8> {
+        match self {
+            Self::F32 => values.iter().flat_map(|v| v.to_le_bytes()).collect(),
+            Self::F16 => values.iter().flat_map(|v| f16::from_f32(*v).to_le_bytes()).collect(),
+            Self::Bf16 => values.iter().flat_map(|v| bf16::from_f32(*v).to_le_bytes()).collect(),
+        }
+    }
+
+    fn widened(self, bytes: &[u8]) -> Vec<f32> {
+        let mut values = vec![0.0; bytes.len() / self.size()];
+        self.widen(bytes, &mut values);
+        values
+    }
+
     /// Bytes of a number.
-    fn size(self) -> usize {
+    pub(super) fn size(self) -> usize {
         if self == Self::F32 { 4 } else { 2 }
     }
 

@@ -6,7 +6,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use snapsnap_data::sample::Stage2Item;
 use snapsnap_net::Window;
 use snapsnap_net::config::Config;
-use snapsnap_net::gaussians::{Seen, assemble, placed, regress, side_images};
+use snapsnap_net::gaussians::{Chosen, Seen, assemble, placed, regress, side_images};
 use snapsnap_net::network::View;
 use snapsnap_ops::host;
 use snapsnap_splat::Gaussians;
@@ -71,16 +71,10 @@ pub(super) fn gaussians(
             view.chunks_exact_mut(3).for_each(|p| (0..3).for_each(|c| p[c] += shift[c]));
         }
     }
-    let finite = |i: usize| points[3 * i..3 * i + 3].iter().all(|v| v.is_finite());
-    let valid: Vec<Vec<bool>> = (0..views)
-        .map(|view| {
-            let chosen = |i: usize| match view {
-                0 | 1 => item.masks[view * area + i] > 0.5,
-                _ => conf[view * area + i] > config.network.conf_threshold,
-            };
-            (0..area).map(|i| chosen(i) && finite(view * area + i)).collect()
-        })
-        .collect();
+    let masks = [0, 1].map(|view| {
+        item.masks[view * area..(view + 1) * area].iter().map(|share| *share > 0.5).collect::<Vec<_>>()
+    });
+    let valid = Chosen::new(&config.network, [&masks[0], &masks[1]], &points, &conf).valid;
     let photos = [0, 1].map(|view| &item.images[3 * view * area..3 * (view + 1) * area]);
     let sides = if views > 2 { side_images(photos, &points, &valid) } else { Vec::new() };
     let images: Vec<&[f32]> = photos.into_iter().chain(sides.iter().map(Vec::as_slice)).collect();

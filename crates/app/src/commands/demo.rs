@@ -1,0 +1,141 @@
+//! `snapsnap demo`: the sample pair that comes with the program, through everything a newcomer wants to see.
+
+use std::path::PathBuf;
+use std::time::Instant;
+
+use clap::Args;
+use image::imageops::FilterType;
+use image::{DynamicImage, RgbImage};
+use serde_json::json;
+use snapsnap_data::photo::{self, Canvas, Placement};
+use snapsnap_eval::pictures::Picture;
+use snapsnap_eval::region::{Region, margin};
+use snapsnap_eval::similarity::psnr;
+use snapsnap_net::{Photograph, Reconstructor};
+use snapsnap_splat::{Camera, Gaussians, RenderOptions, ply, render};
+
+use super::ConfigArguments;
+use crate::failure::Failure;
+use crate::pictures::{read_back, sheet, write_png};
+use crate::progress::Progress;
+use crate::report::{REPORT, ReportFolder, header};
+use crate::turntable::Turntable;
+use crate::{device, output, say, weights};
+
+const FILES: &[&str] = &[
+    "front.png",
+    "back.png",
+    "human.ply",
+    "turntable.gif",
+    "turntable.png",
+    "comparison.png",
+    "report.md",
+    REPORT,
+];
+
+/// Front and back of a made person nobody was trained on, `[1024, 1024]` RGBA, as the nominal cameras see them.
+const PHOTOGRAPHS: [(&str, &[u8]); 2] = [
+    ("front.png", include_bytes!("../../../../assets/sample/front.png")),
+    ("back.png", include_bytes!("../../../../assets/sample/back.png")),
+];
+/// What cameras elsewhere see: degrees around the person from the front, and a picture of [`TRUTH`]² pixels over black.
+const TRUTHS: [(f64, &[u8]); 3] = [
+    (45.0, include_bytes!("../../../../assets/sample/45.png")),
+    (135.0, include_bytes!("../../../../assets/sample/135.png")),
+    (270.0, include_bytes!("../../../../assets/sample/270.png")),
+];
+const TRUTH: u32 = 512;
+
+#[derive(Args)]
+pub struct Arguments {
+    /// Folder for the Gaussians, pictures and report.
+    #[arg(short, long, value_name = "DIR", default_value = "demo")]
+    output: PathBuf,
+    /// auto, cpu, ndarray, wgpu, vulkan, cuda or metal; wgpu:1 is the second adapter.
+    #[arg(long, default_value = "auto")]
+    device: String,
+}
+
+pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
+    let start = Instant::now();
+    let folder = ReportFolder::of(&arguments.output, FILES, &[])?;
+    let device = device::choose(&arguments.device)?;
+    let progress = Progress::stages(quiet);
+    progress.stage("photographs");
+    for (name, bytes) in PHOTOGRAPHS {
+        output::write(&folder.file(name), bytes)?;
+    }
+    let weights = weights::open(None, &ConfigArguments { config: None, set: Vec::new() })?;
+    let config = weights.config.clone();
+    let since = Instant::now();
+    // The sample lies on its canvas already, so that its cameras are known and other views can be compared.
+    let load =
+        |name: &str| photo::load(&folder.path().join(name), None, config.network.resolution, Placement::AsIs);
+    let [front, back] = [load(PHOTOGRAPHS[0].0)?, load(PHOTOGRAPHS[1].0)?]
+        .map(|Canvas { rgb, mask, valid, .. }| Photograph { rgb, mask, valid });
+    let reconstructor = Reconstructor::load(&weights, &device)?;
+    let made = reconstructor.reconstruct(&front, &back, &|name| progress.stage(name));
+    let seconds = since.elapsed().as_secs_f64();
+    let world = made.in_world(&config);
+    progress.stage("writing");
+    ply::write(&world, &folder.file("human.ply"))?;
+    drop(progress);
+    for name in ["turntable.gif", "turntable.png"] {
+        Turntable::new(&folder.file(name))?.write(&world, quiet)?;
+    }
+    let (pictures, errors) = comparison(&world)?;
+    write_png(&folder.file("comparison.png"), &sheet(&pictures, 4))?;
+
+    let header = header(&device::describe(&device));
+    let mut text = header.markdown("Demo");
+    text += &format!(
+        "* {} Gaussians in {seconds:.1} s, photographs and weights read; all of it in {:.1} s\n\n\
+         ![turntable](turntable.png)\n\nThe photographs, then what was made of them beside the truth, from elsewhere:\n\n\
+         ![comparison](comparison.png)\n\n| seen from | PSNR on the person, dB |\n|---|---|\n",
+        world.len(),
+        start.elapsed().as_secs_f64(),
+    );
+    for (degrees, psnr) in &errors {
+        text += &format!("| {degrees}° | {psnr:.2} |\n");
+    }
+    folder.text("report.md", &text)?;
+    let mut value = header.json();
+    value["gaussians"] = json!(world.len());
+    value["reconstruction_s"] = json!(seconds);
+    value["psnr_masked"] = errors.iter().map(|(degrees, psnr)| (format!("{degrees}"), json!(psnr))).collect();
+    folder.finish(&value)?;
+    if !quiet {
+        for name in FILES {
+            say::out(&arguments.output.join(name).display().to_string());
+        }
+    }
+    Ok(())
+}
+
+/// The photographs, and each of [`TRUTHS`] behind what was made of it; and how alike these are on the person, in dB.
+fn comparison(world: &Gaussians) -> Result<(Vec<RgbImage>, Vec<(f64, f64)>), Failure> {
+    let side = TRUTH as usize;
+    let mut pictures = Vec::new();
+    for (name, bytes) in PHOTOGRAPHS {
+        let small = decoded(name, bytes)?.resize_exact(TRUTH, TRUTH, FilterType::Triangle);
+        pictures.push(Picture::from_file(small, "photograph")?.to_rgb8());
+    }
+    let mut errors = Vec::new();
+    for (degrees, bytes) in TRUTHS {
+        let truth = decoded("true picture", bytes)?;
+        let mask: Vec<f32> = truth.to_rgba8().pixels().map(|pixel| f32::from(pixel[3]) / 255.0).collect();
+        let truth = Picture::from_file(truth, "true picture")?;
+        // As `evaluate` does it: twice as large, and shrunk.
+        let camera = Camera::orbit_at_yaw_degrees(degrees, 2 * TRUTH);
+        let rendered = render(world, &[camera], &RenderOptions::inria())?;
+        let made = Picture::rendered(&read_back(rendered.color)?, [2 * side; 2], 2)?;
+        let person = Region::masked(&mask, [side; 2], margin(side))?;
+        errors.push((degrees, psnr(&made, &truth, &person)?));
+        pictures.extend([made.to_rgb8(), truth.to_rgb8()]);
+    }
+    Ok((pictures, errors))
+}
+
+fn decoded(name: &str, bytes: &[u8]) -> Result<DynamicImage, Failure> {
+    image::load_from_memory(bytes).map_err(|e| Failure::Internal(format!("the sample's {name}: {e}")))
+}
