@@ -160,16 +160,16 @@ fn is_single_colour(rgb: &RgbImage, mask: &GrayImage) -> bool {
 
 /// A box of pixels.
 #[derive(Debug, Clone, Copy)]
-struct Rect {
-    x: u32,
-    y: u32,
-    width: u32,
-    height: u32,
+pub(crate) struct Rect {
+    pub x: u32,
+    pub y: u32,
+    pub width: u32,
+    pub height: u32,
 }
 
 impl Rect {
     /// The tight box of the pixels whose mask is at least `least`.
-    fn around(mask: &GrayImage, least: u8) -> Option<Self> {
+    pub fn around(mask: &GrayImage, least: u8) -> Option<Self> {
         let set = mask.enumerate_pixels().filter(|(_, _, p)| p[0] >= least);
         let bounds = set.fold(None, |bounds, (x, y, _)| {
             let (x0, y0, x1, y1) = bounds.unwrap_or((x, y, x, y));

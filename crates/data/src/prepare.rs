@@ -39,6 +39,10 @@ pub struct ViewsConfig {
     pub arrangement: Arrangement,
     /// In groups: how far from the subject's own front, in degrees, their fronts are.
     pub front_within_degrees: f64,
+    /// Degrees that all cameras stand higher up than the published ones, which look down by eight.
+    pub pitch: f64,
+    /// How many times as far away as the published ones they stand.
+    pub distance: f64,
     /// Side in pixels.
     pub resolution: u32,
     /// Whether each view is drawn at twice the side as well, for stage 2's supervision.
@@ -56,6 +60,8 @@ impl Default for ViewsConfig {
             count: 24,
             arrangement: Arrangement::Ring,
             front_within_degrees: 30.0,
+            pitch: 0.0,
+            distance: 1.0,
             resolution: 1024,
             high_resolution: false,
             samples: 3,
@@ -82,6 +88,14 @@ impl DataConfig {
         if !(0.0..=180.0).contains(&front_within_degrees) {
             let message = format!("is {front_within_degrees}, must be 0 to 180");
             return Some(("views.front_within_degrees".into(), message));
+        }
+        let orbits = [
+            ("views.pitch", self.views.pitch, -60.0..=60.0),
+            ("views.distance", self.views.distance, 0.5..=10.0),
+        ];
+        if let Some((key, value, range)) = orbits.into_iter().find(|(_, value, range)| !range.contains(value))
+        {
+            return Some((key.into(), format!("is {value}, must be {} to {}", range.start(), range.end())));
         }
         let most = if self.views.high_resolution { MAX_RESOLUTION / 2 } else { MAX_RESOLUTION };
         if resolution == 0 || resolution > most {
@@ -123,7 +137,7 @@ impl DataConfig {
         if self.views.arrangement == Arrangement::Groups {
             return (0..self.views.count / 4).flat_map(|_| self.group(yaw_degrees, &mut random)).collect();
         }
-        let mut rig = Orbit { yaw_degrees, ..Orbit::default() };
+        let mut rig = self.orbit(yaw_degrees);
         self.jitter.rig.apply(&mut rig, &mut random);
         (0..self.views.count)
             .map(|view| {
@@ -135,10 +149,21 @@ impl DataConfig {
             .collect()
     }
 
+    /// Where a camera stands that does not stray.
+    fn orbit(&self, yaw_degrees: f64) -> Orbit {
+        let published = Orbit::default();
+        Orbit {
+            yaw_degrees,
+            pitch_degrees: published.pitch_degrees + self.views.pitch,
+            radius: published.radius * self.views.distance,
+            ..published
+        }
+    }
+
     /// Cameras of a front photograph, of one of the back, and of both sides as the front's own would see them from there.
     fn group(&self, yaw_degrees: f64, random: &mut impl Rng) -> [Camera; 4] {
         let ViewsConfig { front_within_degrees, resolution, .. } = self.views;
-        let mut front = Orbit { yaw_degrees, ..Orbit::default() };
+        let mut front = self.orbit(yaw_degrees);
         front.yaw_degrees += front_within_degrees * random.random_range(-1.0..1.0);
         self.jitter.rig.apply(&mut front, random);
         let mut back = Orbit { yaw_degrees: front.yaw_degrees + 180.0, ..front };
@@ -226,6 +251,20 @@ mod tests {
         assert_eq!(cameras.len(), 24);
         assert_eq!(cameras[0], Camera::orbit_at_yaw_degrees(30.0, 1024));
         assert_eq!(cameras[12], Camera::orbit_at_yaw_degrees(210.0, 1024));
+    }
+
+    #[test]
+    fn cameras_stand_as_much_higher_and_further_away_as_they_are_told() {
+        let mut config = DataConfig::default();
+        (config.views.pitch, config.views.distance) = (10.0, 1.2);
+        assert_eq!(config.problem(), None);
+        let (published, far) = (Orbit::default(), config.cameras(0.0, "a")[0]);
+        let [from, to] =
+            [Camera::orbit_at_yaw_degrees(0.0, 1024), far].map(|c| c.centre() - published.centre);
+        assert!((to.length() / from.length() - 1.2).abs() < 1e-9);
+        assert!((to.angle_between(from).to_degrees() - 10.0).abs() < 1e-9 && to.y > from.y);
+        config.views.distance = 0.4;
+        assert_eq!(config.problem().expect("a problem").0, "views.distance");
     }
 
     #[test]

@@ -149,7 +149,7 @@ fn compressed(picture: RgbImage, quality: u8) -> RgbImage {
 }
 
 /// The mask with its outline moved outwards by `reach` pixels, or inwards where that is negative.
-fn moved(mask: &GrayImage, reach: f32) -> GrayImage {
+pub(super) fn moved(mask: &GrayImage, reach: f32) -> GrayImage {
     let radius = reach.abs();
     let (width, height) = (i64::from(mask.width()), i64::from(mask.height()));
     let whole = radius.ceil() as i64;

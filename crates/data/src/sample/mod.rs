@@ -1,6 +1,7 @@
 //! Training samples: Burn data sets of stage 1 and stage 2 (SNAPSNAP §5.6, §5.7), their batches, and a loader.
 
 mod augment;
+mod handling;
 mod joined;
 mod loader;
 mod place;
@@ -22,6 +23,7 @@ use snapsnap_splat::Camera;
 use crate::dataset::{Arrangement, Folder, Layout, Split, StoredView};
 use crate::photo::{Mapping, place};
 pub use augment::Augment;
+pub use handling::Handling;
 pub use joined::Joined;
 pub use loader::{Batches, Loader};
 use snapsnap_mesh::FileError;
@@ -220,26 +222,7 @@ impl Source {
     /// A photograph as the networks see it, `[3,H,W]`, its mask `[H,W]`, and where its pixels come from.
     fn photograph(&self, view: (&RgbImage, &GrayImage), random: &mut impl Rng) -> Photograph {
         let (color, mask) = self.config.augment.apply(view.0, view.1, random);
-        let inside = |share: f32| f32::from(u8::from(share >= f32::from(INSIDE) / 255.0));
-        if self.config.place {
-            let side = color.width() as usize;
-            if let Some((canvas, mapping)) = place(&color, &mask, self.config.person_height, side) {
-                let mask = canvas.mask.iter().map(|share| inside(*share)).collect();
-                return Photograph { image: canvas.rgb, mask, mapping };
-            }
-        }
-        // Channels first; the background is 0 (SNAPSNAP §5.7).
-        let channel = |channel: usize| {
-            let pixels = color.pixels().zip(mask.pixels());
-            pixels.map(move |(c, m)| {
-                (2.0 * f32::from(c.0[channel]) / 255.0 - 1.0) * (f32::from(m.0[0]) / 255.0)
-            })
-        };
-        Photograph {
-            image: (0..3).flat_map(channel).collect(),
-            mask: mask.as_raw().iter().map(|m| inside(f32::from(*m) / 255.0)).collect(),
-            mapping: Mapping::AS_IT_IS,
-        }
+        Photograph::new(&color, &mask, if self.config.place { self.config.person_height } else { 0 })
     }
 }
 
@@ -250,6 +233,32 @@ struct Photograph {
     /// `[H,W]` 1 where the mask sees the person.
     mask: Vec<f32>,
     mapping: Mapping,
+}
+
+impl Photograph {
+    /// A photograph as the networks see it: put on its canvas as a user's is, with the person so many pixels of 1024 high, or, with
+    /// 0, as it is.
+    fn new(color: &RgbImage, mask: &GrayImage, height: usize) -> Self {
+        let inside = |share: f32| f32::from(u8::from(share >= f32::from(INSIDE) / 255.0));
+        if let Some((canvas, mapping)) =
+            (height > 0).then(|| place(color, mask, height, color.width() as usize)).flatten()
+        {
+            let mask = canvas.mask.iter().map(|share| inside(*share)).collect();
+            return Self { image: canvas.rgb, mask, mapping };
+        }
+        // Channels first; the background is 0 (SNAPSNAP §5.7).
+        let channel = |channel: usize| {
+            let pixels = color.pixels().zip(mask.pixels());
+            pixels.map(move |(c, m)| {
+                (2.0 * f32::from(c.0[channel]) / 255.0 - 1.0) * (f32::from(m.0[0]) / 255.0)
+            })
+        };
+        Self {
+            image: (0..3).flat_map(channel).collect(),
+            mask: mask.as_raw().iter().map(|m| inside(f32::from(*m) / 255.0)).collect(),
+            mapping: Mapping::AS_IT_IS,
+        }
+    }
 }
 
 /// One field of all items of a batch, as one tensor.

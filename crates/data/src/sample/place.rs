@@ -58,8 +58,11 @@ impl Source {
             }
         } else {
             let sights: Vec<Sight> = sights.collect();
+            let nominal = Camera::orbit_at_yaw_degrees(0.0, front.width);
+            let seen = sights[0].through(&photographs[0].mapping, &front);
+            let rays = centres(front.width).map(|place| (place - nominal.principal_point) / nominal.focal);
             front.world_to_camera.translation +=
-                shift(&sights[0].through(&photographs[0].mapping, &front), front.width);
+                shift(rays.zip(seen).filter_map(|(ray, point)| Some((ray, point?))));
             let [front_seen, back_seen] = [0, 1].map(|i| sights[i].through(&photographs[i].mapping, &front));
             let [right, left] =
                 [(2, 90.0), (3, 270.0)].map(|(i, degrees)| sights[i].as_nominal(&front, degrees));
@@ -154,13 +157,11 @@ fn centres(side: u32) -> impl Iterator<Item = DVec2> {
     (0..side).flat_map(move |row| (0..side).map(move |column| DVec2::new(column.into(), row.into()) + 0.5))
 }
 
-/// The shift t, in metres, after which points p of a canvas's pixels project there best in the nominal camera: the least
-/// squares of f·t_x − (u − c_x)·t_z = (u − c_x)·z − f·x and the same downwards.
-fn shift(seen: &Seen, side: u32) -> DVec3 {
-    let nominal = Camera::orbit_at_yaw_degrees(0.0, side);
+/// The shift t, in metres, after which points p project best where the rays `(x/z, y/z)` beside them go: the least squares of
+/// t_x − r_x·t_z = r_x·z − x and the same downwards.
+pub(super) fn shift(seen: impl Iterator<Item = (DVec2, DVec3)>) -> DVec3 {
     let (mut matrix, mut right) = (DMat3::ZERO, DVec3::ZERO);
-    for (place, point) in centres(side).zip(seen).filter_map(|(place, point)| Some((place, (*point)?))) {
-        let ray = (place - nominal.principal_point) / nominal.focal;
+    for (ray, point) in seen {
         for (row, value) in [
             (DVec3::new(1.0, 0.0, -ray.x), ray.x * point.z - point.x),
             (DVec3::new(0.0, 1.0, -ray.y), ray.y * point.z - point.y),

@@ -4,8 +4,9 @@ use std::sync::Arc;
 
 use snapsnap_splat::Camera;
 
-use super::{Augment, SampleConfig, Source};
+use super::{Augment, Handling, Photograph, SampleConfig, Source};
 use crate::dataset::{Folder, Split, unproject};
+use crate::photo::Mapping;
 use snapsnap_mesh::FileError;
 
 /// Subjects of a test set. Which views go in is the caller's choice, the first and the opposite one in the published test, 0
@@ -24,6 +25,8 @@ pub struct TestItem {
     pub images: Vec<f32>,
     /// `[N,H,W]` 1 where the input masks see the person.
     pub masks: Vec<f32>,
+    /// Where the photographs' pixels came from.
+    pub mappings: Vec<Mapping>,
     /// Cameras of all views.
     pub cameras: Vec<Camera>,
 }
@@ -53,18 +56,21 @@ impl Test {
         &self.0.subjects[index]
     }
 
-    /// One subject with the photographs of some of its views.
+    /// One subject with the photographs of some of its views, changed as `handling` says.
     ///
     /// # Errors
     /// [`FileError`] for files that are missing or damaged.
-    pub fn sample(&self, index: usize, views: &[usize]) -> Result<TestItem, FileError> {
+    pub fn sample(&self, index: usize, views: &[usize], handling: &Handling) -> Result<TestItem, FileError> {
         let source = &self.0;
-        let (subject, mut random) = source.subject(3, index);
+        let (subject, _) = source.subject(3, index);
         let description = source.folder.description();
         let picture = |view: &usize| source.folder.picture(source.split, subject, *view, false);
         let pictures = views.iter().map(picture).collect::<Result<Vec<_>, _>>()?;
-        let photographs: Vec<_> =
-            pictures.iter().map(|(color, mask)| source.photograph((color, mask), &mut random)).collect();
+        let photographs = pictures.iter().enumerate().map(|(place, (color, mask))| {
+            let (color, mask) = handling.apply(place, (color, mask));
+            Photograph::new(&color, &mask, handling.place)
+        });
+        let photographs: Vec<_> = photographs.collect();
         let camera = |view: usize| source.folder.camera(source.split, subject, view);
         let cameras = (0..description.views).map(|view| camera(view).map(|stored| source.camera(&stored)));
         Ok(TestItem {
@@ -72,6 +78,7 @@ impl Test {
             side: description.resolution as usize,
             images: photographs.iter().flat_map(|photograph| photograph.image.iter().copied()).collect(),
             masks: photographs.iter().flat_map(|photograph| photograph.mask.iter().copied()).collect(),
+            mappings: photographs.iter().map(|photograph| photograph.mapping).collect(),
             cameras: cameras.collect::<Result<_, _>>()?,
         })
     }

@@ -5,6 +5,7 @@ mod oracle;
 pub mod report;
 mod tune;
 
+use snapsnap_data::sample::Handling;
 use std::time::{Duration, Instant};
 
 use burn::tensor::Device;
@@ -155,10 +156,10 @@ pub fn measure(
     let first = people.chosen().first().copied().ok_or_else(nobody)?;
     let inputs = people.inputs(&eval.views, 0);
     let mut readings = Vec::new();
-    let mut item = people.item(first, &inputs)?;
+    let mut item = people.item(first, &inputs, &Handling::default())?;
     for _ in 0..config.bench.runs.min(5) {
         let start = Instant::now();
-        item = people.item(first, &inputs)?;
+        item = people.item(first, &inputs, &Handling::default())?;
         let canvases: Vec<_> =
             (0..inputs.len()).map(|place| photograph(&item, place, model.side())).collect();
         readings.push(start.elapsed());

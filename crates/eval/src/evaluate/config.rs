@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 use snapsnap_data::dataset::Split;
+use snapsnap_data::sample::Handling;
 use snapsnap_net::config::{ConfigError, parse};
 use snapsnap_splat::RenderOptions;
 
@@ -16,6 +17,8 @@ pub struct EvalConfig {
     pub data: DataSection,
     /// Which views go in and which are compared.
     pub views: ViewsSection,
+    /// What is done to the photographs that models see; baselines have them as they are.
+    pub photographs: Handling,
     /// What is judged.
     pub model: ModelSection,
     /// How pictures are compared.
@@ -157,11 +160,13 @@ pub struct Ablation {
     pub sides: bool,
     /// Whether their pixels get the colours of the nearest photographed points.
     pub side_colors: bool,
+    /// What is done to the photographs instead of what is done to the model's.
+    pub photographs: Option<Handling>,
 }
 
 impl Default for Ablation {
     fn default() -> Self {
-        Self { weights: None, set: Vec::new(), sides: true, side_colors: true }
+        Self { weights: None, set: Vec::new(), sides: true, side_colors: true, photographs: None }
     }
 }
 
@@ -298,6 +303,10 @@ impl EvalConfig {
         }
         if names.iter().chain(self.groups.keys()).any(|name| name.contains(char::is_control)) {
             return Some(("ablations", "the name of one, or of a group, has control characters".into()));
+        }
+        let handlings = ablations.values().filter_map(|ablation| ablation.photographs.as_ref());
+        if let Some((key, message)) = handlings.chain([&self.photographs]).find_map(Handling::problem) {
+            return Some(("photographs", format!("`{key}` {message}")));
         }
         if let Some(problem) = views_problem(&views.inputs) {
             return Some(("views.inputs", problem));

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use burn::tensor::Device;
-use snapsnap_data::sample::TestItem;
+use snapsnap_data::sample::{Handling, TestItem};
 use snapsnap_net::Photograph;
 use snapsnap_splat::Gaussians;
 
@@ -127,6 +127,9 @@ impl Contestant {
         let plain = |gaussians| Shown { gaussians: Some(gaussians), ..Shown::default() };
         match &self.means {
             Means::Model(_, model) => {
+                let is_changed = model.photographs != Handling::default();
+                let own = is_changed.then(|| people.item(row, inputs, &model.photographs)).transpose()?;
+                let item = own.as_ref().unwrap_or(item);
                 let made = model.reconstruct(item, inputs);
                 if made.gaussians.is_empty() {
                     return Err(nothing());

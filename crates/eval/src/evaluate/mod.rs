@@ -12,7 +12,7 @@ use std::time::Duration;
 
 use image::RgbImage;
 use rayon::prelude::*;
-use snapsnap_data::sample::TestItem;
+use snapsnap_data::sample::{Handling, TestItem};
 use snapsnap_splat::{Camera, Gaussians, render};
 
 use crate::EvalError;
@@ -197,7 +197,7 @@ fn one(
 ) {
     let Place { people, row, turn, person } = *at;
     let inputs = people.inputs(&config.views, turn);
-    let item = match people.item(row, &inputs) {
+    let item = match people.item(row, &inputs, &Handling::default()) {
         Ok(item) => item,
         Err(e) => return at.left_out(outcome, "", &e),
     };
@@ -369,7 +369,7 @@ fn pictures(
     /// Mean absolute difference of channels that is shown white.
     const WORST: f32 = 0.5;
     let inputs = people.inputs(&config.views, config.views.turns[0]);
-    let item = people.item(row, &inputs)?;
+    let item = people.item(row, &inputs, &Handling::default())?;
     let side = people.side(&config.views);
     let shown = contestant.prepare(people, row, &item, &inputs, side)?;
     let mut pictures = Vec::new();

@@ -3,7 +3,8 @@
 use std::time::{Duration, Instant};
 
 use burn::tensor::{Device, Int, Tensor, TensorData};
-use snapsnap_data::sample::TestItem;
+use snapsnap_data::photo::Mapping;
+use snapsnap_data::sample::{Handling, TestItem};
 use snapsnap_net::config::Config;
 use snapsnap_net::gaussians::placed;
 use snapsnap_net::precision::Precision;
@@ -18,6 +19,8 @@ use super::person::photograph;
 pub struct Model {
     reconstructor: Reconstructor,
     leave: Leave,
+    /// What is done to its photographs.
+    pub photographs: Handling,
 }
 
 /// What a model does without.
@@ -72,7 +75,7 @@ impl Model {
         if !leave.side_colors {
             reconstructor = reconstructor.without_side_colors();
         }
-        Ok(Self { reconstructor, leave })
+        Ok(Self { reconstructor, leave, photographs: Handling::default() })
     }
 
     /// The config in force.
@@ -97,7 +100,14 @@ impl Model {
         for first in 0..count {
             let pair = [&photographs[first], &photographs[(first + 1) % inputs.len()]];
             let made = self.reconstructor.reconstruct(pair[0], pair[1], &|_| ());
-            let to_world = item.cameras[inputs[first]].world_to_camera.inverse();
+            let camera = &item.cameras[inputs[first]];
+            let mut to_world = camera.world_to_camera.inverse();
+            let is_placed = item.mappings[first] != Mapping::AS_IT_IS;
+            if is_placed {
+                let points = host(made.maps.points.clone().narrow(0, 0, 1));
+                let back = Handling::back(&item.mappings[first], camera, &points, &made.valid[0]);
+                to_world = back.then(&to_world);
+            }
             parts.push(placed(self.config(), self.thinned(&made, side), &to_world));
             lost += made.lost;
             modules.extend(made.times.iter().copied());
@@ -105,7 +115,8 @@ impl Model {
             if first == 0 {
                 plan.clone_from(&made.plan);
             }
-            if count == 1 {
+            // The pixels of what was placed are not those that have true points.
+            if count == 1 && !is_placed {
                 maps = maps_of(&made, side);
             }
         }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use burn::tensor::{Device, Tensor, TensorData};
 use snapsnap_data::dataset::{Arrangement, Folder, Split};
-use snapsnap_data::sample::{SampleConfig, Test, TestItem};
+use snapsnap_data::sample::{Handling, SampleConfig, Test, TestItem};
 use snapsnap_mesh::FileError;
 use snapsnap_net::Photograph;
 use snapsnap_net::config::Downsample;
@@ -98,12 +98,12 @@ impl People {
         if views.resolution > 0 { views.resolution } else { self.folder.description().resolution as usize }
     }
 
-    /// A person's photographs, masks and cameras.
+    /// A person's photographs, changed as `handling` says, masks and cameras.
     ///
     /// # Errors
     /// [`EvalError::File`]; also for a camera that mirrors, whose world has no Gaussians: no quaternion turns them so.
-    pub fn item(&self, row: usize, inputs: &[usize]) -> Result<TestItem, EvalError> {
-        let item = self.test.sample(row, inputs)?;
+    pub fn item(&self, row: usize, inputs: &[usize], handling: &Handling) -> Result<TestItem, EvalError> {
+        let item = self.test.sample(row, inputs, handling)?;
         let mirrors = |camera: &Camera| camera.world_to_camera.rotation.determinant() < 0.0;
         match item.cameras.iter().position(mirrors) {
             None => Ok(item),

@@ -2,6 +2,7 @@
 
 use glam::DVec3;
 use rayon::prelude::*;
+use snapsnap_data::sample::Handling;
 use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
 
 use super::at_once;
@@ -40,7 +41,7 @@ pub struct Truth {
 /// # Errors
 /// [`EvalError`] for files that cannot be read, or without any point.
 pub fn truth(people: &People, row: usize) -> Result<Truth, EvalError> {
-    let cameras = people.test().sample(row, &[])?.cameras;
+    let cameras = people.test().sample(row, &[], &Handling::default())?.cameras;
     let directions = DIRECTIONS.map(|wanted| nearest_view(&cameras, 0, wanted));
     let of_view = |(view, camera): (usize, &Camera)| {
         let (points, valid) = people.test().points(row, &[view])?;

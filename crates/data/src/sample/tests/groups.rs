@@ -98,6 +98,18 @@ fn placed_samples_lie_where_the_nominal_cameras_see_them() {
         let mean = sum / f64::from(seen);
         assert!(seen > 300 && mean < 0.5 && most < 6.0, "view {view}: {seen} points, {mean}, {most} px");
     }
+    // Whoever knows the true camera finds the way back.
+    let test = Test::new(
+        folder.clone(),
+        TRAIN,
+        SampleConfig { augment: Augment::none(), ..SampleConfig::default() },
+    );
+    let handling = Handling { place: 700, ..Handling::default() };
+    let shown = test.expect("a test").sample(0, &[0, 1], &handling).expect("reads");
+    let valid: Vec<bool> = item.valid[..side * side].iter().map(|there| *there > 0.5).collect();
+    let back = Handling::back(&shown.mappings[0], &shown.cameras[0], &item.points[..3 * side * side], &valid);
+    let moved = item.cameras[0].world_to_camera.translation - shown.cameras[0].world_to_camera.translation;
+    assert!(moved.length() > 0.05 && (back.translation + moved).length() < 1e-4, "{back:?}, {moved}");
     // A point of the front's in the world lies on the surface that the stored depths tell of.
     let stored = folder.depth(TRAIN, "0000", 0).expect("reads");
     let to_world = item.cameras[0].world_to_camera.inverse();

@@ -345,7 +345,7 @@ fn test_samples_are_the_views_that_were_asked_for() {
         let test = Test::new(folder.clone(), TRAIN, SampleConfig::default()).expect("makes samples");
         assert_eq!(test.len(), 2);
         assert_eq!(test.name(1), "0001");
-        let item = test.sample(1, &[0, 15]).expect("reads");
+        let item = test.sample(1, &[0, 15], &Handling::default()).expect("reads");
         assert_eq!((item.subject.as_str(), item.side, item.cameras.len()), ("0001", 64, 30));
         for (view, yaw) in [(0, 0.0), (7, 84.0), (15, 180.0)] {
             let expected = Camera::orbit_at_yaw_degrees(yaw, 64).centre();

@@ -1,0 +1,91 @@
+//! What a user's photographs are like, and a data set's own views are not.
+
+use glam::{DVec2, DVec3};
+use image::{GrayImage, RgbImage};
+use serde::{Deserialize, Serialize};
+
+use super::augment::moved;
+use super::place::shift;
+use crate::photo::{Mapping, Rect};
+use snapsnap_splat::{Camera, RigidTransform};
+
+/// Canvas side that lengths refer to.
+const REFERENCE_SIDE: f32 = 1024.0;
+
+/// What is done to photographs before a model sees them: the section `[photographs]` of an evaluation.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Handling {
+    /// They are put on their canvas as a user's are, the person so many pixels of 1024 high, and what comes out is moved to
+    /// where the photographs' own cameras see it; 0: they are the canvas already.
+    pub place: usize,
+    /// The first is so many stops brighter than the others, half of it each way.
+    pub exposure: f32,
+    /// Masks are too large by so many pixels of 1024, or, below 0, too small.
+    pub mask: f32,
+    /// The frame cuts off so much of the person's width: on the left of the first, on the right of the others.
+    pub cut: f32,
+}
+
+impl Handling {
+    /// The first key that makes no sense, and why.
+    pub fn problem(&self) -> Option<(&'static str, String)> {
+        if self.place != 0 && !(16..=1024).contains(&self.place) {
+            return Some(("place", format!("is {}, must be 0 or 16 to 1024", self.place)));
+        }
+        let limits = [
+            ("exposure", self.exposure, -4.0..=4.0),
+            ("mask", self.mask, -64.0..=64.0),
+            ("cut", self.cut, 0.0..=0.9),
+        ];
+        let (key, value, range) = limits.into_iter().find(|(_, value, range)| !range.contains(value))?;
+        Some((key, format!("is {value}, must be {} to {}", range.start(), range.end())))
+    }
+
+    /// The photograph `place` of a person, and its mask.
+    pub(super) fn apply(
+        &self,
+        place: usize,
+        (color, mask): (&RgbImage, &GrayImage),
+    ) -> (RgbImage, GrayImage) {
+        let (mut color, mut mask) = (color.clone(), mask.clone());
+        if self.exposure != 0.0 {
+            let gain = (if place == 0 { 0.5 } else { -0.5 } * self.exposure).exp2();
+            color.iter_mut().for_each(|v| *v = (f32::from(*v) * gain).round().min(255.0) as u8);
+        }
+        let reach = self.mask * mask.width() as f32 / REFERENCE_SIDE;
+        if reach != 0.0 {
+            mask = moved(&mask, reach);
+        }
+        if let Some(person) = Rect::around(&mask, 1).filter(|_| self.cut > 0.0) {
+            let cut = (self.cut * person.width as f32).round() as u32;
+            let from = if place == 0 { person.x } else { person.x + person.width - cut };
+            for (x, _, pixel) in mask.enumerate_pixels_mut() {
+                if (from..from + cut).contains(&x) {
+                    pixel.0 = [0];
+                }
+            }
+        }
+        (color, mask)
+    }
+
+    /// From the frame of a camera in which placed photographs' points lie to that of the `camera` that took the first one,
+    /// whose pixels came onto the canvas by `mapping`: the shift after which the points `[S, S, 3]`, metres, of the canvas's
+    /// pixels lie on the rays by which that camera saw them.
+    pub fn back(mapping: &Mapping, camera: &Camera, points: &[f32], valid: &[bool]) -> RigidTransform {
+        let side = f64::from(valid.len() as u32).sqrt() as usize;
+        // The canvas may be of another size than the photograph that was placed.
+        let scale = f64::from(camera.width) / side as f64;
+        let seen = valid.iter().enumerate().filter(|(_, valid)| **valid).map(|(pixel, _)| {
+            let canvas = DVec2::new((pixel % side) as f64, (pixel / side) as f64) + 0.5;
+            let ray = (mapping.source(canvas * scale) - camera.principal_point) / camera.focal;
+            let point = DVec3::new(
+                points[3 * pixel].into(),
+                points[3 * pixel + 1].into(),
+                points[3 * pixel + 2].into(),
+            );
+            (ray, point)
+        });
+        RigidTransform { translation: shift(seen), ..RigidTransform::IDENTITY }
+    }
+}
