@@ -48,6 +48,8 @@ pub struct Canvas {
     pub mask: Vec<f32>,
     /// `[S, S]`: whether the pixel belongs to the person.
     pub valid: Vec<bool>,
+    /// Where its pixels came from.
+    pub mapping: Mapping,
     /// What was done, for a person to read.
     pub report: String,
 }
@@ -199,7 +201,7 @@ fn on_canvas(rgb: &RgbImage, mask: &GrayImage, side: usize, report: String) -> C
         }
     }
     let valid = mask.iter().map(|m| *m >= THRESHOLD).collect();
-    Canvas { rgb: values, mask, valid, report }
+    Canvas { rgb: values, mask, valid, mapping: Mapping::AS_IT_IS, report }
 }
 
 /// Where a photograph's pixels come to lie on a canvas, both with pixel centres at +½.
@@ -214,6 +216,13 @@ pub struct Mapping {
 impl Mapping {
     /// Of a photograph that is the canvas.
     pub const AS_IT_IS: Self = Self { scale: DVec2::ONE, origin: DVec2::ZERO };
+
+    /// Of the box `person` that comes to lie at `left` and `top` with this size.
+    fn of(person: Rect, [left, top]: [usize; 2], [width, height]: [usize; 2]) -> Self {
+        let size = |width: u32, height: u32| DVec2::new(f64::from(width), f64::from(height));
+        let scale = DVec2::new(width as f64, height as f64) / size(person.width, person.height);
+        Self { scale, origin: DVec2::new(left as f64, top as f64) - size(person.x, person.y) * scale }
+    }
 
     /// The place on the photograph of a place on the canvas.
     pub fn source(&self, canvas: DVec2) -> DVec2 {
@@ -244,20 +253,12 @@ impl Fit {
         let top = ((centre - height as f32 / 2.0).round().max(0.0) as usize).min(side - height);
         Self { scale, is_limited: scale < by_height, left, top, width, height }
     }
-
-    fn mapping(&self, person: Rect) -> Mapping {
-        let size = |width: u32, height: u32| DVec2::new(f64::from(width), f64::from(height));
-        let scale = DVec2::new(self.width as f64, self.height as f64) / size(person.width, person.height);
-        let corner = DVec2::new(self.left as f64, self.top as f64);
-        Mapping { scale, origin: corner - size(person.x, person.y) * scale }
-    }
 }
 
 /// Puts a photograph on a canvas of `side` pixels as [`Placement::Training`] does; `None` if the mask shows nobody.
-pub fn place(rgb: &RgbImage, mask: &GrayImage, height: usize, side: usize) -> Option<(Canvas, Mapping)> {
+pub fn place(rgb: &RgbImage, mask: &GrayImage, height: usize, side: usize) -> Option<Canvas> {
     let person = Rect::around(mask, u8::MAX.div_ceil(2))?;
-    let mapping = Fit::new(person, [height, side]).mapping(person);
-    Some((placed(rgb, mask, person, [height, side], ""), mapping))
+    Some(placed(rgb, mask, person, [height, side], ""))
 }
 
 /// The person's box at the size and place of the training subjects; what of a soft edge lies outside the box comes
@@ -265,6 +266,7 @@ pub fn place(rgb: &RgbImage, mask: &GrayImage, height: usize, side: usize) -> Op
 fn placed(rgb: &RgbImage, mask: &GrayImage, person: Rect, size: [usize; 2], source: &str) -> Canvas {
     let (side, canvas) = (size[1], size[1] as f32);
     let Fit { scale, is_limited, left, top, width, height } = Fit::new(person, size);
+    let mapping = Mapping::of(person, [left, top], [width, height]);
 
     // Everything the mask touches and the canvas can hold, and where it comes to lie relative to the person's box. A
     // speck far away must not be enlarged with a small person.
@@ -299,7 +301,7 @@ fn placed(rgb: &RgbImage, mask: &GrayImage, person: Rect, size: [usize; 2], sour
     let report = format!(
         "{source}, scaled by {scale:.4}{limited} to {width}×{height} at ({left}, {top}) of {side}×{side}"
     );
-    Canvas { rgb: values, mask: on_canvas, valid, report }
+    Canvas { rgb: values, mask: on_canvas, valid, mapping, report }
 }
 
 /// The published demo's recipe with its quirks: the box loses its last row and column, sampling is plain bilinear,
@@ -319,6 +321,7 @@ fn placed_as_demo(
         if scaled > side { (person.height as usize * side / person.width as usize).max(1) } else { height };
     let width = (scaled / 2 * 2).clamp(2.min(side), side / 2 * 2);
     let (left, top) = ((side - width) / 2, (side - height) / 2);
+    let mapping = Mapping::of(person, [left, top], [width, height]);
     let [r, g, b, m] = planes(rgb, mask, person, |color, _| unit(color), [height, width], Filter::Bilinear);
     let area = side * side;
     let (mut values, mut on_canvas) = (vec![0.0; 3 * area], vec![0.0; area]);
@@ -336,7 +339,7 @@ fn placed_as_demo(
     let valid = on_canvas.iter().map(|m| *m >= 1.0).collect();
     let report =
         format!("{source}, sampled to {width}×{height} at ({left}, {top}) of {side}×{side} as in the demo");
-    Canvas { rgb: values, mask: on_canvas, valid, report }
+    Canvas { rgb: values, mask: on_canvas, valid, mapping, report }
 }
 
 /// Red, green, blue (through `color`, which also gets the mask's value) and mask of the person's box, resized to `size`

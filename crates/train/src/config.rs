@@ -246,6 +246,11 @@ impl TrainConfig {
         Config { network: self.network.clone(), regressor: self.regressor.clone(), mode: self.mode.clone() }
     }
 
+    /// How samples are made: people who are placed are as high as a user's.
+    pub fn samples(&self) -> SampleConfig {
+        SampleConfig { person_height: self.networks().person_height(), ..self.samples.clone() }
+    }
+
     fn problem(&self) -> Option<(String, String)> {
         let t = &self.training;
         let counts = [
@@ -281,6 +286,11 @@ impl TrainConfig {
         }
         if self.network.conf_mode != ConfMode::Sigmoid {
             return Some(("network.conf_mode".into(), "must be \"sigmoid\" to be trained".into()));
+        }
+        if self.mode.placed != (self.samples.place > 0.0) {
+            let message = "is {}, and `samples.place` is {}: what is learned from placed photographs is what they are for";
+            let message = message.replacen("{}", &self.mode.placed.to_string(), 1);
+            return Some(("mode.placed".into(), message.replacen("{}", &self.samples.place.to_string(), 1)));
         }
         if two.curriculum && !self.network.side_heads {
             let message = "begins with the sides alone, which `network.side_heads = false` leaves out";
@@ -347,7 +357,7 @@ mod tests {
 
     #[test]
     fn all_configs_make_sense_and_both_stages_are_of_the_same_predictor() {
-        for size in ["tiny", "small", "full"] {
+        for size in ["tiny", "small", "full", "default"] {
             let [one, two] = [1, 2].map(|stage| read(size, stage));
             assert_eq!(one.network, two.network, "{size}");
             assert_eq!(one.mode, two.mode, "{size}");

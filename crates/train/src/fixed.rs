@@ -40,7 +40,7 @@ impl<I: Send + Sync + 'static> Fixed<I> {
             repeat: wished.div_ceil(people.max(1)).max(1),
             augment: Augment::none(),
             seed: 0,
-            ..config.samples.clone()
+            ..config.samples()
         };
         let sets = there.into_iter().map(|folder| samples(folder.clone(), wanted, fixed.clone()));
         let samples = Joined::new(sets.collect::<Result<_, _>>()?);

@@ -52,7 +52,7 @@ impl PointTask {
         let mut sets = Vec::new();
         for folder in folders {
             check_resolution(folder, config)?;
-            sets.push(Stage1::new(folder.clone(), Some(Split::Train), config.samples.clone())?);
+            sets.push(Stage1::new(folder.clone(), Some(Split::Train), config.samples())?);
         }
         let validation = Fixed::new(folders, config, |folder, split, samples| {
             Ok(Box::new(Stage1::new(folder, split, samples)?))

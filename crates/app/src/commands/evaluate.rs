@@ -246,9 +246,8 @@ fn contestants(
         memory::check_networks(&weights, device)?;
         let sides = ablation.sides && !has_known_sides(config);
         let leave = Leave { sides, side_colors: ablation.side_colors, ..Leave::default() };
-        let mut model = Model::load(&weights, device, leave)?;
-        model.photographs = ablation.photographs.unwrap_or(config.photographs);
-        Ok(model)
+        let photographs = ablation.photographs.unwrap_or(config.photographs);
+        Ok(Model::load(&weights, device, leave)?.seeing(photographs))
     };
     match model(&whole, &devices[0]) {
         Ok(model) => contestants.push(Contestant::model("model", model)),

@@ -52,9 +52,11 @@ pub struct SampleConfig {
     pub high_resolution: bool,
     /// Stage 2: also the points that four views see, for the point loss.
     pub points: bool,
-    /// Whether photographs are put on their canvas as a user's are, and points moved to where the nominal cameras see them.
-    pub place: bool,
-    /// With `place`, the person's height in pixels of a canvas of 1024, as `mode.person_height`.
+    /// Share of the samples whose photographs are put on their canvas as a user's are, and whose points are moved to where the
+    /// nominal cameras see them.
+    pub place: f32,
+    /// How high a person is then, in pixels of a canvas of 1024: `mode.person_height`.
+    #[serde(skip)]
     pub person_height: usize,
     /// Decides everything that is random.
     pub seed: u64,
@@ -72,7 +74,7 @@ impl Default for SampleConfig {
             supervision: 3,
             high_resolution: false,
             points: false,
-            place: false,
+            place: 0.0,
             person_height: 739,
             seed: 1,
             augment: Augment::default(),
@@ -104,11 +106,11 @@ impl SampleConfig {
         if self.compat && self.augment != Augment::none() {
             return Some(("augment".into(), "must be off beside `compat = true`".into()));
         }
-        if self.compat && self.place {
-            return Some(("place".into(), "must be false beside `compat = true`".into()));
+        if !(0.0..=1.0).contains(&self.place) {
+            return Some(("place".into(), format!("is {}, must be 0 to 1", self.place)));
         }
-        if !(16..=1024).contains(&self.person_height) {
-            return Some(("person_height".into(), format!("is {}, must be 16 to 1024", self.person_height)));
+        if self.compat && self.place > 0.0 {
+            return Some(("place".into(), "must be 0 beside `compat = true`".into()));
         }
         self.augment.problem().map(|(key, message)| (format!("augment.{key}"), message))
     }
@@ -220,9 +222,23 @@ impl Source {
     }
 
     /// A photograph as the networks see it, `[3,H,W]`, its mask `[H,W]`, and where its pixels come from.
-    fn photograph(&self, view: (&RgbImage, &GrayImage), random: &mut impl Rng) -> Photograph {
+    fn photograph(
+        &self,
+        view: (&RgbImage, &GrayImage),
+        is_placed: bool,
+        random: &mut impl Rng,
+    ) -> Photograph {
         let (color, mask) = self.config.augment.apply(view.0, view.1, random);
-        Photograph::new(&color, &mask, if self.config.place { self.config.person_height } else { 0 })
+        Photograph::new(&color, &mask, if is_placed { self.config.person_height } else { 0 })
+    }
+
+    /// Whether a sample's photographs are placed as a user's are.
+    fn is_placed(&self, random: &mut impl Rng) -> bool {
+        // Nothing is drawn where nothing is open.
+        match self.config.place {
+            0.0 => false,
+            share => random.random::<f32>() < share,
+        }
     }
 }
 
@@ -240,11 +256,11 @@ impl Photograph {
     /// 0, as it is.
     fn new(color: &RgbImage, mask: &GrayImage, height: usize) -> Self {
         let inside = |share: f32| f32::from(u8::from(share >= f32::from(INSIDE) / 255.0));
-        if let Some((canvas, mapping)) =
+        if let Some(canvas) =
             (height > 0).then(|| place(color, mask, height, color.width() as usize)).flatten()
         {
             let mask = canvas.mask.iter().map(|share| inside(*share)).collect();
-            return Self { image: canvas.rgb, mask, mapping };
+            return Self { image: canvas.rgb, mask, mapping: canvas.mapping };
         }
         // Channels first; the background is 0 (SNAPSNAP §5.7).
         let channel = |channel: usize| {

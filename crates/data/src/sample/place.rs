@@ -37,17 +37,19 @@ impl Source {
         &self,
         subject: &str,
         order: &[usize; 4],
+        is_placed: bool,
         random: &mut impl Rng,
     ) -> Result<Four, FileError> {
         let compat = self.config.compat;
         let views = (0..4).map(|i| self.view_for(subject, order[i], i < 2 || compat));
         let views: Vec<StoredView> = views.collect::<Result<_, _>>()?;
         let cameras: Vec<Camera> = views.iter().map(|view| self.camera(&view.camera)).collect();
-        let photographs = [0, 1].map(|i| self.photograph((&views[i].color, &views[i].mask), random));
+        let photographs =
+            [0, 1].map(|i| self.photograph((&views[i].color, &views[i].mask), is_placed, random));
         let mut front = cameras[0];
         let (mut points, mut valid) = (Vec::new(), Vec::new());
         let sights = views.iter().zip(&cameras).map(|(view, camera)| Sight { view, camera });
-        if !self.config.place {
+        if !is_placed {
             for Sight { view, camera } in sights {
                 points.extend(unproject(view, camera, &front, if compat { COMPAT_FAR } else { 0.0 }));
                 let there = |pixel: usize| match compat {
@@ -87,7 +89,7 @@ impl Source {
         pictures: [&(RgbImage, GrayImage); 2],
         random: &mut impl Rng,
     ) -> (Vec<f32>, Vec<f32>) {
-        let [front, back] = pictures.map(|(color, mask)| self.photograph((color, mask), random));
+        let [front, back] = pictures.map(|(color, mask)| self.photograph((color, mask), false, random));
         ([front.image, back.image].concat(), [front.mask, back.mask].concat())
     }
 }

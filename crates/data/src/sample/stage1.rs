@@ -74,7 +74,9 @@ impl Stage1 {
         // Front, back, and the sides at +90° and +270° (SNAPSNAP §5.6).
         let order = source.folder.description().arrangement.four(first, count);
         let side = source.folder.description().resolution as usize;
-        let Four { images, masks, points, valid, .. } = source.four(subject, &order, &mut random)?;
+        let is_placed = source.is_placed(&mut random);
+        let Four { images, masks, points, valid, .. } =
+            source.four(subject, &order, is_placed, &mut random)?;
         let mut item = Stage1Item { name: String::new(), side, images, masks, points, valid };
         if source.config.augment.mirror && random.random() {
             item.mirror();

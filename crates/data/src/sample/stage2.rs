@@ -115,8 +115,10 @@ impl Stage2 {
             let stored = folder.camera(*split, subject, view)?.resized(target_side, target_side);
             target_cameras.push(source.camera(&stored));
         }
-        let (images, masks, points, valid) = if config.points || config.place {
-            let Four { images, masks, points, valid, front } = source.four(subject, &order, &mut random)?;
+        let is_placed = source.is_placed(&mut random);
+        let (images, masks, points, valid) = if config.points || is_placed {
+            let Four { images, masks, points, valid, front } =
+                source.four(subject, &order, is_placed, &mut random)?;
             cameras[0] = front;
             let (points, valid) = if config.points { (points, valid) } else { Default::default() };
             (images, masks, points, valid)

@@ -19,8 +19,7 @@ use super::person::photograph;
 pub struct Model {
     reconstructor: Reconstructor,
     leave: Leave,
-    /// What is done to its photographs.
-    pub photographs: Handling,
+    photographs: Handling,
 }
 
 /// What a model does without.
@@ -75,7 +74,21 @@ impl Model {
         if !leave.side_colors {
             reconstructor = reconstructor.without_side_colors();
         }
-        Ok(Self { reconstructor, leave, photographs: Handling::default() })
+        Ok(Self { reconstructor, leave, photographs: Handling::default() }.seeing(Handling::default()))
+    }
+
+    /// The same with this done to its photographs; and placed they are, if it knows no others.
+    pub fn seeing(mut self, mut photographs: Handling) -> Self {
+        if self.config().mode.placed && photographs.place == 0 {
+            photographs.place = self.config().person_height();
+        }
+        self.photographs = photographs;
+        self
+    }
+
+    /// What is done to its photographs.
+    pub fn photographs(&self) -> &Handling {
+        &self.photographs
     }
 
     /// The config in force.

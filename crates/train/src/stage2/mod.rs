@@ -76,7 +76,7 @@ impl GaussianTask {
         devices: &[Device],
     ) -> Result<Self, TrainError> {
         let mut sets = Vec::new();
-        let samples = SampleConfig { points: config.stage2.points > 0.0, ..config.samples.clone() };
+        let samples = SampleConfig { points: config.stage2.points > 0.0, ..config.samples() };
         for folder in folders {
             check_resolution(folder, config)?;
             sets.push(Stage2::new(folder.clone(), Some(Split::Train), samples.clone())?);
