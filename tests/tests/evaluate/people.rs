@@ -132,6 +132,42 @@ fn five_photographs_have_no_unseen_sides() {
     assert!(text.contains("| model | 2 | 6 |"), "{text}");
 }
 
+/// Photographs that are changed are what the ablation saw: figures of its own for every view, and none of the points where the
+/// pixels are others.
+#[test]
+fn photographs_are_changed_as_asked_for() {
+    let temporary = tempfile::tempdir().expect("a folder");
+    let report = temporary.path().join("report");
+    let changes = [
+        ("brighter", "{exposure=2.0}"),
+        ("cut", "{cut=0.5}"),
+        ("narrow", "{mask=-48.0}"),
+        ("placed", "{place=500}"),
+        ("same", "{exposure=0.0}"),
+    ];
+    let changes = changes.map(|(name, change)| format!("ablations.{name}.photographs={change}"));
+    let arguments: Vec<&str> = changes.iter().flat_map(|change| ["--set", change]).collect();
+    succeed(&mut evaluate(people(), &report, &arguments));
+    let found = json(&report);
+    let psnr = |of: &Value| of["protocols"]["masked"]["psnr"]["mean"].as_f64().expect("a figure");
+    let model = found["protocols"]["masked"]["overall"]["psnr"]["mean"].as_f64().expect("a figure");
+    let other = |name: &str| &found["compared"][name];
+    assert_eq!(psnr(other("same")), model);
+    for name in ["brighter", "cut", "narrow", "placed"] {
+        assert!((psnr(other(name)) - model).abs() > 0.05, "{name}: {} and {model} dB", psnr(other(name)));
+    }
+    // A stop too bright in front, a stop too dark behind.
+    assert!(psnr(other("brighter")) < model - 1.0, "{} and {model} dB", psnr(other("brighter")));
+    assert!(other("cut")["points_mm"]["front"]["mean"].is_number(), "{}", other("cut")["points_mm"]);
+    assert!(other("placed")["points_mm"]["front"].is_null(), "{}", other("placed")["points_mm"]);
+    // Weights of placed photographs alone see them placed.
+    let with = temporary.path().join("with");
+    let set = "model.set=[\"mode.placed=true\",\"mode.person_height=500\"]";
+    succeed(&mut evaluate(people(), &with, &["--set", set]));
+    let placed = json(&with)["protocols"]["masked"]["overall"]["psnr"]["mean"].as_f64().expect("a figure");
+    assert_eq!(placed, psnr(other("placed")));
+}
+
 #[test]
 fn what_is_missing_or_damaged_is_named_and_the_rest_evaluated() {
     let temporary = tempfile::tempdir().expect("a folder");
@@ -274,6 +310,8 @@ fn what_cannot_be_evaluated_is_refused_by_name() {
     wrong(&["--set", "data.split=\"val\""], &["has no split `val`"]);
     wrong(&["--set", "data.split=\"all\""], &["unknown variant `all`", "`train`", "`none`"]);
     wrong(&["--set", "data.split=\"none\""], &["img", "cannot read"]);
+    wrong(&["--set", "photographs.cut=2"], &["photographs", "`cut` is 2, must be 0 to 0.9"]);
+    wrong(&["--set", "ablations.a.photographs={mask=\"wide\"}"], &["mask", "f32"]);
     wrong(&["--device", "abacus"], &["abacus", "Here there are"]);
     wrong(&["--lpips", "nowhere.pth"], &["nowhere.pth"]);
     wrong(&["--icp"], &["--mesh-dir"]);
