@@ -54,69 +54,132 @@ pub struct Canvas {
     pub report: String,
 }
 
-/// Loads a photograph and puts it on a canvas of `side` pixels. The person is given by the `mask` file (white: person)
-/// or, without one, by the picture's alpha channel.
+/// Loads the photographs of front and back and puts each on a canvas of `side` pixels. The person is given by the `masks` files
+/// (white: person) or, without one, by the picture's alpha channel. With [`Placement::Training`], photographs that were taken
+/// from one place, as far as sizes and boxes tell, are scaled and moved alike, so that both still show the same size.
 ///
 /// # Errors
 /// [`FileError`]: unreadable files, a mask of another size, an empty mask, no mask at all, a picture below 64 pixels
 /// or of a single colour, or, with [`Placement::AsIs`], of another size than the canvas.
 pub fn load(
-    path: &Path,
-    mask: Option<&Path>,
+    paths: [&Path; 2],
+    masks: [Option<&Path>; 2],
     side: usize,
     placement: Placement,
-) -> Result<Canvas, FileError> {
-    let picture = picture::decode(path, MAX_BYTES)?;
-    let refuse = |message: String| FileError::Unsuitable { path: path.to_owned(), message };
-    let (width, height) = (picture.width(), picture.height());
-    if placement == Placement::AsIs {
-        if (width as usize, height as usize) != (side, side) {
+) -> Result<[Canvas; 2], FileError> {
+    let front = Cutout::read(paths[0], masks[0], side, placement)?;
+    let back = Cutout::read(paths[1], masks[1], side, placement)?;
+    let fitted = match placement {
+        Placement::Training { .. } => together([&front.mask, &back.mask], [front.person, back.person]),
+        _ => None,
+    };
+    Ok([front.canvas(fitted, side, placement)?, back.canvas(fitted, side, placement)?])
+}
+
+/// A photograph without its background.
+struct Cutout<'a> {
+    /// Where an empty mask would be found.
+    mask_path: &'a Path,
+    rgb: RgbImage,
+    mask: GrayImage,
+    person: Rect,
+    /// What it is, for a person to read.
+    source: String,
+}
+
+impl<'a> Cutout<'a> {
+    fn read(
+        path: &'a Path,
+        mask: Option<&'a Path>,
+        side: usize,
+        placement: Placement,
+    ) -> Result<Self, FileError> {
+        let picture = picture::decode(path, MAX_BYTES)?;
+        let refuse = |message: String| FileError::Unsuitable { path: path.to_owned(), message };
+        let (width, height) = (picture.width(), picture.height());
+        if placement == Placement::AsIs {
+            if (width as usize, height as usize) != (side, side) {
+                return Err(refuse(format!(
+                    "is {width}×{height}, --as-is wants the canvas itself, {side}×{side}"
+                )));
+            }
+        } else if width.min(height) < MIN_SIDE {
             return Err(refuse(format!(
-                "is {width}×{height}, --as-is wants the canvas itself, {side}×{side}"
+                "is {width}×{height}; both sides must have at least {MIN_SIDE} pixels"
             )));
         }
-    } else if width.min(height) < MIN_SIDE {
-        return Err(refuse(format!("is {width}×{height}; both sides must have at least {MIN_SIDE} pixels")));
-    }
-    let (mask, mask_path) = match mask {
-        Some(mask_path) => {
-            let mask = grey(&picture::decode(mask_path, MAX_BYTES)?);
-            if mask.dimensions() != (width, height) {
-                let message = format!(
-                    "the mask is {}×{}, its picture {} is {width}×{height}",
-                    mask.width(),
-                    mask.height(),
-                    path.display()
-                );
-                return Err(FileError::Unsuitable { path: mask_path.to_owned(), message });
+        let (mask, mask_path) = match mask {
+            Some(mask_path) => {
+                let mask = grey(&picture::decode(mask_path, MAX_BYTES)?);
+                if mask.dimensions() != (width, height) {
+                    let message = format!(
+                        "the mask is {}×{}, its picture {} is {width}×{height}",
+                        mask.width(),
+                        mask.height(),
+                        path.display()
+                    );
+                    return Err(FileError::Unsuitable { path: mask_path.to_owned(), message });
+                }
+                (mask, mask_path)
             }
-            (mask, mask_path)
+            None => (alpha(&picture).map_err(refuse)?, path),
+        };
+        let rgb = picture.into_rgb8();
+        // The demo takes whatever the mask touches; a lossy mask touches much that is not the person.
+        let least = if matches!(placement, Placement::Demo { .. }) { 1 } else { u8::MAX.div_ceil(2) };
+        let person = Rect::around(&mask, least).ok_or_else(|| nobody(mask_path, placement))?;
+        if is_single_colour(&rgb, &mask) {
+            return Err(refuse("the person is of a single colour: this is no photograph".into()));
         }
-        None => (alpha(&picture).map_err(refuse)?, path),
-    };
-    let rgb = picture.into_rgb8();
-    let empty = || {
-        let least =
-            if matches!(placement, Placement::Demo { .. }) { "255, as `mode.compat` asks" } else { "128" };
-        let message = format!("the mask is empty: no pixel of the person reaches {least}");
-        FileError::Unsuitable { path: mask_path.to_owned(), message }
-    };
-    // The demo takes whatever the mask touches; a lossy mask touches much that is not the person.
-    let least = if matches!(placement, Placement::Demo { .. }) { 1 } else { u8::MAX.div_ceil(2) };
-    let person = Rect::around(&mask, least).ok_or_else(empty)?;
-    if is_single_colour(&rgb, &mask) {
-        return Err(refuse("the person is of a single colour: this is no photograph".into()));
+        let source = format!(
+            "{width}×{height}, person's box {}×{} at ({}, {})",
+            person.width, person.height, person.x, person.y
+        );
+        Ok(Self { mask_path, rgb, mask, person, source })
     }
-    let source = format!(
-        "{width}×{height}, person's box {}×{} at ({}, {})",
-        person.width, person.height, person.x, person.y
-    );
-    let canvas = match placement {
-        Placement::AsIs => on_canvas(&rgb, &mask, side, source + ", used as it is"),
-        Placement::Training { height } => placed(&rgb, &mask, person, [height, side], &source),
-        Placement::Demo { height } => placed_as_demo(&rgb, &mask, person, [height, side], &source),
-    };
-    if canvas.valid.contains(&true) { Ok(canvas) } else { Err(empty()) }
+
+    /// On its canvas: its own person's box, or one that is common to both photographs.
+    fn canvas(self, fitted: Option<Rect>, side: usize, placement: Placement) -> Result<Canvas, FileError> {
+        let Self { mask_path, rgb, mask, person, source } = self;
+        let canvas = match placement {
+            Placement::AsIs => on_canvas(&rgb, &mask, side, source + ", used as it is"),
+            Placement::Training { height } => {
+                let source = if fitted.is_some() { source + ", with the other" } else { source };
+                placed(&rgb, &mask, fitted.unwrap_or(person), [height, side], &source)
+            }
+            Placement::Demo { height } => placed_as_demo(&rgb, &mask, person, [height, side], &source),
+        };
+        if canvas.valid.contains(&true) { Ok(canvas) } else { Err(nobody(mask_path, placement)) }
+    }
+}
+
+fn nobody(mask_path: &Path, placement: Placement) -> FileError {
+    let least =
+        if matches!(placement, Placement::Demo { .. }) { "255, as `mode.compat` asks" } else { "128" };
+    let message = format!("the mask is empty: no pixel of the person reaches {least}");
+    FileError::Unsuitable { path: mask_path.to_owned(), message }
+}
+
+/// The box around the person in both photographs, if they look as if taken from one place: of one size, the person about as high in
+/// both, and in the middle of both. Somebody who turns on the spot is seen on the left of the axis in front where it is the
+/// right behind, so that the axis is in the middle of that box.
+fn together(masks: [&GrayImage; 2], people: [Rect; 2]) -> Option<Rect> {
+    /// Towards a camera that looks down, toes reach lower than heels: up to a tenth of the height, and somebody moves a little.
+    const TALLER: f32 = 1.2;
+    /// Of the height; arms are seldom held alike.
+    const ASIDE: f32 = 0.2;
+    let [a, b] = people;
+    let ratio = a.height as f32 / b.height as f32;
+    let middle = |r: Rect| r.x as f32 + r.width as f32 / 2.0;
+    let aside = (middle(a) - middle(b)).abs();
+    let is_one = masks[0].dimensions() == masks[1].dimensions()
+        && (1.0 / TALLER..=TALLER).contains(&ratio)
+        && aside <= ASIDE * a.height.max(b.height) as f32;
+    is_one.then(|| {
+        let (x, y) = (a.x.min(b.x), a.y.min(b.y));
+        let (right, bottom) = ((a.x + a.width).max(b.x + b.width), (a.y + a.height).max(b.y + b.height));
+        Rect { x, y, width: right - x, height: bottom - y }
+    })
 }
 
 /// A mask picture's brightness, on black where it is transparent.
@@ -255,13 +318,22 @@ impl Fit {
     }
 }
 
-/// Puts a photograph on a canvas of `side` pixels as [`Placement::Training`] does; `None` if the mask shows nobody.
-pub fn place(rgb: &RgbImage, mask: &GrayImage, height: usize, side: usize) -> Option<Canvas> {
-    let person = Rect::around(mask, u8::MAX.div_ceil(2))?;
-    Some(placed(rgb, mask, person, [height, side], ""))
+/// Puts photographs on canvases of `side` pixels as [`Placement::Training`] does, two of them together if they look as if taken
+/// from one place; `None` if a mask shows nobody.
+pub fn place(photographs: &[(&RgbImage, &GrayImage)], height: usize, side: usize) -> Option<Vec<Canvas>> {
+    let people = photographs.iter().map(|(_, mask)| Rect::around(mask, u8::MAX.div_ceil(2)));
+    let people: Vec<Rect> = people.collect::<Option<_>>()?;
+    let common = match (photographs, people.as_slice()) {
+        ([(_, front), (_, back)], [a, b]) => together([front, back], [*a, *b]),
+        _ => None,
+    };
+    let placed = |((rgb, mask), person): (&(&RgbImage, &GrayImage), &Rect)| {
+        placed(rgb, mask, common.unwrap_or(*person), [height, side], "")
+    };
+    Some(photographs.iter().zip(&people).map(placed).collect())
 }
 
-/// The person's box at the size and place of the training subjects; what of a soft edge lies outside the box comes
+/// The box at the size and place of the training subjects; what of a soft edge lies outside the box comes
 /// along.
 fn placed(rgb: &RgbImage, mask: &GrayImage, person: Rect, size: [usize; 2], source: &str) -> Canvas {
     let (side, canvas) = (size[1], size[1] as f32);
@@ -276,8 +348,9 @@ fn placed(rgb: &RgbImage, mask: &GrayImage, person: Rect, size: [usize; 2], sour
     let touched = touched.clipped_around(person, [reach(sx), reach(sy)]);
     let target = |length: u32, scale: f32| ((length as f32 * scale).round() as usize).max(1);
     let (wide, high) = (target(touched.width, sx), target(touched.height, sy));
-    let x0 = left as i64 - ((person.x - touched.x) as f32 * sx).round() as i64;
-    let y0 = top as i64 - ((person.y - touched.y) as f32 * sy).round() as i64;
+    let apart = |a: u32, b: u32, scale: f32| ((i64::from(a) - i64::from(b)) as f32 * scale).round() as i64;
+    let x0 = left as i64 - apart(person.x, touched.x, sx);
+    let y0 = top as i64 - apart(person.y, touched.y, sy);
 
     // Colours travel multiplied by the mask, so that what lies behind the person never bleeds in.
     let premultiplied = |color, m| unit(color) * unit(m);

@@ -228,9 +228,6 @@ pub struct ModeConfig {
     /// Height to which the person is scaled, in pixels of a canvas of 1024.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub person_height: Option<usize>,
-    /// Whether the networks know placed photographs alone, as a user's are: evaluations then place views of data sets as well,
-    /// and move what comes out back to where their cameras see it.
-    pub placed: bool,
 }
 
 /// A config that cannot be used.
@@ -306,7 +303,6 @@ impl Config {
             world_frame: Some(self.world_frame()),
             crop: Some(self.crop()),
             person_height: Some(self.person_height()),
-            placed: self.mode.placed,
         };
         config
     }

@@ -81,6 +81,13 @@ impl Gaussians {
         self
     }
 
+    /// The whole set so many times as large, seen from the origin.
+    pub fn scaled(mut self, factor: f64) -> Self {
+        self.means = self.means * factor;
+        self.scales = self.scales * factor;
+        self
+    }
+
     /// Moves the whole set rigidly: the centres, and the quaternions by left multiplication (SNAPSNAP §13.3, fix 1).
     ///
     /// # Panics

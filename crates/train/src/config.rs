@@ -106,6 +106,9 @@ pub enum ValidationSplit {
 pub struct Stage1Config {
     /// λ, the weight of the confidences' cross-entropy: 0.5 in the published code, 1 in the paper.
     pub confidence: f64,
+    /// How much of each sample's mean shift of the photographed points counts, 0 to 1: 1 as published, little where no picture
+    /// tells how far away the camera stood.
+    pub shift: f64,
 }
 
 /// The section `[stage2]`.
@@ -197,7 +200,7 @@ impl Default for TrainingConfig {
 
 impl Default for Stage1Config {
     fn default() -> Self {
-        Self { confidence: 0.5 }
+        Self { confidence: 0.5, shift: 1.0 }
     }
 }
 
@@ -272,6 +275,7 @@ impl TrainConfig {
             ("training.clip", t.clip, 1e-9, 1e9),
             ("training.average", t.average, 0.0, 0.999_999),
             ("stage1.confidence", self.stage1.confidence, 0.0, 1e6),
+            ("stage1.shift", self.stage1.shift, 0.0, 1.0),
             ("stage2.beta", two.beta, 0.0, 1.0),
             ("stage2.alpha", two.alpha, 0.0, 1e6),
             ("stage2.needle", two.needle, 0.0, 1e6),
@@ -286,11 +290,6 @@ impl TrainConfig {
         }
         if self.network.conf_mode != ConfMode::Sigmoid {
             return Some(("network.conf_mode".into(), "must be \"sigmoid\" to be trained".into()));
-        }
-        if self.mode.placed != (self.samples.place > 0.0) {
-            let message = "is {}, and `samples.place` is {}: what is learned from placed photographs is what they are for";
-            let message = message.replacen("{}", &self.mode.placed.to_string(), 1);
-            return Some(("mode.placed".into(), message.replacen("{}", &self.samples.place.to_string(), 1)));
         }
         if two.curriculum && !self.network.side_heads {
             let message = "begins with the sides alone, which `network.side_heads = false` leaves out";

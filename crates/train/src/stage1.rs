@@ -13,7 +13,7 @@ use snapsnap_net::network::{PointMap, View};
 use snapsnap_ops::host;
 
 use crate::TrainError;
-use crate::config::TrainConfig;
+use crate::config::{Stage1Config, TrainConfig};
 use crate::fixed::{Fixed, check_resolution};
 use crate::networks::Networks;
 use crate::points::{Prediction, losses, predict};
@@ -29,8 +29,7 @@ const WORST: f32 = 0.2;
 /// The training of the point predictor.
 pub struct PointTask {
     networks: Config,
-    /// λ.
-    confidence: f64,
+    losses: Stage1Config,
     sets: Vec<Stage1>,
     validation: Fixed<Stage1Item>,
     /// Those that train, with gradients.
@@ -59,7 +58,7 @@ impl PointTask {
         })?;
         Ok(Self {
             networks: config.networks(),
-            confidence: config.stage1.confidence,
+            losses: config.stage1.clone(),
             sets,
             validation,
             devices: devices.to_vec(),
@@ -98,10 +97,10 @@ impl Task for PointTask {
         at: Moment,
     ) -> Result<Vec<Part>, TrainError> {
         let batch = Stage1Batcher.batch(items, &self.devices[at.device]);
-        let losses = losses(&self.predict(networks, &batch), &batch.points, &batch.valid);
+        let losses = losses(&self.predict(networks, &batch), &batch.points, &batch.valid, self.losses.shift);
         Ok(vec![
             Part { name: "points", weight: 1.0, value: losses.regression },
-            Part { name: "confidence", weight: self.confidence, value: losses.confidence },
+            Part { name: "confidence", weight: self.losses.confidence, value: losses.confidence },
         ])
     }
 

@@ -160,12 +160,6 @@ fn photographs_are_changed_as_asked_for() {
     assert!(psnr(other("brighter")) < model - 1.0, "{} and {model} dB", psnr(other("brighter")));
     assert!(other("cut")["points_mm"]["front"]["mean"].is_number(), "{}", other("cut")["points_mm"]);
     assert!(other("placed")["points_mm"]["front"].is_null(), "{}", other("placed")["points_mm"]);
-    // Weights of placed photographs alone see them placed.
-    let with = temporary.path().join("with");
-    let set = "model.set=[\"mode.placed=true\",\"mode.person_height=500\"]";
-    succeed(&mut evaluate(people(), &with, &["--set", set]));
-    let placed = json(&with)["protocols"]["masked"]["overall"]["psnr"]["mean"].as_f64().expect("a figure");
-    assert_eq!(placed, psnr(other("placed")));
 }
 
 #[test]

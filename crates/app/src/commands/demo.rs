@@ -8,11 +8,9 @@ use image::imageops::FilterType;
 use image::{DynamicImage, RgbImage};
 use serde_json::json;
 use snapsnap_data::photo::{self, Canvas, Placement};
-use snapsnap_data::sample::Handling;
 use snapsnap_eval::pictures::Picture;
 use snapsnap_eval::region::{Region, margin};
 use snapsnap_eval::similarity::psnr;
-use snapsnap_net::gaussians::placed;
 use snapsnap_net::{Photograph, Reconstructor};
 use snapsnap_splat::{Camera, Gaussians, RenderOptions, ply, render};
 
@@ -35,7 +33,7 @@ const FILES: &[&str] = &[
     REPORT,
 ];
 
-/// Front and back of a made person nobody was trained on, RGBA, as the nominal cameras see them in [`PHOTOGRAPH`]² pixels.
+/// Front and back of a made person nobody was trained on, RGBA, `[1024, 1024]`, as the nominal cameras see them.
 const PHOTOGRAPHS: [(&str, &[u8]); 2] = [
     ("front.png", include_bytes!("../../../../assets/sample/front.png")),
     ("back.png", include_bytes!("../../../../assets/sample/back.png")),
@@ -47,7 +45,6 @@ const TRUTHS: [(f64, &[u8]); 3] = [
     (270.0, include_bytes!("../../../../assets/sample/270.png")),
 ];
 const TRUTH: u32 = 512;
-const PHOTOGRAPH: u32 = 1024;
 
 #[derive(Args)]
 pub struct Arguments {
@@ -71,21 +68,15 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let weights = weights::open(None, &ConfigArguments { config: None, set: Vec::new() })?;
     let config = weights.config.clone();
     let since = Instant::now();
-    let placement = Placement::Training { height: config.person_height() };
-    let load =
-        |name: &str| photo::load(&folder.path().join(name), None, config.network.resolution, placement);
-    let canvases = [load(PHOTOGRAPHS[0].0)?, load(PHOTOGRAPHS[1].0)?];
-    let mapping = canvases[0].mapping;
+    // The sample lies on its canvas already, so that its cameras are known and other views can be compared.
+    let paths = PHOTOGRAPHS.map(|(name, _)| folder.path().join(name));
+    let canvases =
+        photo::load([&paths[0], &paths[1]], [None; 2], config.network.resolution, Placement::AsIs)?;
     let [front, back] = canvases.map(|Canvas { rgb, mask, valid, .. }| Photograph { rgb, mask, valid });
     let reconstructor = Reconstructor::load(&weights, &device)?;
     let made = reconstructor.reconstruct(&front, &back, &|name| progress.stage(name));
     let seconds = since.elapsed().as_secs_f64();
-    // The sample's cameras are known, and other views can be compared where they see it.
-    let camera = Camera::orbit_at_yaw_degrees(0.0, PHOTOGRAPH);
-    let points = read_back(made.maps.points.clone().narrow(0, 0, 1))?;
-    let back = Handling::back(&mapping, &camera, &points, &made.valid[0]);
-    let to_world = back.then(&camera.world_to_camera.inverse());
-    let world = placed(&config, made.gaussians.clone(), &to_world);
+    let world = made.in_world(&config);
     progress.stage("writing");
     ply::write(&world, &folder.file("human.ply"))?;
     drop(progress);

@@ -247,7 +247,9 @@ fn contestants(
         let sides = ablation.sides && !has_known_sides(config);
         let leave = Leave { sides, side_colors: ablation.side_colors, ..Leave::default() };
         let photographs = ablation.photographs.unwrap_or(config.photographs);
-        Ok(Model::load(&weights, device, leave)?.seeing(photographs))
+        let mut model = Model::load(&weights, device, leave)?;
+        model.photographs = photographs;
+        Ok(model)
     };
     match model(&whole, &devices[0]) {
         Ok(model) => contestants.push(Contestant::model("model", model)),

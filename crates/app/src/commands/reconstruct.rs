@@ -17,8 +17,8 @@ use crate::turntable::Turntable;
 use crate::{device, dump, memory, output, say, weights};
 
 /// Bytes per pixel of a photograph while it is placed on its canvas: as it is decoded, as red, green, blue and mask, and one
-/// plane of numbers.
-const PHOTOGRAPH: u64 = 14;
+/// plane of numbers; beside red, green, blue and mask of another as large.
+const PHOTOGRAPH: u64 = 18;
 
 #[derive(Args)]
 pub struct Arguments {
@@ -85,10 +85,9 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     };
     let masks = arguments.masks.as_deref().unwrap_or_default();
     let since = Instant::now();
-    let load = |path: &Path, mask: Option<&PathBuf>| {
-        photo::load(path, mask.map(PathBuf::as_path), config.network.resolution, placement)
-    };
-    let canvases = [load(&arguments.front, masks.first())?, load(&arguments.back, masks.get(1))?];
+    let masks = [0, 1].map(|i| masks.get(i).map(PathBuf::as_path));
+    let paths = [arguments.front.as_path(), &arguments.back];
+    let canvases = photo::load(paths, masks, config.network.resolution, placement)?;
     timed("photographs", since);
 
     let progress = Progress::stages(quiet);

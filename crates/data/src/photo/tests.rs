@@ -23,6 +23,11 @@ fn quarters() -> tempfile::NamedTempFile {
     file
 }
 
+/// A photograph on its canvas, beside itself.
+fn one(path: &Path, placement: Placement) -> Result<Canvas, FileError> {
+    load([path, path], [None; 2], SIDE, placement).map(|[canvas, _]| canvas)
+}
+
 fn check_quarters(canvas: &Canvas, rows: std::ops::Range<usize>) {
     let columns = {
         let width = rows.len() / 2;
@@ -51,14 +56,14 @@ fn check_quarters(canvas: &Canvas, rows: std::ops::Range<usize>) {
 
 #[test]
 fn the_person_stands_upright_where_training_subjects_stand() {
-    let canvas = load(quarters().path(), None, SIDE, Placement::Training { height: 740 }).expect("a person");
+    let canvas = one(quarters().path(), Placement::Training { height: 740 }).expect("a person");
     // 740 and the middle row 493.5 of 1024, at a quarter of the size.
     check_quarters(&canvas, 31..216);
 }
 
 #[test]
 fn the_demo_puts_the_person_in_the_middle() {
-    let canvas = load(quarters().path(), None, SIDE, Placement::Demo { height: 700 }).expect("a person");
+    let canvas = one(quarters().path(), Placement::Demo { height: 700 }).expect("a person");
     check_quarters(&canvas, 40..215);
 }
 
@@ -74,7 +79,7 @@ fn soft_edges_stay_soft_and_outside_the_box() {
     });
     let file = tempfile::Builder::new().suffix(".png").tempfile().expect("temporary file");
     picture.save(file.path()).expect("PNG");
-    let canvas = load(file.path(), None, SIDE, Placement::Training { height: 739 }).expect("a person");
+    let canvas = one(file.path(), Placement::Training { height: 739 }).expect("a person");
     let column: Vec<f32> = (0..SIDE).map(|row| canvas.mask[row * SIDE + SIDE / 2]).collect();
     let soft = column.iter().filter(|m| (0.3..0.5).contains(*m)).count();
     // Five rows of 100/255, enlarged by 739/4/120.
@@ -90,7 +95,7 @@ fn a_person_wider_than_the_canvas_gets_smaller_not_narrower() {
     let file = tempfile::Builder::new().suffix(".png").tempfile().expect("temporary file");
     picture.save(file.path()).expect("PNG");
     for placement in [Placement::Training { height: 739 }, Placement::Demo { height: 700 }] {
-        let canvas = load(file.path(), None, SIDE, placement).expect("a person");
+        let canvas = one(file.path(), placement).expect("a person");
         let rows = (0..SIDE).filter(|y| canvas.valid[y * SIDE + SIDE / 2]).count();
         let columns = canvas.valid.chunks_exact(SIDE).map(|r| r.iter().filter(|v| **v).count()).max();
         let ratio = columns.expect("rows") as f32 / rows as f32;
@@ -111,7 +116,43 @@ fn a_speck_far_from_a_tiny_person_costs_nothing() {
     });
     let file = tempfile::Builder::new().suffix(".png").tempfile().expect("temporary file");
     picture.save(file.path()).expect("PNG");
-    let canvas = load(file.path(), None, SIDE, Placement::Training { height: 739 }).expect("a person");
+    let canvas = one(file.path(), Placement::Training { height: 739 }).expect("a person");
     let valid = canvas.valid.iter().filter(|v| **v).count();
     assert!((170 * 170..200 * 200).contains(&valid), "{valid}");
+}
+
+/// Of two photographs from one place both show the same scale and the axis in the middle; of two that differ in size, or in how
+/// large the person is, each has its own.
+#[test]
+fn photographs_from_one_place_are_placed_together() {
+    let person = |size: (u32, u32), x: u32, y: u32, height: u32| {
+        let mask = GrayImage::from_fn(size.0, size.1, |i, j| {
+            image::Luma([if (x..x + 60).contains(&i) && (y..y + height).contains(&j) { 255 } else { 0 }])
+        });
+        (RgbImage::from_fn(size.0, size.1, |i, j| image::Rgb([(i % 251) as u8, (j % 241) as u8, 9])), mask)
+    };
+    let rows = |canvas: &Canvas| {
+        let set: Vec<usize> = (0..SIDE * SIDE).filter(|i| canvas.valid[*i]).collect();
+        let columns = || set.iter().map(|i| i % SIDE);
+        let middle = columns().min().expect("a person") + columns().max().expect("a person");
+        (set[0] / SIDE, set[set.len() - 1] / SIDE, middle)
+    };
+    let placed = |a: &(RgbImage, GrayImage), b: &(RgbImage, GrayImage)| {
+        let made = place(&[(&a.0, &a.1), (&b.0, &b.1)], 800, SIDE).expect("two people");
+        (rows(&made[0]), rows(&made[1]), made[0].mapping, made[1].mapping)
+    };
+    // Toes reach 10 pixels lower than heels; the axis is at 130.
+    let (front, back) = (person((300, 300), 110, 40, 210), person((300, 300), 90, 40, 200));
+    let (a, b, of_front, of_back) = placed(&front, &back);
+    assert_eq!((of_front, a.0), (of_back, b.0));
+    assert!(a.1 - a.0 == 199 && (a.1 - b.1).abs_diff(10) <= 1, "{a:?} {b:?}");
+    // As far right of the middle as the other is left.
+    assert!((a.2 + b.2).abs_diff(2 * (SIDE - 1)) <= 2 && a.2 > b.2 + 30, "{a:?} {b:?}");
+    for other in
+        [person((301, 300), 90, 40, 200), person((300, 300), 90, 40, 170), person((300, 300), 20, 40, 200)]
+    {
+        let (a, b, of_front, of_back) = placed(&front, &other);
+        assert!(of_front != of_back && a.0.abs_diff(b.0) <= 1 && a.1.abs_diff(b.1) <= 1, "{a:?} {b:?}");
+        assert!(a.2.abs_diff(SIDE - 1) <= 1 && b.2.abs_diff(SIDE - 1) <= 1, "{a:?} {b:?}");
+    }
 }

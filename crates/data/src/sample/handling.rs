@@ -5,7 +5,7 @@ use image::{GrayImage, RgbImage};
 use serde::{Deserialize, Serialize};
 
 use super::augment::moved;
-use super::place::shift;
+use super::place::{scale_of, shift};
 use crate::photo::{Mapping, Rect};
 use snapsnap_splat::{Camera, RigidTransform};
 
@@ -69,23 +69,21 @@ impl Handling {
         (color, mask)
     }
 
-    /// From the frame of a camera in which placed photographs' points lie to that of the `camera` that took the first one,
-    /// whose pixels came onto the canvas by `mapping`: the shift after which the points `[S, S, 3]`, metres, of the canvas's
-    /// pixels lie on the rays by which that camera saw them.
-    pub fn back(mapping: &Mapping, camera: &Camera, points: &[f32], valid: &[bool]) -> RigidTransform {
+    /// From the nominal camera's frame, in which placed photographs' points lie, to that of the `camera` that took the first one,
+    /// whose pixels came onto the canvas by `mapping`: a scale, since how large somebody is, or how far away, no photograph
+    /// tells and only the known camera does, and then the shift after which the points `[S, S, 3]`, metres, of the canvas's pixels
+    /// lie on the rays by which that camera saw them.
+    pub fn back(mapping: &Mapping, camera: &Camera, points: &[f32], valid: &[bool]) -> (f64, RigidTransform) {
         let side = f64::from(valid.len() as u32).sqrt() as usize;
         // The canvas may be of another size than the photograph that was placed.
-        let scale = f64::from(camera.width) / side as f64;
+        let shrunk = f64::from(camera.width) / side as f64;
+        let scale = scale_of(mapping, camera);
         let seen = valid.iter().enumerate().filter(|(_, valid)| **valid).map(|(pixel, _)| {
             let canvas = DVec2::new((pixel % side) as f64, (pixel / side) as f64) + 0.5;
-            let ray = (mapping.source(canvas * scale) - camera.principal_point) / camera.focal;
-            let point = DVec3::new(
-                points[3 * pixel].into(),
-                points[3 * pixel + 1].into(),
-                points[3 * pixel + 2].into(),
-            );
-            (ray, point)
+            let ray = (mapping.source(canvas * shrunk) - camera.principal_point) / camera.focal;
+            let point = [0, 1, 2].map(|c| f64::from(points[3 * pixel + c]));
+            (ray, scale * DVec3::from(point))
         });
-        RigidTransform { translation: shift(seen), ..RigidTransform::IDENTITY }
+        (scale, RigidTransform { translation: shift(seen), ..RigidTransform::IDENTITY })
     }
 }

@@ -21,7 +21,7 @@ use serde::{Deserialize, Serialize};
 use snapsnap_splat::Camera;
 
 use crate::dataset::{Arrangement, Folder, Layout, Split, StoredView};
-use crate::photo::{Mapping, place};
+use crate::photo::{Canvas, Mapping, place};
 pub use augment::Augment;
 pub use handling::Handling;
 pub use joined::Joined;
@@ -221,15 +221,16 @@ impl Source {
         Ok(((0..3).flat_map(pixels).collect(), share))
     }
 
-    /// A photograph as the networks see it, `[3,H,W]`, its mask `[H,W]`, and where its pixels come from.
-    fn photograph(
+    /// Photographs of front and back as the networks see them.
+    fn photographs(
         &self,
-        view: (&RgbImage, &GrayImage),
+        views: [(&RgbImage, &GrayImage); 2],
         is_placed: bool,
         random: &mut impl Rng,
-    ) -> Photograph {
-        let (color, mask) = self.config.augment.apply(view.0, view.1, random);
-        Photograph::new(&color, &mask, if is_placed { self.config.person_height } else { 0 })
+    ) -> Vec<Photograph> {
+        let changed = views.map(|(color, mask)| self.config.augment.apply(color, mask, random));
+        let changed = [0, 1].map(|i| (&changed[i].0, &changed[i].1));
+        Photograph::all(&changed, if is_placed { self.config.person_height } else { 0 })
     }
 
     /// Whether a sample's photographs are placed as a user's are.
@@ -251,17 +252,36 @@ struct Photograph {
     mapping: Mapping,
 }
 
+/// Whether a share of a pixel makes it the person's.
+fn inside(share: f32) -> f32 {
+    f32::from(u8::from(share >= f32::from(INSIDE) / 255.0))
+}
+
 impl Photograph {
-    /// A photograph as the networks see it: put on its canvas as a user's is, with the person so many pixels of 1024 high, or, with
-    /// 0, as it is.
-    fn new(color: &RgbImage, mask: &GrayImage, height: usize) -> Self {
-        let inside = |share: f32| f32::from(u8::from(share >= f32::from(INSIDE) / 255.0));
-        if let Some(canvas) =
-            (height > 0).then(|| place(color, mask, height, color.width() as usize)).flatten()
-        {
-            let mask = canvas.mask.iter().map(|share| inside(*share)).collect();
-            return Self { image: canvas.rgb, mask, mapping: canvas.mapping };
+    /// Photographs of a person as the networks see them: put on their canvas as a user's are, with the person so many pixels of 1024
+    /// high, or, with 0, as they are.
+    fn all(photographs: &[(&RgbImage, &GrayImage)], height: usize) -> Vec<Self> {
+        let side = photographs.first().map_or(0, |(color, _)| color.width() as usize);
+        let placed = (height > 0).then(|| place(photographs, height, side)).flatten();
+        match placed {
+            Some(canvases) => canvases.into_iter().map(Self::of_canvas).collect(),
+            None => photographs.iter().map(|(color, mask)| Self::as_it_is(color, mask)).collect(),
         }
+    }
+
+    /// Images and masks, one after another.
+    fn joined(photographs: Vec<Self>) -> (Vec<f32>, Vec<f32>) {
+        let (images, masks): (Vec<_>, Vec<_>) =
+            photographs.into_iter().map(|photograph| (photograph.image, photograph.mask)).unzip();
+        (images.concat(), masks.concat())
+    }
+
+    fn of_canvas(canvas: Canvas) -> Self {
+        let mask = canvas.mask.iter().map(|share| inside(*share)).collect();
+        Self { image: canvas.rgb, mask, mapping: canvas.mapping }
+    }
+
+    fn as_it_is(color: &RgbImage, mask: &GrayImage) -> Self {
         // Channels first; the background is 0 (SNAPSNAP §5.7).
         let channel = |channel: usize| {
             let pixels = color.pixels().zip(mask.pixels());

@@ -1,13 +1,13 @@
 //! Photographs to learn from on their canvas as a user's are put there (LEARNING.md, "Targets"), and the points that belong to
-//! them. A person is then always as high and in the same place, and how far away the camera stood, which no picture tells, is
-//! no part of what is learned: points are moved, all of a sample's alike, until those of the front project in the nominal
-//! camera where its pixels lie.
+//! them. A person is then always as high and in the same place, and how large somebody is, or how far away, which no picture
+//! tells, is no part of what is learned: points are scaled as if the body's axis were as far away as from the nominal camera, and
+//! moved, all of a sample's alike, until those of the front project in that camera where its pixels lie.
 
 use glam::{DMat3, DVec2, DVec3};
 use image::{GrayImage, RgbImage};
 use rand::Rng;
 use snapsnap_mesh::FileError;
-use snapsnap_splat::Camera;
+use snapsnap_splat::{Camera, Orbit};
 
 use super::{INSIDE, Photograph, Source};
 use crate::dataset::{StoredView, unproject};
@@ -27,8 +27,10 @@ pub(super) struct Four {
     /// `[4,H,W,3]` metres in the front's frame, and where there are any `[4,H,W]`.
     pub points: Vec<f32>,
     pub valid: Vec<f32>,
-    /// The front's camera, in whose frame the points are: where they were moved, it was moved with them.
+    /// The front's camera, in whose frame the points are once they are multiplied by `scale`: where they were moved, it was
+    /// moved with them.
     pub front: Camera,
+    pub scale: f64,
 }
 
 impl Source {
@@ -45,8 +47,8 @@ impl Source {
         let views: Vec<StoredView> = views.collect::<Result<_, _>>()?;
         let cameras: Vec<Camera> = views.iter().map(|view| self.camera(&view.camera)).collect();
         let photographs =
-            [0, 1].map(|i| self.photograph((&views[i].color, &views[i].mask), is_placed, random));
-        let mut front = cameras[0];
+            self.photographs([0, 1].map(|i| (&views[i].color, &views[i].mask)), is_placed, random);
+        let (mut front, mut scale) = (cameras[0], 1.0);
         let (mut points, mut valid) = (Vec::new(), Vec::new());
         let sights = views.iter().zip(&cameras).map(|(view, camera)| Sight { view, camera });
         if !is_placed {
@@ -61,26 +63,22 @@ impl Source {
         } else {
             let sights: Vec<Sight> = sights.collect();
             let nominal = Camera::orbit_at_yaw_degrees(0.0, front.width);
-            let seen = sights[0].through(&photographs[0].mapping, &front);
+            scale = scale_of(&photographs[0].mapping, &front);
+            let seen = sights[0].through(&photographs[0].mapping, &front, scale);
             let rays = centres(front.width).map(|place| (place - nominal.principal_point) / nominal.focal);
             front.world_to_camera.translation +=
-                shift(rays.zip(seen).filter_map(|(ray, point)| Some((ray, point?))));
-            let [front_seen, back_seen] = [0, 1].map(|i| sights[i].through(&photographs[i].mapping, &front));
+                scale * shift(rays.zip(seen).filter_map(|(ray, point)| Some((ray, point?))));
+            let [front_seen, back_seen] =
+                [0, 1].map(|i| sights[i].through(&photographs[i].mapping, &front, scale));
             let [right, left] =
-                [(2, 90.0), (3, 270.0)].map(|(i, degrees)| sights[i].as_nominal(&front, degrees));
+                [(2, 90.0), (3, 270.0)].map(|(i, degrees)| sights[i].as_nominal(&front, scale, degrees));
             for seen in [front_seen, back_seen, right, left].into_iter().flatten() {
                 points.extend(seen.unwrap_or_default().as_vec3().to_array());
                 valid.push(f32::from(u8::from(seen.is_some())));
             }
         }
-        let [Photograph { image, mask, .. }, back] = photographs;
-        Ok(Four {
-            images: [image, back.image].concat(),
-            masks: [mask, back.mask].concat(),
-            points,
-            valid,
-            front,
-        })
+        let (images, masks) = Photograph::joined(photographs);
+        Ok(Four { images, masks, points, valid, front, scale })
     }
 
     /// The pictures of front and back alone, where no points are asked for and none are needed.
@@ -89,8 +87,8 @@ impl Source {
         pictures: [&(RgbImage, GrayImage); 2],
         random: &mut impl Rng,
     ) -> (Vec<f32>, Vec<f32>) {
-        let [front, back] = pictures.map(|(color, mask)| self.photograph((color, mask), false, random));
-        ([front.image, back.image].concat(), [front.mask, back.mask].concat())
+        let pictures = pictures.map(|(color, mask)| (color, mask));
+        Photograph::joined(self.photographs(pictures, false, random))
     }
 }
 
@@ -118,22 +116,24 @@ impl Sight<'_> {
     }
 
     /// What the view sees at the pixels of a canvas that it was put on.
-    fn through(&self, mapping: &Mapping, front: &Camera) -> Seen {
+    fn through(&self, mapping: &Mapping, front: &Camera, scale: f64) -> Seen {
         let to_front = self.camera.world_to_camera.inverse().then(&front.world_to_camera);
-        let seen = |place| self.point(mapping.source(place)).map(|p| to_front.apply(p));
+        let seen = |place| self.point(mapping.source(place)).map(|p| to_front.apply(p) / scale);
         centres(self.camera.width).map(seen).collect()
     }
 
     /// What the nominal camera `degrees` around the body's axis from the front's sees, as it would stand in the frame of
     /// `front`: points that the view saw, each at the pixel that it projects to.
-    fn as_nominal(&self, front: &Camera, degrees: f64) -> Seen {
+    fn as_nominal(&self, front: &Camera, scale: f64, degrees: f64) -> Seen {
         let [nominal, nominal_front] =
             [degrees, 0.0].map(|yaw| Camera::orbit_at_yaw_degrees(yaw, self.camera.width));
         let to_front = nominal.world_to_camera.inverse().then(&nominal_front.world_to_camera);
-        let to_view = to_front.then(&front.world_to_camera.inverse()).then(&self.camera.world_to_camera);
-        let from_view = to_view.inverse();
+        let onwards = front.world_to_camera.inverse().then(&self.camera.world_to_camera);
+        let to_view = |p: DVec3| onwards.apply(scale * to_front.apply(p));
+        let (back, from_front) = (onwards.inverse(), to_front.inverse());
+        let from_view = |p: DVec3| from_front.apply(back.apply(p) / scale);
         let all = centres(self.camera.width).filter_map(|place| self.point(place));
-        let (sum, count) = all.fold((0.0, 0.0), |(sum, count), p| (sum + from_view.apply(p).z, count + 1.0));
+        let (sum, count) = all.fold((0.0, 0.0), |(sum, count), p| (sum + from_view(p).z, count + 1.0));
         if count == 0.0 {
             return vec![None; self.view.depth.len()];
         }
@@ -141,12 +141,12 @@ impl Sight<'_> {
             let ray = ((place - nominal.principal_point) / nominal.focal).extend(1.0);
             let mut found = DVec3::new(0.0, 0.0, sum / count);
             for _ in 0..LOOKUPS {
-                let there = to_view.apply(found.z * ray);
+                let there = to_view(found.z * ray);
                 if there.z <= 0.0 {
                     return None;
                 }
                 let pixel = self.camera.focal * there.truncate() / there.z + self.camera.principal_point;
-                found = from_view.apply(self.point(pixel)?);
+                found = from_view(self.point(pixel)?);
             }
             Some(to_front.apply(found))
         };
@@ -157,6 +157,14 @@ impl Sight<'_> {
 /// Centres of a square picture's pixels, row by row.
 fn centres(side: u32) -> impl Iterator<Item = DVec2> {
     (0..side).flat_map(move |row| (0..side).map(move |column| DVec2::new(column.into(), row.into()) + 0.5))
+}
+
+/// How many times as large as a nominal camera's what a camera sees is, if its photograph came onto the canvas by `mapping`: as
+/// much as its distance from the body's axis and its pixels are other than a nominal camera's.
+pub(super) fn scale_of(mapping: &Mapping, camera: &Camera) -> f64 {
+    let nominal = Orbit::default();
+    let distance = camera.world_to_camera.apply(nominal.centre).z / nominal.radius;
+    distance * nominal.focal * f64::from(camera.width) / camera.focal.y / mapping.scale.y
 }
 
 /// The shift t, in metres, after which points p project best where the rays `(x/z, y/z)` beside them go: the least squares of

@@ -31,6 +31,8 @@ pub struct Stage2Item {
     pub masks: Vec<f32>,
     /// Cameras of front, back, right and left, side H; the front's where its points were moved to, with `place`.
     pub cameras: [Camera; 4],
+    /// How many times as large the person is as the points say, with `place`.
+    pub scale: f64,
     /// `[4,H,W,3]` points that they see, metres in the front camera's frame; empty unless the config asks for them.
     pub points: Vec<f32>,
     /// `[4,H,W]` 1 where a point is one; empty likewise.
@@ -116,10 +118,11 @@ impl Stage2 {
             target_cameras.push(source.camera(&stored));
         }
         let is_placed = source.is_placed(&mut random);
+        let mut scale = 1.0;
         let (images, masks, points, valid) = if config.points || is_placed {
-            let Four { images, masks, points, valid, front } =
+            let Four { images, masks, points, valid, front, scale: of_four } =
                 source.four(subject, &order, is_placed, &mut random)?;
-            cameras[0] = front;
+            (cameras[0], scale) = (front, of_four);
             let (points, valid) = if config.points { (points, valid) } else { Default::default() };
             (images, masks, points, valid)
         } else {
@@ -133,6 +136,7 @@ impl Stage2 {
             images,
             masks,
             cameras,
+            scale,
             points,
             valid,
             target_side: target_side as usize,

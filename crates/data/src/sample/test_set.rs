@@ -66,19 +66,21 @@ impl Test {
         let description = source.folder.description();
         let picture = |view: &usize| source.folder.picture(source.split, subject, *view, false);
         let pictures = views.iter().map(picture).collect::<Result<Vec<_>, _>>()?;
-        let photographs = pictures.iter().enumerate().map(|(place, (color, mask))| {
-            let (color, mask) = handling.apply(place, (color, mask));
-            Photograph::new(&color, &mask, handling.place)
-        });
-        let photographs: Vec<_> = photographs.collect();
+        let changed = pictures.iter().enumerate();
+        let changed = changed.map(|(place, (color, mask))| handling.apply(place, (color, mask)));
+        let changed: Vec<_> = changed.collect();
+        let changed: Vec<_> = changed.iter().map(|(color, mask)| (color, mask)).collect();
+        let photographs = Photograph::all(&changed, handling.place);
+        let mappings = photographs.iter().map(|photograph| photograph.mapping).collect();
         let camera = |view: usize| source.folder.camera(source.split, subject, view);
         let cameras = (0..description.views).map(|view| camera(view).map(|stored| source.camera(&stored)));
+        let (images, masks) = Photograph::joined(photographs);
         Ok(TestItem {
             subject: subject.to_owned(),
             side: description.resolution as usize,
-            images: photographs.iter().flat_map(|photograph| photograph.image.iter().copied()).collect(),
-            masks: photographs.iter().flat_map(|photograph| photograph.mask.iter().copied()).collect(),
-            mappings: photographs.iter().map(|photograph| photograph.mapping).collect(),
+            images,
+            masks,
+            mappings,
             cameras: cameras.collect::<Result<_, _>>()?,
         })
     }

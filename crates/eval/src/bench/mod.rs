@@ -156,10 +156,10 @@ pub fn measure(
     let first = people.chosen().first().copied().ok_or_else(nobody)?;
     let inputs = people.inputs(&eval.views, 0);
     let mut readings = Vec::new();
-    let mut item = people.item(first, &inputs, model.photographs())?;
+    let mut item = people.item(first, &inputs, &Handling::default())?;
     for _ in 0..config.bench.runs.min(5) {
         let start = Instant::now();
-        item = people.item(first, &inputs, model.photographs())?;
+        item = people.item(first, &inputs, &Handling::default())?;
         let canvases: Vec<_> =
             (0..inputs.len()).map(|place| photograph(&item, place, model.side())).collect();
         readings.push(start.elapsed());
@@ -196,8 +196,7 @@ pub fn measure(
     let mut tuning = None;
     if let Some(what) = setting.tune {
         let steps = tune::STEPS.min(20 * config.bench.runs);
-        let as_is = people.item(first, &inputs, &Handling::default())?;
-        let (tuned, times) = tune::fit(&made.gaussians, &people, (first, &inputs, &as_is), what, steps)?;
+        let (tuned, times) = tune::fit(&made.gaussians, &people, (first, &inputs, &item), what, steps)?;
         made.gaussians = tuned;
         tuning = Some(p(&times, 0.5));
     }

@@ -127,8 +127,8 @@ impl Contestant {
         let plain = |gaussians| Shown { gaussians: Some(gaussians), ..Shown::default() };
         match &self.means {
             Means::Model(_, model) => {
-                let is_changed = *model.photographs() != Handling::default();
-                let own = is_changed.then(|| people.item(row, inputs, model.photographs())).transpose()?;
+                let is_changed = model.photographs != Handling::default();
+                let own = is_changed.then(|| people.item(row, inputs, &model.photographs)).transpose()?;
                 let item = own.as_ref().unwrap_or(item);
                 let made = model.reconstruct(item, inputs);
                 if made.gaussians.is_empty() {

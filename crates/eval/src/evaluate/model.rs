@@ -19,7 +19,8 @@ use super::person::photograph;
 pub struct Model {
     reconstructor: Reconstructor,
     leave: Leave,
-    photographs: Handling,
+    /// What is done to its photographs.
+    pub photographs: Handling,
 }
 
 /// What a model does without.
@@ -74,21 +75,7 @@ impl Model {
         if !leave.side_colors {
             reconstructor = reconstructor.without_side_colors();
         }
-        Ok(Self { reconstructor, leave, photographs: Handling::default() }.seeing(Handling::default()))
-    }
-
-    /// The same with this done to its photographs; and placed they are, if it knows no others.
-    pub fn seeing(mut self, mut photographs: Handling) -> Self {
-        if self.config().mode.placed && photographs.place == 0 {
-            photographs.place = self.config().person_height();
-        }
-        self.photographs = photographs;
-        self
-    }
-
-    /// What is done to its photographs.
-    pub fn photographs(&self) -> &Handling {
-        &self.photographs
+        Ok(Self { reconstructor, leave, photographs: Handling::default() })
     }
 
     /// The config in force.
@@ -115,13 +102,15 @@ impl Model {
             let made = self.reconstructor.reconstruct(pair[0], pair[1], &|_| ());
             let camera = &item.cameras[inputs[first]];
             let mut to_world = camera.world_to_camera.inverse();
+            let mut gaussians = self.thinned(&made, side);
             let is_placed = item.mappings[first] != Mapping::AS_IT_IS;
             if is_placed {
                 let points = host(made.maps.points.clone().narrow(0, 0, 1));
-                let back = Handling::back(&item.mappings[first], camera, &points, &made.valid[0]);
+                let (scale, back) = Handling::back(&item.mappings[first], camera, &points, &made.valid[0]);
+                gaussians = gaussians.scaled(scale);
                 to_world = back.then(&to_world);
             }
-            parts.push(placed(self.config(), self.thinned(&made, side), &to_world));
+            parts.push(placed(self.config(), gaussians, &to_world));
             lost += made.lost;
             modules.extend(made.times.iter().copied());
             // All pairs are treated alike.

@@ -161,7 +161,6 @@ impl Config {
             ("mode.world_frame", self.world_frame() == WorldFrame::Mirrored, "\"mirrored\""),
             ("mode.crop", !self.crop(), "false"),
             ("mode.person_height", self.person_height() == 700, "700"),
-            ("mode.placed", !self.mode.placed, "false"),
         ];
         let (key, _, allowed) = quirks.into_iter().find(|(_, holds, _)| !holds)?;
         Some((

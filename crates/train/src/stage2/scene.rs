@@ -102,8 +102,8 @@ pub(super) fn gaussians(
         return None;
     }
     let (gaussians, _) = assemble(config, parts, device);
-    (!gaussians.is_empty())
-        .then(|| placed(config, gaussians, &item.cameras[View::Front as usize].world_to_camera.inverse()))
+    let to_world = item.cameras[View::Front as usize].world_to_camera.inverse();
+    (!gaussians.is_empty()).then(|| placed(config, gaussians.scaled(item.scale), &to_world))
 }
 
 /// Target pictures `[V,3,h,w]` and masks `[V,h,w]` of some views.

@@ -77,10 +77,11 @@ fn placed_samples_lie_where_the_nominal_cameras_see_them() {
     let first = Stage1::new(folder.clone(), TRAIN, samples).expect("samples").sample(0).expect("a sample");
     assert_eq!((&first.points, &first.images), (&item.points, &item.images));
     let side = 128;
-    let rows = |mask: &[f32]| mask.chunks(side).filter(|row| row.contains(&1.0)).count();
-    for mask in item.masks.chunks(side * side) {
-        assert_eq!(rows(mask), (700.0 / 1024.0 * side as f32).round() as usize);
-    }
+    // Both together are as high as a user's.
+    let seen: Vec<usize> = (0..2 * side * side).filter(|i| item.masks[*i] > 0.5).collect();
+    let rows = || seen.iter().map(|i| i / side % side);
+    let height = rows().max().expect("a person") + 1 - rows().min().expect("a person");
+    assert_eq!(height, (700.0 / 1024.0 * side as f32).round() as usize);
     let around = Camera::orbit_at_yaw_degrees(0.0, side as u32).world_to_camera.inverse();
     // The front's points keep the perspective of their own distance; in a side, of pixels at an edge one may be taken for the
     // next. Where nothing was moved, it is twenty pixels.
@@ -107,15 +108,18 @@ fn placed_samples_lie_where_the_nominal_cameras_see_them() {
     let handling = Handling { place: 700, ..Handling::default() };
     let shown = test.expect("a test").sample(0, &[0, 1], &handling).expect("reads");
     let valid: Vec<bool> = item.valid[..side * side].iter().map(|there| *there > 0.5).collect();
-    let back = Handling::back(&shown.mappings[0], &shown.cameras[0], &item.points[..3 * side * side], &valid);
+    let front = &item.points[..3 * side * side];
+    let (scale, back) = Handling::back(&shown.mappings[0], &shown.cameras[0], front, &valid);
     let moved = item.cameras[0].world_to_camera.translation - shown.cameras[0].world_to_camera.translation;
-    assert!(moved.length() > 0.05 && (back.translation + moved).length() < 1e-4, "{back:?}, {moved}");
+    assert!(moved.length() > 0.02 && (back.translation + moved).length() < 1e-4, "{back:?}, {moved}");
+    assert!((scale - item.scale).abs() < 1e-12 && (scale - 1.0).abs() > 0.02, "{scale}");
     // A point of the front's in the world lies on the surface that the stored depths tell of.
     let stored = folder.depth(TRAIN, "0000", 0).expect("reads");
     let to_world = item.cameras[0].world_to_camera.inverse();
     let mut off = Vec::new();
     for pixel in (0..side * side).filter(|pixel| item.valid[*pixel] > 0.5) {
-        let point = to_world.apply(Vec3::from_slice(&item.points[3 * pixel..3 * pixel + 3]).as_dvec3());
+        let point = item.scale * Vec3::from_slice(&item.points[3 * pixel..3 * pixel + 3]).as_dvec3();
+        let point = to_world.apply(point);
         let (place, depth) = stored.camera.project(point).expect("in front");
         let there = stored.depth[place.y as usize * side + place.x as usize];
         off.push((f64::from(there) - depth).abs());
