@@ -6,7 +6,7 @@ mod tests;
 use std::path::Path;
 
 use glam::DVec2;
-use image::{DynamicImage, GrayImage, RgbImage};
+use image::{DynamicImage, GenericImageView, GrayImage, RgbImage, imageops};
 
 use crate::resize::{Filter, resize};
 use snapsnap_mesh::FileError;
@@ -69,11 +69,11 @@ pub fn load(
 ) -> Result<[Canvas; 2], FileError> {
     let front = Cutout::read(paths[0], masks[0], side, placement)?;
     let back = Cutout::read(paths[1], masks[1], side, placement)?;
-    let fitted = match placement {
+    let common = match placement {
         Placement::Training { .. } => together([&front.mask, &back.mask], [front.person, back.person]),
         _ => None,
     };
-    Ok([front.canvas(fitted, side, placement)?, back.canvas(fitted, side, placement)?])
+    Ok([front.canvas(common, side, placement)?, back.canvas(common, side, placement)?])
 }
 
 /// A photograph without its background.
@@ -139,13 +139,18 @@ impl<'a> Cutout<'a> {
     }
 
     /// On its canvas: its own person's box, or one that is common to both photographs.
-    fn canvas(self, fitted: Option<Rect>, side: usize, placement: Placement) -> Result<Canvas, FileError> {
+    fn canvas(
+        self,
+        common: Option<Standing>,
+        side: usize,
+        placement: Placement,
+    ) -> Result<Canvas, FileError> {
         let Self { mask_path, rgb, mask, person, source } = self;
         let canvas = match placement {
             Placement::AsIs => on_canvas(&rgb, &mask, side, source + ", used as it is"),
             Placement::Training { height } => {
-                let source = if fitted.is_some() { source + ", with the other" } else { source };
-                placed(&rgb, &mask, fitted.unwrap_or(person), [height, side], &source)
+                let source = if common.is_some() { source + ", with the other" } else { source };
+                placed(&rgb, &mask, common.unwrap_or(Standing::alone(person)), [height, side], &source)
             }
             Placement::Demo { height } => placed_as_demo(&rgb, &mask, person, [height, side], &source),
         };
@@ -160,26 +165,56 @@ fn nobody(mask_path: &Path, placement: Placement) -> FileError {
     FileError::Unsuitable { path: mask_path.to_owned(), message }
 }
 
+/// What comes to lie where the training subjects stand.
+#[derive(Debug, Clone, Copy)]
+struct Standing {
+    person: Rect,
+    /// Column that comes to lie in the middle of the canvas.
+    axis: f32,
+}
+
+impl Standing {
+    /// Somebody of whom nothing else is known: the middle of the box.
+    fn alone(person: Rect) -> Self {
+        Self { person, axis: person.x as f32 + person.width as f32 / 2.0 }
+    }
+}
+
 /// The box around the person in both photographs, if they look as if taken from one place: of one size, the person about as high in
-/// both, and in the middle of both. Somebody who turns on the spot is seen on the left of the axis in front where it is the
-/// right behind, so that the axis is in the middle of that box.
-fn together(masks: [&GrayImage; 2], people: [Rect; 2]) -> Option<Rect> {
+/// both, and about as far right. Whoever turns on the spot has as much on the left of the axis in front as on the right
+/// behind.
+fn together(masks: [&GrayImage; 2], people: [Rect; 2]) -> Option<Standing> {
     /// Towards a camera that looks down, toes reach lower than heels: up to a tenth of the height, and somebody moves a little.
     const TALLER: f32 = 1.2;
-    /// Of the height; arms are seldom held alike.
-    const ASIDE: f32 = 0.2;
+    /// Of the height. Half of a person is on either side of a line close to the axis, wherever the arms are.
+    const ASIDE: f32 = 0.1;
     let [a, b] = people;
     let ratio = a.height as f32 / b.height as f32;
-    let middle = |r: Rect| r.x as f32 + r.width as f32 / 2.0;
-    let aside = (middle(a) - middle(b)).abs();
+    let [front, back] = [0, 1].map(|i| median_column(masks[i], people[i]));
+    let aside = front.abs_diff(back);
     let is_one = masks[0].dimensions() == masks[1].dimensions()
         && (1.0 / TALLER..=TALLER).contains(&ratio)
-        && aside <= ASIDE * a.height.max(b.height) as f32;
+        && aside as f32 <= ASIDE * a.height.max(b.height) as f32;
     is_one.then(|| {
         let (x, y) = (a.x.min(b.x), a.y.min(b.y));
         let (right, bottom) = ((a.x + a.width).max(b.x + b.width), (a.y + a.height).max(b.y + b.height));
-        Rect { x, y, width: right - x, height: bottom - y }
+        let person = Rect { x, y, width: right - x, height: bottom - y };
+        Standing { person, axis: (front + back) as f32 / 2.0 }
     })
+}
+
+/// The column of a box that has half of the person in it on its left.
+fn median_column(mask: &GrayImage, person: Rect) -> u32 {
+    let inside = imageops::crop_imm(mask, person.x, person.y, person.width, person.height);
+    let mut columns = vec![0_u64; person.width as usize];
+    inside.pixels().for_each(|(x, _, share)| columns[x as usize] += u64::from(share[0]));
+    let half = columns.iter().sum::<u64>() / 2;
+    let mut sum = 0;
+    let before = columns.iter().take_while(|count| {
+        sum += **count;
+        sum <= half
+    });
+    person.x + before.count() as u32
 }
 
 /// A mask picture's brightness, on black where it is transparent.
@@ -304,14 +339,15 @@ struct Fit {
 }
 
 impl Fit {
-    fn new(person: Rect, [height, side]: [usize; 2]) -> Self {
+    fn new(Standing { person, axis }: Standing, [height, side]: [usize; 2]) -> Self {
         let canvas = side as f32;
         let by_height = height as f32 / REFERENCE_SIDE * canvas / person.height as f32;
         // Somebody with outstretched arms may be wider than high.
-        let scale = by_height.min(canvas / person.width as f32);
+        let (before, behind) = (axis - person.x as f32, (person.x + person.width) as f32 - axis);
+        let scale = by_height.min(canvas / 2.0 / before.max(behind));
         let size = |length: u32| ((length as f32 * scale).round() as usize).clamp(1, side);
         let (width, height) = (size(person.width), size(person.height));
-        let left = (side - width) / 2;
+        let left = ((canvas / 2.0 - before * scale - 0.5).ceil().max(0.0) as usize).min(side - width);
         let centre = TRAINING_CENTRE / REFERENCE_SIDE * canvas;
         let top = ((centre - height as f32 / 2.0).round().max(0.0) as usize).min(side - height);
         Self { scale, is_limited: scale < by_height, left, top, width, height }
@@ -328,16 +364,17 @@ pub fn place(photographs: &[(&RgbImage, &GrayImage)], height: usize, side: usize
         _ => None,
     };
     let placed = |((rgb, mask), person): (&(&RgbImage, &GrayImage), &Rect)| {
-        placed(rgb, mask, common.unwrap_or(*person), [height, side], "")
+        placed(rgb, mask, common.unwrap_or(Standing::alone(*person)), [height, side], "")
     };
     Some(photographs.iter().zip(&people).map(placed).collect())
 }
 
 /// The box at the size and place of the training subjects; what of a soft edge lies outside the box comes
 /// along.
-fn placed(rgb: &RgbImage, mask: &GrayImage, person: Rect, size: [usize; 2], source: &str) -> Canvas {
+fn placed(rgb: &RgbImage, mask: &GrayImage, standing: Standing, size: [usize; 2], source: &str) -> Canvas {
     let (side, canvas) = (size[1], size[1] as f32);
-    let Fit { scale, is_limited, left, top, width, height } = Fit::new(person, size);
+    let Fit { scale, is_limited, left, top, width, height } = Fit::new(standing, size);
+    let person = standing.person;
     let mapping = Mapping::of(person, [left, top], [width, height]);
 
     // Everything the mask touches and the canvas can hold, and where it comes to lie relative to the person's box. A

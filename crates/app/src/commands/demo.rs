@@ -112,8 +112,11 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     Ok(())
 }
 
+/// Degrees and dB.
+type Errors = Vec<(f64, f64)>;
+
 /// The photographs, and each of [`TRUTHS`] behind what was made of it; and how alike these are on the person, in dB.
-fn comparison(world: &Gaussians) -> Result<(Vec<RgbImage>, Vec<(f64, f64)>), Failure> {
+fn comparison(world: &Gaussians) -> Result<(Vec<RgbImage>, Errors), Failure> {
     let side = TRUTH as usize;
     let mut pictures = Vec::new();
     for (name, bytes) in PHOTOGRAPHS {
