@@ -300,7 +300,7 @@ fn a_shift_of_the_whole_person_counts_as_much_as_it_is_told_to() {
             (view, PointMap { points: points + moved[view as usize], conf })
         });
         let prediction = Prediction { window: Window { rows: 0..h, columns: 0..w }, maps: maps.to_vec() };
-        f64::from(losses(&prediction, &truth, &valid, shift).regression.into_scalar::<f64>())
+        losses(&prediction, &truth, &valid, shift).regression.into_scalar::<f64>()
     };
     let diagonal = 3.0_f64.sqrt();
     for (shift, moved, expected) in [
