@@ -47,8 +47,11 @@ fn a_demo_is_made_of_the_sample_pair_and_looks_like_the_person() {
     assert_eq!(sheet.dimensions(), (2048, 1024));
     let gif = fs::read(folder.join("turntable.gif")).expect("an animation");
     assert_eq!(image::guess_format(&gif).expect("a picture"), ImageFormat::Gif);
-    // A second one replaces the first, and nothing else.
+    // A second one replaces the first, and what an interrupted one would leave.
+    fs::write(folder.join("human.ply"), "cut").expect("written");
+    fs::write(folder.join("report.json"), r#"{"command":"snapsnap demo","commit":"0"}"#).expect("written");
     succeed(&mut command);
+    ply::read(&folder.join("human.ply"), &burn::tensor::Device::flex()).expect("a PLY");
     let other = temporary.path().join("mine");
     fs::create_dir(&other).expect("a folder");
     fs::write(other.join("human.ply"), "mine").expect("written");

@@ -21,7 +21,7 @@ impl Hull {
         let to_back = camera.world_to_camera.inverse().then(&back.world_to_camera);
         Self {
             side,
-            masks: masks.map(|mask| grown(mask, side, margin)),
+            masks: masks.map(|mask| dilated(mask, side, margin)),
             to_camera: [RigidTransform::IDENTITY, to_back],
             camera,
         }
@@ -44,47 +44,55 @@ impl Hull {
     }
 }
 
-/// A mask and all pixels within `margin` rows and columns of it.
-fn grown(mask: &[bool], side: usize, margin: usize) -> Vec<bool> {
-    // A running count of set pixels along rows, then along columns.
-    let spread = |mask: &[bool], stride: usize, across: usize| -> Vec<bool> {
-        let mut out = vec![false; side * side];
-        for line in 0..side {
-            let at = |i: usize| line * across + i * stride;
-            let mut count = (0..margin.min(side)).filter(|i| mask[at(*i)]).count();
-            for i in 0..side {
-                if i + margin < side && mask[at(i + margin)] {
-                    count += 1;
+/// Where a mask `[H, W]` of this width is set within `margin` pixels, to the sides and up and down.
+pub fn dilated(mask: &[bool], width: usize, margin: usize) -> Vec<bool> {
+    let rows = mask.len() / width.max(1);
+    let across = spread(mask, [rows, width], [width, 1], margin);
+    spread(&across, [width, rows], [1, width], margin)
+}
+
+/// Set pixels reach `margin` further along lines of `length` pixels; lines and pixels lie `strides` apart.
+fn spread(inside: &[bool], [lines, length]: [usize; 2], strides: [usize; 2], margin: usize) -> Vec<bool> {
+    let mut out = vec![false; inside.len()];
+    for line in 0..lines {
+        let at = |i: usize| line * strides[0] + i * strides[1];
+        // One past the last pixel that the last set one reaches.
+        let mut reach = 0;
+        let mut next = 0;
+        for i in 0..length {
+            while next < length && next <= i.saturating_add(margin) {
+                if inside[at(next)] {
+                    reach = next.saturating_add(margin).saturating_add(1);
                 }
-                out[at(i)] = count > 0;
-                if i >= margin && mask[at(i - margin)] {
-                    count -= 1;
-                }
+                next += 1;
             }
+            out[at(i)] = i < reach;
         }
-        out
-    };
-    spread(&spread(mask, 1, side), side, 1)
+    }
+    out
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
+    /// Against the definition, pixel by pixel.
     #[test]
-    fn masks_grow_by_as_many_pixels_in_every_direction() {
-        let side = 12;
-        let mut mask = vec![false; side * side];
-        mask[3 * side + 4] = true;
-        mask[11 * side] = true;
-        for margin in [0, 1, 3, 20] {
-            let got = grown(&mask, side, margin);
-            for (i, got) in got.into_iter().enumerate() {
-                let near = |row: usize, column: usize| {
-                    (i / side).abs_diff(row) <= margin && (i % side).abs_diff(column) <= margin
-                };
-                assert_eq!(got, near(3, 4) || near(11, 0), "margin {margin}, {i}");
-            }
+    fn masks_grow_by_their_margin_in_all_directions() {
+        let (height, width) = (13, 17);
+        for (seed, margin) in [(1_u32, 0), (2, 1), (3, 2), (4, 5), (5, 40), (6, usize::MAX)] {
+            let lit = |i: usize| (i as u32).wrapping_mul(2_654_435_761).rotate_left(seed) % 23 == 0;
+            let mask: Vec<bool> = (0..height * width).map(lit).collect();
+            let near = |i: usize| {
+                let (x, y) = (i % width, i / width);
+                let lines = y.saturating_sub(margin)..=y.saturating_add(margin).min(height - 1);
+                lines.into_iter().any(|row| {
+                    (x.saturating_sub(margin)..=x.saturating_add(margin).min(width - 1))
+                        .any(|c| lit(row * width + c))
+                })
+            };
+            let expected: Vec<bool> = (0..height * width).map(near).collect();
+            assert_eq!(dilated(&mask, width, margin), expected, "margin {margin}");
         }
     }
 

@@ -16,5 +16,6 @@ pub mod sides;
 pub mod weights;
 
 pub use crop::Window;
+pub use hull::dilated;
 pub use neighbours::Neighbours;
 pub use reconstruct::{Photograph, Reconstruction, Reconstructor};

@@ -211,10 +211,10 @@ impl Run<'_> {
             )
         };
         let window = self.predictor_window(photos);
-        let input = self.timed("input", |_| {
+        let (input, masks) = self.timed("input", |_| {
             let images = Tensor::cat(photos.map(|p| upload(&p.rgb, 3)).to_vec(), 0);
             let masks = Tensor::cat(photos.map(|p| upload(&p.mask, 1)).to_vec(), 0);
-            Input::new(config, images, masks, &window)
+            (Input::new(config, images, masks.clone(), &window), masks)
         });
         let [_, channels, height, width] = input.images.dims();
         self.plan.push(format!(
@@ -238,7 +238,7 @@ impl Run<'_> {
         let maps = self.timed(heads, |_| net.heads(&decoded));
         self.timed("up-sampling", |_| {
             let on_canvas = maps.into_iter().map(|(view, map)| {
-                let mask = photos.get(view as usize).map(|photo| upload(&photo.mask, 1));
+                let mask = ((view as usize) < 2).then(|| masks.clone().narrow(0, view as usize, 1));
                 net.finished(config, view, map, &window, mask).on_canvas(&window, side)
             });
             let (points, conf): (Vec<_>, Vec<_>) = on_canvas.map(|m| (m.points, m.conf)).unzip();

@@ -62,6 +62,9 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let device = device::choose(&arguments.device)?;
     let progress = Progress::stages(quiet);
     progress.stage("photographs");
+    let header = header(&device::describe(&device));
+    // First, so that the next demo replaces what an interrupted one leaves.
+    folder.text(REPORT, &header.json().to_string())?;
     for (name, bytes) in PHOTOGRAPHS {
         output::write(&folder.file(name), bytes)?;
     }
@@ -86,7 +89,6 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let (pictures, errors) = comparison(&world)?;
     write_png(&folder.file("comparison.png"), &sheet(&pictures, 4))?;
 
-    let header = header(&device::describe(&device));
     let mut text = header.markdown("Demo");
     text += &format!(
         "* {} Gaussians in {seconds:.1} s, photographs and weights read; all of it in {:.1} s\n\n\

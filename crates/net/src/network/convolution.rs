@@ -4,12 +4,12 @@
 //! side is the same height in front.
 
 use burn::module::Module;
-use burn::nn::PaddingConfig2d::{Explicit, Valid};
-use burn::nn::conv::{Conv2d, Conv2dConfig};
+use burn::nn::conv::Conv2d;
 use burn::nn::{LayerNorm, Linear, LinearConfig};
 use burn::tensor::{Device, Tensor};
 
 use super::block::{EncoderBlock, layer_norm, normalise};
+use super::dpt::{ResidualConvUnit, conv1x1, conv3x3};
 use crate::config::NetworkConfig;
 use snapsnap_ops::layers::{conv2d, linear};
 use snapsnap_ops::{Rope, as_weight, bilinear};
@@ -19,32 +19,6 @@ pub(crate) const LEVELS: usize = 4;
 /// The finest pixel of a patch of `patch` pixels is this many of the input's.
 fn stride(patch: usize) -> usize {
     patch >> (LEVELS - 1)
-}
-
-fn conv3x3(from: usize, to: usize, stride: usize, device: &Device) -> Conv2d {
-    let config = Conv2dConfig::new([from, to], [3, 3]).with_stride([stride; 2]);
-    config.with_padding(Explicit(1, 1, 1, 1)).init(device)
-}
-
-fn conv1x1(from: usize, to: usize, device: &Device) -> Conv2d {
-    Conv2dConfig::new([from, to], [1, 1]).with_padding(Valid).init(device)
-}
-
-/// x + conv₂(relu(conv₁(relu x))).
-#[derive(Module, Debug)]
-struct Unit {
-    conv1: Conv2d,
-    conv2: Conv2d,
-}
-
-impl Unit {
-    fn new(width: usize, device: &Device) -> Self {
-        Self { conv1: conv3x3(width, width, 1, device), conv2: conv3x3(width, width, 1, device) }
-    }
-
-    fn forward(&self, x: Tensor<4>) -> Tensor<4> {
-        x.clone() + conv2d(&self.conv2, conv2d(&self.conv1, x, true), true)
-    }
 }
 
 /// Tokens of the coarsest image and blocks that let them look at each other.
@@ -85,7 +59,7 @@ impl Attention {
 #[derive(Module, Debug)]
 struct Decoder {
     /// By level.
-    units: Vec<Unit>,
+    units: Vec<ResidualConvUnit>,
     /// To a level from the next coarser one.
     up: Vec<Conv2d>,
     conv_mid: Conv2d,
@@ -96,9 +70,9 @@ impl Decoder {
     fn new(config: &NetworkConfig, device: &Device) -> Self {
         let widths = config.layer_dims;
         Self {
-            units: widths.iter().map(|width| Unit::new(*width, device)).collect(),
+            units: widths.iter().map(|width| ResidualConvUnit::new(*width, device)).collect(),
             up: widths.windows(2).map(|pair| conv1x1(pair[1], pair[0], device)).collect(),
-            conv_mid: conv3x3(widths[0], config.last_dim, 1, device),
+            conv_mid: conv3x3(widths[0], config.last_dim, 1, true, device),
             conv_out: conv1x1(config.last_dim, 8, device),
         }
     }
@@ -134,7 +108,7 @@ pub struct Levels {
 pub struct PointUNet {
     conv_in: Conv2d,
     /// By level.
-    units: Vec<Unit>,
+    units: Vec<ResidualConvUnit>,
     /// From a level to the next coarser one.
     down: Vec<Conv2d>,
     attention: Attention,
@@ -153,9 +127,9 @@ impl PointUNet {
         let side_blocks = [c.dec_depth, c.dec_heads, c.mlp_ratio];
         let sides = || Attention::new([c.enc_dim, c.dec_dim, coarsest], side_blocks, device);
         Self {
-            conv_in: conv3x3(2 * c.input_channels(), widths[0], stride(c.patch), device),
-            units: widths.iter().map(|width| Unit::new(*width, device)).collect(),
-            down: widths.windows(2).map(|pair| conv3x3(pair[0], pair[1], 2, device)).collect(),
+            conv_in: conv3x3(2 * c.input_channels(), widths[0], stride(c.patch), true, device),
+            units: widths.iter().map(|width| ResidualConvUnit::new(*width, device)).collect(),
+            down: widths.windows(2).map(|pair| conv3x3(pair[0], pair[1], 2, true, device)).collect(),
             attention: Attention::new([coarsest, c.enc_dim, coarsest], blocks, device),
             decoder: Decoder::new(c, device),
             side_attention: c.side_heads.then(sides),

@@ -85,22 +85,22 @@ impl Geometry {
 impl Attributes {
     /// Features `[N, 14]`, measured from what the config says; `geometry` where it asks for it.
     pub fn new(config: &RegressorConfig, features: Tensor<2>, geometry: Option<Geometry>) -> Self {
-        let mut attributes = Self::from_features(features.clone());
-        let Some(Geometry { spacing, colors }) = geometry else { return attributes };
-        if config.color() == RegressorColor::Residual {
-            attributes.color = colors + attributes.color;
-        }
-        if config.start() == RegressorStart::Published {
-            return attributes;
-        }
+        let Some(Geometry { spacing, colors }) = geometry else { return Self::from_features(features) };
         let part = |from: usize, width: usize| features.clone().narrow(1, from, width);
+        let color = match config.color() {
+            RegressorColor::Free => part(8, 3).tanh(),
+            RegressorColor::Residual => colors + part(8, 3).tanh(),
+        };
+        if config.start() == RegressorStart::Published {
+            return Self { color, ..Self::from_features(features.clone()) };
+        }
         let upright = Tensor::from_data([[1.0, 0.0, 0.0, 0.0]], &features.device());
         Self {
             opacity: sigmoid(part(0, 1) + START_OPACITY),
             scale: (part(1, 3).tanh() * LOG_SCALE).exp() * (spacing.clone() * START_SCALE),
             rotation: unit(part(4, 4) + upright),
+            color,
             offset: part(11, 3) * spacing,
-            ..attributes
         }
     }
 

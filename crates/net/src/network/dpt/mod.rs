@@ -18,7 +18,7 @@ use crate::config::NetworkConfig;
 use snapsnap_ops::layers::{conv2d, enlarge};
 use snapsnap_ops::{as_weight, bilinear, is_fast};
 
-fn conv3x3(from: usize, to: usize, stride: usize, bias: bool, device: &Device) -> Conv2d {
+pub(super) fn conv3x3(from: usize, to: usize, stride: usize, bias: bool, device: &Device) -> Conv2d {
     Conv2dConfig::new([from, to], [3, 3])
         .with_stride([stride, stride])
         .with_padding(Explicit(1, 1, 1, 1))
@@ -26,7 +26,7 @@ fn conv3x3(from: usize, to: usize, stride: usize, bias: bool, device: &Device) -
         .init(device)
 }
 
-fn conv1x1(from: usize, to: usize, device: &Device) -> Conv2d {
+pub(super) fn conv1x1(from: usize, to: usize, device: &Device) -> Conv2d {
     Conv2dConfig::new([from, to], [1, 1]).with_padding(Valid).init(device)
 }
 
@@ -73,18 +73,18 @@ struct Branches {
 
 /// x + conv₂(relu(conv₁(relu x))).
 #[derive(Module, Debug)]
-struct ResidualConvUnit {
+pub struct ResidualConvUnit {
     conv1: Conv2d,
     conv2: Conv2d,
 }
 
 impl ResidualConvUnit {
-    fn new(features: usize, device: &Device) -> Self {
+    pub(super) fn new(features: usize, device: &Device) -> Self {
         let conv = || conv3x3(features, features, 1, true, device);
         Self { conv1: conv(), conv2: conv() }
     }
 
-    fn forward(&self, x: Tensor<4>) -> Tensor<4> {
+    pub(super) fn forward(&self, x: Tensor<4>) -> Tensor<4> {
         let h = conv2d(&self.conv1, x.clone(), true);
         x + conv2d(&self.conv2, h, true)
     }
