@@ -1,23 +1,24 @@
 //! A photograph and its mask → a square canvas with the person where the networks expect one.
 
+mod placing;
 #[cfg(test)]
 mod tests;
 
 use std::path::Path;
 
-use glam::DVec2;
-use image::{DynamicImage, GenericImageView, GrayImage, RgbImage, imageops};
+use image::{DynamicImage, GrayImage, RgbImage};
 
 use crate::resize::{Filter, resize};
 use snapsnap_mesh::FileError;
 use snapsnap_mesh::picture::{self, MAX_BYTES};
 
+pub use placing::{Mapping, place};
+use placing::{Standing, placed, together};
+
 /// Photographs below this side are refused: nothing of a person is left.
 const MIN_SIDE: u32 = 64;
 /// From this share of the person on, a pixel counts as the person's.
 const THRESHOLD: f32 = 0.5;
-/// Row of a training subject's middle on a canvas of 1024 (SNAPSNAP §5.3: rows 124.39 to 862.52).
-const TRAINING_CENTRE: f32 = 493.5;
 /// Canvas side that heights and rows refer to.
 const REFERENCE_SIDE: f32 = 1024.0;
 
@@ -165,58 +166,6 @@ fn nobody(mask_path: &Path, placement: Placement) -> FileError {
     FileError::Unsuitable { path: mask_path.to_owned(), message }
 }
 
-/// What comes to lie where the training subjects stand.
-#[derive(Debug, Clone, Copy)]
-struct Standing {
-    person: Rect,
-    /// Column that comes to lie in the middle of the canvas.
-    axis: f32,
-}
-
-impl Standing {
-    /// Somebody of whom nothing else is known: the middle of the box.
-    fn alone(person: Rect) -> Self {
-        Self { person, axis: person.x as f32 + person.width as f32 / 2.0 }
-    }
-}
-
-/// The box around the person in both photographs, if they look as if taken from one place: of one size, the person about as high in
-/// both, and about as far right. Whoever turns on the spot has as much on the left of the axis in front as on the right
-/// behind.
-fn together(masks: [&GrayImage; 2], people: [Rect; 2]) -> Option<Standing> {
-    /// Towards a camera that looks down, toes reach lower than heels: up to a tenth of the height, and somebody moves a little.
-    const TALLER: f32 = 1.2;
-    /// Of the height. Half of a person is on either side of a line close to the axis, wherever the arms are.
-    const ASIDE: f32 = 0.1;
-    let [a, b] = people;
-    let ratio = a.height as f32 / b.height as f32;
-    let [front, back] = [0, 1].map(|i| median_column(masks[i], people[i]));
-    let aside = front.abs_diff(back);
-    let is_one = masks[0].dimensions() == masks[1].dimensions()
-        && (1.0 / TALLER..=TALLER).contains(&ratio)
-        && aside as f32 <= ASIDE * a.height.max(b.height) as f32;
-    is_one.then(|| {
-        let (x, y) = (a.x.min(b.x), a.y.min(b.y));
-        let (right, bottom) = ((a.x + a.width).max(b.x + b.width), (a.y + a.height).max(b.y + b.height));
-        let person = Rect { x, y, width: right - x, height: bottom - y };
-        Standing { person, axis: (front + back) as f32 / 2.0 }
-    })
-}
-
-/// The column of a box that has half of the person in it on its left.
-fn median_column(mask: &GrayImage, person: Rect) -> u32 {
-    let inside = imageops::crop_imm(mask, person.x, person.y, person.width, person.height);
-    let mut columns = vec![0_u64; person.width as usize];
-    inside.pixels().for_each(|(x, _, share)| columns[x as usize] += u64::from(share[0]));
-    let half = columns.iter().sum::<u64>() / 2;
-    let mut sum = 0;
-    let before = columns.iter().take_while(|count| {
-        sum += **count;
-        sum <= half
-    });
-    person.x + before.count() as u32
-}
-
 /// A mask picture's brightness, on black where it is transparent.
 fn grey(picture: &DynamicImage) -> GrayImage {
     let pixels = picture.to_luma_alpha8();
@@ -300,118 +249,6 @@ fn on_canvas(rgb: &RgbImage, mask: &GrayImage, side: usize, report: String) -> C
     }
     let valid = mask.iter().map(|m| *m >= THRESHOLD).collect();
     Canvas { rgb: values, mask, valid, mapping: Mapping::AS_IT_IS, report }
-}
-
-/// Where a photograph's pixels come to lie on a canvas, both with pixel centres at +½.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Mapping {
-    /// Canvas pixels per pixel of the photograph, across and down.
-    pub scale: DVec2,
-    /// Where the photograph's origin lies on the canvas.
-    pub origin: DVec2,
-}
-
-impl Mapping {
-    /// Of a photograph that is the canvas.
-    pub const AS_IT_IS: Self = Self { scale: DVec2::ONE, origin: DVec2::ZERO };
-
-    /// Of the box `person` that comes to lie at `left` and `top` with this size.
-    fn of(person: Rect, [left, top]: [usize; 2], [width, height]: [usize; 2]) -> Self {
-        let size = |width: u32, height: u32| DVec2::new(f64::from(width), f64::from(height));
-        let scale = DVec2::new(width as f64, height as f64) / size(person.width, person.height);
-        Self { scale, origin: DVec2::new(left as f64, top as f64) - size(person.x, person.y) * scale }
-    }
-
-    /// The place on the photograph of a place on the canvas.
-    pub fn source(&self, canvas: DVec2) -> DVec2 {
-        (canvas - self.origin) / self.scale
-    }
-}
-
-/// The person's box on a canvas.
-struct Fit {
-    scale: f32,
-    is_limited: bool,
-    left: usize,
-    top: usize,
-    width: usize,
-    height: usize,
-}
-
-impl Fit {
-    fn new(Standing { person, axis }: Standing, [height, side]: [usize; 2]) -> Self {
-        let canvas = side as f32;
-        let by_height = height as f32 / REFERENCE_SIDE * canvas / person.height as f32;
-        // Somebody with outstretched arms may be wider than high.
-        let (before, behind) = (axis - person.x as f32, (person.x + person.width) as f32 - axis);
-        let scale = by_height.min(canvas / 2.0 / before.max(behind));
-        let size = |length: u32| ((length as f32 * scale).round() as usize).clamp(1, side);
-        let (width, height) = (size(person.width), size(person.height));
-        let left = ((canvas / 2.0 - before * scale - 0.5).ceil().max(0.0) as usize).min(side - width);
-        let centre = TRAINING_CENTRE / REFERENCE_SIDE * canvas;
-        let top = ((centre - height as f32 / 2.0).round().max(0.0) as usize).min(side - height);
-        Self { scale, is_limited: scale < by_height, left, top, width, height }
-    }
-}
-
-/// Puts photographs on canvases of `side` pixels as [`Placement::Training`] does, two of them together if they look as if taken
-/// from one place; `None` if a mask shows nobody.
-pub fn place(photographs: &[(&RgbImage, &GrayImage)], height: usize, side: usize) -> Option<Vec<Canvas>> {
-    let people = photographs.iter().map(|(_, mask)| Rect::around(mask, u8::MAX.div_ceil(2)));
-    let people: Vec<Rect> = people.collect::<Option<_>>()?;
-    let common = match (photographs, people.as_slice()) {
-        ([(_, front), (_, back)], [a, b]) => together([front, back], [*a, *b]),
-        _ => None,
-    };
-    let placed = |((rgb, mask), person): (&(&RgbImage, &GrayImage), &Rect)| {
-        placed(rgb, mask, common.unwrap_or(Standing::alone(*person)), [height, side], "")
-    };
-    Some(photographs.iter().zip(&people).map(placed).collect())
-}
-
-/// The box at the size and place of the training subjects; what of a soft edge lies outside the box comes
-/// along.
-fn placed(rgb: &RgbImage, mask: &GrayImage, standing: Standing, size: [usize; 2], source: &str) -> Canvas {
-    let (side, canvas) = (size[1], size[1] as f32);
-    let Fit { scale, is_limited, left, top, width, height } = Fit::new(standing, size);
-    let person = standing.person;
-    let mapping = Mapping::of(person, [left, top], [width, height]);
-
-    // Everything the mask touches and the canvas can hold, and where it comes to lie relative to the person's box. A
-    // speck far away must not be enlarged with a small person.
-    let (sx, sy) = (width as f32 / person.width as f32, height as f32 / person.height as f32);
-    let reach = |scale: f32| (canvas / scale).ceil() as u32;
-    let touched = Rect::around(mask, 1).expect("the person's box is not empty");
-    let touched = touched.clipped_around(person, [reach(sx), reach(sy)]);
-    let target = |length: u32, scale: f32| ((length as f32 * scale).round() as usize).max(1);
-    let (wide, high) = (target(touched.width, sx), target(touched.height, sy));
-    let apart = |a: u32, b: u32, scale: f32| ((i64::from(a) - i64::from(b)) as f32 * scale).round() as i64;
-    let x0 = left as i64 - apart(person.x, touched.x, sx);
-    let y0 = top as i64 - apart(person.y, touched.y, sy);
-
-    // Colours travel multiplied by the mask, so that what lies behind the person never bleeds in.
-    let premultiplied = |color, m| unit(color) * unit(m);
-    let [r, g, b, m] = planes(rgb, mask, touched, premultiplied, [high, wide], Filter::Lanczos3);
-    let area = side * side;
-    let (mut values, mut on_canvas) = (vec![0.0; 3 * area], vec![0.0; area]);
-    for y in (0..high).filter(|y| (0..side as i64).contains(&(y0 + *y as i64))) {
-        for x in (0..wide).filter(|x| (0..side as i64).contains(&(x0 + *x as i64))) {
-            let from = y * wide + x;
-            let to = (y0 + y as i64) as usize * side + (x0 + x as i64) as usize;
-            // Lanczos overshoots at edges.
-            let share = m[from].clamp(0.0, 1.0);
-            on_canvas[to] = share;
-            for (c, plane) in [&r, &g, &b].into_iter().enumerate() {
-                values[c * area + to] = 2.0 * plane[from].clamp(0.0, share) - share;
-            }
-        }
-    }
-    let valid = on_canvas.iter().map(|m| *m >= THRESHOLD).collect();
-    let limited = if is_limited { " (limited by the width)" } else { "" };
-    let report = format!(
-        "{source}, scaled by {scale:.4}{limited} to {width}×{height} at ({left}, {top}) of {side}×{side}"
-    );
-    Canvas { rgb: values, mask: on_canvas, valid, mapping, report }
 }
 
 /// The published demo's recipe with its quirks: the box loses its last row and column, sampling is plain bilinear,

@@ -106,9 +106,6 @@ pub enum ValidationSplit {
 pub struct Stage1Config {
     /// λ, the weight of the confidences' cross-entropy: 0.5 in the published code, 1 in the paper.
     pub confidence: f64,
-    /// How much of each sample's mean shift of the photographed points counts, 0 to 1: 1 as published, little where no picture
-    /// tells how far away the camera stood.
-    pub shift: f64,
 }
 
 /// The section `[stage2]`.
@@ -200,7 +197,7 @@ impl Default for TrainingConfig {
 
 impl Default for Stage1Config {
     fn default() -> Self {
-        Self { confidence: 0.5, shift: 1.0 }
+        Self { confidence: 0.5 }
     }
 }
 
@@ -275,7 +272,6 @@ impl TrainConfig {
             ("training.clip", t.clip, 1e-9, 1e9),
             ("training.average", t.average, 0.0, 0.999_999),
             ("stage1.confidence", self.stage1.confidence, 0.0, 1e6),
-            ("stage1.shift", self.stage1.shift, 0.0, 1.0),
             ("stage2.beta", two.beta, 0.0, 1.0),
             ("stage2.alpha", two.alpha, 0.0, 1e6),
             ("stage2.needle", two.needle, 0.0, 1e6),

@@ -67,37 +67,21 @@ pub fn predict(
 }
 
 /// The losses of predicted maps: true points `[B,V,S,S,3]` in the front camera's frame, metres, and where there are any
-/// `[B,V,S,S]`, 0 or 1. Confidences must be probabilities. All samples' pixels are pooled. Of the mean shift of a sample's
-/// photographed points only the share `shift` counts, in all views.
-pub fn losses(prediction: &Prediction, points: &Tensor<5>, valid: &Tensor<4>, shift: f64) -> Losses {
+/// `[B,V,S,S]`, 0 or 1. Confidences must be probabilities. All samples' pixels are pooled.
+pub fn losses(prediction: &Prediction, points: &Tensor<5>, valid: &Tensor<4>) -> Losses {
     let Prediction { window, maps } = prediction;
     let (b, h, w) = (points.dims()[0], window.rows.len(), window.columns.len());
-    let inside = |view: &View| window.cut(valid.clone().narrow(1, *view as usize, 1)).reshape([b, h, w]);
-    let mut offs: Vec<Tensor<4>> = Vec::new();
-    for (view, map) in maps {
-        let truth = points.clone().narrow(1, *view as usize, 1).narrow(2, window.rows.start, h);
-        let truth = truth.narrow(3, window.columns.start, w).reshape([b, h, w, 3]);
-        // What is not there may be anything, 10⁸ metres or NaN, and must not reach the gradient.
-        let nowhere = inside(view).lower_equal_elem(0.5).unsqueeze_dim::<4>(3).expand([b, h, w, 3]);
-        offs.push((map.points.clone() - truth).mask_fill(nowhere, 0.0));
-    }
-    if shift < 1.0 {
-        let sum = |x: Tensor<4>| x.sum_dim(1).sum_dim(2);
-        let photographed = || maps.iter().zip(&offs).filter(|((view, _), _)| (*view as usize) < 2);
-        let counts = photographed().map(|((view, _), _)| sum(inside(view).unsqueeze_dim(3)));
-        let sums = photographed().map(|(_, off)| sum(off.clone()));
-        let [count, sum] = [counts.collect(), sums.collect()].map(|parts: Vec<Tensor<4>>| {
-            parts.into_iter().reduce(|a, b| a + b).expect("there is a photograph")
-        });
-        let mean = sum / count.clamp_min(1.0);
-        for (off, (view, _)) in offs.iter_mut().zip(maps) {
-            *off = off.clone() - mean.clone() * inside(view).unsqueeze_dim::<4>(3) * (1.0 - shift);
-        }
-    }
     let mut regression = Vec::new();
     let mut confidence = Vec::new();
-    for ((view, map), off) in maps.iter().zip(offs) {
-        let inside = inside(view);
+    for (view, map) in maps {
+        let row = *view as usize;
+        let inside = window.cut(valid.clone().narrow(1, row, 1)).reshape([b, h, w]);
+        let there = inside.clone().greater_elem(0.5);
+        let truth = points.clone().narrow(1, row, 1).narrow(2, window.rows.start, h);
+        let truth = truth.narrow(3, window.columns.start, w).reshape([b, h, w, 3]);
+        // What is not there may be anything, 10⁸ metres or NaN, and must not reach the gradient.
+        let nowhere = there.clone().bool_not().unsqueeze_dim::<4>(3).expand([b, h, w, 3]);
+        let off = (map.points.clone() - truth).mask_fill(nowhere, 0.0);
         let distance = off.square().sum_dim(3).clamp_min(MIN_SQUARE).sqrt().reshape([b, h, w]);
         let count = inside.clone().sum().clamp_min(1.0);
         regression.push((distance * inside.clone()).sum() / count);

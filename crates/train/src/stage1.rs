@@ -13,7 +13,7 @@ use snapsnap_net::network::{PointMap, View};
 use snapsnap_ops::host;
 
 use crate::TrainError;
-use crate::config::{Stage1Config, TrainConfig};
+use crate::config::TrainConfig;
 use crate::fixed::{Fixed, check_resolution};
 use crate::networks::Networks;
 use crate::points::{Prediction, losses, predict};
@@ -29,7 +29,8 @@ const WORST: f32 = 0.2;
 /// The training of the point predictor.
 pub struct PointTask {
     networks: Config,
-    losses: Stage1Config,
+    /// λ.
+    confidence: f64,
     sets: Vec<Stage1>,
     validation: Fixed<Stage1Item>,
     /// Those that train, with gradients.
@@ -58,7 +59,7 @@ impl PointTask {
         })?;
         Ok(Self {
             networks: config.networks(),
-            losses: config.stage1.clone(),
+            confidence: config.stage1.confidence,
             sets,
             validation,
             devices: devices.to_vec(),
@@ -97,10 +98,10 @@ impl Task for PointTask {
         at: Moment,
     ) -> Result<Vec<Part>, TrainError> {
         let batch = Stage1Batcher.batch(items, &self.devices[at.device]);
-        let losses = losses(&self.predict(networks, &batch), &batch.points, &batch.valid, self.losses.shift);
+        let losses = losses(&self.predict(networks, &batch), &batch.points, &batch.valid);
         Ok(vec![
             Part { name: "points", weight: 1.0, value: losses.regression },
-            Part { name: "confidence", weight: self.losses.confidence, value: losses.confidence },
+            Part { name: "confidence", weight: self.confidence, value: losses.confidence },
         ])
     }
 

@@ -52,8 +52,8 @@ pub struct SampleConfig {
     pub high_resolution: bool,
     /// Stage 2: also the points that four views see, for the point loss.
     pub points: bool,
-    /// Share of the samples whose photographs are put on their canvas as a user's are, and whose points are moved to where the
-    /// nominal cameras see them.
+    /// Share of the samples whose photographs are put on their canvas as a user's are, and whose points are scaled and moved to
+    /// where the nominal cameras see them.
     pub place: f32,
     /// How high a person is then, in pixels of a canvas of 1024: `mode.person_height`.
     #[serde(skip)]

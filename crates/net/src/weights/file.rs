@@ -10,11 +10,8 @@ use snapsnap_splat::file::write_whole;
 
 use super::WeightsError;
 use super::schema::{self, Part, TensorSpec};
-use super::source::{Entry, Float, Source, is_readable};
+use super::source::{CONFIG_KEY, Entry, Float, Source, is_readable};
 use crate::config::Config;
-
-/// Metadata key under which the config (TOML) is stored.
-pub const CONFIG_KEY: &str = "snapsnap.config";
 
 /// Hears how many bytes of how many have been written.
 pub type Progress<'a> = &'a dyn Fn(u64, u64);

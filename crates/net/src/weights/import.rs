@@ -4,10 +4,10 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use super::WeightsError;
-use super::file::{CONFIG_KEY, Progress, mismatch, parts_of, write};
+use super::file::{Progress, mismatch, parts_of, write};
 use super::init::{SideHeads, draw};
 use super::schema::{self, DUST3R, SCALE, SIDE, TensorSpec, UNET};
-use super::source::{Float, Source, is_readable};
+use super::source::{CONFIG_KEY, Float, Source, is_readable};
 use crate::config::Config;
 
 /// Choices an import leaves to the user.

@@ -15,11 +15,11 @@ use std::path::{Path, PathBuf};
 
 pub use crate::names::{NamedMapper, NamedVisitor, map_named, visit_named};
 pub use export::export;
-pub use file::{CONFIG_KEY, Progress, WeightFile, not_finite, save, write_tensors};
+pub use file::{Progress, WeightFile, not_finite, save, write_tensors};
 pub use import::{ImportOptions, ImportReport, import, stored_config};
 pub use init::{SideHeads, init};
 pub use load::{random_predictor, random_regressors};
-pub use source::{Entry, Float, Source};
+pub use source::{CONFIG_KEY, Entry, Float, Source};
 
 /// What can be wrong with weights.
 #[derive(Debug, thiserror::Error)]

@@ -13,8 +13,10 @@ use safetensors::tensor::Metadata;
 use snapsnap_splat::file;
 
 use super::WeightsError;
-use super::file::CONFIG_KEY;
 use crate::config::Config;
+
+/// Metadata key under which the config (TOML) is stored.
+pub const CONFIG_KEY: &str = "snapsnap.config";
 
 /// A checkpoint whose tensors can be read by name.
 pub struct Source {

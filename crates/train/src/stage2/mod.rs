@@ -24,7 +24,7 @@ use snapsnap_people::random::stream;
 use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
 
 use crate::TrainError;
-use crate::config::{LpipsConfig, Stage1Config, Stage2Config, TrainConfig};
+use crate::config::{LpipsConfig, Stage2Config, TrainConfig};
 use crate::fixed::{Fixed, check_resolution};
 use crate::networks::Networks;
 use crate::photometric::Photometric;
@@ -46,8 +46,8 @@ const WORST: f32 = 0.5;
 pub struct GaussianTask {
     networks: Config,
     losses: Stage2Config,
-    /// Of the points, where the predictor is trained as well.
-    point_losses: Stage1Config,
+    /// λ of the point loss.
+    confidence: f64,
     seed: u64,
     /// The predictor, unless it is trained as well.
     frozen: Option<Frozen>,
@@ -95,7 +95,7 @@ impl GaussianTask {
         Ok(Self {
             networks: config.networks(),
             losses: config.stage2.clone(),
-            point_losses: config.stage1.clone(),
+            confidence: config.stage1.confidence,
             seed: config.training.seed,
             frozen: predictor.map(|predictor| Frozen::new(config, predictor, devices)),
             lpips,
@@ -246,8 +246,8 @@ impl Task for GaussianTask {
                 let (side, points, valid) = (item.side, item.points.clone(), item.valid.clone());
                 let points = Tensor::from_data(TensorData::new(points, [1, 4, side, side, 3]), device);
                 let valid = Tensor::from_data(TensorData::new(valid, [1, 4, side, side]), device);
-                let losses = losses(&prediction, &points, &valid, self.point_losses.shift);
-                add("points", losses.regression + losses.confidence * self.point_losses.confidence);
+                let losses = losses(&prediction, &points, &valid);
+                add("points", losses.regression + losses.confidence * self.confidence);
             }
             let made = gaussians(&self.networks, networks, item, prediction, &phase, noise, device);
             let Some(gaussians) = made else { continue };

@@ -1,0 +1,334 @@
+//! Every command that README and docs show, in the order in which they show it, on less work: two people, a few steps, small
+//! pictures. A shell reads the pages' blocks, so that its variables and loops count; the programs it would start are recorded
+//! and then run here. Commands within the text are looked at: programs, benches, tests and options must be there.
+#![cfg(unix)]
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use snapsnap_tests::{data, root, shared, snapsnap, succeed};
+
+/// In the order in which a reader meets them: each page's commands find what earlier ones made.
+const PAGES: [&str; 11] = [
+    "README.md",
+    "docs/training.md",
+    "docs/weights.md",
+    "docs/evaluation.md",
+    "docs/formats.md",
+    "docs/architecture.md",
+    "docs/inference.md",
+    "docs/splat.md",
+    "docs/data.md",
+    "docs/fuzz.md",
+    "datasets/README.md",
+];
+/// Tasks of `cargo xtask` that are no commands of the program; the suite itself and its neighbours.
+const TASKS: [&str; 5] = ["test", "lint", "fuzz", "bundle", "help"];
+/// Writes the command line that a shell would start: arguments end with one sign, commands with another.
+const RECORDER: &str = r#"set -eu
+record() { { printf '%s\037' "$@"; printf '\036'; } >> "$COMMANDS"; }
+for program in cargo snapsnap python bash; do eval "$program() { record $program \"\$@\"; }"; done
+"#;
+
+type Words = Vec<String>;
+
+/// What a page shows to be typed into a shell.
+fn blocks(page: &str) -> Vec<String> {
+    let text = fs::read_to_string(root().join(page)).unwrap_or_else(|e| panic!("{page}: {e}"));
+    let mut found = Vec::new();
+    let mut lines = text.lines();
+    while lines.by_ref().any(|line| line == "```sh") {
+        let block: Vec<&str> = lines.by_ref().take_while(|line| *line != "```").collect();
+        found.push(block.join("\n"));
+    }
+    found
+}
+
+/// The commands of a script with these arguments, its variables and loops followed.
+fn recorded(page: &str, script: &str, arguments: &[String]) -> Vec<Words> {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let commands = temporary.path().join("commands");
+    fs::write(&commands, "").expect("written");
+    let mut shell = Command::new("/bin/bash");
+    shell.args(["-c", &format!("{RECORDER}{script}"), page]).args(arguments).env("COMMANDS", &commands);
+    // Nothing but what is recorded may be started.
+    let output = shell.env("PATH", "/nowhere").current_dir(temporary.path()).output().expect("bash starts");
+    assert!(output.status.success(), "{page}: {script}\n{}", String::from_utf8_lossy(&output.stderr));
+    let text = fs::read_to_string(&commands).expect("read");
+    let words = |command: &str| command.split_terminator('\u{1f}').map(str::to_owned).collect();
+    text.split_terminator('\u{1e}').map(words).collect()
+}
+
+/// Commands of a page: those of its blocks, and those of scripts that they run.
+fn commands(page: &str) -> Vec<Words> {
+    let mut all = Vec::new();
+    for block in blocks(page) {
+        for words in recorded(page, &block, &[]) {
+            if words[0] == "bash" {
+                let script =
+                    fs::read_to_string(root().join(&words[1])).unwrap_or_else(|e| panic!("{words:?}: {e}"));
+                all.extend(recorded(&words[1], &script, &words[2..]));
+            } else {
+                all.push(words);
+            }
+        }
+    }
+    all
+}
+
+/// The program's own words, if it is the program that is run.
+fn of_program(words: &[String]) -> Option<&[String]> {
+    match words.iter().map(String::as_str).collect::<Vec<_>>()[..] {
+        ["snapsnap", ..] => Some(&words[1..]),
+        ["cargo", "xtask", task, ..] if !TASKS.contains(&task) => Some(&words[2..]),
+        _ => None,
+    }
+}
+
+/// What else is run must be there.
+fn look(words: &[String]) {
+    let words: Vec<&str> = words.iter().map(String::as_str).collect();
+    let is_there = match words[..] {
+        ["cargo", "xtask", task, ..] => TASKS.contains(&task),
+        ["cargo", "test", ref rest @ ..] => match rest.iter().position(|word| *word == "--test") {
+            Some(at) => ["tests/tests/X.rs", "tests/tests/X/main.rs"]
+                .iter()
+                .any(|path| root().join(path.replace('X', rest[at + 1])).is_file()),
+            None => rest.contains(&"--lib"),
+        },
+        ["cargo", "bench", ref rest @ ..] => {
+            let at = rest.iter().position(|word| *word == "--bench").expect("the name of a bench");
+            let file = format!("benches/{}.rs", rest[at + 1]);
+            let crates = fs::read_dir(root().join("crates")).expect("the crates");
+            crates.flatten().any(|folder| folder.path().join(&file).is_file())
+        }
+        ["python", file, ..] => root().join(file).is_file(),
+        ["cargo", "doc", ..] => true,
+        _ => false,
+    };
+    assert!(is_there, "nobody knows how to try `{}`", words.join(" "));
+}
+
+/// The same on less work.
+fn less(words: &[String]) -> Words {
+    let mut words = words.to_vec();
+    for word in &mut words {
+        // Networks of the published size have a test's size here.
+        if matches!(word.as_str(), "configs/full.toml" | "configs/full-compat.toml") {
+            *word = "published.toml".into();
+        }
+    }
+    let mut more: Vec<&str> = Vec::new();
+    match words[0].as_str() {
+        "prepare" if matches!(words[1].as_str(), "synth" | "makehuman") => {
+            if words[1] == "makehuman" && !shared("makehuman").is_dir() {
+                println!(
+                    "SKIPPED: no {}; simple people instead: {}",
+                    shared("makehuman").display(),
+                    words.join(" ")
+                );
+                words.splice(1..3, ["synth".to_owned()]);
+            }
+            let count = words.iter().position(|word| word == "--subjects").expect("how many people");
+            words[count + 1] = "2".into();
+            more.extend(["--set", "views.count=8", "--set", "views.samples=1"]);
+            let is_fine =
+                !words.iter().any(|word| word.contains("small.toml") || word.contains("default.toml"));
+            more.extend(is_fine.then_some(["--set", "views.resolution=256"]).into_iter().flatten());
+        }
+        "prepare" if words[1] == "scan" => {
+            more.extend(["--set", "views.count=4", "--set", "views.samples=1"])
+        }
+        "train-stage1" | "train-stage2" => {
+            for key in [
+                "steps=2",
+                "validate_every=2",
+                "validation_samples=2",
+                "checkpoint_every=2",
+                "preview_every=0",
+            ] {
+                more.extend(["--set", ["training.", key].concat().leak()]);
+            }
+        }
+        "evaluate" => more.extend(["--set", "data.subjects=1", "--set", "report.people=1"]),
+        "bench" => more.push("--quick"),
+        "stability" => more.extend(["--quick", "--device", "cpu", "--only", "opacity 1e-7"]),
+        "fetch-weights" => more.push("--list"),
+        "import-weights" if words.iter().any(|word| word.ends_with(".pth")) => {
+            more.extend(["--config", "published.toml"]);
+        }
+        _ => {}
+    }
+    if ["reconstruct", "demo", "train-stage1", "train-stage2", "render", "bench"].contains(&words[0].as_str())
+    {
+        more.extend(["--device", "cpu"]);
+    }
+    // One device is enough, and one `--device` all that is allowed.
+    if let Some(at) = words.iter().position(|word| word == "--device") {
+        words.drain(at..at + 2);
+    }
+    words.extend(more.into_iter().map(str::to_owned));
+    words
+}
+
+/// A folder as the pages take for granted: the repository's files, two photographs, checkpoints, scans, MakeHuman's data.
+fn place() -> tempfile::TempDir {
+    use std::os::unix::fs::symlink;
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let to = |name: &str| {
+        let path = temporary.path().join(name);
+        fs::create_dir_all(path.parent().expect("a folder")).expect("made");
+        path
+    };
+    for name in ["configs", "assets", "docs"] {
+        symlink(root().join(name), to(name)).expect("linked");
+    }
+    for side in ["front", "back"] {
+        let picture =
+            image::open(root().join(format!("assets/sample/{side}.png"))).expect("a picture").into_rgba8();
+        picture.save(to(&format!("{side}.png"))).expect("saved");
+        let mask = image::GrayImage::from_fn(picture.width(), picture.height(), |x, y| {
+            image::Luma([picture.get_pixel(x, y)[3]])
+        });
+        mask.save(to(&format!("{side}_mask.png"))).expect("saved");
+        image::DynamicImage::from(picture).into_rgb8().save(to(&format!("{side}.jpg"))).expect("saved");
+    }
+    for (name, from) in [("a.png", "45.png"), ("b.png", "135.png")] {
+        fs::copy(root().join("assets/sample").join(from), to(name)).expect("copied");
+    }
+    for name in ["stage1.pth", "stage2.pth"] {
+        fs::copy(data("pipeline").join(name), to(name)).expect("copied");
+    }
+    fs::write(to("published.toml"), published()).expect("written");
+    symlink(shared("makehuman"), to("path/to/makehuman/data")).expect("linked");
+    let cone: String = (0..12)
+        .map(|i| f64::from(i) * std::f64::consts::TAU / 12.0)
+        .map(|angle| format!("v {} 0 {}\n", 0.3 * angle.cos(), 0.2 * angle.sin()))
+        .chain(["v 0 1.8 0\n".into()])
+        .chain((0..12).map(|i| format!("f {} 13 {}\n", i + 1, (i + 1) % 12 + 1)))
+        .collect();
+    for folder in ["path/to/scans", "meshes"] {
+        for name in ["0000", "0001"] {
+            fs::write(to(&format!("{folder}/{name}.obj")), &cone).expect("written");
+        }
+    }
+    temporary
+}
+
+/// The config of the published networks in the size of the checkpoints above.
+fn published() -> String {
+    let text = fs::read_to_string(data("pipeline").join("config.json")).expect("read");
+    let json: serde_json::Value = serde_json::from_str(&text).expect("JSON");
+    let keys = [
+        "enc_dim",
+        "enc_depth",
+        "enc_heads",
+        "dec_dim",
+        "dec_depth",
+        "dec_heads",
+        "layer_dims",
+        "feature_dim",
+    ];
+    let keys = keys.into_iter().chain([
+        "last_dim",
+        "hooks",
+        "head",
+        "resolution",
+        "net_resolution",
+        "conf_threshold",
+    ]);
+    let lines: Vec<String> = keys.map(|key| format!("{key} = {}", json[key])).collect();
+    format!("[network]\n{}\n[mode]\ncompat = true\n", lines.join("\n"))
+}
+
+#[test]
+fn every_command_of_readme_and_docs_works() {
+    let place = place();
+    let mut made: BTreeSet<PathBuf> = BTreeSet::new();
+    let mut count = 0;
+    for page in PAGES {
+        for words in commands(page) {
+            let Some(own) = of_program(&words) else {
+                look(&words);
+                continue;
+            };
+            let less = less(own);
+            println!("{page}: {}", words.join(" "));
+            // A training is not begun in the folder of another; here pages come after one another.
+            if let (true, Some(at)) =
+                (less[0].starts_with("train-"), less.iter().position(|word| word == "-o"))
+            {
+                let run = place.path().join(&less[at + 1]);
+                if !less.iter().any(|word| word == "--dry-run" || word == "--resume")
+                    && !made.insert(run.clone())
+                {
+                    fs::remove_dir_all(run).expect("removed");
+                }
+            }
+            succeed(snapsnap().current_dir(place.path()).args(&less));
+            count += 1;
+        }
+    }
+    println!("{count} commands");
+    assert!(count > 20, "the pages' blocks were not found");
+}
+
+/// Options of the program's commands within the text are those of its help; what else is named is there.
+#[test]
+fn commands_within_the_text_are_there() {
+    let mut checked = 0;
+    for page in PAGES {
+        let text = fs::read_to_string(root().join(page)).expect("read").replace('\n', " ");
+        let text: String = text.split("```").step_by(2).collect();
+        for span in text.split('`').skip(1).step_by(2) {
+            let words: Words =
+                span.split_whitespace().map(|word| word.trim_matches(['\'', '"']).to_owned()).collect();
+            let names = ["cargo", "snapsnap", "python"];
+            let is_command = words.len() > 2 && names.contains(&words[0].as_str());
+            if !is_command || words.contains(&"COMMAND".to_owned()) {
+                continue;
+            }
+            checked += 1;
+            let Some(own) = of_program(&words) else {
+                look(&words);
+                continue;
+            };
+            let help = help(own);
+            for option in own.iter().filter(|word| word.starts_with("--")) {
+                let option = option.trim_end_matches(',');
+                assert!(help.contains(option), "{page}: `{span}`: there is no {option}");
+            }
+        }
+    }
+    assert!(checked > 10, "{checked} commands were found in the text");
+}
+
+/// The help of a command that may have one below it.
+fn help(own: &[String]) -> String {
+    let below =
+        own.iter().skip(1).take_while(|word| own[0] == "prepare" && word.chars().all(char::is_alphabetic));
+    succeed(snapsnap().arg(&own[0]).args(below.take(1)).arg("--help"))
+}
+
+/// Links from page to page lead somewhere.
+#[test]
+fn links_within_the_repository_lead_somewhere() {
+    let pages = PAGES.into_iter().chain([
+        "assets/README.md",
+        "assets/weights/README.md",
+        "assets/sample/README.md",
+        "docs/stability.md",
+    ]);
+    for page in pages {
+        let text = fs::read_to_string(root().join(page)).unwrap_or_else(|e| panic!("{page}: {e}"));
+        let folder = Path::new(page).parent().expect("a folder");
+        for target in text.split("](").skip(1).filter_map(|rest| rest.split(')').next()) {
+            let file = target.split('#').next().expect("a part");
+            if !target.contains("://") && !file.is_empty() {
+                assert!(root().join(folder).join(file).exists(), "{page}: {target}");
+            }
+        }
+    }
+}
