@@ -44,7 +44,7 @@ fn a_demo_is_made_of_the_sample_pair_and_looks_like_the_person() {
     let gaussians = ply::read(&folder.join("human.ply"), &burn::tensor::Device::flex()).expect("a PLY");
     assert_eq!(Some(gaussians.gaussians.len() as u64), report["gaussians"].as_u64());
     let sheet = image::open(folder.join("comparison.png")).expect("a picture");
-    assert_eq!(sheet.dimensions(), (2048, 1024));
+    assert_eq!(sheet.dimensions(), (1792, 512));
     let gif = fs::read(folder.join("turntable.gif")).expect("an animation");
     assert_eq!(image::guess_format(&gif).expect("a picture"), ImageFormat::Gif);
     // A second one replaces the first, and what an interrupted one would leave.

@@ -101,6 +101,8 @@ pub struct NetworkConfig {
     pub ray_channels: bool,
     /// Whether the back photograph is seen in a mirror, so that both show a limb at the same place.
     pub mirror: bool,
+    /// Whether maps are the mean of what the predictor makes of the photographs and of their mirror images.
+    pub both_ways: bool,
     /// How far, in pixels of a canvas of 1024, a point of an unseen side may lie outside of the photographs' silhouettes; what
     /// lies further outside is left out. Unset: sides are taken as they are.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -140,6 +142,7 @@ impl Default for NetworkConfig {
             mask_channel: false,
             ray_channels: false,
             mirror: false,
+            both_ways: false,
             hull_margin: None,
             drop_empty: false,
         }

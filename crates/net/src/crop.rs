@@ -46,7 +46,7 @@ impl Window {
         let person = if config.network.window { Self::around(masks, side) } else { None };
         let cell = config.network.patch * config.upsample_factor();
         let window = person.map_or_else(|| Self::whole(side), |person| person.in_cells(cell, side));
-        if config.network.mirror { window.symmetric(side) } else { window }
+        if config.network.mirror || config.network.both_ways { window.symmetric(side) } else { window }
     }
 
     /// Grown until a mirror image of the canvas has it at the same place.

@@ -2,7 +2,7 @@
 
 use burn::tensor::{Device, Tensor, TensorData};
 use snapsnap_net::config::Config;
-use snapsnap_net::network::{Grid, Input, PointPredictor, View};
+use snapsnap_net::network::{Grid, Input, PointMap, PointPredictor, View};
 use snapsnap_net::weights::random_predictor;
 use snapsnap_net::{Reconstructor, Window};
 use snapsnap_tests::{device, is_software, relative_error, values};
@@ -110,6 +110,48 @@ fn a_mirrored_back_is_the_back_of_a_mirrored_photograph() {
         for ((view, a), (_, b)) in a.into_iter().zip(b) {
             let b = if view == View::Back { b.points.flip([2]) } else { b.points };
             assert_same(view.name(), &values(a.points), &values(b));
+        }
+    }
+}
+
+/// Whoever looks at somebody and at the mirror image makes of a mirror image the mirror image, to the last bit but for sums' order.
+#[test]
+fn what_is_seen_both_ways_has_no_left_and_right_of_its_own() {
+    let Some(device) = real_device() else { return };
+    for body in [&CONVOLUTION[..], &["network.mask_channel=true", "network.ray_channels=true"]] {
+        let one = config(&[body, &["network.mirror=true"]].concat());
+        let both = config(&[body, &["network.mirror=true", "network.both_ways=true"]].concat());
+        let side = both.network.resolution;
+        let window = Window { rows: 0..side, columns: side / 4..3 * side / 4 };
+        let colors = images([side; 2], 3, 1, &device);
+        let masks = (images([side; 2], 1, 2, &device) + 1.0) * 0.5;
+        let of = |config: &Config, flip: bool| {
+            let seen = |x: &Tensor<4>| if flip { x.clone().flip([3]) } else { x.clone() };
+            let input = Input::new(config, seen(&colors), seen(&masks), &window);
+            random_predictor(config, 5, &device).forward(input)
+        };
+        let mirrored = |map: &PointMap| {
+            let [b, h, w, _] = map.points.dims();
+            let points = map.points.clone().flip([2]);
+            let x = -points.clone().narrow(3, 0, 1);
+            [values(points.slice_assign([0..b, 0..h, 0..w, 0..1], x)), values(map.conf.clone().flip([2]))]
+                .concat()
+        };
+        let (plain, flipped) = (of(&both, false), of(&both, true));
+        let [once, again] = [false, true].map(|flip| of(&one, flip));
+        for ((view, map), other) in plain.iter().zip([0, 1, 3, 2]) {
+            assert_eq!(map.points.dims()[0], 1);
+            let got = [values(map.points.clone()), values(map.conf.clone())].concat();
+            let error = relative_error(&got, &mirrored(&flipped[other].1));
+            assert!(error < 1e-6, "{view:?}: {error:e}");
+            // And it is the mean of what both would be alone.
+            let alone = &once[*view as usize].1;
+            let alone = [values(alone.points.clone()), values(alone.conf.clone())].concat();
+            let mean: Vec<f32> =
+                alone.iter().zip(mirrored(&again[other].1)).map(|(a, b)| (a + b) * 0.5).collect();
+            let error = relative_error(&got, &mean);
+            assert!(error < 1e-6, "{view:?}: {error:e}");
+            assert_different("both ways", &got, &alone);
         }
     }
 }

@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use clap::Args;
 use image::imageops::FilterType;
-use image::{DynamicImage, RgbImage};
+use image::{DynamicImage, RgbImage, imageops};
 use serde_json::json;
 use snapsnap_data::photo::{self, Canvas, Placement};
 use snapsnap_eval::pictures::Picture;
@@ -45,6 +45,8 @@ const TRUTHS: [(f64, &[u8]); 3] = [
     (270.0, include_bytes!("../../../../assets/sample/270.png")),
 ];
 const TRUTH: u32 = 512;
+/// Columns of such a picture that the person needs.
+const COLUMNS: [u32; 2] = [144, 368];
 
 #[derive(Args)]
 pub struct Arguments {
@@ -87,7 +89,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
         Turntable::new(&folder.file(name))?.write(&world, quiet)?;
     }
     let (pictures, errors) = comparison(&world)?;
-    write_png(&folder.file("comparison.png"), &sheet(&pictures, 4))?;
+    write_png(&folder.file("comparison.png"), &sheet(&pictures, pictures.len() as u32))?;
 
     let mut text = header.markdown("Demo");
     text += &format!(
@@ -138,7 +140,9 @@ fn comparison(world: &Gaussians) -> Result<(Vec<RgbImage>, Errors), Failure> {
         errors.push((degrees, psnr(&made, &truth, &person)?));
         pictures.extend([made.to_rgb8(), truth.to_rgb8()]);
     }
-    Ok((pictures, errors))
+    let [left, right] = COLUMNS;
+    let cut = |picture: &RgbImage| imageops::crop_imm(picture, left, 0, right - left, TRUTH).to_image();
+    Ok((pictures.iter().map(cut).collect(), errors))
 }
 
 fn decoded(name: &str, bytes: &[u8]) -> Result<DynamicImage, Failure> {

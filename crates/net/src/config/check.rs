@@ -152,6 +152,7 @@ impl Config {
             ("network.mask_channel", !self.network.mask_channel, "false"),
             ("network.ray_channels", !self.network.ray_channels, "false"),
             ("network.mirror", !self.network.mirror, "false"),
+            ("network.both_ways", !self.network.both_ways, "false"),
             ("network.hull_margin", self.network.hull_margin.is_none(), "unset"),
             ("network.drop_empty", !self.network.drop_empty, "false"),
             ("regressor.start", self.regressor.start() == RegressorStart::Published, "\"published\""),

@@ -11,7 +11,8 @@ use crate::resample::shrink;
 /// What the point predictor sees of B pairs of photographs.
 #[derive(Debug, Clone)]
 pub struct Input {
-    /// `[2·B, C, h, w]`, all fronts, then all backs: colours in [−1, 1] times the mask, then what else the config adds.
+    /// `[2·B, C, h, w]`, all fronts, then all backs: colours in [−1, 1] times the mask, then what else the config adds. With
+    /// `network.both_ways` each of both halves is followed by its mirror images.
     pub images: Tensor<4>,
     /// Which tokens a transformer has of them.
     pub grid: Grid,
@@ -22,7 +23,10 @@ impl Input {
     /// window of `config`.
     pub fn new(config: &Config, photographs: Tensor<4>, masks: Tensor<4>, window: &Window) -> Self {
         let n = &config.network;
-        let small = |x: Tensor<4>| shrink(window.cut(x), config.upsample_factor(), config.downsample());
+        let small = |x: Tensor<4>| {
+            let small = shrink(window.cut(x), config.upsample_factor(), config.downsample());
+            if n.both_ways { both_ways(small) } else { small }
+        };
         let mut parts = vec![small(photographs)];
         let masks = (n.mask_channel || n.drop_empty).then(|| small(masks));
         if let (true, Some(masks)) = (n.mask_channel, &masks) {
@@ -42,6 +46,13 @@ impl Input {
         };
         Self { images: seen(images), grid }
     }
+}
+
+/// Each half of a batch, followed by its mirror images.
+fn both_ways(x: Tensor<4>) -> Tensor<4> {
+    let half = x.dims()[0] / 2;
+    let halves = [0, half].map(|from| x.clone().narrow(0, from, half));
+    Tensor::cat(halves.into_iter().flat_map(|x| [x.clone(), x.flip([3])]).collect(), 0)
 }
 
 /// The second half of a batch flipped.

@@ -68,6 +68,28 @@ fn growth(x: Tensor<4>) -> Tensor<4> {
     direct.mask_where(x.lower_elem(SMALL), series)
 }
 
+/// The mean of the maps of the first half of a batch and of those of the second, which saw the first in a mirror: there x is −x
+/// and each side the other one.
+fn means(maps: &[(View, PointMap)]) -> Vec<(View, PointMap)> {
+    let mirrored = |view: View| match view {
+        View::Right => View::Left,
+        View::Left => View::Right,
+        other => other,
+    };
+    let mean = |&(view, ref map): &(View, PointMap)| {
+        let other = maps.iter().find(|(other, _)| *other == mirrored(view));
+        let (_, other) = other.expect("there are both sides or neither");
+        let [b, h, w] = [map.conf.dims()[0] / 2, map.conf.dims()[1], map.conf.dims()[2]];
+        let seen = other.points.clone().narrow(0, b, b).flip([2]);
+        let x = -seen.clone().narrow(3, 0, 1);
+        let seen = seen.slice_assign([0..b, 0..h, 0..w, 0..1], x);
+        let points = (map.points.clone().narrow(0, 0, b) + seen) * 0.5;
+        let conf = (map.conf.clone().narrow(0, 0, b) + other.conf.clone().narrow(0, b, b).flip([2])) * 0.5;
+        (view, PointMap { points, conf })
+    };
+    maps.iter().map(mean).collect()
+}
+
 /// What the encoder of a predictor gives.
 #[derive(Debug, Clone)]
 pub enum Encoded {
@@ -253,7 +275,8 @@ impl PointPredictor {
             let raw = if self.config.mirror && view == View::Back { raw.flip([3]) } else { raw };
             (view, activate(raw, &self.config))
         };
-        self.views().iter().zip(raw).map(map).collect()
+        let maps: Vec<_> = self.views().iter().zip(raw).map(map).collect();
+        if self.config.both_ways { means(&maps) } else { maps }
     }
 
     /// Point maps of all views at network resolution and without δ.
