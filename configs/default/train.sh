@@ -14,8 +14,16 @@ for split in "train 300" "val 24"; do
   cargo xtask prepare synth --split "$2" --subjects "$3" --seed 1 $options -o people/small/synth
   cargo xtask prepare makehuman "$1" --split "$2" --subjects "$3" --seed 2 $options -o people/small/makehuman
 done
+# A few as large as photographs are.
+for split in "train 45 40" "val 4 4"; do
+  set -- "$1" $split
+  options="--config configs/data/default.toml --set views.resolution=1024"
+  cargo xtask prepare synth --split "$2" --subjects "$3" --seed 103 $options -o people/large/synth
+  cargo xtask prepare makehuman "$1" --split "$2" --subjects "$4" --seed 104 $options -o people/large/makehuman
+done
 data="people/default/synth people/default/makehuman people/small/synth people/small/makehuman"
 cargo xtask train-stage1 --config configs/default/stage1.toml --data $data --resume -o runs/default-points
-cargo xtask train-stage2 --config configs/default/stage2.toml --data $data --weights runs/default-points/best.safetensors --resume -o runs/default
-# 16 bits, for photographs of 1024².
-cargo xtask import-weights runs/default/best.safetensors --half --set network.resolution=1024 -o default.safetensors
+cargo xtask train-stage2 --config configs/default/stage2.toml --data $data --weights runs/default-points/best.safetensors --resume -o runs/default-both
+cargo xtask train-stage2 --config configs/default/regressor.toml --data people/large/synth people/large/makehuman \
+  --weights runs/default-both/best.safetensors --resume -o runs/default
+cargo xtask import-weights runs/default/best.safetensors --half -o default.safetensors

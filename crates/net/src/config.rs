@@ -177,6 +177,8 @@ pub struct RegressorConfig {
     /// Where a Gaussian's colour comes from; unset: the pixel's with a geometric start, else the network's own.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub color: Option<RegressorColor>,
+    /// Whether pixels that the person covers in part have the person's colour whole, and not mixed with grey.
+    pub straight_color: bool,
     /// With `mode.crop`, pixels around the person's box that the network sees; unset: as far as any pixel of the person can
     /// be reached from. What is trained with less does with less.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -205,7 +207,15 @@ impl RegressorConfig {
 
 impl Default for RegressorConfig {
     fn default() -> Self {
-        Self { networks: 1, channels: 16, groups: 16, start: None, color: None, margin: None }
+        Self {
+            networks: 1,
+            channels: 16,
+            groups: 16,
+            start: None,
+            color: None,
+            straight_color: false,
+            margin: None,
+        }
     }
 }
 

@@ -1,5 +1,7 @@
 //! From point maps to Gaussians, as inference and training do it: side colours, the regressor on a window, activations.
 
+use std::borrow::Cow;
+
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use snapsnap_ops::host;
 use snapsnap_splat::{Gaussians, RigidTransform};
@@ -67,6 +69,22 @@ impl Chosen {
         let valid = (0..views).map(|view| (0..area).map(|i| keep(view, i)).collect()).collect();
         Self { valid, lost, outside }
     }
+}
+
+/// Colours `[3, S, S]` in [−1, 1] of a photograph as Gaussians take them. They come multiplied by the `mask` `[S, S]`, so that the rim,
+/// which is what the sides are coloured by, fades to grey; with `regressor.straight_color` they are divided by it where at
+/// least half of a pixel is the person.
+pub fn photograph_colors<'a>(config: &RegressorConfig, rgb: &'a [f32], mask: &[f32]) -> Cow<'a, [f32]> {
+    if !config.straight_color {
+        return Cow::Borrowed(rgb);
+    }
+    let mut colors = rgb.to_vec();
+    for (i, share) in mask.iter().enumerate().filter(|(_, share)| (0.5..1.0).contains(*share)) {
+        for value in colors[i..].iter_mut().step_by(mask.len()) {
+            *value = (*value / share).clamp(-1.0, 1.0);
+        }
+    }
+    Cow::Owned(colors)
 }
 
 /// Pseudo images of the right and the left `[3, S, S]`: every valid pixel has the colour of the nearest valid point of the
@@ -208,5 +226,30 @@ pub fn placed(config: &Config, gaussians: Gaussians, camera_to_world: &RigidTran
     match config.rotation_frame() {
         RotationFrame::Camera => gaussians.transformed(camera_to_world),
         RotationFrame::World => gaussians.with_means_transformed(camera_to_world),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rims_have_the_persons_colour_whole_where_that_is_asked_for() {
+        // Five pixels: background, less than half, half, a tenth of background, all of them the person's.
+        let mask = [0.0, 0.4, 0.5, 0.9, 1.0];
+        let own = [0.8, -0.6, 1.0];
+        let rgb: Vec<f32> = own.iter().flat_map(|c| mask.map(|share| c * share)).collect();
+        let colors = |straight_color| {
+            let config = RegressorConfig { straight_color, ..RegressorConfig::default() };
+            photograph_colors(&config, &rgb, &mask).into_owned()
+        };
+        assert_eq!(colors(false), rgb);
+        for (c, plane) in colors(true).chunks_exact(5).enumerate() {
+            assert_eq!(plane[..2], rgb[5 * c..5 * c + 2]);
+            assert!(plane[2..].iter().all(|value| (value - own[c]).abs() < 1e-6), "{plane:?}");
+        }
+        // What a lossy mask makes of a white pixel stays a colour.
+        let config = RegressorConfig { straight_color: true, ..RegressorConfig::default() };
+        assert_eq!(*photograph_colors(&config, &[0.9, -0.9, 0.9], &[0.6]), [1.0, -1.0, 1.0]);
     }
 }

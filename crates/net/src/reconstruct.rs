@@ -8,7 +8,7 @@ use snapsnap_splat::{Camera, Gaussians, RigidTransform};
 
 use crate::config::{Config, Downsample, WorldFrame};
 use crate::crop::Window;
-use crate::gaussians::{Chosen, Seen, assemble, placed, regress, side_images};
+use crate::gaussians::{Chosen, Seen, assemble, photograph_colors, placed, regress, side_images};
 use crate::network::{Input, PointMap, PointPredictor, View};
 use crate::precision::Precision;
 use crate::regressor::Regressor;
@@ -176,13 +176,14 @@ impl Run<'_> {
                 .push(format!("{outside} pixels of the sides left out: no photograph shows anybody there"));
         }
 
+        let colors =
+            photos.map(|photo| photograph_colors(&self.model.config.regressor, &photo.rgb, &photo.mask));
+        let colors = [0, 1].map(|view| &*colors[view]);
         let side_images = if views.len() > 2 && !self.model.side_colors {
             self.plan.push("side colours left out, as asked for".into());
             vec![vec![EMPTY; 3 * area]; views.len() - 2]
         } else if views.len() > 2 {
-            self.timed("side colours", |_| {
-                side_images(photos.map(|photo| photo.rgb.as_slice()), &points, &valid)
-            })
+            self.timed("side colours", |_| side_images(colors, &points, &valid))
         } else {
             self.plan.push("side colours left out: there are no side heads".into());
             Vec::new()
@@ -195,7 +196,7 @@ impl Run<'_> {
             let points: Vec<f32> = points.iter().map(|v| if v.is_finite() { *v } else { 0.0 }).collect();
             Tensor::from_data(TensorData::new(points, maps.points.dims()), &self.model.device)
         };
-        let gaussians = self.gaussians(photos, &side_images, &usable, &valid);
+        let gaussians = self.gaussians(colors, &side_images, &usable, &valid);
         let (plan, times) = (std::mem::take(&mut self.plan), std::mem::take(&mut self.times));
         Reconstruction { views, maps, valid, side_images, gaussians, lost: lost + self.lost, plan, times }
     }
@@ -256,13 +257,12 @@ impl Run<'_> {
     /// Gaussians of all valid pixels, view after view.
     fn gaussians(
         &mut self,
-        photos: [&Photograph; 2],
+        colors: [&[f32]; 2],
         side_images: &[Vec<f32>],
         points: &Tensor<4>,
         valid: &[Vec<bool>],
     ) -> Gaussians {
-        let images: Vec<&[f32]> =
-            photos.iter().map(|p| p.rgb.as_slice()).chain(side_images.iter().map(Vec::as_slice)).collect();
+        let images: Vec<&[f32]> = colors.into_iter().chain(side_images.iter().map(Vec::as_slice)).collect();
         let mut parts = Vec::new();
         for (pair, what) in ["regressor (front, back)", "regressor (sides)"].into_iter().enumerate() {
             let pair_views = 2 * pair..(2 * pair + 2).min(images.len());

@@ -230,7 +230,7 @@ impl Source {
     ) -> Vec<Photograph> {
         let changed = views.map(|(color, mask)| self.config.augment.apply(color, mask, random));
         let changed = [0, 1].map(|i| (&changed[i].0, &changed[i].1));
-        Photograph::all(&changed, if is_placed { self.config.person_height } else { 0 })
+        Photograph::all(&changed, if is_placed { self.config.person_height } else { 0 }, self.config.compat)
     }
 
     /// Whether a sample's photographs are placed as a user's are.
@@ -247,26 +247,27 @@ impl Source {
 struct Photograph {
     /// `[3,H,W]` in [−1, 1] times the mask.
     image: Vec<f32>,
-    /// `[H,W]` 1 where the mask sees the person.
+    /// `[H,W]` the person's share as the mask sees it; the published code's is 1 or 0.
     mask: Vec<f32>,
     mapping: Mapping,
-}
-
-/// Whether a share of a pixel makes it the person's.
-fn inside(share: f32) -> f32 {
-    f32::from(u8::from(share >= f32::from(INSIDE) / 255.0))
 }
 
 impl Photograph {
     /// Photographs of a person as the networks see them: put on their canvas as a user's are, with the person so many pixels of 1024
     /// high, or, with 0, as they are.
-    fn all(photographs: &[(&RgbImage, &GrayImage)], height: usize) -> Vec<Self> {
+    fn all(photographs: &[(&RgbImage, &GrayImage)], height: usize, compat: bool) -> Vec<Self> {
         let side = photographs.first().map_or(0, |(color, _)| color.width() as usize);
         let placed = (height > 0).then(|| place(photographs, height, side)).flatten();
-        match placed {
+        let mut photographs: Vec<Self> = match placed {
             Some(canvases) => canvases.into_iter().map(Self::of_canvas).collect(),
             None => photographs.iter().map(|(color, mask)| Self::as_it_is(color, mask)).collect(),
+        };
+        if compat {
+            let inside = |share: f32| f32::from(u8::from(share >= f32::from(INSIDE) / 255.0));
+            let masks = photographs.iter_mut().map(|photograph| &mut photograph.mask);
+            masks.flatten().for_each(|share| *share = inside(*share));
         }
+        photographs
     }
 
     /// Images and masks, one after another.
@@ -277,8 +278,7 @@ impl Photograph {
     }
 
     fn of_canvas(canvas: Canvas) -> Self {
-        let mask = canvas.mask.iter().map(|share| inside(*share)).collect();
-        Self { image: canvas.rgb, mask, mapping: canvas.mapping }
+        Self { image: canvas.rgb, mask: canvas.mask, mapping: canvas.mapping }
     }
 
     fn as_it_is(color: &RgbImage, mask: &GrayImage) -> Self {
@@ -291,7 +291,7 @@ impl Photograph {
         };
         Self {
             image: (0..3).flat_map(channel).collect(),
-            mask: mask.as_raw().iter().map(|m| inside(f32::from(*m) / 255.0)).collect(),
+            mask: mask.as_raw().iter().map(|m| f32::from(*m) / 255.0).collect(),
             mapping: Mapping::AS_IT_IS,
         }
     }

@@ -22,7 +22,7 @@ const LOOKUPS: usize = 3;
 pub(super) struct Four {
     /// `[2,3,H,W]` front and back in [−1, 1] times the mask.
     pub images: Vec<f32>,
-    /// `[2,H,W]` 1 where the input masks see the person.
+    /// `[2,H,W]` share of the person as the input masks see it; with `compat` 1 or 0.
     pub masks: Vec<f32>,
     /// `[4,H,W,3]` metres in the front's frame, and where there are any `[4,H,W]`.
     pub points: Vec<f32>,

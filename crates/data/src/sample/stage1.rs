@@ -25,7 +25,7 @@ pub struct Stage1Item {
     pub side: usize,
     /// `[2,3,H,W]` front and back in [−1, 1] times the mask.
     pub images: Vec<f32>,
-    /// `[2,H,W]` 1 where the input masks see the person.
+    /// `[2,H,W]` share of the person as the input masks see it; with `compat` 1 or 0.
     pub masks: Vec<f32>,
     /// `[4,H,W,3]` points that front, back, right and left see, metres in the front camera's frame.
     pub points: Vec<f32>,

@@ -27,7 +27,7 @@ pub struct Stage2Item {
     pub side: usize,
     /// `[2,3,H,W]` front and back in [−1, 1] times the mask.
     pub images: Vec<f32>,
-    /// `[2,H,W]` 1 where the input masks see the person.
+    /// `[2,H,W]` share of the person as the input masks see it; with `compat` 1 or 0.
     pub masks: Vec<f32>,
     /// Cameras of front, back, right and left, side H; the front's where its points were moved to, with `place`.
     pub cameras: [Camera; 4],

@@ -23,7 +23,7 @@ pub struct TestItem {
     pub side: usize,
     /// `[N,3,H,W]` the photographs that go in, in [−1, 1] times the mask.
     pub images: Vec<f32>,
-    /// `[N,H,W]` 1 where the input masks see the person.
+    /// `[N,H,W]` share of the person as the input masks see it; with `compat` 1 or 0.
     pub masks: Vec<f32>,
     /// Where the photographs' pixels came from.
     pub mappings: Vec<Mapping>,
@@ -70,7 +70,7 @@ impl Test {
         let changed = changed.map(|(place, (color, mask))| handling.apply(place, (color, mask)));
         let changed: Vec<_> = changed.collect();
         let changed: Vec<_> = changed.iter().map(|(color, mask)| (color, mask)).collect();
-        let photographs = Photograph::all(&changed, handling.place);
+        let photographs = Photograph::all(&changed, handling.place, source.config.compat);
         let mappings = photographs.iter().map(|photograph| photograph.mapping).collect();
         let camera = |view: usize| source.folder.camera(source.split, subject, view);
         let cameras = (0..description.views).map(|view| camera(view).map(|stored| source.camera(&stored)));

@@ -157,6 +157,7 @@ impl Config {
             ("network.drop_empty", !self.network.drop_empty, "false"),
             ("regressor.start", self.regressor.start() == RegressorStart::Published, "\"published\""),
             ("regressor.color", self.regressor.color() == RegressorColor::Free, "\"free\""),
+            ("regressor.straight_color", !self.regressor.straight_color, "false"),
             ("mode.rotation_frame", self.rotation_frame() == RotationFrame::World, "\"world\""),
             ("mode.downsample", self.downsample() == Downsample::Nearest, "\"nearest\""),
             ("mode.world_frame", self.world_frame() == WorldFrame::Mirrored, "\"mirrored\""),

@@ -6,7 +6,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use snapsnap_data::sample::Stage2Item;
 use snapsnap_net::Window;
 use snapsnap_net::config::Config;
-use snapsnap_net::gaussians::{Chosen, Seen, assemble, placed, regress, side_images};
+use snapsnap_net::gaussians::{Chosen, Seen, assemble, photograph_colors, placed, regress, side_images};
 use snapsnap_net::network::View;
 use snapsnap_ops::host;
 use snapsnap_splat::Gaussians;
@@ -75,7 +75,11 @@ pub(super) fn gaussians(
         item.masks[view * area..(view + 1) * area].iter().map(|share| *share > 0.5).collect::<Vec<_>>()
     });
     let valid = Chosen::new(&config.network, [&masks[0], &masks[1]], &points, &conf).valid;
-    let photos = [0, 1].map(|view| &item.images[3 * view * area..3 * (view + 1) * area]);
+    let photos = [0, 1].map(|view| {
+        let rgb = &item.images[3 * view * area..3 * (view + 1) * area];
+        photograph_colors(&config.regressor, rgb, &item.masks[view * area..(view + 1) * area])
+    });
+    let photos = [&*photos[0], &*photos[1]];
     let sides = if views > 2 { side_images(photos, &points, &valid) } else { Vec::new() };
     let images: Vec<&[f32]> = photos.into_iter().chain(sides.iter().map(Vec::as_slice)).collect();
     let points = if networks.predictor.is_some() {
