@@ -139,14 +139,14 @@ fn less(words: &[String]) -> Words {
             more.extend(is_fine.then_some(["--set", "views.resolution=256"]).into_iter().flatten());
         }
         "prepare" if words[1] == "scan" => {
-            more.extend(["--set", "views.count=4", "--set", "views.samples=1"])
+            more.extend(["--set", "views.count=4", "--set", "views.samples=1"]);
         }
         "train-stage1" | "train-stage2" => {
             for key in [
-                "steps=2",
-                "validate_every=2",
-                "validation_samples=2",
-                "checkpoint_every=2",
+                "steps=1",
+                "validate_every=1",
+                "validation_samples=1",
+                "checkpoint_every=1",
                 "preview_every=0",
             ] {
                 more.extend(["--set", ["training.", key].concat().leak()]);

@@ -113,7 +113,7 @@ fn median_column(mask: &GrayImage, person: Rect) -> u32 {
     person.x + before.count() as u32
 }
 
-/// Puts photographs on canvases of `side` pixels as [`Placement::Training`] does, two of them together if they look as if taken
+/// Puts photographs on canvases of `side` pixels as [`super::Placement::Training`] does, two of them together if they look as if taken
 /// from one place; `None` if a mask shows nobody.
 pub fn place(photographs: &[(&RgbImage, &GrayImage)], height: usize, side: usize) -> Option<Vec<Canvas>> {
     let people = photographs.iter().map(|(_, mask)| Rect::around(mask, u8::MAX.div_ceil(2)));
