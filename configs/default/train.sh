@@ -2,25 +2,24 @@
 # Trains the default weights again: bash configs/default/train.sh MAKEHUMAN_DATA, in the repository's root. What was interrupted goes
 # on when it is run once more.
 set -eu
-for split in "train 932 800" "val 16 16"; do
-  set -- "$1" $split
-  cargo xtask prepare synth --split "$2" --subjects "$3" --seed 101 --config configs/data/default.toml -o people/default/synth
-  cargo xtask prepare makehuman "$1" --split "$2" --subjects "$4" --seed 102 --config configs/data/default.toml -o people/default/makehuman
-done
+makehuman=$1
+# people FOLDER SPLIT SEED SYNTHETIC MAKEHUMAN OPTION…
+people() {
+  folder=people/$1 split=$2 seed=$3 synthetic=$4 made=$5
+  shift 5
+  cargo xtask prepare synth --split "$split" --subjects "$synthetic" --seed "$seed" "$@" -o "$folder/synth"
+  cargo xtask prepare makehuman "$makehuman" --split "$split" --subjects "$made" --seed "$((seed + 1))" "$@" -o "$folder/makehuman"
+}
+own="--config configs/data/default.toml"
+people default train 101 932 800 $own
+people default val 101 16 16 $own
 # Others, whose cameras stray less.
-for split in "train 300" "val 24"; do
-  set -- "$1" $split
-  options="--config configs/data/small.toml --set views.arrangement=groups --set views.front_within_degrees=30"
-  cargo xtask prepare synth --split "$2" --subjects "$3" --seed 1 $options -o people/small/synth
-  cargo xtask prepare makehuman "$1" --split "$2" --subjects "$3" --seed 2 $options -o people/small/makehuman
-done
+less="--config configs/data/small.toml --set views.arrangement=groups --set views.front_within_degrees=30"
+people small train 1 300 300 $less
+people small val 1 24 24 $less
 # A few as large as photographs are.
-for split in "train 45 40" "val 4 4"; do
-  set -- "$1" $split
-  options="--config configs/data/default.toml --set views.resolution=1024"
-  cargo xtask prepare synth --split "$2" --subjects "$3" --seed 103 $options -o people/large/synth
-  cargo xtask prepare makehuman "$1" --split "$2" --subjects "$4" --seed 104 $options -o people/large/makehuman
-done
+people large train 103 45 40 $own --set views.resolution=1024
+people large val 103 4 4 $own --set views.resolution=1024
 data="people/default/synth people/default/makehuman people/small/synth people/small/makehuman"
 cargo xtask train-stage1 --config configs/default/stage1.toml --data $data --resume -o runs/default-points
 cargo xtask train-stage2 --config configs/default/stage2.toml --data $data --weights runs/default-points/best.safetensors --resume -o runs/default-both

@@ -179,6 +179,30 @@ pub fn fixture(name: &str) -> Option<PathBuf> {
     None
 }
 
+/// The TOML config of a fixture's `config.json`, with every quirk.
+pub fn toml_config(json: &Path) -> String {
+    let text = std::fs::read_to_string(json).expect("config.json");
+    let json: serde_json::Value = serde_json::from_str(&text).expect("JSON");
+    let same = [
+        "enc_dim",
+        "enc_depth",
+        "enc_heads",
+        "dec_dim",
+        "dec_depth",
+        "dec_heads",
+        "layer_dims",
+        "feature_dim",
+        "last_dim",
+        "hooks",
+        "head",
+        "resolution",
+        "net_resolution",
+        "conf_threshold",
+    ];
+    let lines: Vec<String> = same.iter().map(|key| format!("{key} = {}", json[key])).collect();
+    format!("[network]\n{}\n[mode]\ncompat = true\n", lines.join("\n"))
+}
+
 /// A folder beside the checkout.
 pub fn shared(name: &str) -> PathBuf {
     root().join("../shared").join(name)

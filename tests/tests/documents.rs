@@ -8,7 +8,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use snapsnap_tests::{data, root, shared, snapsnap, succeed};
+use snapsnap_tests::{data, root, shared, snapsnap, succeed, toml_config};
 
 /// In the order in which a reader meets them: each page's commands find what earlier ones made.
 const PAGES: [&str; 11] = [
@@ -143,13 +143,13 @@ fn less(words: &[String]) -> Words {
         }
         "train-stage1" | "train-stage2" => {
             for key in [
-                "steps=1",
-                "validate_every=1",
-                "validation_samples=1",
-                "checkpoint_every=1",
-                "preview_every=0",
+                "training.steps=1",
+                "training.validate_every=1",
+                "training.validation_samples=1",
+                "training.checkpoint_every=1",
+                "training.preview_every=0",
             ] {
-                more.extend(["--set", ["training.", key].concat().leak()]);
+                more.extend(["--set", key]);
             }
         }
         "evaluate" => more.extend(["--set", "data.subjects=1", "--set", "report.people=1"]),
@@ -201,7 +201,7 @@ fn place() -> tempfile::TempDir {
     for name in ["stage1.pth", "stage2.pth"] {
         fs::copy(data("pipeline").join(name), to(name)).expect("copied");
     }
-    fs::write(to("published.toml"), published()).expect("written");
+    fs::write(to("published.toml"), toml_config(&data("pipeline").join("config.json"))).expect("written");
     symlink(shared("makehuman"), to("path/to/makehuman/data")).expect("linked");
     let cone: String = (0..12)
         .map(|i| f64::from(i) * std::f64::consts::TAU / 12.0)
@@ -215,32 +215,6 @@ fn place() -> tempfile::TempDir {
         }
     }
     temporary
-}
-
-/// The config of the published networks in the size of the checkpoints above.
-fn published() -> String {
-    let text = fs::read_to_string(data("pipeline").join("config.json")).expect("read");
-    let json: serde_json::Value = serde_json::from_str(&text).expect("JSON");
-    let keys = [
-        "enc_dim",
-        "enc_depth",
-        "enc_heads",
-        "dec_dim",
-        "dec_depth",
-        "dec_heads",
-        "layer_dims",
-        "feature_dim",
-    ];
-    let keys = keys.into_iter().chain([
-        "last_dim",
-        "hooks",
-        "head",
-        "resolution",
-        "net_resolution",
-        "conf_threshold",
-    ]);
-    let lines: Vec<String> = keys.map(|key| format!("{key} = {}", json[key])).collect();
-    format!("[network]\n{}\n[mode]\ncompat = true\n", lines.join("\n"))
 }
 
 #[test]

@@ -5,7 +5,7 @@ use std::path::Path;
 use std::process::Command;
 
 use image::{GrayImage, RgbImage};
-use snapsnap_tests::{Numbers, data, device, device_name, relative_error, snapsnap, succeed};
+use snapsnap_tests::{Numbers, data, device, device_name, relative_error, snapsnap, succeed, toml_config};
 
 /// fixtures/README.md: relative L2 error of points and attributes.
 const BOUND: f64 = 1e-4;
@@ -14,30 +14,6 @@ const UNDECIDED: f32 = 1e-5;
 const THRESHOLD: f32 = 0.9;
 /// Side pixels that may take the colour of another, equally near neighbour; random weights give a handful of chances.
 const MOST_TIES: usize = 4;
-
-/// The TOML config of a fixture's `config.json`, with every quirk.
-fn toml_config(json: &Path) -> String {
-    let text = std::fs::read_to_string(json).expect("config.json");
-    let json: serde_json::Value = serde_json::from_str(&text).expect("JSON");
-    let same = [
-        "enc_dim",
-        "enc_depth",
-        "enc_heads",
-        "dec_dim",
-        "dec_depth",
-        "dec_heads",
-        "layer_dims",
-        "feature_dim",
-        "last_dim",
-        "hooks",
-        "head",
-        "resolution",
-        "net_resolution",
-        "conf_threshold",
-    ];
-    let lines: Vec<String> = same.iter().map(|key| format!("{key} = {}", json[key])).collect();
-    format!("[network]\n{}\n[mode]\ncompat = true\n", lines.join("\n"))
-}
 
 /// The fixture's pictures as files; returns the arguments that name them.
 fn pictures(numbers: &Numbers, folder: &Path) -> Vec<String> {
