@@ -7,6 +7,7 @@ use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::time::Instant;
 
 use snapsnap_tests::{data, root, shared, snapsnap, succeed, toml_config};
 
@@ -152,7 +153,11 @@ fn less(words: &[String]) -> Words {
                 more.extend(["--set", key]);
             }
         }
-        "evaluate" => more.extend(["--set", "data.subjects=1", "--set", "report.people=1"]),
+        "evaluate" => {
+            for key in ["data.subjects=1", "report.people=1", "views.compared=[1]", "views.turns=[0]"] {
+                more.extend(["--set", key]);
+            }
+        }
         "bench" => more.push("--quick"),
         "stability" => more.extend(["--quick", "--device", "cpu", "--only", "opacity 1e-7"]),
         "fetch-weights" => more.push("--list"),
@@ -229,7 +234,7 @@ fn every_command_of_readme_and_docs_works() {
                 continue;
             };
             let less = less(own);
-            println!("{page}: {}", words.join(" "));
+            let begun = Instant::now();
             // A training is not begun in the folder of another; here pages come after one another.
             if let (true, Some(at)) =
                 (less[0].starts_with("train-"), less.iter().position(|word| word == "-o"))
@@ -242,6 +247,7 @@ fn every_command_of_readme_and_docs_works() {
                 }
             }
             succeed(snapsnap().current_dir(place.path()).args(&less));
+            println!("{page}: {} ({:.1} s)", words.join(" "), begun.elapsed().as_secs_f32());
             count += 1;
         }
     }

@@ -39,7 +39,7 @@ fn main() -> ExitCode {
             }
         },
         Some(_) => {
-            let mut run = cargo(&["run", "--quiet", "--release", "--package", "snapsnap", "--"]);
+            let mut run = cargo(&["run", "--release", "--bin", "snapsnap", "--"]);
             let code = run.args(&arguments).status().ok().and_then(|status| status.code());
             return ExitCode::from(code.and_then(|code| u8::try_from(code).ok()).unwrap_or(1));
         }

@@ -103,10 +103,16 @@ pub struct NetworkConfig {
     pub mirror: bool,
     /// Whether maps are the mean of what the predictor makes of the photographs and of their mirror images.
     pub both_ways: bool,
+    /// Whether the photographs' points are moved onto the rays of their pixels.
+    pub on_rays: bool,
     /// How far, in pixels of a canvas of 1024, a point of an unseen side may lie outside of the photographs' silhouettes; what
     /// lies further outside is left out. Unset: sides are taken as they are.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub hull_margin: Option<usize>,
+    /// How many times as far as on a surface that faces the camera a pixel's point may lie from its neighbours'; what lies further
+    /// is on no surface but between two, and left out. Unset: points are taken as they are.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub steepest: Option<f32>,
     /// Whether a transformer's tokens without a person in either photograph are left out.
     pub drop_empty: bool,
 }
@@ -143,7 +149,9 @@ impl Default for NetworkConfig {
             ray_channels: false,
             mirror: false,
             both_ways: false,
+            on_rays: false,
             hull_margin: None,
+            steepest: None,
             drop_empty: false,
         }
     }

@@ -3,8 +3,9 @@
 use std::borrow::Cow;
 
 use burn::tensor::{Device, Int, Tensor, TensorData};
+use glam::DVec3;
 use snapsnap_ops::host;
-use snapsnap_splat::{Gaussians, RigidTransform};
+use snapsnap_splat::{Camera, Gaussians, RigidTransform};
 
 use crate::config::{Config, NetworkConfig, RegressorConfig, RegressorStart, RotationFrame};
 use crate::crop::Window;
@@ -37,6 +38,8 @@ pub struct Chosen {
     pub lost: usize,
     /// Pixels of the sides left out because the photographs show that nobody is there.
     pub outside: usize,
+    /// Pixels left out because their points hang between two surfaces.
+    pub between: usize,
 }
 
 impl Chosen {
@@ -66,9 +69,37 @@ impl Chosen {
             outside += usize::from(!is_inside);
             is_inside
         };
-        let valid = (0..views).map(|view| (0..area).map(|i| keep(view, i)).collect()).collect();
-        Self { valid, lost, outside }
+        let mut valid: Vec<Vec<bool>> =
+            (0..views).map(|view| (0..area).map(|i| keep(view, i)).collect()).collect();
+        let mut between = 0;
+        if let Some(steepest) = config.steepest {
+            for (view, points) in valid.iter_mut().zip(points.chunks_exact(3 * area)) {
+                between += leave_out_steep(view, points, side, steepest);
+            }
+        }
+        Self { valid, lost, outside, between }
     }
+}
+
+/// Leaves those pixels of a view out whose points `[S, S, 3]`, metres, lie further from a neighbour's than `steepest` times the
+/// width of a pixel at the person's distance, and says how many.
+fn leave_out_steep(valid: &mut [bool], points: &[f32], side: usize, steepest: f32) -> usize {
+    let nominal = Camera::orbit_at_yaw_degrees(0.0, side as u32);
+    let pixel = (nominal.centre() * DVec3::new(1.0, 0.0, 1.0)).length() / nominal.focal.x;
+    let farthest = (steepest * pixel as f32).powi(2);
+    let squared = |i: usize, j: usize| -> f32 {
+        (0..3).map(|axis| (points[3 * i + axis] - points[3 * j + axis]).powi(2)).sum()
+    };
+    let mut steep = vec![false; valid.len()];
+    for i in (0..valid.len()).filter(|&i| valid[i]) {
+        for j in [(i % side + 1 < side).then_some(i + 1), Some(i + side)].into_iter().flatten() {
+            if valid.get(j) == Some(&true) && squared(i, j) > farthest {
+                (steep[i], steep[j]) = (true, true);
+            }
+        }
+    }
+    valid.iter_mut().zip(&steep).for_each(|(valid, steep)| *valid &= !steep);
+    steep.into_iter().filter(|steep| *steep).count()
 }
 
 /// Colours `[3, S, S]` in [−1, 1] of a photograph as Gaussians take them. They come multiplied by the `mask` `[S, S]`, so that the rim,
@@ -232,6 +263,26 @@ pub fn placed(config: &Config, gaussians: Gaussians, camera_to_world: &RigidTran
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// A wall at two metres, half of which stands a metre closer: the pixels along the step are between both.
+    #[test]
+    fn what_hangs_between_two_surfaces_is_left_out() {
+        let side = 8;
+        let point = |i: usize| {
+            let (x, y) = ((i % side) as f32, (i / side) as f32);
+            [0.3 * x, 0.3 * y, if x < 4.0 { 1.0 } else { 2.0 }]
+        };
+        let points: Vec<f32> = (0..64).flat_map(point).collect();
+        // A pixel is 31 cm wide there; the step is 3.4 times as long as that, from a row's end to the next it is 7 times.
+        for (steepest, step) in [(3.0, true), (4.0, false)] {
+            let mut valid = vec![true; 64];
+            valid[3] = false;
+            let lost = leave_out_steep(&mut valid, &points, side, steepest);
+            let kept = |i: usize| i != 3 && !(step && i > 7 && matches!(i % side, 3 | 4));
+            assert_eq!(valid, (0..64).map(kept).collect::<Vec<_>>());
+            assert_eq!(lost, if step { 14 } else { 0 });
+        }
+    }
 
     #[test]
     fn rims_have_the_persons_colour_whole_where_that_is_asked_for() {

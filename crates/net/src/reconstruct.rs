@@ -163,7 +163,8 @@ impl Run<'_> {
             self.timed("reading back", |_| (host(maps.points.clone()), host(maps.conf.clone())));
         let area = self.side * self.side;
         let masks = photos.map(|photo| photo.valid.as_slice());
-        let Chosen { valid, lost, outside } = Chosen::new(&self.model.config.network, masks, &points, &conf);
+        let Chosen { valid, lost, outside, between } =
+            Chosen::new(&self.model.config.network, masks, &points, &conf);
         for (view, mask) in views.iter().zip(&valid) {
             let n = count(mask);
             self.plan.push(format!("{}: {n} of {area} pixels become Gaussians", view.name()));
@@ -174,6 +175,10 @@ impl Run<'_> {
         if outside > 0 {
             self.plan
                 .push(format!("{outside} pixels of the sides left out: no photograph shows anybody there"));
+        }
+
+        if between > 0 {
+            self.plan.push(format!("{between} pixels left out: their points hang between two surfaces"));
         }
 
         let colors =
@@ -240,7 +245,8 @@ impl Run<'_> {
         self.timed("up-sampling", |_| {
             let on_canvas = maps.into_iter().map(|(view, map)| {
                 let mask = ((view as usize) < 2).then(|| masks.clone().narrow(0, view as usize, 1));
-                net.finished(config, view, map, &window, mask).on_canvas(&window, side)
+                let map = net.finished(config, view, map, &window, mask.as_ref());
+                map.on_canvas(&config.network, view, &window, mask.as_ref())
             });
             let (points, conf): (Vec<_>, Vec<_>) = on_canvas.map(|m| (m.points, m.conf)).unzip();
             PointMap { points: Tensor::cat(points, 0), conf: Tensor::cat(conf, 0) }

@@ -2,7 +2,7 @@
 
 use burn::tensor::Tensor;
 use snapsnap_net::Window;
-use snapsnap_net::config::Config;
+use snapsnap_net::config::{Config, NetworkConfig};
 use snapsnap_net::network::{Input, PointMap, PointPredictor, View};
 use snapsnap_ops::host;
 
@@ -31,10 +31,20 @@ pub struct Prediction {
 }
 
 impl Prediction {
-    /// The same on the whole canvas; what lies outside is 0.
-    pub fn on_canvas(self, side: usize) -> Vec<(View, PointMap)> {
-        self.maps.into_iter().map(|(view, map)| (view, map.on_canvas(&self.window, side))).collect()
+    /// The same as inference takes it, on the whole canvas; what lies outside is 0. `masks` `[B,2,S,S]` are those of the
+    /// photographs.
+    pub fn on_canvas(self, config: &NetworkConfig, masks: &Tensor<4>) -> Vec<(View, PointMap)> {
+        let placed = |(view, map): (View, PointMap)| {
+            let mask = mask_of(view, masks);
+            (view, map.on_canvas(config, view, &self.window, mask.as_ref()))
+        };
+        self.maps.into_iter().map(placed).collect()
     }
+}
+
+/// A photograph's own mask `[B,1,S,S]` of both `[B,2,S,S]`.
+fn mask_of(view: View, masks: &Tensor<4>) -> Option<Tensor<4>> {
+    ((view as usize) < 2).then(|| masks.clone().narrow(1, view as usize, 1))
 }
 
 /// The window of the canvas that the predictor sees of photographs with these masks `[.., S, S]`.
@@ -58,8 +68,7 @@ pub fn predict(
     let photographs = images.swap_dims(0, 1).reshape([2 * b, channels, side, side]);
     let of_input = masks.clone().swap_dims(0, 1).reshape([2 * b, 1, side, side]);
     let finished = |(view, map): (View, PointMap)| {
-        let mask = ((view as usize) < 2).then(|| masks.clone().narrow(1, view as usize, 1));
-        (view, predictor.finished(config, view, map, &window, mask))
+        (view, predictor.finished(config, view, map, &window, mask_of(view, masks).as_ref()))
     };
     let maps = predictor.forward(Input::new(config, photographs, of_input, &window));
     let maps = maps.into_iter().map(finished).collect();

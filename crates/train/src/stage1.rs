@@ -115,7 +115,7 @@ impl Task for PointTask {
             let batch = Stage1Batcher.batch(vec![item.clone()], &self.device);
             errors.add(
                 &item,
-                &self.predict(networks, &batch).on_canvas(item.side),
+                &self.predict(networks, &batch).on_canvas(&self.networks.network, &batch.masks),
                 self.networks.network.conf_threshold,
             );
         }
@@ -128,7 +128,7 @@ impl Task for PointTask {
             let item = self.validation.get(index)?;
             let (side, area) = (item.side, item.side * item.side);
             let batch = Stage1Batcher.batch(vec![item.clone()], &self.device);
-            let maps = self.predict(networks, &batch).on_canvas(side);
+            let maps = self.predict(networks, &batch).on_canvas(&self.networks.network, &batch.masks);
             for (row, (view, map)) in maps.iter().enumerate() {
                 let (points, conf) = (host(map.points.clone()), host(map.conf.clone()));
                 let view = *view as usize;

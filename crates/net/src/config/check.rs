@@ -89,6 +89,12 @@ impl Config {
         if n.hull_margin.is_some_and(|margin| margin > 1024) {
             return Some(("network.hull_margin", "must be at most 1024 (of a canvas of 1024)".into()));
         }
+        if n.steepest.is_some_and(|steepest| steepest.is_nan() || steepest < 1.0) {
+            return Some((
+                "network.steepest",
+                "must be at least 1 (as on a surface that faces the camera)".into(),
+            ));
+        }
         if n.conf_threshold.is_nan() {
             return Some(("network.conf_threshold", "is not a number".into()));
         }
@@ -153,7 +159,9 @@ impl Config {
             ("network.ray_channels", !self.network.ray_channels, "false"),
             ("network.mirror", !self.network.mirror, "false"),
             ("network.both_ways", !self.network.both_ways, "false"),
+            ("network.on_rays", !self.network.on_rays, "false"),
             ("network.hull_margin", self.network.hull_margin.is_none(), "unset"),
+            ("network.steepest", self.network.steepest.is_none(), "unset"),
             ("network.drop_empty", !self.network.drop_empty, "false"),
             ("regressor.start", self.regressor.start() == RegressorStart::Published, "\"published\""),
             ("regressor.color", self.regressor.color() == RegressorColor::Free, "\"free\""),

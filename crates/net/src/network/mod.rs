@@ -9,6 +9,7 @@ mod dust3r;
 mod input;
 mod linear;
 mod predictor;
+mod rays;
 
 pub use anchor::anchors;
 pub use convolution::{Levels, PointUNet};

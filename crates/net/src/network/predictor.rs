@@ -8,6 +8,7 @@ use super::anchor::anchors;
 use super::convolution::{Levels, PointUNet};
 use super::dust3r::{Dust3r, Grid, TokenMaps, View};
 use super::input::Input;
+use super::rays::on_rays;
 use crate::config::{Anchor, Body, ConfMode, Config, Downsample, NetworkConfig, Upsample};
 use crate::crop::Window;
 use crate::resample::shrink;
@@ -23,13 +24,26 @@ pub struct PointMap {
 }
 
 impl PointMap {
-    /// A map of a window on the whole canvas; what lies outside is 0.
-    pub fn on_canvas(self, window: &Window, side: usize) -> Self {
-        if *window == Window::whole(side) {
-            return self;
+    /// A view's map of a window on the whole canvas of `config`; what lies outside is 0. With `network.on_rays` points of a
+    /// photograph, whose `mask` is `[B, 1, S, S]`, are moved onto their pixels' rays. Stage 1's losses are of maps before that,
+    /// else nothing would teach the network where the rays are that it thinks of.
+    pub fn on_canvas(
+        self,
+        config: &NetworkConfig,
+        view: View,
+        window: &Window,
+        mask: Option<&Tensor<4>>,
+    ) -> Self {
+        let Self { mut points, conf } = self;
+        let side = config.resolution;
+        if let Some(mask) = mask.filter(|_| config.on_rays) {
+            points = on_rays(view, side, window, points, mask);
         }
-        let conf = window.pasted(self.conf.unsqueeze_dim(3), side).squeeze_dim(3);
-        Self { points: window.pasted(self.points, side), conf }
+        if *window == Window::whole(side) {
+            return Self { points, conf };
+        }
+        let conf = window.pasted(conf.unsqueeze_dim(3), side).squeeze_dim(3);
+        Self { points: window.pasted(points, side), conf }
     }
 }
 
@@ -220,11 +234,11 @@ impl PointPredictor {
         view: View,
         map: PointMap,
         window: &Window,
-        mask: Option<Tensor<4>>,
+        mask: Option<&Tensor<4>>,
     ) -> PointMap {
         let (method, factor) = (config.upsample(), config.upsample_factor());
         let weights = (method == Upsample::MaskAware && factor > 1).then(|| match mask {
-            Some(mask) => shrink(window.cut(mask), factor, Downsample::Area),
+            Some(mask) => shrink(window.cut(mask.clone()), factor, Downsample::Area),
             None => {
                 let body = map.conf.clone().detach().greater_elem(config.network.conf_threshold);
                 body.float().unsqueeze_dim(1)

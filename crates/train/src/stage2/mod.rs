@@ -170,6 +170,7 @@ impl GaussianTask {
         let device = self.devices[0].clone().inner();
         let mut config = self.networks.clone();
         config.mode.compat = false;
+        config.network.on_rays = false;
         config.regressor.start = Some(RegressorStart::Geometric);
         let networks = Networks { predictor: None, regressors: random_regressors(&config, 0, &device) };
         let mut sums = Scores::default();

@@ -58,7 +58,9 @@ pub(super) fn gaussians(
     let side = item.side;
     let area = side * side;
     let (mut points, mut conf, mut maps) = (Vec::new(), Vec::new(), Vec::new());
-    for (_, map) in prediction.on_canvas(side) {
+    let masks = TensorData::new(item.masks.clone(), [1, 2, side, side]);
+    let masks = Tensor::from_data(masks, &prediction.maps[0].1.points.device());
+    for (_, map) in prediction.on_canvas(&config.network, &masks) {
         points.extend(host(map.points.clone()));
         conf.extend(host(map.conf));
         maps.push(map.points);
