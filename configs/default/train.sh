@@ -11,7 +11,7 @@ people() {
   cargo xtask prepare makehuman "$makehuman" --split "$split" --subjects "$made" --seed "$((seed + 1))" "$@" -o "$folder/makehuman"
 }
 own="--config configs/data/default.toml"
-people default train 101 932 800 $own
+people default train 101 967 910 $own
 people default val 101 16 16 $own
 # Others, whose cameras stray less.
 less="--config configs/data/small.toml --set views.arrangement=groups --set views.front_within_degrees=30"
@@ -22,7 +22,10 @@ people large train 103 45 40 $own --set views.resolution=1024
 people large val 103 4 4 $own --set views.resolution=1024
 data="people/default/synth people/default/makehuman people/small/synth people/small/makehuman"
 cargo xtask train-stage1 --config configs/default/stage1.toml --data $data --resume -o runs/default-points
-cargo xtask train-stage2 --config configs/default/stage2.toml --data $data --weights runs/default-points/best.safetensors --resume -o runs/default-both
+# Once more, from a rate that is high again.
+cargo xtask train-stage1 --config configs/default/stage1.toml --data $data --weights runs/default-points/best.safetensors \
+  --set training.steps=12_000 --set optimizer.rate=6e-4 --set optimizer.muon.rate=9e-4 --resume -o runs/default-again
+cargo xtask train-stage2 --config configs/default/stage2.toml --data $data --weights runs/default-again/best.safetensors --resume -o runs/default-both
 cargo xtask train-stage2 --config configs/default/regressor.toml --data people/large/synth people/large/makehuman \
   --weights runs/default-both/best.safetensors --resume -o runs/default
 cargo xtask import-weights runs/default/best.safetensors --half -o default.safetensors
