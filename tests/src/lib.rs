@@ -87,7 +87,10 @@ pub fn device() -> Option<Device> {
 
 /// Whether an adapter answers; one that does not is an error where `SNAPSNAP_REQUIRE_WGPU` is set.
 fn adapter(kind: DeviceType) -> bool {
-    let found = std::panic::catch_unwind(|| !Device::enumerate(kind).into_vec().is_empty());
+    let is_wgpu = matches!(kind, DeviceType::Wgpu);
+    let found = std::panic::catch_unwind(|| {
+        !(is_wgpu && snapsnap_splat::adapter::is_opengl()) && !Device::enumerate(kind).into_vec().is_empty()
+    });
     let found = found.unwrap_or(false);
     if !found {
         let name = device_name();

@@ -4,7 +4,7 @@ use std::fs;
 
 use image::{GenericImageView, ImageFormat};
 use snapsnap_net::weights::{Source, WeightFile};
-use snapsnap_splat::ply;
+use snapsnap_splat::scene;
 use snapsnap_tests::{refused, root, snapsnap, succeed};
 
 /// Worse than this on the person, seen from elsewhere, is no reconstruction: the photographs as flat cut-outs give 15 dB and
@@ -41,7 +41,7 @@ fn a_demo_is_made_of_the_sample_pair_and_looks_like_the_person() {
         let psnr = report["psnr_masked"][degrees].as_f64().expect("a figure");
         assert!(psnr > LEAST_DB, "{degrees}°: {psnr} dB");
     }
-    let gaussians = ply::read(&folder.join("human.ply"), &burn::tensor::Device::flex()).expect("a PLY");
+    let gaussians = scene::read(&folder.join("human.ply"), &burn::tensor::Device::flex()).expect("a PLY");
     assert_eq!(Some(gaussians.gaussians.len() as u64), report["gaussians"].as_u64());
     let sheet = image::open(folder.join("comparison.png")).expect("a picture");
     assert_eq!(sheet.dimensions(), (1792, 512));
@@ -51,7 +51,7 @@ fn a_demo_is_made_of_the_sample_pair_and_looks_like_the_person() {
     fs::write(folder.join("human.ply"), "cut").expect("written");
     fs::write(folder.join("report.json"), r#"{"command":"snapsnap demo","commit":"0"}"#).expect("written");
     succeed(&mut command);
-    ply::read(&folder.join("human.ply"), &burn::tensor::Device::flex()).expect("a PLY");
+    scene::read(&folder.join("human.ply"), &burn::tensor::Device::flex()).expect("a PLY");
     let other = temporary.path().join("mine");
     fs::create_dir(&other).expect("a folder");
     fs::write(other.join("human.ply"), "mine").expect("written");
@@ -73,7 +73,7 @@ fn two_pictures_become_a_person_with_the_default_weights() {
         .args(["--device", "cpu", "-v"]);
     let said = succeed(&mut command);
     assert!(said.contains("weights: the default weights"), "{said}");
-    let count = ply::read(&temporary.path().join("human.ply"), &burn::tensor::Device::flex())
+    let count = scene::read(&temporary.path().join("human.ply"), &burn::tensor::Device::flex())
         .expect("a PLY")
         .gaussians
         .len();

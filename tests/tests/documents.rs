@@ -12,9 +12,10 @@ use std::time::Instant;
 use snapsnap_tests::{data, root, shared, snapsnap, succeed, toml_config};
 
 /// In the order in which a reader meets them: each page's commands find what earlier ones made.
-const PAGES: [&str; 11] = [
+const PAGES: [&str; 12] = [
     "README.md",
     "docs/training.md",
+    "docs/look.md",
     "docs/weights.md",
     "docs/evaluation.md",
     "docs/formats.md",
@@ -158,6 +159,8 @@ fn less(words: &[String]) -> Words {
                 more.extend(["--set", key]);
             }
         }
+        // It would serve for ever; tests/tests/view.rs asks it.
+        "view" => more.push("--help"),
         "bench" => more.push("--quick"),
         "stability" => more.extend(["--quick", "--device", "cpu", "--only", "opacity 1e-7"]),
         "fetch-weights" => more.push("--list"),
@@ -166,7 +169,8 @@ fn less(words: &[String]) -> Words {
         }
         _ => {}
     }
-    if ["reconstruct", "demo", "train-stage1", "train-stage2", "render", "bench"].contains(&words[0].as_str())
+    if ["reconstruct", "demo", "train-stage1", "train-stage2", "render", "bench", "mesh"]
+        .contains(&words[0].as_str())
     {
         more.extend(["--device", "cpu"]);
     }

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use burn::tensor::{Device, Tensor};
-use snapsnap_splat::{Camera, Gaussians, RenderOptions, cameras, ply, render, sh};
+use snapsnap_splat::{Camera, Gaussians, RenderOptions, cameras, render, scene, sh};
 use snapsnap_tests::scenes::Random;
 use snapsnap_tests::{Numbers, refused, snapsnap, succeed, values};
 
@@ -132,7 +132,7 @@ fn every_layout_of_one_cloud_is_the_same_cloud() {
         let rows = cloud(50, degree);
         let read = |name: &str, bytes: &[u8]| {
             let loaded =
-                ply::read(&place.file(name, bytes), &device).unwrap_or_else(|e| panic!("{name}: {e}"));
+                scene::read(&place.file(name, bytes), &device).unwrap_or_else(|e| panic!("{name}: {e}"));
             let g = loaded.gaussians;
             let mut all = vec![
                 values(g.means),
@@ -187,10 +187,10 @@ fn what_is_written_is_read_again() {
     let place = Place::new();
     let device = Device::flex();
     let loaded =
-        ply::read(&place.file("in.ply", &ply_bytes(&cloud(300, 0), Format::Little, "", b"")), &device);
+        scene::read(&place.file("in.ply", &ply_bytes(&cloud(300, 0), Format::Little, "", b"")), &device);
     let first = loaded.expect("read").gaussians;
-    ply::write(&first, &place.path("out.ply")).expect("written");
-    let second = ply::read(&place.path("out.ply"), &device).expect("read").gaussians;
+    scene::write(&first, &place.path("out.ply")).expect("written");
+    let second = scene::read(&place.path("out.ply"), &device).expect("read").gaussians;
     let close =
         |a: Vec<f32>, b: Vec<f32>| a.iter().zip(&b).all(|(a, b)| (a - b).abs() <= 2e-6 * (1.0 + b.abs()));
     assert_eq!(values(first.means), values(second.means));
@@ -223,7 +223,7 @@ fn an_orbit_gives_pictures_cameras_and_raw_tensors() {
     // The library, asked directly.
     let device = Device::flex();
     let views = Camera::orbit(3, 80, 64);
-    let loaded = ply::read(&path, &device).expect("read");
+    let loaded = scene::read(&path, &device).expect("read");
     let background = Some(Tensor::<1>::from_floats([0.2, 0.4, 1.0], &device));
     let options = RenderOptions { depth: true, background, ..RenderOptions::inria() };
     let raw = Numbers::read(&place.path("raw"));
@@ -450,7 +450,7 @@ fn colours_that_are_not_finite_are_kept() {
         row[6].1 = value;
     }
     let path = place.file("in.ply", &ply_bytes(&rows, Format::Little, "", b""));
-    let colors = values(ply::read(&path, &Device::flex()).expect("read").gaussians.colors);
+    let colors = values(scene::read(&path, &Device::flex()).expect("read").gaussians.colors);
     assert!([0, 3, 6].iter().all(|i| !colors[*i].is_finite()), "{colors:?}");
 }
 

@@ -1,8 +1,10 @@
 //! `--device`: names of devices, and which of them this build and this machine have.
 
 use burn::tensor::{Device, DeviceKind, DeviceType};
+use snapsnap_splat::adapter;
 
 use crate::failure::Failure;
+use crate::memory;
 
 /// The device called `name`.
 ///
@@ -39,6 +41,67 @@ pub fn choose(name: &str) -> Result<Device, Failure> {
 pub fn all() -> Vec<Device> {
     let gpus = gpus().into_iter().filter_map(|(name, _)| choose(name).ok());
     [Device::flex(), ndarray()].into_iter().chain(gpus).collect()
+}
+
+/// A device that answers.
+pub struct Found {
+    /// As `--device` wants it.
+    pub name: String,
+    /// As it calls itself.
+    pub adapter: String,
+    /// What computes on it.
+    pub backend: &'static str,
+    /// Whether it is a GPU made of software.
+    pub software: bool,
+    /// Whether it is a GPU that `auto` takes.
+    pub card: bool,
+    /// Bytes, where they are known.
+    pub memory: Option<u64>,
+}
+
+/// Every device that answers, of all kinds that are compiled in.
+pub fn found() -> Vec<Found> {
+    let processor = |name: &str, backend| Found {
+        name: name.into(),
+        adapter: processor(),
+        backend,
+        software: false,
+        card: false,
+        memory: Some(memory::there()),
+    };
+    let mut found = vec![processor("cpu", "Burn's flex"), processor("ndarray", "Burn's ndarray")];
+    for (kind, device_type) in gpus() {
+        for (i, device) in devices(device_type).iter().enumerate() {
+            let identity = device.identity();
+            found.push(Found {
+                name: format!("{kind}:{i}"),
+                adapter: identity.as_ref().map_or_else(|| "?".into(), |identity| identity.name.clone()),
+                backend: match kind {
+                    "wgpu" => "wgpu, WGSL",
+                    "vulkan" => "wgpu, SPIR-V",
+                    "metal" => "wgpu, MSL",
+                    _ => "CUDA",
+                },
+                software: !is_card(device),
+                card: is_card(device),
+                // The graphics layer does not tell.
+                memory: (!is_card(device)).then(memory::there),
+            });
+        }
+    }
+    found
+}
+
+/// Kinds of devices of this build.
+pub fn compiled_in() -> Vec<&'static str> {
+    ["cpu", "ndarray"].into_iter().chain(gpus().into_iter().map(|(name, _)| name)).collect()
+}
+
+fn processor() -> String {
+    let mut system = sysinfo::System::new();
+    system.refresh_cpu_list(sysinfo::CpuRefreshKind::nothing());
+    let brand = system.cpus().first().map(|cpu| cpu.brand().trim().to_owned());
+    brand.filter(|brand| !brand.is_empty()).unwrap_or_else(|| "this processor".into())
 }
 
 /// Kinds of GPU devices that are compiled in, best first.
@@ -79,7 +142,8 @@ fn real_gpu() -> Option<Device> {
 }
 
 fn devices(kind: DeviceType) -> Vec<Device> {
-    quietly(|| Device::enumerate(kind).into_vec())
+    let is_wgpu = matches!(kind, DeviceType::Wgpu);
+    quietly(|| if is_wgpu && adapter::is_opengl() { Vec::new() } else { Device::enumerate(kind).into_vec() })
 }
 
 /// Runs `look`, taking a panic for "nothing there": the graphics layer panics where no driver answers.
@@ -95,9 +159,10 @@ fn nth(name: &str, kind: DeviceType, index: Option<usize>) -> Result<Device, Fai
     let devices = devices(kind);
     let found = devices.len();
     match index {
-        _ if found == 0 => {
-            Err(unknown(name, "no adapter answers; is there a card, and is its driver installed?"))
-        }
+        _ if found == 0 => Err(unknown(
+            name,
+            "no adapter answers; is there a card, and is its driver installed (Vulkan, not OpenGL)?",
+        )),
         // Without an index the runtime's own choice: the fastest card.
         None if name == "wgpu" => Ok(Device::wgpu(DeviceKind::DefaultDevice)),
         _ => {

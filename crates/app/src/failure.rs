@@ -7,6 +7,7 @@ use std::process::ExitCode;
 
 use snapsnap_eval::EvalError;
 use snapsnap_mesh::FileError;
+use snapsnap_mesh::fuse::FuseError;
 use snapsnap_net::config::ConfigError;
 use snapsnap_net::weights::WeightsError;
 use snapsnap_splat::SplatError;
@@ -60,6 +61,16 @@ impl From<SplatError> for Failure {
         match e {
             SplatError::Shape { .. } | SplatError::NotFinite { .. } => Self::Internal(e.to_string()),
             _ => Self::Input(e.to_string()),
+        }
+    }
+}
+
+impl From<FuseError> for Failure {
+    fn from(e: FuseError) -> Self {
+        match e {
+            FuseError::Splat(e) => e.into(),
+            FuseError::Reduce(_) => Self::Internal(e.to_string()),
+            FuseError::Nothing(_) | FuseError::Hollow | FuseError::Texture(_) => Self::Input(e.to_string()),
         }
     }
 }

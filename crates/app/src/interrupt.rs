@@ -11,6 +11,9 @@ static PATIENT: AtomicBool = AtomicBool::new(false);
 /// Whether it was asked to.
 static STOP: AtomicBool = AtomicBool::new(false);
 
+/// Whether being ended from outside is how the command ends.
+static WELL: AtomicBool = AtomicBool::new(false);
+
 /// Listens to Ctrl-C and to the signal that ends programs.
 pub fn listen() {
     let handler = ctrlc::set_handler(|| {
@@ -20,7 +23,7 @@ pub fn listen() {
         }
         // 130 as shells expect, and no temporary file stays behind.
         file::remove_unfinished();
-        std::process::exit(130);
+        std::process::exit(if WELL.load(Ordering::Relaxed) { 0 } else { 130 });
     });
     if let Err(e) = handler {
         say::err(&format!("warning: Ctrl-C will not clean up temporary files: {e}"));
@@ -31,4 +34,9 @@ pub fn listen() {
 pub fn patiently() -> &'static AtomicBool {
     PATIENT.store(true, Ordering::Relaxed);
     &STOP
+}
+
+/// From now on Ctrl-C is how the command ends, and no failure.
+pub fn end_well() {
+    WELL.store(true, Ordering::Relaxed);
 }

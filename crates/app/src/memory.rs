@@ -35,7 +35,7 @@ pub fn check_networks(weights: &WeightFile, device: &Device) -> Result<(), Failu
 }
 
 /// Bytes that the machine has, or, where that is less, that this process is allowed.
-fn there() -> u64 {
+pub fn there() -> u64 {
     let memory = RefreshKind::nothing().with_memory(MemoryRefreshKind::everything());
     let system = System::new_with_specifics(memory);
     // 0 where the system is not known.

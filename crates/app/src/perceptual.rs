@@ -9,7 +9,7 @@ use crate::device;
 use crate::failure::Failure;
 
 /// Where `cargo xtask fetch-weights` puts them.
-const FOLDER: &str = "weights";
+pub const FOLDER: &str = "weights";
 
 #[derive(Args)]
 pub struct Arguments {

@@ -13,6 +13,11 @@ pub fn err(line: &str) {
     let _ = writeln!(std::io::stderr(), "{}", printable(line));
 }
 
+/// Bytes of our own on stdout, as they are.
+pub fn raw(bytes: &[u8]) {
+    let _ = std::io::stdout().write_all(bytes);
+}
+
 /// The text with control characters written out; line breaks and tabs stay.
 pub fn printable(text: &str) -> String {
     let is_plain = |c: char| !c.is_control() || c == '\n' || c == '\t';

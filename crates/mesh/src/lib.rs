@@ -1,7 +1,8 @@
-//! Textured meshes: their files in and out, and the views of them.
+//! Textured meshes: their files in and out, the views of them, and surfaces out of Gaussians.
 
 mod error;
 pub mod export;
+pub mod fuse;
 pub mod import;
 pub mod mesh;
 pub mod picture;

@@ -87,6 +87,13 @@ pub enum MeshError {
 }
 
 impl Mesh {
+    /// Triangles in the colours of their positions.
+    pub fn colored(positions: Vec<Vec3>, colors: Vec<Vec3>, triangles: Vec<[u32; 3]>) -> Self {
+        let face = |positions| Face { positions, texcoords: None, material: 0 };
+        let faces = triangles.into_iter().map(face).collect();
+        Self { positions, colors, faces, materials: vec![Material::default()], ..Self::default() }
+    }
+
     /// Whether the mesh can be drawn.
     ///
     /// # Errors

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-/// Errors of cameras, Gaussians and PLY files.
+/// Errors of cameras, Gaussians and their files.
 #[derive(Debug, thiserror::Error)]
 pub enum SplatError {
     /// The tensors of one set of Gaussians disagree.
@@ -70,9 +70,9 @@ pub enum SplatError {
         /// What is wrong with it.
         problem: String,
     },
-    /// A PLY file that holds no Gaussians that can be read.
+    /// A file that holds no Gaussians that can be read, or cannot hold those to be written.
     #[error("{path}: {problem}")]
-    Ply {
+    Scene {
         /// The file.
         path: PathBuf,
         /// What is wrong with it.

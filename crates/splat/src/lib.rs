@@ -1,5 +1,6 @@
-//! Cameras, 3D Gaussians, their PLY files and the differentiable rasteriser: the lowest floor of snapsnap.
+//! Cameras, 3D Gaussians, their files and the differentiable rasteriser: the lowest floor of snapsnap.
 
+pub mod adapter;
 mod camera;
 pub mod cameras;
 mod error;
@@ -10,7 +11,9 @@ mod options;
 pub mod ply;
 pub mod reference;
 mod render;
+pub mod scene;
 pub mod sh;
+mod spz;
 mod vjp;
 
 pub use camera::{Camera, Orbit, RigidTransform};

@@ -12,7 +12,7 @@ use snapsnap_eval::pictures::Picture;
 use snapsnap_eval::region::{Region, margin};
 use snapsnap_eval::similarity::psnr;
 use snapsnap_net::{Photograph, Reconstructor};
-use snapsnap_splat::{Camera, Gaussians, RenderOptions, ply, render};
+use snapsnap_splat::{Camera, Gaussians, RenderOptions, render, scene};
 
 use super::ConfigArguments;
 use crate::failure::Failure;
@@ -83,7 +83,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let seconds = since.elapsed().as_secs_f64();
     let world = made.in_world(&config);
     progress.stage("writing");
-    ply::write(&world, &folder.file("human.ply"))?;
+    scene::write(&world, &folder.file("human.ply"))?;
     drop(progress);
     for name in ["turntable.gif", "turntable.png"] {
         Turntable::new(&folder.file(name))?.write(&world, quiet)?;

@@ -2,17 +2,22 @@
 
 pub mod bench;
 pub mod compare;
+pub mod convert;
 pub mod demo;
+pub mod doctor;
 pub mod evaluate;
 pub mod export_weights;
 pub mod fetch_weights;
 pub mod import_weights;
 pub mod init_weights;
+pub mod manuals;
+pub mod mesh;
 pub mod prepare;
 pub mod reconstruct;
 pub mod render;
 pub mod stability;
 pub mod train;
+pub mod view;
 
 use std::path::{Component, Path, PathBuf};
 

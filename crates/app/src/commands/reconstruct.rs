@@ -8,8 +8,9 @@ use snapsnap_data::photo::{self, Canvas, Placement};
 use snapsnap_mesh::picture;
 use snapsnap_net::weights::schema::Part;
 use snapsnap_net::{Photograph, Reconstructor};
-use snapsnap_splat::{file, ply};
+use snapsnap_splat::{file, scene};
 
+use super::mesh::{SurfaceArguments, Target, told};
 use super::{ConfigArguments, check_outputs, is_same_file};
 use crate::failure::Failure;
 use crate::progress::Progress;
@@ -40,12 +41,17 @@ pub struct Arguments {
     /// auto, cpu, ndarray, wgpu, vulkan, cuda or metal; wgpu:1 is the second adapter.
     #[arg(long, default_value = "auto")]
     device: String,
-    /// Gaussian PLY to write; the config in force is written beside it.
+    /// Gaussians to write, .ply or .spz; the config in force is written beside them.
     #[arg(short, long, default_value = "human.ply")]
     output: PathBuf,
     /// Also render the result all around: an animation, a sheet of eight views, or a folder of pictures.
     #[arg(long, value_name = "OUT.gif|OUT.png|DIR")]
     turntable: Option<PathBuf>,
+    /// Also make a mesh.
+    #[arg(long, value_name = "OUT.glb|.obj|.ply")]
+    mesh: Option<PathBuf>,
+    #[command(flatten)]
+    surface: SurfaceArguments,
     /// Also write every intermediate tensor.
     #[arg(long, value_name = "FILE.safetensors")]
     dump: Option<PathBuf>,
@@ -63,7 +69,11 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let mut times = vec![("opening weights", start.elapsed())];
     let mut timed = |name: &'static str, since: Instant| times.push((name, since.elapsed()));
     let turntable = arguments.turntable.as_deref().map(Turntable::new).transpose()?;
-    let config_path = check_paths(arguments, weights.path(), turntable.as_ref())?;
+    let mesh = match &arguments.mesh {
+        Some(path) => Some(Target::new(path, &arguments.surface)?),
+        None => arguments.surface.refuse("without --mesh there is no mesh to shape")?,
+    };
+    let config_path = check_paths(arguments, weights.path(), turntable.as_ref(), mesh.as_ref())?;
     let since = Instant::now();
     let device = device::choose(&arguments.device)?;
     timed("finding the device", since);
@@ -115,7 +125,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     progress.stage("writing");
     let since = Instant::now();
     let world = result.in_world(&config);
-    ply::write(&world, &arguments.output)?;
+    scene::write(&world, &arguments.output)?;
     if let Some(path) = &config_path {
         output::write(path, config.resolved().to_toml().as_bytes())?;
     }
@@ -128,6 +138,11 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
         let since = Instant::now();
         turntable.write(&world, quiet)?;
         times.push(("turntable", since.elapsed()));
+    }
+    if let Some(mesh) = &mesh {
+        let since = Instant::now();
+        plan.push(told(&mesh.write(&world, quiet)?));
+        times.push(("mesh", since.elapsed()));
     }
     // What goes into a pipe must stay a PLY.
     let say = if file::is_special(&arguments.output) { say::err } else { say::out };
@@ -146,6 +161,7 @@ fn check_paths(
     arguments: &Arguments,
     weights: &Path,
     turntable: Option<&Turntable>,
+    mesh: Option<&Target>,
 ) -> Result<Option<PathBuf>, Failure> {
     let mut inputs: Vec<&Path> = vec![&arguments.front, &arguments.back, weights];
     inputs.extend(arguments.masks.iter().flatten().map(PathBuf::as_path));
@@ -158,6 +174,7 @@ fn check_paths(
     inputs.extend(given);
     let outputs = [Some(&arguments.output), arguments.dump.as_ref(), config_path.as_ref()];
     let mut outputs: Vec<&Path> = outputs.into_iter().flatten().map(PathBuf::as_path).collect();
+    outputs.extend(mesh.map(Target::files).unwrap_or_default());
     for output in &outputs {
         turntable.map_or(Ok(()), |turntable| turntable.check_apart(output))?;
     }

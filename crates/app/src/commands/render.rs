@@ -7,7 +7,7 @@ use std::time::Instant;
 
 use burn::tensor::{Device, Tensor};
 use clap::{Args, ValueEnum};
-use snapsnap_splat::ply::{self, Loaded};
+use snapsnap_splat::scene::{self, Loaded};
 use snapsnap_splat::{
     Camera, Counts, Gaussians, MAX_SIDE, RenderOptions, Rendered, cameras, file, render, sh,
 };
@@ -85,7 +85,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     check_paths(arguments, folder.as_ref())?;
     let device = device::choose(&arguments.device)?;
     let start = Instant::now();
-    let loaded = ply::read(&arguments.ply, &device)?;
+    let loaded = scene::read(&arguments.ply, &device)?;
     let reading = start.elapsed();
     let preset = match arguments.preset {
         Preset::Inria => RenderOptions::inria(),

@@ -13,7 +13,7 @@ use glam::{DVec2, DVec3};
 use serde::{Deserialize, Serialize};
 use snapsnap_mesh::FileError;
 use snapsnap_net::weights::WeightFile;
-use snapsnap_splat::{Camera, Gaussians, ply};
+use snapsnap_splat::{Camera, Gaussians, scene};
 
 use crate::EvalError;
 use crate::evaluate::config::{DataSection, EvalConfig, Protocol};
@@ -203,7 +203,7 @@ pub fn measure(
     let memory = most_used();
     let temporary = tempfile::tempdir().map_err(FileError::write(&std::env::temp_dir()))?;
     let start = Instant::now();
-    ply::write(&made.gaussians, &temporary.path().join("human.ply"))?;
+    scene::write(&made.gaussians, &temporary.path().join("human.ply"))?;
     modules.push(("writing the PLY".into(), start.elapsed().as_secs_f64()));
     let side = people.side(&eval.views);
     let camera = item.cameras[eval.views.compared[0]];

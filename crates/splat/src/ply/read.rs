@@ -2,113 +2,24 @@
 //! further properties and elements ignored.
 
 use std::io::{self, BufRead, BufReader, Cursor, Read};
-use std::path::Path;
-
-use burn::tensor::{Device, Tensor, TensorData};
 
 use super::header::{Element, Format, Header, MAX_HEADER, Property, parse};
 use crate::error::quoted;
-use crate::file;
-use crate::{Gaussians, SplatError, sh};
-
-/// Every property that must be there, in the order in which they are gathered.
-const REQUIRED: [&str; 14] = [
-    "x", "y", "z", "rot_0", "rot_1", "rot_2", "rot_3", "scale_0", "scale_1", "scale_2", "opacity", "f_dc_0",
-    "f_dc_1", "f_dc_2",
-];
+use crate::scene::{Problem, Stored};
 
 /// Longest line of a body in text.
 const MAX_LINE: u64 = 1 << 20;
 
-/// What keeps a file from being read.
-enum Problem {
-    Io(io::Error),
-    Ply(String),
-}
-
-impl From<io::Error> for Problem {
-    fn from(e: io::Error) -> Self {
-        Self::Io(e)
-    }
-}
-
-impl From<String> for Problem {
-    fn from(problem: String) -> Self {
-        Self::Ply(problem)
-    }
-}
-
-/// A file's Gaussians.
-#[derive(Debug, Clone)]
-pub struct Loaded {
-    /// After activation; colours are those of SH degree 0, max(0, ½ + C₀·f_dc).
-    pub gaussians: Gaussians,
-    /// Coefficients `[N,K,3]` for [`sh::colors`], where the file has a degree above 0.
-    pub harmonics: Option<Tensor<3>>,
-}
-
-/// Reads the Gaussians of `path` onto `device`. Values that are not finite are kept, a render counts and leaves them
-/// out.
-///
-/// # Errors
-/// [`SplatError::Read`] if the file cannot be read, [`SplatError::Ply`] if it is no PLY, is shorter than its header
-/// says, or lacks a property.
-pub fn read(path: &Path, device: &Device) -> Result<Loaded, SplatError> {
-    let cannot = |source| SplatError::Read { path: path.to_owned(), source };
-    let failed = |problem| match problem {
-        Problem::Io(source) => cannot(source),
-        Problem::Ply(problem) => SplatError::Ply { path: path.to_owned(), problem },
-    };
-    let mut file = file::open(path).map_err(cannot)?;
+/// Reads a PLY's Gaussians, and no more than its header promises of an input that may go on for ever.
+pub(crate) fn read(mut input: impl Read) -> Result<Stored, Problem> {
     let mut start = Vec::new();
-    (&mut file).take(MAX_HEADER as u64 + 1).read_to_end(&mut start).map_err(cannot)?;
-    let header = parse(&start).map_err(|problem| failed(Problem::Ply(problem)))?;
-    // Only what the header promises is read of a file that may go on for ever.
-    let mut body = BufReader::new(Cursor::new(start.split_off(header.len)).chain(file));
-    let table = table(&header, &mut body).map_err(failed)?;
-    let Table { n, coefficients: k, columns } = table;
-    let rows = |names: usize, first: usize, f: fn(f32) -> f32| {
-        let values: Vec<f32> = (0..n)
-            .flat_map(|i| (first..first + names).map(move |c| (c, i)))
-            .map(|(c, i)| f(columns[c][i]))
-            .collect();
-        Tensor::<2>::from_data(TensorData::new(values, [n, names]), device)
-    };
-    let opacities = columns[10].iter().map(|o| 1.0 / (1.0 + (-o).exp())).collect::<Vec<f32>>();
-    let gaussians = Gaussians::new(
-        rows(3, 0, |v| v),
-        rows(4, 3, |v| v),
-        rows(3, 7, f32::exp),
-        Tensor::from_data(TensorData::new(opacities, [n]), device),
-        rows(3, 11, |v| {
-            let color = 0.5 + sh::C0 * v;
-            // Not `max`: it would turn a NaN into black.
-            if color < 0.0 && color.is_finite() { 0.0 } else { color }
-        }),
-    )?;
-    let harmonics = (k > 1).then(|| {
-        // In the file all coefficients of red come first, then green, then blue.
-        let value = |i: usize, band: usize, channel: usize| match band {
-            0 => columns[11 + channel][i],
-            band => columns[REQUIRED.len() + channel * (k - 1) + band - 1][i],
-        };
-        let bands = |i: usize| (0..k).flat_map(move |band| (0..3).map(move |c| (i, band, c)));
-        let values: Vec<f32> = (0..n).flat_map(bands).map(|(i, band, c)| value(i, band, c)).collect();
-        Tensor::<3>::from_data(TensorData::new(values, [n, k, 3]), device)
-    });
-    Ok(Loaded { gaussians, harmonics })
+    (&mut input).take(MAX_HEADER as u64 + 1).read_to_end(&mut start)?;
+    let header = parse(&start)?;
+    let mut body = BufReader::new(Cursor::new(start.split_off(header.len)).chain(input));
+    table(&header, &mut body)
 }
 
-/// The vertex element, column by column.
-struct Table {
-    n: usize,
-    /// SH coefficients per channel: 1, 4, 9 or 16.
-    coefficients: usize,
-    /// [`REQUIRED`], then `f_rest_0` ….
-    columns: Vec<Vec<f32>>,
-}
-
-fn table(header: &Header, body: &mut impl BufRead) -> Result<Table, Problem> {
+fn table(header: &Header, body: &mut impl BufRead) -> Result<Stored, Problem> {
     let at = header
         .elements
         .iter()
@@ -121,7 +32,7 @@ fn table(header: &Header, body: &mut impl BufRead) -> Result<Table, Problem> {
     }
     let position = |name: &str| vertex.properties.iter().position(|p| p.name == name);
     let mut wanted = Vec::new();
-    for name in REQUIRED {
+    for name in Stored::COLUMNS {
         wanted.push(position(name).ok_or_else(|| {
             let found: Vec<String> = vertex.properties.iter().map(|p| quoted(&p.name)).take(12).collect();
             format!(
@@ -149,7 +60,7 @@ fn table(header: &Header, body: &mut impl BufRead) -> Result<Table, Problem> {
         Format::Ascii => ascii(header, at, body, &wanted)?,
         Format::LittleEndian | Format::BigEndian => binary(header, at, body, &wanted)?,
     };
-    Ok(Table { n: vertex.count, coefficients, columns })
+    Ok(Stored { coefficients, columns })
 }
 
 /// Where `vertex` cannot be read to its end.

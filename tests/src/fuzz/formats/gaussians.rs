@@ -4,7 +4,7 @@ use std::path::Path;
 
 use burn::tensor::{Device, Tensor};
 use snapsnap_net::config::Config;
-use snapsnap_splat::{Camera, Gaussians, cameras, ply};
+use snapsnap_splat::{Camera, Gaussians, cameras, ply, scene};
 
 use super::super::Format;
 use super::put;
@@ -25,7 +25,7 @@ const RENDER: Format = Format {
 pub const FORMATS: &[Format] = &[
     Format {
         name: "gaussians",
-        sample: |folder| ply::write(&three(), &folder.join("h.ply")).expect("written"),
+        sample: |folder| scene::write(&three(), &folder.join("h.ply")).expect("written"),
         ..RENDER
     },
     Format { name: "gaussians-ascii", sample: |folder| put(folder, "h.ply", file("ascii", 1)), ..RENDER },
@@ -37,7 +37,7 @@ pub const FORMATS: &[Format] = &[
     Format {
         name: "cameras",
         sample: |folder| {
-            ply::write(&three(), &folder.join("h.ply")).expect("written");
+            scene::write(&three(), &folder.join("h.ply")).expect("written");
             cameras::write(&Camera::orbit(2, 24, 16), &folder.join("cameras.json")).expect("written");
         },
         changed: &["cameras.json"],
@@ -97,7 +97,7 @@ fn file(format: &str, degree: usize) -> Vec<u8> {
 
 /// Whether `reconstruct` wrote a PLY that can be read again, and its config.
 pub fn reconstruction(folder: &Path) -> Result<(), String> {
-    let loaded = ply::read(&folder.join("out.ply"), &Device::flex()).map_err(|e| e.to_string())?;
+    let loaded = scene::read(&folder.join("out.ply"), &Device::flex()).map_err(|e| e.to_string())?;
     if loaded.gaussians.is_empty() {
         return Err("the PLY is empty".into());
     }

@@ -39,12 +39,22 @@ pub struct Arguments {
 #[derive(Subcommand)]
 enum Kind {
     /// Render scans, OBJ, PLY or GLB, into a data set.
+    #[command(
+        after_help = "Example: snapsnap prepare scan path/to/scans --split train --config configs/data/small.toml -o people/scans"
+    )]
     Scan(scan::Arguments),
     /// Make people of simple shapes, with cloth full of detail.
+    #[command(
+        after_help = "Example: snapsnap prepare synth --subjects 300 --seed 1 --config configs/data/small.toml -o people/synth"
+    )]
     Synth(synth::Arguments),
     /// Make people from MakeHuman's free data.
+    #[command(
+        after_help = "Example: snapsnap prepare makehuman path/to/makehuman/data --subjects 300 --seed 2 -o people/makehuman"
+    )]
     Makehuman(makehuman::Arguments),
     /// List what is wrong with a data set.
+    #[command(after_help = "Example: snapsnap prepare check people/synth")]
     Check(check::Arguments),
 }
 

@@ -2,13 +2,13 @@
 
 use std::collections::HashMap;
 use std::fs;
-use std::io::{self, Cursor, Write};
-use std::path::Path;
+use std::io::Write;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use image::ImageFormat;
 use snapsnap_splat::file::write_whole;
 
+use super::png;
 use crate::FileError;
 use crate::mesh::Mesh;
 
@@ -27,14 +27,11 @@ pub fn write_obj(mesh: &Mesh, path: &Path) -> Result<(), FileError> {
         materials += &format!("newmtl m{row}\nKd {r} {g} {b}\n");
         if let Some(texture) = &material.texture {
             let count = textures.len();
-            let name = textures.entry(Arc::as_ptr(texture)).or_insert_with(|| format!("{stem}_{count}.png"));
+            let file = textures.entry(Arc::as_ptr(texture)).or_insert_with(|| texture_beside(path, count));
+            let name = file.file_name().unwrap_or_default().to_string_lossy();
             materials += &format!("map_Kd {name}\n");
-            let file = folder.join(&*name);
-            let mut bytes = Cursor::new(Vec::new());
-            texture
-                .write_to(&mut bytes, ImageFormat::Png)
-                .map_err(|e| FileError::write(&file)(io::Error::other(e)))?;
-            write_whole(&file, |out| out.write_all(bytes.get_ref())).map_err(FileError::write(&file))?;
+            let bytes = png(texture).map_err(FileError::write(file))?;
+            write_whole(file, |out| out.write_all(&bytes)).map_err(FileError::write(file))?;
         }
     }
     let file = folder.join(format!("{stem}.mtl"));
@@ -65,4 +62,10 @@ pub fn write_obj(mesh: &Mesh, path: &Path) -> Result<(), FileError> {
         Ok(())
     })
     .map_err(FileError::write(path))
+}
+
+/// Where the texture of this number goes.
+pub fn texture_beside(path: &Path, number: usize) -> PathBuf {
+    let stem = path.file_stem().unwrap_or_default().to_string_lossy();
+    path.with_file_name(format!("{stem}_{number}.png"))
 }

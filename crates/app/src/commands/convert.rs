@@ -1,0 +1,52 @@
+//! `snapsnap convert`.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use snapsnap_splat::file;
+use snapsnap_splat::scene::{Kind, Stored};
+
+use super::check_outputs;
+use crate::failure::Failure;
+use crate::say;
+
+#[derive(Args)]
+pub struct Arguments {
+    /// File of Gaussians, PLY or SPZ.
+    input: PathBuf,
+    /// What to write: .ply or .spz.
+    output: PathBuf,
+}
+
+pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
+    let Arguments { input, output } = arguments;
+    if Kind::named(output).is_none() && !file::is_special(output) {
+        let message = "is neither .ply nor .spz; the extension says what to write";
+        return Err(Failure::Input(format!("{}: {message}", output.display())));
+    }
+    check_outputs(&[output], &[input])?;
+    let mut stored = Stored::read(input)?;
+    let dropped = stored.drop_not_finite();
+    stored.write(output)?;
+    if quiet {
+        return Ok(());
+    }
+    // What goes into a pipe stays what it is.
+    let say = if file::is_special(output) { say::err } else { say::out };
+    if dropped > 0 {
+        say(&format!(
+            "{}: {dropped} Gaussians with values that are not finite were left out",
+            input.display()
+        ));
+    }
+    let size = |path: &PathBuf| std::fs::metadata(path).map_or(0.0, |metadata| metadata.len() as f64 / 1e6);
+    say(&format!(
+        "{}: {} Gaussians of SH degree {}, {:.1} MB instead of {:.1}",
+        output.display(),
+        stored.len(),
+        stored.degree(),
+        size(output),
+        size(input)
+    ));
+    Ok(())
+}

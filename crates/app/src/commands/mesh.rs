@@ -1,0 +1,124 @@
+//! `snapsnap mesh`.
+
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use clap::Args;
+use snapsnap_mesh::export::{self, Kind};
+use snapsnap_mesh::fuse::{Fused, Options, fuse};
+use snapsnap_splat::{Gaussians, scene};
+
+use super::check_outputs;
+use crate::failure::Failure;
+use crate::progress::Progress;
+use crate::{device, say};
+
+#[derive(Args)]
+pub struct Arguments {
+    /// File of Gaussians, PLY or SPZ.
+    input: PathBuf,
+    /// What to write: .glb, .obj or .ply.
+    #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+    #[command(flatten)]
+    surface: SurfaceArguments,
+    /// auto, cpu, ndarray, wgpu, vulkan, cuda or metal; wgpu:1 is the second adapter.
+    #[arg(long, default_value = "auto")]
+    device: String,
+    /// Print what was closed and dropped, and the time.
+    #[arg(short, long)]
+    verbose: bool,
+}
+
+/// What a surface is to be like.
+#[derive(Args)]
+pub struct SurfaceArguments {
+    /// Triangles of the mesh, about; 0 keeps all [default: 100000].
+    #[arg(long, value_name = "N")]
+    faces: Option<usize>,
+    /// A texture of so many pixels' side instead of colours at the corners (not in a .ply).
+    #[arg(long, value_name = "SIZE", value_parser = clap::value_parser!(u32).range(64..=16384))]
+    texture: Option<u32>,
+}
+
+impl SurfaceArguments {
+    /// Refuses arguments that nothing would come of.
+    pub fn refuse<T>(&self, why: &str) -> Result<Option<T>, Failure> {
+        let given = [("--faces", self.faces.is_some()), ("--texture", self.texture.is_some())];
+        match given.iter().find(|(_, given)| *given) {
+            Some((name, _)) => Err(Failure::Input(format!("{name}: {why}"))),
+            None => Ok(None),
+        }
+    }
+}
+
+pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
+    let since = Instant::now();
+    let target = Target::new(&arguments.output, &arguments.surface)?;
+    check_outputs(&target.files(), &[&arguments.input])?;
+    let device = device::choose(&arguments.device)?;
+    let loaded = scene::read(&arguments.input, &device)?;
+    let fused = target.write(&loaded.gaussians, quiet)?;
+    if arguments.verbose {
+        say::out(&told(&fused));
+        say::out(&format!("{:.1} s", since.elapsed().as_secs_f64()));
+    }
+    if !quiet {
+        let (file, faces) = (arguments.output.display(), fused.mesh.faces.len());
+        say::out(&format!("{file}: {faces} triangles, {} positions", fused.mesh.positions.len()));
+    }
+    Ok(())
+}
+
+/// A mesh that is to be written.
+pub struct Target {
+    path: PathBuf,
+    companions: Vec<PathBuf>,
+    options: Options,
+}
+
+impl Target {
+    /// Refuses what is no kind of mesh.
+    pub fn new(path: &Path, surface: &SurfaceArguments) -> Result<Self, Failure> {
+        if Kind::named(path).is_none() {
+            let message = "is neither .glb nor .obj nor .ply; the extension says what to write";
+            return Err(Failure::Input(format!("{}: {message}", path.display())));
+        }
+        let texture = surface.texture.unwrap_or(0) as usize;
+        if texture > 0 && Kind::named(path) == Some(Kind::Ply) {
+            let message = "a PLY has no texture: leave out --texture, or write a .glb or .obj";
+            return Err(Failure::Input(format!("{}: {message}", path.display())));
+        }
+        let options = Options { faces: surface.faces.unwrap_or(Options::default().faces), texture };
+        Ok(Self { path: path.to_owned(), companions: export::companions(path, texture > 0), options })
+    }
+
+    /// Everything that will be written.
+    pub fn files(&self) -> Vec<&Path> {
+        let companions = self.companions.iter().map(PathBuf::as_path);
+        companions.chain([self.path.as_path()]).collect()
+    }
+
+    /// Makes the mesh of Gaussians and writes it.
+    pub fn write(&self, gaussians: &Gaussians, quiet: bool) -> Result<Fused, Failure> {
+        let progress = Progress::stages(quiet);
+        let fused = fuse(gaussians, self.options, &|name| progress.stage(name))?;
+        progress.stage("writing");
+        export::write(&fused.mesh, &self.path)?;
+        Ok(fused)
+    }
+}
+
+/// How a surface came about.
+pub fn told(fused: &Fused) -> String {
+    format!(
+        "surface from a field of {:.1} mm: {} gaps between the shells closed, {} hollows filled, {} flying pieces dropped; \
+         {} triangles reduced to {}",
+        1e3 * fused.cell,
+        fused.closed,
+        fused.filled,
+        fused.dropped,
+        fused.faces,
+        fused.mesh.faces.len()
+    )
+}

@@ -1,0 +1,196 @@
+// The page of `snapsnap view`. World: metres, y up, a person who faces +z stands near the origin.
+
+import { SparkRenderer, SplatFileType, SplatMesh } from "@sparkjsdev/spark";
+import * as THREE from "three";
+import { OrbitControls } from "three/addons/controls/OrbitControls.js";
+
+const element = (id) => document.getElementById(id);
+const canvas = element("canvas");
+
+const renderer = new THREE.WebGLRenderer({ canvas, antialias: false });
+const scene = new THREE.Scene();
+// The kernel of the program's own rasteriser: 0.3 pixels² wider and no less opaque, to where alpha falls below 1/255.
+const spark = new SparkRenderer({
+  renderer,
+  preBlurAmount: 0.3,
+  blurAmount: 0,
+  maxStdDev: 3,
+  minAlpha: 1 / 255,
+  sortRadial: false,
+});
+scene.add(spark);
+
+// The nominal camera: 2 m away, 8° above the horizon, focal length 0.8 of the picture's height.
+const CENTRE = new THREE.Vector3(0, 0.85, 0);
+const DISTANCE = 2;
+const PITCH = (8 * Math.PI) / 180;
+const FIELD = (2 * Math.atan(0.5 / 0.8) * 180) / Math.PI;
+
+const camera = new THREE.PerspectiveCamera(FIELD, 1, 0.01, 100);
+const controls = new OrbitControls(camera, canvas);
+controls.enableDamping = true;
+controls.listenToKeyEvents(canvas);
+
+/** Where the camera looks and from how far: from the person's box, so that anybody, of any size, is whole in the picture. */
+let view = { centre: CENTRE.clone(), distance: DISTANCE };
+
+function lookFrom(yawDegrees) {
+  const yaw = (yawDegrees * Math.PI) / 180;
+  const away = new THREE.Vector3(Math.cos(PITCH) * Math.sin(yaw), Math.sin(PITCH), Math.cos(PITCH) * Math.cos(yaw));
+  // A window that is higher than wide shows less of the sides.
+  const distance = view.distance * Math.max(1, 0.45 / camera.aspect);
+  controls.target.copy(view.centre);
+  camera.position.copy(view.centre).addScaledVector(away, distance);
+  // No drift of an earlier drag.
+  controls.enableDamping = false;
+  controls.update();
+  controls.enableDamping = true;
+}
+
+function frame(box) {
+  const size = box.getSize(new THREE.Vector3());
+  const height = Math.max(size.y, 0.5 * Math.max(size.x, size.z));
+  const person = !box.isEmpty() && Number.isFinite(height) && height > 0;
+  const upright = person && height > 1 && height < 2.5 && Math.abs(box.min.y) < 0.3;
+  view = upright || !person
+    ? { centre: CENTRE.clone(), distance: DISTANCE }
+    : { centre: box.getCenter(new THREE.Vector3()), distance: (DISTANCE * height) / 1.7 };
+  camera.near = view.distance / 200;
+  camera.far = view.distance * 50;
+  camera.updateProjectionMatrix();
+}
+
+function resize() {
+  renderer.setPixelRatio(window.devicePixelRatio);
+  renderer.setSize(window.innerWidth, window.innerHeight, false);
+  camera.aspect = window.innerWidth / window.innerHeight;
+  camera.updateProjectionMatrix();
+}
+window.addEventListener("resize", resize);
+resize();
+
+function say(text) {
+  element("message").textContent = text;
+}
+
+let shown = null;
+
+async function show(bytes, name, fileType) {
+  const mesh = new SplatMesh({ fileBytes: bytes, fileName: name, fileType, extSplats: true });
+  await mesh.initialized;
+  if (shown) {
+    scene.remove(shown);
+    shown.dispose();
+  }
+  shown = mesh;
+  scene.add(mesh);
+  frame(mesh.getBoundingBox(true));
+  lookFrom(0);
+  element("name").textContent = name;
+  const count = (mesh.extSplats ?? mesh.packedSplats).numSplats;
+  element("count").textContent = `${count.toLocaleString("en")} Gaussians`;
+  document.title = `${name} – snapsnap`;
+  say("");
+}
+
+async function showServed() {
+  say("Loading …");
+  // What lies there now, and not what a cache remembers.
+  const answer = await fetch("./scene.ply", { cache: "no-store" });
+  if (!answer.ok) {
+    throw new Error(await answer.text());
+  }
+  const name = decodeURIComponent(answer.headers.get("x-name") ?? "scene.ply");
+  await show(new Uint8Array(await answer.arrayBuffer()), name, SplatFileType.PLY);
+}
+
+function failed(what) {
+  return (error) => say(`${what}: ${error.message ?? error}`);
+}
+
+window.addEventListener("dragover", (event) => event.preventDefault());
+window.addEventListener("drop", async (event) => {
+  event.preventDefault();
+  const file = event.dataTransfer.files[0];
+  if (!file) {
+    return;
+  }
+  say("Loading …");
+  try {
+    await show(new Uint8Array(await file.arrayBuffer()), file.name);
+    // The downloads are of the file that the program serves.
+    element("downloads").classList.add("hidden");
+  } catch (error) {
+    failed(file.name)(error);
+  }
+});
+
+for (const button of document.querySelectorAll("button[data-yaw]")) {
+  button.addEventListener("click", () => lookFrom(Number(button.dataset.yaw)));
+}
+
+function background() {
+  scene.background = new THREE.Color(element("background").value);
+  // Colours of Gaussians are those of the screen, and so is this one.
+  scene.background.convertLinearToSRGB();
+}
+element("background").addEventListener("input", background);
+
+function save(blob, name) {
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(blob);
+  link.download = name;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
+}
+
+const stem = () => element("name").textContent.replace(/\.[^.]*$/, "") || "scene";
+
+function screenshot() {
+  // In one go with the drawing: afterwards the canvas is empty.
+  renderer.render(scene, camera);
+  return new Promise((done) => canvas.toBlob(done));
+}
+element("screenshot").addEventListener("click", async () => save(await screenshot(), `${stem()}.png`));
+
+/** What is seen now as an entry of `cameras.json`: OpenCV axes, pixels of the canvas. */
+function cameraEntry() {
+  camera.updateMatrixWorld();
+  const m = camera.matrixWorldInverse.elements;
+  // Columns to rows; y and z point the other way.
+  const row = (i, sign) => [0, 1, 2, 3].map((j) => sign * m[4 * j + i]);
+  const { width, height } = canvas;
+  const focal = (0.5 * height) / Math.tan((0.5 * camera.fov * Math.PI) / 180);
+  return {
+    width,
+    height,
+    fx: focal,
+    fy: focal,
+    cx: width / 2,
+    cy: height / 2,
+    world_to_camera: [row(0, 1), row(1, -1), row(2, -1), [0, 0, 0, 1]],
+  };
+}
+element("camera").addEventListener("click", () => {
+  save(new Blob([JSON.stringify([cameraEntry()], null, 1)], { type: "application/json" }), "cameras.json");
+});
+
+let drawn = 0;
+let since = performance.now();
+renderer.setAnimationLoop(() => {
+  controls.update();
+  renderer.render(scene, camera);
+  drawn += 1;
+  const now = performance.now();
+  if (now - since > 1000) {
+    element("rate").textContent = `${Math.round((1000 * drawn) / (now - since))} frames/s`;
+    drawn = 0;
+    since = now;
+  }
+});
+
+background();
+lookFrom(0);
+const ready = showServed().catch(failed("Cannot show the file"));
+// For tests and for whoever has the console open.
+window.snapsnap = { ready, camera: cameraEntry, screenshot, lookFrom, renderer, spark };

@@ -1,0 +1,293 @@
+//! A texture for a surface: pieces that face one way are laid flat beside one another.
+
+use std::collections::{HashMap, HashSet, VecDeque};
+
+use glam::{IVec2, Vec2, Vec3};
+
+use crate::mesh::Mesh;
+
+/// Share of the texture that pieces fill at best.
+const FILLED: f32 = 0.75;
+/// How much coarser the texels become until all pieces find room.
+const COARSER: f32 = 1.06;
+/// Free texels around each piece, which have its colours too, so that filters do not see its neighbours.
+const PADDING: i32 = 3;
+/// A piece grows as long as its faces are met more squarely than at this cosine.
+const FLATTEST: f32 = 0.4;
+/// Tries to find room.
+const TRIES: usize = 200;
+
+/// A texel of the surface.
+pub struct Texel {
+    /// Row of the texture, column by column in a row.
+    pub at: usize,
+    /// World metres.
+    pub place: Vec3,
+    /// Unit vector outwards.
+    pub normal: Vec3,
+}
+
+/// Where the faces of a mesh lie on a square texture.
+pub struct Atlas {
+    /// Texture coordinates of each face's corners, (0, 0) at the lower left.
+    pub texcoords: Vec<[Vec2; 3]>,
+    /// Texels that faces cover.
+    pub texels: Vec<Texel>,
+}
+
+/// Faces that are seen from along one axis and do not cover one another.
+struct Chart {
+    faces: Vec<usize>,
+    /// Smallest and largest texel, before it is placed.
+    low: IVec2,
+    high: IVec2,
+}
+
+/// Lays the faces of `mesh` on a texture of `side`² pixels.
+///
+/// # Errors
+/// If there are too many pieces for it.
+pub fn atlas(mesh: &Mesh, side: usize) -> Result<Atlas, String> {
+    let normals = mesh.normals();
+    let axes: Vec<usize> = mesh.faces.iter().map(|face| axis(corners(mesh, face.positions))).collect();
+    let neighbours = neighbours(mesh);
+    let area: f32 = (0..axes.len())
+        .map(|face| {
+            let [a, b, c] = flat(mesh, face, axes[face], 1.0);
+            0.5 * (b - a).perp_dot(c - a).abs()
+        })
+        .sum();
+    let mut texel = (area / (FILLED * (side * side) as f32)).sqrt();
+    for _ in 0..TRIES {
+        let charts = charts(mesh, &axes, &neighbours, texel);
+        if let Some(places) = pack(&charts, side as i32) {
+            return Ok(lay(mesh, &normals, &axes, &charts, &places, side, texel));
+        }
+        texel *= COARSER;
+    }
+    Err(format!("a texture of {side}² pixels has no room for the pieces of the surface"))
+}
+
+fn corners(mesh: &Mesh, rows: [u32; 3]) -> [Vec3; 3] {
+    rows.map(|row| mesh.positions[row as usize])
+}
+
+/// The axis along which a face is seen best: 0 to 2 are x, y and z, 3 to 5 the same from behind.
+fn axis([a, b, c]: [Vec3; 3]) -> usize {
+    let normal = (b - a).cross(c - a);
+    let along = (0..3).max_by(|i, j| normal[*i].abs().total_cmp(&normal[*j].abs())).expect("three");
+    if normal[along] < 0.0 { along + 3 } else { along }
+}
+
+/// How squarely a face is met along an axis.
+fn cosine(mesh: &Mesh, face: usize, axis: usize) -> f32 {
+    let [a, b, c] = corners(mesh, mesh.faces[face].positions);
+    let along = (b - a).cross(c - a).normalize_or_zero()[axis % 3];
+    if axis < 3 { along } else { -along }
+}
+
+/// Corners of a face as seen along an axis, in texels.
+fn flat(mesh: &Mesh, face: usize, axis: usize, texel: f32) -> [Vec2; 3] {
+    let (right, up) = [(2, 1), (0, 2), (0, 1)][axis % 3];
+    corners(mesh, mesh.faces[face].positions).map(|p| Vec2::new(p[right], p[up]) / texel)
+}
+
+/// Faces across each face's edges.
+fn neighbours(mesh: &Mesh) -> Vec<[usize; 3]> {
+    let edges = |face: usize| {
+        let [a, b, c] = mesh.faces[face].positions;
+        [(a, b), (b, c), (c, a)]
+    };
+    let all = (0..mesh.faces.len()).flat_map(|face| edges(face).map(|edge| (edge, face)));
+    let owners: HashMap<(u32, u32), usize> = all.collect();
+    // Across the edge of a closed surface there always is a face.
+    let across = |face| edges(face).map(|(a, b)| *owners.get(&(b, a)).unwrap_or(&face));
+    (0..mesh.faces.len()).map(across).collect()
+}
+
+fn charts(mesh: &Mesh, axes: &[usize], neighbours: &[[usize; 3]], texel: f32) -> Vec<Chart> {
+    let mut taken = vec![false; axes.len()];
+    let mut charts = Vec::new();
+    for seed in 0..axes.len() {
+        if taken[seed] {
+            continue;
+        }
+        let mut chart = Chart { faces: Vec::new(), low: IVec2::MAX, high: IVec2::MIN };
+        let mut covered = HashSet::new();
+        let mut waiting = VecDeque::from([seed]);
+        while let Some(face) = waiting.pop_front() {
+            if taken[face] {
+                continue;
+            }
+            let triangle = flat(mesh, face, axes[seed], texel);
+            let mut texels = Vec::new();
+            inside(triangle, |at, _| texels.push(at));
+            // What lies before or behind a part of this piece goes into another one.
+            if texels.iter().any(|at| covered.contains(at)) {
+                continue;
+            }
+            covered.extend(texels);
+            taken[face] = true;
+            chart.faces.push(face);
+            for corner in triangle {
+                chart.low = chart.low.min(corner.floor().as_ivec2());
+                chart.high = chart.high.max(corner.floor().as_ivec2());
+            }
+            let next = neighbours[face].into_iter();
+            waiting.extend(next.filter(|next| !taken[*next] && cosine(mesh, *next, axes[seed]) > FLATTEST));
+        }
+        charts.push(chart);
+    }
+    charts
+}
+
+/// Calls `each` with the texels whose centres lie in a triangle, and with where: the weights of its corners.
+fn inside(triangle: [Vec2; 3], mut each: impl FnMut(IVec2, Vec3)) {
+    let [a, b, c] = triangle;
+    let area = (b - a).perp_dot(c - a);
+    if area == 0.0 {
+        return;
+    }
+    let (low, high) = (a.min(b).min(c).floor().as_ivec2(), a.max(b).max(c).ceil().as_ivec2());
+    for y in low.y..=high.y {
+        for x in low.x..=high.x {
+            let p = Vec2::new(x as f32 + 0.5, y as f32 + 0.5);
+            let weights =
+                Vec3::new((b - p).perp_dot(c - p), (c - p).perp_dot(a - p), (a - p).perp_dot(b - p)) / area;
+            if weights.min_element() > 0.0 {
+                each(IVec2::new(x, y), weights);
+            }
+        }
+    }
+}
+
+/// Places of the charts' smallest texels on shelves, the highest first.
+fn pack(charts: &[Chart], side: i32) -> Option<Vec<IVec2>> {
+    let size = |chart: &Chart| chart.high - chart.low + 1 + 2 * PADDING;
+    let mut order: Vec<usize> = (0..charts.len()).collect();
+    order.sort_by_key(|i| (-size(&charts[*i]).y, -size(&charts[*i]).x));
+    let mut places = vec![IVec2::ZERO; charts.len()];
+    let (mut at, mut shelf) = (IVec2::ZERO, 0);
+    for i in order {
+        let size = size(&charts[i]);
+        if at.x + size.x > side {
+            at = IVec2::new(0, at.y + shelf);
+            shelf = 0;
+        }
+        shelf = shelf.max(size.y);
+        if size.x > side || at.y + shelf > side {
+            return None;
+        }
+        places[i] = at + PADDING;
+        at.x += size.x;
+    }
+    Some(places)
+}
+
+fn lay(
+    mesh: &Mesh,
+    normals: &[Vec3],
+    axes: &[usize],
+    charts: &[Chart],
+    places: &[IVec2],
+    side: usize,
+    texel: f32,
+) -> Atlas {
+    let mut texcoords = vec![[Vec2::ZERO; 3]; mesh.faces.len()];
+    let mut texels = Vec::new();
+    for (chart, place) in charts.iter().zip(places) {
+        let moved = (*place - chart.low).as_vec2();
+        for &face in &chart.faces {
+            let triangle = flat(mesh, face, axes[chart.faces[0]], texel).map(|corner| corner + moved);
+            texcoords[face] = triangle.map(|p| Vec2::new(p.x, side as f32 - p.y) / side as f32);
+            let rows = mesh.faces[face].positions;
+            let of = |all: &[Vec3], w: Vec3| {
+                w.x * all[rows[0] as usize] + w.y * all[rows[1] as usize] + w.z * all[rows[2] as usize]
+            };
+            inside(triangle, |at, weights| {
+                texels.push(Texel {
+                    at: at.y as usize * side + at.x as usize,
+                    place: of(&mesh.positions, weights),
+                    normal: of(normals, weights).normalize_or_zero(),
+                });
+            });
+        }
+    }
+    Atlas { texcoords, texels }
+}
+
+/// Hands colours on to texels beside them that have none, as far as filters reach.
+pub fn spread(colors: &mut [Option<Vec3>], side: usize) {
+    for _ in 0..PADDING {
+        let old = colors.to_vec();
+        for (row, color) in colors.iter_mut().enumerate().filter(|(_, color)| color.is_none()) {
+            let (x, y) = (row % side, row / side);
+            let columns = x.saturating_sub(1)..(x + 2).min(side);
+            let around = (y.saturating_sub(1)..(y + 2).min(side))
+                .flat_map(|y| columns.clone().map(move |x| y * side + x))
+                .filter_map(|row| old[row]);
+            let (sum, count) = around.fold((Vec3::ZERO, 0.0), |(sum, n), color| (sum + color, n + 1.0));
+            if count > 0.0 {
+                *color = Some(sum / count);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fuse::grid::Grid;
+
+    /// Two balls on a stick: what hides a part of itself from every side.
+    fn dumbbell() -> Mesh {
+        let n = 40;
+        let mut grid = Grid {
+            origin: Vec3::splat(-1.0),
+            cell: 2.0 / (n - 1) as f32,
+            counts: glam::USizeVec3::splat(n),
+            values: vec![0.0; n * n * n],
+        };
+        for row in 0..grid.values.len() {
+            let p = grid.place(row);
+            let ball = |x: f32| (p - Vec3::new(x, 0.0, 0.0)).length() - 0.35;
+            let stick = Vec2::new(p.y, p.z).length().max(p.x.abs() - 0.5) - 0.12;
+            grid.values[row] = ball(-0.5).min(ball(0.5)).min(stick);
+        }
+        let (positions, faces) = grid.surface();
+        Mesh::colored(positions, Vec::new(), faces)
+    }
+
+    #[test]
+    fn no_texel_belongs_to_two_places_and_every_face_has_its_own_part() {
+        let mesh = dumbbell();
+        let side = 256;
+        let atlas = atlas(&mesh, side).expect("room");
+        let mut places: Vec<usize> = atlas.texels.iter().map(|texel| texel.at).collect();
+        let count = places.len();
+        places.sort_unstable();
+        places.dedup();
+        assert_eq!(places.len(), count);
+        assert!(4 * count > side * side, "{count} of {}", side * side);
+        for texcoord in atlas.texcoords.as_flattened() {
+            assert!(texcoord.min_element() > 0.0 && texcoord.max_element() < 1.0, "{texcoord}");
+        }
+        for texel in &atlas.texels {
+            assert!((texel.normal.length() - 1.0).abs() < 1e-4 && texel.place.is_finite());
+        }
+    }
+
+    #[test]
+    fn a_texture_without_room_is_refused() {
+        assert!(atlas(&dumbbell(), 8).is_err());
+    }
+
+    #[test]
+    fn colours_spread_as_far_as_filters_reach() {
+        let mut colors = vec![None; 81];
+        colors[40] = Some(Vec3::X);
+        spread(&mut colors, 9);
+        let reached = colors.iter().filter(|color| **color == Some(Vec3::X)).count();
+        assert_eq!(reached, (2 * PADDING as usize + 1).pow(2));
+    }
+}

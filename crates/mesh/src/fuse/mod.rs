@@ -1,0 +1,240 @@
+//! One closed surface out of Gaussians: depths rendered from all around are fused into a signed distance field (Curless and
+//! Levoy, "A Volumetric Method for Building Complex Models from Range Images", 1996), of which one body is kept.
+
+mod atlas;
+mod color;
+mod grid;
+mod simplify;
+mod views;
+
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use glam::{USizeVec3, Vec3};
+use image::RgbImage;
+use rayon::prelude::*;
+use snapsnap_splat::{Camera, Gaussians, SplatError};
+
+use crate::mesh::Mesh;
+use color::Mean;
+use grid::Grid;
+use views::{Seen, View};
+
+/// Cubes along the longest side of the body.
+const CUBES: f32 = 320.0;
+/// Side of the pictures that distances are taken from, pixels.
+const SIDE: u32 = 640;
+/// Side of those that a texture is taken from: a picture at a time is kept.
+const TEXTURE_SIDE: u32 = 1600;
+/// Distances are kept up to so many cubes from the surface.
+const TRUNCATION: f32 = 4.0;
+/// A place that fewer views see through counts as inside: gaps between the shells of front, back and sides are seen through from
+/// few directions, whatever lies around a body from many.
+const FREE_VIEWS: u8 = 3;
+/// Gaussians less opaque than this do not say where the body is.
+const OPAQUE: f32 = 0.1;
+/// This share of the Gaussians, at either end of each axis, does not say where the body is: some may fly about.
+const FLYING: f32 = 0.002;
+/// Times that neighbouring distances are averaged: steps between views, and the grain of Gaussians.
+const SMOOTHED: usize = 2;
+
+/// What a mesh is made of.
+#[derive(Debug, thiserror::Error)]
+pub enum FuseError {
+    /// Nothing that could be seen.
+    #[error("no surface: fewer than {0} Gaussians are finite and opaque")]
+    Nothing(usize),
+    /// Gaussians in which no body was found.
+    #[error("no surface: nothing that the Gaussians show is solid from any side")]
+    Hollow,
+    /// A texture that is too small.
+    #[error("{0}: choose a larger one, or fewer triangles")]
+    Texture(String),
+    /// A surface that cannot be reduced.
+    #[error("the surface cannot be reduced: {0}")]
+    Reduce(#[from] meshoptimizer_rs::Error),
+    /// The rasteriser's refusal.
+    #[error(transparent)]
+    Splat(#[from] SplatError),
+}
+
+/// Wishes.
+#[derive(Debug, Clone, Copy)]
+pub struct Options {
+    /// Triangles to reduce the surface to, about; 0 keeps all.
+    pub faces: usize,
+    /// Side of a texture in pixels; 0: positions have colours instead.
+    pub texture: usize,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self { faces: 100_000, texture: 0 }
+    }
+}
+
+/// A surface and how it came about.
+#[derive(Debug, Clone)]
+pub struct Fused {
+    /// Closed, one piece, with a colour at each position; world metres, as the Gaussians were.
+    pub mesh: Mesh,
+    /// Places between the shells that too few views see through, in connected pieces.
+    pub closed: usize,
+    /// Hollows inside that were filled.
+    pub filled: usize,
+    /// Pieces beside the body that were dropped.
+    pub dropped: usize,
+    /// Triangles before they were reduced.
+    pub faces: usize,
+    /// Edge of the field's cubes, metres.
+    pub cell: f32,
+}
+
+/// Fewest Gaussians that are taken for a body.
+const FEWEST: usize = 50;
+
+/// Makes a mesh of Gaussians. `stage` hears what is being done.
+///
+/// # Errors
+/// [`FuseError`].
+pub fn fuse(gaussians: &Gaussians, options: Options, stage: &dyn Fn(&str)) -> Result<Fused, FuseError> {
+    let (low, high) = bounds(gaussians)?;
+    let size = high - low;
+    let cell = size.max_element() / CUBES;
+    // The border stays outside.
+    let margin = cell * (TRUNCATION + 2.0);
+    let counts = ((size + 2.0 * margin) / cell).ceil();
+    let counts = USizeVec3::new(counts.x as usize + 1, counts.y as usize + 1, counts.z as usize + 1);
+
+    stage("views from all around");
+    let (centre, radius) = ((0.5 * (low + high)).as_dvec3(), f64::from(0.5 * size.length()));
+    let views: Result<Vec<View>, SplatError> =
+        views::cameras(centre, radius, SIDE).into_iter().map(|camera| View::new(gaussians, camera)).collect();
+    let views = views?;
+
+    stage("distance field");
+    let mut grid = Grid { origin: low - margin, cell, counts, values: Vec::new() };
+    let all = (0..counts.element_product()).into_par_iter();
+    let (values, closed): (Vec<f32>, Vec<bool>) =
+        all.map(|row| distance(grid.place(row), cell, &views)).unzip();
+    grid.values = closed.iter().map(|closed| if *closed { -1.0 } else { 1.0 }).collect();
+    let closed = grid.bodies();
+    grid.values = values;
+    (0..SMOOTHED).for_each(|_| grid.smooth());
+    let (dropped, filled) = grid.keep_one_body();
+
+    stage("surface");
+    let (positions, triangles) = grid.surface();
+    let cell = grid.cell;
+    drop(grid);
+    if triangles.is_empty() {
+        return Err(FuseError::Hollow);
+    }
+    let faces = triangles.len();
+    let mut mesh = Mesh::colored(positions, Vec::new(), triangles);
+    stage("colours");
+    mesh.colors = color::colors(&mesh, &views, cell);
+    stage("reducing");
+    let mut mesh = simplify::simplify(mesh, options.faces)?;
+    if options.texture > 0 {
+        drop(views);
+        stage("texture");
+        textured(&mut mesh, gaussians, &views::cameras(centre, radius, TEXTURE_SIDE), options.texture, cell)?;
+    }
+    Ok(Fused { mesh, closed, filled, dropped, faces, cell })
+}
+
+/// Gives a mesh a texture instead of its positions' colours, which stay where no view shows a place.
+fn textured(
+    mesh: &mut Mesh,
+    gaussians: &Gaussians,
+    cameras: &[Camera],
+    side: usize,
+    cell: f32,
+) -> Result<(), FuseError> {
+    let atlas = atlas::atlas(mesh, side).map_err(FuseError::Texture)?;
+    let mut means = vec![Mean::default(); atlas.texels.len()];
+    for camera in cameras {
+        let view = View::new(gaussians, *camera)?;
+        let hear = |(mean, texel): (&mut Mean, &atlas::Texel)| {
+            mean.hear(&view, texel.place, texel.normal, color::REACH * cell);
+        };
+        means.par_iter_mut().zip(&atlas.texels).for_each(hear);
+    }
+    let mut colors = vec![None; side * side];
+    means.iter().zip(&atlas.texels).for_each(|(mean, texel)| colors[texel.at] = mean.color());
+    atlas::spread(&mut colors, side);
+    let background = mesh.colors.iter().sum::<Vec3>() / mesh.colors.len().max(1) as f32;
+    let bytes = colors.iter().flat_map(|color| color.unwrap_or(background).to_array());
+    let bytes = bytes.map(|c| (255.0 * c).round() as u8).collect();
+    let texture = RgbImage::from_raw(side as u32, side as u32, bytes).expect("three bytes for each texel");
+    mesh.colors.clear();
+    mesh.materials[0].texture = Some(Arc::new(texture));
+    // Faces of one piece share their corners' coordinates.
+    let mut rows = HashMap::new();
+    for (face, texcoords) in mesh.faces.iter_mut().zip(atlas.texcoords) {
+        face.texcoords = Some([0, 1, 2].map(|corner| {
+            let key = (face.positions[corner], texcoords[corner].to_array().map(f32::to_bits));
+            *rows.entry(key).or_insert_with(|| {
+                mesh.texcoords.push(texcoords[corner]);
+                mesh.texcoords.len() as u32 - 1
+            })
+        }));
+    }
+    Ok(())
+}
+
+/// Signed distance of a place from the surface, truncated: the mean of what the views say that meet it squarely enough. And
+/// whether it counts as inside though a few views see through it.
+fn distance(place: Vec3, cell: f32, views: &[View]) -> (f32, bool) {
+    let reach = TRUNCATION * cell;
+    let (mut sum, mut weight, mut free) = (0.0, 0.0, 0_u8);
+    for view in views {
+        match view.see(place) {
+            Seen::Unknown => {}
+            Seen::Free => {
+                sum += reach;
+                weight += 1.0;
+                free = free.saturating_add(1);
+            }
+            // Behind the surface nothing is known.
+            Seen::Surface { distance, .. } if distance < -reach => {}
+            Seen::Surface { distance, facing } => {
+                // Along the ray to along the normal.
+                let apart = (distance * facing).min(reach);
+                sum += facing * apart;
+                weight += facing;
+                free = free.saturating_add(u8::from(apart >= reach));
+            }
+        }
+    }
+    let mean = if weight > 0.0 { sum / weight } else { -reach };
+    // Within reach of a surface its own distance decides.
+    let gap = mean >= 0.99 * reach && free < FREE_VIEWS;
+    (if gap { -reach } else { mean }, gap)
+}
+
+/// The box of the Gaussians that make the body.
+fn bounds(gaussians: &Gaussians) -> Result<(Vec3, Vec3), FuseError> {
+    let host = |data: burn::tensor::TensorData| -> Vec<f32> {
+        data.convert::<f32>().try_into_vec().expect("converted to f32 on this very line")
+    };
+    let opacities = host(gaussians.opacities.to_data());
+    let means = host(gaussians.means.to_data());
+    let means: Vec<Vec3> = means.as_chunks::<3>().0.iter().map(|p| Vec3::from_array(*p)).collect();
+    let solid = |(p, opacity): &(&Vec3, &f32)| p.is_finite() && **opacity >= OPAQUE;
+    let there: Vec<Vec3> = means.iter().zip(&opacities).filter(solid).map(|(p, _)| *p).collect();
+    if there.len() < FEWEST {
+        return Err(FuseError::Nothing(FEWEST));
+    }
+    let (mut low, mut high) = (Vec3::ZERO, Vec3::ZERO);
+    for axis in 0..3 {
+        let mut along: Vec<f32> = there.iter().map(|p| p[axis]).collect();
+        along.sort_unstable_by(f32::total_cmp);
+        let skipped = (FLYING * along.len() as f32) as usize;
+        (low[axis], high[axis]) = (along[skipped], along[along.len() - 1 - skipped]);
+    }
+    // What was skipped at either end may be a hand.
+    let margin = 0.06 * (high - low).max_element().max(1e-3);
+    Ok((low - margin, high + margin))
+}

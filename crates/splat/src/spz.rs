@@ -1,0 +1,421 @@
+//! Niantic's SPZ: quantised Gaussians, column by column, in one gzip stream. Written: version 3. Read: versions 1 to 3; of SH
+//! degree 4 the first three.
+//!
+//! Its axes are x right, y up, z back, as those of our worlds; nothing is turned. Layout: github.com/nianticlabs/spz, README
+//! ("File Format").
+
+use std::io::{self, Read, Write};
+use std::ops::Range;
+
+use burn::tensor::f16;
+use flate2::Compression;
+use flate2::read::GzDecoder;
+use flate2::write::GzEncoder;
+
+use crate::scene::{Problem, Stored};
+
+/// First bytes of a gzip stream.
+pub(crate) const GZIP: [u8; 2] = [0x1f, 0x8b];
+/// First bytes of versions that are no gzip stream as a whole.
+pub(crate) const BARE: [u8; 2] = *b"NG";
+const MAGIC: u32 = 0x5053_474e;
+const VERSION: u32 = 3;
+/// Largest file that Niantic's library reads; it is what bounds a hostile one, which may be a thousandth of its content.
+const MAX_POINTS: usize = 10_000_000;
+/// Bits behind the point of coordinates, where they fit: a quarter of a millimetre up to 2 km.
+const FRACTIONAL_BITS: u8 = 12;
+/// Largest coordinate in 24 bits.
+const MAX_FIXED: f64 = 8_388_607.0;
+/// Coefficients of SH degree 0 to its byte.
+const COLOR_SCALE: f32 = 0.15;
+/// Steps of SH coefficients, of degree 1 and of those above: what Niantic's library writes, so that gzip finds something.
+const SH_STEPS: [i32; 2] = [8, 16];
+/// Values per channel of SH degrees 0 to 4.
+const COEFFICIENTS: [usize; 5] = [1, 4, 9, 16, 25];
+
+/// Reads a gzip stream.
+pub(crate) fn read(input: impl Read) -> Result<Stored, Problem> {
+    let mut input = Bytes { input: GzDecoder::new(input) };
+    let header = input.take(16, "the header")?;
+    let word = |at: usize| u32::from_le_bytes([header[at], header[at + 1], header[at + 2], header[at + 3]]);
+    if word(0) != MAGIC {
+        return Err("a gzip stream, but no SPZ in it (its magic is missing)".to_owned().into());
+    }
+    let version = word(4);
+    if !(1..=VERSION).contains(&version) {
+        return Err(format!("SPZ of version {version}; 1 to {VERSION} are read").into());
+    }
+    let n = word(8) as usize;
+    if n > MAX_POINTS {
+        return Err(format!("{n} Gaussians; SPZ files have {MAX_POINTS} at most").into());
+    }
+    let [degree, bits] = [header[12], header[13]];
+    let Some(&there) = COEFFICIENTS.get(usize::from(degree)) else {
+        return Err(format!("SH of degree {degree}; an SPZ has 0 to 4").into());
+    };
+    if bits > 24 {
+        return Err(format!("coordinates with {bits} bits behind the point, which have 24 in all").into());
+    }
+    let coefficients = there.min(COEFFICIENTS[3]);
+    let mut columns = Vec::with_capacity(Stored::COLUMNS.len() + 3 * (coefficients - 1));
+
+    if version == 1 {
+        let halves = input.take(6 * n, "centres")?;
+        for axis in 0..3 {
+            let half = |p: &[u8]| f16::from_le_bytes([p[2 * axis], p[2 * axis + 1]]).to_f32();
+            columns.push(halves.chunks_exact(6).map(half).collect());
+        }
+    } else {
+        let fixed = input.take(9 * n, "centres")?;
+        let unit = f64::from(bits).exp2().recip();
+        for axis in 0..3 {
+            let value = |p: &[u8]| {
+                // Into the upper bytes and back, for the sign.
+                let [a, b, c] = [0, 1, 2].map(|i| p[3 * axis + i]);
+                (f64::from(i32::from_le_bytes([0, a, b, c]) >> 8) * unit) as f32
+            };
+            columns.push(fixed.chunks_exact(9).map(value).collect());
+        }
+    }
+    let opacities: Vec<f32> = input.take(n, "opacities")?.iter().map(|&a| logit(a)).collect();
+    let colors = input.take(3 * n, "colours")?;
+    let scales = input.take(3 * n, "scales")?;
+    let size = if version == VERSION { 4 } else { 3 };
+    let rotations = input.take(size * n, "rotations")?;
+    let mut quaternions = [(); 4].map(|()| Vec::with_capacity(n));
+    for packed in rotations.chunks_exact(size) {
+        let q = match *packed {
+            [a, b, c, d] => smallest_three(u32::from_le_bytes([a, b, c, d])),
+            _ => first_three([packed[0], packed[1], packed[2]]),
+        };
+        quaternions.iter_mut().zip(q).for_each(|(column, value)| column.push(value));
+    }
+    columns.extend(quaternions);
+    for axis in 0..3 {
+        columns.push(scales.chunks_exact(3).map(|s| f32::from(s[axis]) / 16.0 - 10.0).collect());
+    }
+    columns.push(opacities);
+    for channel in 0..3 {
+        let color = |c: &[u8]| (f32::from(c[channel]) / 255.0 - 0.5) / COLOR_SCALE;
+        columns.push(colors.chunks_exact(3).map(color).collect());
+    }
+    if there > 1 {
+        let stride = 3 * (there - 1);
+        let bands = input.take(stride * n, "spherical harmonics")?;
+        for channel in 0..3 {
+            for band in 0..coefficients - 1 {
+                let value = |s: &[u8]| (f32::from(s[3 * band + channel]) - 128.0) / 128.0;
+                columns.push(bands.chunks_exact(stride).map(value).collect());
+            }
+        }
+    }
+    input.finish()?;
+    Ok(Stored { coefficients, columns })
+}
+
+/// What an SPZ cannot hold.
+pub(crate) fn check(stored: &Stored) -> Result<(), String> {
+    let n = stored.len();
+    if n > MAX_POINTS {
+        return Err(format!("{n} Gaussians are more than an SPZ holds ({MAX_POINTS}): write a PLY"));
+    }
+    if largest(stored) > MAX_FIXED {
+        return Err(format!("centres lie {} m away, an SPZ reaches 8,388 km", largest(stored)));
+    }
+    Ok(())
+}
+
+fn largest(stored: &Stored) -> f64 {
+    stored.columns[..3].iter().flatten().fold(0.0, |most, v| most.max(f64::from(v.abs())))
+}
+
+/// Writes a gzip stream; [`check`] has been asked before.
+pub(crate) fn write(stored: &Stored, out: &mut impl Write) -> io::Result<()> {
+    let (n, largest) = (stored.len(), largest(stored));
+    let fits = |bits: &u8| (largest * f64::from(*bits).exp2()).round() <= MAX_FIXED;
+    let bits = (0..=FRACTIONAL_BITS).rev().find(fits).unwrap_or(0);
+    let mut out = GzEncoder::new(out, Compression::best());
+    out.write_all(&MAGIC.to_le_bytes())?;
+    out.write_all(&VERSION.to_le_bytes())?;
+    out.write_all(&u32::try_from(n).map_err(io::Error::other)?.to_le_bytes())?;
+    out.write_all(&[u8::try_from(stored.degree()).map_err(io::Error::other)?, bits, 0, 0])?;
+
+    // Row after row of some columns, each value as its bytes.
+    let mut rows = |range: Range<usize>, bytes: &dyn Fn(&[f32], &mut Vec<u8>)| {
+        let mut row = vec![0.0; range.len()];
+        let mut block = Vec::new();
+        for i in 0..n {
+            row.iter_mut().zip(&stored.columns[range.clone()]).for_each(|(value, column)| *value = column[i]);
+            bytes(&row, &mut block);
+            if block.len() > 1 << 16 || i + 1 == n {
+                out.write_all(&block)?;
+                block.clear();
+            }
+        }
+        Ok::<_, io::Error>(())
+    };
+    let unit = f64::from(bits).exp2();
+    rows(0..3, &|row, block| {
+        for &v in row {
+            let fixed = (f64::from(v) * unit).round() as i32;
+            block.extend_from_slice(&fixed.to_le_bytes()[..3]);
+        }
+    })?;
+    let each = |f: fn(f32) -> f32| {
+        move |row: &[f32], block: &mut Vec<u8>| block.extend(row.iter().map(|&v| byte(f(v))))
+    };
+    rows(10..11, &each(|v| 255.0 / (1.0 + (-v).exp())))?;
+    rows(11..14, &each(|v| 255.0 * (v * COLOR_SCALE + 0.5)))?;
+    rows(7..10, &each(|v| 16.0 * (v + 10.0)))?;
+    rows(3..7, &|row, block| {
+        block.extend_from_slice(&packed([row[0], row[1], row[2], row[3]]).to_le_bytes())
+    })?;
+    let bands = stored.coefficients - 1;
+    rows(14..14 + 3 * bands, &|row, block| {
+        for band in 0..bands {
+            let step = SH_STEPS[usize::from(band >= 3)];
+            block.extend((0..3).map(|channel| sh_byte(row[channel * bands + band], step)));
+        }
+    })?;
+    out.finish().map(drop)
+}
+
+/// Content of the stream, of which no more memory is taken than is there.
+struct Bytes<R> {
+    input: R,
+}
+
+impl<R: Read> Bytes<R> {
+    fn take(&mut self, length: usize, what: &str) -> Result<Vec<u8>, Problem> {
+        let mut bytes = Vec::new();
+        (&mut self.input).take(length as u64).read_to_end(&mut bytes).map_err(damaged)?;
+        if bytes.len() < length {
+            return Err(
+                format!("the file ends too early: {} of {length} bytes of {what}", bytes.len()).into()
+            );
+        }
+        Ok(bytes)
+    }
+
+    /// Lets the decoder compare its checksum. What follows the Gaussians are extensions, which nothing here needs.
+    fn finish(&mut self) -> Result<(), Problem> {
+        (&mut self.input).take(1).read_to_end(&mut Vec::new()).map_err(damaged)?;
+        Ok(())
+    }
+}
+
+/// A stream that ends early or whose checksum is wrong is a bad file, not a bad disk.
+fn damaged(e: io::Error) -> Problem {
+    match e.kind() {
+        io::ErrorKind::UnexpectedEof => "the file ends too early: its gzip stream is cut".to_owned().into(),
+        io::ErrorKind::InvalidInput | io::ErrorKind::InvalidData => {
+            format!("its gzip stream is damaged: {e}").into()
+        }
+        _ => Problem::Io(e),
+    }
+}
+
+/// The nearest byte; a NaN, which nobody passes, is 0.
+fn byte(value: f32) -> u8 {
+    value.round().clamp(0.0, 255.0) as u8
+}
+
+/// Logit of an opacity in 255 steps, finite at both ends: half a step away from them.
+fn logit(alpha: u8) -> f32 {
+    let opacity = f32::from(alpha).clamp(0.25, 254.75) / 255.0;
+    (opacity / (1.0 - opacity)).ln()
+}
+
+/// The middle of a coefficient's step.
+fn sh_byte(value: f32, step: i32) -> u8 {
+    let q = (value * 128.0).round().clamp(-128.0, 127.0) as i32 + 128;
+    (((q + step / 2) / step) * step).clamp(0, 255) as u8
+}
+
+/// A quaternion (w, x, y, z) of versions 1 and 2: x, y and z in a byte each, w ≥ 0 from them.
+fn first_three(packed: [u8; 3]) -> [f32; 4] {
+    let [x, y, z] = packed.map(|v| f32::from(v) / 127.5 - 1.0);
+    [(1.0 - x * x - y * y - z * z).max(0.0).sqrt(), x, y, z]
+}
+
+/// Bits of a component of version 3, beside its sign.
+const COMPONENT: u32 = (1 << 9) - 1;
+
+/// A quaternion (w, x, y, z) of version 3: which of (x, y, z, w) is the largest, and sign and size of the others over √½.
+fn smallest_three(mut packed: u32) -> [f32; 4] {
+    let largest = (packed >> 30) as usize;
+    let mut q = [0.0_f32; 4];
+    let mut sum = 0.0;
+    for i in (0..4).rev().filter(|&i| i != largest) {
+        let size = std::f32::consts::FRAC_1_SQRT_2 * (packed & COMPONENT) as f32 / COMPONENT as f32;
+        q[i] = if packed >> 9 & 1 == 1 { -size } else { size };
+        sum += size * size;
+        packed >>= 10;
+    }
+    q[largest] = (1.0 - sum).max(0.0).sqrt();
+    [q[3], q[0], q[1], q[2]]
+}
+
+/// The inverse of [`smallest_three`], of a quaternion of any length; one of length 0 is no rotation.
+fn packed(wxyz: [f32; 4]) -> u32 {
+    let length = wxyz.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
+    let [w, x, y, z] =
+        if length > 0.0 { wxyz.map(|v| (f64::from(v) / length) as f32) } else { [1.0, 0.0, 0.0, 0.0] };
+    let q = [x, y, z, w];
+    let mut largest = 0;
+    for i in 1..4 {
+        if q[i].abs() > q[largest].abs() {
+            largest = i;
+        }
+    }
+    let others = (0..4).filter(|&i| i != largest);
+    others.fold(largest as u32, |packed, i| {
+        let size = (COMPONENT as f32 * q[i].abs() / std::f32::consts::FRAC_1_SQRT_2 + 0.5) as u32;
+        let negative = (q[i] < 0.0) != (q[largest] < 0.0);
+        packed << 10 | u32::from(negative) << 9 | size.min(COMPONENT)
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+    use std::path::PathBuf;
+
+    use serde_json::Value;
+
+    use super::*;
+
+    /// Files of Niantic's library, made by docs/spz_reference.mjs, and what went into it and came out of it.
+    fn reference(name: &str) -> (Vec<u8>, Value) {
+        let folder = PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/data/spz"));
+        let bytes = fs::read(folder.join(format!("{name}.spz"))).expect("a file");
+        let text = fs::read_to_string(folder.join(format!("{name}.json"))).unwrap_or_else(|_| "null".into());
+        (bytes, serde_json::from_str(&text).expect("JSON"))
+    }
+
+    /// Niantic's lists as columns of ours.
+    fn stored(values: &Value, degree: u64) -> Stored {
+        let list = |key: &str| -> Vec<f32> {
+            values[key]
+                .as_array()
+                .expect("a list")
+                .iter()
+                .map(|v| v.as_f64().expect("a number") as f32)
+                .collect()
+        };
+        let column = |all: &[f32], width: usize, at: usize| -> Vec<f32> {
+            all.iter().skip(at).step_by(width).copied().collect()
+        };
+        let [positions, rotations, scales, colors, bands] =
+            ["positions", "rotations", "scales", "colors", "sh"].map(list);
+        let mut columns: Vec<Vec<f32>> = (0..3).map(|axis| column(&positions, 3, axis)).collect();
+        columns.extend([3, 0, 1, 2].map(|at| column(&rotations, 4, at)));
+        columns.extend((0..3).map(|axis| column(&scales, 3, axis)));
+        columns.push(list("alphas"));
+        columns.extend((0..3).map(|channel| column(&colors, 3, channel)));
+        let coefficients = COEFFICIENTS[degree as usize];
+        for channel in 0..3 {
+            let bands = |band: usize| column(&bands, 3 * (coefficients - 1), 3 * band + channel);
+            columns.extend((0..coefficients - 1).map(bands));
+        }
+        Stored { coefficients, columns }
+    }
+
+    fn content(gzip: &[u8]) -> Vec<u8> {
+        let mut bytes = Vec::new();
+        GzDecoder::new(gzip).read_to_end(&mut bytes).expect("a gzip stream");
+        bytes
+    }
+
+    #[test]
+    fn niantics_files_are_read_as_niantics_library_reads_them() {
+        for name in ["v2_degree0", "v3_degree0", "v3_degree3"] {
+            let (bytes, values) = reference(name);
+            let degree = values["degree"].as_u64().expect("a degree");
+            let expected = stored(&values["output"], degree);
+            let found = read(&bytes[..]).unwrap_or_else(|_| panic!("{name}"));
+            assert_eq!(found.degree() as u64, degree);
+            assert_eq!(found.columns.len(), expected.columns.len());
+            for (row, (found, expected)) in found.columns.iter().zip(&expected.columns).enumerate() {
+                for (a, b) in found.iter().zip(expected) {
+                    assert!((a - b).abs() < 2e-5, "{name}, column {row}: {a}, expected {b}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn what_is_written_is_what_niantics_library_writes() {
+        for name in ["v3_degree0", "v3_degree3"] {
+            let (expected, values) = reference(name);
+            let mut bytes = Vec::new();
+            let stored = stored(&values["input"], values["degree"].as_u64().expect("a degree"));
+            write(&stored, &mut bytes).expect("written");
+            let (found, expected) = (content(&bytes), content(&expected));
+            assert_eq!(found.len(), expected.len(), "{name}");
+            let other = found.iter().zip(&expected).filter(|(a, b)| a.abs_diff(**b) > 0).count();
+            // Rounding in f32 and f64 differs where a value lies in the middle of two steps.
+            assert!(other * 100 <= found.len(), "{name}: {other} of {} bytes differ", found.len());
+        }
+    }
+
+    #[test]
+    fn what_is_no_spz_or_a_damaged_one_is_refused() {
+        let problem = |bytes: &[u8]| match read(bytes) {
+            Ok(_) => panic!("was read"),
+            Err(Problem::Content(problem)) => problem,
+            Err(Problem::Io(e)) => panic!("{e}"),
+        };
+        let (good, _) = reference("v3_degree3");
+        let packed = |content: &[u8]| {
+            let mut out = GzEncoder::new(Vec::new(), Compression::fast());
+            out.write_all(content).expect("packed");
+            out.finish().expect("packed")
+        };
+        let changed = |at: usize, value: u8| {
+            let mut bytes = content(&good);
+            bytes[at] = value;
+            packed(&bytes)
+        };
+        assert!(problem(&packed(b"hello, this is a text")).contains("no SPZ"));
+        assert!(problem(&changed(4, 9)).contains("version 9"));
+        assert!(problem(&changed(11, 0x7f)).contains("at most"));
+        assert!(problem(&changed(12, 5)).contains("degree 5"));
+        assert!(problem(&changed(13, 25)).contains("25 bits"));
+        assert!(problem(&changed(8, 25)).contains("too early"));
+        assert!(problem(&good[..good.len() / 2]).contains("gzip stream is cut"));
+        assert!(problem(&GZIP).contains("gzip stream is cut"));
+        let mut sum = good.clone();
+        let at = sum.len() - 6;
+        sum[at] ^= 1;
+        assert!(problem(&sum).contains("damaged"));
+        // Nothing is taken for what a header merely promises.
+        let mut header = content(&good)[..16].to_vec();
+        header[8..12].copy_from_slice(&10_000_000_u32.to_le_bytes());
+        assert!(problem(&packed(&header)).contains("0 of 90000000 bytes"));
+    }
+
+    #[test]
+    fn quaternions_of_any_length_and_sign_keep_their_rotation() {
+        for q in [[1.0, 0.0, 0.0, 0.0], [-3.0, 0.1, -0.2, 0.4], [0.0, -0.5, 0.5, 1e-6], [0.0; 4]] {
+            let length = q.iter().map(|v: &f32| v * v).sum::<f32>().sqrt();
+            let expected = if length > 0.0 { q.map(|v| v / length) } else { [1.0, 0.0, 0.0, 0.0] };
+            let found = smallest_three(packed(q));
+            let cosine: f32 = found.iter().zip(expected).map(|(a, b)| a * b).sum();
+            assert!(cosine.abs() > 0.999_99, "{q:?}: {found:?}");
+        }
+    }
+
+    #[test]
+    fn far_away_places_get_coarser_steps() {
+        let mut values = stored(&reference("v3_degree0").1["input"], 0);
+        values.columns[0][0] = -70_000.0;
+        let mut bytes = Vec::new();
+        write(&values, &mut bytes).expect("written");
+        let Ok(found) = read(&bytes[..]) else { panic!("was written just now") };
+        assert!((found.columns[0][0] + 70_000.0).abs() < 0.01);
+        assert!((found.columns[1][0] - values.columns[1][0]).abs() <= 0.5 / 64.0);
+        values.columns[0][0] = 1e7;
+        assert!(check(&values).expect_err("too far").contains("8,388 km"));
+    }
+}

@@ -1,0 +1,74 @@
+//! What the program says of itself and of the machine.
+
+use std::fs;
+
+use serde_json::Value;
+use snapsnap_tests::{refused, snapsnap, succeed};
+
+#[test]
+fn the_doctor_names_devices_weights_and_what_mends() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let said = succeed(snapsnap().current_dir(temporary.path()).args(["doctor", "--json"]));
+    let report: Value = serde_json::from_str(&said).expect("JSON");
+    let devices = report["devices"].as_array().expect("devices");
+    assert!(
+        devices.iter().any(|device| device["name"] == "cpu" && device["memory_bytes"].as_u64() > Some(0))
+    );
+    assert_eq!(devices.iter().filter(|device| device["chosen"] == true).count(), 1);
+    assert!(
+        report["threads"].as_u64() > Some(0)
+            && report["compiled_in"].as_array().is_some_and(|all| all.len() > 2)
+    );
+    assert_eq!(report["weights"][0]["sound"], true);
+    let missing = report["missing"].as_array().expect("a list");
+    assert!(missing.iter().any(|m| m["mend"].as_str().is_some_and(|mend| mend.contains("fetch-weights"))));
+
+    let said = succeed(snapsnap().current_dir(temporary.path()).arg("doctor"));
+    for part in ["compiled in", "--device auto takes", "the default weights: sound", "what could be better"] {
+        assert!(said.contains(part), "{part}: {said}");
+    }
+    fs::write(temporary.path().join("bad.safetensors"), "no weights").expect("written");
+    let doctor =
+        |path: &str| refused(snapsnap().current_dir(temporary.path()).args(["doctor", "--weights", path]));
+    assert!(doctor("bad.safetensors").contains("bad.safetensors"));
+    assert!(doctor("none.safetensors").contains("none.safetensors"));
+}
+
+#[test]
+fn every_command_has_a_manual_page_and_an_example() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    succeed(snapsnap().current_dir(temporary.path()).args(["man", "-o", "pages"]));
+    let mut count = 0;
+    for entry in fs::read_dir(temporary.path().join("pages")).expect("a folder") {
+        let path = entry.expect("an entry").path();
+        let name = path.file_stem().expect("a name").to_string_lossy().into_owned();
+        let page = fs::read_to_string(&path).expect("a page");
+        assert!(page.contains(".TH") && page.contains("SYNOPSIS"), "{name}");
+        let words: Vec<&str> = if name.starts_with("snapsnap-prepare-") {
+            name.splitn(3, '-').skip(1).collect()
+        } else {
+            name.splitn(2, '-').skip(1).collect()
+        };
+        let help = succeed(snapsnap().args(&words).arg("--help"));
+        assert!(help.contains("Example") || help.contains("First steps"), "{name} has no example:\n{help}");
+        count += 1;
+    }
+    assert!(count > 20, "{count}");
+}
+
+#[test]
+fn shells_get_their_completions() {
+    for shell in ["bash", "zsh", "fish", "powershell", "elvish"] {
+        let said = succeed(snapsnap().args(["completions", shell]));
+        assert!(said.contains("snapsnap") && said.contains("reconstruct"), "{shell}");
+    }
+}
+
+#[test]
+fn without_arguments_a_newcomer_reads_the_first_steps() {
+    let message = refused(&mut snapsnap());
+    for part in ["First steps", "snapsnap demo", "snapsnap reconstruct", "snapsnap view"] {
+        assert!(message.contains(part), "{part}: {message}");
+    }
+    assert!(!message.contains('\u{1b}'));
+}

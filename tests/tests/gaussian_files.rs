@@ -1,0 +1,109 @@
+//! Files of Gaussians from one kind into another.
+
+use std::fs;
+use std::path::Path;
+
+use burn::tensor::Device;
+use snapsnap_splat::scene::{self, Stored};
+use snapsnap_tests::{data, refused, snapsnap, succeed, values};
+
+/// A PLY of `n` Gaussians with spherical harmonics of degree 1.
+fn ply(path: &Path, n: usize, bad: Option<usize>) {
+    let rest: Vec<String> = (0..9).map(|i| format!("f_rest_{i}")).collect();
+    let names = [
+        "x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2", "rot_0",
+        "rot_1", "rot_2", "rot_3",
+    ];
+    let names: Vec<&str> = names.into_iter().chain(rest.iter().map(String::as_str)).collect();
+    let mut text = format!("ply\nformat ascii 1.0\nelement vertex {n}\n");
+    names.iter().for_each(|name| text += &format!("property float {name}\n"));
+    text += "end_header\n";
+    for i in 0..n {
+        let value = |column: usize| {
+            let wave = ((i * 31 + column * 17) as f32).sin();
+            match column {
+                0 if bad == Some(i) => "nan".into(),
+                6 => (4.0 * wave).to_string(),
+                7..=9 => (wave - 5.0).to_string(),
+                10 => "1".into(),
+                14.. => (0.4 * wave).to_string(),
+                _ => wave.to_string(),
+            }
+        };
+        text += &(0..names.len()).map(value).collect::<Vec<String>>().join(" ");
+        text += "\n";
+    }
+    fs::write(path, text).expect("written");
+}
+
+#[test]
+fn gaussians_go_into_an_spz_and_back_within_its_steps() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let [first, small, back] = ["a.ply", "a.spz", "b.ply"].map(|name| temporary.path().join(name));
+    ply(&first, 500, None);
+    let said = succeed(snapsnap().arg("convert").args([&first, &small]));
+    assert!(said.contains("500 Gaussians of SH degree 1"), "{said}");
+    succeed(snapsnap().arg("convert").args([&small, &back]));
+    let size = |path: &Path| fs::metadata(path).expect("there").len();
+    assert!(3 * size(&small) < size(&back), "{} {}", size(&small), size(&back));
+    let device = Device::flex();
+    let [before, after] = [&first, &back].map(|path| scene::read(path, &device).expect("read"));
+    let apart =
+        |a: Vec<f32>, b: Vec<f32>| a.iter().zip(b).fold(0.0_f32, |most, (a, b)| most.max((a - b).abs()));
+    let (a, b) = (before.gaussians, after.gaussians);
+    // Half a step of each attribute: 1/4096 m, 1/255, 1/16 in the logarithm, C₀/0.15/255 of a colour, 16/128 of a coefficient.
+    assert!(apart(values(a.means), values(b.means)) <= 0.5001 / 4096.0);
+    assert!(apart(values(a.opacities), values(b.opacities)) <= 0.501 / 255.0);
+    assert!(apart(values(a.scales.log()), values(b.scales.log())) <= 0.501 / 16.0);
+    assert!(apart(values(a.colors), values(b.colors)) <= 0.501 * 0.2821 / 0.15 / 255.0);
+    assert!(apart(values(a.rotations), values(b.rotations)) < 0.005);
+    let bands = |loaded: Option<_>| values::<3>(loaded.expect("degree 1"));
+    assert!(apart(bands(before.harmonics)[3..].to_vec(), bands(after.harmonics)[3..].to_vec()) < 0.07);
+    // What has gone through the steps once stays where it is.
+    let again = temporary.path().join("again.spz");
+    succeed(snapsnap().arg("convert").args([&back, &again]));
+    assert_eq!(fs::read(&small).expect("read"), fs::read(&again).expect("read"));
+}
+
+#[test]
+fn a_ply_becomes_a_ply_of_the_same_numbers_without_what_is_not_finite() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let [first, second] = ["a.ply", "b.PLY"].map(|name| temporary.path().join(name));
+    ply(&first, 20, Some(7));
+    let said = succeed(snapsnap().arg("convert").args([&first, &second]));
+    assert!(said.contains("1 Gaussians with values that are not finite were left out"), "{said}");
+    let mut expected = Stored::read(&first).expect("read");
+    assert_eq!(expected.drop_not_finite(), 1);
+    let found = Stored::read(&second).expect("read");
+    assert_eq!(format!("{found:?}"), format!("{expected:?}"));
+}
+
+#[test]
+fn every_command_that_reads_a_ply_reads_an_spz() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let theirs = data("spz/v3_degree3.spz");
+    succeed(
+        snapsnap()
+            .current_dir(temporary.path())
+            .arg("render")
+            .arg(&theirs)
+            .args(["--orbit", "2", "--size", "64x64", "--device", "cpu", "-o", "renders"]),
+    );
+    assert!(temporary.path().join("renders/001.png").is_file());
+}
+
+#[test]
+fn conversions_that_cannot_be_are_refused() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let path = |name: &str| temporary.path().join(name);
+    ply(&path("a.ply"), 5, None);
+    let convert = |from: &str, to: &str| refused(snapsnap().arg("convert").args([path(from), path(to)]));
+    assert!(convert("a.ply", "a.splat").contains("neither .ply nor .spz"));
+    assert!(convert("a.ply", "a.ply").contains("would be overwritten"));
+    assert!(convert("none.ply", "b.spz").contains("none.ply: cannot read"));
+    fs::copy(data("spz/v4_degree1.spz"), path("v4.spz")).expect("copied");
+    assert!(convert("v4.spz", "b.ply").contains("version 4"), "{}", convert("v4.spz", "b.ply"));
+    fs::write(path("cut.spz"), &fs::read(data("spz/v3_degree0.spz")).expect("read")[..300]).expect("written");
+    assert!(convert("cut.spz", "b.ply").contains("cut"));
+    assert!(!path("b.ply").exists() && !path("b.spz").exists());
+}
