@@ -89,7 +89,8 @@ pub fn device() -> Option<Device> {
 fn adapter(kind: DeviceType) -> bool {
     let is_wgpu = matches!(kind, DeviceType::Wgpu);
     let found = std::panic::catch_unwind(|| {
-        !(is_wgpu && snapsnap_splat::adapter::is_opengl()) && !Device::enumerate(kind).into_vec().is_empty()
+        let unused = is_wgpu && snapsnap_splat::adapter::is_opengl();
+        !(unused || Device::enumerate(kind).into_vec().is_empty())
     });
     let found = found.unwrap_or(false);
     if !found {

@@ -161,7 +161,13 @@ fn less(words: &[String]) -> Words {
         }
         // It would serve for ever; tests/tests/view.rs asks it.
         "view" => more.push("--help"),
-        "bench" => more.push("--quick"),
+        "bench" => {
+            more.push("--quick");
+            if words.iter().any(|word| word == "configs/bench.toml") {
+                // A software GPU takes minutes to compile its kernels.
+                more.extend(["--set", "settings.wgpu.device=\"cpu\""]);
+            }
+        }
         "stability" => more.extend(["--quick", "--device", "cpu", "--only", "opacity 1e-7"]),
         "fetch-weights" => more.push("--list"),
         "import-weights" if words.iter().any(|word| word.ends_with(".pth")) => {

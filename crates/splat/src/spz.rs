@@ -168,7 +168,7 @@ pub(crate) fn write(stored: &Stored, out: &mut impl Write) -> io::Result<()> {
     rows(11..14, &each(|v| 255.0 * (v * COLOR_SCALE + 0.5)))?;
     rows(7..10, &each(|v| 16.0 * (v + 10.0)))?;
     rows(3..7, &|row, block| {
-        block.extend_from_slice(&packed([row[0], row[1], row[2], row[3]]).to_le_bytes())
+        block.extend_from_slice(&packed([row[0], row[1], row[2], row[3]]).to_le_bytes());
     })?;
     let bands = stored.coefficients - 1;
     rows(14..14 + 3 * bands, &|row, block| {

@@ -59,7 +59,7 @@ pub fn glb_bytes(mesh: &Mesh) -> io::Result<Vec<u8>> {
     glb::bytes(mesh)
 }
 
-/// What [`write`] writes beside `path` for a mesh of one material.
+/// What [`write()`] writes beside `path` for a mesh of one material.
 pub fn companions(path: &Path, textured: bool) -> Vec<PathBuf> {
     if Kind::named(path) != Some(Kind::Obj) {
         return Vec::new();

@@ -125,12 +125,11 @@ fn opposite_camera(pairs: &[(DVec3, DVec2)]) -> RigidTransform {
 /// x of A x = b, A symmetric and positive definite, by Gauss's elimination.
 fn solved(mut a: [[f64; 6]; 6], mut b: [f64; 6]) -> [f64; 6] {
     for i in 0..6 {
-        for j in i + 1..6 {
-            let factor = a[j][i] / a[i][i];
-            for k in i..6 {
-                a[j][k] -= factor * a[i][k];
-            }
-            b[j] -= factor * b[i];
+        let (pivot, known) = (a[i], b[i]);
+        for (row, value) in a.iter_mut().zip(&mut b).skip(i + 1) {
+            let factor = row[i] / pivot[i];
+            row.iter_mut().zip(pivot).skip(i).for_each(|(entry, above)| *entry -= factor * above);
+            *value -= factor * known;
         }
     }
     for i in (0..6).rev() {
