@@ -1,10 +1,24 @@
+import { appendFileSync, readFileSync } from "node:fs";
 import { defineConfig } from "vite";
+
+const outDir = "../../../assets/viewer";
+
+// Spark comes with fflate in it, which Vite's list therefore lacks.
+const bundledInSpark = {
+  name: "bundled-in-spark",
+  closeBundle() {
+    const { version, license } = JSON.parse(readFileSync("node_modules/fflate/package.json", "utf8"));
+    const text = readFileSync("node_modules/fflate/LICENSE", "utf8").trim();
+    appendFileSync(`${outDir}/LICENSES.md`, `\n## fflate - ${version} (${license})\n\n${text}\n`);
+  },
+};
 
 // Three files with fixed names, so that the Rust program can embed them.
 export default defineConfig({
   base: "./",
+  plugins: [bundledInSpark],
   build: {
-    outDir: "../../../assets/viewer",
+    outDir,
     emptyOutDir: true,
     chunkSizeWarningLimit: 8000,
     license: { fileName: "LICENSES.md" },
