@@ -1,9 +1,12 @@
 //! Helpers of the parity and end-to-end tests: devices, fixtures, error norms.
 
-// What it measures and limits, it asks of Linux.
+// What these measure, limit and open, they ask of Linux.
+#[cfg(target_os = "linux")]
+pub mod browser;
 #[cfg(target_os = "linux")]
 pub mod fuzz;
 pub mod scenes;
+pub mod server;
 
 use std::path::{Path, PathBuf};
 use std::process::Command;

@@ -55,6 +55,8 @@ fn recorded(page: &str, script: &str, arguments: &[String]) -> Vec<Words> {
     fs::write(&commands, "").expect("written");
     let mut shell = Command::new("/bin/bash");
     shell.args(["-c", &format!("{RECORDER}{script}"), page]).args(arguments).env("COMMANDS", &commands);
+    // Of the sweep's rows, which are all alike.
+    shell.env("ROWS", "base transformer regressor");
     // Nothing but what is recorded may be started.
     let output = shell.env("PATH", "/nowhere").current_dir(temporary.path()).output().expect("bash starts");
     assert!(output.status.success(), "{page}: {script}\n{}", String::from_utf8_lossy(&output.stderr));

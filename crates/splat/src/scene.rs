@@ -6,7 +6,7 @@ use std::path::Path;
 
 use burn::tensor::{Device, Tensor, TensorData};
 
-use crate::{Gaussians, SplatError, file, ply, sh, spz};
+use crate::{Camera, Gaussians, SplatError, file, ply, sh, spz};
 
 /// Opacities are stored as logits; f32 saturates to ±∞ at 0 and 1, so they are kept this far away from both.
 const OPACITY_MARGIN: f32 = 1e-6;
@@ -20,6 +20,28 @@ pub struct Loaded {
     pub gaussians: Gaussians,
     /// Coefficients `[N,K,3]` for [`sh::colors`], where the file has a degree above 0.
     pub harmonics: Option<Tensor<3>>,
+}
+
+impl Loaded {
+    /// The Gaussians in the colours that a camera sees.
+    ///
+    /// # Errors
+    /// [`SplatError::Shape`] for coefficients of no degree.
+    pub fn seen_by(&self, camera: &Camera) -> Result<Gaussians, SplatError> {
+        let gaussians = self.gaussians.clone();
+        match &self.harmonics {
+            None => Ok(gaussians),
+            Some(harmonics) => {
+                Ok(Gaussians { colors: sh::colors(harmonics, &gaussians.means, camera)?, ..gaussians })
+            }
+        }
+    }
+}
+
+impl From<Gaussians> for Loaded {
+    fn from(gaussians: Gaussians) -> Self {
+        Self { gaussians, harmonics: None }
+    }
 }
 
 /// Kinds of files.

@@ -197,9 +197,11 @@ impl<R: Read> Bytes<R> {
         Ok(bytes)
     }
 
-    /// Lets the decoder compare its checksum. What follows the Gaussians are extensions, which nothing here needs.
+    /// Lets the decoder compare its checksum. What follows the Gaussians are extensions, which nothing here needs; beyond some
+    /// megabytes of them nobody waits for it.
     fn finish(&mut self) -> Result<(), Problem> {
-        (&mut self.input).take(1).read_to_end(&mut Vec::new()).map_err(damaged)?;
+        const EXTENSIONS: u64 = 1 << 24;
+        io::copy(&mut (&mut self.input).take(EXTENSIONS), &mut io::sink()).map_err(damaged)?;
         Ok(())
     }
 }
@@ -220,7 +222,7 @@ fn byte(value: f32) -> u8 {
     value.round().clamp(0.0, 255.0) as u8
 }
 
-/// Logit of an opacity in 255 steps, finite at both ends: half a step away from them.
+/// Logit of an opacity in 255 steps, finite at both ends: a quarter of a step away from them.
 fn logit(alpha: u8) -> f32 {
     let opacity = f32::from(alpha).clamp(0.25, 254.75) / 255.0;
     (opacity / (1.0 - opacity)).ln()

@@ -4,6 +4,9 @@
 use std::io::{Cursor, Read, Write};
 use std::path::Path;
 
+use flate2::Compression;
+use flate2::read::GzDecoder;
+use flate2::write::GzEncoder;
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipArchive, ZipWriter};
 
@@ -22,6 +25,8 @@ enum Kind {
     Png,
     /// Kinds of the chunks.
     Glb(Vec<[u8; 4]>),
+    /// A stream.
+    Gzip,
     /// Header and data.
     Safetensors,
     /// Names of the entries and how they are packed.
@@ -37,6 +42,11 @@ impl Envelope {
             "glb" => {
                 let (kinds, parts) = glb_chunks(bytes)?;
                 (Kind::Glb(kinds), parts)
+            }
+            "spz" => {
+                let mut content = Vec::new();
+                GzDecoder::new(bytes).read_to_end(&mut content).ok()?;
+                (Kind::Gzip, vec![content])
             }
             "safetensors" => {
                 let (length, rest) = bytes.split_first_chunk()?;
@@ -75,6 +85,10 @@ impl Envelope {
                 }
                 let length = (12 + chunks.len() as u32).to_le_bytes();
                 [b"glTF", &2_u32.to_le_bytes()[..], &length, &chunks].concat()
+            }
+            Kind::Gzip => {
+                let mut encoder = GzEncoder::new(Vec::new(), Compression::fast());
+                encoder.write_all(&parts[0]).and_then(|()| encoder.finish()).expect("memory")
             }
             Kind::Safetensors => [&(parts[0].len() as u64).to_le_bytes()[..], &parts[0], &parts[1]].concat(),
             Kind::Zip(names) => {

@@ -7,7 +7,7 @@ use snapsnap_mesh::{export::write_obj, import};
 use snapsnap_tests::fuzz::Random;
 use snapsnap_tests::{snapsnap, succeed};
 
-use super::{ended, json, people};
+use super::{ended, evaluate, json, people};
 
 #[test]
 fn a_mesh_is_as_far_from_the_truth_as_it_was_moved_until_it_is_aligned() {
@@ -73,4 +73,28 @@ fn scans_are_the_truth_where_they_are_given() {
     }
     // Points of both are drawn apart: 50,000 on some three square metres.
     assert!((0.3..0.5).contains(&figure("chamfer")), "{found}");
+}
+
+/// What `snapsnap mesh` would make of a reconstruction lies about as near to the truth as its Gaussians.
+#[test]
+fn the_mesh_of_the_gaussians_is_measured_beside_them() {
+    let temporary = tempfile::tempdir().expect("a folder");
+    let (people, report) = (temporary.path().join("people"), temporary.path().join("report"));
+    let mut command = snapsnap();
+    command.args(["prepare", "synth", "--seed", "5", "--subjects", "1", "--split", "test", "--config"]);
+    command.arg(snapsnap_tests::root().join("configs/data/evaluation.toml"));
+    command.args(["--set", "views.resolution=512", "--set", "views.count=12", "-o"]);
+    succeed(command.arg(&people));
+    let weights = snapsnap_tests::root().join("assets/weights/default.safetensors").display().to_string();
+    let arguments = ["--set", "metrics.mesh=true", "--set", "views.compared=[2]", "--weights", &weights];
+    succeed(&mut evaluate(&people, &report, &arguments));
+    let found = json(&report);
+    let figure = |of: &str, key: &str| found[of][key]["mean"].as_f64().expect("a number");
+    let [centres, mesh] = ["geometry_cm", "mesh_cm"].map(|of| figure(of, "chamfer"));
+    assert!(mesh > 0.3 && mesh < 1.5 * centres && mesh < 3.0, "{mesh} and {centres} cm");
+    // A surface has smoother normals than depths of Gaussians have.
+    let [centres, mesh] = ["geometry_cm", "mesh_cm"].map(|of| figure(of, "normal_consistency"));
+    assert!(mesh > centres && mesh > 0.8, "{mesh} and {centres}");
+    let text = fs::read_to_string(report.join("report.md")).expect("a report");
+    assert!(text.contains("| model, mesh |"), "{text}");
 }

@@ -29,7 +29,12 @@ struct Weights {
     name: String,
     /// What they are, or what is wrong with them.
     state: Result<String, String>,
+    /// How sound ones are got.
+    mend: &'static str,
 }
+
+const GET_WEIGHTS: &str = "make them again with import-weights or init-weights, or train them; docs/formats.md says what is in them";
+const GET_LPIPS: &str = "snapsnap fetch-weights alexnet lpips";
 
 /// Something that could be better, and how.
 struct Missing {
@@ -134,7 +139,7 @@ fn weights_found(arguments: &Arguments) -> Vec<Weights> {
             }
             Err(e) => Err(e.to_string()),
         };
-        Weights { name, state }
+        Weights { name, state, mend: GET_WEIGHTS }
     };
     let mut found = vec![look(None, weights::DEFAULT_NAME.into())];
     if let Some(path) = &arguments.weights {
@@ -147,6 +152,7 @@ fn weights_found(arguments: &Arguments) -> Vec<Weights> {
         found.push(Weights {
             name,
             state: loaded.map(|_| "the published ones".into()).map_err(|e| e.to_string()),
+            mend: GET_LPIPS,
         });
     }
     found
@@ -157,7 +163,7 @@ fn missing(devices: &[Found], weights: &[Weights], memory: u64) -> Vec<Missing> 
     let mut add = |what: &str, mend: &str| missing.push(Missing { what: what.into(), mend: mend.into() });
     if !devices.iter().any(|found| found.card) {
         let mend = if snapsnap_splat::adapter::is_opengl() {
-            "there is OpenGL alone, which is not used: install the card's Vulkan driver (Debian, Ubuntu: apt-get install \
+            "OpenGL alone knows a card here, and it is not used: install the card's Vulkan driver (Debian, Ubuntu: apt-get install \
              libvulkan1 mesa-vulkan-drivers, or NVIDIA's own)"
         } else {
             "a card needs its Vulkan driver (Debian, Ubuntu: apt-get install libvulkan1 mesa-vulkan-drivers, or NVIDIA's own); \
@@ -171,15 +177,13 @@ fn missing(devices: &[Found], weights: &[Weights], memory: u64) -> Vec<Missing> 
             "snapsnap reconstruct … --set network.resolution=512",
         );
     }
-    if Lpips::missing(perceptual::FOLDER.as_ref()).len() == 2 {
-        add(
-            "no weights of LPIPS in this folder: evaluations go without it",
-            "snapsnap fetch-weights alexnet lpips",
-        );
+    let gone: Vec<String> =
+        Lpips::missing(perceptual::FOLDER.as_ref()).iter().map(|file| file.display().to_string()).collect();
+    if !gone.is_empty() {
+        add(&format!("no {} here: evaluations go without LPIPS", gone.join(", no ")), GET_LPIPS);
     }
     for w in weights.iter().filter(|w| w.state.is_err()) {
-        let mend = "make them again with import-weights or init-weights, or train them; docs/formats.md says what is in them";
-        add(&format!("{} are not sound", w.name), mend);
+        add(&format!("{} are not sound", w.name), w.mend);
     }
     missing
 }

@@ -6,12 +6,12 @@ use std::time::Instant;
 use clap::Args;
 use snapsnap_mesh::export::{self, Kind};
 use snapsnap_mesh::fuse::{Fused, Options, fuse};
-use snapsnap_splat::{Gaussians, scene};
+use snapsnap_splat::scene::{self, Loaded};
 
 use super::check_outputs;
 use crate::failure::Failure;
 use crate::progress::Progress;
-use crate::{device, say};
+use crate::{device, memory, say};
 
 #[derive(Args)]
 pub struct Arguments {
@@ -58,7 +58,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     check_outputs(&target.files(), &[&arguments.input])?;
     let device = device::choose(&arguments.device)?;
     let loaded = scene::read(&arguments.input, &device)?;
-    let fused = target.write(&loaded.gaussians, quiet)?;
+    let fused = target.write(&loaded, quiet)?;
     if arguments.verbose {
         say::out(&told(&fused));
         say::out(&format!("{:.1} s", since.elapsed().as_secs_f64()));
@@ -89,6 +89,13 @@ impl Target {
             let message = "a PLY has no texture: leave out --texture, or write a .glb or .obj";
             return Err(Failure::Input(format!("{}: {message}", path.display())));
         }
+        // Texels of the surface with their places, normals and colours, and what views said of them.
+        const BYTES: u64 = 60;
+        memory::check(
+            &format!("--texture {texture}"),
+            BYTES * (texture as u64).pow(2),
+            "choose a smaller one",
+        )?;
         let options = Options { faces: surface.faces.unwrap_or(Options::default().faces), texture };
         Ok(Self { path: path.to_owned(), companions: export::companions(path, texture > 0), options })
     }
@@ -100,9 +107,9 @@ impl Target {
     }
 
     /// Makes the mesh of Gaussians and writes it.
-    pub fn write(&self, gaussians: &Gaussians, quiet: bool) -> Result<Fused, Failure> {
+    pub fn write(&self, scene: &Loaded, quiet: bool) -> Result<Fused, Failure> {
         let progress = Progress::stages(quiet);
-        let fused = fuse(gaussians, self.options, &|name| progress.stage(name))?;
+        let fused = fuse(scene, self.options, &|name| progress.stage(name))?;
         progress.stage("writing");
         export::write(&fused.mesh, &self.path)?;
         Ok(fused)

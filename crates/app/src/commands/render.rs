@@ -8,9 +8,7 @@ use std::time::Instant;
 use burn::tensor::{Device, Tensor};
 use clap::{Args, ValueEnum};
 use snapsnap_splat::scene::{self, Loaded};
-use snapsnap_splat::{
-    Camera, Counts, Gaussians, MAX_SIDE, RenderOptions, Rendered, cameras, file, render, sh,
-};
+use snapsnap_splat::{Camera, Counts, MAX_SIDE, RenderOptions, Rendered, cameras, file, render};
 
 use super::check_outputs;
 use crate::failure::Failure;
@@ -151,14 +149,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
 
 /// Renders one view, with the colours that its direction gives.
 fn view(loaded: &Loaded, camera: &Camera, options: &RenderOptions) -> Result<Rendered, Failure> {
-    let gaussians = match &loaded.harmonics {
-        None => loaded.gaussians.clone(),
-        Some(harmonics) => {
-            let colors = sh::colors(harmonics, &loaded.gaussians.means, camera)?;
-            Gaussians { colors, ..loaded.gaussians.clone() }
-        }
-    };
-    Ok(render(&gaussians, std::slice::from_ref(camera), options)?)
+    Ok(render(&loaded.seen_by(camera)?, std::slice::from_ref(camera), options)?)
 }
 
 fn views(arguments: &Arguments) -> Result<Vec<Camera>, Failure> {

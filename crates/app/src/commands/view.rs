@@ -3,6 +3,7 @@
 use std::io::Cursor;
 use std::net::Ipv4Addr;
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, TryLockError};
 use std::thread;
 
 use burn::tensor::Device;
@@ -29,6 +30,8 @@ pub struct Arguments {
 
 /// Requests that are answered at once; making a mesh takes seconds, and the page must not wait for it.
 const THREADS: usize = 4;
+/// Held by whoever makes a mesh: one at a time, each takes all cores and a gigabyte.
+static MESH: Mutex<()> = Mutex::new(());
 /// Nothing from elsewhere, and nothing to elsewhere.
 const POLICY: &str = "default-src 'none'; script-src 'self' 'wasm-unsafe-eval' blob:; worker-src 'self' blob:; \
                       connect-src 'self' blob: data:; img-src 'self' blob: data:; style-src 'self'; base-uri 'none'; \
@@ -70,6 +73,8 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
                 while let Ok(request) = server.recv() {
                     answer(request, &arguments.input, port);
                 }
+                // Nothing comes any more: the next one hears of it, too.
+                server.unblock();
             });
         }
     });
@@ -85,8 +90,12 @@ fn respond(request: &Request, input: &Path, port: u16) -> Response<Cursor<Vec<u8
     // A page elsewhere whose name was pointed at 127.0.0.1 may not read the file.
     let host = request.headers().iter().find(|header| header.field.equiv("Host"));
     let host = host.map(|header| header.value.as_str());
-    let ours = [format!("127.0.0.1:{port}"), format!("localhost:{port}")];
-    if !host.is_some_and(|host| ours.iter().any(|ours| ours == host)) {
+    let is_ours = |host: &str| {
+        // Browsers leave out the usual port.
+        let name = host.strip_suffix(&format!(":{port}")).or((port == 80).then_some(host));
+        name.is_some_and(|name| ["127.0.0.1", "localhost"].contains(&name))
+    };
+    if !host.is_some_and(is_ours) {
         return text(403, "only for http://127.0.0.1");
     }
     if !matches!(request.method(), Method::Get | Method::Head) {
@@ -100,7 +109,10 @@ fn respond(request: &Request, input: &Path, port: u16) -> Response<Cursor<Vec<u8
         "/scene.ply" => bytes(input, Kind::Ply),
         "/scene.spz" => bytes(input, Kind::Spz),
         "/scene.glb" if *request.method() == Method::Head => Ok(Vec::new()),
-        "/scene.glb" => mesh(input),
+        "/scene.glb" => match MESH.try_lock() {
+            Err(TryLockError::WouldBlock) => return text(503, "a mesh is being made; try again in a minute"),
+            _one => mesh(input),
+        },
         _ => return text(404, "no such page"),
     };
     let extension = &path["/scene".len()..];
@@ -125,8 +137,7 @@ fn bytes(input: &Path, kind: Kind) -> Result<Vec<u8>, Failure> {
 
 /// A mesh as `snapsnap mesh` makes it.
 fn mesh(input: &Path) -> Result<Vec<u8>, Failure> {
-    let gaussians = Stored::read(input)?.load(&Device::flex()).gaussians;
-    let fused = fuse(&gaussians, Options::default(), &|_| {})?;
+    let fused = fuse(&Stored::read(input)?.load(&Device::flex()), Options::default(), &|_| {})?;
     export::glb_bytes(&fused.mesh).map_err(|e| Failure::Internal(e.to_string()))
 }
 

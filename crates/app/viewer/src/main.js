@@ -47,14 +47,38 @@ function lookFrom(yawDegrees) {
   controls.enableDamping = true;
 }
 
+/** The box of what is not nearly transparent, without the outermost few, which may fly about. */
+function bounds(mesh) {
+  const along = { x: [], y: [], z: [] };
+  mesh.forEachSplat((_, centre, __, ___, opacity) => {
+    if (opacity >= 0.1 && [centre.x, centre.y, centre.z].every(Number.isFinite)) {
+      Object.keys(along).forEach((axis) => along[axis].push(centre[axis]));
+    }
+  });
+  const box = new THREE.Box3();
+  const count = along.x.length;
+  if (count > 0) {
+    const skipped = Math.floor(0.002 * count);
+    for (const [axis, values] of Object.entries(along)) {
+      const sorted = Float64Array.from(values).sort();
+      box.min[axis] = sorted[skipped];
+      box.max[axis] = sorted[count - 1 - skipped];
+    }
+  }
+  return box;
+}
+
 function frame(box) {
   const size = box.getSize(new THREE.Vector3());
+  const centre = box.getCenter(new THREE.Vector3());
   const height = Math.max(size.y, 0.5 * Math.max(size.x, size.z));
   const person = !box.isEmpty() && Number.isFinite(height) && height > 0;
-  const upright = person && height > 1 && height < 2.5 && Math.abs(box.min.y) < 0.3;
-  view = upright || !person
+  // As the nominal camera sees it: standing at the origin, and no higher than its picture.
+  const standing = Math.abs(box.min.y) < 0.3 && Math.hypot(centre.x, centre.z) < 0.3;
+  const nominal = standing && height > 1 && box.max.y < 1.95;
+  view = nominal || !person
     ? { centre: CENTRE.clone(), distance: DISTANCE }
-    : { centre: box.getCenter(new THREE.Vector3()), distance: (DISTANCE * height) / 1.7 };
+    : { centre, distance: (DISTANCE * height) / 1.7 };
   camera.near = view.distance / 200;
   camera.far = view.distance * 50;
   camera.updateProjectionMatrix();
@@ -74,54 +98,62 @@ function say(text) {
 }
 
 let shown = null;
+let asked = 0;
 
-async function show(bytes, name, fileType) {
-  const mesh = new SplatMesh({ fileBytes: bytes, fileName: name, fileType, extSplats: true });
-  await mesh.initialized;
+/** Shows what `read` gives, unless something else was asked for meanwhile. */
+async function show(what, read) {
+  asked += 1;
+  const own = asked;
+  say("Loading …");
+  let mesh, name, served;
+  try {
+    const file = await read();
+    ({ name, served } = file);
+    mesh = new SplatMesh({ fileBytes: file.bytes, fileName: name, fileType: file.type, extSplats: true });
+    await mesh.initialized;
+  } catch (error) {
+    if (own === asked) {
+      say(`${what}: ${error.message ?? error}`);
+    }
+    return;
+  }
+  if (own !== asked) {
+    mesh.dispose();
+    return;
+  }
   if (shown) {
     scene.remove(shown);
     shown.dispose();
   }
   shown = mesh;
   scene.add(mesh);
-  frame(mesh.getBoundingBox(true));
+  frame(bounds(mesh));
   lookFrom(0);
   element("name").textContent = name;
   const count = (mesh.extSplats ?? mesh.packedSplats).numSplats;
   element("count").textContent = `${count.toLocaleString("en")} Gaussians`;
   document.title = `${name} – snapsnap`;
+  // The downloads are of the file that the program serves.
+  element("downloads").classList.toggle("hidden", !served);
   say("");
 }
 
-async function showServed() {
-  say("Loading …");
+async function served() {
   // What lies there now, and not what a cache remembers.
   const answer = await fetch("./scene.ply", { cache: "no-store" });
   if (!answer.ok) {
     throw new Error(await answer.text());
   }
   const name = decodeURIComponent(answer.headers.get("x-name") ?? "scene.ply");
-  await show(new Uint8Array(await answer.arrayBuffer()), name, SplatFileType.PLY);
-}
-
-function failed(what) {
-  return (error) => say(`${what}: ${error.message ?? error}`);
+  return { bytes: new Uint8Array(await answer.arrayBuffer()), name, type: SplatFileType.PLY, served: true };
 }
 
 window.addEventListener("dragover", (event) => event.preventDefault());
-window.addEventListener("drop", async (event) => {
+window.addEventListener("drop", (event) => {
   event.preventDefault();
   const file = event.dataTransfer.files[0];
-  if (!file) {
-    return;
-  }
-  say("Loading …");
-  try {
-    await show(new Uint8Array(await file.arrayBuffer()), file.name);
-    // The downloads are of the file that the program serves.
-    element("downloads").classList.add("hidden");
-  } catch (error) {
-    failed(file.name)(error);
+  if (file) {
+    show(file.name, async () => ({ bytes: new Uint8Array(await file.arrayBuffer()), name: file.name }));
   }
 });
 
@@ -131,8 +163,6 @@ for (const button of document.querySelectorAll("button[data-yaw]")) {
 
 function background() {
   scene.background = new THREE.Color(element("background").value);
-  // Colours of Gaussians are those of the screen, and so is this one.
-  scene.background.convertLinearToSRGB();
 }
 element("background").addEventListener("input", background);
 
@@ -191,6 +221,6 @@ renderer.setAnimationLoop(() => {
 
 background();
 lookFrom(0);
-const ready = showServed().catch(failed("Cannot show the file"));
+const ready = show("Cannot show the file", served);
 // For tests and for whoever has the console open.
 window.snapsnap = { ready, camera: cameraEntry, screenshot, lookFrom, renderer, spark };

@@ -210,6 +210,8 @@ pub struct MetricsSection {
     pub geometry: bool,
     /// Gaussians at least so opaque are surface.
     pub opaque: f32,
+    /// The same of the mesh that `snapsnap mesh` makes of the Gaussians: seconds per person.
+    pub mesh: bool,
 }
 
 impl Default for MetricsSection {
@@ -219,6 +221,7 @@ impl Default for MetricsSection {
             lpips: "weights".into(),
             geometry: true,
             opaque: 0.5,
+            mesh: false,
         }
     }
 }

@@ -8,7 +8,6 @@ use serde::Serialize;
 use snapsnap_data::scan::{Collection, normalise};
 use snapsnap_mesh::FileError;
 use snapsnap_mesh::import::{self, EXTENSIONS};
-use snapsnap_mesh::view::{Renderer, ViewOptions};
 
 use super::config::EvalConfig;
 use super::person::People;
@@ -121,8 +120,6 @@ fn one(
             middle(&mut points.iter().map(|p| motion.apply(*p))) - middle(&mut points.iter().copied());
         aligned = Some([angle.to_degrees(), 1e2 * moved.length(), scale]);
     }
-    let renderer = Renderer::new(&mesh).map_err(|e| EvalError::Empty(e.to_string()))?;
-    let options = ViewOptions { samples: 1, ..ViewOptions::default() };
     let surface = sampled(&mesh, POINTS, SEEDS[0])?;
     let apart = chamfer(&surface, &truth)?;
     let to_scan = scan.map(|scan| point_to_surface(&surface, &scan)).transpose()?;
@@ -133,7 +130,7 @@ fn one(
         chamfer: 1e2 * apart.mean(),
         truth_to_surface: 1e2 * point_to_surface(&truth, &mesh)?,
         surface_to_scan: to_scan.map(|distance| 1e2 * distance),
-        normal_consistency: seen.agreement(|camera| Ok(renderer.draw(camera, &options).depth))?,
+        normal_consistency: seen.agreement_of_mesh(&mesh)?,
         aligned,
     })
 }

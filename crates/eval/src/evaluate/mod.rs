@@ -56,6 +56,8 @@ pub struct Judged {
     pub points: Vec<(usize, Vec<PointError>)>,
     /// The Gaussians as a surface, per person and turn.
     pub surface: Vec<(usize, Surface)>,
+    /// The mesh made of them, likewise.
+    pub mesh: Vec<(usize, Surface)>,
     /// From the photographs to the Gaussians, per person and turn.
     pub times: Vec<Duration>,
     /// Number of Gaussians, likewise.
@@ -108,7 +110,8 @@ pub fn evaluate(
         for &row in people.chosen() {
             let person = outcome.people.len();
             outcome.people.push(name_of(sets, people, row));
-            let truth = config.metrics.geometry.then(|| truth(people, row)).transpose();
+            let wanted = config.metrics.geometry || config.metrics.mesh;
+            let truth = wanted.then(|| truth(people, row)).transpose();
             let truth = truth.unwrap_or_else(|e| {
                 let name = format!("{}, geometry", outcome.people[person]);
                 outcome.left_out.push(LeftOut { name, why: e.to_string() });
@@ -226,9 +229,17 @@ fn one(
         judged.times.extend(made.time);
         judged.gaussians.extend(made.gaussians.as_ref().map(Gaussians::len));
         if let (Some(truth), Some(gaussians)) = (truth, &made.gaussians) {
-            match Surface::of_gaussians(gaussians, truth, config.metrics.opaque) {
-                Ok(surface) => judged.surface.push((person, surface)),
-                Err(e) => at.left_out(outcome, &format!(", {}, geometry", contestant.name), &e),
+            if config.metrics.geometry {
+                match Surface::of_gaussians(gaussians, truth, config.metrics.opaque) {
+                    Ok(surface) => judged.surface.push((person, surface)),
+                    Err(e) => at.left_out(outcome, &format!(", {}, geometry", contestant.name), &e),
+                }
+            }
+            if config.metrics.mesh && outcome.judged[i].kind != Kind::Baseline {
+                match Surface::of_mesh(gaussians, truth) {
+                    Ok(surface) => outcome.judged[i].mesh.push((person, surface)),
+                    Err(e) => at.left_out(outcome, &format!(", {}, mesh", contestant.name), &e),
+                }
             }
         }
         shown.push(Some(made));

@@ -3,12 +3,15 @@
 use glam::DVec3;
 use rayon::prelude::*;
 use snapsnap_data::sample::Handling;
+use snapsnap_mesh::fuse::{Options, fuse};
+use snapsnap_mesh::mesh::Mesh;
+use snapsnap_mesh::view::{Renderer, ViewOptions};
 use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
 
 use super::at_once;
 use super::person::{People, means, nearest_view, part_of};
 use crate::EvalError;
-use crate::geometry::{Chamfer, chamfer, consistency, normals, points};
+use crate::geometry::{Chamfer, chamfer, consistency, normals, points, sampled};
 
 /// True points kept per view, at most.
 const PER_VIEW: usize = 4000;
@@ -16,6 +19,8 @@ const PER_VIEW: usize = 4000;
 const MOST: usize = 60_000;
 /// Normals are compared in maps of this side at most, where a pixel is about a centimetre wide: finer, they tell of roughness.
 const NORMALS: usize = 256;
+/// Decides which points are drawn of a mesh.
+const SEED: u64 = 1;
 /// Directions from which normals are compared, degrees from the first view.
 const DIRECTIONS: [f64; 4] = [0.0, 90.0, 180.0, 270.0];
 
@@ -97,6 +102,16 @@ impl Truth {
         }
         Ok((count > 0).then(|| sum / count as f64))
     }
+
+    /// The same of a mesh (world frame, metres).
+    ///
+    /// # Errors
+    /// [`EvalError::Empty`] for a mesh that cannot be drawn.
+    pub fn agreement_of_mesh(&self, mesh: &Mesh) -> Result<Option<f64>, EvalError> {
+        let renderer = Renderer::new(mesh).map_err(|e| EvalError::Empty(e.to_string()))?;
+        let options = ViewOptions { samples: 1, ..ViewOptions::default() };
+        self.agreement(|camera| Ok(renderer.draw(camera, &options).depth))
+    }
 }
 
 /// So many of a list at most, evenly.
@@ -125,5 +140,16 @@ impl Surface {
             Ok(depth.iter().zip(alpha).map(|(z, a)| if a > 0.5 { z / a } else { 0.0 }).collect())
         };
         Ok(Self { chamfer: chamfer(&there, &truth.points)?, normals: truth.agreement(depth)? })
+    }
+
+    /// Of the mesh that is made of Gaussians (world frame): points drawn from it, and the depths of its triangles.
+    ///
+    /// # Errors
+    /// [`EvalError`] if no mesh can be made of them.
+    pub fn of_mesh(gaussians: &Gaussians, truth: &Truth) -> Result<Self, EvalError> {
+        let fused = fuse(&gaussians.clone().into(), Options::default(), &|_| {});
+        let mesh = fused.map_err(|e| EvalError::Empty(e.to_string()))?.mesh;
+        let drawn = sampled(&mesh, MOST, SEED)?;
+        Ok(Self { chamfer: chamfer(&drawn, &truth.points)?, normals: truth.agreement_of_mesh(&mesh)? })
     }
 }

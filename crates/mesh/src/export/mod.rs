@@ -39,7 +39,8 @@ impl Kind {
     }
 }
 
-/// Writes `mesh` to `path` as the kind that its extension names (else GLB), whole or not at all.
+/// Writes `mesh` to `path` as the kind that its extension names (else GLB), whole or not at all
+/// (of an OBJ, its pictures and materials before it).
 ///
 /// # Errors
 /// [`FileError::Write`]; [`FileError::Unsuitable`] for a texture in a PLY.

@@ -16,15 +16,19 @@ const PADDING: i32 = 3;
 const FLATTEST: f32 = 0.4;
 /// Tries to find room.
 const TRIES: usize = 200;
+/// Tries one after another in which there are too many pieces and they do not become fewer.
+const IN_VAIN: usize = 10;
 
 /// A texel of the surface.
 pub struct Texel {
     /// Row of the texture, column by column in a row.
-    pub at: usize,
+    pub at: u32,
     /// World metres.
     pub place: Vec3,
     /// Unit vector outwards.
     pub normal: Vec3,
+    /// Between those of the face's corners.
+    pub color: Vec3,
 }
 
 /// Where the faces of a mesh lie on a square texture.
@@ -58,10 +62,18 @@ pub fn atlas(mesh: &Mesh, side: usize) -> Result<Atlas, String> {
         })
         .sum();
     let mut texel = (area / (FILLED * (side * side) as f32)).sqrt();
+    let (mut fewest, mut vain) = (usize::MAX, 0);
     for _ in 0..TRIES {
         let charts = charts(mesh, &axes, &neighbours, texel);
         if let Some(places) = pack(&charts, side as i32) {
             return Ok(lay(mesh, &normals, &axes, &charts, &places, side, texel));
+        }
+        // Coarser texels make pieces smaller, down to one texel and its padding, and at first fewer.
+        let has_room = charts.len() * (1 + 2 * PADDING as usize).pow(2) <= side * side;
+        vain = if has_room || charts.len() < fewest { 0 } else { vain + 1 };
+        fewest = fewest.min(charts.len());
+        if vain == IN_VAIN {
+            break;
         }
         texel *= COARSER;
     }
@@ -206,9 +218,10 @@ fn lay(
             };
             inside(triangle, |at, weights| {
                 texels.push(Texel {
-                    at: at.y as usize * side + at.x as usize,
+                    at: at.y as u32 * side as u32 + at.x as u32,
                     place: of(&mesh.positions, weights),
                     normal: of(normals, weights).normalize_or_zero(),
+                    color: of(&mesh.colors, weights),
                 });
             });
         }
@@ -217,20 +230,24 @@ fn lay(
 }
 
 /// Hands colours on to texels beside them that have none, as far as filters reach.
-pub fn spread(colors: &mut [Option<Vec3>], side: usize) {
+pub fn spread(texture: &mut [Option<[u8; 3]>], side: usize) {
     for _ in 0..PADDING {
-        let old = colors.to_vec();
-        for (row, color) in colors.iter_mut().enumerate().filter(|(_, color)| color.is_none()) {
+        // Found first, so that none is handed on in the same round.
+        let mut found = Vec::new();
+        for row in (0..texture.len()).filter(|row| texture[*row].is_none()) {
             let (x, y) = (row % side, row / side);
             let columns = x.saturating_sub(1)..(x + 2).min(side);
             let around = (y.saturating_sub(1)..(y + 2).min(side))
                 .flat_map(|y| columns.clone().map(move |x| y * side + x))
-                .filter_map(|row| old[row]);
-            let (sum, count) = around.fold((Vec3::ZERO, 0.0), |(sum, n), color| (sum + color, n + 1.0));
-            if count > 0.0 {
-                *color = Some(sum / count);
+                .filter_map(|row| texture[row]);
+            let (sum, count) = around.fold(([0_u16; 3], 0), |(sum, n), color| {
+                ([0, 1, 2].map(|c| sum[c] + u16::from(color[c])), n + 1)
+            });
+            if count > 0 {
+                found.push((row, sum.map(|c| ((c + count / 2) / count) as u8)));
             }
         }
+        found.into_iter().for_each(|(row, color)| texture[row] = Some(color));
     }
 }
 
@@ -255,7 +272,8 @@ mod tests {
             grid.values[row] = ball(-0.5).min(ball(0.5)).min(stick);
         }
         let (positions, faces) = grid.surface();
-        Mesh::colored(positions, Vec::new(), faces)
+        let colors = vec![Vec3::ONE; positions.len()];
+        Mesh::colored(positions, colors, faces)
     }
 
     #[test]
@@ -263,7 +281,7 @@ mod tests {
         let mesh = dumbbell();
         let side = 256;
         let atlas = atlas(&mesh, side).expect("room");
-        let mut places: Vec<usize> = atlas.texels.iter().map(|texel| texel.at).collect();
+        let mut places: Vec<u32> = atlas.texels.iter().map(|texel| texel.at).collect();
         let count = places.len();
         places.sort_unstable();
         places.dedup();
@@ -284,10 +302,10 @@ mod tests {
 
     #[test]
     fn colours_spread_as_far_as_filters_reach() {
-        let mut colors = vec![None; 81];
-        colors[40] = Some(Vec3::X);
-        spread(&mut colors, 9);
-        let reached = colors.iter().filter(|color| **color == Some(Vec3::X)).count();
+        let mut texture = vec![None; 81];
+        texture[40] = Some([255, 7, 0]);
+        spread(&mut texture, 9);
+        let reached = texture.iter().filter(|color| **color == Some([255, 7, 0])).count();
         assert_eq!(reached, (2 * PADDING as usize + 1).pow(2));
     }
 }

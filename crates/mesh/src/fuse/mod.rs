@@ -10,17 +10,18 @@ mod views;
 use std::collections::HashMap;
 use std::sync::Arc;
 
-use glam::{USizeVec3, Vec3};
+use glam::{DVec3, USizeVec3, Vec3};
 use image::RgbImage;
 use rayon::prelude::*;
-use snapsnap_splat::{Camera, Gaussians, SplatError};
+use snapsnap_splat::scene::Loaded;
+use snapsnap_splat::{Gaussians, SplatError};
 
 use crate::mesh::Mesh;
 use color::Mean;
 use grid::Grid;
 use views::{Seen, View};
 
-/// Cubes along the longest side of the body.
+/// Cubes along the longest side of the body's box and its margins.
 const CUBES: f32 = 320.0;
 /// Side of the pictures that distances are taken from, pixels.
 const SIDE: u32 = 640;
@@ -35,6 +36,8 @@ const FREE_VIEWS: u8 = 3;
 const OPAQUE: f32 = 0.1;
 /// This share of the Gaussians, at either end of each axis, does not say where the body is: some may fly about.
 const FLYING: f32 = 0.002;
+/// Standard deviations around a Gaussian's centre at which it is no surface any more.
+const SEEN: f32 = 2.0;
 /// Times that neighbouring distances are averaged: steps between views, and the grain of Gaussians.
 const SMOOTHED: usize = 2;
 
@@ -97,8 +100,8 @@ const FEWEST: usize = 50;
 ///
 /// # Errors
 /// [`FuseError`].
-pub fn fuse(gaussians: &Gaussians, options: Options, stage: &dyn Fn(&str)) -> Result<Fused, FuseError> {
-    let (low, high) = bounds(gaussians)?;
+pub fn fuse(scene: &Loaded, options: Options, stage: &dyn Fn(&str)) -> Result<Fused, FuseError> {
+    let (low, high) = bounds(&scene.gaussians)?;
     let size = high - low;
     let cell = size.max_element() / CUBES;
     // The border stays outside.
@@ -108,8 +111,9 @@ pub fn fuse(gaussians: &Gaussians, options: Options, stage: &dyn Fn(&str)) -> Re
 
     stage("views from all around");
     let (centre, radius) = ((0.5 * (low + high)).as_dvec3(), f64::from(0.5 * size.length()));
+    let cameras = views::cameras(centre, radius, SIDE).into_iter();
     let views: Result<Vec<View>, SplatError> =
-        views::cameras(centre, radius, SIDE).into_iter().map(|camera| View::new(gaussians, camera)).collect();
+        cameras.map(|camera| View::new(scene, camera, radius)).collect();
     let views = views?;
 
     stage("distance field");
@@ -139,35 +143,39 @@ pub fn fuse(gaussians: &Gaussians, options: Options, stage: &dyn Fn(&str)) -> Re
     if options.texture > 0 {
         drop(views);
         stage("texture");
-        textured(&mut mesh, gaussians, &views::cameras(centre, radius, TEXTURE_SIDE), options.texture, cell)?;
+        textured(&mut mesh, scene, (centre, radius), options.texture, cell)?;
     }
     Ok(Fused { mesh, closed, filled, dropped, faces, cell })
 }
 
-/// Gives a mesh a texture instead of its positions' colours, which stay where no view shows a place.
+/// Gives a mesh a texture instead of its positions' colours, which stay where no view shows a place. The ball is that of the body,
+/// its centre and radius.
 fn textured(
     mesh: &mut Mesh,
-    gaussians: &Gaussians,
-    cameras: &[Camera],
+    scene: &Loaded,
+    (centre, radius): (DVec3, f64),
     side: usize,
     cell: f32,
 ) -> Result<(), FuseError> {
     let atlas = atlas::atlas(mesh, side).map_err(FuseError::Texture)?;
     let mut means = vec![Mean::default(); atlas.texels.len()];
-    for camera in cameras {
-        let view = View::new(gaussians, *camera)?;
+    for camera in views::cameras(centre, radius, TEXTURE_SIDE) {
+        let view = View::new(scene, camera, radius)?;
         let hear = |(mean, texel): (&mut Mean, &atlas::Texel)| {
             mean.hear(&view, texel.place, texel.normal, color::REACH * cell);
         };
         means.par_iter_mut().zip(&atlas.texels).for_each(hear);
     }
-    let mut colors = vec![None; side * side];
-    means.iter().zip(&atlas.texels).for_each(|(mean, texel)| colors[texel.at] = mean.color());
-    atlas::spread(&mut colors, side);
-    let background = mesh.colors.iter().sum::<Vec3>() / mesh.colors.len().max(1) as f32;
-    let bytes = colors.iter().flat_map(|color| color.unwrap_or(background).to_array());
-    let bytes = bytes.map(|c| (255.0 * c).round() as u8).collect();
-    let texture = RgbImage::from_raw(side as u32, side as u32, bytes).expect("three bytes for each texel");
+    let mut texture = vec![None; side * side];
+    let bytes = |color: Vec3| color.to_array().map(|c| (255.0 * c).round() as u8);
+    for (mean, texel) in means.iter().zip(&atlas.texels) {
+        texture[texel.at as usize] = Some(bytes(mean.color().unwrap_or(texel.color)));
+    }
+    atlas::spread(&mut texture, side);
+    // Beyond what filters reach.
+    let background = bytes(mesh.colors.iter().sum::<Vec3>() / mesh.colors.len().max(1) as f32);
+    let texture = texture.into_iter().flat_map(|color| color.unwrap_or(background)).collect();
+    let texture = RgbImage::from_raw(side as u32, side as u32, texture).expect("three bytes for each texel");
     mesh.colors.clear();
     mesh.materials[0].texture = Some(Arc::new(texture));
     // Faces of one piece share their corners' coordinates.
@@ -220,19 +228,25 @@ fn bounds(gaussians: &Gaussians) -> Result<(Vec3, Vec3), FuseError> {
         data.convert::<f32>().try_into_vec().expect("converted to f32 on this very line")
     };
     let opacities = host(gaussians.opacities.to_data());
-    let means = host(gaussians.means.to_data());
-    let means: Vec<Vec3> = means.as_chunks::<3>().0.iter().map(|p| Vec3::from_array(*p)).collect();
-    let solid = |(p, opacity): &(&Vec3, &f32)| p.is_finite() && **opacity >= OPAQUE;
-    let there: Vec<Vec3> = means.iter().zip(&opacities).filter(solid).map(|(p, _)| *p).collect();
+    let (means, scales) = (host(gaussians.means.to_data()), host(gaussians.scales.to_data()));
+    let rows = means.as_chunks::<3>().0.iter().zip(scales.as_chunks::<3>().0);
+    // A place, and how far around it something is seen.
+    let rows = rows.map(|(p, s)| (Vec3::from_array(*p), SEEN * Vec3::from_array(*s).max_element()));
+    let solid = |((p, reach), opacity): &((Vec3, f32), &f32)| {
+        p.is_finite() && reach.is_finite() && **opacity >= OPAQUE
+    };
+    let there: Vec<(Vec3, f32)> = rows.zip(&opacities).filter(solid).map(|(row, _)| row).collect();
     if there.len() < FEWEST {
         return Err(FuseError::Nothing(FEWEST));
     }
     let (mut low, mut high) = (Vec3::ZERO, Vec3::ZERO);
     for axis in 0..3 {
-        let mut along: Vec<f32> = there.iter().map(|p| p[axis]).collect();
-        along.sort_unstable_by(f32::total_cmp);
-        let skipped = (FLYING * along.len() as f32) as usize;
-        (low[axis], high[axis]) = (along[skipped], along[along.len() - 1 - skipped]);
+        let end = |sign: f32| {
+            let mut along: Vec<f32> = there.iter().map(|(p, reach)| sign * p[axis] + reach).collect();
+            let skipped = along.len() - 1 - (FLYING * along.len() as f32) as usize;
+            sign * *along.select_nth_unstable_by(skipped, f32::total_cmp).1
+        };
+        (low[axis], high[axis]) = (end(-1.0), end(1.0));
     }
     // What was skipped at either end may be a hand.
     let margin = 0.06 * (high - low).max_element().max(1e-3);

@@ -4,7 +4,7 @@ use std::collections::HashMap;
 
 use glam::Vec3;
 use meshoptimizer_rs::{
-    Attributes, Error, Positions, SimplifyOptions, SimplifySettings, VertexFlags, Workspace,
+    Attributes, Error, Limits, Positions, SimplifyOptions, SimplifySettings, VertexFlags, Workspace,
     simplify_with_attributes,
 };
 
@@ -68,7 +68,8 @@ fn reduce(mesh: &Mesh, triangles: &[[u32; 3]], kept: &[bool], faces: usize) -> R
             target_error: ERROR,
             options: SimplifyOptions::REGULARIZE_LIGHT,
         },
-        &mut Workspace::default(),
+        // The memory of the surface is ours; the library would stop at a gigabyte.
+        &mut Workspace::new(Limits { max_bytes: usize::MAX, max_work: u64::MAX }),
     )?;
     Ok(reduced.indices.as_chunks::<3>().0.to_vec())
 }

@@ -2,11 +2,14 @@
 
 use burn::tensor::Tensor;
 use glam::{DMat3, DVec2, DVec3, Mat4, Vec3};
-use snapsnap_splat::{Camera, Gaussians, RenderOptions, RigidTransform, SplatError, render};
+use snapsnap_splat::scene::Loaded;
+use snapsnap_splat::{Camera, RenderOptions, RigidTransform, SplatError, render};
 
 /// Rings of cameras around the subject: how far they look down, in degrees, and how many of them there are.
 const RINGS: [(f64, usize); 7] =
     [(-85.0, 1), (-55.0, 6), (-25.0, 10), (5.0, 16), (35.0, 10), (65.0, 6), (88.0, 1)];
+/// Radii between a ball and the cameras around it: far enough away that perspective hides little, near enough for f32's depths.
+const DISTANCE: f64 = 4.0;
 /// A pixel shows a surface where Gaussians cover it so far.
 pub const COVERED: f32 = 0.5;
 /// Surfaces that are met at a flatter angle than this cosine are not trusted: their pixels mix what lies behind one another.
@@ -40,8 +43,7 @@ pub enum Seen {
 
 /// Cameras around a ball, each with the whole of it in its picture of `side`² pixels.
 pub fn cameras(centre: DVec3, radius: f64, side: u32) -> Vec<Camera> {
-    // Far enough away that perspective hides little, and near enough for f32's depths.
-    let distance = 4.0 * radius;
+    let distance = DISTANCE * radius;
     let focal = (distance * distance / (radius * radius) - 1.0).sqrt() * 0.5 * 0.98;
     let ring = |(row, (pitch, count)): (usize, (f64, usize))| {
         (0..count).map(move |i| {
@@ -65,13 +67,15 @@ pub fn cameras(centre: DVec3, radius: f64, side: u32) -> Vec<Camera> {
 }
 
 impl View {
-    /// Renders Gaussians.
+    /// Renders Gaussians as one of the [`cameras`] around a ball of this radius sees them.
     ///
     /// # Errors
     /// Those of [`render`].
-    pub fn new(gaussians: &Gaussians, camera: Camera) -> Result<Self, SplatError> {
-        let options = RenderOptions { depth: true, near: 1e-6, ..RenderOptions::inria() };
-        let rendered = render(gaussians, std::slice::from_ref(&camera), &options)?;
+    pub fn new(scene: &Loaded, camera: Camera, radius: f64) -> Result<Self, SplatError> {
+        // What flies between the camera and the ball hides nothing.
+        let near = ((DISTANCE - 1.0) * radius) as f32;
+        let options = RenderOptions { depth: true, near, ..RenderOptions::inria() };
+        let rendered = render(&scene.seen_by(&camera)?, std::slice::from_ref(&camera), &options)?;
         let alpha = host(rendered.alpha);
         let depth = host(rendered.depth.expect("asked for"));
         let color = host(rendered.color);

@@ -1,5 +1,6 @@
-//! Gaussian PLY files and the cameras that they are rendered from.
+//! Files of Gaussians, PLY and SPZ, and the cameras that they are rendered from.
 
+use std::fs;
 use std::path::Path;
 
 use burn::tensor::{Device, Tensor};
@@ -8,6 +9,7 @@ use snapsnap_splat::{Camera, Gaussians, cameras, ply, scene};
 
 use super::super::Format;
 use super::put;
+use crate::data;
 
 /// What all have in common.
 const RENDER: Format = Format {
@@ -32,6 +34,27 @@ pub const FORMATS: &[Format] = &[
     Format {
         name: "gaussians-big-endian",
         sample: |folder| put(folder, "h.ply", file("binary_big_endian", 2)),
+        ..RENDER
+    },
+    Format {
+        name: "spz",
+        sample: |folder| scene::write(&three(), &folder.join("h.spz")).expect("written"),
+        changed: &["h.spz"],
+        command: "render in/h.spz --orbit 2 --size 16x24 --device cpu -o out --raw out.safetensors",
+        ..RENDER
+    },
+    // With spherical harmonics, from another implementation.
+    Format {
+        name: "spz-harmonics",
+        sample: |folder| {
+            put(folder, "h.spz", fs::read(data("spz/v3_degree3.spz")).expect("a file of the tests"));
+        },
+        changed: &["h.spz"],
+        command: "convert in/h.spz out.ply",
+        file: Some("out.ply"),
+        whole: |folder| {
+            scene::read(&folder.join("out.ply"), &Device::flex()).map(drop).map_err(|e| e.to_string())
+        },
         ..RENDER
     },
     Format {
@@ -109,7 +132,7 @@ fn pictures(folder: &Path) -> Result<(), String> {
     let views = cameras::read(&folder.join("out/cameras.json"))
         .or_else(|_| {
             // The cameras that were given are not written again.
-            let inputs = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
+            let inputs = fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
             let given = inputs.map(|path| path.join("cameras.json")).find(|path| path.is_file());
             cameras::read(&given.unwrap_or_default())
         })

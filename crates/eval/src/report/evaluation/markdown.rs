@@ -122,23 +122,27 @@ impl Evaluation<'_> {
             }
             text.push('\n');
         }
-        if made.iter().any(|judged| !judged.surface.is_empty()) {
+        let centres = made.iter().map(|judged| (judged.name.clone(), &judged.surface));
+        let meshes = made.iter().map(|judged| (format!("{}, mesh", judged.name), &judged.mesh));
+        let surfaces: Vec<_> = centres.chain(meshes).filter(|(_, found)| !found.is_empty()).collect();
+        if !surfaces.is_empty() {
             let _ = writeln!(
                 text,
                 "## Surface\n\nCentres of the Gaussians at least {} opaque against the true points of all views, in the world as it is \
-                 (nothing is aligned), cm; normals: mean cosine from the views nearest to 0, 90, 180 and 270°, in maps of 256² at most.\n\n\
+                 (nothing is aligned), and points drawn from the meshes made of them, cm; normals: mean cosine from the views nearest to \
+                 0, 90, 180 and 270°, in maps of 256² at most.\n\n\
                  | | to the truth | from the truth | Chamfer | normals |\n|---|---|---|---|---|",
                 self.config.metrics.opaque
             );
-            for judged in &made {
-                let [forward, backward, mean, normals] = surface_intervals(judged);
+            for (name, found) in surfaces {
+                let [forward, backward, mean, normals] = surface_intervals(found);
                 let cells = [
                     cell(forward, 1.0, 2),
                     cell(backward, 1.0, 2),
                     cell(mean, 1.0, 2),
                     cell(normals, 1.0, 3),
                 ];
-                let _ = writeln!(text, "| {} | {} |", escaped(&judged.name), cells.join(" | "));
+                let _ = writeln!(text, "| {} | {} |", escaped(&name), cells.join(" | "));
             }
             text.push('\n');
         }

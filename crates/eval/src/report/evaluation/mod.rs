@@ -10,7 +10,7 @@ use serde_json::{Map, Value, json};
 use super::plot::{Axes, Series, svg};
 use super::{Header, table};
 use crate::evaluate::config::{EvalConfig, Protocol};
-use crate::evaluate::{Judged, Kind, Outcome, Row, is_named};
+use crate::evaluate::{Judged, Kind, Outcome, Row, Surface, is_named};
 use crate::points::VIEWS;
 use crate::score::Score;
 use crate::statistics::{Interval, difference, interval, quantile};
@@ -103,7 +103,7 @@ impl Evaluation<'_> {
             Value::Object(self.of_kind(kind).map(|judged| (judged.name.clone(), value(judged))).collect())
         };
         report["baselines"] = named(Kind::Baseline, &plain);
-        report["baselines_geometry_cm"] = named(Kind::Baseline, &geometry_json);
+        report["baselines_geometry_cm"] = named(Kind::Baseline, &|judged| geometry_json(&judged.surface));
         report["compared"] = named(Kind::Other, &|judged| {
             let difference = |protocol: usize| match self.model() {
                 Some(model) => figures(&Self::difference(judged, model, protocol)),
@@ -113,12 +113,14 @@ impl Evaluation<'_> {
                 "protocols": plain(judged),
                 "difference": self.by_protocol(difference),
                 "points_mm": points_json(judged),
-                "geometry_cm": geometry_json(judged),
+                "geometry_cm": geometry_json(&judged.surface),
+                "mesh_cm": geometry_json(&judged.mesh),
                 "seconds": seconds_json(judged),
             })
         });
         report["points_mm"] = self.model().map_or(json!({}), points_json);
-        report["geometry_cm"] = self.model().map_or(Value::Null, geometry_json);
+        report["geometry_cm"] = self.model().map_or(Value::Null, |model| geometry_json(&model.surface));
+        report["mesh_cm"] = self.model().map_or(Value::Null, |model| geometry_json(&model.mesh));
         report["seconds"] = self.model().map_or(Value::Null, seconds_json);
         report["groups"] =
             Value::Object(self.groups().map(|(name, rows)| (name, group_json(&rows))).collect());
@@ -289,11 +291,11 @@ fn points_json(judged: &Judged) -> Value {
 }
 
 /// Centimetres to the truth, from it and both, and cosines, over people.
-fn surface_intervals(judged: &Judged) -> [Option<Interval>; 4] {
-    type Of = fn(&crate::evaluate::Surface) -> Option<f64>;
+fn surface_intervals(surfaces: &[(usize, Surface)]) -> [Option<Interval>; 4] {
+    type Of = fn(&Surface) -> Option<f64>;
     let over = |of: Of| {
         let mut people: BTreeMap<usize, Vec<f64>> = BTreeMap::new();
-        for (person, surface) in &judged.surface {
+        for (person, surface) in surfaces {
             people.entry(*person).or_default().extend(of(surface));
         }
         let means: Vec<f64> = people
@@ -311,8 +313,8 @@ fn surface_intervals(judged: &Judged) -> [Option<Interval>; 4] {
     ]
 }
 
-fn geometry_json(judged: &Judged) -> Value {
-    let [forward, backward, mean, normals] = surface_intervals(judged);
+fn geometry_json(surfaces: &[(usize, Surface)]) -> Value {
+    let [forward, backward, mean, normals] = surface_intervals(surfaces);
     json!({ "to_truth": forward, "from_truth": backward, "chamfer": mean, "normal_consistency": normals })
 }
 

@@ -1,0 +1,50 @@
+//! `snapsnap view` as a server.
+
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::TcpStream;
+use std::path::Path;
+use std::process::{Child, Stdio};
+
+use crate::snapsnap;
+
+/// A server, ended with the test.
+pub struct Server {
+    process: Child,
+    /// On 127.0.0.1.
+    pub port: u16,
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        let _ = self.process.kill();
+        let _ = self.process.wait();
+    }
+}
+
+impl Server {
+    /// Serves a file of Gaussians on a free port.
+    pub fn new(file: &Path) -> Self {
+        let mut command = snapsnap();
+        command.arg("view").arg(file).stdout(Stdio::piped()).stderr(Stdio::null());
+        let mut process = command.spawn().expect("started");
+        let mut line = String::new();
+        BufReader::new(process.stdout.take().expect("piped")).read_line(&mut line).expect("an address");
+        let port = line.trim().strip_prefix("http://127.0.0.1:").and_then(|rest| rest.strip_suffix('/'));
+        let port = port.and_then(|port| port.parse().ok()).unwrap_or_else(|| panic!("{line}"));
+        Self { process, port }
+    }
+
+    /// Status, headers in lower case, and content.
+    pub fn ask(&self, request: &str, host: Option<&str>) -> (u16, String, Vec<u8>) {
+        let mut stream = TcpStream::connect(("127.0.0.1", self.port)).expect("connected");
+        let own = format!("127.0.0.1:{}", self.port);
+        let host = host.unwrap_or(&own);
+        write!(stream, "{request} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n").expect("asked");
+        let mut answer = Vec::new();
+        stream.read_to_end(&mut answer).expect("answered");
+        let end = answer.windows(4).position(|w| w == b"\r\n\r\n").expect("headers");
+        let headers = String::from_utf8_lossy(&answer[..end]).to_ascii_lowercase();
+        let status = headers.split(' ').nth(1).and_then(|status| status.parse().ok()).expect("a status");
+        (status, headers, answer[end + 4..].to_vec())
+    }
+}

@@ -1,0 +1,150 @@
+//! The page of `snapsnap view` in a browser: what it shows is what `snapsnap render` shows.
+#![cfg(target_os = "linux")]
+
+use std::fs;
+use std::path::Path;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use serde_json::{Value, json};
+use snapsnap_tests::browser::Page;
+use snapsnap_tests::server::Server;
+use snapsnap_tests::{data, root, snapsnap, succeed};
+
+const SIDE: u32 = 768;
+/// Whatever takes longer has failed.
+const PATIENCE: Duration = Duration::from_secs(120);
+/// Fewer dB between the page and our own render are two pictures.
+const ALIKE: f64 = 25.0;
+
+/// A screenshot as the page's button saves it, once the Gaussians are sorted for this camera: nothing changes any more.
+fn screenshot(page: &mut Page, path: &Path) {
+    let bytes = |page: &mut Page| {
+        let found = page.value(
+            "snapsnap.screenshot().then(blob => blob.arrayBuffer()).then(b => Array.from(new Uint8Array(b)))",
+        );
+        let byte = |value: &Value| value.as_u64().and_then(|v| u8::try_from(v).ok()).expect("a byte");
+        found.as_array().expect("bytes").iter().map(byte).collect::<Vec<u8>>()
+    };
+    let end = Instant::now() + PATIENCE;
+    let mut before = bytes(page);
+    loop {
+        thread::sleep(Duration::from_secs(1));
+        let now = bytes(page);
+        if now == before {
+            return fs::write(path, now).expect("written");
+        }
+        assert!(Instant::now() < end, "the page never comes to rest");
+        before = now;
+    }
+}
+
+/// dB between what the page shows and our own render of the file by the page's camera.
+fn agreement(page: &mut Page, file: &Path, folder: &Path) -> f64 {
+    let folder = tempfile::tempdir_in(folder).expect("temporary folder");
+    let [shot, cameras, own] = ["shot.png", "cameras.json", "own"].map(|name| folder.path().join(name));
+    screenshot(page, &shot);
+    let camera = page.value("[snapsnap.camera()]").to_string();
+    fs::write(&cameras, camera).expect("written");
+    let mut render = snapsnap();
+    render.arg("render").arg(file).arg("--cameras").arg(&cameras).args(["--device", "cpu", "-o"]);
+    succeed(render.arg(&own));
+    let said = succeed(snapsnap().arg("compare").arg(&shot).arg(own.join("000.png")).arg("--json"));
+    let found: Value = serde_json::from_str(&said).expect("JSON");
+    let size = image::image_dimensions(&shot).expect("a picture");
+    assert_eq!(size, (SIDE, SIDE));
+    found["psnr"].as_f64().unwrap_or(f64::INFINITY)
+}
+
+/// Where the camera is: degrees around the person and above the horizon, and metres from what it turns around.
+fn place(page: &mut Page) -> [f64; 3] {
+    let camera = page.value("snapsnap.camera()");
+    let entry =
+        |row: usize, column: usize| camera["world_to_camera"][row][column].as_f64().expect("a number");
+    let centre: [f64; 3] =
+        [0, 1, 2].map(|axis| -(0..3).map(|row| entry(row, axis) * entry(row, 3)).sum::<f64>());
+    let [x, y, z] = [centre[0], centre[1] - 0.85, centre[2]];
+    let away = (x * x + y * y + z * z).sqrt();
+    [x.atan2(z).to_degrees(), (y / away).asin().to_degrees(), away]
+}
+
+#[test]
+fn a_browser_shows_the_person_and_turns_it() {
+    let Some(mut page) = Page::new(SIDE, SIDE) else { return };
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let folder = temporary.path();
+    let file = folder.join("human.ply");
+    let sample = root().join("assets/sample");
+    let mut reconstruct = snapsnap();
+    reconstruct.arg("reconstruct").arg(sample.join("front.png")).arg(sample.join("back.png"));
+    succeed(reconstruct.args(["--device", "cpu", "-o"]).arg(&file));
+
+    let server = Server::new(&file);
+    let url = format!("http://127.0.0.1:{}/", server.port);
+    page.ask("Page.navigate", json!({ "url": url }));
+    page.wait("window.snapsnap !== undefined");
+    page.value("snapsnap.ready");
+    assert_eq!(page.value("document.getElementById('message').textContent"), "");
+    assert_eq!(page.value("document.getElementById('name').textContent"), "human.ply");
+
+    // From the front, and turned by a drag, once it has come to rest.
+    let front = agreement(&mut page, &file, folder);
+    let [yaw, pitch, away] = place(&mut page);
+    assert!(
+        yaw.abs() < 0.1 && (pitch - 8.0).abs() < 0.1 && (away - 2.0).abs() < 0.01,
+        "{yaw} {pitch} {away}"
+    );
+    page.drag([384.0, 384.0], [234.0, 384.0]);
+    let turned = agreement(&mut page, &file, folder);
+    let [yaw, pitch, _] = place(&mut page);
+    // 150 of 768 pixels are 70°, and it runs on a little.
+    assert!((60.0..150.0).contains(&yaw) && (pitch - 8.0).abs() < 0.1, "{yaw} {pitch}");
+    // A wheel brings it nearer, a button to the person's back.
+    let wheel = json!({ "type": "mouseWheel", "x": 384, "y": 384, "deltaX": 0, "deltaY": -240 });
+    page.ask("Input.dispatchMouseEvent", wheel);
+    let end = Instant::now() + PATIENCE;
+    while place(&mut page)[2] > 1.9 {
+        assert!(Instant::now() < end, "the wheel brings nothing nearer");
+        thread::sleep(Duration::from_millis(50));
+    }
+    page.value("document.querySelector('button[data-yaw=\"180\"]').click()");
+    let back = agreement(&mut page, &file, folder);
+    let [yaw, _, away] = place(&mut page);
+    assert!(yaw.abs() > 179.9 && (away - 2.0).abs() < 0.01, "{yaw} {away}");
+    println!(
+        "{front:.1}, {turned:.1} and {back:.1} dB; {}",
+        page.value("document.getElementById('rate').textContent")
+    );
+    assert!(front.min(turned).min(back) >= ALIKE, "{front} {turned} {back}");
+
+    // The background is the colour that was chosen.
+    page.value(
+        "{ const chosen = document.getElementById('background'); chosen.value = '#806040'; \
+         chosen.dispatchEvent(new Event('input')); }",
+    );
+    let shot = folder.join("background.png");
+    screenshot(&mut page, &shot);
+    let corner = image::open(&shot).expect("a picture").into_rgb8().get_pixel(1, 1).0;
+    assert!(corner.iter().zip([128, 96, 64]).all(|(c, chosen)| c.abs_diff(chosen) <= 1), "{corner:?}");
+
+    // Another file, dropped on it; what is no such file is told, and the page goes on.
+    let drop = |name: &str, bytes: &[u8]| {
+        format!(
+            "{{ const transfer = new DataTransfer();\
+             transfer.items.add(new File([new Uint8Array({bytes:?})], '{name}'));\
+             window.dispatchEvent(new DragEvent('drop', {{ dataTransfer: transfer, cancelable: true }})); }}"
+        )
+    };
+    let other = fs::read(data("spz/v3_degree0.spz")).expect("read");
+    page.value(&drop("other.spz", &other));
+    page.wait("document.getElementById('count').textContent === '40 Gaussians'");
+    assert!(page.errors.is_empty(), "{:?}", page.errors);
+    page.value(&drop("nothing.ply", b"nothing"));
+    page.wait("document.getElementById('message').textContent.startsWith('nothing.ply')");
+    assert_eq!(page.value("document.getElementById('count').textContent"), "40 Gaussians");
+
+    let elsewhere =
+        |address: &&String| !["blob:", "data:", url.as_str()].iter().any(|own| address.starts_with(own));
+    let asked: Vec<&String> = page.requests.iter().filter(elsewhere).collect();
+    assert!(asked.is_empty() && page.requests.len() > 3, "{asked:?} of {:?}", page.requests);
+}
