@@ -114,7 +114,8 @@ impl Page {
         let end = Instant::now() + PATIENCE;
         loop {
             let left = end.saturating_duration_since(Instant::now());
-            let answer = self.from.recv_timeout(left).unwrap_or_else(|e| panic!("{method}: {e}"));
+            let answer = self.from.recv_timeout(left);
+            let answer = answer.unwrap_or_else(|e| panic!("{message}: {e}; errors: {:?}", self.errors));
             self.hear(&answer);
             if answer["id"] == json!(self.last) {
                 assert!(answer["error"].is_null(), "{method}: {}", answer["error"]);

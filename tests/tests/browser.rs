@@ -77,7 +77,8 @@ fn a_browser_shows_the_person_and_turns_it() {
     let sample = root().join("assets/sample");
     let mut reconstruct = snapsnap();
     reconstruct.arg("reconstruct").arg(sample.join("front.png")).arg(sample.join("back.png"));
-    succeed(reconstruct.args(["--device", "cpu", "-o"]).arg(&file));
+    // A software GPU draws one frame a second of the default's 340,000 Gaussians.
+    succeed(reconstruct.args(["--set", "network.resolution=256", "--device", "cpu", "-o"]).arg(&file));
 
     let server = Server::new(&file);
     let url = format!("http://127.0.0.1:{}/", server.port);

@@ -107,6 +107,14 @@ fn every_command_that_reads_a_ply_reads_an_spz() {
 #[test]
 fn conversions_that_cannot_be_are_refused() {
     let temporary = tempfile::tempdir().expect("temporary folder");
+    let (nothing, empty) = (temporary.path().join("nothing.ply"), temporary.path().join("empty.spz"));
+    ply(&nothing, 1, Some(0));
+    for command in [snapsnap().arg("convert").args([&nothing, &empty]), snapsnap().arg("view").arg(&nothing)]
+    {
+        let message = refused(command);
+        assert!(message.contains("nothing.ply: none of its 1 Gaussians is finite"), "{message}");
+    }
+    assert!(!empty.exists());
     let path = |name: &str| temporary.path().join(name);
     ply(&path("a.ply"), 5, None);
     let convert = |from: &str, to: &str| refused(snapsnap().arg("convert").args([path(from), path(to)]));

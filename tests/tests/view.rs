@@ -1,6 +1,8 @@
 //! `snapsnap view`, as a browser and as somebody else would ask it.
 
 use std::fs;
+use std::io::Write;
+use std::net::TcpStream;
 
 use burn::tensor::Device;
 use snapsnap_splat::scene;
@@ -51,6 +53,25 @@ fn the_page_and_its_file_are_served_to_this_machine_alone() {
     assert_eq!(server.ask("POST /scene.ply", None).0, 405);
     assert_eq!(server.ask("GET /scene.ply", Some("evil.example")).0, 403);
     assert_eq!(server.ask("GET /", Some(&format!("localhost:{}", server.port))).0, 200);
+
+    assert_eq!(server.ask("GET /", Some(&format!("LocalHost:{}", server.port))).0, 200);
+    assert_eq!(server.ask(&format!("GET http://127.0.0.1:{}/viewer.css", server.port), None).0, 200);
+    assert_eq!(server.ask("GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX: y", None).0, 400);
+    assert_eq!(server.ask(&format!("GET /{}", "x".repeat(20_000)), None).0, 431);
+    assert_eq!(server.ask("nonsense\r\n", None).0, 400);
+
+    // Whatever clients promise, withhold or leave unread, others are served.
+    let connect = || TcpStream::connect(("127.0.0.1", server.port)).expect("connected");
+    let idle: Vec<TcpStream> = (0..20).map(|_| connect()).collect();
+    let unread: Vec<TcpStream> = (0..8).map(|_| connect()).collect();
+    for mut stream in &unread {
+        write!(stream, "GET /viewer.js HTTP/1.1\r\nHost: 127.0.0.1:{}\r\n\r\n", server.port).expect("asked");
+    }
+    for length in ["99999999999999", "18446744073709551615", "2000"] {
+        let request = format!("GET / HTTP/1.1\r\nContent-Length: {length}\r\nX: y");
+        assert_eq!(server.ask(&request, None).0, 200, "{length}");
+    }
+    drop((idle, unread));
 
     // What is replaced is shown on reload, and what is broken says so.
     fs::copy(data("spz/v3_degree3.spz"), &file).expect("copied");

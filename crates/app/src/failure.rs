@@ -28,6 +28,14 @@ impl Failure {
         Self::Input(format!("{}: cannot write: {e}", path.display()))
     }
 
+    /// With the file that it is about.
+    pub fn about(self, path: &Path) -> Self {
+        match self {
+            Self::Input(said) => Self::Input(format!("{}: {said}", path.display())),
+            Self::Internal(said) => Self::Internal(format!("{}: {said}", path.display())),
+        }
+    }
+
     pub fn exit_code(&self) -> ExitCode {
         match self {
             Self::Input(_) => ExitCode::from(2),

@@ -12,6 +12,7 @@ mod pictures;
 mod progress;
 mod report;
 mod say;
+mod server;
 mod turntable;
 mod view_folder;
 mod weights;
@@ -169,10 +170,7 @@ fn main() -> ExitCode {
         Command::InitWeights(arguments) => commands::init_weights::run(&arguments, quiet),
         Command::ExportWeights(arguments) => commands::export_weights::run(&arguments, quiet),
         Command::Doctor(arguments) => commands::doctor::run(&arguments),
-        Command::Completions(arguments) => {
-            commands::manuals::completions(&arguments, Arguments::command());
-            Ok(())
-        }
+        Command::Completions(arguments) => commands::manuals::completions(&arguments, Arguments::command()),
         Command::Man(arguments) => commands::manuals::pages(&arguments, Arguments::command(), quiet),
     };
     match result {

@@ -1,7 +1,9 @@
 //! Printing that never fails: a closed pipe or a full disk on the other end is no reason to lose a result. What files are
 //! called and what they hold reaches the terminal as text, never as a command to it.
 
-use std::io::Write;
+use std::io::{ErrorKind, Write};
+
+use crate::failure::Failure;
 
 /// A line on stdout.
 pub fn out(line: &str) {
@@ -13,9 +15,15 @@ pub fn err(line: &str) {
     let _ = writeln!(std::io::stderr(), "{}", printable(line));
 }
 
-/// Bytes of our own on stdout, as they are.
-pub fn raw(bytes: &[u8]) {
-    let _ = std::io::stdout().write_all(bytes);
+/// A text of our own on stdout, as it is: all of the command's result, so that a full disk is told. Whoever reads it may leave.
+pub fn result(text: &[u8]) -> Result<(), Failure> {
+    let mut stdout = std::io::stdout();
+    match stdout.write_all(text).and_then(|()| stdout.flush()) {
+        Err(e) if e.kind() != ErrorKind::BrokenPipe => {
+            Err(Failure::Input(format!("stdout: cannot write: {e}")))
+        }
+        _ => Ok(()),
+    }
 }
 
 /// The text with control characters written out; line breaks and tabs stay.

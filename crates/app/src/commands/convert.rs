@@ -1,6 +1,6 @@
 //! `snapsnap convert`.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 use snapsnap_splat::file;
@@ -25,8 +25,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
         return Err(Failure::Input(format!("{}: {message}", output.display())));
     }
     check_outputs(&[output], &[input])?;
-    let mut stored = Stored::read(input)?;
-    let dropped = stored.drop_not_finite();
+    let (stored, dropped) = finite(input)?;
     stored.write(output)?;
     if quiet {
         return Ok(());
@@ -49,4 +48,20 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
         size(input)
     ));
     Ok(())
+}
+
+/// Reads the Gaussians whose values are finite, and how many others there are.
+///
+/// # Errors
+/// For a file that cannot be read, or that has Gaussians of which none is finite.
+pub fn finite(input: &Path) -> Result<(Stored, usize), Failure> {
+    let mut stored = Stored::read(input)?;
+    let dropped = stored.drop_not_finite();
+    if stored.is_empty() && dropped > 0 {
+        return Err(Failure::Input(format!(
+            "{}: none of its {dropped} Gaussians is finite",
+            input.display()
+        )));
+    }
+    Ok((stored, dropped))
 }

@@ -25,10 +25,10 @@ pub struct ManArguments {
 }
 
 /// Prints the completions of `command`.
-pub fn completions(arguments: &CompletionArguments, mut command: Command) {
+pub fn completions(arguments: &CompletionArguments, mut command: Command) -> Result<(), Failure> {
     let mut text = Vec::new();
     clap_complete::generate(arguments.shell, &mut command, "snapsnap", &mut text);
-    say::raw(&text);
+    say::result(&text)
 }
 
 /// Writes the manual pages of `command` and of each of its own.

@@ -58,7 +58,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     check_outputs(&target.files(), &[&arguments.input])?;
     let device = device::choose(&arguments.device)?;
     let loaded = scene::read(&arguments.input, &device)?;
-    let fused = target.write(&loaded, quiet)?;
+    let fused = target.write(&loaded, &arguments.input, quiet)?;
     if arguments.verbose {
         say::out(&told(&fused));
         say::out(&format!("{:.1} s", since.elapsed().as_secs_f64()));
@@ -106,10 +106,11 @@ impl Target {
         companions.chain([self.path.as_path()]).collect()
     }
 
-    /// Makes the mesh of Gaussians and writes it.
-    pub fn write(&self, scene: &Loaded, quiet: bool) -> Result<Fused, Failure> {
+    /// Makes the mesh of Gaussians and writes it; `name` is the file that they are from.
+    pub fn write(&self, scene: &Loaded, name: &Path, quiet: bool) -> Result<Fused, Failure> {
         let progress = Progress::stages(quiet);
-        let fused = fuse(scene, self.options, &|name| progress.stage(name))?;
+        let fused = fuse(scene, self.options, &|name| progress.stage(name));
+        let fused = fused.map_err(|e| Failure::from(e).about(name))?;
         progress.stage("writing");
         export::write(&fused.mesh, &self.path)?;
         Ok(fused)

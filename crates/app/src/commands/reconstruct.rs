@@ -141,7 +141,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     }
     if let Some(mesh) = &mesh {
         let since = Instant::now();
-        plan.push(told(&mesh.write(&world.clone().into(), quiet)?));
+        plan.push(told(&mesh.write(&world.clone().into(), &arguments.output, quiet)?));
         times.push(("mesh", since.elapsed()));
     }
     // What goes into a pipe must stay a PLY.

@@ -3,6 +3,7 @@
 import { SparkRenderer, SplatFileType, SplatMesh } from "@sparkjsdev/spark";
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
+import { inBatches } from "./batches.js";
 
 const element = (id) => document.getElementById(id);
 const canvas = element("canvas");
@@ -18,6 +19,7 @@ const spark = new SparkRenderer({
   minAlpha: 1 / 255,
   sortRadial: false,
 });
+inBatches(spark);
 scene.add(spark);
 
 // The nominal camera: 2 m away, 8° above the horizon, focal length 0.8 of the picture's height.
