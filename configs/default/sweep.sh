@@ -24,9 +24,9 @@ row() {
   shift 2
   cargo xtask train-stage1 --config configs/default/stage1.toml --data $data --set training.steps=400 --set training.average=0.99 \
     --set training.log_every=20 --set training.validate_every=100 --set training.validation_samples=32 "$@" --resume -o "runs/sweep/$name"
-  case $name in no-flip | no-place) return 0 ;; esac
+  case $name in no-flip | no-place) return 0 ;; esac # Their networks are those of the first row.
   cargo xtask train-stage2 --config configs/default/stage2.toml --data $data --weights "runs/sweep/$name/best.safetensors" \
-    --set training.steps=1 --set training.validation_samples=1 "$@" --resume -o "runs/sweep/$name/both"
+    "$@" --set training.steps=1 --set training.validation_samples=1 --resume -o "runs/sweep/$name/both"
 }
 row base groups
 row no-mask groups --set network.mask_channel=false
@@ -44,7 +44,8 @@ row drop-empty groups $transformer --set network.drop_empty=true
 row rings rings
 row whole-canvas groups --set network.window=false
 row net-64 groups --set network.net_resolution=64
-row net-256 groups --set network.net_resolution=256
+# A step takes four times as long.
+row net-256 groups --set network.net_resolution=256 --set training.steps=100 --set training.validate_every=25
 row small groups --set 'network.layer_dims=[16,32,48,64]' --set network.enc_dim=64 --set network.dec_dim=64 --set network.last_dim=16
 row shallow groups --set network.enc_depth=3 --set network.dec_depth=2
 row large groups --set 'network.layer_dims=[48,96,144,192]' --set network.enc_dim=192 --set network.dec_dim=192 --set network.last_dim=48
