@@ -39,6 +39,48 @@ fn screenshot(page: &mut Page, path: &Path) {
     }
 }
 
+/// Waits until nothing is drawn any more, and looks whether the middle of what is on the screen, which no button covers, is what a
+/// screenshot would be.
+fn check_rest(page: &mut Page, folder: &Path) {
+    let end = Instant::now() + PATIENCE;
+    let drawn = |page: &mut Page| page.value("snapsnap.renderer.info.render.frame");
+    let mut before = drawn(page);
+    loop {
+        // Longer than the camera is watched after a drag.
+        thread::sleep(Duration::from_millis(1500));
+        let now = drawn(page);
+        if now == before {
+            break;
+        }
+        assert!(Instant::now() < end, "the page never stops drawing");
+        before = now;
+    }
+    let seen = page.ask("Page.captureScreenshot", json!({ "format": "png" }));
+    let seen = base64(seen["data"].as_str().expect("a picture"));
+    let seen = image::load_from_memory(&seen).expect("a picture").into_rgb8();
+    let shot = folder.join("rest.png");
+    screenshot(page, &shot);
+    let shot = image::open(&shot).expect("a picture").into_rgb8();
+    assert_eq!(seen.dimensions(), shot.dimensions());
+    let middle = SIDE / 3..2 * SIDE / 3;
+    let mut all = middle.clone().flat_map(|y| middle.clone().map(move |x| (x, y)));
+    let lit = all.clone().filter(|(x, y)| seen.get_pixel(*x, *y).0 != [0; 3]).count();
+    assert!(lit > 1000, "only {lit} pixels are lit");
+    let close = |a: [u8; 3], b: [u8; 3]| a.iter().zip(b).all(|(a, b)| a.abs_diff(b) <= 1);
+    let other = all.find(|(x, y)| !close(seen.get_pixel(*x, *y).0, shot.get_pixel(*x, *y).0));
+    assert_eq!(other, None, "the screen shows something else");
+}
+
+fn base64(text: &str) -> Vec<u8> {
+    const DIGITS: &str = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+    let digits: Vec<u32> = text.chars().filter_map(|c| DIGITS.find(c)).map(|digit| digit as u32).collect();
+    let bytes = digits.chunks(4).flat_map(|four| {
+        let bits = four.iter().fold(0, |bits, digit| bits << 6 | digit) << (6 * (4 - four.len()));
+        bits.to_be_bytes().into_iter().skip(1).take(four.len() - 1)
+    });
+    bytes.collect()
+}
+
 /// dB between what the page shows and our own render of the file by the page's camera.
 fn agreement(page: &mut Page, file: &Path, folder: &Path) -> f64 {
     let folder = tempfile::tempdir_in(folder).expect("temporary folder");
@@ -90,6 +132,7 @@ fn a_browser_shows_the_person_and_turns_it() {
 
     // From the front, and turned by a drag, once it has come to rest.
     let front = agreement(&mut page, &file, folder);
+    check_rest(&mut page, folder);
     let [yaw, pitch, away] = place(&mut page);
     assert!(
         yaw.abs() < 0.1 && (pitch - 8.0).abs() < 0.1 && (away - 2.0).abs() < 0.01,
@@ -97,6 +140,7 @@ fn a_browser_shows_the_person_and_turns_it() {
     );
     page.drag([384.0, 384.0], [234.0, 384.0]);
     let turned = agreement(&mut page, &file, folder);
+    check_rest(&mut page, folder);
     let [yaw, pitch, _] = place(&mut page);
     // 150 of 768 pixels are 70°, and it runs on a little.
     assert!((60.0..150.0).contains(&yaw) && (pitch - 8.0).abs() < 0.1, "{yaw} {pitch}");
@@ -110,6 +154,7 @@ fn a_browser_shows_the_person_and_turns_it() {
     }
     page.value("document.querySelector('button[data-yaw=\"180\"]').click()");
     let back = agreement(&mut page, &file, folder);
+    check_rest(&mut page, folder);
     let [yaw, _, away] = place(&mut page);
     assert!(yaw.abs() > 179.9 && (away - 2.0).abs() < 0.01, "{yaw} {away}");
     println!(
@@ -123,6 +168,7 @@ fn a_browser_shows_the_person_and_turns_it() {
         "{ const chosen = document.getElementById('background'); chosen.value = '#806040'; \
          chosen.dispatchEvent(new Event('input')); }",
     );
+    check_rest(&mut page, folder);
     let shot = folder.join("background.png");
     screenshot(&mut page, &shot);
     let corner = image::open(&shot).expect("a picture").into_rgb8().get_pixel(1, 1).0;

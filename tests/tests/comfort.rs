@@ -35,6 +35,18 @@ fn the_doctor_names_devices_weights_and_what_mends() {
 }
 
 #[test]
+#[cfg(target_os = "linux")]
+fn a_report_that_the_disk_does_not_take_is_a_failure() {
+    for arguments in [&["doctor"][..], &["doctor", "--json"], &["completions", "bash"]] {
+        let full = fs::File::options().write(true).open("/dev/full").expect("a device");
+        let done = snapsnap().args(arguments).stdout(full).output().expect("runs");
+        assert_eq!(done.status.code(), Some(2), "{arguments:?}");
+        let said = String::from_utf8(done.stderr).expect("text");
+        assert!(said.contains("stdout: cannot write"), "{arguments:?}: {said}");
+    }
+}
+
+#[test]
 fn every_command_has_a_manual_page_and_an_example() {
     let temporary = tempfile::tempdir().expect("temporary folder");
     succeed(snapsnap().current_dir(temporary.path()).args(["man", "-o", "pages"]));
@@ -71,4 +83,29 @@ fn without_arguments_a_newcomer_reads_the_first_steps() {
         assert!(message.contains(part), "{part}: {message}");
     }
     assert!(!message.contains('\u{1b}'));
+}
+
+/// On a terminal that `script` pretends to be.
+#[test]
+#[cfg(target_os = "linux")]
+fn colours_are_for_terminals_that_want_them() {
+    let colored = |variables: &[(&str, &str)]| {
+        let mut command = std::process::Command::new("script");
+        for name in ["NO_COLOR", "CLICOLOR", "CLICOLOR_FORCE", "CI"] {
+            command.env_remove(name);
+        }
+        command.env("TERM", "xterm").envs(variables.iter().copied());
+        let program = snapsnap().get_program().to_string_lossy().into_owned();
+        let output = command.args(["-qec", &format!("'{program}' --help"), "/dev/null"]).output().ok()?;
+        assert!(output.status.success());
+        Some(output.stdout.contains(&0x1b))
+    };
+    match colored(&[]) {
+        None => println!("SKIPPED: no `script` on this machine"),
+        Some(plain) => {
+            assert!(plain);
+            assert_eq!(colored(&[("NO_COLOR", "1")]), Some(false));
+            assert_eq!(colored(&[("TERM", "dumb")]), Some(false));
+        }
+    }
 }

@@ -166,9 +166,19 @@ fn less(words: &[String]) -> Words {
         "bench" => {
             more.push("--quick");
             if words.iter().any(|word| word == "configs/bench.toml") {
+                for name in ["canvas 512", "canvas 1024"] {
+                    words.extend([
+                        "--set".into(),
+                        format!("settings.{name}.set=[\"network.resolution=256\"]"),
+                    ]);
+                }
                 // A software GPU takes minutes to compile its kernels.
                 more.extend(["--set", "settings.wgpu.device=\"cpu\""]);
             }
+        }
+        // Canvases of the published size are drawn by tests/tests/demo.rs.
+        "reconstruct" if !words.iter().any(|word| word == "--weights") => {
+            more.extend(["--set", "network.resolution=256"]);
         }
         "stability" => more.extend(["--quick", "--device", "cpu", "--only", "opacity 1e-7"]),
         "fetch-weights" => more.push("--list"),

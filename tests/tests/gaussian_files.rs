@@ -4,6 +4,7 @@ use std::fs;
 use std::path::Path;
 
 use burn::tensor::Device;
+use snapsnap_splat::Gaussians;
 use snapsnap_splat::scene::{self, Stored};
 use snapsnap_tests::{data, refused, snapsnap, succeed, values};
 
@@ -75,6 +76,19 @@ fn gaussians_go_into_an_spz_and_back_within_its_steps() {
     assert!(values(once.means) == values(twice.means) && values(once.scales) == values(twice.scales));
     assert!(values(once.opacities) == values(twice.opacities) && values(once.colors) == values(twice.colors));
     check_rotations(values(once.rotations), values(twice.rotations));
+}
+
+#[test]
+fn what_an_spz_holds_badly_is_told() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let [near, far, small] = ["a.ply", "b.ply", "b.spz"].map(|name| temporary.path().join(name));
+    ply(&near, 20, None);
+    let gaussians = scene::read(&near, &Device::flex()).expect("read").gaussians;
+    let moved = Gaussians { means: gaussians.means.clone() + 1e6, ..gaussians };
+    scene::write(&moved, &far).expect("written");
+    let said = succeed(snapsnap().arg("convert").args([&far, &small]));
+    assert!(said.contains("centres are kept in steps of 125.0 mm"), "{said}");
+    assert!(!succeed(snapsnap().arg("convert").args([&near, &small])).contains("steps"));
 }
 
 #[test]

@@ -98,8 +98,8 @@ fn a_folder_of_views_never_replaces_inputs_or_other_outputs() {
         }
     }
     // Others may lie there.
-    succeed(&mut place.reconstruct(["i.png"; 2], ["-o", "d/040.png", "--turntable", "d"]));
-    assert!(fs::read(place.path("d/040.png")).expect("the PLY").starts_with(b"ply"));
+    succeed(&mut place.reconstruct(["i.png"; 2], ["-o", "d/040.ply", "--turntable", "d"]));
+    assert!(fs::read(place.path("d/040.ply")).expect("the PLY").starts_with(b"ply"));
     assert!(place.path("d/039.png").exists() && place.path("d/cameras.json").exists());
 }
 

@@ -31,8 +31,12 @@ const CENTRE: Vec3 = Vec3::new(0.05, 0.9, -0.03);
 
 /// The ellipsoid, and a speck that flies beside it.
 fn written(path: &Path) {
-    let (mut means, mut colors) = shell(20_000, HALF, CENTRE);
-    let (speck, its) = shell(40, Vec3::splat(0.015), CENTRE + Vec3::new(0.32, 0.3, 0.0));
+    written_around(path, CENTRE);
+}
+
+fn written_around(path: &Path, centre: Vec3) {
+    let (mut means, mut colors) = shell(20_000, HALF, centre);
+    let (speck, its) = shell(40, Vec3::splat(0.015), centre + Vec3::new(0.32, 0.3, 0.0));
     means.extend(speck);
     colors.extend(its);
     let n = means.len() / 3;
@@ -84,9 +88,11 @@ fn volume(mesh: &Mesh) -> f64 {
 fn a_shell_becomes_one_closed_surface_of_its_size_and_colours_in_every_kind_of_file() {
     let temporary = tempfile::tempdir().expect("temporary folder");
     let path = |name: &str| temporary.path().join(name);
-    written(&path("human.ply"));
     let expected = 4.0 / 3.0 * std::f64::consts::PI * f64::from(HALF.x * HALF.y * HALF.z);
-    for name in ["a.glb", "a.obj", "mesh.ply"] {
+    // The last in the coordinates of a survey, where f32 has steps of a millimetre.
+    let far = Vec3::new(9_000.0, 120.0, -11_000.0);
+    for (name, centre) in [("a.glb", CENTRE), ("a.obj", CENTRE), ("mesh.ply", far)] {
+        written_around(&path("human.ply"), centre);
         let mut command = snapsnap();
         command.arg("mesh").arg(path("human.ply")).arg("-o").arg(path(name));
         let said = succeed(command.args(["--faces", "12000", "-v", "--device", "cpu"]));
@@ -97,11 +103,11 @@ fn a_shell_becomes_one_closed_surface_of_its_size_and_colours_in_every_kind_of_f
         let found = volume(&mesh);
         // Gaussians have some thickness, 6 mm here.
         assert!((found / expected - 1.0).abs() < 0.08, "{name}: {found}, expected {expected}");
-        let off = |p: &Vec3| (((*p - CENTRE) / HALF).length() - 1.0).abs() * HALF.min_element();
+        let off = |p: &Vec3| (((*p - centre) / HALF).length() - 1.0).abs() * HALF.min_element();
         let worst = mesh.positions.iter().map(off).fold(0.0, f32::max);
         assert!(worst < 0.012, "{name}: {worst} m off");
         for (p, color) in mesh.positions.iter().zip(&mesh.colors) {
-            let above = p.y - CENTRE.y;
+            let above = p.y - centre.y;
             let expected = if above > 0.0 { Vec3::new(0.1, 0.8, 0.2) } else { Vec3::new(0.8, 0.1, 0.2) };
             assert!(above.abs() < 0.03 || (*color - expected).length() < 0.08, "{name}: {p} is {color}");
         }
@@ -155,6 +161,7 @@ fn meshes_that_cannot_be_are_refused() {
     assert!(mesh("human.ply", "a.ply", &["--texture", "512"]).contains("a PLY has no texture"));
     assert!(mesh("human.ply", "no/such/folder/a.glb", &[]).contains("cannot write"));
     assert!(mesh("human.ply", "a.glb", &["--texture", "3"]).contains("64"));
+    assert!(mesh("human.ply", "a\nb.obj", &[]).contains("must be plain text"));
     // An OBJ's materials lie beside it, where an input may lie.
     fs::copy(path("human.ply"), path("b.mtl")).expect("copied");
     assert!(mesh("b.mtl", "b.obj", &[]).contains("would be overwritten"));

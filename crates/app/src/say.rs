@@ -15,6 +15,20 @@ pub fn err(line: &str) {
     let _ = writeln!(std::io::stderr(), "{}", printable(line));
 }
 
+/// Lines on stdout that are all of the command's result.
+pub fn lines(text: &str) -> Result<(), Failure> {
+    result(format!("{}\n", printable(text)).as_bytes())
+}
+
+/// The same as JSON, in which only strings have control characters.
+pub fn json(text: &str) -> Result<(), Failure> {
+    let escaped = |c: char| match c {
+        c if c.is_control() && c != '\n' => format!("\\u{:04x}", u32::from(c)),
+        c => c.to_string(),
+    };
+    result(text.chars().map(escaped).chain(["\n".into()]).collect::<String>().as_bytes())
+}
+
 /// A text of our own on stdout, as it is: all of the command's result, so that a full disk is told. Whoever reads it may leave.
 pub fn result(text: &[u8]) -> Result<(), Failure> {
     let mut stdout = std::io::stdout();

@@ -191,7 +191,9 @@ fn permissions_of(path: &Path) -> io::Result<Option<fs::Permissions>> {
             Err(io::Error::new(io::ErrorKind::PermissionDenied, "is write-protected"))
         }
         Ok(there) => Ok(Some(there.permissions())),
-        Err(_) => Ok(None),
+        Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(None),
+        // A name that is too long, or a circle of links.
+        Err(e) => Err(e),
     }
 }
 
@@ -347,6 +349,7 @@ mod tests {
         let folder = tempfile::tempdir().expect("temporary folder");
         assert!(check_writable(&folder.path().join("no/such/file")).is_err());
         assert!(check_writable(folder.path()).is_err());
+        assert!(check_writable(&folder.path().join("long".repeat(64))).is_err());
         assert!(check_writable(&folder.path().join("new")).is_ok());
         assert_eq!(fs::read_dir(folder.path()).expect("list").count(), 0);
     }

@@ -211,6 +211,14 @@ impl Stored {
         encoded.map_err(|source| SplatError::Write { path: path.to_owned(), source }).map(|()| bytes)
     }
 
+    /// What a file of this kind would hold less well than its steps let expect: a sentence each.
+    pub fn losses(&self, kind: Kind) -> Vec<String> {
+        match kind {
+            Kind::Ply => Vec::new(),
+            Kind::Spz => spz::losses(self),
+        }
+    }
+
     fn encode(&self, kind: Kind, out: &mut impl Write) -> io::Result<()> {
         match kind {
             Kind::Ply => ply::write(self, out),

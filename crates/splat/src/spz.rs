@@ -125,15 +125,43 @@ pub(crate) fn check(stored: &Stored) -> Result<(), String> {
     Ok(())
 }
 
+/// What an SPZ holds less well than its usual steps: a sentence each. Scales below e⁻¹⁰ m (45 µm) become that, which nobody sees.
+pub(crate) fn losses(stored: &Stored) -> Vec<String> {
+    let mut losses = Vec::new();
+    let bits = fractional_bits(stored);
+    if bits < FRACTIONAL_BITS {
+        let (step, largest) = (1e3 / f64::from(bits).exp2(), largest(stored));
+        losses.push(format!("centres are kept in steps of {step:.1} mm, since one lies {largest:.0} m away"));
+    }
+    let mut count = |columns: Range<usize>, beyond: &dyn Fn(f64) -> bool, text: &str| {
+        let has =
+            |i: &usize| stored.columns[columns.clone()].iter().any(|column| beyond(f64::from(column[*i])));
+        let count = (0..stored.len()).filter(has).count();
+        if count > 0 {
+            losses.push(format!("{count} Gaussians have {text}, and are cut off there"));
+        }
+    };
+    // Half a step beyond the last one is still the last one.
+    let beyond = |step: f64| !(0.0..=255.0).contains(&step.round());
+    count(7..10, &|v| 16.0 * (v + 10.0) > 255.5, "scales beyond 379 m");
+    count(11..14, &|v| beyond(255.0 * (v * f64::from(COLOR_SCALE) + 0.5)), "colours (f_dc) beyond ±3.33");
+    count(14..stored.columns.len(), &|v| v.abs() > 1.0, "spherical harmonics beyond ±1");
+    losses
+}
+
+fn fractional_bits(stored: &Stored) -> u8 {
+    let largest = largest(stored);
+    let fits = |bits: &u8| (largest * f64::from(*bits).exp2()).round() <= MAX_FIXED;
+    (0..=FRACTIONAL_BITS).rev().find(fits).unwrap_or(0)
+}
+
 fn largest(stored: &Stored) -> f64 {
     stored.columns[..3].iter().flatten().fold(0.0, |most, v| most.max(f64::from(v.abs())))
 }
 
 /// Writes a gzip stream; [`check`] has been asked before.
 pub(crate) fn write(stored: &Stored, out: &mut impl Write) -> io::Result<()> {
-    let (n, largest) = (stored.len(), largest(stored));
-    let fits = |bits: &u8| (largest * f64::from(*bits).exp2()).round() <= MAX_FIXED;
-    let bits = (0..=FRACTIONAL_BITS).rev().find(fits).unwrap_or(0);
+    let (n, bits) = (stored.len(), fractional_bits(stored));
     let mut out = GzEncoder::new(out, Compression::best());
     out.write_all(&MAGIC.to_le_bytes())?;
     out.write_all(&VERSION.to_le_bytes())?;
@@ -279,145 +307,4 @@ fn packed(wxyz: [f32; 4]) -> u32 {
 }
 
 #[cfg(test)]
-mod tests {
-    use std::fs;
-    use std::path::PathBuf;
-
-    use serde_json::Value;
-
-    use super::*;
-
-    /// Files of Niantic's library, made by docs/spz_reference.mjs, and what went into it and came out of it.
-    fn reference(name: &str) -> (Vec<u8>, Value) {
-        let folder = PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/data/spz"));
-        let bytes = fs::read(folder.join(format!("{name}.spz"))).expect("a file");
-        let text = fs::read_to_string(folder.join(format!("{name}.json"))).unwrap_or_else(|_| "null".into());
-        (bytes, serde_json::from_str(&text).expect("JSON"))
-    }
-
-    /// Niantic's lists as columns of ours.
-    fn stored(values: &Value, degree: u64) -> Stored {
-        let list = |key: &str| -> Vec<f32> {
-            values[key]
-                .as_array()
-                .expect("a list")
-                .iter()
-                .map(|v| v.as_f64().expect("a number") as f32)
-                .collect()
-        };
-        let column = |all: &[f32], width: usize, at: usize| -> Vec<f32> {
-            all.iter().skip(at).step_by(width).copied().collect()
-        };
-        let [positions, rotations, scales, colors, bands] =
-            ["positions", "rotations", "scales", "colors", "sh"].map(list);
-        let mut columns: Vec<Vec<f32>> = (0..3).map(|axis| column(&positions, 3, axis)).collect();
-        columns.extend([3, 0, 1, 2].map(|at| column(&rotations, 4, at)));
-        columns.extend((0..3).map(|axis| column(&scales, 3, axis)));
-        columns.push(list("alphas"));
-        columns.extend((0..3).map(|channel| column(&colors, 3, channel)));
-        let coefficients = COEFFICIENTS[degree as usize];
-        for channel in 0..3 {
-            let bands = |band: usize| column(&bands, 3 * (coefficients - 1), 3 * band + channel);
-            columns.extend((0..coefficients - 1).map(bands));
-        }
-        Stored { coefficients, columns }
-    }
-
-    fn content(gzip: &[u8]) -> Vec<u8> {
-        let mut bytes = Vec::new();
-        GzDecoder::new(gzip).read_to_end(&mut bytes).expect("a gzip stream");
-        bytes
-    }
-
-    #[test]
-    fn niantics_files_are_read_as_niantics_library_reads_them() {
-        for name in ["v2_degree0", "v3_degree0", "v3_degree3"] {
-            let (bytes, values) = reference(name);
-            let degree = values["degree"].as_u64().expect("a degree");
-            let expected = stored(&values["output"], degree);
-            let found = read(&bytes[..]).unwrap_or_else(|_| panic!("{name}"));
-            assert_eq!(found.degree() as u64, degree);
-            assert_eq!(found.columns.len(), expected.columns.len());
-            for (row, (found, expected)) in found.columns.iter().zip(&expected.columns).enumerate() {
-                for (a, b) in found.iter().zip(expected) {
-                    assert!((a - b).abs() < 2e-5, "{name}, column {row}: {a}, expected {b}");
-                }
-            }
-        }
-    }
-
-    #[test]
-    fn what_is_written_is_what_niantics_library_writes() {
-        for name in ["v3_degree0", "v3_degree3"] {
-            let (expected, values) = reference(name);
-            let mut bytes = Vec::new();
-            let stored = stored(&values["input"], values["degree"].as_u64().expect("a degree"));
-            write(&stored, &mut bytes).expect("written");
-            let (found, expected) = (content(&bytes), content(&expected));
-            assert_eq!(found.len(), expected.len(), "{name}");
-            let other = found.iter().zip(&expected).filter(|(a, b)| a.abs_diff(**b) > 0).count();
-            // Rounding in f32 and f64 differs where a value lies in the middle of two steps.
-            assert!(other * 100 <= found.len(), "{name}: {other} of {} bytes differ", found.len());
-        }
-    }
-
-    #[test]
-    fn what_is_no_spz_or_a_damaged_one_is_refused() {
-        let problem = |bytes: &[u8]| match read(bytes) {
-            Ok(_) => panic!("was read"),
-            Err(Problem::Content(problem)) => problem,
-            Err(Problem::Io(e)) => panic!("{e}"),
-        };
-        let (good, _) = reference("v3_degree3");
-        let packed = |content: &[u8]| {
-            let mut out = GzEncoder::new(Vec::new(), Compression::fast());
-            out.write_all(content).expect("packed");
-            out.finish().expect("packed")
-        };
-        let changed = |at: usize, value: u8| {
-            let mut bytes = content(&good);
-            bytes[at] = value;
-            packed(&bytes)
-        };
-        assert!(problem(&packed(b"hello, this is a text")).contains("no SPZ"));
-        assert!(problem(&changed(4, 9)).contains("version 9"));
-        assert!(problem(&changed(11, 0x7f)).contains("at most"));
-        assert!(problem(&changed(12, 5)).contains("degree 5"));
-        assert!(problem(&changed(13, 25)).contains("25 bits"));
-        assert!(problem(&changed(8, 25)).contains("too early"));
-        assert!(problem(&good[..good.len() / 2]).contains("gzip stream is cut"));
-        assert!(problem(&GZIP).contains("gzip stream is cut"));
-        let mut sum = good.clone();
-        let at = sum.len() - 6;
-        sum[at] ^= 1;
-        assert!(problem(&sum).contains("damaged"));
-        // Nothing is taken for what a header merely promises.
-        let mut header = content(&good)[..16].to_vec();
-        header[8..12].copy_from_slice(&10_000_000_u32.to_le_bytes());
-        assert!(problem(&packed(&header)).contains("0 of 90000000 bytes"));
-    }
-
-    #[test]
-    fn quaternions_of_any_length_and_sign_keep_their_rotation() {
-        for q in [[1.0, 0.0, 0.0, 0.0], [-3.0, 0.1, -0.2, 0.4], [0.0, -0.5, 0.5, 1e-6], [0.0; 4]] {
-            let length = q.iter().map(|v: &f32| v * v).sum::<f32>().sqrt();
-            let expected = if length > 0.0 { q.map(|v| v / length) } else { [1.0, 0.0, 0.0, 0.0] };
-            let found = smallest_three(packed(q));
-            let cosine: f32 = found.iter().zip(expected).map(|(a, b)| a * b).sum();
-            assert!(cosine.abs() > 0.999_99, "{q:?}: {found:?}");
-        }
-    }
-
-    #[test]
-    fn far_away_places_get_coarser_steps() {
-        let mut values = stored(&reference("v3_degree0").1["input"], 0);
-        values.columns[0][0] = -70_000.0;
-        let mut bytes = Vec::new();
-        write(&values, &mut bytes).expect("written");
-        let Ok(found) = read(&bytes[..]) else { panic!("was written just now") };
-        assert!((found.columns[0][0] + 70_000.0).abs() < 0.01);
-        assert!((found.columns[1][0] - values.columns[1][0]).abs() <= 0.5 / 64.0);
-        values.columns[0][0] = 1e7;
-        assert!(check(&values).expect_err("too far").contains("8,388 km"));
-    }
-}
+mod tests;

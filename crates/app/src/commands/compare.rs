@@ -76,14 +76,12 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let lpips = arguments.lpips.load(&arguments.device)?;
     if !arguments.a.is_dir() && !arguments.b.is_dir() {
         let compared = compare(arguments, &arguments.a, &arguments.b, arguments.mask.as_deref(), &lpips)?;
-        let json = || {
+        if arguments.json {
             let mut value = json_of(&compared);
             value["lpips_weights"] = perceptual::describe(&lpips).into();
-            value.to_string()
-        };
-        let text = if arguments.json { json() } else { text_of(&compared, &lpips) };
-        say::out(&text);
-        return Ok(());
+            return say::json(&value.to_string());
+        }
+        return say::lines(&text_of(&compared, &lpips));
     }
     folders(arguments, &lpips)
 }
@@ -122,17 +120,16 @@ fn folders(arguments: &Arguments, lpips: &Result<Lpips, String>) -> Result<(), F
         let pictures: Vec<Value> = compared.iter().map(named).collect();
         let left_out: Vec<Value> =
             left_out.iter().map(|(name, why)| json!({ "name": name, "why": why })).collect();
-        say::out(&json!({
+        let found = json!({
             "pictures": pictures, "mean": mean, "left_out": left_out, "lpips_weights": perceptual::describe(lpips),
-        }).to_string());
+        });
+        say::json(&found.to_string())?;
     } else {
-        for c in &compared {
-            say::out(&format!("{:<24} {}", c.name, line_of(&c.score)));
-        }
-        if let Some(mean) = mean {
-            say::out(&format!("{:<24} {}", format!("mean of {}", compared.len()), line_of(&mean)));
-        }
-        say::out(&format!("LPIPS: {}", perceptual::describe(lpips)));
+        let line = |name: &str, score: &Score| format!("{name:<24} {}", line_of(score));
+        let mut lines: Vec<String> = compared.iter().map(|c| line(&c.name, &c.score)).collect();
+        lines.extend(mean.map(|mean| line(&format!("mean of {}", compared.len()), &mean)));
+        lines.push(format!("LPIPS: {}", perceptual::describe(lpips)));
+        say::lines(&lines.join("\n"))?;
         left_out.iter().for_each(|(name, why)| say::err(&format!("left out: {name}: {why}")));
     }
     match (compared.len(), left_out.len()) {

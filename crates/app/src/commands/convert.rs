@@ -6,7 +6,7 @@ use clap::Args;
 use snapsnap_splat::file;
 use snapsnap_splat::scene::{Kind, Stored};
 
-use super::check_outputs;
+use super::{check_kind, check_outputs};
 use crate::failure::Failure;
 use crate::say;
 
@@ -20,10 +20,7 @@ pub struct Arguments {
 
 pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let Arguments { input, output } = arguments;
-    if Kind::named(output).is_none() && !file::is_special(output) {
-        let message = "is neither .ply nor .spz; the extension says what to write";
-        return Err(Failure::Input(format!("{}: {message}", output.display())));
-    }
+    check_kind(output)?;
     check_outputs(&[output], &[input])?;
     let (stored, dropped) = finite(input)?;
     stored.write(output)?;
@@ -37,6 +34,9 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
             "{}: {dropped} Gaussians with values that are not finite were left out",
             input.display()
         ));
+    }
+    for loss in stored.losses(Kind::of(output)) {
+        say(&format!("{}: {loss}", output.display()));
     }
     let size = |path: &PathBuf| std::fs::metadata(path).map_or(0.0, |metadata| metadata.len() as f64 / 1e6);
     say(&format!(

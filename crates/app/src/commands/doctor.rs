@@ -74,35 +74,31 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
             "weights": weights.iter().map(weight).collect::<Vec<Value>>(),
             "missing": missing.iter().map(|m| json!({ "what": m.what, "mend": m.mend })).collect::<Vec<Value>>(),
         });
-        say::out(&serde_json::to_string_pretty(&report).expect("JSON of our own"));
+        say::json(&format!("{report:#}"))?;
         return broken(&weights);
     }
-    say::out(&format!("snapsnap {}, commit {}", env!("CARGO_PKG_VERSION"), env!("SNAPSNAP_COMMIT")));
-    say::out(&format!("compiled in  {}", device::compiled_in().join(", ")));
-    say::out(&format!("threads      {}", threads()));
-    say::out(&format!("memory       {}", gigabytes(memory)));
-    say::out("devices");
-    for found in &devices {
+    let mut lines = vec![
+        format!("snapsnap {}, commit {}", env!("CARGO_PKG_VERSION"), env!("SNAPSNAP_COMMIT")),
+        format!("compiled in  {}", device::compiled_in().join(", ")),
+        format!("threads      {}", threads()),
+        format!("memory       {}", gigabytes(memory)),
+        "devices".into(),
+    ];
+    lines.extend(devices.iter().map(|found| {
         let mark = if found.name == chosen { "*" } else { " " };
         let software = if found.software { ", software" } else { "" };
         let memory = found.memory.map(|bytes| format!(", {}", gigabytes(bytes))).unwrap_or_default();
-        say::out(&format!(
-            "{mark} {:<10} {} ({}{software}{memory})",
-            found.name, found.adapter, found.backend
-        ));
-    }
-    say::out(&format!("  --device auto takes {chosen}: {why}"));
-    say::out("weights");
-    for w in &weights {
-        match &w.state {
-            Ok(text) => say::out(&format!("  {}: sound, {text}", w.name)),
-            Err(text) => say::out(&format!("! {}: {text}", w.name)),
-        }
-    }
-    say::out(if missing.is_empty() { "nothing is missing" } else { "what could be better" });
-    for Missing { what, mend } in &missing {
-        say::out(&format!("  {what}\n    {mend}"));
-    }
+        format!("{mark} {:<10} {} ({}{software}{memory})", found.name, found.adapter, found.backend)
+    }));
+    lines.push(format!("  --device auto takes {chosen}: {why}"));
+    lines.push("weights".into());
+    lines.extend(weights.iter().map(|w| match &w.state {
+        Ok(text) => format!("  {}: sound, {text}", w.name),
+        Err(text) => format!("! {}: {text}", w.name),
+    }));
+    lines.push(if missing.is_empty() { "nothing is missing" } else { "what could be better" }.into());
+    lines.extend(missing.iter().map(|Missing { what, mend }| format!("  {what}\n    {mend}")));
+    say::lines(&lines.join("\n"))?;
     broken(&weights)
 }
 

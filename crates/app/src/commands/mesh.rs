@@ -84,6 +84,11 @@ impl Target {
             let message = "is neither .glb nor .obj nor .ply; the extension says what to write";
             return Err(Failure::Input(format!("{}: {message}", path.display())));
         }
+        let name = path.file_name().unwrap_or_default().to_str();
+        if Kind::named(path) == Some(Kind::Obj) && name.is_none_or(|name| name.contains(char::is_control)) {
+            let message = "an OBJ names its materials' file, so its own name must be plain text (UTF-8)";
+            return Err(Failure::Input(format!("{}: {message}", path.display())));
+        }
         let texture = surface.texture.unwrap_or(0) as usize;
         if texture > 0 && Kind::named(path) == Some(Kind::Ply) {
             let message = "a PLY has no texture: leave out --texture, or write a .glb or .obj";

@@ -24,6 +24,7 @@ use std::path::{Component, Path, PathBuf};
 use clap::Args;
 use snapsnap_net::config::Config;
 use snapsnap_splat::file;
+use snapsnap_splat::scene::Kind;
 
 use crate::failure::Failure;
 
@@ -74,6 +75,15 @@ pub fn check_outputs(outputs: &[&Path], inputs: &[&Path]) -> Result<(), Failure>
         }
     }
     Ok(())
+}
+
+/// Refuses a file of Gaussians whose extension does not say what to write. A pipe or a device without one gets a PLY.
+pub fn check_kind(path: &Path) -> Result<(), Failure> {
+    if Kind::named(path).is_some() || file::is_special(path) {
+        return Ok(());
+    }
+    let message = "is neither .ply nor .spz; the extension says what to write";
+    Err(Failure::Input(format!("{}: {message}", path.display())))
 }
 
 /// Refuses a folder to write into that lies in a data set (roots), before it is made: an empty folder among a data set's would be

@@ -11,7 +11,7 @@ use snapsnap_net::{Photograph, Reconstructor};
 use snapsnap_splat::{file, scene};
 
 use super::mesh::{SurfaceArguments, Target, told};
-use super::{ConfigArguments, check_outputs, is_same_file};
+use super::{ConfigArguments, check_kind, check_outputs, is_same_file};
 use crate::failure::Failure;
 use crate::progress::Progress;
 use crate::turntable::Turntable;
@@ -181,6 +181,7 @@ fn check_paths(
     let pictures = turntable.map(Turntable::outputs).unwrap_or_default();
     outputs.extend(pictures.iter().map(PathBuf::as_path));
     check_outputs(&outputs, &inputs)?;
+    check_kind(&arguments.output)?;
     Ok(config_path)
 }
 

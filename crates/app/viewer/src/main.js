@@ -10,6 +10,11 @@ const canvas = element("canvas");
 
 const renderer = new THREE.WebGLRenderer({ canvas, antialias: false });
 const scene = new THREE.Scene();
+// Drawn is what has changed: a page that nobody touches costs nothing.
+let changed = true;
+const redraw = () => {
+  changed = true;
+};
 // The kernel of the program's own rasteriser: 0.3 pixels² wider and no less opaque, to where alpha falls below 1/255.
 const spark = new SparkRenderer({
   renderer,
@@ -18,6 +23,8 @@ const spark = new SparkRenderer({
   maxStdDev: 3,
   minAlpha: 1 / 255,
   sortRadial: false,
+  // Sorted for a camera once that has been drawn.
+  onDirty: redraw,
 });
 inBatches(spark);
 scene.add(spark);
@@ -33,6 +40,29 @@ const controls = new OrbitControls(camera, canvas);
 controls.enableDamping = true;
 controls.listenToKeyEvents(canvas);
 
+/** Frames without a visible move after which the camera is held: damping alone never quite ends. */
+const REST = 60;
+let still = 0;
+let pressed = false;
+controls.addEventListener("change", () => {
+  still = 0;
+  redraw();
+});
+controls.addEventListener("start", () => {
+  pressed = true;
+});
+controls.addEventListener("end", () => {
+  pressed = false;
+  still = 0;
+});
+
+/** Ends what a drag has left to run. */
+function hold() {
+  controls.enableDamping = false;
+  controls.update();
+  controls.enableDamping = true;
+}
+
 /** Where the camera looks and from how far: from the person's box, so that anybody, of any size, is whole in the picture. */
 let view = { centre: CENTRE.clone(), distance: DISTANCE };
 
@@ -41,12 +71,10 @@ function lookFrom(yawDegrees) {
   const away = new THREE.Vector3(Math.cos(PITCH) * Math.sin(yaw), Math.sin(PITCH), Math.cos(PITCH) * Math.cos(yaw));
   // A window that is higher than wide shows less of the sides.
   const distance = view.distance * Math.max(1, 0.45 / camera.aspect);
+  hold();
   controls.target.copy(view.centre);
   camera.position.copy(view.centre).addScaledVector(away, distance);
-  // No drift of an earlier drag.
-  controls.enableDamping = false;
   controls.update();
-  controls.enableDamping = true;
 }
 
 /** The box of what is not nearly transparent, without the outermost few, which may fly about. */
@@ -91,8 +119,14 @@ function resize() {
   renderer.setSize(window.innerWidth, window.innerHeight, false);
   camera.aspect = window.innerWidth / window.innerHeight;
   camera.updateProjectionMatrix();
+  redraw();
 }
 window.addEventListener("resize", resize);
+canvas.addEventListener("webglcontextrestored", () => {
+  // What Spark had made of the Gaussians is gone.
+  shown?.updateVersion();
+  redraw();
+});
 resize();
 
 function say(text) {
@@ -131,6 +165,7 @@ async function show(what, read) {
   scene.add(mesh);
   frame(bounds(mesh));
   lookFrom(0);
+  redraw();
   element("name").textContent = name;
   const count = (mesh.extSplats ?? mesh.packedSplats).numSplats;
   element("count").textContent = `${count.toLocaleString("en")} Gaussians`;
@@ -165,6 +200,7 @@ for (const button of document.querySelectorAll("button[data-yaw]")) {
 
 function background() {
   scene.background = new THREE.Color(element("background").value);
+  redraw();
 }
 element("background").addEventListener("input", background);
 
@@ -207,17 +243,32 @@ element("camera").addEventListener("click", () => {
   save(new Blob([JSON.stringify([cameraEntry()], null, 1)], { type: "application/json" }), "cameras.json");
 });
 
+// Frames that followed one another, and how long they took, milliseconds.
 let drawn = 0;
-let since = performance.now();
-renderer.setAnimationLoop(() => {
+let busy = 0;
+let last = null;
+renderer.setAnimationLoop((now) => {
   controls.update();
+  still += pressed ? 0 : 1;
+  if (still === REST) {
+    hold();
+    redraw();
+  }
+  if (!changed) {
+    last = null;
+    return;
+  }
+  changed = false;
   renderer.render(scene, camera);
-  drawn += 1;
-  const now = performance.now();
-  if (now - since > 1000) {
-    element("rate").textContent = `${Math.round((1000 * drawn) / (now - since))} frames/s`;
+  if (last !== null) {
+    drawn += 1;
+    busy += now - last;
+  }
+  last = now;
+  if (busy > 1000) {
+    element("rate").textContent = `${Math.round((1000 * drawn) / busy)} frames/s`;
     drawn = 0;
-    since = now;
+    busy = 0;
   }
 });
 

@@ -79,8 +79,9 @@ pub fn svg(axes: &Axes, series: &[Series]) -> String {
                 }
             };
         }
-        if axes.log {
-            let least = all.iter().map(|p| p.0).fold(f64::MAX, f64::min);
+        let least = all.iter().map(|p| p.0).fold(f64::MAX, f64::min);
+        // Ticks are powers of ten: within one of them there is none.
+        if axes.log && right >= 10.0 * least {
             draw!((0.8 * least..1.2 * right).log_scale());
         } else {
             draw!(left..right);
@@ -104,5 +105,15 @@ mod tests {
         assert_eq!(drawn.matches("<circle").count(), 3, "{drawn}");
         assert!(drawn.contains("a &lt; b"));
         assert_eq!(svg(&axes, &series(vec![(f64::INFINITY, 1.0)])), "");
+    }
+
+    #[test]
+    fn a_logarithmic_axis_has_ticks_within_a_power_of_ten_too() {
+        let axes = Axes { caption: "c", x: "x", y: "y", log: true };
+        let drawn = |last: f64| {
+            svg(&axes, &[Series { name: "n".into(), points: vec![(3000.0, 1.0), (last, 2.0)], line: true }])
+        };
+        assert!(drawn(4800.0).contains("3600.0"), "{}", drawn(4800.0));
+        assert!(!drawn(90_000.0).contains("3600.0") && drawn(90_000.0).contains("10000.0"));
     }
 }

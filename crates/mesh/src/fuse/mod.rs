@@ -10,6 +10,7 @@ mod views;
 use std::collections::HashMap;
 use std::sync::Arc;
 
+use burn::tensor::{Tensor, TensorData};
 use glam::{DVec3, USizeVec3, Vec3};
 use image::RgbImage;
 use rayon::prelude::*;
@@ -102,6 +103,28 @@ const FEWEST: usize = 50;
 /// [`FuseError`].
 pub fn fuse(scene: &Loaded, options: Options, stage: &dyn Fn(&str)) -> Result<Fused, FuseError> {
     let (low, high) = bounds(&scene.gaussians)?;
+    // Around the origin f32 is finest: people in the coordinates of a survey lie far from it.
+    let away = (0.5 * low + 0.5 * high).round();
+    let mut fused = fuse_here(&moved(scene, -away), (low - away, high - away), options, stage)?;
+    fused.mesh.positions.iter_mut().for_each(|place| *place += away);
+    Ok(fused)
+}
+
+/// The same somewhere else.
+fn moved(scene: &Loaded, by: Vec3) -> Loaded {
+    let mut moved = scene.clone();
+    let means = &mut moved.gaussians.means;
+    let by = Tensor::<1>::from_floats(by.to_array(), &means.device()).unsqueeze::<2>();
+    *means = means.clone() + by;
+    moved
+}
+
+fn fuse_here(
+    scene: &Loaded,
+    (low, high): (Vec3, Vec3),
+    options: Options,
+    stage: &dyn Fn(&str),
+) -> Result<Fused, FuseError> {
     let size = high - low;
     let cell = size.max_element() / CUBES;
     // The border stays outside.
@@ -118,9 +141,10 @@ pub fn fuse(scene: &Loaded, options: Options, stage: &dyn Fn(&str)) -> Result<Fu
 
     stage("distance field");
     let mut grid = Grid { origin: low - margin, cell, counts, values: Vec::new() };
-    let all = (0..counts.element_product()).into_par_iter();
+    // Along a row, view by view: neighbours lie beside one another in a picture, and a cache, too.
+    let rows = (0..counts.y * counts.z).into_par_iter();
     let (values, closed): (Vec<f32>, Vec<bool>) =
-        all.map(|row| distance(grid.place(row), cell, &views)).unzip();
+        rows.flat_map_iter(|row| distances(&grid, row * counts.x, &views)).unzip();
     grid.values = closed.iter().map(|closed| if *closed { -1.0 } else { 1.0 }).collect();
     let closed = grid.bodies();
     grid.values = values;
@@ -192,39 +216,62 @@ fn textured(
     Ok(())
 }
 
-/// Signed distance of a place from the surface, truncated: the mean of what the views say that meet it squarely enough. And
-/// whether it counts as inside though a few views see through it.
-fn distance(place: Vec3, cell: f32, views: &[View]) -> (f32, bool) {
-    let reach = TRUNCATION * cell;
-    let (mut sum, mut weight, mut free) = (0.0, 0.0, 0_u8);
-    for view in views {
-        match view.see(place) {
+/// What views say of a place.
+#[derive(Default, Clone, Copy)]
+struct Heard {
+    sum: f32,
+    weight: f32,
+    free: u8,
+}
+
+impl Heard {
+    fn hear(&mut self, seen: Seen, reach: f32) {
+        match seen {
             Seen::Unknown => {}
             Seen::Free => {
-                sum += reach;
-                weight += 1.0;
-                free = free.saturating_add(1);
+                self.sum += reach;
+                self.weight += 1.0;
+                self.free = self.free.saturating_add(1);
             }
             // Behind the surface nothing is known.
             Seen::Surface { distance, .. } if distance < -reach => {}
             Seen::Surface { distance, facing } => {
                 // Along the ray to along the normal.
                 let apart = (distance * facing).min(reach);
-                sum += facing * apart;
-                weight += facing;
-                free = free.saturating_add(u8::from(apart >= reach));
+                self.sum += facing * apart;
+                self.weight += facing;
+                self.free = self.free.saturating_add(u8::from(apart >= reach));
             }
         }
     }
-    let mean = if weight > 0.0 { sum / weight } else { -reach };
-    // Within reach of a surface its own distance decides.
-    let gap = mean >= 0.99 * reach && free < FREE_VIEWS;
-    (if gap { -reach } else { mean }, gap)
+
+    /// Signed distance from the surface, truncated: the mean of what the views say that meet it squarely enough. And whether the
+    /// place counts as inside though a few views see through it.
+    fn distance(self, reach: f32) -> (f32, bool) {
+        let mean = if self.weight > 0.0 { self.sum / self.weight } else { -reach };
+        // Within reach of a surface its own distance decides.
+        let gap = mean >= 0.99 * reach && self.free < FREE_VIEWS;
+        (if gap { -reach } else { mean }, gap)
+    }
+}
+
+/// Distances of the row of corners along x that begins with `first`.
+fn distances(grid: &Grid, first: usize, views: &[View]) -> impl Iterator<Item = (f32, bool)> {
+    let reach = TRUNCATION * grid.cell;
+    let start = grid.place(first);
+    let mut heard = vec![Heard::default(); grid.counts.x];
+    for view in views {
+        for (x, heard) in heard.iter_mut().enumerate() {
+            let place = Vec3 { x: start.x + grid.cell * x as f32, ..start };
+            heard.hear(view.see(place), reach);
+        }
+    }
+    heard.into_iter().map(move |heard| heard.distance(reach))
 }
 
 /// The box of the Gaussians that make the body.
 fn bounds(gaussians: &Gaussians) -> Result<(Vec3, Vec3), FuseError> {
-    let host = |data: burn::tensor::TensorData| -> Vec<f32> {
+    let host = |data: TensorData| -> Vec<f32> {
         data.convert::<f32>().try_into_vec().expect("converted to f32 on this very line")
     };
     let opacities = host(gaussians.opacities.to_data());

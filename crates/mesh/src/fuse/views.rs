@@ -97,9 +97,10 @@ impl View {
     /// The pixel of a place and its depth.
     fn pixel(&self, place: Vec3) -> Option<(usize, f32)> {
         let p = self.projection.transform_point3(place);
-        let (x, y) = ((p.x / p.z).floor(), (p.y / p.z).floor());
+        let (x, y) = (p.x / p.z, p.y / p.z);
         let side = self.side as f32;
         let within = p.z > 0.0 && x >= 0.0 && y >= 0.0 && x < side && y < side;
+        // What is not below 0 is rounded down like this.
         within.then(|| (y as usize * self.side as usize + x as usize, p.z))
     }
 
