@@ -125,11 +125,12 @@ impl Target {
 /// How a surface came about.
 pub fn told(fused: &Fused) -> String {
     format!(
-        "surface from a field of {:.1} mm: {} gaps between the shells closed, {} hollows filled, {} flying pieces dropped; \
-         {} triangles reduced to {}",
+        "surface from a field of {:.1} mm: {} gaps between the shells closed, {} hollows filled, {} parts joined with the body, \
+         {} flying pieces dropped; {} triangles reduced to {}",
         1e3 * fused.cell,
         fused.closed,
         fused.filled,
+        fused.joined,
         fused.dropped,
         fused.faces,
         fused.mesh.faces.len()

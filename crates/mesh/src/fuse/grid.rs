@@ -42,7 +42,7 @@ impl Grid {
             + self.cell * Vec3::new((row % nx) as f32, (row / nx % ny) as f32, (row / (nx * ny)) as f32)
     }
 
-    fn strides(&self) -> [usize; 3] {
+    pub(super) fn strides(&self) -> [usize; 3] {
         [1, self.counts.x, self.counts.x * self.counts.y]
     }
 
@@ -53,7 +53,7 @@ impl Grid {
     }
 
     /// Whether the corner lies on the border.
-    fn on_border(&self, row: usize) -> bool {
+    pub(super) fn on_border(&self, row: usize) -> bool {
         let USizeVec3 { x: nx, y: ny, z: nz } = self.counts;
         let at = [row % nx, row / nx % ny, row / (nx * ny)];
         at.iter().zip([nx, ny, nz]).any(|(i, n)| *i == 0 || i + 1 == n)
@@ -61,7 +61,7 @@ impl Grid {
 
     /// For every corner which piece of connected ones with the same sign it is in, from 0, and how many corners each piece has.
     /// Connected is what the edges of the tetrahedra connect: by them the surface between two pieces is one.
-    fn pieces(&self) -> (Vec<u32>, Vec<usize>) {
+    pub(super) fn pieces(&self) -> (Vec<u32>, Vec<usize>) {
         let steps = self.steps();
         let mut piece = vec![u32::MAX; self.values.len()];
         let (mut sizes, mut waiting) = (Vec::new(), Vec::new());

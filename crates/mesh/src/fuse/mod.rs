@@ -4,6 +4,7 @@
 mod atlas;
 mod color;
 mod grid;
+mod join;
 mod simplify;
 mod views;
 
@@ -86,6 +87,8 @@ pub struct Fused {
     pub closed: usize,
     /// Hollows inside that were filled.
     pub filled: usize,
+    /// Parts that lay apart from the body and were joined with it.
+    pub joined: usize,
     /// Pieces beside the body that were dropped.
     pub dropped: usize,
     /// Triangles before they were reduced.
@@ -149,6 +152,7 @@ fn fuse_here(
     let closed = grid.bodies();
     grid.values = values;
     (0..SMOOTHED).for_each(|_| grid.smooth());
+    let joined = grid.join_parts();
     let (dropped, filled) = grid.keep_one_body();
 
     stage("surface");
@@ -169,7 +173,7 @@ fn fuse_here(
         stage("texture");
         textured(&mut mesh, scene, (centre, radius), options.texture, cell)?;
     }
-    Ok(Fused { mesh, closed, filled, dropped, faces, cell })
+    Ok(Fused { mesh, closed, filled, joined, dropped, faces, cell })
 }
 
 /// Gives a mesh a texture instead of its positions' colours, which stay where no view shows a place. The ball is that of the body,

@@ -1,0 +1,131 @@
+//! Parts that the Gaussians show apart from the body: a foot below a skirt, a hand beyond a cuff.
+
+use std::collections::VecDeque;
+
+use super::grid::Grid;
+
+/// Pieces of at least this share of the body's corners are parts of it; smaller ones fly beside it.
+const PART: f64 = 0.002;
+/// Parts farther away than so many cubes are no parts.
+const FARTHEST: usize = 32;
+/// Not reached yet.
+const NOWHERE: u32 = u32::MAX;
+
+impl Grid {
+    /// Joins parts with the body by the shortest way through the outside, three cubes thick. Returns how many.
+    pub fn join_parts(&mut self) -> usize {
+        let (piece, sizes) = self.pieces();
+        let mut inside = vec![false; sizes.len()];
+        piece.iter().zip(&self.values).for_each(|(piece, value)| inside[*piece as usize] |= *value < 0.0);
+        let Some(body) = (0..sizes.len()).filter(|i| inside[*i]).max_by_key(|i| sizes[*i]) else { return 0 };
+        let least = PART * sizes[body] as f64;
+        let is_part = |i: usize| inside[i] && i != body && sizes[i] as f64 >= least;
+        let parts = (0..sizes.len()).filter(|i| is_part(*i)).count();
+        let mut waits: Vec<bool> = (0..sizes.len()).map(is_part).collect();
+        if parts == 0 {
+            return 0;
+        }
+        let steps = self.strides();
+        // Outwards from the body, every corner remembers whence it was reached.
+        let mut from = vec![NOWHERE; piece.len()];
+        let mut front = VecDeque::new();
+        let begin = |number: usize, from: &mut [u32], front: &mut VecDeque<(usize, usize)>| {
+            for row in (0..piece.len()).filter(|row| piece[*row] as usize == number) {
+                from[row] = row as u32;
+                front.push_back((row, 0));
+            }
+        };
+        begin(body, &mut from, &mut front);
+        let (mut joined, mut ways) = (0, Vec::new());
+        while let Some((row, far)) = front.pop_front() {
+            if far > FARTHEST || self.on_border(row) {
+                continue;
+            }
+            for next in steps.iter().flat_map(|step| [row - step, row + step]) {
+                if from[next] != NOWHERE {
+                    continue;
+                }
+                from[next] = row as u32;
+                let number = piece[next] as usize;
+                if !waits[number] {
+                    front.push_back((next, far + 1));
+                    continue;
+                }
+                waits[number] = false;
+                joined += 1;
+                let mut back = row;
+                while from[back] as usize != back {
+                    ways.push(back);
+                    back = from[back] as usize;
+                }
+                // What lies beyond the part may be joined with it.
+                begin(number, &mut from, &mut front);
+            }
+        }
+        for row in ways {
+            self.thicken(row);
+        }
+        joined
+    }
+
+    /// Takes a corner and those around it inside.
+    fn thicken(&mut self, row: usize) {
+        if self.on_border(row) {
+            return;
+        }
+        let [x, y, z] = self.strides();
+        for plane in [row - z, row, row + z] {
+            for line in [plane - y, plane, plane + y] {
+                for at in [line - x, line, line + x] {
+                    self.values[at] = self.values[at].min(-0.5 * self.cell);
+                }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::{USizeVec3, Vec3};
+
+    use super::*;
+
+    #[test]
+    fn a_foot_is_joined_with_the_body_and_a_speck_is_not() {
+        const N: usize = 81;
+        let ball = |p: Vec3, centre: Vec3, radius: f32| (p - centre).length() - radius;
+        let cell = 2.0 / (N - 1) as f32;
+        let scene = |feet: &[Vec3]| {
+            let mut grid = Grid {
+                origin: Vec3::NEG_ONE,
+                cell,
+                counts: USizeVec3::splat(N),
+                values: vec![0.0; N * N * N],
+            };
+            for row in 0..grid.values.len() {
+                let p = grid.place(row);
+                let body = ball(p, Vec3::new(0.0, 0.3, 0.0), 0.5);
+                let speck = ball(p, Vec3::new(0.7, 0.7, 0.7), 0.04);
+                let feet = feet.iter().map(|foot| ball(p, *foot, 0.1)).fold(f32::MAX, f32::min);
+                grid.values[row] = body.min(speck).min(feet);
+            }
+            grid
+        };
+        let mut grid = scene(&[]);
+        assert_eq!((grid.join_parts(), grid.keep_one_body()), (0, (1, 0)));
+        // One 20 cubes below the body, the other 20 cubes beside that one.
+        let (one, other) = (Vec3::new(0.0, -0.8, 0.0), Vec3::new(0.7, -0.8, 0.0));
+        let mut grid = scene(&[one, other]);
+        assert_eq!((grid.join_parts(), grid.keep_one_body()), (2, (1, 0)));
+        let inside = |place: Vec3, within: f32| {
+            (0..grid.values.len())
+                .any(|row| grid.values[row] < 0.0 && grid.place(row).distance(place) < within)
+        };
+        assert!(inside(one, cell) && inside(other, cell));
+        // Several ways are equally short.
+        assert!(
+            inside(Vec3::new(0.0, -0.45, 0.0), 4.0 * cell) && inside(Vec3::new(0.35, -0.8, 0.0), 4.0 * cell)
+        );
+        assert!(!inside(Vec3::new(0.35, -0.45, 0.0), 4.0 * cell));
+    }
+}
