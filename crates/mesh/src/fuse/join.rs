@@ -20,9 +20,8 @@ impl Grid {
         let Some(body) = (0..sizes.len()).filter(|i| inside[*i]).max_by_key(|i| sizes[*i]) else { return 0 };
         let least = PART * sizes[body] as f64;
         let is_part = |i: usize| inside[i] && i != body && sizes[i] as f64 >= least;
-        let parts = (0..sizes.len()).filter(|i| is_part(*i)).count();
         let mut waits: Vec<bool> = (0..sizes.len()).map(is_part).collect();
-        if parts == 0 {
+        if !waits.contains(&true) {
             return 0;
         }
         let steps = self.strides();
@@ -68,11 +67,8 @@ impl Grid {
         joined
     }
 
-    /// Takes a corner and those around it inside.
+    /// Takes a corner that is not on the border inside, and those around it.
     fn thicken(&mut self, row: usize) {
-        if self.on_border(row) {
-            return;
-        }
         let [x, y, z] = self.strides();
         for plane in [row - z, row, row + z] {
             for line in [plane - y, plane, plane + y] {

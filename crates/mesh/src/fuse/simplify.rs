@@ -19,10 +19,10 @@ const RINGS: usize = 2;
 /// Tries before the surface is left as it is.
 const TRIES: usize = 40;
 
-/// Reduces a closed surface with colours to about `faces` triangles, which stays closed: every edge has two of them. 0 keeps
-/// all.
+/// Reduces a closed surface of one piece with colours to about `faces` triangles, which stays so: every edge has two of them.
+/// 0 keeps all.
 ///
-/// The library lets edges of thin places fall onto one another. What it tore is left as it was in the next try, so that
+/// The library lets edges of thin places fall onto one another. What it tore, or tore off, is left as it was in the next try, so that
 /// there may be some triangles more than asked for.
 ///
 /// # Errors
@@ -74,21 +74,55 @@ fn reduce(mesh: &Mesh, triangles: &[[u32; 3]], kept: &[bool], faces: usize) -> R
     Ok(reduced.indices.as_chunks::<3>().0.to_vec())
 }
 
-/// Positions at the ends of edges that do not have two triangles which run along them in opposite directions.
+/// Positions at the ends of edges that do not have two triangles which run along them in opposite directions; where there are
+/// none, those of all pieces but the largest.
 fn torn(triangles: &[[u32; 3]]) -> Vec<u32> {
-    // How many triangles run along each edge from its smaller end to its larger one, and how many back.
-    let mut edges: HashMap<(u32, u32), [u8; 2]> = HashMap::with_capacity(3 * triangles.len() / 2);
-    for &[a, b, c] in triangles {
-        for (from, to) in [(a, b), (b, c), (c, a)] {
-            let count = &mut edges.entry((from.min(to), from.max(to))).or_default()[usize::from(from > to)];
-            *count = count.saturating_add(1);
+    let sides = |&[a, b, c]: &[u32; 3]| [(a, b), (b, c), (c, a)];
+    // The triangle that runs along each edge, in each direction.
+    let mut along = HashMap::with_capacity(3 * triangles.len());
+    let mut torn = Vec::new();
+    for (face, triangle) in triangles.iter().enumerate() {
+        for (from, to) in sides(triangle) {
+            if from == to || along.insert((from, to), face).is_some() {
+                torn.extend([from, to]);
+            }
         }
     }
-    let torn = edges.into_iter().filter(|((a, b), count)| *count != [1, 1] || a == b);
-    let mut torn: Vec<u32> = torn.flat_map(|((a, b), _)| [a, b]).collect();
+    torn.extend(
+        along.keys().filter(|&&(from, to)| !along.contains_key(&(to, from))).flat_map(|&(a, b)| [a, b]),
+    );
+    if torn.is_empty() {
+        let across = |face: usize| sides(&triangles[face]).map(|(from, to)| along[&(to, from)]);
+        torn = lesser_pieces(triangles.len(), across).flat_map(|face| triangles[face]).collect();
+    }
     torn.sort_unstable();
     torn.dedup();
     torn
+}
+
+/// The faces that are not in the largest piece. `across` tells a face's neighbours.
+fn lesser_pieces(faces: usize, across: impl Fn(usize) -> [usize; 3]) -> impl Iterator<Item = usize> {
+    let mut piece = vec![usize::MAX; faces];
+    let mut sizes = Vec::new();
+    for first in 0..faces {
+        if piece[first] != usize::MAX {
+            continue;
+        }
+        piece[first] = sizes.len();
+        let (mut waiting, mut size) = (vec![first], 0);
+        while let Some(face) = waiting.pop() {
+            size += 1;
+            for next in across(face) {
+                if piece[next] == usize::MAX {
+                    piece[next] = sizes.len();
+                    waiting.push(next);
+                }
+            }
+        }
+        sizes.push(size);
+    }
+    let largest = (0..sizes.len()).max_by_key(|i| sizes[*i]);
+    (0..faces).filter(move |face| Some(piece[*face]) != largest)
 }
 
 fn compact(mesh: &Mesh, triangles: &[[u32; 3]]) -> Mesh {
@@ -142,11 +176,45 @@ mod tests {
         assert_eq!(simplify(mesh, 0).expect("the same").faces.len(), all);
     }
 
+    /// Beads on threads that hang from a plate: what is torn through where nothing is kept.
+    #[test]
+    fn what_hangs_by_a_thread_stays_in_one_piece() {
+        use crate::fuse::grid::Grid;
+        let n = 96;
+        let counts = glam::USizeVec3::splat(n);
+        let mut grid = Grid { origin: Vec3::ZERO, cell: 1.0, counts, values: vec![1.0; n * n * n] };
+        for row in 0..grid.values.len() {
+            let p = grid.place(row);
+            let (x, z) = ((p.x / 24.0).round(), (p.z / 24.0).round());
+            let thick = 0.7 + 0.2 * x + 3.0 * (p.y * (0.15 + 0.06 * z)).sin().max(0.0);
+            let thread = (p.x - 24.0 * x).hypot(p.z - 24.0 * z) - thick;
+            grid.values[row] = thread.min(p.y - 12.0).max((p - 48.0).abs().max_element() - 42.0);
+        }
+        grid.keep_one_body();
+        let (positions, triangles) = grid.surface();
+        assert!(torn(&triangles).is_empty());
+        let (all, colors) = (triangles.len(), vec![Vec3::ONE; positions.len()]);
+        let reduced = simplify(Mesh::colored(positions, colors, triangles), all / 100).expect("reduced");
+        let reduced: Vec<[u32; 3]> = reduced.faces.iter().map(|face| face.positions).collect();
+        assert!(torn(&reduced).is_empty());
+        assert!(reduced.len() < all / 10, "{} of {all}", reduced.len());
+    }
+
     #[test]
     fn a_hole_is_torn() {
         let closed = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]];
         assert!(torn(&closed).is_empty());
         assert_eq!(torn(&closed[..3]), [0, 2, 3]);
         assert_eq!(torn(&[[0, 1, 2], [0, 1, 2]]), [0, 1, 2]);
+    }
+
+    #[test]
+    fn a_second_piece_is_torn_off() {
+        let closed = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]];
+        // A pyramid beside it, of more triangles; then one that shares a position with it.
+        let pyramid = [[4, 5, 8], [5, 6, 8], [6, 7, 8], [7, 4, 8], [6, 5, 4], [7, 6, 4]];
+        assert_eq!(torn(&[&closed[..], &pyramid].concat()), [0, 1, 2, 3]);
+        let touching = pyramid.map(|face| face.map(|row| if row == 8 { 3 } else { row }));
+        assert_eq!(torn(&[&closed[..], &touching].concat()), [0, 1, 2, 3]);
     }
 }
