@@ -125,8 +125,8 @@ impl Target {
 /// How a surface came about.
 pub fn told(fused: &Fused) -> String {
     format!(
-        "surface from a field of {:.1} mm: {} gaps between the shells closed, {} hollows filled, {} parts joined with the body, \
-         {} flying pieces dropped; {} triangles reduced to {}",
+        "surface from a field of {:.1} mm: gaps between the shells closed: {}, hollows filled: {}, \
+         parts joined with the body: {}, flying pieces dropped: {}; {} triangles reduced to {}",
         1e3 * fused.cell,
         fused.closed,
         fused.filled,

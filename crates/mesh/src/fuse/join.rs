@@ -1,6 +1,6 @@
 //! Parts that the Gaussians show apart from the body: a foot below a skirt, a hand beyond a cuff.
 
-use std::collections::VecDeque;
+use std::collections::{HashMap, VecDeque};
 
 use super::grid::Grid;
 
@@ -28,10 +28,16 @@ impl Grid {
         // Outwards from the body, every corner remembers whence it was reached.
         let mut from = vec![NOWHERE; piece.len()];
         let mut front = VecDeque::new();
+        let mut rows: HashMap<usize, Vec<usize>> = HashMap::new();
+        for (row, number) in piece.iter().map(|number| *number as usize).enumerate() {
+            if waits[number] || number == body {
+                rows.entry(number).or_default().push(row);
+            }
+        }
         let begin = |number: usize, from: &mut [u32], front: &mut VecDeque<(usize, usize)>| {
-            for row in (0..piece.len()).filter(|row| piece[*row] as usize == number) {
-                from[row] = row as u32;
-                front.push_back((row, 0));
+            for row in &rows[&number] {
+                from[*row] = *row as u32;
+                front.push_back((*row, 0));
             }
         };
         begin(body, &mut from, &mut front);
