@@ -236,11 +236,11 @@ fn tetrahedron(
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
 
     /// Every edge has two faces that run along it in opposite directions.
-    fn is_closed(faces: &[[u32; 3]]) -> bool {
+    pub fn is_closed(faces: &[[u32; 3]]) -> bool {
         let mut edges = HashMap::new();
         for f in faces {
             for (a, b) in [(f[0], f[1]), (f[1], f[2]), (f[2], f[0])] {
@@ -260,7 +260,7 @@ mod tests {
         grid
     }
 
-    fn volume(positions: &[Vec3], faces: &[[u32; 3]]) -> f64 {
+    pub fn volume(positions: &[Vec3], faces: &[[u32; 3]]) -> f64 {
         let corner = |row: u32| positions[row as usize].as_dvec3();
         faces.iter().map(|f| corner(f[0]).dot(corner(f[1]).cross(corner(f[2]))) / 6.0).sum()
     }

@@ -5,6 +5,7 @@ mod atlas;
 mod color;
 mod grid;
 mod join;
+mod manifold;
 mod simplify;
 mod views;
 
