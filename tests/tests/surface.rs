@@ -9,7 +9,7 @@ use glam::Vec3;
 use snapsnap_mesh::import;
 use snapsnap_mesh::mesh::Mesh;
 use snapsnap_splat::{Gaussians, scene};
-use snapsnap_tests::{refused, snapsnap, succeed};
+use snapsnap_tests::{refused, root, snapsnap, succeed};
 
 /// A shell of round Gaussians: an upright ellipsoid of half axes `half` around `centre`, green above its middle and red below.
 fn shell(n: usize, half: Vec3, centre: Vec3) -> (Vec<f32>, Vec<f32>) {
@@ -143,6 +143,31 @@ fn a_texture_has_the_colours_of_the_places_it_lies_on() {
         looked_at += 1;
     }
     assert!(looked_at > 3000);
+}
+
+/// Fringes and fingers of a person fall onto one another when there are few triangles.
+#[test]
+fn a_person_of_few_triangles_is_one_closed_surface() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let here = || {
+        let mut command = snapsnap();
+        command.current_dir(temporary.path());
+        command
+    };
+    let pictures = ["front.png", "back.png"].map(|name| root().join("assets/sample").join(name));
+    let mut command = here();
+    command.arg("reconstruct").args(pictures).args(["--set", "network.resolution=512", "--device", "cpu"]);
+    succeed(command.args(["--mesh", "few.ply", "--faces", "20000"]));
+    succeed(here().args(["mesh", "human.ply", "-o", "all.ply", "--faces", "0", "--device", "cpu"]));
+    let [few, all] = ["few.ply", "all.ply"].map(|name| {
+        let mesh = import::read(&temporary.path().join(name)).expect("a mesh");
+        check_closed(&mesh);
+        mesh
+    });
+    assert!((15_000..25_000).contains(&few.faces.len()), "{}", few.faces.len());
+    assert!(all.faces.len() > 100_000, "{}", all.faces.len());
+    let (few, all) = (volume(&few), volume(&all));
+    assert!((few / all - 1.0).abs() < 0.05, "{few} m³ instead of {all}");
 }
 
 #[test]
