@@ -27,7 +27,7 @@ const PAGES: [&str; 12] = [
     "datasets/README.md",
 ];
 /// Tasks of `cargo xtask` that are no commands of the program; the suite itself and its neighbours.
-const TASKS: [&str; 5] = ["test", "lint", "fuzz", "bundle", "help"];
+const TASKS: [&str; 6] = ["test", "lint", "dist", "fuzz", "bundle", "help"];
 /// Writes the command line that a shell would start: arguments end with one sign, commands with another.
 const RECORDER: &str = r#"set -eu
 record() { { printf '%s\037' "$@"; printf '\036'; } >> "$COMMANDS"; }
