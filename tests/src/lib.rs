@@ -5,6 +5,7 @@
 pub mod browser;
 #[cfg(target_os = "linux")]
 pub mod fuzz;
+pub mod ply;
 pub mod scenes;
 pub mod server;
 

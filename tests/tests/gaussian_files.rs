@@ -1,4 +1,4 @@
-//! Files of Gaussians from one kind into another.
+//! Files of Gaussians: what is read from them, and from one kind into another.
 
 use std::fs;
 use std::path::Path;
@@ -6,35 +6,14 @@ use std::path::Path;
 use burn::tensor::Device;
 use snapsnap_splat::Gaussians;
 use snapsnap_splat::scene::{self, Stored};
+use snapsnap_tests::ply::{Format, cloud, ply_bytes};
 use snapsnap_tests::{data, refused, snapsnap, succeed, values};
 
 /// A PLY of `n` Gaussians with spherical harmonics of degree 1.
 fn ply(path: &Path, n: usize, bad: Option<usize>) {
-    let rest: Vec<String> = (0..9).map(|i| format!("f_rest_{i}")).collect();
-    let names = [
-        "x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2", "rot_0",
-        "rot_1", "rot_2", "rot_3",
-    ];
-    let names: Vec<&str> = names.into_iter().chain(rest.iter().map(String::as_str)).collect();
-    let mut text = format!("ply\nformat ascii 1.0\nelement vertex {n}\n");
-    names.iter().for_each(|name| text += &format!("property float {name}\n"));
-    text += "end_header\n";
-    for i in 0..n {
-        let value = |column: usize| {
-            let wave = ((i * 31 + column * 17) as f32).sin();
-            match column {
-                0 if bad == Some(i) => "nan".into(),
-                6 => (4.0 * wave).to_string(),
-                7..=9 => (wave - 5.0).to_string(),
-                10 => "1".into(),
-                14.. => (0.4 * wave).to_string(),
-                _ => wave.to_string(),
-            }
-        };
-        text += &(0..names.len()).map(value).collect::<Vec<String>>().join(" ");
-        text += "\n";
-    }
-    fs::write(path, text).expect("written");
+    let mut rows = cloud(n, 1);
+    bad.into_iter().for_each(|bad| rows[bad][0].1 = f64::NAN);
+    fs::write(path, ply_bytes(&rows, Format::Ascii, "", b"")).expect("written");
 }
 
 /// An SPZ keeps the rotation, not the quaternion's length and sign.
@@ -44,6 +23,98 @@ fn check_rotations(before: Vec<f32>, after: Vec<f32>) {
         let cosine = dot(p, q) / (dot(p, p) * dot(q, q)).sqrt();
         assert!(cosine.abs() > 0.999_99, "{p:?} became {q:?}");
     }
+}
+
+/// All formats, properties in another order, extra properties and elements: the same tensors.
+#[test]
+fn every_layout_of_one_cloud_is_the_same_cloud() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let device = Device::flex();
+    for degree in 0..=3 {
+        let rows = cloud(50, degree);
+        let read = |name: &str, bytes: &[u8]| {
+            let path = temporary.path().join(name);
+            fs::write(&path, bytes).expect("written");
+            let loaded = scene::read(&path, &device).unwrap_or_else(|e| panic!("{name}: {e}"));
+            let g = loaded.gaussians;
+            let mut all = vec![
+                values(g.means),
+                values(g.rotations),
+                values(g.scales),
+                values(g.colors),
+                values(g.opacities),
+            ];
+            assert_eq!(loaded.harmonics.is_some(), degree > 0);
+            all.extend(loaded.harmonics.map(values));
+            all
+        };
+        let expected = read("little.ply", &ply_bytes(&rows, Format::Little, "", b""));
+        for format in [Format::Ascii, Format::Big, Format::Double] {
+            let name = format!("{format:?}.ply");
+            assert!(read(&name, &ply_bytes(&rows, format, "", b"")) == expected, "{name}, degree {degree}");
+        }
+        let mut other = rows.clone();
+        for row in &mut other {
+            row.retain(|(name, _)| !name.starts_with('n'));
+            row.reverse();
+            row.insert(3, ("weight".into(), 17.0));
+        }
+        assert!(read("other.ply", &ply_bytes(&other, Format::Big, "", b"")) == expected, "degree {degree}");
+        // A list ahead of the vertices: two faces, of 3 and 1 corners.
+        let faces = "element face 2\nproperty list uchar int vertex_indices\n";
+        let mut prefix = vec![3];
+        prefix.extend([7_i32, 8, 9].iter().flat_map(|v| v.to_be_bytes()));
+        prefix.push(1);
+        prefix.extend(5_i32.to_be_bytes());
+        assert!(read("faces.ply", &ply_bytes(&rows, Format::Big, faces, &prefix)) == expected);
+        let lines = b"3 7 8 9\n1 5\n";
+        assert!(read("lines.ply", &ply_bytes(&rows, Format::Ascii, faces, lines)) == expected);
+
+        // And the numbers are what they should be.
+        let row = |name: &str| rows[7].iter().find(|(n, _)| n == name).expect(name).1 as f32;
+        assert_eq!(expected[0][21..24], ["x", "y", "z"].map(row));
+        assert_eq!(expected[1][28..32], ["rot_0", "rot_1", "rot_2", "rot_3"].map(row));
+        assert_eq!(expected[2][21..24], ["scale_0", "scale_1", "scale_2"].map(|n| row(n).exp()));
+        assert_eq!(expected[4][7], 1.0 / (1.0 + (-row("opacity")).exp()));
+        if degree > 0 {
+            let k = (degree + 1) * (degree + 1);
+            // Coefficient 2 of green: the second of green's block.
+            assert_eq!(expected[5][(7 * k + 2) * 3 + 1], row(&format!("f_rest_{}", k - 1 + 1)));
+            assert_eq!(expected[5][7 * k * 3 + 2], row("f_dc_2"));
+        }
+    }
+}
+
+#[test]
+fn what_is_written_is_read_again() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let [first, second] = ["in.ply", "out.ply"].map(|name| temporary.path().join(name));
+    fs::write(&first, ply_bytes(&cloud(300, 0), Format::Little, "", b"")).expect("written");
+    let device = Device::flex();
+    let read = |path: &Path| scene::read(path, &device).expect("read").gaussians;
+    scene::write(&read(&first), &second).expect("written");
+    let (first, second) = (read(&first), read(&second));
+    let close =
+        |a: Vec<f32>, b: Vec<f32>| a.iter().zip(&b).all(|(a, b)| (a - b).abs() <= 2e-6 * (1.0 + b.abs()));
+    assert_eq!(values(first.means), values(second.means));
+    assert_eq!(values(first.rotations), values(second.rotations));
+    assert!(close(values(first.scales), values(second.scales)));
+    assert!(close(values(first.opacities), values(second.opacities)));
+    assert!(close(values(first.colors), values(second.colors)));
+}
+
+/// A colour that is no number is not black.
+#[test]
+fn colours_that_are_not_finite_are_kept() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let path = temporary.path().join("in.ply");
+    let mut rows = cloud(3, 0);
+    for (row, value) in rows.iter_mut().zip([f64::NAN, f64::INFINITY, f64::NEG_INFINITY]) {
+        row[6].1 = value;
+    }
+    fs::write(&path, ply_bytes(&rows, Format::Little, "", b"")).expect("written");
+    let colors = values(scene::read(&path, &Device::flex()).expect("read").gaussians.colors);
+    assert!([0, 3, 6].iter().all(|i| !colors[*i].is_finite()), "{colors:?}");
 }
 
 #[test]

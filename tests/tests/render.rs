@@ -1,4 +1,4 @@
-//! `snapsnap render` and PLY files as a user has them.
+//! `snapsnap render` as a user types it.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -6,84 +6,8 @@ use std::process::Command;
 
 use burn::tensor::{Device, Tensor};
 use snapsnap_splat::{Camera, Gaussians, RenderOptions, cameras, render, scene, sh};
-use snapsnap_tests::scenes::Random;
+use snapsnap_tests::ply::{Format, cloud, ply_bytes};
 use snapsnap_tests::{Numbers, refused, snapsnap, succeed, values};
-
-/// A Gaussian's numbers by property name, as text.
-type Row = Vec<(String, f64)>;
-
-/// A person-sized cloud in the files' own terms (logits, logarithms, SH coefficients).
-fn cloud(n: usize, degree: usize) -> Vec<Row> {
-    let mut random = Random(4);
-    let mut between = |low: f32, high: f32| f64::from(random.between(low, high));
-    let rest = 3 * ((degree + 1) * (degree + 1) - 1);
-    (0..n)
-        .map(|_| {
-            let mut row: Row = Vec::new();
-            let mut put = |name: &str, value: f64| row.push((name.to_owned(), f64::from(value as f32)));
-            put("x", between(-0.3, 0.3));
-            put("y", between(0.0, 1.8));
-            put("z", between(-0.2, 0.2));
-            for axis in ["nx", "ny", "nz"] {
-                put(axis, 0.0);
-            }
-            for c in 0..3 {
-                put(&format!("f_dc_{c}"), between(-1.0, 1.5));
-            }
-            for i in 0..rest {
-                put(&format!("f_rest_{i}"), between(-0.3, 0.3));
-            }
-            put("opacity", between(-1.0, 8.0));
-            for c in 0..3 {
-                put(&format!("scale_{c}"), between(-5.0, -3.5));
-            }
-            for c in 0..4 {
-                put(&format!("rot_{c}"), between(-1.0, 1.0));
-            }
-            row
-        })
-        .collect()
-}
-
-#[derive(Clone, Copy, Debug, PartialEq)]
-enum Format {
-    Ascii,
-    Little,
-    Big,
-    /// Doubles in little-endian order.
-    Double,
-}
-
-/// A PLY file of these rows, in `format`, with `before` in the header ahead of the vertices and `prefix` in the body.
-fn ply_bytes(rows: &[Row], format: Format, before: &str, prefix: &[u8]) -> Vec<u8> {
-    let name = match format {
-        Format::Ascii => "ascii",
-        Format::Big => "binary_big_endian",
-        Format::Little | Format::Double => "binary_little_endian",
-    };
-    let kind = if format == Format::Double { "double" } else { "float" };
-    let mut bytes =
-        format!("ply\nformat {name} 1.0\ncomment test\n{before}element vertex {}\n", rows.len()).into_bytes();
-    for (property, _) in rows.first().into_iter().flatten() {
-        bytes.extend(format!("property {kind} {property}\n").bytes());
-    }
-    bytes.extend(b"end_header\n");
-    bytes.extend(prefix);
-    for row in rows {
-        for (_, value) in row {
-            match format {
-                Format::Ascii => bytes.extend(format!("{value} ").bytes()),
-                Format::Little => bytes.extend((*value as f32).to_le_bytes()),
-                Format::Big => bytes.extend((*value as f32).to_be_bytes()),
-                Format::Double => bytes.extend(value.to_le_bytes()),
-            }
-        }
-        if format == Format::Ascii {
-            bytes.push(b'\n');
-        }
-    }
-    bytes
-}
 
 struct Place(tempfile::TempDir);
 
@@ -121,83 +45,6 @@ impl Place {
 
 fn picture(path: &Path) -> image::RgbImage {
     image::open(path).unwrap_or_else(|e| panic!("{}: {e}", path.display())).into_rgb8()
-}
-
-/// All formats, properties in another order, extra properties and elements: the same tensors.
-#[test]
-fn every_layout_of_one_cloud_is_the_same_cloud() {
-    let place = Place::new();
-    let device = Device::flex();
-    for degree in 0..=3 {
-        let rows = cloud(50, degree);
-        let read = |name: &str, bytes: &[u8]| {
-            let loaded =
-                scene::read(&place.file(name, bytes), &device).unwrap_or_else(|e| panic!("{name}: {e}"));
-            let g = loaded.gaussians;
-            let mut all = vec![
-                values(g.means),
-                values(g.rotations),
-                values(g.scales),
-                values(g.colors),
-                values(g.opacities),
-            ];
-            assert_eq!(loaded.harmonics.is_some(), degree > 0);
-            all.extend(loaded.harmonics.map(values));
-            all
-        };
-        let expected = read("little.ply", &ply_bytes(&rows, Format::Little, "", b""));
-        for format in [Format::Ascii, Format::Big, Format::Double] {
-            let name = format!("{format:?}.ply");
-            assert!(read(&name, &ply_bytes(&rows, format, "", b"")) == expected, "{name}, degree {degree}");
-        }
-        let mut other = rows.clone();
-        for row in &mut other {
-            row.retain(|(name, _)| !name.starts_with('n'));
-            row.reverse();
-            row.insert(3, ("weight".into(), 17.0));
-        }
-        assert!(read("other.ply", &ply_bytes(&other, Format::Big, "", b"")) == expected, "degree {degree}");
-        // A list ahead of the vertices: two faces, of 3 and 1 corners.
-        let faces = "element face 2\nproperty list uchar int vertex_indices\n";
-        let mut prefix = vec![3];
-        prefix.extend([7_i32, 8, 9].iter().flat_map(|v| v.to_be_bytes()));
-        prefix.push(1);
-        prefix.extend(5_i32.to_be_bytes());
-        assert!(read("faces.ply", &ply_bytes(&rows, Format::Big, faces, &prefix)) == expected);
-        let lines = b"3 7 8 9\n1 5\n";
-        assert!(read("lines.ply", &ply_bytes(&rows, Format::Ascii, faces, lines)) == expected);
-
-        // And the numbers are what they should be.
-        let row = |name: &str| rows[7].iter().find(|(n, _)| n == name).expect(name).1 as f32;
-        assert_eq!(expected[0][21..24], ["x", "y", "z"].map(row));
-        assert_eq!(expected[1][28..32], ["rot_0", "rot_1", "rot_2", "rot_3"].map(row));
-        assert_eq!(expected[2][21..24], ["scale_0", "scale_1", "scale_2"].map(|n| row(n).exp()));
-        assert_eq!(expected[4][7], 1.0 / (1.0 + (-row("opacity")).exp()));
-        if degree > 0 {
-            let k = (degree + 1) * (degree + 1);
-            // Coefficient 2 of green: the second of green's block.
-            assert_eq!(expected[5][(7 * k + 2) * 3 + 1], row(&format!("f_rest_{}", k - 1 + 1)));
-            assert_eq!(expected[5][7 * k * 3 + 2], row("f_dc_2"));
-        }
-    }
-}
-
-#[test]
-fn what_is_written_is_read_again() {
-    let place = Place::new();
-    let device = Device::flex();
-    let loaded =
-        scene::read(&place.file("in.ply", &ply_bytes(&cloud(300, 0), Format::Little, "", b"")), &device);
-    let first = loaded.expect("read").gaussians;
-    scene::write(&first, &place.path("out.ply")).expect("written");
-    let second = scene::read(&place.path("out.ply"), &device).expect("read").gaussians;
-    let close =
-        |a: Vec<f32>, b: Vec<f32>| a.iter().zip(&b).all(|(a, b)| (a - b).abs() <= 2e-6 * (1.0 + b.abs()));
-    assert_eq!(values(first.means), values(second.means));
-    assert_eq!(values(first.rotations), values(second.rotations));
-    assert!(close(values(first.scales), values(second.scales)));
-    assert!(close(values(first.opacities), values(second.opacities)));
-    assert!(close(values(first.colors), values(second.colors)));
 }
 
 #[test]
@@ -439,19 +286,6 @@ fn raw_tensors_go_into_a_pipe() {
     assert!(output.status.success());
     assert!(output.stdout == fs::read(place.path("file")).expect("read"));
     assert!(String::from_utf8_lossy(&output.stderr).contains("2 views of 20 Gaussians"));
-}
-
-/// A colour that is no number is not black.
-#[test]
-fn colours_that_are_not_finite_are_kept() {
-    let place = Place::new();
-    let mut rows = cloud(3, 0);
-    for (row, value) in rows.iter_mut().zip([f64::NAN, f64::INFINITY, f64::NEG_INFINITY]) {
-        row[6].1 = value;
-    }
-    let path = place.file("in.ply", &ply_bytes(&rows, Format::Little, "", b""));
-    let colors = values(scene::read(&path, &Device::flex()).expect("read").gaussians.colors);
-    assert!([0, 3, 6].iter().all(|i| !colors[*i].is_finite()), "{colors:?}");
 }
 
 /// Values that are not finite in a file are counted and left out.

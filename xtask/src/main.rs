@@ -8,11 +8,12 @@ mod fuzz;
 #[cfg(test)]
 mod house;
 
-const USAGE: &str = "usage: cargo xtask test [FILTER…] | lint | dist | fuzz [OPTION…] | bundle … | COMMAND…
+const USAGE: &str = "usage: cargo xtask test [FILTER…] | lint | dist [OPTION…] | fuzz [OPTION…] | bundle … | COMMAND…
 
   test     the whole suite on flex, then the numerical tests on ndarray and wgpu
   lint     formatting, clippy and documentation, warnings refused
-  dist     the smallest program, target/dist/snapsnap; 20 minutes, and slower pictures (docs/inference.md)
+  dist     the smallest program, target/dist/snapsnap; takes cargo's options, 20 minutes, and slower pictures
+           (docs/inference.md)
   fuzz     damaged files of every format that the program reads; see cargo xtask fuzz --help
   bundle   [--features vulkan] [-o FILE.tar.xz]: program, tests, benchmark and a script that runs them and writes a
            report, for a machine without cargo
@@ -31,7 +32,7 @@ fn main() -> ExitCode {
         }
         Some("test") => test(rest),
         Some("lint") => lint(),
-        Some("dist") => dist(),
+        Some("dist") => dist(rest),
         Some("fuzz") => fuzz::run(rest),
         Some("bundle") => match bundle::Options::parse(rest) {
             Ok(options) => bundle::bundle(&options).map_err(|e| eprintln!("error: {e}")).is_ok(),
@@ -74,10 +75,9 @@ fn lint() -> bool {
         & succeeds("documentation", cargo(&doc).env("RUSTDOCFLAGS", "-D warnings"))
 }
 
-fn dist() -> bool {
-    let mut build =
-        cargo(&["rustc", "--profile", "dist", "--package", "snapsnap", "--bin", "snapsnap", "--"]);
-    build.args(["-C", "strip=symbols"]);
+fn dist(options: &[String]) -> bool {
+    let mut build = cargo(&["rustc", "--profile", "dist", "--package", "snapsnap", "--bin", "snapsnap"]);
+    build.args(options).args(["--", "-C", "strip=symbols"]);
     // What the loader has to relocate is listed in a fraction of the room; needs glibc 2.36.
     if cfg!(target_os = "linux") {
         build.args(["-C", "link-arg=-Wl,-z,pack-relative-relocs"]);

@@ -250,7 +250,8 @@ pub(super) mod tests {
         edges.iter().all(|((a, b), n)| *n == 1 && edges.get(&(*b, *a)) == Some(&1))
     }
 
-    fn grid(n: usize, value: impl Fn(Vec3) -> f32) -> Grid {
+    /// Of n³ corners from (−1, −1, −1) to (1, 1, 1).
+    pub fn grid(n: usize, value: impl Fn(Vec3) -> f32) -> Grid {
         let cell = 2.0 / (n - 1) as f32;
         let mut grid =
             Grid { origin: Vec3::NEG_ONE, cell, counts: USizeVec3::splat(n), values: vec![0.0; n * n * n] };

@@ -88,9 +88,9 @@ impl Grid {
 
 #[cfg(test)]
 mod tests {
-    use glam::{USizeVec3, Vec3};
+    use glam::Vec3;
 
-    use super::*;
+    use crate::fuse::grid::tests::grid;
 
     #[test]
     fn a_foot_is_joined_with_the_body_and_a_speck_is_not() {
@@ -98,20 +98,12 @@ mod tests {
         let ball = |p: Vec3, centre: Vec3, radius: f32| (p - centre).length() - radius;
         let cell = 2.0 / (N - 1) as f32;
         let scene = |feet: &[Vec3]| {
-            let mut grid = Grid {
-                origin: Vec3::NEG_ONE,
-                cell,
-                counts: USizeVec3::splat(N),
-                values: vec![0.0; N * N * N],
-            };
-            for row in 0..grid.values.len() {
-                let p = grid.place(row);
+            grid(N, |p| {
                 let body = ball(p, Vec3::new(0.0, 0.3, 0.0), 0.5);
                 let speck = ball(p, Vec3::new(0.7, 0.7, 0.7), 0.04);
                 let feet = feet.iter().map(|foot| ball(p, *foot, 0.1)).fold(f32::MAX, f32::min);
-                grid.values[row] = body.min(speck).min(feet);
-            }
-            grid
+                body.min(speck).min(feet)
+            })
         };
         let mut grid = scene(&[]);
         assert_eq!((grid.join_parts(), grid.keep_one_body()), (0, (1, 0)));

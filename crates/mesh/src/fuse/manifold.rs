@@ -157,16 +157,12 @@ fn around(side: usize, steps: usize) -> usize {
 fn unfolded(mut triangles: Vec<[u32; 3]>) -> Vec<[u32; 3]> {
     let mut there: HashMap<[u32; 3], Vec<usize>> = HashMap::new();
     let mut kept = vec![true; triangles.len()];
-    for (face, &[a, b, c]) in triangles.iter().enumerate() {
-        let least = a.min(b).min(c);
-        let key = if least == a {
-            [a, b, c]
-        } else if least == b {
-            [b, c, a]
-        } else {
-            [c, a, b]
-        };
-        if a == b || b == c || c == a {
+    for (face, triangle) in triangles.iter().enumerate() {
+        let mut key = *triangle;
+        while key[0] > key[1] || key[0] > key[2] {
+            key.rotate_left(1);
+        }
+        if key[0] == key[1] || key[1] == key[2] || key[2] == key[0] {
             kept[face] = false;
         } else if let Some(other) = there.get_mut(&[key[0], key[2], key[1]]).and_then(Vec::pop) {
             (kept[face], kept[other]) = (false, false);

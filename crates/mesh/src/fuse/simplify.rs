@@ -146,15 +146,12 @@ fn compact(mesh: &Mesh, triangles: &[[u32; 3]]) -> Mesh {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::fuse::grid::Grid;
-    use crate::fuse::grid::tests::{is_closed, volume};
+    use crate::fuse::grid::tests::{grid, is_closed, volume};
 
+    /// Of n³ corners a step apart.
     fn surface(n: usize, value: impl Fn(Vec3) -> f32) -> Mesh {
-        let counts = glam::USizeVec3::splat(n);
-        let mut grid = Grid { origin: Vec3::ZERO, cell: 1.0, counts, values: vec![1.0; n * n * n] };
-        for row in 0..grid.values.len() {
-            grid.values[row] = value(grid.place(row));
-        }
+        let steps = 0.5 * (n - 1) as f32;
+        let mut grid = grid(n, |p| value((steps * (p + 1.0)).round()));
         grid.keep_one_body();
         let (positions, triangles) = grid.surface();
         let colors = vec![Vec3::ONE; positions.len()];
