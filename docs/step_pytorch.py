@@ -5,8 +5,9 @@
     python docs/step_pytorch.py PROGRAM [--threads 2] [--seconds 20] [--side 256] [--batch 2] [--network tiny]
     python docs/step_pytorch.py PROGRAM --memory [...]  # each network alone, and the most memory of its process
 
-Both networks are those of SNAPSNAP sections 1, 2 and 8, in their plainest form, with PyTorch's own operators; the loss is
-the mean square of what comes out. Forward and backward, the fastest of all repetitions; programs take turns.
+Both networks are written in their plainest form with PyTorch's own operators: docs/method.md, "Point predictor" and
+docs/method.md, "Gaussian regressor". The loss is the mean square of the output. Forward and backward, the fastest of all
+repetitions; programs take turns.
 """
 
 import argparse

@@ -176,15 +176,28 @@ pub fn data(name: &str) -> PathBuf {
     root().join("tests/data").join(name)
 }
 
-/// Path of a reference fixture: in this repository, or in the folder of all of them beside the checkout; `None`, said
-/// aloud, where neither has it.
-pub fn fixture(name: &str) -> Option<PathBuf> {
-    let path = shared("fixtures").join(name);
-    if let Some(path) = [data(name), path.clone()].into_iter().find(|path| path.exists()) {
-        return Some(path);
-    }
-    println!("SKIPPED: no reference fixture {}", path.display());
-    None
+/// A file or folder of reference numbers (tests/data/README.md); `SNAPSNAP_FIXTURES` names another folder that has them.
+///
+/// # Panics
+/// If it is missing.
+pub fn fixture(name: &str) -> PathBuf {
+    let folder = std::env::var_os("SNAPSNAP_FIXTURES").map_or_else(|| data(""), PathBuf::from);
+    let path = folder.join(name);
+    assert!(path.exists(), "{}: a reference fixture is missing", path.display());
+    path
+}
+
+/// How many values of each tensor the repository's fixtures of gradients and trained weights have at least, if the tensor has
+/// as many: they are cut to their first values.
+pub const FIXTURE_VALUES: usize = 512;
+
+/// Relative L2 error of `got` where `expected` has values: the first ones of a tensor, or all.
+///
+/// # Panics
+/// If `expected` has fewer than [`FIXTURE_VALUES`] values and `got` more.
+pub fn start_error(got: &[f32], expected: &[f32]) -> f64 {
+    assert!(expected.len() >= got.len().min(FIXTURE_VALUES), "{} of {} values", expected.len(), got.len());
+    relative_error(&got[..expected.len()], expected)
 }
 
 /// The TOML config of a fixture's `config.json`, with every quirk.

@@ -413,7 +413,7 @@ fn sample_photographs_stand_where_training_subjects_stand() {
     assert_eq!(shape, [4, 128, 128]);
     for view in valid.chunks_exact(128 * 128).take(2) {
         let rows: Vec<usize> = (0..128).filter(|y| view[y * 128..(y + 1) * 128].contains(&1)).collect();
-        // SNAPSNAP §5.3: rows 124 to 863 of 1024, so 15.5 to 107.8 of 128.
+        // Rows 124 to 863 of 1024 are 15.5 to 107.8 of 128 (docs/method.md, "Cameras").
         let (first, last) = (rows[0], rows[rows.len() - 1]);
         assert!((15..=17).contains(&first) && (106..=108).contains(&last), "rows {first} to {last}");
     }

@@ -264,7 +264,7 @@ fn wrong_arguments_are_refused_before_any_work() {
         (&["--set", "jitter.view.pitch=-1"], "`jitter.view.pitch`: is -1"),
         (&["--set", "samples.compat=true"], "`samples.augment`: must be off beside `compat = true`"),
         (&["--set", "views.colour=1"], "unknown field `colour`"),
-        (&["--config", "/no/such.toml"], "/no/such.toml: cannot read the config"),
+        (&["--config", "/no/such.toml"], "/no/such.toml: cannot read"),
         (&["--set", "views.layout=authors"], "must end in `_1024_24`"),
     ];
     for (arguments, expected) in table {

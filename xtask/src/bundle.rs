@@ -12,9 +12,6 @@ const RUN: &str = include_str!("run.sh");
 /// Files and folders that the programs read.
 const DATA: [&str; 4] = ["configs", "tests/data", "README.md", "LICENSE"];
 
-/// Further reference numbers that tests look for, where they lie beside the checkout; as many as the archive has room for.
-const FIXTURES: [&str; 5] = ["net-linear", "photometric.safetensors", "splat", "train-stage1", "unet"];
-
 /// What `bundle` was told.
 pub struct Options {
     /// Features of the program, comma-separated.
@@ -57,12 +54,6 @@ pub fn bundle(options: &Options) -> Result<(), String> {
     }
     for path in DATA {
         copy(Path::new(path), &folder.join(path))?;
-    }
-    for name in FIXTURES {
-        let fixture = Path::new("../shared/fixtures").join(name);
-        if fixture.exists() {
-            copy(&fixture, &folder.join("tests/data").join(name))?;
-        }
     }
     let script = folder.join("run.sh");
     let device = match options.features.as_deref() {

@@ -5,10 +5,10 @@ use std::io;
 use std::path::Path;
 use std::process::ExitCode;
 
+use snapsnap_base::FileError;
+use snapsnap_base::config::ConfigError;
 use snapsnap_eval::EvalError;
-use snapsnap_mesh::FileError;
 use snapsnap_mesh::fuse::FuseError;
-use snapsnap_net::config::ConfigError;
 use snapsnap_net::weights::WeightsError;
 use snapsnap_splat::SplatError;
 use snapsnap_train::TrainError;

@@ -2,7 +2,7 @@
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use snapsnap_splat::file;
+use snapsnap_base::file;
 
 use crate::say;
 

@@ -133,7 +133,7 @@ fn main() -> ExitCode {
     // A library that panics on a damaged file is an error of that file's, which is reported as such.
     let hook = std::panic::take_hook();
     std::panic::set_hook(Box::new(move |panic| {
-        if !snapsnap_mesh::is_guarded() {
+        if !snapsnap_base::is_guarded() {
             hook(panic);
         }
     }));

@@ -3,7 +3,7 @@
 use std::io::Write;
 use std::path::Path;
 
-use snapsnap_splat::file::write_whole;
+use snapsnap_base::file::write_whole;
 
 use crate::failure::Failure;
 

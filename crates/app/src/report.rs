@@ -7,8 +7,8 @@ use std::path::{Path, PathBuf};
 
 use image::RgbImage;
 use serde_json::Value;
+use snapsnap_base::file;
 use snapsnap_eval::report::{Header, today};
-use snapsnap_splat::file;
 
 use crate::commands::check_outputs;
 use crate::failure::Failure;

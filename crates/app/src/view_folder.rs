@@ -5,7 +5,8 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use image::RgbImage;
-use snapsnap_splat::{Camera, cameras, file};
+use snapsnap_base::file;
+use snapsnap_splat::{Camera, cameras};
 
 use crate::commands::is_same_file;
 use crate::failure::Failure;

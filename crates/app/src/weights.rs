@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use snapsnap_base::config::Schema;
 use snapsnap_net::config::Config;
 use snapsnap_net::weights::WeightFile;
 

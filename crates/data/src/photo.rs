@@ -9,7 +9,7 @@ use std::path::Path;
 use image::{DynamicImage, GrayImage, RgbImage};
 
 use crate::resize::{Filter, resize};
-use snapsnap_mesh::FileError;
+use snapsnap_base::FileError;
 use snapsnap_mesh::picture::{self, MAX_BYTES};
 
 pub use placing::{Mapping, place};
@@ -237,7 +237,7 @@ impl Rect {
     }
 }
 
-/// The picture without any change of size (SNAPSNAP §5.7).
+/// The picture without any change of size (docs/method.md, "Photographs on the canvas").
 fn on_canvas(rgb: &RgbImage, mask: &GrayImage, side: usize, report: String) -> Canvas {
     let area = side * side;
     let mask: Vec<f32> = mask.pixels().map(|p| unit(p[0])).collect();

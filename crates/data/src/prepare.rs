@@ -12,10 +12,11 @@ use crate::dataset::{
     Arrangement, Description, Drawn, Folder, Layout, MAX_RESOLUTION, MAX_VIEWS, Made, Split,
 };
 use crate::sample::SampleConfig;
-use snapsnap_mesh::FileError;
+use snapsnap_base::FileError;
+use snapsnap_base::config::Schema;
+use snapsnap_base::random::stream;
 use snapsnap_mesh::mesh::Mesh;
 use snapsnap_mesh::view::{Lights, Renderer, ViewOptions};
-use snapsnap_people::random::stream;
 
 /// How subjects become views, and views samples: `configs/data/*.toml`.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -70,9 +71,8 @@ impl Default for ViewsConfig {
     }
 }
 
-impl DataConfig {
-    /// The first key that makes no sense, and why.
-    pub fn problem(&self) -> Option<(String, String)> {
+impl Schema for DataConfig {
+    fn refusal(&self) -> Option<(String, String)> {
         let ViewsConfig { count, arrangement, front_within_degrees, resolution, samples, layout, .. } =
             self.views;
         if count == 0 || count > MAX_VIEWS {
@@ -107,15 +107,9 @@ impl DataConfig {
         let jitter = self.jitter.problem().map(|(key, message)| (format!("jitter.{key}"), message));
         jitter.or_else(|| self.samples.problem().map(|(key, message)| (format!("samples.{key}"), message)))
     }
+}
 
-    /// The config as TOML, every key written out.
-    ///
-    /// # Panics
-    /// Never: every field is representable in TOML.
-    pub fn to_toml(&self) -> String {
-        toml::to_string(self).expect("the config has only TOML types")
-    }
-
+impl DataConfig {
     /// What a data set made with this config says of itself.
     pub fn description(&self, source: &str) -> Description {
         let ViewsConfig { count, arrangement, resolution, high_resolution, layout, .. } = self.views;
@@ -131,7 +125,8 @@ impl DataConfig {
         }
     }
 
-    /// The cameras of a subject that faces `yaw_degrees` (SNAPSNAP §5.3), straying as `name` decides.
+    /// The cameras of a subject that faces `yaw_degrees` (docs/method.md, "Cameras"). `name` decides their random
+    /// deviations.
     pub fn cameras(&self, yaw_degrees: f64, name: &str) -> Vec<Camera> {
         let mut random = stream(&format!("cameras/{name}"));
         if self.views.arrangement == Arrangement::Groups {
@@ -257,14 +252,14 @@ mod tests {
     fn cameras_stand_as_much_higher_and_further_away_as_they_are_told() {
         let mut config = DataConfig::default();
         (config.views.pitch, config.views.distance) = (10.0, 1.2);
-        assert_eq!(config.problem(), None);
+        assert_eq!(config.refusal(), None);
         let (published, far) = (Orbit::default(), config.cameras(0.0, "a")[0]);
         let [from, to] =
             [Camera::orbit_at_yaw_degrees(0.0, 1024), far].map(|c| c.centre() - published.centre);
         assert!((to.length() / from.length() - 1.2).abs() < 1e-9);
         assert!((to.angle_between(from).to_degrees() - 10.0).abs() < 1e-9 && to.y > from.y);
         config.views.distance = 0.4;
-        assert_eq!(config.problem().expect("a problem").0, "views.distance");
+        assert_eq!(config.refusal().expect("a problem").0, "views.distance");
     }
 
     #[test]
@@ -273,7 +268,7 @@ mod tests {
         (config.views.arrangement, config.views.count) = (Arrangement::Groups, 12);
         config.jitter.rig = Jitter { pitch: 6.0, distance: 0.1, roll: 2.0, ..Jitter::default() };
         config.jitter.view = Jitter { yaw: 5.0, pitch: 3.0, ..Jitter::default() };
-        assert_eq!(config.problem(), None);
+        assert_eq!(config.refusal(), None);
         let cameras = config.cameras(40.0, "a");
         let yaw = |camera: &Camera| camera.centre().x.atan2(camera.centre().z).to_degrees();
         let apart = |a: f64, b: f64| (a - b + 540.0).rem_euclid(360.0) - 180.0;
@@ -289,9 +284,9 @@ mod tests {
         }
         assert!(cameras[0] != cameras[4] && cameras[4] != cameras[8]);
         config.views.count = 6;
-        assert_eq!(config.problem().expect("a problem").0, "views.count");
+        assert_eq!(config.refusal().expect("a problem").0, "views.count");
         (config.views.count, config.views.layout) = (8, Layout::Authors);
-        assert_eq!(config.problem().expect("a problem").0, "views.arrangement");
+        assert_eq!(config.refusal().expect("a problem").0, "views.arrangement");
     }
 
     #[test]
@@ -311,9 +306,9 @@ mod tests {
         }
         assert!(nearest > 1.7 && furthest < 2.3 && furthest - nearest > 0.4, "{nearest} {furthest}");
         assert!(shortest >= 0.72 && longest <= 0.88 && longest - shortest > 0.15, "{shortest} {longest}");
-        assert_eq!(config.problem(), None);
+        assert_eq!(config.refusal(), None);
         config.jitter.rig.focal = 0.6;
-        assert_eq!(config.problem(), Some(("jitter.rig.focal".into(), "is 0.6, must be 0 to 0.5".into())));
+        assert_eq!(config.refusal(), Some(("jitter.rig.focal".into(), "is 0.6, must be 0 to 0.5".into())));
     }
 
     #[test]

@@ -2,6 +2,7 @@
 
 use image::imageops::{self, FilterType};
 use image::{ImageBuffer, Luma};
+use snapsnap_base::bilinear::taps;
 
 /// How samples are weighted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -25,15 +26,7 @@ pub fn resize(values: Vec<f32>, from: [usize; 2], to: [usize; 2], filter: Filter
 }
 
 fn bilinear(values: &[f32], [rows, columns]: [usize; 2], to: [usize; 2]) -> Vec<f32> {
-    let taps = |from: usize, to: usize| -> Vec<(usize, usize, f32)> {
-        let tap = |i: usize| {
-            let at = ((i as f64 + 0.5) * from as f64 / to as f64 - 0.5).clamp(0.0, (from - 1) as f64);
-            let low = at as usize;
-            (low, (low + 1).min(from - 1), (at - low as f64) as f32)
-        };
-        (0..to).map(tap).collect()
-    };
-    let (down, across) = (taps(rows, to[0]), taps(columns, to[1]));
+    let (down, across) = (taps(rows, to[0], false), taps(columns, to[1], false));
     let mut out = Vec::with_capacity(to[0] * to[1]);
     for &(y0, y1, fy) in &down {
         for &(x0, x1, fx) in &across {
@@ -48,7 +41,7 @@ fn bilinear(values: &[f32], [rows, columns]: [usize; 2], to: [usize; 2]) -> Vec<
 mod tests {
     use super::*;
 
-    /// Check value of SNAPSNAP §13.4: [0, 1] → [0, ¼, ¾, 1].
+    /// [0, 1] → [0, ¼, ¾, 1] (docs/method.md, "Check values").
     #[test]
     fn bilinear_has_its_published_check_value() {
         assert_eq!(resize(vec![0.0, 1.0], [1, 2], [1, 4], Filter::Bilinear), [0.0, 0.25, 0.75, 1.0]);

@@ -9,10 +9,12 @@ use rand::Rng;
 use serde::{Deserialize, Serialize};
 
 use crate::dataset::Split;
+use snapsnap_base::FileError;
+use snapsnap_mesh::import;
 use snapsnap_mesh::mesh::{Mesh, MeshError};
-use snapsnap_mesh::{FileError, import};
 
-/// Height of a normalised subject in metres (SNAPSNAP §5.4). Real stature is lost on purpose: two photographs do not show it.
+/// Height of a normalised subject in metres (docs/method.md, "Scans"). Real stature is lost on purpose: two photographs
+/// do not show it.
 pub const HEIGHT: f32 = 1.8;
 /// Training subjects are up to this much taller or shorter.
 const HEIGHT_JITTER: f32 = 0.05;
@@ -41,8 +43,8 @@ pub enum Collection {
 }
 
 impl Collection {
-    /// Where a subject belongs, the `place`-th of its set: the published lists for THuman; the first 100 of 2K2K and all
-    /// of 4D-Dress are tested on, others trained on (SNAPSNAP §5.1).
+    /// The split of a subject, the `place`-th of its set. THuman follows the published lists. The first 100 of 2K2K and
+    /// all of 4D-Dress are for testing, the others for training (docs/method.md, "Scans").
     pub fn split(self, subject: &str, place: usize) -> Split {
         match (self.of(subject), subject.parse::<u32>()) {
             (Self::FourDDress, _) => Split::Test,
@@ -61,7 +63,8 @@ impl Collection {
         }
     }
 
-    /// Whether SMPL-X parameters say which way its subjects face; those of the other sets face +z (SNAPSNAP §5.3).
+    /// Whether SMPL-X parameters give the direction that its subjects face. Those of the other sets face +z
+    /// (docs/method.md, "Cameras").
     pub fn has_orientation(self) -> bool {
         matches!(self, Self::Thuman20 | Self::Thuman21)
     }
@@ -69,7 +72,7 @@ impl Collection {
     /// Turns the set's axes into ours (y up).
     fn axes(self) -> Mat3 {
         match self {
-            // Rows of SNAPSNAP §5.4's matrix: (0, −1, 0), (0, 0, 1), (−1, 0, 0).
+            // The matrix with rows (0, −1, 0), (0, 0, 1), (−1, 0, 0) (docs/method.md, "Scans").
             Self::Thuman21 => Mat3::from_cols(Vec3::NEG_Z, Vec3::NEG_X, Vec3::Y),
             _ => Mat3::IDENTITY,
         }
@@ -194,8 +197,8 @@ fn search(
     Ok(())
 }
 
-/// Stands a scan up: axes, height, feet on y = 0 (SNAPSNAP §5.4). With `jitter`, as for training: another height, and not
-/// quite in the middle.
+/// Normalises a scan: axes, height, feet on y = 0 (docs/method.md, "Scans"). `jitter`, for training, changes the height
+/// and moves the scan a little sideways.
 ///
 /// # Errors
 /// [`MeshError::NoHeight`].

@@ -9,8 +9,8 @@ use std::rc::Rc;
 
 use serde_json::Value as Json;
 
-use snapsnap_mesh::FileError;
-use snapsnap_splat::file;
+use snapsnap_base::FileError;
+use snapsnap_base::file;
 
 /// Largest file that is read; parameters take a few kilobytes.
 const MAX_BYTES: u64 = 16 << 20;
@@ -22,7 +22,7 @@ const MAX_NODES: usize = 100;
 const ORIENTATION: &str = "global_orient";
 
 /// The yaw in degrees, around +y, by which the body faces away from +z: the second component of `global_orient`, taken
-/// for a pure rotation around y as the authors do (SNAPSNAP §5.3).
+/// for a pure rotation around y as in the published code (docs/method.md, "Cameras").
 ///
 /// # Errors
 /// [`FileError`] for files that are no such parameters.

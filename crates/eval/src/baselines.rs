@@ -1,4 +1,4 @@
-//! What a model must beat, and what it can at most begin with (EVALUATION.md).
+//! Baselines of an evaluation (docs/method.md, "Evaluation").
 
 use std::path::Path;
 use std::sync::Arc;

@@ -1,7 +1,7 @@
 //! What can be wrong with what is compared.
 
-use snapsnap_mesh::FileError;
-use snapsnap_net::config::ConfigError;
+use snapsnap_base::FileError;
+use snapsnap_base::config::ConfigError;
 use snapsnap_net::weights::WeightsError;
 use snapsnap_splat::SplatError;
 

@@ -4,8 +4,8 @@ use std::io::{Cursor, Write};
 use std::path::Path;
 
 use image::{ImageFormat, Rgb, RgbImage, imageops};
-use snapsnap_mesh::FileError;
-use snapsnap_splat::file;
+use snapsnap_base::FileError;
+use snapsnap_base::file;
 
 /// Largest side of one picture of a grid in pixels.
 const MOST: u32 = 256;

@@ -1,4 +1,5 @@
-//! Where pictures are compared: everywhere, in the paper's window around the person, or on the person (SNAPSNAP §10).
+//! Regions in which pictures are compared: the whole picture, the paper's window around the person, or the person
+//! (docs/method.md, "Evaluation").
 
 use snapsnap_net::dilated;
 

@@ -1,4 +1,4 @@
-//! PSNR and SSIM of two pictures (SNAPSNAP §10).
+//! PSNR and SSIM of two pictures (docs/method.md, "Evaluation").
 
 use burn::tensor::module::conv2d;
 use burn::tensor::ops::ConvOptions;

@@ -5,7 +5,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
 
-/// Resamples of a bootstrap (EVALUATION.md).
+/// Resamples of a bootstrap.
 const RESAMPLES: usize = 2000;
 /// Their seed: equal data give equal intervals.
 const SEED: u64 = 1;

@@ -7,10 +7,9 @@ mod tests;
 use std::io::{BufRead, BufReader, Cursor, Read, Seek};
 use std::path::Path;
 
-use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader};
+use image::{DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader};
 
-use crate::FileError;
-use crate::error::{guarded, open};
+use snapsnap_base::{FileError, file, guarded};
 
 /// Bytes that a decoded photograph, mask or view may take: 201 million pixels of red, green, blue and alpha, as many as
 /// telephones give. What comes after decoding needs about twice as much again.
@@ -24,7 +23,7 @@ const MAX_FILE: u64 = 1 << 30;
 /// [`FileError`] for a file that cannot be read, is no picture, is damaged or cut short, or would take more than `most`
 /// bytes in memory; the last is known before it is decoded.
 pub fn decode(path: &Path, most: u64) -> Result<DynamicImage, FileError> {
-    let file = BufReader::new(open(path)?);
+    let file = BufReader::new(file::open(path).map_err(FileError::read(path))?);
     guarded(path, || decode_from(path, file, most))
 }
 
@@ -33,11 +32,11 @@ pub fn decode(path: &Path, most: u64) -> Result<DynamicImage, FileError> {
 /// # Errors
 /// [`FileError`] for a file that cannot be read or is no picture.
 pub fn size(path: &Path) -> Result<[u32; 2], FileError> {
-    let file = BufReader::new(open(path)?);
+    let file = BufReader::new(file::open(path).map_err(FileError::read(path))?);
     guarded(path, || {
         let reader = ImageReader::new(file).with_guessed_format().map_err(FileError::read(path))?;
         let size = reader.into_dimensions();
-        size.map(Into::into).map_err(|source| FileError::Decode { path: path.to_owned(), source })
+        size.map(Into::into).map_err(unreadable(path))
     })
 }
 
@@ -49,8 +48,13 @@ pub fn decode_bytes(path: &Path, bytes: &[u8], most: u64) -> Result<DynamicImage
     guarded(path, || decode_from(path, Cursor::new(bytes), most))
 }
 
+/// For `map_err`: `path` is no image of a known format, or a damaged one.
+pub fn unreadable(path: &Path) -> impl Fn(ImageError) -> FileError {
+    move |source| FileError::unsuitable(path, format!("not a readable image: {source}"))
+}
+
 fn decode_from(path: &Path, source: impl BufRead + Seek, most: u64) -> Result<DynamicImage, FileError> {
-    let failed = |source| FileError::Decode { path: path.to_owned(), source };
+    let failed = unreadable(path);
     let large = |[width, height]: [u32; 2], bytes: u64| {
         let (mega, most) = (bytes.div_ceil(1 << 20), most >> 20);
         let message =
@@ -61,21 +65,21 @@ fn decode_from(path: &Path, source: impl BufRead + Seek, most: u64) -> Result<Dy
     let (mut picture, orientation) = if reader.format() == Some(ImageFormat::Jpeg) {
         let mut bytes = Vec::new();
         reader.into_inner().take(MAX_FILE).read_to_end(&mut bytes).map_err(FileError::read(path))?;
-        let jpeg = jpeg::Jpeg::open(&bytes).map_err(failed)?;
+        let jpeg = jpeg::Jpeg::open(&bytes).map_err(&failed)?;
         if jpeg.bytes_decoded() > most {
             return large(jpeg.size, jpeg.bytes_decoded());
         }
-        jpeg.decode().map_err(failed)?
+        jpeg.decode().map_err(&failed)?
     } else {
-        let mut decoder = reader.into_decoder().map_err(failed)?;
+        let mut decoder = reader.into_decoder().map_err(&failed)?;
         let (width, height) = decoder.dimensions();
         // Whatever it is stored as, red, green and blue are made of it.
         let bytes = decoder.total_bytes().max(3 * u64::from(width) * u64::from(height));
         if bytes > most {
             return large([width, height], bytes);
         }
-        let orientation = decoder.orientation().map_err(failed)?;
-        (DynamicImage::from_decoder(decoder).map_err(failed)?, orientation)
+        let orientation = decoder.orientation().map_err(&failed)?;
+        (DynamicImage::from_decoder(decoder).map_err(&failed)?, orientation)
     };
     picture.apply_orientation(orientation);
     Ok(picture)

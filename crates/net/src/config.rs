@@ -5,11 +5,8 @@ mod modes;
 #[cfg(test)]
 mod tests;
 
-use std::path::{Path, PathBuf};
-
-use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
-use snapsnap_splat::file;
+pub use snapsnap_base::config::{ConfigError, Schema};
 
 pub use modes::{
     Anchor, Body, ConfMode, Downsample, Fusion, HeadKind, RegressorColor, RegressorStart, RotationFrame,
@@ -21,18 +18,15 @@ pub use modes::{
 /// because an enlarged pixel lies beside, not on, the one it came from. Rounded up to a multiple of 4.
 pub const RECEPTIVE_RADIUS: usize = 100;
 
-/// Longest config that is read.
-const MAX_BYTES: u64 = 1 << 20;
-
 /// Everything that decides what the networks compute.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Config {
-    /// The point predictor (SNAPSNAP §1, 2, 4).
+    /// The point predictor (docs/method.md, "Point predictor").
     pub network: NetworkConfig,
-    /// The Gaussian regressor (SNAPSNAP §8).
+    /// The Gaussian regressor (docs/method.md, "Gaussian regressor").
     pub regressor: RegressorConfig,
-    /// Which quirks of the published code are reproduced (SNAPSNAP §13).
+    /// Reproduction of the published code's quirks (docs/method.md, "Quirks of the published code").
     pub mode: ModeConfig,
 }
 
@@ -63,14 +57,14 @@ pub struct NetworkConfig {
     /// Base of the rotary position embedding.
     pub rope_base: f64,
     /// Channels of the four DPT branches.
-    #[serde(deserialize_with = "four")]
+    #[serde(deserialize_with = "snapsnap_base::config::four")]
     pub layer_dims: [usize; 4],
     /// Channels inside the DPT fusion blocks.
     pub feature_dim: usize,
     /// Channels before the last DPT convolution.
     pub last_dim: usize,
     /// Which token maps feed the DPT branches: 0 is the encoder's output, l the l-th decoder layer's.
-    #[serde(deserialize_with = "four")]
+    #[serde(deserialize_with = "snapsnap_base::config::four")]
     pub hooks: [usize; 4],
     /// Kind of head.
     pub head: HeadKind,
@@ -93,7 +87,8 @@ pub struct NetworkConfig {
     pub delta: f64,
     /// What the predicted points are measured from.
     pub anchor: Anchor,
-    /// Whether the predictor sees only the window of the canvas that holds the person (LEARNING.md).
+    /// Whether the predictor's input is only the window of the canvas that holds the person
+    /// (docs/method.md, "Window").
     pub window: bool,
     /// Whether the predictor sees each pixel's share of the person as a channel of its own.
     pub mask_channel: bool,
@@ -251,65 +246,7 @@ pub struct ModeConfig {
     pub person_height: Option<usize>,
 }
 
-/// A config that cannot be used.
-#[derive(Debug, thiserror::Error)]
-pub enum ConfigError {
-    /// The file could not be read.
-    #[error("{path}: cannot read the config: {source}")]
-    Read {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        source: std::io::Error,
-    },
-    /// Not TOML, an unknown key, a wrong type or an unknown name.
-    #[error("{origin}: {message}")]
-    Syntax {
-        /// File or other origin of the text.
-        origin: String,
-        /// The parser's message, with line and key.
-        message: String,
-    },
-    /// A value that makes no sense, alone or beside another.
-    #[error("{origin}: `{key}`: {message}")]
-    Value {
-        /// File or other origin of the text.
-        origin: String,
-        /// Dotted key.
-        key: &'static str,
-        /// What is wrong and what is allowed.
-        message: String,
-    },
-}
-
 impl Config {
-    /// Reads and checks a TOML file; `overrides` are `a.b=c` assignments applied on top.
-    ///
-    /// # Errors
-    /// [`ConfigError`], naming file, key and allowed values.
-    pub fn from_file(path: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
-        let text = file::read_text(path, MAX_BYTES)
-            .map_err(|source| ConfigError::Read { path: path.to_owned(), source })?;
-        Self::from_toml(&text, &path.display().to_string(), overrides)
-    }
-
-    /// Parses and checks TOML text; `origin` names it in errors, `overrides` are `a.b=c` assignments applied on top.
-    ///
-    /// # Errors
-    /// [`ConfigError`], naming origin, key and allowed values.
-    pub fn from_toml(text: &str, origin: &str, overrides: &[String]) -> Result<Self, ConfigError> {
-        let (config, origin): (Self, String) = parse(text, origin, overrides)?;
-        config.checked(&origin)
-    }
-
-    /// The config as TOML, every set key written out.
-    ///
-    /// # Panics
-    /// Never: every field is representable in TOML.
-    pub fn to_toml(&self) -> String {
-        toml::to_string_pretty(self).expect("the config has only TOML types")
-    }
-
     /// The same config with every key set that follows `mode.compat` otherwise.
     pub fn resolved(&self) -> Self {
         let mut config = self.clone();
@@ -370,76 +307,9 @@ impl Config {
         self.mode.crop.unwrap_or(!self.mode.compat)
     }
 
-    /// Height to which the person is scaled, in pixels of a canvas of 1024: that of the training subjects (SNAPSNAP
-    /// §5.3, rows 124 to 863), or the published demo's (§11).
+    /// Height to which the person is scaled, in pixels of a canvas of 1024: that of the training subjects, which cover
+    /// rows 124 to 863, or the published demo's (docs/method.md, "Photographs on the canvas").
     pub fn person_height(&self) -> usize {
         self.mode.person_height.unwrap_or(if self.mode.compat { 700 } else { 739 })
     }
-
-    /// The config itself, if all its values make sense; `origin` names it in errors.
-    ///
-    /// # Errors
-    /// [`ConfigError::Value`].
-    pub fn checked(self, origin: &str) -> Result<Self, ConfigError> {
-        match self.problem() {
-            Some((key, message)) => Err(ConfigError::Value { origin: origin.to_owned(), key, message }),
-            None => Ok(self),
-        }
-    }
-}
-
-/// Parses TOML text of sections as any config; `origin` names it in errors, `overrides` are `a.b=c` assignments applied on
-/// top. Returns the config, unchecked, and the origin for errors about its values.
-///
-/// # Errors
-/// [`ConfigError::Syntax`], naming origin and key.
-pub fn parse<T: DeserializeOwned>(
-    text: &str,
-    origin: &str,
-    overrides: &[String],
-) -> Result<(T, String), ConfigError> {
-    let syntax = |origin: &str, message: String| ConfigError::Syntax { origin: origin.to_owned(), message };
-    // Straight from the text first: only this way do messages carry line numbers.
-    let config: T = toml::from_str(text).map_err(|e| syntax(origin, e.to_string()))?;
-    let mut table: toml::Table = toml::from_str(text).map_err(|e| syntax(origin, e.to_string()))?;
-    // A list of values would pass for a section.
-    if let Some((key, value)) = table.iter().find(|(_, value)| !value.is_table()) {
-        return Err(syntax(origin, format!("`{key}` is a {}, must be a section [{key}]", value.type_str())));
-    }
-    if overrides.is_empty() {
-        return Ok((config, origin.to_owned()));
-    }
-    for assignment in overrides {
-        assign(&mut table, assignment).map_err(|message| syntax(&format!("--set {assignment}"), message))?;
-    }
-    let origin = format!("{origin} with --set {}", overrides.join(" --set "));
-    let config =
-        toml::Value::Table(table).try_into().map_err(|e: toml::de::Error| syntax(&origin, e.to_string()))?;
-    Ok((config, origin))
-}
-
-/// Exactly four numbers; an array type alone would drop a fifth without a word.
-fn four<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<[usize; 4], D::Error> {
-    let values = Vec::<usize>::deserialize(deserializer)?;
-    let count = values.len();
-    values.try_into().map_err(|_| serde::de::Error::custom(format!("{count} numbers, must be 4")))
-}
-
-/// Applies `a.b=c`: `c` is a TOML value, or a bare word for a string.
-fn assign(table: &mut toml::Table, assignment: &str) -> Result<(), String> {
-    let Some((key, value)) = assignment.split_once('=') else {
-        return Err("expected SECTION.KEY=VALUE".into());
-    };
-    let parsed = toml::from_str::<toml::Table>(&format!("v = {value}")).ok();
-    let parsed = parsed.filter(|table| table.len() == 1).and_then(|mut table| table.remove("v"));
-    let value = parsed.unwrap_or_else(|| toml::Value::String(value.trim().to_owned()));
-    let mut path: Vec<&str> = key.split('.').map(str::trim).collect();
-    let last = path.pop().filter(|k| !k.is_empty()).ok_or("the key is empty")?;
-    let mut at = table;
-    for section in path {
-        let entry = at.entry(section).or_insert_with(|| toml::Value::Table(toml::Table::new()));
-        at = entry.as_table_mut().ok_or_else(|| format!("`{section}` is a value, not a section"))?;
-    }
-    at.insert(last.to_owned(), value);
-    Ok(())
 }

@@ -187,8 +187,9 @@ pub fn regress(network: &Regressor, config: &Config, views: &[Seen], window: &Wi
     parts
 }
 
-/// What the geometry alone gives, without a regressor (LEARNING.md, "A geometric start"): on every valid point of some views
-/// a round Gaussian, 0.3 times as wide as its neighbours are apart, of its pixel's colour; front camera's frame.
+/// Gaussians of the geometry alone, without a regressor, front camera's frame. Every valid point of some views becomes
+/// a round Gaussian of its pixel's colour. σ is 0.3 times the distance of its neighbours
+/// (docs/method.md, "Geometric start").
 pub fn geometric(views: &[Seen], device: &Device) -> Gaussians {
     let regressor = RegressorConfig { start: Some(RegressorStart::Geometric), ..RegressorConfig::default() };
     let config = Config { regressor, ..Config::default() };

@@ -16,7 +16,10 @@ fn component(name: &str, container: &str) -> String {
         // Burn's normalisation layers.
         "gamma" => "weight".into(),
         "beta" => "bias".into(),
-        // Variants of the head.
+        // Variants of the body and of the head.
+        "body" => String::new(),
+        "Transformer" if container.starts_with("Enum:") => "dust3r".into(),
+        "Convolution" if container.starts_with("Enum:") => "unet".into(),
         "Dpt" if container.starts_with("Enum:") => "dpt".into(),
         "Linear" if container.starts_with("Enum:") => String::new(),
         // Entries of a PyTorch `Sequential`.
@@ -41,6 +44,11 @@ impl<'a> Path<'a> {
         let parts: Vec<&str> =
             self.open.iter().map(|(part, _)| part.as_str()).filter(|p| !p.is_empty()).collect();
         format!("{}{}", self.prefix, parts.join("."))
+    }
+
+    /// Kind of the module that holds the current parameter, as Burn names it.
+    pub(crate) fn container(&self) -> &str {
+        self.open.last().map_or("", |(_, container)| container)
     }
 
     /// Whether the current parameter is the weight of a Burn `Linear`, which is the transpose of PyTorch's.

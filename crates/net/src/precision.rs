@@ -5,6 +5,7 @@ use burn::module::{Module, ModuleMapper, Param};
 use burn::tensor::{FloatDType, Tensor};
 use serde::{Deserialize, Serialize};
 
+use crate::names::Path;
 use crate::network::PointPredictor;
 
 /// What the point predictor computes in.
@@ -45,42 +46,79 @@ impl Precision {
         if self == Self::F32 {
             return predictor;
         }
-        predictor.map(&mut Lower { dtype: self.dtype(), open: Vec::new() })
+        let is_last = predictor.is_last_layer();
+        predictor.map(&mut Lower { dtype: self.dtype(), is_last, path: Path::new("") })
     }
 }
 
-struct Lower {
+struct Lower<'a> {
     dtype: FloatDType,
-    /// Names and kinds of the open modules.
-    open: Vec<[String; 2]>,
+    /// Tells the layers that give raw points by their names: points of 2 m would be rounded by a centimetre in bf16.
+    is_last: fn(&str) -> bool,
+    path: Path<'a>,
 }
 
-impl Lower {
-    /// Whether the open module is a layer of weights, and none that gives what is activated: points of 2 m would be
-    /// rounded by a centimetre in bf16.
-    fn applies(&self) -> bool {
-        // The innermost entry is the parameter's own.
-        let [.., [name, _], [_, kind]] = self.open.as_slice() else { return false };
-        let is_layer = ["Struct:Linear", "Struct:Conv2d", "Struct:ConvTranspose2d"].contains(&kind.as_str());
-        let in_head = self.open.iter().any(|[name, _]| name.starts_with("downstream_head"));
-        is_layer && !(in_head && ["at_4", "proj"].contains(&name.as_str()))
-    }
-}
-
-impl ModuleMapper for Lower {
+impl ModuleMapper for Lower<'_> {
     fn enter_module(&mut self, name: &str, container_type: &str) {
-        self.open.push([name.to_owned(), container_type.to_owned()]);
+        self.path.enter(name, container_type);
     }
 
     fn exit_module(&mut self, _name: &str, _container_type: &str) {
-        self.open.pop();
+        self.path.leave();
     }
 
     fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
-        if !self.applies() {
+        let name = self.path.name();
+        let layer = name.rsplit_once('.').map_or("", |(layer, _)| layer);
+        let is_layer =
+            ["Struct:Linear", "Struct:Conv2d", "Struct:ConvTranspose2d"].contains(&self.path.container());
+        if !is_layer || (self.is_last)(layer) {
             return param;
         }
         let (id, values, mapper) = param.consume();
         Param::from_mapped_value(id, values.cast(self.dtype), mapper)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use burn::tensor::{DType, Device};
+
+    use super::*;
+    use crate::config::{Body, Config, HeadKind};
+    use crate::weights::{NamedVisitor, random_predictor, visit_named};
+
+    /// Names of the weights of layers that stay in f32.
+    fn in_f32(config: &Config) -> Vec<String> {
+        struct Collect(Vec<String>);
+        impl NamedVisitor for Collect {
+            fn visit<const D: usize>(&mut self, name: &str, _: bool, parameter: &Param<Tensor<D>>) {
+                if D > 1 && parameter.val().dtype() == DType::F32 {
+                    self.0.push(name.to_owned());
+                }
+            }
+        }
+        let mut names = Collect(Vec::new());
+        let predictor = Precision::Bf16.lower(random_predictor(config, 1, &Device::flex()));
+        visit_named(&predictor, "", &mut names);
+        names.0
+    }
+
+    #[test]
+    fn the_last_layers_of_every_body_and_head_stay_in_f32() {
+        let mut config = Config::default();
+        let n = &mut config.network;
+        (n.enc_dim, n.enc_depth, n.dec_dim, n.dec_depth) = (64, 1, 48, 1);
+        (n.enc_heads, n.dec_heads, n.hooks) = (4, 4, [0, 1, 1, 1]);
+        (n.layer_dims, n.feature_dim, n.last_dim) = ([8, 8, 8, 8], 8, 8);
+        let of_heads = |tail: &str| -> Vec<String> {
+            (1..=4).map(|k| format!("dust3r.downstream_head{k}.{tail}.weight")).collect()
+        };
+        assert_eq!(in_f32(&config), of_heads("dpt.head.4"));
+        config.network.head = HeadKind::Linear;
+        assert_eq!(in_f32(&config), of_heads("proj"));
+        (config.network.body, config.network.patch) = (Body::Convolution, 8);
+        let decoders = ["unet.decoder.conv_out.weight", "unet.side_decoder.conv_out.weight"];
+        assert_eq!(in_f32(&config), decoders);
     }
 }

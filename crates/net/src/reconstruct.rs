@@ -1,4 +1,4 @@
-//! The whole inference: two photographs on their canvas → Gaussians (SNAPSNAP §0).
+//! The whole inference: two photographs on their canvas → Gaussians (docs/method.md).
 
 use std::time::{Duration, Instant};
 
@@ -54,7 +54,7 @@ impl Reconstruction {
             WorldFrame::Upright => {
                 Camera::orbit_at_yaw_degrees(0.0, config.network.resolution as u32).world_to_camera.inverse()
             }
-            // The published demo: a determinant of −1, so the person comes out mirrored (SNAPSNAP §11).
+            // As in the published demo: the determinant is −1, so the person is mirrored.
             WorldFrame::Mirrored => RigidTransform {
                 rotation: glam::DMat3::from_diagonal(glam::DVec3::NEG_ONE),
                 translation: glam::DVec3::new(0.0, 0.0, 2.0),

@@ -1,4 +1,5 @@
-//! Colours for the unseen sides: every side point takes the colour of the nearest front or back point (SNAPSNAP §7).
+//! Colours of the unseen sides: every side point takes the colour of the nearest front or back point
+//! (docs/method.md, "Side colours").
 
 use crate::neighbours::Neighbours;
 

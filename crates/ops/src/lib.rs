@@ -31,6 +31,7 @@ use burn::tensor::{DType, Device, FloatDType, Tensor, TensorData};
 
 use buffers::Buffers;
 pub use rope::Rope;
+use snapsnap_base::bilinear::{Tap, taps};
 use train::{Attention, Tokens};
 
 /// Whether `x` lives where this crate's own kernels apply: in f32 on `flex`, with nothing tracked for gradients.
@@ -120,16 +121,16 @@ pub fn linear_gelu(layer: &Linear, x: Tensor<3>) -> Tensor<3> {
 /// Bilinear resize of `[B, C, H, W]` to `size` (rows, columns).
 ///
 /// `align_corners`: the outermost samples coincide (inside the DPT head); otherwise pixel areas do (everything else).
-/// Check values (SNAPSNAP §13.4): [0, 1] → [0, ⅓, ⅔, 1] and [0, ¼, ¾, 1].
+/// Check values: [0, 1] → [0, ⅓, ⅔, 1] and [0, ¼, ¾, 1] (docs/method.md, "Check values").
 pub fn bilinear(x: Tensor<4>, size: [usize; 2], align_corners: bool) -> Tensor<4> {
     let ([b, c, h, w], device) = (x.dims(), x.device());
-    let [down, across] = [(h, size[0]), (w, size[1])].map(|(from, to)| resize::taps(from, to, align_corners));
+    let [down, across] = [(h, size[0]), (w, size[1])].map(|(from, to)| taps(from, to, align_corners));
     if is_trained_fast(&x) {
         return tracked::resized(x, down, across);
     }
     if device.is_autodiff() {
         // Burn's own operator has no backward pass on GPUs; products with constant matrices have.
-        let matrix = |taps: &[resize::Tap], from: usize| {
+        let matrix = |taps: &[Tap], from: usize| {
             let data = TensorData::new(resize::matrix(taps, from), [taps.len(), from]);
             Tensor::<2>::from_data(data, &device).cast(x.dtype())
         };

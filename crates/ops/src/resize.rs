@@ -3,27 +3,11 @@
 
 use pulp::Arch;
 use rayon::prelude::*;
+use snapsnap_base::bilinear::Tap;
 
 use crate::wide::Buffers;
 
-/// Where the samples of one target position are: lower index, upper index, weight of the upper.
-pub type Tap = (usize, usize, f32);
-
-/// Samples and weights of every target position along one axis.
-pub fn taps(from: usize, to: usize, align_corners: bool) -> Vec<Tap> {
-    let position = |i: usize| match align_corners {
-        true if to > 1 => i as f64 * (from - 1) as f64 / (to - 1) as f64,
-        true => 0.0,
-        false => ((i as f64 + 0.5) * from as f64 / to as f64 - 0.5).clamp(0.0, (from - 1) as f64),
-    };
-    let tap = |at: f64| {
-        let low = (at as usize).min(from - 1);
-        (low, (low + 1).min(from - 1), (at - low as f64) as f32)
-    };
-    (0..to).map(position).map(tap).collect()
-}
-
-/// The same as a matrix `[taps.len(), from]`, row-major.
+/// Taps as a matrix `[taps.len(), from]`, row-major.
 pub fn matrix(taps: &[Tap], from: usize) -> Vec<f32> {
     let mut values = vec![0.0_f32; taps.len() * from];
     for (row, &(low, high, weight)) in values.chunks_exact_mut(from).zip(taps) {

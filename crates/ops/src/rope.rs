@@ -1,5 +1,5 @@
-//! Rotary position embedding in two dimensions (SNAPSNAP §1.3): the first half of a head's channels is turned by the
-//! token's row, the second half by its column.
+//! Rotary position embedding in two dimensions. The first half of a head's channels is rotated by the token's row, the
+//! second half by its column (docs/method.md, "Patch embedding and RoPE").
 
 use burn::tensor::{Device, Tensor, TensorData};
 

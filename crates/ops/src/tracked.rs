@@ -4,7 +4,9 @@ use burn::tensor::Tensor;
 
 use crate::layers::BUFFERS;
 use crate::op::{self, Kept, Kernel};
-use crate::resize::{Tap, resize, resize_gradient};
+use snapsnap_base::bilinear::Tap;
+
+use crate::resize::{resize, resize_gradient};
 use crate::train::{Attention, Tokens};
 use crate::{Rope, host};
 

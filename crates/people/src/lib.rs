@@ -3,5 +3,4 @@
 pub mod makehuman;
 mod math;
 mod pattern;
-pub mod random;
 pub mod synth;

@@ -67,7 +67,7 @@ pub struct Orbit {
 }
 
 impl Default for Orbit {
-    /// The training camera in front of the subject (SNAPSNAP §5.3).
+    /// The nominal camera in front of the subject (docs/method.md, "Cameras").
     fn default() -> Self {
         Self {
             centre: DVec3::new(0.0, 0.85, 0.0),
@@ -81,8 +81,8 @@ impl Default for Orbit {
 }
 
 impl Orbit {
-    /// The camera with a square image of `size` pixels; its principal point is moved down by 25/1024 of the size, as that
-    /// of the training cameras (SNAPSNAP §5.3).
+    /// The camera with a square image of `size` pixels. Its principal point is moved down by 25/1024 of the size
+    /// (docs/method.md, "Cameras").
     pub fn camera(&self, size: u32) -> Camera {
         let (sin, cos) = self.yaw_degrees.to_radians().sin_cos();
         let (pitch_sin, pitch_cos) = self.pitch_degrees.to_radians().sin_cos();
@@ -106,7 +106,7 @@ impl Orbit {
 }
 
 impl Camera {
-    /// The training orbit's camera at `yaw_degrees` with a square image of `size` pixels (SNAPSNAP §5.3): 2 m from
+    /// The training orbit's camera at `yaw_degrees` with a square image of `size` pixels: 2 m from
     /// (0, 0.85, 0), 8° downward pitch, focal length 0.8·size, principal point moved down by 25/1024 of the size.
     /// World: y up, floor at y = 0; yaw 0 stands on +z and sees the front of a subject that faces +z.
     pub fn orbit_at_yaw_degrees(yaw_degrees: f64, size: u32) -> Self {
@@ -204,7 +204,7 @@ mod tests {
         assert!((a.0 - b.0).length() < 1e-9 && (a.1 - b.1).abs() < 1e-12, "{a:?} {b:?}");
     }
 
-    /// Check values of SNAPSNAP §5.3 and §13.4.
+    /// The camera's published numbers (docs/method.md, "Check values").
     #[test]
     fn orbit_camera_matches_the_published_check_values() {
         let camera = Camera::orbit_at_yaw_degrees(0.0, 1024);

@@ -6,10 +6,10 @@ use std::path::Path;
 use glam::{DMat3, DVec2, DVec3};
 use serde::Serialize;
 use serde_json::Value;
+use snapsnap_base::file::{self, write_whole};
+use snapsnap_base::{FileError, quoted};
 
-use crate::error::quoted;
-use crate::file::{self, write_whole};
-use crate::{Camera, RigidTransform, SplatError};
+use crate::{Camera, RigidTransform};
 
 /// Largest file that is read; a camera takes about 400 bytes.
 const MAX_BYTES: u64 = 256 << 20;
@@ -69,12 +69,11 @@ impl Entry {
 /// Reads the cameras of `path`.
 ///
 /// # Errors
-/// [`SplatError::Read`] if the file cannot be read, [`SplatError::Cameras`] if it is not such a list, names the entry
-/// and the field, or if a camera in it cannot be rendered into.
-pub fn read(path: &Path) -> Result<Vec<Camera>, SplatError> {
-    let wrong = |problem: String| SplatError::Cameras { path: path.to_owned(), problem };
-    let text = file::read_text(path, MAX_BYTES)
-        .map_err(|source| SplatError::Read { path: path.to_owned(), source })?;
+/// [`FileError`] if the file cannot be read or is no such list, or if nothing can be rendered into one of its cameras. It
+/// names the entry and the field.
+pub fn read(path: &Path) -> Result<Vec<Camera>, FileError> {
+    let wrong = |problem: String| FileError::unsuitable(path, problem);
+    let text = file::read_text(path, MAX_BYTES).map_err(FileError::read(path))?;
     // In two steps, so that an error can name the camera.
     let text = text.trim_start_matches('\u{feff}');
     let entries: Vec<Value> = serde_json::from_str(text).map_err(|e| wrong(quoted(&e.to_string())))?;
@@ -109,8 +108,8 @@ pub fn read(path: &Path) -> Result<Vec<Camera>, SplatError> {
 /// Writes `cameras` to `path`, whole or not at all.
 ///
 /// # Errors
-/// [`SplatError::Write`].
-pub fn write(cameras: &[Camera], path: &Path) -> Result<(), SplatError> {
+/// [`FileError::Write`].
+pub fn write(cameras: &[Camera], path: &Path) -> Result<(), FileError> {
     let entry = |camera: &Camera| {
         let RigidTransform { rotation, translation } = camera.world_to_camera;
         let row = |i: usize| {
@@ -132,14 +131,14 @@ pub fn write(cameras: &[Camera], path: &Path) -> Result<(), SplatError> {
         serde_json::to_writer_pretty(&mut *out, &entries)?;
         writeln!(out)
     })
-    .map_err(|source| SplatError::Write { path: path.to_owned(), source })
+    .map_err(FileError::write(path))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn read_text(text: &str) -> Result<Vec<Camera>, SplatError> {
+    fn read_text(text: &str) -> Result<Vec<Camera>, FileError> {
         let folder = tempfile::tempdir().expect("folder");
         let path = folder.path().join("cameras.json");
         std::fs::write(&path, text).expect("written");

@@ -1,6 +1,6 @@
 //! What can go wrong on this floor.
 
-use std::path::PathBuf;
+use snapsnap_base::FileError;
 
 /// Errors of cameras, Gaussians and their files.
 #[derive(Debug, thiserror::Error)]
@@ -62,47 +62,7 @@ pub enum SplatError {
         /// Row of the offending value.
         index: usize,
     },
-    /// A camera file that cannot be used.
-    #[error("{path}: {problem}")]
-    Cameras {
-        /// The file.
-        path: PathBuf,
-        /// What is wrong with it.
-        problem: String,
-    },
-    /// A file that holds no Gaussians that can be read, or cannot hold those to be written.
-    #[error("{path}: {problem}")]
-    Scene {
-        /// The file.
-        path: PathBuf,
-        /// What is wrong with it.
-        problem: String,
-    },
-    /// A file could not be read.
-    #[error("{path}: cannot read: {source}")]
-    Read {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        source: std::io::Error,
-    },
-    /// A file could not be written.
-    #[error("{path}: cannot write: {source}")]
-    Write {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        source: std::io::Error,
-    },
-}
-
-/// Text from a file as it may appear in a message: escaped and short.
-pub fn quoted(text: &str) -> String {
-    /// Characters that are shown.
-    const SHOWN: usize = 80;
-    let mut shown: String = text.chars().take(SHOWN).flat_map(char::escape_debug).collect();
-    if text.chars().nth(SHOWN).is_some() {
-        shown.push('…');
-    }
-    shown
+    /// A file of cameras or Gaussians.
+    #[error(transparent)]
+    File(#[from] FileError),
 }

@@ -88,7 +88,8 @@ impl Gaussians {
         self
     }
 
-    /// Moves the whole set rigidly: the centres, and the quaternions by left multiplication (SNAPSNAP §13.3, fix 1).
+    /// Moves the whole set rigidly: the centres, and the quaternions by left multiplication
+    /// (docs/method.md, "World frame").
     ///
     /// # Panics
     /// If `transform` is a reflection: no quaternion can express the mirrored Gaussians.

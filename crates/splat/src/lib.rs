@@ -4,7 +4,6 @@ pub mod adapter;
 mod camera;
 pub mod cameras;
 mod error;
-pub mod file;
 mod gaussians;
 mod op;
 mod options;
@@ -17,7 +16,7 @@ mod spz;
 mod vjp;
 
 pub use camera::{Camera, Orbit, RigidTransform};
-pub use error::{SplatError, quoted};
+pub use error::SplatError;
 pub use gaussians::Gaussians;
 pub use op::{Counts, MAX_SIDE};
 pub use options::{MIN_ALPHA, MIN_TRANSMITTANCE, RenderOptions, TILE};

@@ -11,8 +11,7 @@ use crate::scene::Stored;
 pub(crate) use read::read;
 
 /// Properties of one vertex of SH degree 0, in INRIA's order; those of higher degrees, `f_rest_*`, come behind `f_dc_2`. No
-/// zeros are written for them: every known viewer reads a missing band as zero, and 45 floats would triple the file
-/// (SNAPSNAP §13.3, fix 17).
+/// zeros are written for them: every known viewer reads a missing band as zero, and 45 floats would triple the file.
 pub const PROPERTIES: [&str; 17] = [
     "x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1",
     "scale_2", "rot_0", "rot_1", "rot_2", "rot_3",

@@ -22,7 +22,7 @@ pub struct Rendered {
 }
 
 /// Renders `gaussians` into `cameras`, all of one image size, by front-to-back alpha compositing of their elliptical
-/// projections (EWA splatting; SNAPSNAP §9.1).
+/// projections (EWA splatting; docs/method.md, "Splatting").
 ///
 /// Differentiable in means, rotations, scales, opacities, colours and background; what nobody tracks costs nothing in
 /// the backward pass. On the CPU and on the GPU, equal inputs give equal bits, forward and backward. A Gaussian whose

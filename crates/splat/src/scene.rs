@@ -6,7 +6,9 @@ use std::path::Path;
 
 use burn::tensor::{Device, Tensor, TensorData};
 
-use crate::{Camera, Gaussians, SplatError, file, ply, sh, spz};
+use snapsnap_base::{FileError, file};
+
+use crate::{Camera, Gaussians, SplatError, ply, sh, spz};
 
 /// Opacities are stored as logits; f32 saturates to ±∞ at 0 and 1, so they are kept this far away from both.
 const OPACITY_MARGIN: f32 = 1e-6;
@@ -169,34 +171,34 @@ impl Stored {
     /// Reads a file of either kind.
     ///
     /// # Errors
-    /// [`SplatError::Read`] if it cannot be read, [`SplatError::Scene`] if it is neither, is cut short, or lacks something.
+    /// [`SplatError::File`] if it cannot be read, is of neither kind, is cut short, or lacks something.
     pub fn read(path: &Path) -> Result<Self, SplatError> {
-        let cannot = |source| SplatError::Read { path: path.to_owned(), source };
-        let mut file = file::open(path).map_err(cannot)?;
+        let cannot = FileError::read(path);
+        let mut file = file::open(path).map_err(&cannot)?;
         let mut start = [0; 2];
-        let length = fill(&mut file, &mut start).map_err(cannot)?;
+        let length = fill(&mut file, &mut start).map_err(&cannot)?;
         let whole = start[..length].chain(file);
         let read = match start {
             spz::GZIP => spz::read(whole),
             spz::BARE => Err("SPZ of version 4 or later; 1 to 3 are read".to_owned().into()),
             _ => ply::read(whole),
         };
-        read.map_err(|problem| match problem {
+        let read = read.map_err(|problem| match problem {
             Problem::Io(source) => cannot(source),
-            Problem::Content(problem) => SplatError::Scene { path: path.to_owned(), problem },
-        })
+            Problem::Content(problem) => FileError::unsuitable(path, problem),
+        });
+        Ok(read?)
     }
 
     /// Writes the kind of file that `path`'s extension says, whole or not at all.
     ///
     /// # Errors
-    /// [`SplatError::NotFinite`], [`SplatError::Scene`] for what an SPZ cannot hold, [`SplatError::Write`] if the disk says
-    /// no; `path` is then left as it was.
+    /// [`SplatError::NotFinite`]; [`SplatError::File`] for values that an SPZ cannot hold, or if the file cannot be written.
+    /// `path` is then left as it was.
     pub fn write(&self, path: &Path) -> Result<(), SplatError> {
         let kind = Kind::of(path);
         self.check(kind, path)?;
-        file::write_whole(path, |out| self.encode(kind, out))
-            .map_err(|source| SplatError::Write { path: path.to_owned(), source })
+        Ok(file::write_whole(path, |out| self.encode(kind, out)).map_err(FileError::write(path))?)
     }
 
     /// The bytes of a file of this kind.
@@ -207,8 +209,8 @@ impl Stored {
         let path = Path::new("memory");
         self.check(kind, path)?;
         let mut bytes = Vec::new();
-        let encoded = self.encode(kind, &mut bytes);
-        encoded.map_err(|source| SplatError::Write { path: path.to_owned(), source }).map(|()| bytes)
+        self.encode(kind, &mut bytes).map_err(FileError::write(path))?;
+        Ok(bytes)
     }
 
     /// What a file of this kind would hold less well than its steps let expect: a sentence each.
@@ -235,9 +237,7 @@ impl Stored {
         }
         match kind {
             Kind::Ply => Ok(()),
-            Kind::Spz => {
-                spz::check(self).map_err(|problem| SplatError::Scene { path: path.to_owned(), problem })
-            }
+            Kind::Spz => Ok(spz::check(self).map_err(|problem| FileError::unsuitable(path, problem))?),
         }
     }
 }

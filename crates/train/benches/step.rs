@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 use burn::module::{Module, Param, ParamGroup, ParamId};
 use burn::optim::GradientsParams;
 use burn::tensor::{Device, Distribution, Tensor};
+use snapsnap_base::config::Schema;
 use snapsnap_net::network::{PointPredictor, View};
 use snapsnap_net::regressor::Statistics;
 use snapsnap_net::weights::{NamedVisitor, random_predictor, random_regressors, visit_named};

@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 
 use burn::tensor::Device;
+use snapsnap_base::FileError;
 use snapsnap_net::weights::{Source, WeightsError, write_tensors};
 use snapsnap_ops::host;
 
@@ -19,7 +20,7 @@ const PROGRESS_KEY: &str = "snapsnap.training";
 /// Writes the state of a run.
 ///
 /// # Errors
-/// [`WeightsError::Write`]; what was there before stays.
+/// [`WeightsError::File`]; what was there before stays.
 pub(crate) fn save<T: Task>(path: &Path, learner: &Learner<T>) -> Result<(), WeightsError> {
     let (mut rows, times) = learner.optimizer.record();
     let progress = Progress { times, ..learner.progress.clone() };
@@ -48,7 +49,7 @@ pub(crate) fn load<T: Task>(
     learner: &mut Learner<T>,
     device: &Device,
 ) -> Result<(), WeightsError> {
-    let wrong = |message: String| WeightsError::Format { path: path.to_owned(), message };
+    let wrong = |message: String| WeightsError::from(FileError::unsuitable(path, message));
     let source = Source::open(path)?;
     let text = source.metadata.get(PROGRESS_KEY).ok_or_else(|| wrong("is no state of a training".into()))?;
     let progress: Progress = serde_json::from_str(text).map_err(|e| wrong(format!("{PROGRESS_KEY}: {e}")))?;

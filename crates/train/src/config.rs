@@ -5,9 +5,7 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 use snapsnap_data::sample::SampleConfig;
 use snapsnap_eval::lpips::MIN_SIDE;
-use snapsnap_net::config::{
-    ConfMode, Config, ConfigError, ModeConfig, NetworkConfig, RegressorConfig, parse,
-};
+use snapsnap_net::config::{ConfMode, Config, ModeConfig, NetworkConfig, RegressorConfig, Schema};
 
 use crate::optimizer::OptimizerConfig;
 use crate::precision::Precision;
@@ -217,30 +215,13 @@ impl Default for Stage2Config {
     }
 }
 
+impl Schema for TrainConfig {
+    fn refusal(&self) -> Option<(String, String)> {
+        self.networks().refusal().or_else(|| self.problem())
+    }
+}
+
 impl TrainConfig {
-    /// Parses and checks TOML text; `origin` names it in errors, `overrides` are `a.b=c` assignments applied on top.
-    ///
-    /// # Errors
-    /// [`ConfigError`], naming origin, key and allowed values.
-    pub fn from_toml(text: &str, origin: &str, overrides: &[String]) -> Result<Self, ConfigError> {
-        let (config, origin): (Self, String) = parse(text, origin, overrides)?;
-        config.networks().checked(&origin)?;
-        match config.problem() {
-            Some((key, message)) => {
-                Err(ConfigError::Syntax { origin, message: format!("`{key}`: {message}") })
-            }
-            None => Ok(config),
-        }
-    }
-
-    /// The config as TOML, every set key written out.
-    ///
-    /// # Panics
-    /// Never: every field is representable in TOML.
-    pub fn to_toml(&self) -> String {
-        toml::to_string_pretty(self).expect("the config has only TOML types")
-    }
-
     /// The part that a weight file holds.
     pub fn networks(&self) -> Config {
         Config { network: self.network.clone(), regressor: self.regressor.clone(), mode: self.mode.clone() }

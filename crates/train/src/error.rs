@@ -1,7 +1,7 @@
 //! What can go wrong in a training.
 
+use snapsnap_base::FileError;
 use snapsnap_eval::EvalError;
-use snapsnap_mesh::FileError;
 use snapsnap_net::weights::WeightsError;
 use snapsnap_splat::SplatError;
 

@@ -3,9 +3,9 @@
 use std::sync::Arc;
 
 use burn::data::dataset::Dataset;
+use snapsnap_base::FileError;
 use snapsnap_data::dataset::{Folder, Split};
 use snapsnap_data::sample::{Augment, Joined, SampleConfig};
-use snapsnap_mesh::FileError;
 
 use crate::TrainError;
 use crate::config::{TrainConfig, ValidationSplit};

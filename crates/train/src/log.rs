@@ -6,8 +6,8 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
-use snapsnap_mesh::FileError;
-use snapsnap_splat::file;
+use snapsnap_base::FileError;
+use snapsnap_base::file;
 
 use crate::events::Events;
 

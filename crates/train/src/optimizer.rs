@@ -1,4 +1,5 @@
-//! Optimisers: AdamW as published, and Muon for hidden matrices and kernels with AdamW for the rest (LEARNING.md).
+//! Optimisers: AdamW as published, or Muon for hidden matrices and kernels with AdamW for the other parameters
+//! (docs/method.md, "Optimisation and schedules").
 
 use std::collections::BTreeMap;
 

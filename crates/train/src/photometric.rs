@@ -1,4 +1,4 @@
-//! Stage 2: how far rendered pictures are from the true ones (SNAPSNAP §9.2).
+//! Stage 2: the difference of rendered and true pictures (docs/method.md, "Losses of stage 2").
 
 use burn::tensor::Tensor;
 use snapsnap_eval::similarity::ssim_gaussian;

@@ -1,4 +1,5 @@
-//! Stage 1: how far predicted points lie from the true ones, and how sure the network may be of them (SNAPSNAP §6).
+//! Stage 1: distances of predicted points from the true ones, and the entropy of the confidences
+//! (docs/method.md, "Losses of stage 1").
 
 use burn::tensor::Tensor;
 use snapsnap_net::Window;

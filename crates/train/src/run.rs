@@ -8,10 +8,11 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use burn::tensor::Device;
+use snapsnap_base::FileError;
+use snapsnap_base::config::Schema;
+use snapsnap_base::file;
 use snapsnap_eval::preview;
-use snapsnap_mesh::FileError;
 use snapsnap_net::weights;
-use snapsnap_splat::file;
 
 use crate::checkpoint;
 use crate::config::TrainConfig;

@@ -8,7 +8,8 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
 pub enum Schedule {
-    /// PyTorch's `OneCycleLR` with cosine annealing, as the published code trains (SNAPSNAP §6).
+    /// PyTorch's `OneCycleLR` with cosine annealing, as in the published code
+    /// (docs/method.md, "Optimisation and schedules").
     OneCycle {
         /// Steps that the cycle is longer than the run.
         overhang: usize,
@@ -81,7 +82,7 @@ impl Schedule {
 mod tests {
     use super::*;
 
-    /// Of the published run: 4e-6, 1e-4 at step 1000, 4e-10 (SNAPSNAP §6).
+    /// Rates of the published run: 4e-6, 1e-4 at step 1000, 4e-10 (docs/method.md, "Check values").
     #[test]
     fn one_cycle_is_the_published_one() {
         let schedule = Schedule::published();

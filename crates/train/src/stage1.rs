@@ -1,4 +1,5 @@
-//! Stage 1: the point predictor learns from the points that four views see (SNAPSNAP §6).
+//! Stage 1: the point predictor is trained on the true points of four views
+//! (docs/method.md, "Losses of stage 1").
 
 use std::sync::Arc;
 

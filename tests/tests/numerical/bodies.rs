@@ -156,7 +156,8 @@ fn what_is_seen_both_ways_has_no_left_and_right_of_its_own() {
     }
 }
 
-/// The nominal cameras' focal length is 0.8 of the canvas, their axis 25 of 1024 pixels below its middle (SNAPSNAP §5.3).
+/// The nominal cameras' focal length is 0.8 of the canvas, their axis 25 of 1024 pixels below its middle
+/// (docs/method.md, "Cameras").
 #[test]
 fn channels_say_how_much_of_a_pixel_is_the_person_and_where_it_lies() {
     let device = Device::flex();

@@ -7,9 +7,9 @@ use std::process::Command;
 use image::{GrayImage, RgbImage};
 use snapsnap_tests::{Numbers, data, device, device_name, relative_error, snapsnap, succeed, toml_config};
 
-/// fixtures/README.md: relative L2 error of points and attributes.
+/// Relative L2 error of points and attributes.
 const BOUND: f64 = 1e-4;
-/// fixtures/README.md: a confidence this close to the threshold may fall on either side of it.
+/// A confidence this close to the threshold may fall on either side of it.
 const UNDECIDED: f32 = 1e-5;
 const THRESHOLD: f32 = 0.9;
 /// Side pixels that may take the colour of another, equally near neighbour; random weights give a handful of chances.

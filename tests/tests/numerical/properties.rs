@@ -1,6 +1,7 @@
 //! What must hold whatever the weights: symmetries of the networks, and indifference to what is not the person.
 
 use burn::tensor::{Device, Tensor, TensorData};
+use snapsnap_base::config::Schema;
 use snapsnap_net::config::{Config, Downsample, NetworkConfig, Upsample};
 use snapsnap_net::network::{Grid, Input, PointMap, PointPredictor, View, activate};
 use snapsnap_net::regressor::{RECEPTIVE_RADIUS, Statistics};
@@ -88,7 +89,8 @@ fn rope_depends_on_relative_positions_only() {
     assert!(error < 1e-5, "{error:e}");
 }
 
-/// Check values of SNAPSNAP §1.3: at y = 1, x = 0 the first pair turns by 1 rad, the second by 0.749894 rad.
+/// At row 1, column 0 the first pair turns by 1 rad, the second by 0.749894 rad
+/// (docs/method.md, "Check values").
 #[test]
 fn rope_has_its_published_check_values() {
     let Some(device) = device() else { return };
@@ -107,7 +109,7 @@ fn rope_has_its_published_check_values() {
     assert!((turned[64 + 32] - 1.0).abs() < 1e-6, "column 0 does not turn");
 }
 
-/// Check value of SNAPSNAP §2.2: r = (0.3, 0, 0.4) gives d = 0.5 and p = (0.389233, 0, 0.518977).
+/// r = (0.3, 0, 0.4) gives p = (0.389233, 0, 0.518977) (docs/method.md, "Check values").
 #[test]
 fn points_have_their_published_check_value_and_lose_nothing_near_zero() {
     let Some(device) = device() else { return };
@@ -125,7 +127,8 @@ fn points_have_their_published_check_value_and_lose_nothing_near_zero() {
     assert_eq!(raw([0.0; 3]), [0.0; 3]);
 }
 
-/// Check values of SNAPSNAP §13.4: [0, 1] → [0, ⅓, ⅔, 1] with aligned corners, [0, ¼, ¾, 1] without.
+/// [0, 1] → [0, ⅓, ⅔, 1] with aligned corners, [0, ¼, ¾, 1] without
+/// (docs/method.md, "Check values").
 #[test]
 fn bilinear_has_its_published_check_values() {
     let Some(device) = device() else { return };

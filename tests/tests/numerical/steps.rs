@@ -8,6 +8,7 @@ use burn::data::dataset::Dataset;
 use burn::tensor::{DType, Device, Tensor, TensorData};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use snapsnap_base::config::Schema;
 use snapsnap_data::dataset::{Folder, Split};
 use snapsnap_data::prepare::{DataConfig, Subject};
 use snapsnap_net::Window;

@@ -10,7 +10,9 @@ use snapsnap_eval::bench::report::{Bench, Training};
 use snapsnap_eval::bench::{Measured, dominated, measure};
 use snapsnap_eval::evaluate::LeftOut;
 
-use super::{ConfigArguments, outside_data, read_config};
+use snapsnap_base::config::Schema;
+
+use super::{ConfigArguments, outside_data};
 use crate::failure::Failure;
 use crate::progress::Progress;
 use crate::report::{ReportFolder, header};
@@ -137,9 +139,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
 }
 
 fn config_of(arguments: &Arguments) -> Result<BenchConfig, Failure> {
-    let path = &arguments.config;
-    let text = read_config(path)?;
-    let mut config = BenchConfig::from_toml(&text, &path.display().to_string(), &arguments.set)?;
+    let mut config = BenchConfig::from_file(&arguments.config, &arguments.set)?;
     if let Some(data) = &arguments.data {
         config.data.folders = vec![data.clone()];
     }

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use snapsnap_splat::file;
+use snapsnap_base::file;
 use snapsnap_splat::scene::{Kind, Stored};
 
 use super::{check_kind, check_outputs};

@@ -15,7 +15,9 @@ use snapsnap_eval::evaluate::{Contestant, LeftOut, Outcome, evaluate, sheet};
 use snapsnap_eval::report;
 use snapsnap_eval::report::evaluation::{Cost, Evaluation};
 
-use super::{ConfigArguments, outside_data, read_config};
+use snapsnap_base::config::Schema;
+
+use super::{ConfigArguments, outside_data};
 use crate::failure::Failure;
 use crate::progress::Progress;
 use crate::report::{ReportFolder, header};
@@ -213,9 +215,7 @@ fn judge_meshes(
 }
 
 fn config_of(arguments: &Arguments) -> Result<EvalConfig, Failure> {
-    let path = &arguments.config;
-    let text = read_config(path)?;
-    let mut config = EvalConfig::from_toml(&text, &path.display().to_string(), &arguments.set)?;
+    let mut config = EvalConfig::from_file(&arguments.config, &arguments.set)?;
     if !arguments.data.is_empty() {
         config.data.folders.clone_from(&arguments.data);
     }

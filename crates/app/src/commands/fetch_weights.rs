@@ -7,8 +7,8 @@ use std::time::Duration;
 
 use clap::{Args, ValueEnum};
 use sha2::{Digest, Sha256};
+use snapsnap_base::file;
 use snapsnap_eval::lpips;
-use snapsnap_splat::file;
 use ureq::Agent;
 use ureq::http::StatusCode;
 

@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
+use snapsnap_base::config::Schema;
 use snapsnap_net::config::Config;
 use snapsnap_net::weights::{self, Float, ImportOptions, SideHeads};
 

@@ -22,8 +22,9 @@ pub mod view;
 use std::path::{Component, Path, PathBuf};
 
 use clap::Args;
+use snapsnap_base::config::Schema;
+use snapsnap_base::file;
 use snapsnap_net::config::Config;
-use snapsnap_splat::file;
 use snapsnap_splat::scene::Kind;
 
 use crate::failure::Failure;
@@ -52,14 +53,6 @@ impl ConfigArguments {
             None => Config::from_toml(fallback.1, fallback.0, &self.set)?,
         })
     }
-}
-
-/// The text of a config.
-pub fn read_config(path: &Path) -> Result<String, Failure> {
-    /// Longest config that is read.
-    const MOST: u64 = 1 << 20;
-    file::read_text(path, MOST)
-        .map_err(|e| Failure::Input(format!("{}: cannot read the config: {e}", path.display())))
 }
 
 /// Refuses output paths that could not be written in the end, that are one another, or that are an input.

@@ -4,11 +4,13 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use clap::Args;
+use snapsnap_base::config::Schema;
+use snapsnap_base::file;
 use snapsnap_data::photo::{self, Canvas, Placement};
 use snapsnap_mesh::picture;
 use snapsnap_net::weights::schema::Part;
 use snapsnap_net::{Photograph, Reconstructor};
-use snapsnap_splat::{file, scene};
+use snapsnap_splat::scene;
 
 use super::mesh::{SurfaceArguments, Target, told};
 use super::{ConfigArguments, check_kind, check_outputs, is_same_file};

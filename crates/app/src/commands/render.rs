@@ -7,8 +7,9 @@ use std::time::Instant;
 
 use burn::tensor::{Device, Tensor};
 use clap::{Args, ValueEnum};
+use snapsnap_base::file;
 use snapsnap_splat::scene::{self, Loaded};
-use snapsnap_splat::{Camera, Counts, MAX_SIDE, RenderOptions, Rendered, cameras, file, render};
+use snapsnap_splat::{Camera, Counts, MAX_SIDE, RenderOptions, Rendered, cameras, render};
 
 use super::check_outputs;
 use crate::failure::Failure;

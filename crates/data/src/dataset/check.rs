@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use super::agree::{LEAST_SIDE, Seen, disagreements};
 use super::write::UNFINISHED;
 use super::{Arrangement, Description, Folder, Layout, Split, split_alpha};
-use snapsnap_mesh::FileError;
+use snapsnap_base::FileError;
 
 /// Share of the person that may have no depth: scans have gaps that are narrower than a pixel.
 const HOLES: f64 = 0.01;

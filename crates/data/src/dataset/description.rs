@@ -7,8 +7,8 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use crate::JitterConfig;
-use snapsnap_mesh::FileError;
-use snapsnap_splat::file;
+use snapsnap_base::FileError;
+use snapsnap_base::file;
 
 /// Name of the file that describes a folder.
 pub const DESCRIPTION: &str = "dataset.toml";
@@ -36,8 +36,9 @@ pub enum Arrangement {
     /// Evenly around the subject, each straying by itself: any may be the front, the opposite one is its back.
     #[default]
     Ring,
-    /// In fours: a front photograph, one of the back that strays, and the right and left sides exactly a quarter turn from the
-    /// front's own camera, so that what the sides see follows from the front (LEARNING.md, "Targets").
+    /// In fours: a front photograph, one of the back whose camera deviates, and the right and left sides exactly a
+    /// quarter turn from the front's own camera. The sides' view thereby follows from the front
+    /// (docs/method.md, "Samples").
     Groups,
 }
 

@@ -14,12 +14,13 @@ use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipArchive, ZipWriter};
 
 use super::MAX_RESOLUTION;
-use snapsnap_mesh::FileError;
-use snapsnap_mesh::open;
+use snapsnap_base::FileError;
+use snapsnap_base::file;
+use snapsnap_mesh::picture::unreadable;
 use snapsnap_mesh::picture::{MAX_BYTES, decode};
 use snapsnap_mesh::view::View;
 
-/// Stored depths of the authors' layout are ⌊2¹⁵/z⌋ (SNAPSNAP §5.2).
+/// Stored depths of the authors' layout are ⌊2¹⁵/z⌋ (docs/method.md, "Layouts").
 const INVERSE_DEPTH_UNIT: f64 = 32_768.0;
 /// What is not further than this, in metres, has no number there.
 pub const NEAREST: f32 = 0.5;
@@ -44,7 +45,7 @@ fn write_png(
     let mut out = Vec::new();
     PngEncoder::new_with_quality(&mut out, CompressionType::Fast, FilterType::Adaptive)
         .write_image(bytes, side.0 as u32, side.1 as u32, kind)
-        .map_err(|source| FileError::Decode { path: path.to_owned(), source })?;
+        .map_err(unreadable(path))?;
     write(path, &out)
 }
 
@@ -76,9 +77,7 @@ pub fn write_jpeg(path: &Path, view: &View) -> Result<(), FileError> {
         image::Rgb(if view.depth[pixel] > 0.0 { straight(view, pixel) } else { [0; 3] })
     });
     let mut out = Vec::new();
-    JpegEncoder::new_with_quality(&mut out, JPEG_QUALITY)
-        .encode_image(&picture)
-        .map_err(|source| FileError::Decode { path: path.to_owned(), source })?;
+    JpegEncoder::new_with_quality(&mut out, JPEG_QUALITY).encode_image(&picture).map_err(unreadable(path))?;
     write(path, &out)
 }
 
@@ -153,7 +152,8 @@ pub fn write_depth(path: &Path, view: &View) -> Result<(), FileError> {
 /// Undoes [`write_depth`].
 pub fn read_depth(path: &Path) -> Result<Depth, FileError> {
     let wrong = |e: &dyn std::fmt::Display| FileError::unsuitable(path, format!("is no depth map: {e}"));
-    let mut archive = ZipArchive::new(BufReader::new(open(path)?)).map_err(|e| wrong(&e))?;
+    let mut archive = ZipArchive::new(BufReader::new(file::open(path).map_err(FileError::read(path))?))
+        .map_err(|e| wrong(&e))?;
     let entry = archive.by_name(&format!("{DEPTH}.npy")).map_err(|e| wrong(&e))?;
     let mut npy = Vec::new();
     // What is longer than the largest depth map is cut off, and refused for that.
@@ -191,7 +191,8 @@ pub fn read_camera(folder: &Path, view: usize, side: u32) -> Result<Camera, File
     let load = |name: &str, shape: (usize, usize)| {
         let path = folder.join(format!("{view}_{name}.npy"));
         let mut bytes = Vec::new();
-        open(&path)?.take(4096).read_to_end(&mut bytes).map_err(FileError::read(&path))?;
+        let cannot = FileError::read(&path);
+        file::open(&path).map_err(&cannot)?.take(4096).read_to_end(&mut bytes).map_err(cannot)?;
         if !holds_its_shape(&bytes) {
             return Err(FileError::unsuitable(&path, "is no matrix: its header promises more than it holds"));
         }

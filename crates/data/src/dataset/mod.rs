@@ -1,5 +1,5 @@
-//! Data-set folders: rendered views of many subjects, in the layout of the authors' tools (SNAPSNAP §5.2) or in our exact
-//! one.
+//! Data-set folders: rendered views of many subjects, in the layout of the authors' tools or in our exact one
+//! (docs/method.md, "Layouts").
 //!
 //! ```text
 //! authors' layout                          exact layout
@@ -29,13 +29,14 @@ use std::path::{Path, PathBuf};
 
 use glam::DVec2;
 use image::{DynamicImage, GrayImage, RgbImage};
-use snapsnap_splat::{Camera, cameras, file};
+use snapsnap_base::file;
+use snapsnap_splat::{Camera, cameras};
 
 pub use check::{Checked, check};
 use description::DESCRIPTION;
 pub use description::{Arrangement, Description, Drawn, Layout, MAX_RESOLUTION, MAX_VIEWS, Split};
-use snapsnap_mesh::FileError;
-use snapsnap_mesh::open;
+use snapsnap_base::FileError;
+use snapsnap_mesh::picture;
 use snapsnap_mesh::picture::{MAX_BYTES, decode};
 pub use stored::{StoredView, unproject};
 pub use write::Made;
@@ -84,10 +85,8 @@ impl Folder {
             .find_map(|split| Some((split, folder.subjects(split).ok()?.into_iter().next()?)))
             .ok_or_else(|| foreign("no subject lies in img, train/img, val/img or test/img"))?;
         let first = folder.path(split, "img", &subject).join("0.jpg");
-        drop(open(&first)?);
-        let size = image::image_dimensions(&first)
-            .map_err(|source| FileError::Decode { path: first.clone(), source })?;
-        folder.description.resolution = size.0;
+        let [width, _] = picture::size(&first)?;
+        folder.description.resolution = width;
         folder.description.high_resolution = first.with_file_name("0_hr.jpg").is_file();
         if let Some(problem) = folder.description.problem() {
             return Err(FileError::unsuitable(&first, problem));
@@ -263,8 +262,7 @@ impl Folder {
             }
             Layout::Exact => {
                 let path = self.split_path(split).join("cameras").join(format!("{subject}.json"));
-                drop(open(&path)?);
-                let cameras = cameras::read(&path).map_err(|e| FileError::splat(&path, e))?;
+                let cameras = cameras::read(&path)?;
                 let views = self.description.views;
                 if cameras.len() != views {
                     let message = format!("holds {} cameras, the data set has {views} views", cameras.len());

@@ -5,10 +5,12 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
-use snapsnap_splat::{Camera, cameras, file, quoted};
+use snapsnap_base::file;
+use snapsnap_base::quoted;
+use snapsnap_splat::{Camera, cameras};
 
 use super::{Folder, Layout, Split, files};
-use snapsnap_mesh::FileError;
+use snapsnap_base::FileError;
 use snapsnap_mesh::view::View;
 
 /// Refuses names that lead elsewhere than to a subject's own folders, or to hidden ones.
@@ -159,7 +161,7 @@ impl Folder {
         views.collect::<Vec<_>>().into_iter().collect::<Result<(), _>>()?;
         if self.description.layout == Layout::Exact {
             let path = folder.join("cameras").join(format!("{subject}.json"));
-            cameras::write(cameras, &path).map_err(|e| FileError::splat(&path, e))?;
+            cameras::write(cameras, &path)?;
         }
         Ok(())
     }

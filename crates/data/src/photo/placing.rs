@@ -6,7 +6,8 @@ use image::{GenericImageView, GrayImage, RgbImage, imageops};
 use super::{Canvas, REFERENCE_SIDE, Rect, THRESHOLD, planes, unit};
 use crate::resize::Filter;
 
-/// Row of a training subject's middle on a canvas of 1024 (SNAPSNAP §5.3: rows 124.39 to 862.52).
+/// Row of a training subject's middle on a canvas of 1024. The subject covers rows 124.39 to 862.52
+/// (docs/method.md, "Cameras").
 const TRAINING_CENTRE: f32 = 493.5;
 
 /// Where a photograph's pixels come to lie on a canvas, both with pixel centres at +½.

@@ -200,7 +200,7 @@ pub(super) fn moved(mask: &GrayImage, reach: f32) -> GrayImage {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use snapsnap_people::random::stream;
+    use snapsnap_base::random::stream;
 
     fn disc(radius: f32) -> GrayImage {
         GrayImage::from_fn(64, 64, |x, y| {

@@ -14,7 +14,7 @@ use burn::data::dataset::{Dataset, DatasetError};
 use burn::tensor::Device;
 use rand::seq::SliceRandom;
 
-use snapsnap_people::random::stream;
+use snapsnap_base::random::stream;
 
 /// Loads batches of items of type `I` as `O`.
 pub struct Loader<I, O> {

@@ -1,4 +1,5 @@
-//! Training samples: Burn data sets of stage 1 and stage 2 (SNAPSNAP §5.6, §5.7), their batches, and a loader.
+//! Training samples: Burn data sets of stage 1 and stage 2, their batches, and a loader
+//! (docs/method.md, "Samples").
 
 mod augment;
 mod handling;
@@ -26,8 +27,8 @@ pub use augment::Augment;
 pub use handling::Handling;
 pub use joined::Joined;
 pub use loader::{Batches, Loader};
-use snapsnap_mesh::FileError;
-use snapsnap_people::random::stream;
+use snapsnap_base::FileError;
+use snapsnap_base::random::stream;
 pub use stage1::{Stage1, Stage1Batch, Stage1Batcher, Stage1Item};
 pub use stage2::{Stage2, Stage2Batch, Stage2Batcher, Stage2Item};
 pub use test_set::{Test, TestItem};
@@ -162,7 +163,7 @@ impl Source {
         self.subjects.len() * self.config.repeat
     }
 
-    /// The subject of a sample and what is random about it. Subjects come one after another (SNAPSNAP §5.6).
+    /// The subject of a sample and its random stream. Subjects come one after another, as in the published code.
     fn subject(&self, stage: u32, index: usize) -> (&str, ChaCha8Rng) {
         let subject = &self.subjects[index % self.subjects.len()];
         let random = stream(&format!("sample/{stage}/{}/{}/{index}", self.config.seed, self.epoch));
@@ -282,7 +283,7 @@ impl Photograph {
     }
 
     fn as_it_is(color: &RgbImage, mask: &GrayImage) -> Self {
-        // Channels first; the background is 0 (SNAPSNAP §5.7).
+        // Channels first; the background is 0.
         let channel = |channel: usize| {
             let pixels = color.pixels().zip(mask.pixels());
             pixels.map(move |(c, m)| {

@@ -1,12 +1,12 @@
-//! Photographs to learn from on their canvas as a user's are put there (LEARNING.md, "Targets"), and the points that belong to
-//! them. A person is then always as high and in the same place, and how large somebody is, or how far away, which no picture
-//! tells, is no part of what is learned: points are scaled as if the body's axis were as far away as from the nominal camera, and
-//! moved, all of a sample's alike, until those of the front project in that camera where its pixels lie.
+//! Training photographs placed on their canvas as a user's are, and the points that belong to them
+//! (docs/method.md, "Targets placed as a user's photographs"). A person then always has the same height and place.
+//! Size and distance, which no picture shows, are no part of the task. Points are scaled as if the body's axis were at
+//! the nominal camera's distance. One shift per sample then aligns the front's points with the rays of its pixels.
 
 use glam::{DMat3, DVec2, DVec3};
 use image::{GrayImage, RgbImage};
 use rand::Rng;
-use snapsnap_mesh::FileError;
+use snapsnap_base::FileError;
 use snapsnap_splat::{Camera, Orbit};
 
 use super::{INSIDE, Photograph, Source};

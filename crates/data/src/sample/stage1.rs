@@ -10,9 +10,10 @@ use rand::Rng;
 use super::place::Four;
 use super::{SampleConfig, Source, together};
 use crate::dataset::{Folder, Split};
-use snapsnap_mesh::FileError;
+use snapsnap_base::FileError;
 
-/// Samples of stage 1 (SNAPSNAP §5.6): any view is the front, the opposite one the back, those at right angles the sides.
+/// Samples of stage 1 (docs/method.md, "Samples"): any view is the front, the opposite one the back, those at right
+/// angles the sides.
 #[derive(Debug, Clone)]
 pub struct Stage1(Source);
 
@@ -71,7 +72,7 @@ impl Stage1 {
         let (subject, mut random) = source.subject(1, index);
         let count = source.folder.description().views;
         let first = source.front(&mut random);
-        // Front, back, and the sides at +90° and +270° (SNAPSNAP §5.6).
+        // Front, back, and the sides at +90° and +270°.
         let order = source.folder.description().arrangement.four(first, count);
         let side = source.folder.description().resolution as usize;
         let is_placed = source.is_placed(&mut random);

@@ -11,10 +11,10 @@ use snapsnap_splat::Camera;
 use super::place::Four;
 use super::{SampleConfig, Source, together};
 use crate::dataset::{Folder, Layout, Split};
-use snapsnap_mesh::FileError;
+use snapsnap_base::FileError;
 
-/// Samples of stage 2 (SNAPSNAP §5.6): with `compat`, front and back are the first view and the opposite one, else any that
-/// the config allows and the opposite one; compared are the sides and random views.
+/// Samples of stage 2 (docs/method.md, "Samples"). The front is the first view with `compat`, else any view that the
+/// config allows. The back is the opposite view. Targets are random views and the sides.
 #[derive(Debug, Clone)]
 pub struct Stage2(Source);
 

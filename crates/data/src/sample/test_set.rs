@@ -7,10 +7,10 @@ use snapsnap_splat::Camera;
 use super::{Augment, Handling, Photograph, SampleConfig, Source};
 use crate::dataset::{Folder, Split, unproject};
 use crate::photo::Mapping;
-use snapsnap_mesh::FileError;
+use snapsnap_base::FileError;
 
-/// Subjects of a test set. Which views go in is the caller's choice, the first and the opposite one in the published test, 0
-/// and 15 of 30 (SNAPSNAP §5.6). Nothing about a subject is random.
+/// Subjects of a test set. The caller chooses the input views. The published test takes the first and the opposite one,
+/// 0 and 15 of 30 (docs/method.md, "Samples"). Nothing about a subject is random.
 #[derive(Debug, Clone)]
 pub struct Test(Source);
 

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
-use snapsnap_net::config::{ConfigError, parse};
+use snapsnap_base::config::Schema;
 use snapsnap_net::precision::Precision;
 
 use crate::evaluate::config::{DataSection, Preset, views_problem};
@@ -149,27 +149,13 @@ impl Setting {
 /// Name of the setting that changes nothing.
 pub const AS_IT_IS: &str = "as it is";
 
+impl Schema for BenchConfig {
+    fn refusal(&self) -> Option<(String, String)> {
+        self.problem().map(|(key, message)| (key.to_owned(), message))
+    }
+}
+
 impl BenchConfig {
-    /// Parses and checks TOML text; `origin` names it in errors, `overrides` are `a.b=c` assignments applied on top.
-    ///
-    /// # Errors
-    /// [`ConfigError`], naming origin, key and allowed values.
-    pub fn from_toml(text: &str, origin: &str, overrides: &[String]) -> Result<Self, ConfigError> {
-        let (config, origin): (Self, String) = parse(text, origin, overrides)?;
-        match config.problem() {
-            Some((key, message)) => Err(ConfigError::Value { origin, key, message }),
-            None => Ok(config),
-        }
-    }
-
-    /// As TOML.
-    ///
-    /// # Panics
-    /// Never: every field is representable in TOML.
-    pub fn to_toml(&self) -> String {
-        toml::to_string_pretty(self).expect("the config has only TOML types")
-    }
-
     /// Names of all settings in the order of the report, the model as it is first.
     pub fn names(&self) -> Vec<String> {
         let mut named: Vec<(&String, &Setting)> = self.settings.iter().collect();

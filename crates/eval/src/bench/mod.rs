@@ -1,4 +1,4 @@
-//! Error against run time: the same people, reconstructed in different settings (EVALUATION.md).
+//! Error against run time: the same people, reconstructed in different settings.
 
 pub mod config;
 mod oracle;
@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use burn::tensor::Device;
 use glam::{DVec2, DVec3};
 use serde::{Deserialize, Serialize};
-use snapsnap_mesh::FileError;
+use snapsnap_base::FileError;
 use snapsnap_net::weights::WeightFile;
 use snapsnap_splat::{Camera, Gaussians, scene};
 

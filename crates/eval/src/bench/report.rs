@@ -4,12 +4,12 @@ use std::fmt::Write;
 use std::path::Path;
 
 use serde_json::{Value, json};
-use snapsnap_splat::file;
+use snapsnap_base::file;
 
 use super::{Measured, dominated};
 use crate::evaluate::LeftOut;
-use crate::report::plot::{Axes, Series, svg};
 use crate::report::{Header, escaped, table};
+use snapsnap_base::plot::{Axes, Series, svg};
 
 /// Longest log of a training that is read.
 const MOST: u64 = 256 << 20;
@@ -288,9 +288,10 @@ impl Bench<'_> {
             caption: "Error against run time",
             x: "a reconstruction and a view, p50, ms",
             y: "PSNR, masked, dB",
-            log: true,
+            log_x: true,
+            log_y: false,
         };
-        svg(&axes, &series)
+        svg(&[(axes, series)])
     }
 
     /// Validations of one kind over wall-clock time.
@@ -303,8 +304,9 @@ impl Bench<'_> {
                 line: true,
             })
             .collect();
-        let axes = Axes { caption: "Validation against wall-clock time", x: "minutes", y: what, log: false };
-        svg(&axes, &series)
+        let caption = "Validation against wall-clock time";
+        let axes = Axes { caption, x: "minutes", y: what, ..Axes::default() };
+        svg(&[(axes, series)])
     }
 
     /// The plots by their names, empty where there is nothing to draw.

@@ -4,9 +4,9 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
+use snapsnap_base::config::Schema;
 use snapsnap_data::dataset::Split;
 use snapsnap_data::sample::Handling;
-use snapsnap_net::config::{ConfigError, parse};
 use snapsnap_splat::RenderOptions;
 
 /// Everything that decides what an evaluation computes.
@@ -270,27 +270,13 @@ pub(crate) fn views_problem(inputs: &[usize]) -> Option<String> {
     is_twice.then(|| "names a view twice".into())
 }
 
+impl Schema for EvalConfig {
+    fn refusal(&self) -> Option<(String, String)> {
+        self.problem().map(|(key, message)| (key.to_owned(), message))
+    }
+}
+
 impl EvalConfig {
-    /// Parses and checks TOML text; `origin` names it in errors, `overrides` are `a.b=c` assignments applied on top.
-    ///
-    /// # Errors
-    /// [`ConfigError`], naming origin, key and allowed values.
-    pub fn from_toml(text: &str, origin: &str, overrides: &[String]) -> Result<Self, ConfigError> {
-        let (config, origin): (Self, String) = parse(text, origin, overrides)?;
-        match config.problem() {
-            Some((key, message)) => Err(ConfigError::Value { origin, key, message }),
-            None => Ok(config),
-        }
-    }
-
-    /// As TOML.
-    ///
-    /// # Panics
-    /// Never: every field is representable in TOML.
-    pub fn to_toml(&self) -> String {
-        toml::to_string_pretty(self).expect("the config has only TOML types")
-    }
-
     fn problem(&self) -> Option<(&'static str, String)> {
         /// Names that reports have for others.
         const TAKEN: [&str; 5] = ["model", "against", "billboard", "true_points", "mean_picture"];

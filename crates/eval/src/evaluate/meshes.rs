@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 use glam::{DVec3, Vec3};
 use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
+use snapsnap_base::FileError;
 use snapsnap_data::scan::{Collection, normalise};
-use snapsnap_mesh::FileError;
 use snapsnap_mesh::import::{self, EXTENSIONS};
 
 use super::config::EvalConfig;

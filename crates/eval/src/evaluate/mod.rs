@@ -1,4 +1,4 @@
-//! A model, and what it is compared with, on the people of a data set (EVALUATION.md, SNAPSNAP §10).
+//! Evaluation of a model and its baselines on the people of a data set (docs/method.md, "Evaluation").
 
 pub mod config;
 mod contest;

@@ -88,8 +88,8 @@ impl Model {
         self.config().network.resolution
     }
 
-    /// Gaussians of a person seen from the views `inputs`. Of more than two photographs each and the next, around the circle,
-    /// are a pair, in the frame of its first one's known camera (SNAPSNAP §5.6).
+    /// Gaussians of a person seen from the views `inputs`. With more than two photographs, each and the next around the
+    /// circle form a pair, in the frame of the known camera of its first one.
     pub fn reconstruct(&self, item: &TestItem, inputs: &[usize]) -> Made {
         let side = self.side();
         let photographs: Vec<_> = (0..inputs.len()).map(|place| photograph(item, place, side)).collect();

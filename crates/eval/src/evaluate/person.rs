@@ -4,9 +4,9 @@ use std::path::Path;
 use std::sync::Arc;
 
 use burn::tensor::{Device, Tensor, TensorData};
+use snapsnap_base::FileError;
 use snapsnap_data::dataset::{Arrangement, Folder, Split};
 use snapsnap_data::sample::{Handling, SampleConfig, Test, TestItem};
-use snapsnap_mesh::FileError;
 use snapsnap_net::Photograph;
 use snapsnap_net::config::Downsample;
 use snapsnap_net::resample::shrink;

@@ -1,8 +1,7 @@
-//! Reports: JSON whose keys stay, Markdown for people, tables and pictures (EVALUATION.md).
+//! Reports: JSON with stable keys, Markdown for people, tables and pictures.
 
 pub mod evaluation;
 pub mod meshes;
-pub mod plot;
 
 use std::time::{SystemTime, UNIX_EPOCH};
 

@@ -1,4 +1,4 @@
-//! Extreme and degenerate inputs, each with what must hold of it (EVALUATION.md, "Stability").
+//! Extreme and degenerate inputs, each with its required result (docs/method.md, "Stability cases").
 
 pub mod networks;
 pub mod report;

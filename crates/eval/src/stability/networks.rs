@@ -15,7 +15,7 @@ use snapsnap_ops::{Rope, host, rotary_attention};
 
 use super::{Case, Found, nan_is_worst};
 
-/// All cases of EVALUATION.md but those of the trained default in 16 bits, which need its weights.
+/// All cases of networks but those in 16 bits, which need trained weights.
 pub fn cases() -> Vec<Case> {
     let mut cases = Vec::new();
     for norm in [0.0_f32, 1e-12, 0.29, 0.31, 20.0, 88.0, 1e4] {

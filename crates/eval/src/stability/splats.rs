@@ -24,7 +24,7 @@ const SMALLEST: f64 = 1e-30;
 /// Norms of quaternions that name a rotation.
 const QUATERNIONS: RangeInclusive<f32> = 1e-6..=1e18;
 
-/// All cases of EVALUATION.md.
+/// All cases of the rasteriser (docs/method.md, "Stability cases").
 pub fn cases() -> Vec<Case> {
     let mut cases = Vec::new();
     let camera = camera(32, 24, 30.0);

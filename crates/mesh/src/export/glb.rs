@@ -6,11 +6,11 @@ use std::path::Path;
 
 use glam::{Vec2, Vec3};
 use serde_json::{Value, json};
-use snapsnap_splat::file::write_whole;
+use snapsnap_base::file::write_whole;
 
 use super::png;
-use crate::FileError;
 use crate::mesh::Mesh;
+use snapsnap_base::FileError;
 
 /// Kinds of numbers, in glTF's codes.
 const U16: u32 = 5123;

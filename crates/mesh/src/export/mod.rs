@@ -10,8 +10,8 @@ use std::sync::Arc;
 
 use image::{ImageFormat, RgbImage};
 
-use crate::FileError;
 use crate::mesh::Mesh;
+use snapsnap_base::FileError;
 
 pub use obj::write_obj;
 

@@ -6,11 +6,11 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use snapsnap_splat::file::write_whole;
+use snapsnap_base::file::write_whole;
 
 use super::png;
-use crate::FileError;
 use crate::mesh::Mesh;
+use snapsnap_base::FileError;
 
 /// Writes `mesh` to `path`, with its materials and textures beside it under the same name; the OBJ is written last.
 ///

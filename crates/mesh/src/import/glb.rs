@@ -11,13 +11,13 @@ use gltf::mesh::Mode;
 use gltf::{Accessor, Document, Node, Primitive, image::Source};
 use image::RgbImage;
 use serde_json::Value;
-use snapsnap_splat::file;
+use snapsnap_base::file;
 
 use super::{MAX_BYTES, Room};
 
-use crate::FileError;
 use crate::mesh::{Face, Material, Mesh};
 use crate::picture::decode_bytes;
+use snapsnap_base::FileError;
 
 /// Deepest nesting of nodes.
 const MAX_DEPTH: usize = 256;

@@ -12,12 +12,12 @@ use std::sync::Arc;
 
 use glam::Vec3;
 use image::{DynamicImage, RgbImage};
-use snapsnap_splat::quoted;
+use snapsnap_base::quoted;
 
-use crate::FileError;
-use crate::error::guarded;
 use crate::mesh::Mesh;
 use crate::picture::decode;
+use snapsnap_base::FileError;
+use snapsnap_base::guarded;
 
 /// Endings of the files that [`read`] understands, in lower case.
 pub const EXTENSIONS: [&str; 3] = ["obj", "ply", "glb"];

@@ -6,12 +6,12 @@ use std::io::{self, BufRead, Read};
 use std::path::Path;
 
 use glam::{Vec2, Vec3};
-use snapsnap_splat::{file, quoted};
+use snapsnap_base::{file, quoted};
 use tobj::{LoadError, LoadOptions};
 
 use super::{MAX_BYTES, Textures, beside};
-use crate::FileError;
 use crate::mesh::{Face, Material, Mesh};
+use snapsnap_base::FileError;
 
 /// Longest line; a face of a scan has a handful of corners.
 const MAX_LINE: usize = 1 << 20;

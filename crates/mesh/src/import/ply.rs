@@ -5,13 +5,13 @@ use std::path::Path;
 use std::str::SplitAsciiWhitespace;
 
 use glam::{Vec2, Vec3};
-use snapsnap_splat::file;
+use snapsnap_base::file;
+use snapsnap_base::quoted;
 use snapsnap_splat::ply::header::{Element, Format, Scalar, parse};
-use snapsnap_splat::quoted;
 
 use super::{MAX_BYTES, Textures};
-use crate::FileError;
 use crate::mesh::{Face, Material, Mesh};
+use snapsnap_base::FileError;
 
 /// Most corners of a face; a longer list is a damaged file.
 const MAX_CORNERS: usize = 1 << 16;

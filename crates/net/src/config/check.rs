@@ -3,16 +3,21 @@
 use crate::weights::schema::{self, TensorSpec};
 
 use super::{
-    Anchor, Body, Config, Downsample, HeadKind, RegressorColor, RegressorStart, RotationFrame, Upsample,
-    WorldFrame,
+    Anchor, Body, Config, Downsample, HeadKind, RegressorColor, RegressorStart, RotationFrame, Schema,
+    Upsample, WorldFrame,
 };
 
-/// Seven times the published size; 16 GB of f32. Beyond, a slip of the finger is likelier than a wish.
+/// Seven times the published size, 16 GB of f32. A larger number is taken for a typing error.
 const MAX_PARAMETERS: usize = 4_000_000_000;
 
+impl Schema for Config {
+    fn refusal(&self) -> Option<(String, String)> {
+        self.problem().map(|(key, message)| (key.to_owned(), message))
+    }
+}
+
 impl Config {
-    /// The first value that makes no sense: its key, and what is wrong.
-    pub(super) fn problem(&self) -> Option<(&'static str, String)> {
+    fn problem(&self) -> Option<(&'static str, String)> {
         let n = &self.network;
         let sizes = [
             ("network.enc_dim", n.enc_dim, 8_192),

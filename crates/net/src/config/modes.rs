@@ -22,14 +22,15 @@ names! {
 names! {
     /// What lies between photographs and raw points.
     Body {
-        /// DUSt3R: encoder, two decoders, a head per view (SNAPSNAP §1).
+        /// DUSt3R: encoder, two decoders, a head per view (docs/method.md, "Point predictor").
         Transformer = "transformer",
-        /// A U-shaped convolutional network over both photographs at once with attention where it is coarsest (LEARNING.md).
+        /// A U-shaped convolutional network over both photographs, with attention at the coarsest level
+        /// (docs/method.md, "Convolutional body").
         Convolution = "convolution",
     }
 }
 names! {
-    /// What predicted points are measured from (LEARNING.md).
+    /// Origin of predicted points (docs/method.md, "Ray anchors").
     Anchor {
         /// The front camera: direction and exponential distance, as published.
         None = "none",
@@ -38,7 +39,7 @@ names! {
     }
 }
 names! {
-    /// How the tokens of the two photographs become those of the unseen sides (SNAPSNAP §4, §13.3 fix 4).
+    /// Fusion of the photographs' tokens into those of the unseen sides (docs/method.md, "Tokens of the sides").
     Fusion {
         /// Arithmetic mean at equal token positions.
         Mean = "mean",
@@ -49,7 +50,7 @@ names! {
     }
 }
 names! {
-    /// Activation of the confidence channel (SNAPSNAP §2.2).
+    /// Activation of the confidence channel (docs/method.md, "Points and confidence").
     ConfMode {
         /// 1 / (1 + e^−x), Snap-Snap.
         Sigmoid = "sigmoid",
@@ -62,14 +63,15 @@ names! {
     Upsample {
         /// Bilinear, blending body and background points across the silhouette.
         Bilinear = "bilinear",
-        /// Bilinear, normalised by the mask: only body points are blended (SNAPSNAP §13.3 fix 6).
+        /// Bilinear, normalised by the mask: only body points are blended
+        /// (docs/method.md, "Enlargement and delta").
         MaskAware = "mask-aware",
     }
 }
 names! {
-    /// What the regressor's output is measured from (LEARNING.md).
+    /// Reference of the regressor's output (docs/method.md, "Attributes").
     RegressorStart {
-        /// Nothing: sizes of 0.7 mm, half transparent, grey (SNAPSNAP §8.3).
+        /// Fixed: at zero output a Gaussian has a size of 0.7 mm, opacity ½ and grey colour.
         Published = "published",
         /// The point map and the picture: at zero output a Gaussian is round, as large as its point's distance from its
         /// neighbours asks, opaque, and has the pixel's colour.
@@ -77,7 +79,7 @@ names! {
     }
 }
 names! {
-    /// Where a Gaussian's colour comes from (LEARNING.md).
+    /// Source of a Gaussian's colour (docs/method.md, "Colour residual").
     RegressorColor {
         /// The network's own.
         Free = "free",
@@ -88,7 +90,7 @@ names! {
 names! {
     /// Axes that predicted quaternions refer to.
     RotationFrame {
-        /// The front camera's; rotated into the world with the means (SNAPSNAP §13.3 fix 1).
+        /// The front camera's. Quaternions are rotated into the world with the means.
         Camera = "camera",
         /// Passed on unchanged, as if they were in world axes.
         World = "world",

@@ -1,5 +1,5 @@
-//! Where points are before the network corrects them (LEARNING.md, "Ray anchors"): a pixel's ray, of the nominal camera of
-//! its view, meets the upright plane through the body's axis that faces the camera.
+//! Points before the network's correction (docs/method.md, "Ray anchors"): the ray of a pixel, by its view's nominal
+//! camera, meets the upright plane through the body's axis that faces this camera.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use glam::{DVec2, DVec3};

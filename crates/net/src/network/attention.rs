@@ -1,5 +1,5 @@
 //! Multi-head attention with rotary positions: self-attention with one fused projection, cross-attention with three
-//! (SNAPSNAP §1.4). The scale is head_dim^(−½), there is no mask.
+//! (docs/method.md, "Transformer blocks"). The scale is head_dim^(−½). There is no mask.
 
 use burn::module::Module;
 use burn::nn::{Linear, LinearConfig};

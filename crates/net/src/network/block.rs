@@ -1,4 +1,4 @@
-//! Pre-norm transformer blocks of the encoder and the decoders (SNAPSNAP §1.4).
+//! Pre-norm transformer blocks of the encoder and the decoders (docs/method.md, "Transformer blocks").
 
 use burn::module::Module;
 use burn::nn::{LayerNorm, LayerNormConfig, Linear, LinearConfig};
@@ -8,7 +8,7 @@ use super::attention::{CrossAttention, SelfAttention};
 use snapsnap_ops::layers::{self, linear};
 use snapsnap_ops::{Rope, linear_gelu};
 
-/// Epsilon of every layer normalisation (SNAPSNAP §1.1).
+/// Epsilon of every layer normalisation.
 const NORM_EPSILON: f64 = 1e-6;
 
 pub(crate) fn layer_norm(dim: usize, device: &Device) -> LayerNorm {

@@ -1,7 +1,7 @@
-//! A U-shaped convolutional network over both photographs at once (LEARNING.md, "A convolutional body"): residual units at
-//! four sizes, attention where it is coarsest. The photographs' maps come from a decoder that sees the encoder's images of
-//! their own size; those of the sides, which no photograph shows, from one that sees their rows alone: a height in a
-//! side is the same height in front.
+//! A U-shaped convolutional network over both photographs (docs/method.md, "Convolutional body"): residual units at
+//! four sizes, attention at the coarsest. One decoder gives the photographs' maps and uses the encoder's images as skips. A
+//! second decoder gives the maps of the unseen sides and uses the row means of these images: a height in a side view is
+//! the same height in the front view.
 
 use burn::module::Module;
 use burn::nn::conv::Conv2d;
@@ -15,7 +15,7 @@ use snapsnap_ops::layers::{conv2d, linear};
 use snapsnap_ops::{Rope, as_weight, bilinear};
 
 /// Sizes of images inside, each half of the one before.
-pub(crate) const LEVELS: usize = 4;
+const LEVELS: usize = 4;
 /// The finest pixel of a patch of `patch` pixels is this many of the input's.
 fn stride(patch: usize) -> usize {
     patch >> (LEVELS - 1)
@@ -141,6 +141,11 @@ impl PointUNet {
     /// The same network without the decoder of the unseen sides.
     pub fn without_sides(self) -> Self {
         Self { side_attention: None, side_decoder: None, ..self }
+    }
+
+    /// Whether the layer of this name gives the raw points.
+    pub(super) fn is_last_layer(name: &str) -> bool {
+        name.ends_with("decoder.conv_out")
     }
 
     /// Whether it has a decoder of the unseen sides.

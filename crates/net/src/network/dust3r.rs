@@ -1,4 +1,5 @@
-//! The two-view transformer: shared encoder, twin cross-attention decoders, two or four heads (SNAPSNAP §1.5, §4).
+//! The two-view transformer: shared encoder, twin cross-attention decoders, two or four heads
+//! (docs/method.md, "Transformer blocks").
 //!
 //! Field names are the checkpoint's.
 
@@ -176,6 +177,11 @@ impl Dust3r {
     /// The same network without the heads of the unseen sides, for scenes that have none.
     pub fn without_sides(self) -> Self {
         Self { downstream_head3: None, downstream_head4: None, ..self }
+    }
+
+    /// Whether the layer of this name gives the raw points.
+    pub(super) fn is_last_layer(name: &str) -> bool {
+        name.contains("downstream_head") && (name.ends_with(".head.4") || name.ends_with(".proj"))
     }
 
     /// Whether it has heads for the unseen sides.

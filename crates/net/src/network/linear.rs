@@ -1,4 +1,4 @@
-//! The linear head: one projection of the last tokens and a pixel shuffle (SNAPSNAP §2.3).
+//! The linear head: one projection of the last tokens and a pixel shuffle (docs/method.md, "Linear head").
 
 use burn::module::Module;
 use burn::nn::{Linear, LinearConfig};

@@ -1,4 +1,5 @@
-//! The point predictor: two photographs → one point map per side of the person (SNAPSNAP §1, 2, 4).
+//! The point predictor: two photographs → one point map per side of the person
+//! (docs/method.md, "Point predictor").
 
 mod anchor;
 mod attention;
@@ -16,5 +17,3 @@ pub use convolution::{Levels, PointUNet};
 pub use dust3r::{Dust3r, Grid, TokenMaps, View};
 pub use input::Input;
 pub use predictor::{Decoded, Encoded, PointMap, PointPredictor, activate};
-
-pub(crate) use convolution::LEVELS;

@@ -9,7 +9,7 @@ use super::convolution::{Levels, PointUNet};
 use super::dust3r::{Dust3r, Grid, TokenMaps, View};
 use super::input::Input;
 use super::rays::on_rays;
-use crate::config::{Anchor, Body, ConfMode, Config, Downsample, NetworkConfig, Upsample};
+use crate::config::{self, Anchor, ConfMode, Config, Downsample, NetworkConfig, Upsample};
 use crate::crop::Window;
 use crate::resample::shrink;
 use snapsnap_ops::bilinear;
@@ -50,8 +50,8 @@ impl PointMap {
 /// Exponents beyond this leave f32's range; what a network says there is no depth, but must stay a number.
 const MAX_EXPONENT: f64 = 88.0;
 
-/// Raw x, y, z, confidence `[B, 4, H, W]` → point map: p = r / ‖r‖ · (e^‖r‖ − 1) (SNAPSNAP §2.2), or p = r where points are
-/// measured from anchors.
+/// Raw x, y, z, confidence `[B, 4, H, W]` → point map: p = r / ‖r‖ · (e^‖r‖ − 1), or p = r with anchors
+/// (docs/method.md, "Points and confidence").
 pub fn activate(raw: Tensor<4>, config: &NetworkConfig) -> PointMap {
     let [b, _, h, w] = raw.dims();
     let xyz = raw.clone().narrow(1, 0, 3).permute([0, 2, 3, 1]);
@@ -123,13 +123,20 @@ pub enum Decoded {
     Levels(Levels),
 }
 
+/// The network between photographs and raw points.
+#[derive(Module, Debug)]
+#[allow(clippy::large_enum_variant, reason = "there is one at a time")]
+enum Body {
+    Transformer(Dust3r),
+    Convolution(PointUNet),
+}
+
 /// A network for both photographs and global scale δ.
 #[derive(Module, Debug)]
 pub struct PointPredictor {
     /// δ `[1]`: metres per network unit.
     scale: Param<Tensor<1>>,
-    dust3r: Option<Dust3r>,
-    unet: Option<PointUNet>,
+    body: Body,
     #[module(skip)]
     config: NetworkConfig,
 }
@@ -138,40 +145,46 @@ impl PointPredictor {
     /// A predictor whose parameters wait to be loaded.
     pub fn new(config: &NetworkConfig, device: &Device) -> Self {
         let scale = Param::from_tensor(Tensor::full([1], config.delta, device));
-        let body = |body: Body| config.body == body;
-        Self {
-            scale,
-            dust3r: body(Body::Transformer).then(|| Dust3r::new(config, device)),
-            unet: body(Body::Convolution).then(|| PointUNet::new(config, device)),
-            config: config.clone(),
-        }
+        let body = match config.body {
+            config::Body::Transformer => Body::Transformer(Dust3r::new(config, device)),
+            config::Body::Convolution => Body::Convolution(PointUNet::new(config, device)),
+        };
+        Self { scale, body, config: config.clone() }
     }
 
-    /// The transformer that it is.
+    /// The transformer.
     ///
     /// # Panics
-    /// If it is a convolution.
+    /// If the body is a convolution.
     pub fn transformer(&self) -> &Dust3r {
-        self.dust3r.as_ref().expect("a transformer")
+        let Body::Transformer(net) = &self.body else { panic!("the body is a convolution") };
+        net
     }
 
-    fn convolution(&self) -> &PointUNet {
-        self.unet.as_ref().expect("what is no transformer is a convolution")
-    }
-
-    /// The same network without what makes the unseen sides, for scenes that have none.
+    /// The same network without the layers of the unseen sides.
     pub fn without_sides(self) -> Self {
-        Self {
-            dust3r: self.dust3r.map(Dust3r::without_sides),
-            unet: self.unet.map(PointUNet::without_sides),
-            ..self
-        }
+        let body = match self.body {
+            Body::Transformer(net) => Body::Transformer(net.without_sides()),
+            Body::Convolution(net) => Body::Convolution(net.without_sides()),
+        };
+        Self { body, ..self }
     }
 
-    /// Views of which it gives maps.
+    /// Views of the maps.
     pub fn views(&self) -> &'static [View] {
-        let sides = self.dust3r.as_ref().map_or_else(|| self.convolution().has_sides(), Dust3r::has_sides);
+        let sides = match &self.body {
+            Body::Transformer(net) => net.has_sides(),
+            Body::Convolution(net) => net.has_sides(),
+        };
         if sides { &View::ALL } else { &View::ALL[..2] }
+    }
+
+    /// Tells by a layer's name in a checkpoint whether its output is the raw points, with nothing but activations behind it.
+    pub(crate) fn is_last_layer(&self) -> fn(&str) -> bool {
+        match &self.body {
+            Body::Transformer(_) => Dust3r::is_last_layer,
+            Body::Convolution(_) => PointUNet::is_last_layer,
+        }
     }
 
     /// δ `[1]`.
@@ -179,7 +192,8 @@ impl PointPredictor {
         self.scale.val()
     }
 
-    /// Point map of one view on the canvas: enlarged `factor` times and multiplied by δ (in this order, SNAPSNAP §4).
+    /// Point map of one view on the canvas: enlarged `factor` times, then multiplied by δ
+    /// (docs/method.md, "Enlargement and delta").
     ///
     /// `weights` `[B, 1, H, W]` ≥ 0 are the body's share of each network pixel, for `mask-aware` interpolation.
     pub fn to_canvas(
@@ -249,12 +263,12 @@ impl PointPredictor {
 
     /// What each photograph shows.
     pub fn encode(&self, Input { images, grid }: Input) -> Encoded {
-        match &self.dust3r {
-            Some(dust3r) => Encoded::Tokens(dust3r.encode(images, &grid), grid),
-            None => {
+        match &self.body {
+            Body::Transformer(net) => Encoded::Tokens(net.encode(images, &grid), grid),
+            Body::Convolution(net) => {
                 let b = images.dims()[0] / 2;
                 let (front, back) = (images.clone().narrow(0, 0, b), images.narrow(0, b, b));
-                Encoded::Levels(self.convolution().encode(front, back))
+                Encoded::Levels(net.encode(front, back))
             }
         }
     }
@@ -273,16 +287,15 @@ impl PointPredictor {
 
     /// Point maps of all views at network resolution and without δ.
     pub fn heads(&self, decoded: &Decoded) -> Vec<(View, PointMap)> {
-        let raw: Vec<Tensor<4>> = match decoded {
-            Decoded::Tokens(maps, grid) => {
-                let net = self.transformer();
+        let raw: Vec<Tensor<4>> = match (&self.body, decoded) {
+            (Body::Transformer(net), Decoded::Tokens(maps, grid)) => {
                 self.views().iter().map(|view| net.raw_points(*view, maps, grid)).collect()
             }
-            Decoded::Levels(levels) => {
-                let net = self.convolution();
+            (Body::Convolution(net), Decoded::Levels(levels)) => {
                 let sides = net.has_sides().then(|| net.sides(levels));
                 net.photographed(levels).into_iter().chain(sides.into_iter().flatten()).collect()
             }
+            _ => panic!("decoded by another network"),
         };
         let map = |(&view, raw): (&View, Tensor<4>)| {
             // What was seen in a mirror lies in a mirror.

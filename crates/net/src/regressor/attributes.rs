@@ -1,4 +1,4 @@
-//! Activations of the regressor's 14 channels (SNAPSNAP §8.3, LEARNING.md).
+//! Activations of the regressor's 14 channels (docs/method.md, "Attributes").
 
 use burn::tensor::activation::sigmoid;
 use burn::tensor::{Tensor, TensorData};
@@ -31,8 +31,8 @@ pub struct Geometry {
     pub colors: Tensor<2>,
 }
 
-/// Standard deviation of a Gaussian at the start over the distance of its neighbours. (0.2 and 0.4 render true points with
-/// 23.3 and 22.3 dB at right angles, LEARNING.md; the first shows holes where the camera comes closer.)
+/// Standard deviation of a Gaussian at the start over the distance of its neighbours. (Rendered at right angles, true
+/// points reach 23.3 dB with 0.2 and 22.3 dB with 0.4. The smaller value shows holes in close views.)
 const START_SCALE: f64 = 0.3;
 /// Opacity at the start, as the logit of 0.9.
 const START_OPACITY: f64 = 2.197_224_577_336_219;
@@ -56,7 +56,7 @@ impl Geometry {
         let (mut spacing, mut colors) = (Vec::new(), Vec::new());
         for i in (0..side * side).filter(|i| valid[*i]) {
             let (here, row, column) = (point(i), i / side, i % side);
-            // The published cameras' focal length is 0.8 of the canvas (SNAPSNAP §5.3).
+            // The nominal cameras' focal length is 0.8 of the canvas (docs/method.md, "Cameras").
             let footprint = (here[2].abs() / (0.8 * side as f32)).clamp(1e-5, 1.0);
             let beside = [
                 (column > 0, i.wrapping_sub(1)),
@@ -117,7 +117,7 @@ impl Attributes {
         }
     }
 
-    /// Features `[N, 14]`: opacity, scale, rotation, colour, offset, as published (SNAPSNAP §8.3).
+    /// Features `[N, 14]`: opacity, scale, rotation, colour, offset, activated as in the published code.
     pub fn from_features(features: Tensor<2>) -> Self {
         let part = |from: usize, width: usize| features.clone().narrow(1, from, width);
         Self {
@@ -154,7 +154,7 @@ mod tests {
         x.into_data().try_into_vec().expect("f32")
     }
 
-    /// Check value of SNAPSNAP §13.4: the scale head at 0 gives 6.931e-4.
+    /// The published scale at 0 is 6.931e-4 (docs/method.md, "Check values").
     #[test]
     fn softplus_has_its_published_value_and_stays_finite_at_the_extremes() {
         let device = Device::flex();

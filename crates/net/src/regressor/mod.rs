@@ -1,11 +1,11 @@
-//! The Gaussian regressor: colours and points of one view → one Gaussian per pixel (SNAPSNAP §8).
+//! The Gaussian regressor: colours and points of one view → one Gaussian per pixel
+//! (docs/method.md, "Gaussian regressor").
 
 mod attributes;
-mod fused;
+mod kernel;
 mod statistics;
 #[cfg(test)]
 mod tests;
-mod trained;
 mod unet;
 
 use burn::module::Module;
@@ -22,7 +22,7 @@ use crate::config::RegressorConfig;
 
 /// Channels in: red, green, blue in [−1, 1], then x, y, z in metres (front camera's frame).
 pub const INPUT_CHANNELS: usize = 6;
-/// Channels out: opacity 1, scale 3, rotation 4, colour 3, offset 3 (SNAPSNAP §8.3).
+/// Channels out: opacity 1, scale 3, rotation 4, colour 3, offset 3.
 pub const FEATURES: usize = 14;
 
 /// UNet and final 1×1 convolution. Field names are the checkpoint's.
@@ -50,11 +50,9 @@ impl Regressor {
         let [_, channels, h, w] = input.dims();
         assert_eq!(channels, INPUT_CHANNELS, "regressor input must be [B, {INPUT_CHANNELS}, H, W]");
         assert!(h % 4 == 0 && w % 4 == 0, "regressor input {h}×{w}: both sides must be multiples of 4");
-        if snapsnap_ops::is_fast(&input) && self.pred_unet.suits_cpu_kernel() {
-            return fused::regress(&self.pred_unet, &self.gs_conv, input, statistics);
-        }
-        if snapsnap_ops::is_trained_fast(&input) && self.pred_unet.suits_cpu_kernel() {
-            return trained::regress(&self.pred_unet, &self.gs_conv, input, statistics);
+        let has_kernel = snapsnap_ops::is_fast(&input) || snapsnap_ops::is_trained_fast(&input);
+        if has_kernel && self.pred_unet.suits_cpu_kernel() {
+            return kernel::regress(&self.pred_unet, &self.gs_conv, input, statistics);
         }
         self.gs_conv.forward(self.pred_unet.forward(input, statistics)).permute([0, 2, 3, 1])
     }

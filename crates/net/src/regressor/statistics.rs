@@ -23,14 +23,7 @@ impl Statistics {
         Self { layers: self.layers.clone(), next: Some(0) }
     }
 
-    /// Frozen statistics of one image on the host, layer by layer: means and reciprocal standard deviations.
-    pub(crate) fn of_sample(&self, sample: usize) -> Option<Vec<[Vec<f32>; 2]>> {
-        self.next?;
-        let row = |x: &Tensor<2>| x.clone().narrow(0, sample, 1).into_data().try_into_vec().expect("f32");
-        Some(self.layers.iter().map(|[mean, rstd]| [row(mean), row(rstd)]).collect())
-    }
-
-    /// Frozen statistics of all images on the host, layer by layer.
+    /// Frozen statistics of all images on the host, layer by layer: means and reciprocal standard deviations.
     pub(crate) fn of_batch(&self) -> Option<Vec<[Vec<f32>; 2]>> {
         self.next?;
         let host = |x: &Tensor<2>| x.clone().into_data().try_into_vec().expect("f32");

@@ -1,10 +1,10 @@
-//! The fused road of the regressor against the plain tensor code, with groups of several channels and sizes that reach
+//! The kernels of the regressor against the plain tensor code, with groups of several channels and sizes that reach
 //! its corners: bands that do not divide, widths below a register block, strides.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use rand::{RngCore, SeedableRng};
 
-use super::{Statistics, fused};
+use super::{Statistics, kernel};
 use crate::config::Config;
 use crate::weights::{WeightFile, init};
 
@@ -39,7 +39,7 @@ fn the_fused_regressor_equals_the_composed_one() {
         let image = |seed| random([2, 6, height, width], seed) + 2.0;
         let x = image(1);
         let (mut fast, mut plain) = (Statistics::measured(), Statistics::measured());
-        let got = fused::regress(&regressor.pred_unet, &regressor.gs_conv, x.clone(), &mut fast);
+        let got = kernel::regress(&regressor.pred_unet, &regressor.gs_conv, x.clone(), &mut fast);
         let composed = |x: Tensor<4>, statistics: &mut Statistics| {
             regressor.gs_conv.forward(regressor.pred_unet.forward(x, statistics)).permute([0, 2, 3, 1])
         };
@@ -48,7 +48,7 @@ fn the_fused_regressor_equals_the_composed_one() {
         // Each road understands the statistics of the other.
         let other = image(2);
         let by_fast =
-            fused::regress(&regressor.pred_unet, &regressor.gs_conv, other.clone(), &mut plain.frozen());
+            kernel::regress(&regressor.pred_unet, &regressor.gs_conv, other.clone(), &mut plain.frozen());
         assert_equal(&format!("{what}, frozen"), by_fast, composed(other, &mut fast.frozen()));
     }
 }

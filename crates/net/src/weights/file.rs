@@ -6,12 +6,13 @@ use std::path::Path;
 
 use rayon::prelude::*;
 use safetensors::tensor::{Metadata, TensorInfo};
-use snapsnap_splat::file::write_whole;
+use snapsnap_base::FileError;
+use snapsnap_base::file::write_whole;
 
 use super::WeightsError;
 use super::schema::{self, Part, TensorSpec};
 use super::source::{CONFIG_KEY, Entry, Float, Source, is_readable};
-use crate::config::Config;
+use crate::config::{Config, Schema};
 
 /// Hears how many bytes of how many have been written.
 pub type Progress<'a> = &'a dyn Fn(u64, u64);
@@ -105,7 +106,7 @@ fn write_floats(
         Err(Failure::Weights(WeightsError::Tensors { origin: origin.to_owned(), problems }))
     })
     .map_err(|e| match e {
-        Failure::Io(source) => WeightsError::Write { path: path.to_owned(), source },
+        Failure::Io(e) => FileError::write(path)(e).into(),
         Failure::Weights(e) => e,
     })
 }
@@ -114,7 +115,7 @@ fn write_floats(
 /// part make a file of that part.
 ///
 /// # Errors
-/// [`WeightsError::Write`], or [`WeightsError::Tensors`] for values that are not finite.
+/// [`WeightsError::File`], or [`WeightsError::Tensors`] for values that are not finite.
 ///
 /// # Panics
 /// If a tensor of a part that is there is missing or has another size.
@@ -201,7 +202,7 @@ impl WeightFile {
     /// Refuses a file that lacks one of the parts.
     ///
     /// # Errors
-    /// [`WeightsError::Format`], saying which checkpoint to import as well.
+    /// [`WeightsError::File`], saying which checkpoint to import as well.
     pub fn require(&self, part: Part) -> Result<(), WeightsError> {
         let parts = parts_of(self.source.tensors().keys());
         if parts.contains(part) {
@@ -215,7 +216,7 @@ impl WeightFile {
                 "has no Gaussian regressor (`pred_unet.*`, `gs_conv.*`): import a stage-2 checkpoint as well"
             }
         };
-        Err(WeightsError::format(self.path(), message))
+        Err(FileError::unsuitable(self.path(), message).into())
     }
 }
 

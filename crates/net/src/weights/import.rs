@@ -54,7 +54,7 @@ fn is_ignored(key: &str) -> bool {
     key == "mask_token" || key.starts_with("prediction_head.")
 }
 
-/// The second name under which PyTorch lists a `layerN_rn` convolution (SNAPSNAP §3.2).
+/// The second name under which PyTorch lists a `layerN_rn` convolution (docs/method.md, "Weight files").
 pub(super) fn alias_of(name: &str) -> Option<String> {
     let (head, digit) = name.strip_suffix("_rn.weight")?.rsplit_once("scratch.layer")?;
     let n: usize = digit.parse().ok()?;
@@ -227,7 +227,7 @@ fn same_bits(source: &Source, a: &str, b: &str) -> Result<bool, WeightsError> {
     Ok(a.iter().zip(&b).all(|(a, b)| a.to_bits() == b.to_bits()))
 }
 
-/// CroCo checkpoints have one decoder; both sides start from it (SNAPSNAP §3.3).
+/// CroCo checkpoints have one decoder. Both decoders start from it.
 fn copy_decoder(found: &mut Found, report: &mut ImportReport) {
     let (first, second) = (format!("{DUST3R}dec_blocks."), format!("{DUST3R}dec_blocks2."));
     if found.keys().any(|k| k.starts_with(&second)) {

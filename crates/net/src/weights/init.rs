@@ -45,7 +45,7 @@ fn fnv1a(text: &str) -> u64 {
 /// Writes random weights for every tensor of `config` to `path`; returns the number of parameters.
 ///
 /// # Errors
-/// [`WeightsError::Write`].
+/// [`WeightsError::File`].
 pub fn init(config: &Config, seed: u64, path: &Path, progress: Progress) -> Result<usize, WeightsError> {
     let tensors = schema::tensors(config);
     write(path, "random weights", config, &tensors, Float::F32, |spec| Ok(draw(spec, seed)), progress)?;

@@ -11,7 +11,8 @@ mod load;
 pub mod schema;
 mod source;
 
-use std::path::{Path, PathBuf};
+use snapsnap_base::FileError;
+use snapsnap_base::config::ConfigError;
 
 pub use crate::names::{NamedMapper, NamedVisitor, map_named, visit_named};
 pub use export::export;
@@ -24,30 +25,9 @@ pub use source::{CONFIG_KEY, Entry, Float, Source};
 /// What can be wrong with weights.
 #[derive(Debug, thiserror::Error)]
 pub enum WeightsError {
-    /// The file could not be read.
-    #[error("{path}: cannot read: {source}")]
-    Read {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        source: std::io::Error,
-    },
-    /// The file could not be written.
-    #[error("{path}: cannot write: {source}")]
-    Write {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        source: std::io::Error,
-    },
-    /// The file is not what it should be.
-    #[error("{path}: {message}")]
-    Format {
-        /// The file.
-        path: PathBuf,
-        /// What is wrong.
-        message: String,
-    },
+    /// The file could not be read or written, or is not what it should be.
+    #[error(transparent)]
+    File(#[from] FileError),
     /// Tensors are missing, unused, mis-shaped, of the wrong type, not finite or given twice.
     #[error("{origin}: {} problem(s) with the weights:\n  {}", .problems.len(), .problems.join("\n  "))]
     Tensors {
@@ -58,11 +38,5 @@ pub enum WeightsError {
     },
     /// The config in a file's metadata, or beside it.
     #[error(transparent)]
-    Config(#[from] crate::config::ConfigError),
-}
-
-impl WeightsError {
-    fn format(path: &Path, message: &str) -> Self {
-        Self::Format { path: path.to_owned(), message: message.to_owned() }
-    }
+    Config(#[from] ConfigError),
 }

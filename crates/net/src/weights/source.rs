@@ -10,10 +10,10 @@ use pytorch_reader::PytorchReader;
 use rayon::prelude::*;
 use safetensors::Dtype;
 use safetensors::tensor::Metadata;
-use snapsnap_splat::file;
+use snapsnap_base::{FileError, file};
 
 use super::WeightsError;
-use crate::config::Config;
+use crate::config::{Config, Schema};
 
 /// Metadata key under which the config (TOML) is stored.
 pub const CONFIG_KEY: &str = "snapsnap.config";
@@ -56,10 +56,10 @@ impl Source {
     /// # Errors
     /// [`WeightsError`] for a file that is missing, truncated, or neither of the two formats.
     pub fn open(path: &Path) -> Result<Self, WeightsError> {
-        let read = |source| WeightsError::Read { path: path.to_owned(), source };
-        let mut file = file::open(path).map_err(read)?;
+        let read = FileError::read(path);
+        let mut file = file::open(path).map_err(&read)?;
         let mut start = [0_u8; 9];
-        let filled = read_up_to(&mut file, &mut start).map_err(read)?;
+        let filled = read_up_to(&mut file, &mut start).map_err(&read)?;
         // A safetensors file starts with a little-endian header length and then JSON; every PyTorch container starts
         // with bytes that would make that length absurd.
         let header = u64::from_le_bytes([
@@ -69,7 +69,7 @@ impl Source {
             return Self::safetensors(path, file, header);
         }
         if path.extension().is_some_and(|e| e == "safetensors") {
-            return Err(WeightsError::format(path, "not a safetensors file (no header)"));
+            return Err(FileError::unsuitable(path, "not a safetensors file (no header)").into());
         }
         Self::pytorch(path)
     }
@@ -81,7 +81,7 @@ impl Source {
     pub fn embedded(name: &str, bytes: &'static [u8]) -> Result<Self, WeightsError> {
         let path = Path::new(name);
         let Some((start, rest)) = bytes.split_first_chunk::<8>() else {
-            return Err(WeightsError::format(path, "not a safetensors file (no header)"));
+            return Err(FileError::unsuitable(path, "not a safetensors file (no header)").into());
         };
         let header = u64::from_le_bytes(*start);
         let text = &rest[..rest.len().min(usize::try_from(header).unwrap_or(usize::MAX))];
@@ -89,23 +89,23 @@ impl Source {
     }
 
     fn safetensors(path: &Path, mut file: File, header: u64) -> Result<Self, WeightsError> {
-        let read = |source| WeightsError::Read { path: path.to_owned(), source };
-        let size = file.metadata().map_err(read)?.len();
+        let read = FileError::read(path);
+        let size = file.metadata().map_err(&read)?.len();
         let mut text = vec![b'{'; 1];
-        (&mut file).take(header - 1).read_to_end(&mut text).map_err(read)?;
+        (&mut file).take(header - 1).read_to_end(&mut text).map_err(&read)?;
         Self::described(path, &text, size, Reader::Safetensors(file))
     }
 
     /// A safetensors file of `size` bytes with this header.
     fn described(path: &Path, text: &[u8], size: u64, reader: Reader) -> Result<Self, WeightsError> {
         let metadata: Metadata = serde_json::from_slice(text).map_err(|e| {
-            WeightsError::format(path, &format!("damaged or truncated safetensors header: {e}"))
+            FileError::unsuitable(path, format!("damaged or truncated safetensors header: {e}"))
         })?;
         let data = 8 + text.len() as u64;
         let expected = data + metadata.data_len() as u64;
         if size != expected {
             let message = format!("truncated or damaged: {size} bytes, the header promises {expected}");
-            return Err(WeightsError::format(path, &message));
+            return Err(FileError::unsuitable(path, &message).into());
         }
         let tensors = metadata.tensors().into_iter().map(|(name, info)| {
             let (from, to) = info.data_offsets;
@@ -123,7 +123,7 @@ impl Source {
     fn pytorch(path: &Path) -> Result<Self, WeightsError> {
         let all = PytorchReader::new(path)
             .map_err(|e| {
-                WeightsError::format(path, &format!("neither safetensors nor a PyTorch checkpoint: {e}"))
+                FileError::unsuitable(path, format!("neither safetensors nor a PyTorch checkpoint: {e}"))
             })?
             .into_tensors();
         // Snap-Snap keeps its weights under `network`, DUSt3R and CroCo under `model`; beside them lie optimiser states.
@@ -158,7 +158,7 @@ impl Source {
     pub(super) fn config(&self) -> Result<Config, WeightsError> {
         let text = self.metadata.get(CONFIG_KEY).ok_or_else(|| {
             let message = "has no config in its metadata; give one with --config, or import it first";
-            WeightsError::format(&self.path, message)
+            FileError::unsuitable(&self.path, message)
         })?;
         Ok(Config::from_toml(text, &format!("{} (metadata {CONFIG_KEY})", self.path.display()), &[])?)
     }
@@ -176,9 +176,9 @@ impl Source {
         let entry = self
             .tensors
             .get(name)
-            .ok_or_else(|| WeightsError::format(&self.path, &format!("has no tensor `{name}`")))?;
+            .ok_or_else(|| FileError::unsuitable(&self.path, format!("has no tensor `{name}`")))?;
         let kind = Float::called(&entry.dtype).ok_or_else(|| {
-            WeightsError::format(&self.path, &format!("`{name}` is {}, not f32, f16 or bf16", entry.dtype))
+            FileError::unsuitable(&self.path, format!("`{name}` is {}, not f32, f16 or bf16", entry.dtype))
         })?;
         let values = match &self.reader {
             Reader::Safetensors(file) => read_values(file, entry, kind),
@@ -188,7 +188,7 @@ impl Source {
             }
             Reader::Pytorch(tensors) => tensors[name].read().map(|bytes| kind.widened(&bytes)),
         };
-        values.map_err(|source| WeightsError::Read { path: self.path.clone(), source })
+        Ok(values.map_err(FileError::read(&self.path))?)
     }
 }
 

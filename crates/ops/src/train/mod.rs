@@ -34,7 +34,8 @@ pub use norm::{LayerNorm, Statistics};
 pub use patches::Patches;
 pub use unfolded::Unfolded;
 
-pub use crate::resize::{Tap, resize, resize_gradient, taps};
+pub use crate::resize::{resize, resize_gradient};
+pub use snapsnap_base::bilinear::{Tap, taps};
 
 /// Which gradients are needed; what is not costs nothing.
 #[derive(Debug, Clone, Copy)]

@@ -1,7 +1,7 @@
 //! The operators as plain loops in f64, for tests.
 
 use super::{Attention, Enlarge, Linear, Tables};
-use crate::resize::Tap;
+use snapsnap_base::bilinear::Tap;
 
 /// A convolution of square kernels.
 pub struct Convolution {

@@ -3,9 +3,9 @@
 
 use super::reference::{self as plain, Convolution};
 use super::*;
-use crate::resize::taps;
 use crate::wide::Buffers;
 use rand::{RngCore, SeedableRng};
+use snapsnap_base::bilinear::taps;
 
 /// Uniform in ±1; the same numbers on every run.
 pub fn random(len: usize, seed: u64) -> Vec<f32> {

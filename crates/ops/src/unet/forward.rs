@@ -17,8 +17,8 @@ pub struct Forward {
     pub features: Vec<f32>,
     /// Per normalisation: means and reciprocal standard deviations `[B, groups]`, measured or as given.
     pub statistics: Vec<Layer>,
-    /// For [`Network::backward`].
-    pub saved: Saved,
+    /// For [`Network::backward`], if kept.
+    pub saved: Option<Saved>,
 }
 
 /// The tape: 16 planes' worth of pixels per image at full size (64 bytes per pixel each), the input not among them.
@@ -47,7 +47,8 @@ impl Sample {
 
 impl Network {
     /// `input` `[B, H, W, 6]`, H and W multiples of 4 → features, with `parameters` in the order of
-    /// [`Network::tensors`]. `frozen` statistics are taken instead of measured ones.
+    /// [`Network::tensors`]. `frozen` statistics replace measured ones. `keep`: for a backward pass; without it, planes are
+    /// released after their last reader, and images are computed one after another.
     ///
     /// # Panics
     /// If lengths and sizes do not fit.
@@ -57,29 +58,42 @@ impl Network {
         input: &[f32],
         [b, h, w]: [usize; 3],
         frozen: Option<&[Layer]>,
+        keep: bool,
         buffers: &Buffers,
     ) -> Forward {
         assert!(h % 4 == 0 && w % 4 == 0, "regressor input {h}×{w}: both sides must be multiples of 4");
         assert_eq!(parameters.len(), self.parameters());
         assert_eq!(input.len(), b * h * w * INPUT_CHANNELS);
         let mut features = vec![0.0; b * h * w * FEATURES];
+        let last_readers = if keep { Vec::new() } else { self.last_readers() };
         let run = |(i, (input, features)): (usize, (&[f32], &mut [f32]))| {
             let part = |values: &Vec<f32>| values[i * self.groups..(i + 1) * self.groups].to_vec();
             let frozen = frozen.map(|layers| layers.iter().map(|layer| layer.each_ref().map(part)).collect());
-            let mut pass = Pass { network: self, parameters, frozen, sample: Sample::default(), buffers };
+            let sample = Sample::default();
+            let mut pass =
+                Pass { network: self, parameters, frozen, sample, last_readers: &last_readers, buffers };
             let out = pass.run(pad::<INPUT_CHANNELS>(input, [h, w], buffers));
             cut::<FEATURES>(&out.data, features);
             buffers.give(out.data);
             pass.sample
         };
-        let inputs = input.par_chunks_exact(h * w * INPUT_CHANNELS);
-        let samples: Vec<Sample> =
-            inputs.zip(features.par_chunks_exact_mut(h * w * FEATURES)).enumerate().map(run).collect();
+        let [inputs, outputs] = [INPUT_CHANNELS, FEATURES].map(|channels| h * w * channels);
+        let samples: Vec<Sample> = if keep {
+            input
+                .par_chunks_exact(inputs)
+                .zip(features.par_chunks_exact_mut(outputs))
+                .enumerate()
+                .map(run)
+                .collect()
+        } else {
+            input.chunks_exact(inputs).zip(features.chunks_exact_mut(outputs)).enumerate().map(run).collect()
+        };
         let layer = |k: usize| {
             [0, 1].map(|part| samples.iter().flat_map(|sample| sample.layers[k][part].clone()).collect())
         };
         let statistics = (0..samples.first().map_or(0, |sample| sample.layers.len())).map(layer).collect();
-        Forward { features, statistics, saved: Saved { samples, frozen: frozen.is_some() } }
+        let saved = keep.then(|| Saved { samples, frozen: frozen.is_some() });
+        Forward { features, statistics, saved }
     }
 }
 
@@ -126,13 +140,22 @@ struct Pass<'a> {
     /// Statistics to use instead of measured ones.
     frozen: Option<Vec<Layer>>,
     sample: Sample,
+    /// Of each plane; empty if planes are kept.
+    last_readers: &'a [usize],
     buffers: &'a Buffers,
 }
 
 impl Pass<'_> {
+    /// Releases the planes that no step after `step` reads.
+    fn release(&mut self, step: usize) {
+        for (plane, last) in self.sample.planes.iter_mut().zip(self.last_readers) {
+            plane.take_if(|_| *last <= step).into_iter().for_each(|plane| self.buffers.give(plane.data));
+        }
+    }
+
     fn run(&mut self, input: Plane) -> Plane {
         self.sample.planes.push(Some(input));
-        for step in &self.network.steps {
+        for (i, step) in self.network.steps.iter().enumerate() {
             let (plane, hidden) = match step {
                 Step::Convolve { conv, from, stride, enlarge } => {
                     (self.plain(conv, *from, *stride, *enlarge), None)
@@ -144,7 +167,12 @@ impl Pass<'_> {
                 }
             };
             self.sample.planes.push(Some(plane));
-            self.sample.hidden.push(hidden);
+            if self.last_readers.is_empty() {
+                self.sample.hidden.push(hidden);
+            } else {
+                hidden.into_iter().for_each(|plane| self.buffers.give(plane.data));
+                self.release(i);
+            }
             // The caller has the input.
             let input = self.sample.planes[0].take();
             input.into_iter().for_each(|plane| self.buffers.give(plane.data));
@@ -154,8 +182,10 @@ impl Pass<'_> {
         let (weights, bias) = compose(&self.network.conv_out, &self.network.gs_conv, self.parameters);
         let sources = [Source { plane: self.sample.plane(last), affine: Some(affine) }];
         let (stride, enlarge, shortcut) = (1, false, Shortcut::None);
-        Conv { sources: &sources, weights: &weights, bias, stride, enlarge, shortcut, scale: 1.0 }
-            .run_into(self.buffers)
+        let out = Conv { sources: &sources, weights: &weights, bias, stride, enlarge, shortcut, scale: 1.0 }
+            .run_into(self.buffers);
+        self.release(last);
+        out
     }
 
     /// A convolution without normalisation or shortcut.

@@ -1,8 +1,9 @@
 //! The operators in order of execution, and where each one's parameters lie in one flat vector.
 
+use std::collections::HashMap;
 use std::ops::Range;
 
-use super::{EPSILON, FEATURES, INPUT_CHANNELS};
+use super::EPSILON;
 use crate::conv::{CHANNELS, GroupNorm};
 
 /// Levels of the UNet.
@@ -65,17 +66,18 @@ pub struct Network {
 }
 
 impl Network {
-    /// The network whose normalisations have `groups` groups.
+    /// The network whose normalisations have `groups` groups and whose parameters have these `shapes`, by their names in a
+    /// checkpoint.
     ///
     /// # Panics
-    /// If `groups` does not divide 16.
-    pub fn new(groups: usize) -> Self {
+    /// If `groups` does not divide 16, or if a parameter is missing.
+    pub fn new(groups: usize, shapes: &HashMap<String, Vec<usize>>) -> Self {
         assert!(groups > 0 && CHANNELS.is_multiple_of(groups), "{groups} groups of 16 channels");
-        let mut places = Places::default();
+        let mut places = Places { shapes, tensors: Vec::new(), norms: 0 };
         let steps = places.steps();
-        let norm_out = places.norm("norm_out", CHANNELS);
-        let conv_out = places.conv("conv_out", CHANNELS, FEATURES, 3);
-        let gs_conv = places.conv("gs_conv", FEATURES, FEATURES, 1);
+        let norm_out = places.norm("norm_out");
+        let conv_out = places.conv("conv_out");
+        let gs_conv = places.conv("gs_conv");
         Self { groups, steps, norm_out, conv_out, gs_conv, tensors: places.tensors }
     }
 
@@ -89,6 +91,20 @@ impl Network {
         self.gs_conv.bias.end
     }
 
+    /// The last step that reads each plane; the normalisation at the end counts as one more step.
+    pub(super) fn last_readers(&self) -> Vec<usize> {
+        let mut readers = vec![0; self.steps.len() + 1];
+        for (i, step) in self.steps.iter().enumerate() {
+            let (Step::Convolve { from, .. } | Step::Residual { from, .. }) = step;
+            readers[*from] = i;
+            if let Step::Residual { skip: Some(skip), .. } = step {
+                readers[*skip] = i;
+            }
+        }
+        readers[self.steps.len()] = self.steps.len();
+        readers
+    }
+
     pub(super) fn norm<'a>(&self, norm: &Norm, parameters: &'a [f32]) -> GroupNorm<'a> {
         GroupNorm {
             groups: self.groups,
@@ -99,72 +115,78 @@ impl Network {
     }
 }
 
-/// Hands out places one after another.
-#[derive(Default)]
-struct Places {
+/// Assigns places in the flat vector, one after another.
+struct Places<'a> {
+    shapes: &'a HashMap<String, Vec<usize>>,
     tensors: Vec<Tensor>,
     norms: usize,
 }
 
-impl Places {
-    fn place(&mut self, name: String, shape: &[usize]) -> Range<usize> {
+impl Places<'_> {
+    fn place(&mut self, name: String) -> Range<usize> {
+        let shape =
+            self.shapes.get(&name).unwrap_or_else(|| panic!("the network has no parameter {name}")).clone();
         let start = self.tensors.last().map_or(0, |tensor| tensor.range.end);
         let range = start..start + shape.iter().product::<usize>();
-        self.tensors.push(Tensor { name, shape: shape.to_vec(), range: range.clone() });
+        self.tensors.push(Tensor { name, shape, range: range.clone() });
         range
     }
 
-    fn conv(&mut self, name: &str, from: usize, to: usize, side: usize) -> Conv {
-        let weight = self.place(format!("{name}.weight"), &[to, from, side, side]);
-        let bias = self.place(format!("{name}.bias"), &[to]);
-        Conv { weight, bias, shape: [to, from, side * side] }
+    fn conv(&mut self, name: &str) -> Conv {
+        let weight = self.place(format!("{name}.weight"));
+        let [to, from, height, width] = self.tensors.last().expect("just placed").shape[..] else {
+            panic!("{name} is no convolution")
+        };
+        let bias = self.place(format!("{name}.bias"));
+        Conv { weight, bias, shape: [to, from, height * width] }
     }
 
-    fn norm(&mut self, name: &str, channels: usize) -> Norm {
-        let gamma = self.place(format!("{name}.weight"), &[channels]);
-        let beta = self.place(format!("{name}.bias"), &[channels]);
+    fn norm(&mut self, name: &str) -> Norm {
+        let gamma = self.place(format!("{name}.weight"));
+        let beta = self.place(format!("{name}.bias"));
         self.norms += 1;
         Norm { gamma, beta, index: self.norms - 1 }
     }
 
-    fn residual(&mut self, name: &str, from: usize) -> Residual {
-        Residual {
-            norm1: self.norm(&format!("{name}.norm1"), from),
-            conv1: self.conv(&format!("{name}.conv1"), from, CHANNELS, 3),
-            norm2: self.norm(&format!("{name}.norm2"), CHANNELS),
-            conv2: self.conv(&format!("{name}.conv2"), CHANNELS, CHANNELS, 3),
-            shortcut: (from != CHANNELS).then(|| self.conv(&format!("{name}.shortcut"), from, CHANNELS, 1)),
-        }
+    fn residual(&mut self, name: &str) -> Box<Residual> {
+        let shortcut = format!("{name}.shortcut");
+        Box::new(Residual {
+            norm1: self.norm(&format!("{name}.norm1")),
+            conv1: self.conv(&format!("{name}.conv1")),
+            norm2: self.norm(&format!("{name}.norm2")),
+            conv2: self.conv(&format!("{name}.conv2")),
+            shortcut: self.shapes.contains_key(&format!("{shortcut}.weight")).then(|| self.conv(&shortcut)),
+        })
     }
 
-    /// The order of the paper's table (SNAPSNAP §8.2), which is the state dict's as well.
+    /// All operators in the order of the state dict.
     fn steps(&mut self) -> Vec<Step> {
-        let conv = self.conv("conv_in", INPUT_CHANNELS, CHANNELS, 3);
+        let conv = self.conv("conv_in");
         let mut steps = vec![Step::Convolve { conv, from: 0, stride: 1, enlarge: false }];
         let mut skips = vec![steps.len()];
         for level in 0..LEVELS {
             for i in 0..2 {
-                let block = Box::new(self.residual(&format!("down_blocks.{level}.nets.{i}"), CHANNELS));
+                let block = self.residual(&format!("down_blocks.{level}.nets.{i}"));
                 steps.push(Step::Residual { block, from: steps.len(), skip: None });
                 skips.push(steps.len());
             }
             if level + 1 < LEVELS {
-                let conv = self.conv(&format!("down_blocks.{level}.downsample"), CHANNELS, CHANNELS, 3);
+                let conv = self.conv(&format!("down_blocks.{level}.downsample"));
                 steps.push(Step::Convolve { conv, from: steps.len(), stride: 2, enlarge: false });
                 skips.push(steps.len());
             }
         }
         for i in 0..2 {
-            let block = Box::new(self.residual(&format!("mid_block.nets.{i}"), CHANNELS));
+            let block = self.residual(&format!("mid_block.nets.{i}"));
             steps.push(Step::Residual { block, from: steps.len(), skip: None });
         }
         for level in 0..LEVELS {
             for i in 0..3 {
-                let block = Box::new(self.residual(&format!("up_blocks.{level}.nets.{i}"), 2 * CHANNELS));
+                let block = self.residual(&format!("up_blocks.{level}.nets.{i}"));
                 steps.push(Step::Residual { block, from: steps.len(), skip: skips.pop() });
             }
             if level + 1 < LEVELS {
-                let conv = self.conv(&format!("up_blocks.{level}.upsample"), CHANNELS, CHANNELS, 3);
+                let conv = self.conv(&format!("up_blocks.{level}.upsample"));
                 steps.push(Step::Convolve { conv, from: steps.len(), stride: 1, enlarge: true });
             }
         }

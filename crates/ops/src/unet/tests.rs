@@ -1,11 +1,13 @@
 //! The fused passes against the authors' network, against a plain f64 network, and that one against differences.
 
+use std::collections::HashMap;
+
 use rand::{RngCore, SeedableRng};
 
 use super::reference::Reference;
-use super::{FEATURES, INPUT_CHANNELS, Network};
+use super::{FEATURES, INPUT_CHANNELS, Network, Saved};
 use crate::buffers::Buffers;
-use crate::conv::{Layer, Wanted};
+use crate::conv::{CHANNELS, Layer, Wanted};
 
 const BOTH: Wanted = Wanted { input: true, parameters: true };
 /// Expected of every tensor's relative L2 error at the fixture's size. The worst are normalisations at a quarter of the
@@ -18,6 +20,41 @@ const TINY: f64 = 2e-5;
 fn random(n: usize, seed: u64) -> Vec<f32> {
     let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
     (0..n).map(|_| random.next_u32() as f32 / u32::MAX as f32 * 2.0 - 1.0).collect()
+}
+
+/// The published network with normalisations of so many groups.
+fn network(groups: usize) -> Network {
+    let mut shapes = HashMap::new();
+    let mut layer = |name: String, weight: &[usize]| {
+        shapes.insert(format!("{name}.weight"), weight.to_vec());
+        shapes.insert(format!("{name}.bias"), vec![weight[0]]);
+    };
+    layer("conv_in".into(), &[CHANNELS, INPUT_CHANNELS, 3, 3]);
+    layer("norm_out".into(), &[CHANNELS]);
+    layer("conv_out".into(), &[FEATURES, CHANNELS, 3, 3]);
+    layer("gs_conv".into(), &[FEATURES, FEATURES, 1, 1]);
+    for i in 0..2 {
+        layer(format!("down_blocks.{i}.downsample"), &[CHANNELS, CHANNELS, 3, 3]);
+        layer(format!("up_blocks.{i}.upsample"), &[CHANNELS, CHANNELS, 3, 3]);
+    }
+    let of = |part: &str, nets: usize| (0..nets).map(|i| format!("{part}.nets.{i}")).collect::<Vec<_>>();
+    let plain = (0..3).flat_map(|level| of(&format!("down_blocks.{level}"), 2)).chain(of("mid_block", 2));
+    let skipping = (0..3).flat_map(|level| of(&format!("up_blocks.{level}"), 3));
+    let plain = plain.map(|name| (name, CHANNELS));
+    for (name, from) in plain.chain(skipping.map(|name| (name, 2 * CHANNELS))) {
+        layer(format!("{name}.norm1"), &[from]);
+        layer(format!("{name}.conv1"), &[CHANNELS, from, 3, 3]);
+        layer(format!("{name}.norm2"), &[CHANNELS]);
+        layer(format!("{name}.conv2"), &[CHANNELS, CHANNELS, 3, 3]);
+        if from > CHANNELS {
+            layer(format!("{name}.shortcut"), &[CHANNELS, from, 1, 1]);
+        }
+    }
+    Network::new(groups, &shapes)
+}
+
+fn kept(saved: Option<Saved>) -> Saved {
+    saved.expect("kept for the backward pass")
 }
 
 /// Weights of a size that keeps signals alive, normalisations near 1.
@@ -114,16 +151,16 @@ fn gradients_equal_those_of_the_plain_network() {
         (16, [2, 12, 20], true),
         (4, [1, 8, 140], true),
     ] {
-        let (network, buffers) = (Network::new(groups), Buffers::default());
+        let (network, buffers) = (network(groups), Buffers::default());
         let size = [b, h, w];
         let parameters = parameters(&network, 1);
         let input = images(size, 2);
         let upstream = random(b * h * w * FEATURES, 3);
-        let other =
-            freeze.then(|| network.forward(&parameters, &images(size, 4), size, None, &buffers).statistics);
+        let other = freeze
+            .then(|| network.forward(&parameters, &images(size, 4), size, None, true, &buffers).statistics);
         let frozen = other.as_deref();
-        let forward = network.forward(&parameters, &input, size, frozen, &buffers);
-        let got = network.backward(&parameters, &input, forward.saved, &upstream, BOTH, &buffers);
+        let forward = network.forward(&parameters, &input, size, frozen, true, &buffers);
+        let got = network.backward(&parameters, &input, kept(forward.saved), &upstream, BOTH, &buffers);
         let [features, inputs, sum] = plain(&network, &parameters, &input, size, frozen, &upstream);
         let what = format!("{groups} groups, {size:?}, frozen {freeze}");
         let errors = [error(&forward.features, &features), error(&got.input, &inputs)];
@@ -137,7 +174,7 @@ fn gradients_equal_those_of_the_plain_network() {
 #[test]
 fn the_plain_network_has_the_slopes_of_its_differences() {
     for (groups, freeze) in [(16, false), (4, false), (1, true)] {
-        let network = Network::new(groups);
+        let network = network(groups);
         let [h, w] = [12, 20];
         let values = wide(&parameters(&network, 5));
         let input = wide(&images([1, h, w], 6));
@@ -176,12 +213,13 @@ fn the_plain_network_has_the_slopes_of_its_differences() {
 
 #[test]
 fn untracked_sides_cost_nothing_and_change_nothing() {
-    let (network, size, buffers) = (Network::new(16), [2, 12, 20], Buffers::default());
+    let (network, size, buffers) = (network(16), [2, 12, 20], Buffers::default());
     let (parameters, input) = (parameters(&network, 1), images(size, 2));
     let upstream = random(2 * 12 * 20 * FEATURES, 3);
-    let forward = network.forward(&parameters, &input, size, None, &buffers);
-    let run =
-        |wanted| network.backward(&parameters, &input, forward.saved.clone(), &upstream, wanted, &buffers);
+    let forward = network.forward(&parameters, &input, size, None, true, &buffers);
+    let run = |wanted| {
+        network.backward(&parameters, &input, kept(forward.saved.clone()), &upstream, wanted, &buffers)
+    };
     let both = run(BOTH);
     let only_input = run(Wanted { input: true, parameters: false });
     let only_parameters = run(Wanted { input: false, parameters: true });
@@ -191,15 +229,26 @@ fn untracked_sides_cost_nothing_and_change_nothing() {
 }
 
 #[test]
+fn a_pass_that_keeps_nothing_computes_the_same() {
+    let (network, size, buffers) = (network(8), [2, 12, 20], Buffers::default());
+    let (parameters, input) = (parameters(&network, 1), images(size, 2));
+    let run = |keep| network.forward(&parameters, &input, size, None, keep, &buffers);
+    let (kept, released) = (run(true), run(false));
+    assert!(released.saved.is_none());
+    assert_eq!((kept.features, kept.statistics), (released.features, released.statistics));
+}
+
+#[test]
 fn bits_do_not_depend_on_the_number_of_threads() {
-    let (network, size, buffers) = (Network::new(8), [2, 36, 68], Buffers::default());
+    let (network, size, buffers) = (network(8), [2, 36, 68], Buffers::default());
     let (parameters, input) = (parameters(&network, 1), images(size, 2));
     let upstream = random(2 * 36 * 68 * FEATURES, 3);
     let run = |threads| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads");
         pool.install(|| {
-            let forward = network.forward(&parameters, &input, size, None, &buffers);
-            let gradients = network.backward(&parameters, &input, forward.saved, &upstream, BOTH, &buffers);
+            let forward = network.forward(&parameters, &input, size, None, true, &buffers);
+            let gradients =
+                network.backward(&parameters, &input, kept(forward.saved), &upstream, BOTH, &buffers);
             [forward.features, gradients.input, gradients.parameters]
         })
     };

@@ -5,7 +5,7 @@ use rayon::prelude::*;
 
 use super::transforms::Lines;
 use super::{Buffers, GROUP};
-use crate::resize::{Tap, taps};
+use snapsnap_base::bilinear::{Tap, taps};
 
 /// An image in groups of channels; those of the last group that do not exist are 0.
 #[derive(Debug)]

@@ -7,9 +7,9 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use glam::Vec3;
 use serde::Deserialize;
-use snapsnap_mesh::{file, quoted};
+use snapsnap_base::{file, quoted};
 
-use snapsnap_mesh::FileError;
+use snapsnap_base::FileError;
 
 /// MakeHuman counts in decimetres.
 const METRES: f32 = 0.1;

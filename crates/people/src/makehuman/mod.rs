@@ -15,7 +15,6 @@ mod tests;
 
 use glam::{Mat3, Vec3};
 
-use crate::random::stream;
 use crate::synth::MOVES;
 use crate::synth::atlas;
 use crate::synth::body::Body;
@@ -28,7 +27,8 @@ pub use files::Library;
 use net::{Net, PARTS, Vertex};
 use rig::{Joints, Posed};
 use shape::{Mix, morph};
-use snapsnap_mesh::FileError;
+use snapsnap_base::FileError;
+use snapsnap_base::random::stream;
 use snapsnap_mesh::mesh::{Face, Material, Mesh};
 
 /// Kinds and sides of the parts of [`Vertex::parts`].

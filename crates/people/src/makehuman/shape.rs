@@ -4,7 +4,7 @@ use glam::Vec3;
 use rand::Rng;
 
 use super::files::Library;
-use snapsnap_mesh::FileError;
+use snapsnap_base::FileError;
 
 /// Folders of details and how many of each a person gets at most.
 const DETAILS: [(&str, usize); 8] = [

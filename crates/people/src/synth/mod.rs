@@ -15,11 +15,11 @@ mod tests;
 
 use glam::Vec3;
 
-use crate::random::stream;
 use body::Body;
 use figure::{Build, Figure, Pose};
 use outfit::Outfit;
 use paint::Painter;
+use snapsnap_base::random::stream;
 use snapsnap_mesh::mesh::Mesh;
 
 /// Side of the cells that bodies are meshed with, metres.

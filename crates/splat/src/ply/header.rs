@@ -1,6 +1,6 @@
 //! The header of any PLY file, of Gaussians or of triangles: format, elements and their properties.
 
-use crate::error::quoted;
+use snapsnap_base::quoted;
 
 /// Longest header that is read, in bytes.
 pub const MAX_HEADER: usize = 1 << 20;

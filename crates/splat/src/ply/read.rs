@@ -4,8 +4,8 @@
 use std::io::{self, BufRead, BufReader, Cursor, Read};
 
 use super::header::{Element, Format, Header, MAX_HEADER, Property, parse};
-use crate::error::quoted;
 use crate::scene::{Problem, Stored};
+use snapsnap_base::quoted;
 
 /// Longest line of a body in text.
 const MAX_LINE: u64 = 1 << 20;

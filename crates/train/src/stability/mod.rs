@@ -1,8 +1,10 @@
-//! Cases of the stability table (EVALUATION.md) that need losses, an optimiser or a training.
+//! Cases of the stability table that need losses, an optimiser or a training
+//! (docs/method.md, "Stability cases").
 
 mod trainings;
 
 use burn::tensor::{Device, Tensor, TensorData};
+use snapsnap_base::config::Schema;
 use snapsnap_eval::pictures::Picture;
 use snapsnap_eval::region::Region;
 use snapsnap_eval::similarity::{psnr, ssim};
@@ -62,7 +64,7 @@ anisotropy = 1.5
 points = 1.0
 "#;
 
-/// All cases of EVALUATION.md, those of a million steps with so many.
+/// All cases of losses, optimiser and training. `many_steps` is the length of the case of a million steps.
 pub fn cases(many_steps: u64) -> Vec<Case> {
     let mut cases = Vec::new();
     for (name, count) in [("empty", 0), ("of one pixel", 1)] {

@@ -26,7 +26,7 @@ use crate::stage1::PointTask;
 use crate::stage2::GaussianTask;
 use crate::task::{Moment, Part, Task, Validation};
 
-/// Those of EVALUATION.md, "Stiff training", and the poisoned sample.
+/// Stiff trainings, and one sample whose loss is not a number (docs/method.md, "Stability cases").
 pub(super) fn cases() -> Vec<Case> {
     let mut cases = Vec::new();
     cases.push(Case {

@@ -1,5 +1,5 @@
-//! What a frozen point predictor made of photographs, kept on disk: where the same ones come again, it is read instead of
-//! computed. (The published training does so, SNAPSNAP §5.2.)
+//! Point maps of a frozen predictor, kept on disk. They are read instead of computed if the same photographs come
+//! again. (The published training does so.)
 
 use std::collections::HashMap;
 use std::fs;
@@ -7,8 +7,9 @@ use std::path::{Path, PathBuf};
 
 use burn::tensor::{Device, Tensor, TensorData};
 use sha2::{Digest, Sha256};
+use snapsnap_base::FileError;
+use snapsnap_base::config::Schema;
 use snapsnap_data::sample::Stage2Item;
-use snapsnap_mesh::FileError;
 use snapsnap_net::Window;
 use snapsnap_net::config::Config;
 use snapsnap_net::network::{PointMap, PointPredictor, View};

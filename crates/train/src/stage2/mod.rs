@@ -1,4 +1,5 @@
-//! Stage 2: the regressor learns Gaussians that look like the person from every side (SNAPSNAP §9.2, LEARNING.md).
+//! Stage 2: the regressor is trained on rendered views from every side
+//! (docs/method.md, "Losses of stage 2").
 
 mod frozen;
 mod maps;
@@ -12,6 +13,7 @@ use burn::data::dataset::Dataset;
 use burn::tensor::{Device, Tensor, TensorData};
 use image::RgbImage;
 use rand::Rng;
+use snapsnap_base::random::stream;
 use snapsnap_data::dataset::{Folder, Split};
 use snapsnap_data::sample::{Joined, SampleConfig, Stage2, Stage2Item};
 use snapsnap_eval::lpips::Lpips;
@@ -20,7 +22,6 @@ use snapsnap_net::config::{Config, RegressorStart};
 use snapsnap_net::network::{PointMap, PointPredictor, View, anchors};
 use snapsnap_net::weights::random_regressors;
 use snapsnap_ops::host;
-use snapsnap_people::random::stream;
 use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
 
 use crate::TrainError;

@@ -14,7 +14,8 @@ use snapsnap_splat::Gaussians;
 use crate::networks::Networks;
 use crate::points::Prediction;
 
-/// Where the published curriculum goes from the sides to front and back, and from these to everything (SNAPSNAP §9.2).
+/// Steps at which the published curriculum changes from the sides to front and back, and from these to all views
+/// (docs/method.md, "Losses of stage 2").
 const CURRICULUM: [u64; 2] = [2000, 4000];
 /// Until here the published curriculum compares one view per step, then all.
 const ONE_VIEW: u64 = 10_000;

@@ -4,6 +4,7 @@ use std::fs;
 use std::path::Path;
 
 use burn::tensor::{Device, Tensor};
+use snapsnap_base::config::Schema;
 use snapsnap_net::config::Config;
 use snapsnap_splat::{Camera, Gaussians, cameras, ply, scene};
 

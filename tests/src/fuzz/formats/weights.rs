@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use safetensors::SafeTensors;
+use snapsnap_base::config::Schema;
 use snapsnap_net::config::Config;
 use snapsnap_net::weights::{Source, WeightFile, init};
 

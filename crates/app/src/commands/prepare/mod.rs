@@ -11,16 +11,16 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::{Args, Subcommand, ValueEnum};
+use snapsnap_base::FileError;
+use snapsnap_base::config::Schema;
+use snapsnap_base::file;
+use snapsnap_base::random::stream;
 use snapsnap_data::dataset::{Folder, Made, Split};
 use snapsnap_data::prepare::{DataConfig, Shard, Subject};
 use snapsnap_data::scan::{Collection, normalise};
+use snapsnap_mesh::export;
 use snapsnap_mesh::mesh::Mesh;
-use snapsnap_mesh::{FileError, export};
-use snapsnap_net::config::parse;
-use snapsnap_people::random::stream;
-use snapsnap_splat::file;
 
-use super::read_config;
 use crate::failure::Failure;
 use crate::progress::Progress;
 use crate::{output, say};
@@ -117,15 +117,10 @@ impl Common {
     }
 
     fn config(&self) -> Result<DataConfig, Failure> {
-        let (text, origin) = match &self.config {
-            Some(path) => (read_config(path)?, path.display().to_string()),
-            None => (String::new(), "the built-in config".to_owned()),
-        };
-        let (config, origin): (DataConfig, String) = parse(&text, &origin, &self.set)?;
-        match config.problem() {
-            Some((key, message)) => Err(Failure::Input(format!("{origin}: `{key}`: {message}"))),
-            None => Ok(config),
-        }
+        Ok(match &self.config {
+            Some(path) => DataConfig::from_file(path, &self.set)?,
+            None => DataConfig::from_toml("", "the built-in config", &self.set)?,
+        })
     }
 }
 

@@ -4,10 +4,11 @@ use std::cell::Cell;
 use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
+use snapsnap_base::FileError;
 use snapsnap_data::dataset::Split;
 use snapsnap_data::scan::{Collection, Source, find};
 use snapsnap_data::smplx;
-use snapsnap_mesh::{FileError, import};
+use snapsnap_mesh::import;
 
 use super::{Common, Person, SplitArgument, Work, make};
 use crate::failure::Failure;

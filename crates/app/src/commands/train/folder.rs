@@ -8,9 +8,10 @@ use snapsnap_data::dataset::Folder;
 use snapsnap_train::config::TrainConfig;
 use snapsnap_train::run::{BEST, CONFIG, LAST, STATE};
 
-use super::super::{outside_data, read_config};
+use super::super::outside_data;
 use super::Arguments;
 use crate::failure::Failure;
+use snapsnap_base::config::Schema;
 
 /// The config of a run: of --config, or of the run that goes on, with what the command line says on top.
 pub fn config(arguments: &Arguments) -> Result<TrainConfig, Failure> {
@@ -43,8 +44,7 @@ pub fn config(arguments: &Arguments) -> Result<TrainConfig, Failure> {
 }
 
 fn read(path: &Path, overrides: &[String]) -> Result<TrainConfig, Failure> {
-    let text = read_config(path)?;
-    Ok(TrainConfig::from_toml(&text, &path.display().to_string(), overrides)?)
+    Ok(TrainConfig::from_file(path, overrides)?)
 }
 
 /// The folder of a run, which nobody else writes into.

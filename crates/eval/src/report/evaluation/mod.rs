@@ -7,13 +7,13 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde::Serialize;
 use serde_json::{Map, Value, json};
 
-use super::plot::{Axes, Series, svg};
 use super::{Header, table};
 use crate::evaluate::config::{EvalConfig, Protocol};
 use crate::evaluate::{Judged, Kind, Outcome, Row, Surface, is_named};
 use crate::points::VIEWS;
 use crate::score::Score;
 use crate::statistics::{Interval, difference, interval, quantile};
+use snapsnap_base::plot::{Axes, Series, svg};
 
 /// The figures of a score: name, what it is, factor and digits in tables.
 type Figure = (&'static str, fn(&Score) -> Option<f64>, f64, usize);
@@ -216,9 +216,9 @@ impl Evaluation<'_> {
             Series { name: judged.name.clone(), points, line: true }
         };
         let caption = format!("PSNR by view, protocol `{}`, mean over people", name.name());
-        let axes =
-            Axes { caption: &caption, x: "degrees from the first photograph", y: "PSNR, dB", log: false };
-        svg(&axes, &self.outcome.judged.iter().map(series).collect::<Vec<_>>())
+        let (x, y) = ("degrees from the first photograph", "PSNR, dB");
+        let axes = Axes { caption: &caption, x, y, ..Axes::default() };
+        svg(&[(axes, self.outcome.judged.iter().map(series).collect())])
     }
 
     /// The people whom the model shows best, those in the middle, and the worst, `count` of each and nobody twice: rows of

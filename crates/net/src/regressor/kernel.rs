@@ -1,4 +1,4 @@
-//! The regressor in training on `flex`: one operator with a gradient of its own, over all parameters as one vector.
+//! The regressor on `flex`: one operator with a gradient of its own, over all parameters as one vector.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -15,7 +15,7 @@ use super::statistics::Statistics;
 use super::unet::UNet;
 use crate::names::{NamedVisitor, visit_named};
 
-/// Planes of one step are those of the next.
+/// Memory of planes, for the next pass.
 static BUFFERS: Buffers = Buffers::new();
 
 /// One pass of the network.
@@ -35,10 +35,10 @@ impl Kernel for Pass {
     }
 
     fn forward(&self, [input, parameters, _]: [&[f32]; 3], keep: bool) -> (Vec<f32>, Kept) {
-        let pass = self.network.forward(parameters, input, self.size, self.frozen.as_deref(), &BUFFERS);
+        let frozen = self.frozen.as_deref();
+        let pass = self.network.forward(parameters, input, self.size, frozen, keep, &BUFFERS);
         *self.measured.lock().unwrap_or_else(PoisonError::into_inner) = pass.statistics;
-        let saved: Kept = if keep { Some(Box::new(pass.saved)) } else { None };
-        (pass.features, saved)
+        (pass.features, pass.saved.map(|saved| Box::new(saved) as _))
     }
 
     fn backward(
@@ -58,8 +58,7 @@ impl Kernel for Pass {
 /// Input `[B, 6, H, W]` → features `[B, H, W, 14]`: `unet`, then the 1×1 convolution `last`.
 pub fn regress(unet: &UNet, last: &Conv2d, input: Tensor<4>, statistics: &mut Statistics) -> Tensor<4> {
     let ([b, _, h, w], device) = (input.dims(), input.device());
-    let network = Network::new(unet.groups());
-    let parameters = flat(unet, last, &network);
+    let (network, parameters) = flat(unet, last);
     let measured = Arc::default();
     let pass =
         Pass { network, size: [b, h, w], frozen: statistics.of_batch(), measured: Arc::clone(&measured) };
@@ -75,17 +74,25 @@ pub fn regress(unet: &UNet, last: &Conv2d, input: Tensor<4>, statistics: &mut St
     features
 }
 
-/// All parameters in the order of [`Network::tensors`].
-fn flat(unet: &UNet, last: &Conv2d, network: &Network) -> Tensor<1> {
-    struct Collect(HashMap<String, Tensor<1>>);
+/// The network's layout, and all parameters in its order.
+fn flat(unet: &UNet, last: &Conv2d) -> (Network, Tensor<1>) {
+    #[derive(Default)]
+    struct Collect {
+        shapes: HashMap<String, Vec<usize>>,
+        values: HashMap<String, Tensor<1>>,
+    }
     impl NamedVisitor for Collect {
         fn visit<const D: usize>(&mut self, name: &str, _: bool, parameter: &Param<Tensor<D>>) {
-            self.0.insert(name.to_owned(), parameter.val().reshape([-1]));
+            let values = parameter.val();
+            self.shapes.insert(name.to_owned(), values.dims().to_vec());
+            self.values.insert(name.to_owned(), values.reshape([-1]));
         }
     }
-    let mut collect = Collect(HashMap::new());
+    let mut collect = Collect::default();
     visit_named(unet, "", &mut collect);
     visit_named(last, "gs_conv.", &mut collect);
-    let mut parameter = |name: &str| collect.0.remove(name).expect("the network has this parameter");
-    Tensor::cat(network.tensors().iter().map(|tensor| parameter(&tensor.name)).collect(), 0)
+    let network = Network::new(unet.groups(), &collect.shapes);
+    let mut values = |name: &str| collect.values.remove(name).expect("the layout names existing parameters");
+    let flat = Tensor::cat(network.tensors().iter().map(|tensor| values(&tensor.name)).collect(), 0);
+    (network, flat)
 }

@@ -1,19 +1,8 @@
-//! What can go wrong on this floor.
+//! Errors of files, and readers that panic.
 
 use std::cell::Cell;
-use std::fs::File;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
-
-use snapsnap_splat::{file, quoted};
-
-/// Opens a regular file: reading a pipe or a device might never end.
-///
-/// # Errors
-/// [`FileError`] if it is something else, or cannot be opened.
-pub fn open(path: &Path) -> Result<File, FileError> {
-    file::open(path).map_err(FileError::read(path))
-}
 
 thread_local! {
     static GUARDED: Cell<bool> = const { Cell::new(false) };
@@ -40,7 +29,7 @@ pub fn guarded<T>(path: &Path, read: impl FnOnce() -> Result<T, FileError>) -> R
     })
 }
 
-/// Errors of photographs, scans, data of people and data sets; each names its file.
+/// Errors of files; each names its file.
 #[derive(Debug, thiserror::Error)]
 pub enum FileError {
     /// Missing or unreadable file.
@@ -58,14 +47,6 @@ pub enum FileError {
         path: PathBuf,
         /// Why.
         source: std::io::Error,
-    },
-    /// Not an image of a known format, or a damaged one.
-    #[error("{path}: not a readable image: {source}")]
-    Decode {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        source: image::ImageError,
     },
     /// A file that can be read but not used.
     #[error("{path}: {message}")]
@@ -88,18 +69,19 @@ impl FileError {
         move |source| Self::Write { path: path.to_owned(), source }
     }
 
-    /// A camera file's error, which names the file itself.
-    pub fn splat(path: &Path, error: snapsnap_splat::SplatError) -> Self {
-        if let snapsnap_splat::SplatError::Write { source, .. } = error {
-            return Self::Write { path: path.to_owned(), source };
-        }
-        let message = error.to_string();
-        let message = message.strip_prefix(&format!("{}: ", path.display())).unwrap_or(&message).to_owned();
-        Self::Unsuitable { path: path.to_owned(), message }
-    }
-
     /// `path` can be read but not used.
     pub fn unsuitable(path: &Path, message: impl ToString) -> Self {
         Self::Unsuitable { path: path.to_owned(), message: message.to_string() }
     }
+}
+
+/// Text from a file as it may appear in a message: escaped and short.
+pub fn quoted(text: &str) -> String {
+    /// Characters that are shown.
+    const SHOWN: usize = 80;
+    let mut shown: String = text.chars().take(SHOWN).flat_map(char::escape_debug).collect();
+    if text.chars().nth(SHOWN).is_some() {
+        shown.push('…');
+    }
+    shown
 }

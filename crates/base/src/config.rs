@@ -1,0 +1,299 @@
+//! TOML configs: a file, the file that it `extends`, and assignments on top.
+
+use std::path::{Path, PathBuf};
+
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use toml::{Table, Value};
+
+use crate::{FileError, file};
+
+/// Longest config that is read, in bytes.
+const MAX_BYTES: u64 = 1 << 20;
+/// Longest chain of files that extend one another.
+const MAX_CHAIN: usize = 8;
+/// The key that names the file which a config extends. Its path is relative to the config's own folder.
+const EXTENDS: &str = "extends";
+
+/// A config that cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum ConfigError {
+    /// The file could not be read.
+    #[error(transparent)]
+    File(#[from] FileError),
+    /// Not TOML, an unknown key, a wrong type or an unknown name.
+    #[error("{origin}: {message}")]
+    Syntax {
+        /// File or other origin of the text.
+        origin: String,
+        /// The parser's message, with line and key.
+        message: String,
+    },
+    /// A value that makes no sense, alone or beside another.
+    #[error("{origin}: `{key}`: {message}")]
+    Value {
+        /// File or other origin of the text.
+        origin: String,
+        /// Dotted key.
+        key: String,
+        /// What is wrong and what is allowed.
+        message: String,
+    },
+}
+
+/// The type of a config. Every key has a default, so that a file may hold any part of it.
+pub trait Schema: DeserializeOwned + Serialize {
+    /// Former names of keys with the present ones, dotted. A former name is refused with the present one in the message.
+    const RENAMED: &'static [(&'static str, &'static str)] = &[];
+
+    /// The first value that makes no sense: its dotted key, and what is wrong.
+    fn refusal(&self) -> Option<(String, String)>;
+
+    /// Reads and checks a file and those that it extends; `overrides` are `a.b=c` assignments on top.
+    ///
+    /// # Errors
+    /// [`ConfigError`], naming file, key and allowed values.
+    fn from_file(path: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
+        let (table, origin) = layers::<Self>(path)?;
+        build(table, origin, overrides)
+    }
+
+    /// Parses and checks TOML text that extends no file; `origin` names it in errors, `overrides` are `a.b=c` assignments on
+    /// top.
+    ///
+    /// # Errors
+    /// [`ConfigError`], naming origin, key and allowed values.
+    fn from_toml(text: &str, origin: &str, overrides: &[String]) -> Result<Self, ConfigError> {
+        let (table, extended) = layer::<Self>(text, origin)?;
+        if extended.is_some() {
+            return Err(syntax(origin, format!("`{EXTENDS}`: only a file can extend another")));
+        }
+        build(table, origin.to_owned(), overrides)
+    }
+
+    /// The config itself, if all its values make sense; `origin` names it in errors.
+    ///
+    /// # Errors
+    /// [`ConfigError::Value`].
+    fn checked(self, origin: &str) -> Result<Self, ConfigError> {
+        match self.refusal() {
+            Some((key, message)) => Err(ConfigError::Value { origin: origin.to_owned(), key, message }),
+            None => Ok(self),
+        }
+    }
+
+    /// The config as TOML, every set key written out.
+    ///
+    /// # Panics
+    /// For a type that TOML cannot represent.
+    fn to_toml(&self) -> String {
+        toml::to_string_pretty(self).expect("configs have only TOML types")
+    }
+}
+
+fn syntax(origin: &str, message: String) -> ConfigError {
+    ConfigError::Syntax { origin: origin.to_owned(), message }
+}
+
+/// The keys of a file over those of the files that it extends, and the name of them all for errors.
+fn layers<T: Schema>(path: &Path) -> Result<(Table, String), ConfigError> {
+    let mut chain: Vec<PathBuf> = Vec::new();
+    let mut merged = Table::new();
+    let mut next = Some(path.to_owned());
+    while let Some(path) = next {
+        let origin = path.display().to_string();
+        if chain.len() == MAX_CHAIN {
+            return Err(syntax(&origin, format!("more than {MAX_CHAIN} configs extend one another")));
+        }
+        let text = file::read_text(&path, MAX_BYTES).map_err(FileError::read(&path))?;
+        let (below, extended) = layer::<T>(&text, &origin)?;
+        next = extended.map(|name| path.parent().unwrap_or(Path::new("")).join(name));
+        let above = std::mem::replace(&mut merged, below);
+        merge(&mut merged, above);
+        chain.push(path);
+    }
+    let names: Vec<String> = chain.iter().map(|path| path.display().to_string()).collect();
+    Ok((merged, names.join(" extending ")))
+}
+
+/// One text's keys, each of them of the right type, and the name of the file that it extends.
+fn layer<T: Schema>(text: &str, origin: &str) -> Result<(Table, Option<String>), ConfigError> {
+    let mut table: Table = toml::from_str(text).map_err(|e| syntax(origin, e.to_string()))?;
+    let extended = match table.remove(EXTENDS) {
+        None => None,
+        Some(Value::String(name)) => Some(name),
+        Some(other) => {
+            return Err(syntax(origin, format!("`{EXTENDS}` is a {}, must be a path", other.type_str())));
+        }
+    };
+    check_names::<T>(&table, origin)?;
+    // A list of values would pass for a section.
+    if let Some((key, value)) = table.iter().find(|(_, value)| !value.is_table()) {
+        return Err(syntax(origin, format!("`{key}` is a {}, must be a section [{key}]", value.type_str())));
+    }
+    // From the text, since only then do messages carry line numbers. Keys of the whole file come before its sections.
+    let is_extends = |line: &str| line.trim_start().starts_with(EXTENDS);
+    let mut in_section = false;
+    let own: Vec<&str> = text
+        .lines()
+        .map(|line| {
+            in_section |= line.trim_start().starts_with('[');
+            if !in_section && is_extends(line) { "" } else { line }
+        })
+        .collect();
+    toml::from_str::<T>(&own.join("\n")).map_err(|e| syntax(origin, e.to_string()))?;
+    Ok((table, extended))
+}
+
+/// Refuses former names of keys.
+fn check_names<T: Schema>(table: &Table, origin: &str) -> Result<(), ConfigError> {
+    for (old, new) in T::RENAMED {
+        let (section, key) = old.rsplit_once('.').expect("a dotted key");
+        let section = section.split('.').try_fold(table, |at, name| at.get(name)?.as_table());
+        if section.is_some_and(|section| section.contains_key(key)) {
+            return Err(syntax(origin, format!("`{old}` is now called `{new}`")));
+        }
+    }
+    Ok(())
+}
+
+/// Puts `above` over `below`, section by section and key by key.
+fn merge(below: &mut Table, above: Table) {
+    for (key, value) in above {
+        match (below.get_mut(&key), value) {
+            (Some(Value::Table(below)), Value::Table(above)) => merge(below, above),
+            (_, value) => {
+                below.insert(key, value);
+            }
+        }
+    }
+}
+
+fn build<T: Schema>(mut table: Table, origin: String, overrides: &[String]) -> Result<T, ConfigError> {
+    for assignment in overrides {
+        let origin = format!("--set {assignment}");
+        assign(&mut table, assignment).map_err(|message| syntax(&origin, message))?;
+        check_names::<T>(&table, &origin)?;
+    }
+    let origin = match overrides {
+        [] => origin,
+        _ => format!("{origin} with --set {}", overrides.join(" --set ")),
+    };
+    let config: T =
+        Value::Table(table).try_into().map_err(|e: toml::de::Error| syntax(&origin, e.to_string()))?;
+    config.checked(&origin)
+}
+
+/// Applies `a.b=c`: `c` is a TOML value, or a bare word for a string.
+fn assign(table: &mut Table, assignment: &str) -> Result<(), String> {
+    let Some((key, value)) = assignment.split_once('=') else {
+        return Err("expected SECTION.KEY=VALUE".into());
+    };
+    let parsed = toml::from_str::<Table>(&format!("v = {value}")).ok();
+    let parsed = parsed.filter(|table| table.len() == 1).and_then(|mut table| table.remove("v"));
+    let value = parsed.unwrap_or_else(|| Value::String(value.trim().to_owned()));
+    let mut path: Vec<&str> = key.split('.').map(str::trim).collect();
+    let last = path.pop().filter(|k| !k.is_empty()).ok_or("the key is empty")?;
+    let mut at = table;
+    for section in path {
+        let entry = at.entry(section).or_insert_with(|| Value::Table(Table::new()));
+        at = entry.as_table_mut().ok_or_else(|| format!("`{section}` is a value, not a section"))?;
+    }
+    at.insert(last.to_owned(), value);
+    Ok(())
+}
+
+/// For `deserialize_with`: exactly four numbers. An array type alone would drop a fifth without a word.
+///
+/// # Errors
+/// The deserialiser's, for another count.
+pub fn four<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<[usize; 4], D::Error> {
+    let values: Vec<usize> = serde::Deserialize::deserialize(deserializer)?;
+    let count = values.len();
+    values.try_into().map_err(|_| serde::de::Error::custom(format!("{count} numbers, must be 4")))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use serde::Deserialize;
+
+    use super::*;
+
+    #[derive(Debug, Default, PartialEq, Serialize, Deserialize)]
+    #[serde(default, deny_unknown_fields)]
+    struct Config {
+        network: Network,
+    }
+
+    #[derive(Debug, Default, PartialEq, Serialize, Deserialize)]
+    #[serde(default, deny_unknown_fields)]
+    struct Network {
+        dim: usize,
+        name: String,
+    }
+
+    impl Schema for Config {
+        const RENAMED: &'static [(&'static str, &'static str)] = &[("network.width", "network.dim")];
+
+        fn refusal(&self) -> Option<(String, String)> {
+            (self.network.dim > 9).then(|| ("network.dim".into(), "must be at most 9".into()))
+        }
+    }
+
+    fn in_folder(files: &[(&str, &str)], overrides: &[&str]) -> Result<Config, String> {
+        let folder = tempfile::tempdir().expect("temporary folder");
+        for (name, text) in files {
+            fs::create_dir_all(folder.path().join(name).parent().expect("a folder")).expect("made");
+            fs::write(folder.path().join(name), text).expect("written");
+        }
+        let overrides: Vec<String> = overrides.iter().map(|s| (*s).to_owned()).collect();
+        Config::from_file(&folder.path().join(files[0].0), &overrides).map_err(|e| e.to_string())
+    }
+
+    #[test]
+    fn the_nearest_file_wins_and_overrides_win_over_all() {
+        let files = [
+            ("runs/a.toml", "extends = \"../b.toml\"\n[network]\ndim = 3\n"),
+            ("b.toml", "extends = \"c.toml\"\n[network]\nname = \"b\"\n"),
+            ("c.toml", "[network]\ndim = 1\nname = \"c\"\n"),
+        ];
+        let network = |dim, name: &str| Ok(Config { network: Network { dim, name: name.into() } });
+        assert_eq!(in_folder(&files, &[]), network(3, "b"));
+        assert_eq!(in_folder(&files, &["network.dim=4"]), network(4, "b"));
+    }
+
+    #[test]
+    fn circles_missing_files_and_wrong_types_are_refused() {
+        let circle = in_folder(&[("a.toml", "extends = \"a.toml\"\n")], &[]).expect_err("a circle");
+        assert!(circle.contains("more than 8 configs"), "{circle}");
+        let missing = in_folder(&[("a.toml", "extends = \"b.toml\"\n")], &[]).expect_err("no file");
+        assert!(missing.contains("b.toml: cannot read"), "{missing}");
+        let number = in_folder(&[("a.toml", "extends = 3\n")], &[]).expect_err("no path");
+        assert!(number.contains("`extends` is a integer"), "{number}");
+        let text = Config::from_toml("extends = \"b.toml\"", "x", &[]).expect_err("no file").to_string();
+        assert!(text.contains("only a file"), "{text}");
+    }
+
+    #[test]
+    fn errors_name_the_file_the_line_and_the_key_of_the_layer_that_is_wrong() {
+        let files = [("a.toml", "extends = \"b.toml\"\n"), ("b.toml", "[network]\ndim = 1\ndims = 2\n")];
+        let message = in_folder(&files, &[]).expect_err("unknown key");
+        assert!(message.contains("b.toml: ") && message.contains("line 3") && message.contains("dims"));
+        let files = [("a.toml", "extends = \"b.toml\"\n[network]\ndims = 2\n"), ("b.toml", "")];
+        let message = in_folder(&files, &[]).expect_err("unknown key");
+        assert!(message.contains("a.toml: ") && message.contains("line 3"), "{message}");
+        let files = [("a.toml", "extends = \"b.toml\"\n"), ("b.toml", "[network]\ndim = 10\n")];
+        let message = in_folder(&files, &[]).expect_err("too large");
+        assert!(message.contains("a.toml extending") && message.contains("`network.dim`: must"), "{message}");
+    }
+
+    #[test]
+    fn former_names_are_refused_with_the_present_ones() {
+        let text = Config::from_toml("[network]\nwidth = 3\n", "x", &[]).expect_err("former").to_string();
+        assert_eq!(text, "x: `network.width` is now called `network.dim`");
+        let set = Config::from_toml("", "x", &["network.width=3".into()]).expect_err("former").to_string();
+        assert_eq!(set, "--set network.width=3: `network.width` is now called `network.dim`");
+    }
+}
