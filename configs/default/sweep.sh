@@ -22,7 +22,7 @@ row() {
   name=$1 data="people/sweep/$2/synth people/sweep/$2/makehuman"
   wanted "$name" || return 0
   shift 2
-  cargo xtask train-stage1 --config configs/default/stage1.toml --data $data --set training.steps=400 --set training.average=0.99 \
+  cargo xtask train-stage1 --config configs/default/stage1.toml --data $data --set training.steps=400 --set training.ema_decay=0.99 \
     --set training.log_every=20 --set training.validate_every=100 --set training.validation_samples=32 "$@" --resume -o "runs/sweep/$name"
   case $name in no-* | plain | rings) return 0 ;; esac
   cargo xtask train-stage2 --config configs/default/stage2.toml --data $data --weights "runs/sweep/$name/best.safetensors" \
@@ -33,10 +33,10 @@ row no-mask groups --set network.mask_channel=false
 row no-rays groups --set network.ray_channels=false
 row no-mirror groups --set network.mirror=false
 row no-anchor groups --set 'network.anchor="none"'
-row no-flip groups --set samples.augment.mirror=false
-row no-place groups --set samples.place=0.0
+row no-flip groups --set samples.augment.flip=false
+row no-place groups --set samples.placed_share=0.0
 row plain groups --set network.mask_channel=false --set network.ray_channels=false --set network.mirror=false --set 'network.anchor="none"' \
-  --set samples.augment.mirror=false
+  --set samples.augment.flip=false
 transformer="--set network.body=\"transformer\" --set network.enc_depth=4 --set network.dec_dim=128 --set network.dec_depth=3 \
   --set network.layer_dims=[16,32,48,64] --set network.feature_dim=32 --set network.last_dim=16 --set network.hooks=[0,1,2,3] --set network.patch=16"
 row transformer groups $transformer

@@ -44,7 +44,7 @@ supervision = 1
 [training]
 steps = 40
 batch = 2
-average = 0.9
+ema_decay = 0.9
 log_every = 1
 validate_every = 10
 validation_samples = 2
@@ -60,9 +60,9 @@ kind = "cosine"
 warm_up = 4
 end = 0.01
 [stage2]
-alpha = 0.5
-needle = 0.01
-noise = 0.01
+alpha_weight = 0.5
+anisotropy_weight = 0.01
+point_noise = 0.01
 "#;
 
 /// Name of the device that tests run on: `SNAPSNAP_TEST_DEVICE` = `flex` (default), `ndarray`, `wgpu`, or, where it is

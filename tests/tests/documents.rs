@@ -137,13 +137,13 @@ fn less(words: &[String]) -> Words {
             }
             let count = words.iter().position(|word| word == "--subjects").expect("how many people");
             words[count + 1] = "2".into();
-            more.extend(["--set", "views.count=8", "--set", "views.samples=1"]);
+            more.extend(["--set", "views.count=8", "--set", "views.samples_per_axis=1"]);
             let is_fine =
                 !words.iter().any(|word| word.contains("small.toml") || word.contains("default.toml"));
             more.extend(is_fine.then_some(["--set", "views.resolution=256"]).into_iter().flatten());
         }
         "prepare" if words[1] == "scan" => {
-            more.extend(["--set", "views.count=4", "--set", "views.samples=1"]);
+            more.extend(["--set", "views.count=4", "--set", "views.samples_per_axis=1"]);
         }
         "train-stage1" | "train-stage2" => {
             for key in [

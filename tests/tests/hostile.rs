@@ -123,7 +123,8 @@ fn outputs_are_told_apart_by_where_they_are() {
         assert!(message.contains("is given for two outputs"), "{message}");
     }
 
-    let small = ["--set", "views.count=2", "--set", "views.resolution=32", "--set", "views.samples=1"];
+    let small =
+        ["--set", "views.count=2", "--set", "views.resolution=32", "--set", "views.samples_per_axis=1"];
     let mut make = place.run(["prepare", "synth", "--subjects", "1", "--save-scans", "-o", "people"]);
     succeed(make.args(small));
     fs::create_dir(place.path("scans")).expect("folder");

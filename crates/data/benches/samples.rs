@@ -21,7 +21,7 @@ fn data_set(root: &std::path::Path, layout: Layout, resolution: u32) -> Arc<Fold
     let mut config = DataConfig::default();
     config.views.layout = layout;
     config.views.resolution = resolution;
-    config.views.samples = 1;
+    config.views.samples_per_axis = 1;
     let folder =
         Folder::create(&root.join(format!("{layout:?}_{resolution}_24")), config.description("bench"));
     let folder = folder.expect("makes the folder");

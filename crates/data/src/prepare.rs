@@ -11,14 +11,13 @@ use crate::JitterConfig;
 use crate::dataset::{
     Arrangement, Description, Drawn, Folder, Layout, MAX_RESOLUTION, MAX_VIEWS, Made, Split,
 };
-use crate::sample::SampleConfig;
 use snapsnap_base::FileError;
 use snapsnap_base::config::Schema;
 use snapsnap_base::random::stream;
 use snapsnap_mesh::mesh::Mesh;
 use snapsnap_mesh::view::{Lights, Renderer, ViewOptions};
 
-/// How subjects become views, and views samples: `configs/data/*.toml`.
+/// How subjects become views: `configs/data/*.toml`.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DataConfig {
@@ -26,8 +25,6 @@ pub struct DataConfig {
     pub views: ViewsConfig,
     /// How cameras stray from the training orbit.
     pub jitter: JitterConfig,
-    /// How training makes samples of the views; nothing to `prepare`.
-    pub samples: SampleConfig,
 }
 
 /// Which views.
@@ -49,7 +46,7 @@ pub struct ViewsConfig {
     /// Whether each view is drawn at twice the side as well, for stage 2's supervision.
     pub high_resolution: bool,
     /// Samples per pixel along each axis, 1 to 6.
-    pub samples: usize,
+    pub samples_per_axis: usize,
     /// How views are stored.
     pub layout: Layout,
 }
@@ -65,16 +62,25 @@ impl Default for ViewsConfig {
             distance: 1.0,
             resolution: 1024,
             high_resolution: false,
-            samples: 3,
+            samples_per_axis: 3,
             layout: Layout::Exact,
         }
     }
 }
 
 impl Schema for DataConfig {
+    const RENAMED: &'static [(&'static str, &'static str)] = &[("views.samples", "views.samples_per_axis")];
+
     fn refusal(&self) -> Option<(String, String)> {
-        let ViewsConfig { count, arrangement, front_within_degrees, resolution, samples, layout, .. } =
-            self.views;
+        let ViewsConfig {
+            count,
+            arrangement,
+            front_within_degrees,
+            resolution,
+            samples_per_axis,
+            layout,
+            ..
+        } = self.views;
         if count == 0 || count > MAX_VIEWS {
             return Some(("views.count".into(), format!("is {count}, must be 1 to {MAX_VIEWS}")));
         }
@@ -101,11 +107,12 @@ impl Schema for DataConfig {
         if resolution == 0 || resolution > most {
             return Some(("views.resolution".into(), format!("is {resolution}, must be 1 to {most}")));
         }
-        if !(1..=6).contains(&samples) {
-            return Some(("views.samples".into(), format!("is {samples}, must be 1 to 6")));
+        if !(1..=6).contains(&samples_per_axis) {
+            let message = format!("is {samples_per_axis}, must be 1 to 6");
+            return Some(("views.samples_per_axis".into(), message));
         }
         let jitter = self.jitter.problem().map(|(key, message)| (format!("jitter.{key}"), message));
-        jitter.or_else(|| self.samples.problem().map(|(key, message)| (format!("samples.{key}"), message)))
+        jitter
     }
 }
 
@@ -121,7 +128,7 @@ impl DataConfig {
             high_resolution,
             pixel_centre: if layout == Layout::Authors { 0.0 } else { 0.5 },
             source: source.to_owned(),
-            drawn: Some(Drawn { samples: self.views.samples, jitter: self.jitter.clone() }),
+            drawn: Some(Drawn { samples: self.views.samples_per_axis, jitter: self.jitter.clone() }),
         }
     }
 
@@ -175,7 +182,7 @@ impl DataConfig {
     pub fn add(&self, folder: &Folder, subject: &Subject, mesh: &Mesh) -> Result<Made, FileError> {
         let Subject { split, name, identity, yaw_degrees, origin } = *subject;
         let renderer = Renderer::new(mesh).map_err(|e| FileError::unsuitable(origin, e))?;
-        let options = ViewOptions { samples: self.views.samples, lights: Lights::default() };
+        let options = ViewOptions { samples: self.views.samples_per_axis, lights: Lights::default() };
         let cameras = self.cameras(yaw_degrees, identity);
         folder.write_subject(split, name, origin, &cameras, |camera| renderer.draw(camera, &options))
     }

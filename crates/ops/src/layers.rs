@@ -1,5 +1,5 @@
-//! Layers of the networks as functions of Burn's modules: kernels with gradients of their own on `flex` in training, Burn's
-//! operators everywhere else.
+//! Layers of the networks as functions of Burn's modules: kernels with gradients of their own on `flex`, Burn's operators
+//! everywhere else.
 
 use burn::module::Param;
 use burn::nn;
@@ -14,7 +14,7 @@ use crate::train::{
 };
 use crate::{in_f32, is_fast, is_trained_fast};
 
-/// What one step needed, the next one needs again.
+/// Memory of intermediate results, for the next call.
 pub(crate) static BUFFERS: Buffers = Buffers::new();
 
 /// `[B, N, inputs]` → `[B, N, outputs]`.
@@ -71,7 +71,7 @@ pub fn conv2d(layer: &Conv2d, x: Tensor<4>, rectified: bool) -> Tensor<4> {
 
 /// A transposed convolution whose kernel is as large as its stride: `[B, C, H, W]` → `[B, D, stride·H, stride·W]`.
 pub fn enlarge(layer: &ConvTranspose2d, x: Tensor<4>) -> Tensor<4> {
-    if !is_trained_fast(&x) {
+    if !is_trained_fast(&x) && !is_fast(&x) {
         return layer.forward(x);
     }
     let ([batch, inputs, height, width], [_, outputs, stride, _]) = (x.dims(), layer.weight.dims());

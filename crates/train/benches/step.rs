@@ -77,12 +77,9 @@ fn peak() -> String {
 
 fn run(seconds: f64, side: usize, batch: usize) {
     let device = Device::flex().autodiff();
-    let text = match ["tiny", "full"].map(asked_for) {
-        [true, _] => include_str!("../../../configs/tiny/stage1.toml"),
-        [_, true] => include_str!("../../../configs/full/stage1.toml"),
-        _ => include_str!("../../../configs/small/stage1.toml"),
-    };
-    let config = TrainConfig::from_toml(text, "the config", &[]).expect("a config").networks();
+    let network = ["tiny", "full"].into_iter().find(|word| asked_for(word)).unwrap_or("small");
+    let path = format!("{}/../../configs/{network}/stage1.toml", env!("CARGO_MANIFEST_DIR"));
+    let config = TrainConfig::from_file(path.as_ref(), &[]).expect("a config").networks();
     let predictor = random_predictor(&config, 1, &device);
     let regressor = random_regressors(&config, 1, &device).remove(0);
     let threads = rayon::current_num_threads();

@@ -57,8 +57,8 @@ pub struct TrainingConfig {
     pub accumulate: usize,
     /// Largest norm of all gradients together.
     pub clip: f64,
-    /// Share of the past in the averaged weights, which are validated and written; 0: the weights themselves.
-    pub average: f64,
+    /// Decay of the exponential moving average of the weights, which is validated and written; 0: the weights themselves.
+    pub ema_decay: f64,
     /// Weight file to begin with, ours or imported; `--weights` replaces it. Without one, stage 1 begins with random weights.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub start: Option<PathBuf>,
@@ -103,34 +103,35 @@ pub enum ValidationSplit {
 #[serde(deny_unknown_fields, default)]
 pub struct Stage1Config {
     /// λ, the weight of the confidences' cross-entropy: 0.5 in the published code, 1 in the paper.
-    pub confidence: f64,
+    pub confidence_weight: f64,
 }
 
 /// The section `[stage2]`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Stage2Config {
-    /// β: the share of the absolute difference, beside the structural similarity.
-    pub beta: f64,
+    /// β: the share of the L1 loss; the rest is that of the structural dissimilarity.
+    pub l1_share: f64,
     /// The published curriculum: the sides alone with small scales, then front and back alone, then everything.
     pub curriculum: bool,
     /// Weight of the mean absolute difference of coverage and mask.
-    pub alpha: f64,
-    /// Weight of what a Gaussian's longest axis has beyond `anisotropy` times its shortest, as logarithms.
-    pub needle: f64,
-    /// How many times as long as its shortest axis a Gaussian's longest may be for free.
-    pub anisotropy: f64,
+    pub alpha_weight: f64,
+    /// Weight of the anisotropy penalty: the logarithm of the ratio of a Gaussian's longest to its shortest axis, as far as it
+    /// exceeds that of `anisotropy_limit`.
+    pub anisotropy_weight: f64,
+    /// Ratio of the longest to the shortest axis that costs nothing.
+    pub anisotropy_limit: f64,
     /// Standard deviation in metres by which a sample's predicted points are shifted at random, since points of people
     /// trained on are better than others'.
-    pub noise: f64,
+    pub point_noise: f64,
     /// Perceptual distance, towards the end.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lpips: Option<LpipsConfig>,
     /// Folder that keeps the frozen predictor's point maps from step to step and from run to run.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub maps: Option<PathBuf>,
-    /// Whether the point predictor is tuned as well, with stage 1's loss kept on at this weight; 0: it is frozen.
-    pub points: f64,
+    pub point_map_cache: Option<PathBuf>,
+    /// Weight of stage 1's loss, with which the point predictor is trained as well; 0: it is frozen.
+    pub points_weight: f64,
 }
 
 /// The section `[stage2.lpips]`.
@@ -175,7 +176,7 @@ impl Default for TrainingConfig {
             batch: 1,
             accumulate: 1,
             clip: 1.0,
-            average: 0.0,
+            ema_decay: 0.0,
             start: None,
             seed: 3407,
             shuffle: true,
@@ -195,27 +196,41 @@ impl Default for TrainingConfig {
 
 impl Default for Stage1Config {
     fn default() -> Self {
-        Self { confidence: 0.5 }
+        Self { confidence_weight: 0.5 }
     }
 }
 
 impl Default for Stage2Config {
     fn default() -> Self {
         Self {
-            beta: 0.8,
+            l1_share: 0.8,
             curriculum: false,
-            alpha: 0.0,
-            needle: 0.0,
-            anisotropy: 8.0,
-            noise: 0.0,
+            alpha_weight: 0.0,
+            anisotropy_weight: 0.0,
+            anisotropy_limit: 8.0,
+            point_noise: 0.0,
             lpips: None,
-            maps: None,
-            points: 0.0,
+            point_map_cache: None,
+            points_weight: 0.0,
         }
     }
 }
 
 impl Schema for TrainConfig {
+    const RENAMED: &'static [(&'static str, &'static str)] = &[
+        ("samples.place", "samples.placed_share"),
+        ("samples.augment.flip", "samples.augment.flip"),
+        ("training.ema_decay", "training.ema_decay"),
+        ("stage1.confidence_weight", "stage1.confidence_weight"),
+        ("stage2.beta", "stage2.l1_share"),
+        ("stage2.alpha", "stage2.alpha_weight"),
+        ("stage2.anisotropy_weight", "stage2.anisotropy_weight"),
+        ("stage2.anisotropy", "stage2.anisotropy_limit"),
+        ("stage2.point_noise", "stage2.point_noise"),
+        ("stage2.points_weight", "stage2.points_weight"),
+        ("stage2.point_map_cache", "stage2.point_map_cache"),
+    ];
+
     fn refusal(&self) -> Option<(String, String)> {
         self.networks().refusal().or_else(|| self.problem())
     }
@@ -251,14 +266,14 @@ impl TrainConfig {
         let two = &self.stage2;
         let ranges = [
             ("training.clip", t.clip, 1e-9, 1e9),
-            ("training.average", t.average, 0.0, 0.999_999),
-            ("stage1.confidence", self.stage1.confidence, 0.0, 1e6),
-            ("stage2.beta", two.beta, 0.0, 1.0),
-            ("stage2.alpha", two.alpha, 0.0, 1e6),
-            ("stage2.needle", two.needle, 0.0, 1e6),
-            ("stage2.anisotropy", two.anisotropy, 1.0, 1e6),
-            ("stage2.noise", two.noise, 0.0, 1.0),
-            ("stage2.points", two.points, 0.0, 1e6),
+            ("training.ema_decay", t.ema_decay, 0.0, 0.999_999),
+            ("stage1.confidence_weight", self.stage1.confidence_weight, 0.0, 1e6),
+            ("stage2.l1_share", two.l1_share, 0.0, 1.0),
+            ("stage2.alpha_weight", two.alpha_weight, 0.0, 1e6),
+            ("stage2.anisotropy_weight", two.anisotropy_weight, 0.0, 1e6),
+            ("stage2.anisotropy_limit", two.anisotropy_limit, 1.0, 1e6),
+            ("stage2.point_noise", two.point_noise, 0.0, 1.0),
+            ("stage2.points_weight", two.points_weight, 0.0, 1e6),
         ];
         if let Some((key, value, least, most)) =
             ranges.into_iter().find(|(_, value, least, most)| !(*least..=*most).contains(value))
@@ -272,13 +287,13 @@ impl TrainConfig {
             let message = "begins with the sides alone, which `network.side_heads = false` leaves out";
             return Some(("stage2.curriculum".into(), message.into()));
         }
-        if two.points > 0.0 && two.noise > 0.0 {
-            let message = "must be 0 beside `stage2.points`: what is trained makes errors of its own";
-            return Some(("stage2.noise".into(), message.into()));
+        if two.points_weight > 0.0 && two.point_noise > 0.0 {
+            let message = "must be 0 beside `stage2.points_weight`: what is trained makes errors of its own";
+            return Some(("stage2.point_noise".into(), message.into()));
         }
-        if two.points > 0.0 && two.curriculum {
+        if two.points_weight > 0.0 && two.curriculum {
             let message = "must be 0 beside `stage2.curriculum = true`, which renders parts of a person";
-            return Some(("stage2.points".into(), message.into()));
+            return Some(("stage2.points_weight".into(), message.into()));
         }
         if let Some(lpips) = &two.lpips {
             if !(0.0..=1e6).contains(&lpips.weight) || !(0.0..=1.0).contains(&lpips.after) {
@@ -299,17 +314,17 @@ impl TrainConfig {
                 return Some(("stage2.lpips".into(), message));
             }
         }
-        if two.maps.as_ref().is_some_and(|folder| folder.as_os_str().is_empty()) {
-            return Some(("stage2.maps".into(), "must name a folder".into()));
+        if two.point_map_cache.as_ref().is_some_and(|folder| folder.as_os_str().is_empty()) {
+            return Some(("stage2.point_map_cache".into(), "must name a folder".into()));
         }
-        if two.maps.is_some() && two.points > 0.0 {
-            let message = "needs a predictor that stays as it is, which `stage2.points = 0` means";
-            return Some(("stage2.maps".into(), message.into()));
+        if two.point_map_cache.is_some() && two.points_weight > 0.0 {
+            let message = "needs a predictor that stays as it is, which `stage2.points_weight = 0` means";
+            return Some(("stage2.point_map_cache".into(), message.into()));
         }
-        if two.maps.is_some() && self.samples.augment.changes_photographs() {
+        if two.point_map_cache.is_some() && self.samples.augment.changes_photographs() {
             let message = "needs photographs that stay as they are, for which exposure, white_balance, mask_erosion, \
                            mask_dilation and jpeg_quality of `samples.augment` are 0 and background is false";
-            return Some(("stage2.maps".into(), message.into()));
+            return Some(("stage2.point_map_cache".into(), message.into()));
         }
         if let Some((key, message)) = self.samples.problem() {
             return Some((format!("samples.{key}"), message));
@@ -327,8 +342,7 @@ mod tests {
 
     fn read(size: &str, stage: u32) -> TrainConfig {
         let path = format!("{}/../../configs/{size}/stage{stage}.toml", env!("CARGO_MANIFEST_DIR"));
-        let text = std::fs::read_to_string(&path).expect("a config");
-        TrainConfig::from_toml(&text, &path, &[]).expect("makes sense")
+        TrainConfig::from_file(path.as_ref(), &[]).expect("makes sense")
     }
 
     #[test]
@@ -355,7 +369,7 @@ mod tests {
         assert_eq!((&one.samples, &one.optimizer), (&published.samples, &published.optimizer));
         assert_eq!((one.schedule, &one.stage1), (published.schedule, &published.stage1));
         assert_eq!((one.training.steps, one.training.batch, one.training.clip), (100_000, 1, 1.0));
-        assert_eq!((two.training.steps, two.stage2.beta, two.stage2.curriculum), (50_000, 0.8, true));
+        assert_eq!((two.training.steps, two.stage2.l1_share, two.stage2.curriculum), (50_000, 0.8, true));
         assert_eq!((two.schedule, &two.optimizer), (one.schedule, &one.optimizer));
     }
 }

@@ -38,7 +38,7 @@ pub(crate) type Skipped = String;
 impl<'a, T: Task> Learner<'a, T> {
     /// At the beginning of a run; `networks` are on the first of the devices.
     pub fn new(task: &'a T, config: &'a TrainConfig, networks: Networks, devices: &'a [Device]) -> Self {
-        let share = config.training.average;
+        let share = config.training.ema_decay;
         Self {
             task,
             config,

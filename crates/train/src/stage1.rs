@@ -60,7 +60,7 @@ impl PointTask {
         })?;
         Ok(Self {
             networks: config.networks(),
-            confidence: config.stage1.confidence,
+            confidence: config.stage1.confidence_weight,
             sets,
             validation,
             devices: devices.to_vec(),

@@ -84,7 +84,7 @@ fn the_mesh_of_the_gaussians_is_measured_beside_them() {
     let mut command = snapsnap();
     command.args(["prepare", "synth", "--seed", "3", "--subjects", "1", "--split", "test", "--config"]);
     command.arg(snapsnap_tests::root().join("configs/data/evaluation.toml"));
-    command.args(["--set", "views.samples=1", "--set", "views.count=4", "-o"]);
+    command.args(["--set", "views.samples_per_axis=1", "--set", "views.count=4", "-o"]);
     succeed(command.arg(&people));
     let weights = snapsnap_tests::root().join("assets/weights/default.safetensors").display().to_string();
     let arguments = ["--set", "metrics.mesh=true", "--set", "views.compared=[1]", "--weights", &weights];

@@ -223,13 +223,13 @@ fn tokens_that_show_nobody_are_left_out() {
     }
 }
 
-/// The plan says what was left out, and all of it gives Gaussians.
+/// The plan counts the input's channels and the tokens that were left out, and every pixel of a photograph becomes a Gaussian.
 #[test]
-fn a_reconstruction_with_every_key_says_what_it_left_out() {
+fn the_plan_of_a_reconstruction_names_what_it_left_out() {
     let Some(device) = device() else { return };
-    for (body, said) in [
-        (&["network.drop_empty=true", "network.head=linear", "network.patch=8"][..], "tokens left out"),
-        (&["network.body=convolution", "network.dec_depth=1"], "channels"),
+    for (body, drops_tokens) in [
+        (&["network.drop_empty=true", "network.head=linear", "network.patch=8"][..], true),
+        (&["network.body=convolution", "network.dec_depth=1"], false),
     ] {
         let keys = [
             "network.window=true",
@@ -243,8 +243,14 @@ fn a_reconstruction_with_every_key_says_what_it_left_out() {
         let (_file, weights) = weights(&config, 4);
         let model = Reconstructor::load(&weights, &device).expect("weights");
         let side = config.network.resolution;
-        let made = model.reconstruct(&photograph(side, 1), &photograph(side, 2), &|_| ());
-        assert!(made.gaussians.len() > 500, "{:?}", made.plan);
-        assert!(made.plan.iter().any(|line| line.contains(said)), "{:?}", made.plan);
+        let photographs = [photograph(side, 1), photograph(side, 2)];
+        let made = model.reconstruct(&photographs[0], &photographs[1], &|_| ());
+        let has = |text: &str| made.plan.iter().any(|line| line.contains(text));
+        // Colours, the mask and two of the ray; the person's window is less than the canvas.
+        assert!(has("tokens each, 6 channels") && has(", the person's window"), "{:?}", made.plan);
+        assert_eq!(has("tokens left out"), drops_tokens, "{:?}", made.plan);
+        for (photograph, valid) in photographs.iter().zip(&made.valid) {
+            assert_eq!(&photograph.valid, valid, "{:?}", made.plan);
+        }
     }
 }

@@ -33,9 +33,9 @@ fn config() -> TrainConfig {
         "network.net_resolution=32",
         "network.conf_threshold=0.4",
         "training.validation_samples=0",
-        "stage2.noise=0",
-        "stage2.needle=0.1",
-        "stage2.anisotropy=1.5",
+        "stage2.point_noise=0",
+        "stage2.anisotropy_weight=0.1",
+        "stage2.anisotropy_limit=1.5",
     ];
     TrainConfig::from_toml(TRAINING, "the tests' config", &OTHER.map(String::from)).expect("a config")
 }
@@ -154,7 +154,7 @@ fn a_step_of_stage_2_is_the_same_on_every_device() {
             continue;
         }
         let mut config = config();
-        config.stage2.points = if joint { 1.0 } else { 0.0 };
+        config.stage2.points_weight = if joint { 1.0 } else { 0.0 };
         let networks = config.networks();
         // Corrections of nothing have no gradient but the last layer's.
         let mut published = networks.clone();
@@ -281,6 +281,6 @@ fn gradients_of_the_losses_are_finite_differences() {
     let photometric = |image: Tensor<4>| Photometric::new(image, target.clone()).loss(0.8);
     check("photometric", &random(&[1, 2, 13, 12], 0.0..1.0, 5), [1, 2, 13, 12], photometric);
 
-    let needle = |scales: Tensor<2>| snapsnap_train::stage2::needles(&scales, 2.0);
+    let needle = |scales: Tensor<2>| snapsnap_train::stage2::anisotropy_penalty(&scales, 2.0);
     check("needles", &random(&[6, 3], 0.01..1.0, 6), [6, 3], needle);
 }

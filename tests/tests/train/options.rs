@@ -35,7 +35,7 @@ fn point_maps_that_are_kept_change_nothing() {
             .arg("--weights")
             .arg(one.join("best.safetensors"));
         if kept {
-            command.arg("--set").arg(format!("stage2.maps='{}'", maps.display()));
+            command.arg("--set").arg(format!("stage2.point_map_cache='{}'", maps.display()));
         }
         succeed(&mut command);
         results(&run)
@@ -68,15 +68,22 @@ fn point_maps_that_are_kept_change_nothing() {
         command.args(&plain).arg("--weights").arg(one.join("best.safetensors"));
         refused(command.args(arguments))
     };
-    let said = refused(&["--set", "stage2.maps=maps", "--set", "samples.augment.exposure=0.1"]);
-    assert!(said.contains("stage2.maps") && said.contains("exposure"), "{said}");
-    let said = refused(&["--set", "stage2.maps=maps", "--set", "stage2.points=1", "--set", "stage2.noise=0"]);
-    assert!(said.contains("stage2.maps"), "{said}");
-    let said = refused(&["--set=stage2.maps="]);
-    assert!(said.contains("stage2.maps") && said.contains("folder"), "{said}");
+    let said = refused(&["--set", "stage2.point_map_cache=maps", "--set", "samples.augment.exposure=0.1"]);
+    assert!(said.contains("stage2.point_map_cache") && said.contains("exposure"), "{said}");
+    let said = refused(&[
+        "--set",
+        "stage2.point_map_cache=maps",
+        "--set",
+        "stage2.points_weight=1",
+        "--set",
+        "stage2.point_noise=0",
+    ]);
+    assert!(said.contains("stage2.point_map_cache"), "{said}");
+    let said = refused(&["--set=stage2.point_map_cache="]);
+    assert!(said.contains("stage2.point_map_cache") && said.contains("folder"), "{said}");
     let said = refused(&["--set=stage2.lpips={ weight = 1.0, files = [] }"]);
     assert!(said.contains("stage2.lpips.files"), "{said}");
-    let inside = format!("stage2.maps='{}'", people().join("maps").display());
+    let inside = format!("stage2.point_map_cache='{}'", people().join("maps").display());
     let said = refused(&["--set", &inside]);
     assert!(said.contains("lies in a data set"), "{said}");
 }

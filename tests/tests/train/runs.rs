@@ -56,7 +56,7 @@ fn two_devices_share_batches_and_learn_what_one_does() {
                 .arg(people());
             command.args(["--device", devices, "--set", "training.steps=3", "--set", "training.batch=3"]);
             // What is random within a step follows from the device's number.
-            command.args(["--set", "stage2.noise=0", "-o"]).arg(&run);
+            command.args(["--set", "stage2.point_noise=0", "-o"]).arg(&run);
             if stage == 2 {
                 command.arg("--weights").arg(&weights);
             }

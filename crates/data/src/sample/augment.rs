@@ -26,8 +26,8 @@ pub struct Augment {
     pub background: bool,
     /// Stage 2: views are compared over a random colour instead of black.
     pub background_color: bool,
-    /// Stage 1: every other person is seen in a mirror, which makes two people of each.
-    pub mirror: bool,
+    /// Stage 1: half of the samples are mirrored, which makes two people of each.
+    pub flip: bool,
 }
 
 impl Default for Augment {
@@ -41,7 +41,7 @@ impl Default for Augment {
             jpeg_quality: 70,
             background: true,
             background_color: true,
-            mirror: false,
+            flip: false,
         }
     }
 }
@@ -57,13 +57,13 @@ impl Augment {
             jpeg_quality: 0,
             background: false,
             background_color: false,
-            mirror: false,
+            flip: false,
         }
     }
 
     /// Whether photographs and masks differ from pass to pass.
     pub fn changes_photographs(&self) -> bool {
-        let same = Self { background_color: self.background_color, mirror: self.mirror, ..Self::none() };
+        let same = Self { background_color: self.background_color, flip: self.flip, ..Self::none() };
         *self != same
     }
 

@@ -55,7 +55,7 @@ pub struct SampleConfig {
     pub points: bool,
     /// Share of the samples whose photographs are put on their canvas as a user's are, and whose points are scaled and moved to
     /// where the nominal cameras see them.
-    pub place: f32,
+    pub placed_share: f32,
     /// How high a person is then, in pixels of a canvas of 1024: `mode.person_height`.
     #[serde(skip)]
     pub person_height: usize,
@@ -75,7 +75,7 @@ impl Default for SampleConfig {
             supervision: 3,
             high_resolution: false,
             points: false,
-            place: 0.0,
+            placed_share: 0.0,
             person_height: 739,
             seed: 1,
             augment: Augment::default(),
@@ -107,11 +107,11 @@ impl SampleConfig {
         if self.compat && self.augment != Augment::none() {
             return Some(("augment".into(), "must be off beside `compat = true`".into()));
         }
-        if !(0.0..=1.0).contains(&self.place) {
-            return Some(("place".into(), format!("is {}, must be 0 to 1", self.place)));
+        if !(0.0..=1.0).contains(&self.placed_share) {
+            return Some(("placed_share".into(), format!("is {}, must be 0 to 1", self.placed_share)));
         }
-        if self.compat && self.place > 0.0 {
-            return Some(("place".into(), "must be 0 beside `compat = true`".into()));
+        if self.compat && self.placed_share > 0.0 {
+            return Some(("placed_share".into(), "must be 0 beside `compat = true`".into()));
         }
         self.augment.problem().map(|(key, message)| (format!("augment.{key}"), message))
     }
@@ -237,7 +237,7 @@ impl Source {
     /// Whether a sample's photographs are placed as a user's are.
     fn is_placed(&self, random: &mut impl Rng) -> bool {
         // Nothing is drawn where nothing is open.
-        match self.config.place {
+        match self.config.placed_share {
             0.0 => false,
             share => random.random::<f32>() < share,
         }

@@ -79,7 +79,7 @@ impl Stage1 {
         let Four { images, masks, points, valid, .. } =
             source.four(subject, &order, is_placed, &mut random)?;
         let mut item = Stage1Item { name: String::new(), side, images, masks, points, valid };
-        if source.config.augment.mirror && random.random() {
+        if source.config.augment.flip && random.random() {
             item.mirror();
         }
         item.name = format!("{}: {subject}, view {first}", source.folder.root().display());

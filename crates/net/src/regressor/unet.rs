@@ -1,4 +1,4 @@
-//! The UNet of the regressor (SNAPSNAP §8.2): two halvings, residual blocks with group normalisation, no attention.
+//! The UNet of the regressor (docs/method.md, "UNet"): two halvings, residual blocks with group normalisation, no attention.
 //!
 //! Field names are the checkpoint's.
 

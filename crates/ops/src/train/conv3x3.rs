@@ -12,7 +12,7 @@ use super::elements::channel_sums;
 use super::planes::{Planes, Scatter, Transposer};
 use super::{Gradients, Unfolded, Wanted};
 use crate::wide::convolution::{Bands, Weights};
-use crate::wide::transforms::{POINTS, TILE, Then};
+use crate::wide::transforms::{POINTS, TILE};
 use crate::wide::{Buffers, GROUP, pieces};
 
 /// Floats that a block's transformed inputs and products take together: 1 MiB, of which a core's second-level cache
@@ -103,8 +103,8 @@ impl Conv3x3 {
                 bands.map(move |(i, out)| (image, x, i * band, out))
             })
             .collect();
-        let (tiles, then) = (self.block_tiles(), Then::Store);
-        let bands = Bands { inputs: self.inputs, filters: &transformed, bias: &padded, width, tiles, then };
+        let tiles = self.block_tiles();
+        let bands = Bands { inputs: self.inputs, filters: &transformed, bias: &padded, width, tiles };
         tasks.into_par_iter().for_each(|(image, data, row, mut out)| {
             let planes = Planes { data, height: self.height, width, rectified, transposer };
             let pixels = out[0].len();

@@ -1,12 +1,9 @@
-//! Convolutions of hundreds of channels, as the DPT heads have them: 3×3 by Winograd's method, and everything that is a
-//! matrix product per pixel.
+//! Parts of 3×3 convolutions by Winograd's method: transforms, and matrix products per point of a tile.
 //!
-//! Channels stand in groups of 16, one vector of the widest kind. So an image is at once the left factor of a matrix
-//! product as the kernel in `product` reads it, and every step between products works on whole vectors.
+//! Channels stand in groups of 16, one vector of the widest kind. The kernel in `product` reads them
+//! as the left factor of a matrix product, and every step between products works on whole vectors.
 
 pub(crate) mod convolution;
-mod image;
-mod pointwise;
 pub(crate) mod product;
 pub(crate) mod transforms;
 
@@ -14,9 +11,6 @@ pub(crate) mod transforms;
 mod tests;
 
 pub use crate::buffers::Buffers;
-pub use convolution::Conv3x3;
-pub use image::{Image, Source};
-pub use pointwise::Pointwise;
 
 /// Channels that stand together.
 pub const GROUP: usize = 16;

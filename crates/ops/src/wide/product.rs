@@ -4,7 +4,6 @@
 //! dimension and writes the block once. Every element is one sum in one order, whatever the split among threads.
 
 use pulp::{Simd, WithSimd};
-use rayon::prelude::*;
 
 use super::GROUP;
 
@@ -142,20 +141,4 @@ fn load<S: Simd, const VECTORS: usize>(simd: S, values: &[f32]) -> [S::f32s; VEC
     let mut vectors = [simd.splat_f32s(0.0); VECTORS];
     vectors.copy_from_slice(&values[..VECTORS]);
     vectors
-}
-
-/// A right factor's panels. Element (row, column) is `weights[rows[row] + columns[column]]`, or 0 where either has no
-/// place; `rows` are whole groups.
-pub fn pack(weights: &[f32], rows: &[Option<usize>], columns: &[Option<usize>], out: &mut [f32]) {
-    assert_eq!(out.len(), columns.len().div_ceil(PANEL) * rows.len() * PANEL);
-    out.par_chunks_mut(rows.len() * PANEL).zip(columns.par_chunks(PANEL)).for_each(|(out, columns)| {
-        for (out, row) in out.as_chunks_mut::<PANEL>().0.iter_mut().zip(rows) {
-            out.fill(0.0);
-            for (out, column) in out.iter_mut().zip(columns) {
-                if let (Some(row), Some(column)) = (row, column) {
-                    *out = weights[row + column];
-                }
-            }
-        }
-    });
 }

@@ -1,140 +1,22 @@
-//! The wide convolutions against Burn's, at sizes that reach their corners: channels that fill no group or panel, tiles
-//! that overhang, fewer rows than a register block, rows longer than a block.
+//! Accuracy of Winograd's method, products at every width of vectors, and the memory that is used again.
 
-use burn::tensor::activation::relu;
-use burn::tensor::module::{conv_transpose2d, conv2d};
-use burn::tensor::ops::{ConvOptions, ConvTransposeOptions};
-use burn::tensor::{Device, Tensor, TensorData};
 use pulp::{Arch, Scalar, Simd, WithSimd};
 
-use super::product::{Left, PANEL, Product, Right, pack};
-use super::{Buffers, Conv3x3, GROUP, Image, Pointwise, Source};
-use crate::tests::{assert_equal, random};
-use crate::{bilinear, host};
-
-/// Inputs, outputs, height, width.
-const SIZES: [[usize; 4]; 7] = [
-    [1, 1, 1, 1],
-    [5, 7, 2, 3],
-    [16, 48, 9, 13],
-    [33, 17, 1, 21],
-    [200, 70, 7, 301],
-    [20, 40, 5, 1300],
-    [256, 256, 12, 20],
-];
-
-fn image(x: &Tensor<4>) -> Image {
-    let [_, channels, height, width] = x.dims();
-    Image::from_pixels(&host(x.clone().permute([0, 2, 3, 1])), channels, [height, width], &Buffers::default())
-}
-
-fn tensor(image: &Image) -> Tensor<4> {
-    let Image { channels, height, width, ref data } = *image;
-    let groups = channels.div_ceil(GROUP);
-    let data = TensorData::new(data.clone(), [1, groups, height * width, GROUP]);
-    let planes = Tensor::<4>::from_data(data, &Device::flex()).swap_dims(2, 3);
-    planes.reshape([1, groups * GROUP, height, width]).narrow(1, 0, channels)
-}
-
-fn direct(x: Tensor<4>, weight: &Tensor<4>, bias: &Tensor<1>, stride: usize) -> Tensor<4> {
-    let padding = weight.dims()[2] / 2;
-    let options = ConvOptions::new([stride; 2], [padding; 2], [1, 1], 1);
-    conv2d(x, weight.clone(), Some(bias.clone()), options)
-}
-
-/// An input, a weight of side `side` and a bias.
-fn example([inputs, outputs, height, width]: [usize; 4], side: usize) -> (Tensor<4>, Tensor<4>, Tensor<1>) {
-    (random([1, inputs, height, width], 3), random([outputs, inputs, side, side], 1), random([outputs], 2))
-}
-
-#[test]
-fn winograd_equals_direct_convolution() {
-    for size @ [inputs, outputs, height, width] in SIZES {
-        let ((x, weight, bias), buffers) = (example(size, 3), Buffers::default());
-        let layer = || Conv3x3::new(&host(weight.clone()), &host(bias.clone()), [inputs, outputs], &buffers);
-        let image = image(&x);
-        let sources = [
-            ("plain", Source::plain(&image), x.clone()),
-            ("rectified", Source::rectified(&image), relu(x.clone())),
-            ("doubled", Source::doubled(&image), bilinear(x, [2 * height, 2 * width], true)),
-        ];
-        for (name, source, x) in sources {
-            let what = format!("{inputs}→{outputs} at {height}×{width}, {name}");
-            let expected = direct(x, &weight, &bias, 1);
-            let mut got = layer().run(&source, &buffers);
-            assert_equal(&what, tensor(&got), expected.clone());
-            layer().add_to(&mut got, &source, &buffers);
-            assert_equal(&format!("{what}, added"), tensor(&got), expected * 2.0);
-        }
-    }
-}
-
-#[test]
-fn a_rectified_projection_equals_its_composition() {
-    for size @ [inputs, outputs, height, width] in SIZES {
-        let ((x, weight, bias), buffers) = (example(size, 3), Buffers::default());
-        let (last, last_bias) = (random([4, outputs, 1, 1], 4), random([4], 5));
-        let pointwise = Pointwise::new(&host(last.clone()), &host(last_bias.clone()), [outputs, 4], &buffers);
-        let layer = Conv3x3::new(&host(weight.clone()), &host(bias.clone()), [inputs, outputs], &buffers);
-        let got = layer.rectified_into(&pointwise, &Source::plain(&image(&x)), &buffers);
-        let got = Tensor::from_data(TensorData::new(got, [1, 4, height, width]), &Device::flex());
-        let expected = direct(relu(direct(x, &weight, &bias, 1)), &last, &last_bias, 1);
-        assert_equal(&format!("{inputs}→{outputs}→4 at {height}×{width}"), got, expected);
-    }
-}
-
-#[test]
-fn pointwise_layers_equal_burns() {
-    for size @ [inputs, outputs, height, width] in SIZES {
-        let (what, buffers) = (format!("{inputs}→{outputs} at {height}×{width}"), Buffers::default());
-        let (x, weight, bias) = example(size, 1);
-        let layer = Pointwise::new(&host(weight.clone()), &host(bias.clone()), [inputs, outputs], &buffers);
-        assert_equal(&what, tensor(&layer.run(&image(&x), &buffers)), direct(x, &weight, &bias, 1));
-
-        let (x, weight, bias) = example(size, 3);
-        let layer =
-            Pointwise::halving(&host(weight.clone()), &host(bias.clone()), [inputs, outputs], &buffers);
-        let got = layer.run(&image(&x).unfold(&buffers), &buffers);
-        assert_equal(&format!("{what}, halving"), tensor(&got), direct(x, &weight, &bias, 2));
-    }
-    for (stride, [inputs, outputs, height, width]) in
-        [(2, [18, 35, 3, 5]), (4, [96, 96, 4, 4]), (3, [1, 1, 1, 2])]
-    {
-        let buffers = Buffers::default();
-        let x = random([1, inputs, height, width], 1);
-        let (weight, bias) = (random([inputs, outputs, stride, stride], 2), random([outputs], 3));
-        let channels = [inputs, outputs];
-        let layer =
-            Pointwise::enlarging(&host(weight.clone()), &host(bias.clone()), channels, stride, &buffers);
-        let got = layer.run(&image(&x), &buffers).shuffle(stride, outputs, &buffers);
-        let options = ConvTransposeOptions::new([stride; 2], [0, 0], [0, 0], [1, 1], 1);
-        let expected = conv_transpose2d(x, weight, Some(bias), options);
-        assert_equal(&format!("{inputs}→{outputs}, {stride} times as large"), tensor(&got), expected);
-    }
-}
-
-#[test]
-fn a_doubled_image_is_cut_to_the_one_it_is_added_to() {
-    for [height, width] in [[3_usize, 5], [4, 4], [1, 2]] {
-        let coarse = random([1, 35, height.div_ceil(2), width.div_ceil(2)], 1);
-        let fine = random([1, 35, height, width], 2);
-        let mut got = image(&fine);
-        got.add_doubled(&image(&coarse));
-        let doubled = bilinear(coarse, [height, width].map(|n| 2 * n.div_ceil(2)), true);
-        let expected = fine + doubled.narrow(2, 0, height).narrow(3, 0, width);
-        assert_equal(&format!("{height}×{width}"), tensor(&got), expected);
-    }
-}
+use super::product::{Left, PANEL, Product, Right};
+use super::{Buffers, GROUP};
+use crate::host;
+use crate::tests::random;
+use crate::train::Conv3x3;
 
 /// The bound is what F(4×4, 3×3) reaches with its points (1.5e-6) and some room; with 0, ±1, ±2, ∞ it is 3.0e-6.
 #[test]
 fn winograd_is_accurate() {
     let [channels, side] = [256, 16];
-    let (x, weight, bias) = example([channels, channels, side, side], 3);
-    let (x_values, weights, biases) = (host(x.clone()), host(weight), host(bias));
-    let buffers = Buffers::default();
-    let layer = Conv3x3::new(&weights, &biases, [channels; 2], &buffers);
-    let got = host(tensor(&layer.run(&Source::plain(&image(&x)), &buffers)));
+    let x_values = host(random([channels * side * side], 3));
+    let (weights, biases) = (host(random([channels * channels * 9], 1)), host(random([channels], 2)));
+    let (inputs, outputs, rectified) = (channels, channels, false);
+    let layer = Conv3x3 { batch: 1, inputs, outputs, height: side, width: side, rectified };
+    let got = layer.forward(&x_values, &weights, Some(&biases), &Buffers::default());
     let exact = |output: usize, y: usize, x: usize| {
         let mut sum = f64::from(biases[output]);
         for (input, tap) in (0..channels).flat_map(|input| (0..9).map(move |tap| (input, tap))) {
@@ -157,30 +39,18 @@ fn winograd_is_accurate() {
     assert!(error < 2e-6, "{error:e}");
 }
 
-#[test]
-fn the_number_of_threads_changes_no_bit() {
-    let (x, weight, bias) = example([40, 72, 30, 50], 3);
-    let run = |threads: usize| {
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads");
-        pool.install(|| {
-            let buffers = Buffers::default();
-            let layer = Conv3x3::new(&host(weight.clone()), &host(bias.clone()), [40, 72], &buffers);
-            layer.run(&Source::doubled(&image(&x)), &buffers).data
-        })
-    };
-    let bits = |values: Vec<f32>| values.into_iter().map(f32::to_bits).collect::<Vec<_>>();
-    assert_eq!(bits(run(1)), bits(run(3)));
-}
-
 /// A product of 29×48 and 48×80, once per width of vectors that this processor has.
 #[test]
 fn every_width_of_vectors_computes_the_same_product() {
     let (rows, inner, columns) = (29, 48, 80);
     let (left, right) = (host(random([inner / GROUP, rows, GROUP], 1)), host(random([inner, columns], 2)));
     let bias = host(random([columns.next_multiple_of(PANEL)], 3));
+    // `[panels][inner][32]`.
     let mut panels = vec![0.0; columns.next_multiple_of(PANEL) * inner];
-    let places = |count: usize, step: usize| (0..count).map(|i| Some(i * step)).collect::<Vec<_>>();
-    pack(&right, &places(inner, columns), &places(columns, 1), &mut panels);
+    for (i, value) in right.iter().enumerate() {
+        let (row, column) = (i / columns, i % columns);
+        panels[(column / PANEL * inner + row) * PANEL + column % PANEL] = *value;
+    }
     struct Run<'a>(Product<'a, 'a>);
     impl WithSimd for Run<'_> {
         type Output = ();

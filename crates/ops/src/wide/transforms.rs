@@ -218,17 +218,6 @@ fn mix_rows<S: Simd>(simd: S, lines: &mut [f32]) {
     }
 }
 
-/// What becomes of a convolution's results.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Then {
-    /// They replace what was there.
-    Store,
-    /// They are added to it.
-    Add,
-    /// Their positive part replaces it.
-    Rectify,
-}
-
 /// Aᵀ·m·A + bias of every tile of a block.
 pub struct Outputs<'a, 'b> {
     /// `[36][groups][stride][16]`.
@@ -238,7 +227,6 @@ pub struct Outputs<'a, 'b> {
     pub stride: usize,
     /// One value per channel, in whole groups.
     pub bias: &'a [f32],
-    pub then: Then,
     /// Pixels per row of the image.
     pub width: usize,
     /// Rows of the image from the block's first on, `[rows][width][16]` per group; tiles may overhang them.
@@ -250,7 +238,7 @@ impl WithSimd for Outputs<'_, '_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        let Self { products, block, stride, bias, then, width, out } = self;
+        let Self { products, block, stride, bias, width, out } = self;
         let (groups, vectors) = (out.len(), GROUP / S::F32_LANES);
         let zero = simd.splat_f32s(0.0);
         for (group, out) in out.iter_mut().enumerate() {
@@ -288,13 +276,7 @@ impl WithSimd for Outputs<'_, '_> {
                     for y in 0..rows {
                         let line = &mut out[((top + y) * width + left) * vectors..][..columns * vectors];
                         for x in 0..columns {
-                            let (value, out) =
-                                (simd.add_f32s(tile[x][y], bias[v]), &mut line[x * vectors + v]);
-                            *out = match then {
-                                Then::Store => value,
-                                Then::Add => simd.add_f32s(*out, value),
-                                Then::Rectify => simd.max_f32s(value, zero),
-                            };
+                            line[x * vectors + v] = simd.add_f32s(tile[x][y], bias[v]);
                         }
                     }
                 }

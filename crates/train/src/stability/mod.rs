@@ -50,7 +50,7 @@ supervision = 1
 [training]
 steps = 24
 batch = 2
-average = 0.9
+ema_decay = 0.9
 log_every = 1
 validation_samples = 0
 [optimizer]
@@ -58,10 +58,10 @@ rate = 1e-3
 [optimizer.muon]
 rate = 1e-3
 [stage2]
-alpha = 0.5
-needle = 0.1
-anisotropy = 1.5
-points = 1.0
+alpha_weight = 0.5
+anisotropy_weight = 0.1
+anisotropy_limit = 1.5
+points_weight = 1.0
 "#;
 
 /// All cases of losses, optimiser and training. `many_steps` is the length of the case of a million steps.

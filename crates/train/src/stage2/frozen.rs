@@ -26,7 +26,7 @@ pub(super) struct Frozen {
 impl Frozen {
     /// `predictor` is not tracked and on the first of the devices.
     pub fn new(config: &TrainConfig, predictor: PointPredictor, devices: &[Device]) -> Self {
-        let maps = config.stage2.maps.as_ref();
+        let maps = config.stage2.point_map_cache.as_ref();
         let maps = maps.map(|folder| Maps::new(folder, &config.networks(), &predictor));
         let precision = config.training.precision;
         let networks = Networks { predictor: Some(predictor), regressors: Vec::new() };

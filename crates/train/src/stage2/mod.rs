@@ -29,12 +29,12 @@ use crate::config::{LpipsConfig, Stage2Config, TrainConfig};
 use crate::fixed::{Fixed, check_resolution};
 use crate::networks::Networks;
 use crate::photometric::Photometric;
-use crate::points::{Prediction, losses};
+use crate::points::{Prediction, losses as points_losses};
 use crate::task::{Moment, Part, Task, Validation};
 use snapsnap_eval::preview::{grid, heat, picture};
 
 use frozen::{Frozen, of_sample};
-pub use scene::needles;
+pub use scene::anisotropy_penalty;
 use scene::{Phase, gaussians, targets};
 use scores::Scores;
 
@@ -77,7 +77,7 @@ impl GaussianTask {
         devices: &[Device],
     ) -> Result<Self, TrainError> {
         let mut sets = Vec::new();
-        let samples = SampleConfig { points: config.stage2.points > 0.0, ..config.samples() };
+        let samples = SampleConfig { points: config.stage2.points_weight > 0.0, ..config.samples() };
         for folder in folders {
             check_resolution(folder, config)?;
             sets.push(Stage2::new(folder.clone(), Some(Split::Train), samples.clone())?);
@@ -96,7 +96,7 @@ impl GaussianTask {
         Ok(Self {
             networks: config.networks(),
             losses: config.stage2.clone(),
-            confidence: config.stage1.confidence,
+            confidence: config.stage1.confidence_weight,
             seed: config.training.seed,
             frozen: predictor.map(|predictor| Frozen::new(config, predictor, devices)),
             lpips,
@@ -225,7 +225,8 @@ impl Task for GaussianTask {
     ) -> Result<Vec<Part>, TrainError> {
         let (phase, device) = (Phase::new(self.losses.curriculum, step), &self.devices[place]);
         let mut random = stream(&format!("stage2/{}/{step}/{batch}/{place}", self.seed));
-        let mut sums: BTreeMap<&'static str, Vec<Tensor<1>>> = BTreeMap::new();
+        let mut sums: BTreeMap<&'static str, (f64, Vec<Tensor<1>>)> = BTreeMap::new();
+        let losses = &self.losses;
         for item in &items {
             let count = item.target_cameras.len();
             let all: Vec<usize> = (0..count).collect();
@@ -235,7 +236,7 @@ impl Task for GaussianTask {
                 (_, true) => vec![random.random_range(0..count)],
                 _ => all,
             };
-            let deviation = self.losses.noise as f32;
+            let deviation = self.losses.point_noise as f32;
             let mut noise = || {
                 // Sum of uniform numbers: nearly normal, and bounded.
                 deviation * (0..3).map(|_| random.random_range(-1.0_f32..1.0)).sum::<f32>()
@@ -243,13 +244,16 @@ impl Task for GaussianTask {
             let noise: Option<&mut dyn FnMut() -> f32> =
                 if deviation > 0.0 { Some(&mut noise) } else { None };
             let prediction = self.predict(networks, item, Some(place))?;
-            let mut add = |name, value: Tensor<1>| sums.entry(name).or_default().push(value);
+            let mut add = |name, weight: f64, value: Tensor<1>| {
+                sums.entry(name).or_insert((weight, Vec::new())).1.push(value);
+            };
             if networks.predictor.is_some() {
                 let (side, points, valid) = (item.side, item.points.clone(), item.valid.clone());
                 let points = Tensor::from_data(TensorData::new(points, [1, 4, side, side, 3]), device);
                 let valid = Tensor::from_data(TensorData::new(valid, [1, 4, side, side]), device);
-                let losses = losses(&prediction, &points, &valid);
-                add("points", losses.regression + losses.confidence * self.confidence);
+                let of_points = points_losses(&prediction, &points, &valid);
+                let value = of_points.regression + of_points.confidence * self.confidence;
+                add("points", losses.points_weight, value);
             }
             let made = gaussians(&self.networks, networks, item, prediction, &phase, noise, device);
             let Some(gaussians) = made else { continue };
@@ -257,36 +261,25 @@ impl Task for GaussianTask {
             let (image, coverage) = self.render(&gaussians, &cameras, item.background)?;
             let (target, mask) = targets(item, &chosen, device);
             if let Some(lpips) = self.lpips.get(place).filter(|_| step >= self.lpips_from) {
-                add("lpips", lpips.distance(image.clone(), target.clone()).mean());
+                let weight = losses.lpips.as_ref().map_or(0.0, |lpips| lpips.weight);
+                add("lpips", weight, lpips.distance(image.clone(), target.clone()).mean());
             }
             let photometric = Photometric::new(image, target);
-            add("l1", photometric.l1);
-            add("dissimilarity", 1.0 - photometric.ssim);
-            if self.losses.alpha > 0.0 {
-                add("alpha", (coverage - mask).abs().mean());
+            add("l1", losses.l1_share, photometric.l1);
+            add("dissimilarity", 1.0 - losses.l1_share, 1.0 - photometric.ssim);
+            if losses.alpha_weight > 0.0 {
+                add("alpha", losses.alpha_weight, (coverage - mask).abs().mean());
             }
             if phase.scale > 0.0 {
-                add("scale", gaussians.scales.clone().mean());
+                add("scale", phase.scale, gaussians.scales.clone().mean());
             }
-            if self.losses.needle > 0.0 {
-                add("needle", needles(&gaussians.scales, self.losses.anisotropy));
+            if losses.anisotropy_weight > 0.0 {
+                let penalty = anisotropy_penalty(&gaussians.scales, losses.anisotropy_limit);
+                add("anisotropy", losses.anisotropy_weight, penalty);
             }
         }
-        let weight = |name| match name {
-            "l1" => self.losses.beta,
-            "dissimilarity" => 1.0 - self.losses.beta,
-            "alpha" => self.losses.alpha,
-            "scale" => phase.scale,
-            "points" => self.losses.points,
-            "lpips" => self.losses.lpips.as_ref().map_or(0.0, |lpips| lpips.weight),
-            _ => self.losses.needle,
-        };
-        let part = |(name, values): (&'static str, Vec<Tensor<1>>)| Part {
-            name,
-            weight: weight(name),
-            value: Tensor::cat(values, 0).mean(),
-        };
-        Ok(sums.into_iter().map(part).collect())
+        let mean = |(name, (weight, values))| Part { name, weight, value: Tensor::cat(values, 0).mean() };
+        Ok(sums.into_iter().map(mean).collect())
     }
 
     fn validate(&self, networks: &Networks) -> Result<Option<Validation>, TrainError> {

@@ -127,7 +127,7 @@ pub(super) fn targets(item: &Stage2Item, views: &[usize], device: &Device) -> (T
 
 /// Mean over Gaussians with these `scales` `[N,3]` of ln(longest / shortest axis) − ln(limit), where that is positive. (A mean
 /// penalty on scales alone misses the few that are too long.)
-pub fn needles(scales: &Tensor<2>, limit: f64) -> Tensor<1> {
+pub fn anisotropy_penalty(scales: &Tensor<2>, limit: f64) -> Tensor<1> {
     let logs = scales.clone().clamp_min(1e-12).log();
     let ratio = logs.clone().max_dim(1) - logs.min_dim(1);
     (ratio - limit.ln()).clamp_min(0.0).mean()
@@ -152,7 +152,7 @@ mod tests {
     fn only_what_a_needle_has_too_much_costs() {
         let device = Device::flex();
         let scales = Tensor::<2>::from_floats([[0.01, 0.01, 0.08], [0.01, 0.1, 1.0]], &device);
-        let cost = host(needles(&scales, 10.0))[0];
+        let cost = host(anisotropy_penalty(&scales, 10.0))[0];
         assert!((cost - 10.0_f32.ln() / 2.0).abs() < 1e-5, "{cost}");
     }
 }

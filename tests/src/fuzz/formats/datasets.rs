@@ -49,7 +49,7 @@ pub fn four_views(root: &Path, splits: &[Split]) {
 }
 
 fn people(root: &Path, splits: &[Split], views: ViewsConfig) {
-    let config = DataConfig { views: ViewsConfig { samples: 1, ..views }, ..DataConfig::default() };
+    let config = DataConfig { views: ViewsConfig { samples_per_axis: 1, ..views }, ..DataConfig::default() };
     let folder = Folder::create(root, config.description("for tests")).expect("created");
     for split in splits {
         config.add(&folder, &Subject::plain(*split, "0000"), &scans::person()).expect("written");

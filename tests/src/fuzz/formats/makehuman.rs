@@ -11,7 +11,7 @@ pub const FORMATS: &[Format] = &[Format {
     name: "makehuman",
     sample: write,
     changed: &["base.obj", ".mhskel", ".mhw", ".target"],
-    command: "prepare makehuman in --subjects 1 -o out --set views.count=2 --set views.resolution=16 --set views.samples=1",
+    command: "prepare makehuman in --subjects 1 -o out --set views.count=2 --set views.resolution=16 --set views.samples_per_axis=1",
     file: None,
     partial: false,
     kept: scans::DESCRIPTIONS,

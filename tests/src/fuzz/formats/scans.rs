@@ -35,7 +35,7 @@ macro_rules! scan {
         concat!(
             "prepare scan ",
             $arguments,
-            " -o out --set views.count=2 --set views.resolution=16 --set views.samples=1"
+            " -o out --set views.count=2 --set views.resolution=16 --set views.samples_per_axis=1"
         )
     };
 }

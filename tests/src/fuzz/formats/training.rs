@@ -27,7 +27,7 @@ steps = 40
 batch = 1
 accumulate = 2
 clip = 1.0
-average = 0.9
+ema_decay = 0.9
 seed = 7
 shuffle = true
 prefetch = 1
@@ -49,14 +49,14 @@ warm_up = 4
 end = 0.01
 
 [stage1]
-confidence = 0.5
+confidence_weight = 0.5
 
 [stage2]
-beta = 0.8
-alpha = 0.5
-needle = 0.01
-anisotropy = 4.0
-noise = 0.01
+l1_share = 0.8
+alpha_weight = 0.5
+anisotropy_weight = 0.01
+anisotropy_limit = 4.0
+point_noise = 0.01
 "#;
 
 /// A rehearsal, which writes nothing. What takes long without being a mistake is held fixed.

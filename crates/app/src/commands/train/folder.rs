@@ -30,7 +30,7 @@ pub fn config(arguments: &Arguments) -> Result<TrainConfig, Failure> {
     }
     // Whole paths: a run may go on from another folder.
     let lpips = config.stage2.lpips.iter_mut().flat_map(|lpips| &mut lpips.files);
-    let others = config.training.start.iter_mut().chain(&mut config.stage2.maps).chain(lpips);
+    let others = config.training.start.iter_mut().chain(&mut config.stage2.point_map_cache).chain(lpips);
     let paths = config.data.folders.iter_mut().chain(others);
     for path in paths {
         *path = std::path::absolute(&*path).unwrap_or_else(|_| path.clone());

@@ -100,10 +100,10 @@ pub fn stage2(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
         return Err(Failure::Input(message.into()));
     };
     let weights = open(&start, &plan.config)?;
-    if let Some(maps) = &plan.config.stage2.maps {
+    if let Some(maps) = &plan.config.stage2.point_map_cache {
         outside_data(maps, plan.folders.iter().map(|folder| folder.root()))?;
     }
-    let joint = plan.config.stage2.points > 0.0;
+    let joint = plan.config.stage2.points_weight > 0.0;
     let frozen = (!joint).then(|| weights.point_predictor(&plan.devices[0].clone().inner())).transpose()?;
     let task = GaussianTask::new(&plan.folders, &plan.config, frozen, &plan.devices)?;
     plan.check_validation(task.validation_samples());
@@ -131,7 +131,7 @@ impl<'a> Plan<'a> {
         }
         let mut config = folder::config(arguments)?;
         if arguments.dry_run {
-            config.stage2.maps = None;
+            config.stage2.point_map_cache = None;
             // What counts late takes time and memory as well.
             config.stage2.lpips.iter_mut().for_each(|lpips| lpips.after = 0.0);
         }

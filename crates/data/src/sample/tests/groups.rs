@@ -65,7 +65,7 @@ fn placed_samples_lie_where_the_nominal_cameras_see_them() {
     config.add(&folder, &Subject::plain(Split::Train, "0000"), person()).expect("adds a subject");
     let folder = Arc::new(Folder::open(folder.root()).expect("opens"));
     let samples = SampleConfig {
-        place: 1.0,
+        placed_share: 1.0,
         person_height: 700,
         points: true,
         repeat: 1,

@@ -410,7 +410,7 @@ fn contradictions_are_refused() {
 fn mirrored_samples_are_those_of_a_mirrored_person() {
     let (_temporary, folder) = data_set(person(), Layout::Exact, 64, 4, false, 1);
     let config = |mirror| SampleConfig {
-        augment: Augment { mirror, ..Augment::none() },
+        augment: Augment { flip: mirror, ..Augment::none() },
         front_within_degrees: 0.0,
         ..SampleConfig::default()
     };

@@ -1,13 +1,8 @@
-//! The DPT head: the tokens of four layers → one raw point map (SNAPSNAP §2.1).
+//! The DPT head: the tokens of four layers → one raw point map (docs/method.md, "DPT head").
 //!
 //! Field names are the checkpoint's, with `at_N` for entry N of a PyTorch `Sequential`.
 
 #![allow(non_snake_case, reason = "the checkpoint's names")]
-
-mod fused;
-
-#[cfg(test)]
-mod tests;
 
 use burn::module::Module;
 use burn::nn::PaddingConfig2d::{Explicit, Valid};
@@ -16,7 +11,7 @@ use burn::tensor::{Device, Tensor};
 
 use crate::config::NetworkConfig;
 use snapsnap_ops::layers::{conv2d, enlarge};
-use snapsnap_ops::{as_weight, bilinear, is_fast};
+use snapsnap_ops::{as_weight, bilinear};
 
 pub(super) fn conv3x3(from: usize, to: usize, stride: usize, bias: bool, device: &Device) -> Conv2d {
     Conv2dConfig::new([from, to], [3, 3])
@@ -184,14 +179,9 @@ impl DptHead {
         }
     }
 
-    /// Tokens `[B, N, C]` of the four hooked layers on a `grid` (rows, columns) → raw x, y, z, confidence
+    /// Tokens `[B, N, C]` of the four hooked layers on a grid → raw x, y, z, confidence
     /// `[B, 4, 16·rows, 16·columns]`.
-    pub(crate) fn forward(&self, tokens: [Tensor<3>; 4], grid: [usize; 2]) -> Tensor<4> {
-        if is_fast(&tokens[0]) { fused::forward(self, tokens, grid) } else { self.compose(tokens, grid) }
-    }
-
-    /// The same layer by layer, on every device and in training.
-    fn compose(&self, tokens: [Tensor<3>; 4], [rows, columns]: [usize; 2]) -> Tensor<4> {
+    pub(crate) fn forward(&self, tokens: [Tensor<3>; 4], [rows, columns]: [usize; 2]) -> Tensor<4> {
         let [m0, m1, m2, m3] = tokens.map(|x| {
             let [b, _, c] = x.dims();
             x.swap_dims(1, 2).reshape([b, c, rows, columns])
