@@ -40,7 +40,7 @@ start = "geometric"
 [mode]
 compat = false
 [samples]
-supervision = 1
+random_targets = 1
 [training]
 steps = 40
 batch = 2

@@ -12,8 +12,9 @@ use std::time::Instant;
 use snapsnap_tests::{data, root, shared, snapsnap, succeed, toml_config};
 
 /// In the order in which a reader meets them: each page's commands find what earlier ones made.
-const PAGES: [&str; 12] = [
+const PAGES: [&str; 13] = [
     "README.md",
+    "CONTRIBUTING.md",
     "docs/training.md",
     "docs/look.md",
     "docs/weights.md",
@@ -110,6 +111,10 @@ fn look(words: &[String]) {
         }
         ["python", file, ..] => root().join(file).is_file(),
         ["cargo", "doc", ..] => true,
+        ["cargo", "install", "--path", folder] => root().join(folder).join("Cargo.toml").is_file(),
+        ["cargo", "run", .., "--example", name] | ["cargo", "run", .., "--example", name, "--", _] => {
+            root().join("examples").join(name).with_extension("rs").is_file()
+        }
         _ => false,
     };
     assert!(is_there, "nobody knows how to try `{}`", words.join(" "));

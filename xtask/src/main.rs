@@ -6,7 +6,7 @@ use std::process::{Command, ExitCode};
 mod bundle;
 mod fuzz;
 #[cfg(test)]
-mod house;
+mod layers;
 
 const USAGE: &str = "usage: cargo xtask test [FILTER…] | lint | dist [OPTION…] | fuzz [OPTION…] | bundle … | COMMAND…
 

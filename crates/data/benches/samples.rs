@@ -1,15 +1,13 @@
-//! Samples per second and memory of the loader: `cargo bench --workspace --bench samples -- [--full]`. With `--full`, memory
-//! over 10,000 samples.
+//! Samples per second and memory of the loader: `cargo bench --workspace --bench samples -- [--full]`. `--full` also measures
+//! the memory of 10,000 samples.
 
 use std::sync::Arc;
 use std::time::Instant;
 
-use burn::data::dataloader::DataLoader;
-use burn::tensor::Device;
 use peak_alloc::PeakAlloc;
 use snapsnap_data::dataset::{Folder, Layout, Split};
 use snapsnap_data::prepare::{DataConfig, Subject};
-use snapsnap_data::sample::{Augment, Loader, SampleConfig, Stage1, Stage1Batcher, Stage2, Stage2Batcher};
+use snapsnap_data::sample::{Augment, Loader, SampleConfig, Stage1, Stage2};
 use snapsnap_people::synth;
 
 #[global_allocator]
@@ -32,14 +30,14 @@ fn data_set(root: &std::path::Path, layout: Layout, resolution: u32) -> Arc<Fold
     Arc::new(folder)
 }
 
-/// Loads `count` samples one by one; prints rate and peak memory.
-fn measure<O>(name: &str, loader: &dyn DataLoader<O>, count: usize) {
+/// Loads `count` samples one by one. Prints rate and peak memory.
+fn measure<I: Send + Sync + 'static>(name: &str, loader: &Loader<I>, count: usize) {
     ALLOCATOR.reset_peak_usage();
     let before = ALLOCATOR.current_usage_as_mb();
     let start = Instant::now();
     let mut loaded = 0;
     'all: loop {
-        for batch in loader.iter() {
+        for batch in loader.batches(0) {
             batch.expect("loads");
             loaded += 1;
             if [100, 1000, 10_000].contains(&loaded) || loaded == count {
@@ -57,7 +55,6 @@ fn measure<O>(name: &str, loader: &dyn DataLoader<O>, count: usize) {
 fn main() {
     let full = std::env::args().any(|argument| argument == "--full");
     let temporary = tempfile::tempdir().expect("temporary folder");
-    let device = Device::flex();
     let ours = SampleConfig::default();
     let plain = SampleConfig { augment: Augment::none(), ..SampleConfig::default() };
     let compat = SampleConfig { high_resolution: false, ..SampleConfig::compat() };
@@ -72,15 +69,13 @@ fn main() {
         ];
         for (name, folder, config) in sets {
             let stage = Stage1::new(folder.clone(), Some(Split::Train), config.clone()).expect("samples");
-            let loader = Loader::new(stage, Stage1Batcher, 1, 2, 2, &device);
-            measure(&format!("stage 1, {resolution}², {name}"), &loader, 100);
+            measure(&format!("stage 1, {resolution}², {name}"), &Loader::new(stage, 1, 2, 2), 100);
             let stage = Stage2::new(folder.clone(), Some(Split::Train), config.clone()).expect("samples");
-            let loader = Loader::new(stage, Stage2Batcher, 1, 2, 2, &device);
-            measure(&format!("stage 2, {resolution}², {name}"), &loader, 100);
+            measure(&format!("stage 2, {resolution}², {name}"), &Loader::new(stage, 1, 2, 2), 100);
         }
         if full && resolution == 512 {
             let stage = Stage1::new(exact, Some(Split::Train), ours.clone()).expect("samples");
-            let loader = Loader::new(stage, Stage1Batcher, 1, 2, 2, &device).shuffled(1);
+            let loader = Loader::new(stage, 1, 2, 2).shuffled(1);
             measure("stage 1, 512², exact, ours", &loader, 10_000);
         }
     }

@@ -1,5 +1,5 @@
-//! The state of a run in one file, which is there as a whole or not at all: weights, averages, what the optimiser remembers,
-//! and how far the run has come. Everything random follows from the seed and the step.
+//! The state of a run in one file, written whole or not at all: weights, averages, the optimiser's state and the progress.
+//! Everything random follows from the seed and the step.
 
 use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
@@ -20,7 +20,7 @@ const PROGRESS_KEY: &str = "snapsnap.training";
 /// Writes the state of a run.
 ///
 /// # Errors
-/// [`WeightsError::File`]; what was there before stays.
+/// [`WeightsError::File`]; the former file stays.
 pub(crate) fn save<T: Task>(path: &Path, learner: &Learner<T>) -> Result<(), WeightsError> {
     let (mut rows, times) = learner.optimizer.record();
     let progress = Progress { times, ..learner.progress.clone() };
@@ -34,16 +34,16 @@ pub(crate) fn save<T: Task>(path: &Path, learner: &Learner<T>) -> Result<(), Wei
     let text = serde_json::to_string(&progress).expect("plain numbers");
     let metadata = HashMap::from([(PROGRESS_KEY.to_owned(), text)]);
     let names = rows.iter().map(|(name, row)| (name.clone(), row.dims().to_vec())).collect();
-    // Never more than one copy at a time.
+    // One copy on the host at a time.
     let rows: Vec<_> = rows.into_values().collect();
     let values = |i: usize| Ok(host(rows[i].clone()));
     write_tensors(path, "the state of the training", metadata, names, values, &|_, _| ())
 }
 
-/// Brings a learner of the same config to where the state of a run is.
+/// Restores a learner of the same config from the state of a run.
 ///
 /// # Errors
-/// [`WeightsError`] for a file that is damaged or belongs to other networks.
+/// [`WeightsError`] for a file that is damaged or of other networks.
 pub(crate) fn load<T: Task>(
     path: &Path,
     learner: &mut Learner<T>,
@@ -57,7 +57,7 @@ pub(crate) fn load<T: Task>(
         return Err(wrong(format!("is of stage {}, not of stage {}", progress.stage, T::STAGE)));
     }
     if progress.loss_scale.is_some_and(|scale| !scale.is_sound()) {
-        return Err(wrong(format!("{PROGRESS_KEY}: no training comes to this loss_scale")));
+        return Err(wrong(format!("{PROGRESS_KEY}: loss_scale is out of range")));
     }
     let mut rows = BTreeMap::new();
     for name in source.tensors().keys() {

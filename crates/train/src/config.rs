@@ -11,7 +11,7 @@ use crate::optimizer::OptimizerConfig;
 use crate::precision::Precision;
 use crate::schedule::Schedule;
 
-/// Everything that decides what a training computes.
+/// All settings of a training.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TrainConfig {
@@ -21,11 +21,11 @@ pub struct TrainConfig {
     pub regressor: RegressorConfig,
     /// Quirks of the published code.
     pub mode: ModeConfig,
-    /// Data sets; `--data` replaces them.
+    /// Data sets. `--data` replaces them.
     pub data: DataSets,
-    /// How samples are made.
+    /// Samples.
     pub samples: SampleConfig,
-    /// Steps, batches, reports.
+    /// Steps, batches and reports.
     pub training: TrainingConfig,
     /// The optimiser.
     pub optimizer: OptimizerConfig,
@@ -41,7 +41,7 @@ pub struct TrainConfig {
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DataSets {
-    /// Folders of data sets, whose people are mixed.
+    /// Folders of data sets. Their people are mixed.
     pub folders: Vec<PathBuf>,
 }
 
@@ -55,20 +55,21 @@ pub struct TrainingConfig {
     pub batch: usize,
     /// Batches per step.
     pub accumulate: usize,
-    /// Largest norm of all gradients together.
+    /// Largest norm of all gradients together. Larger gradients are scaled down to it.
     pub clip: f64,
-    /// Decay of the exponential moving average of the weights, which is validated and written; 0: the weights themselves.
+    /// Decay of the exponential moving average of the weights. The average is validated and written; 0: the weights themselves.
     pub ema_decay: f64,
-    /// Weight file to begin with, ours or imported; `--weights` replaces it. Without one, stage 1 begins with random weights.
+    /// Weight file to begin with, trained by this program or imported. `--weights` replaces it. Without one, stage 1 begins
+    /// with random weights.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub start: Option<PathBuf>,
-    /// Decides random weights and the order of samples.
+    pub weights: Option<PathBuf>,
+    /// Seed of random weights and of the order of samples.
     pub seed: u64,
     /// People in random order instead of one after another.
     pub shuffle: bool,
     /// Threads that make samples.
     pub workers: usize,
-    /// Batches that may wait.
+    /// Batches that are loaded in advance.
     pub prefetch: usize,
     /// Steps between two lines of the log.
     pub log_every: usize,
@@ -76,25 +77,26 @@ pub struct TrainingConfig {
     pub validate_every: usize,
     /// Samples of a validation; 0: none.
     pub validation_samples: usize,
-    /// Which people are validated on.
+    /// People of the validations.
     pub validate_on: ValidationSplit,
     /// Steps between two checkpoints; 0: only at the end.
     pub checkpoint_every: usize,
     /// Steps between two previews; 0: only at the end.
     pub preview_every: usize,
-    /// What the point predictor computes in, on devices that have it.
+    /// Number format of the point predictor's layers. The device must support it.
     pub precision: Precision,
-    /// Computes what is cheap again instead of keeping it, on devices without kernels of our own.
-    pub checkpointing: bool,
+    /// Whether the backward pass computes cheap intermediate results again instead of keeping them. Operators with a backward pass of
+    /// their own ignore it.
+    pub gradient_checkpointing: bool,
 }
 
-/// Which people are validated on.
+/// People of the validations.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ValidationSplit {
-    /// Those set apart.
+    /// Held-out people.
     Val,
-    /// Those trained on, to see whether they can be learned at all.
+    /// People of the training set, to test whether they can be learned at all.
     Train,
 }
 
@@ -102,7 +104,7 @@ pub enum ValidationSplit {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Stage1Config {
-    /// λ, the weight of the confidences' cross-entropy: 0.5 in the published code, 1 in the paper.
+    /// λ: the weight of the confidences' cross-entropy. The published code has 0.5, the paper 1.
     pub confidence_weight: f64,
 }
 
@@ -110,27 +112,27 @@ pub struct Stage1Config {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Stage2Config {
-    /// β: the share of the L1 loss; the rest is that of the structural dissimilarity.
+    /// β: the share of the L1 loss. The rest is the share of the structural dissimilarity.
     pub l1_share: f64,
-    /// The published curriculum: the sides alone with small scales, then front and back alone, then everything.
+    /// Whether views follow the published curriculum: the sides with a penalty on scales, then front and back, then all.
     pub curriculum: bool,
     /// Weight of the mean absolute difference of coverage and mask.
     pub alpha_weight: f64,
-    /// Weight of the anisotropy penalty: the logarithm of the ratio of a Gaussian's longest to its shortest axis, as far as it
-    /// exceeds that of `anisotropy_limit`.
+    /// Weight of the anisotropy penalty: the logarithm of a Gaussian's ratio of axes, longest to shortest, above
+    /// `anisotropy_limit`.
     pub anisotropy_weight: f64,
-    /// Ratio of the longest to the shortest axis that costs nothing.
+    /// Largest ratio of the longest to the shortest axis without a penalty.
     pub anisotropy_limit: f64,
-    /// Standard deviation in metres by which a sample's predicted points are shifted at random, since points of people
-    /// trained on are better than others'.
+    /// Standard deviation, in metres, of random shifts of the predicted points. The frozen predictor's points are better for
+    /// the people that it was trained on than for others.
     pub point_noise: f64,
-    /// Perceptual distance, towards the end.
+    /// Perceptual distance, in the last steps.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lpips: Option<LpipsConfig>,
-    /// Folder that keeps the frozen predictor's point maps from step to step and from run to run.
+    /// Folder in which the frozen predictor's point maps are kept for later steps and runs.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub point_map_cache: Option<PathBuf>,
-    /// Weight of stage 1's loss, with which the point predictor is trained as well; 0: it is frozen.
+    /// Weight of stage 1's loss while the point predictor is trained as well; 0: it is frozen.
     pub points_weight: f64,
 }
 
@@ -140,10 +142,10 @@ pub struct Stage2Config {
 pub struct LpipsConfig {
     /// Weight of the mean distance.
     pub weight: f64,
-    /// Share of the steps before it counts.
+    /// Share of the steps before the distance becomes part of the loss.
     #[serde(default = "late")]
     pub after: f64,
-    /// AlexNet as torchvision publishes it and the learned layers of LPIPS v0.1, `.pth` or `.safetensors`.
+    /// Weights of torchvision's AlexNet and of the learned layers of LPIPS v0.1, `.pth` or `.safetensors`.
     pub files: Vec<PathBuf>,
 }
 
@@ -152,7 +154,7 @@ fn late() -> f64 {
 }
 
 impl Default for TrainConfig {
-    /// The published one.
+    /// The published training.
     fn default() -> Self {
         Self {
             network: NetworkConfig::default(),
@@ -177,7 +179,7 @@ impl Default for TrainingConfig {
             accumulate: 1,
             clip: 1.0,
             ema_decay: 0.0,
-            start: None,
+            weights: None,
             seed: 3407,
             shuffle: true,
             workers: 1,
@@ -189,7 +191,7 @@ impl Default for TrainingConfig {
             checkpoint_every: 1000,
             preview_every: 2000,
             precision: Precision::F32,
-            checkpointing: false,
+            gradient_checkpointing: false,
         }
     }
 }
@@ -219,16 +221,19 @@ impl Default for Stage2Config {
 impl Schema for TrainConfig {
     const RENAMED: &'static [(&'static str, &'static str)] = &[
         ("samples.place", "samples.placed_share"),
-        ("samples.augment.flip", "samples.augment.flip"),
-        ("training.ema_decay", "training.ema_decay"),
-        ("stage1.confidence_weight", "stage1.confidence_weight"),
+        ("samples.supervision", "samples.random_targets"),
+        ("samples.augment.mirror", "samples.augment.flip"),
+        ("training.average", "training.ema_decay"),
+        ("training.start", "training.weights"),
+        ("training.checkpointing", "training.gradient_checkpointing"),
+        ("stage1.confidence", "stage1.confidence_weight"),
         ("stage2.beta", "stage2.l1_share"),
         ("stage2.alpha", "stage2.alpha_weight"),
-        ("stage2.anisotropy_weight", "stage2.anisotropy_weight"),
+        ("stage2.needle", "stage2.anisotropy_weight"),
         ("stage2.anisotropy", "stage2.anisotropy_limit"),
-        ("stage2.point_noise", "stage2.point_noise"),
-        ("stage2.points_weight", "stage2.points_weight"),
-        ("stage2.point_map_cache", "stage2.point_map_cache"),
+        ("stage2.noise", "stage2.point_noise"),
+        ("stage2.points", "stage2.points_weight"),
+        ("stage2.maps", "stage2.point_map_cache"),
     ];
 
     fn refusal(&self) -> Option<(String, String)> {
@@ -237,34 +242,27 @@ impl Schema for TrainConfig {
 }
 
 impl TrainConfig {
-    /// The part that a weight file holds.
+    /// The part of the config that a weight file contains.
     pub fn networks(&self) -> Config {
         Config { network: self.network.clone(), regressor: self.regressor.clone(), mode: self.mode.clone() }
     }
 
-    /// How samples are made: people who are placed are as high as a user's.
+    /// The samples' config, with the height of people from the section `[mode]`.
     pub fn samples(&self) -> SampleConfig {
         SampleConfig { person_height: self.networks().person_height(), ..self.samples.clone() }
     }
 
     fn problem(&self) -> Option<(String, String)> {
-        let t = &self.training;
-        let counts = [
-            ("steps", t.steps, 1, 100_000_000),
-            ("batch", t.batch, 1, 4096),
-            ("accumulate", t.accumulate, 1, 4096),
-            ("workers", t.workers, 1, 256),
-            ("prefetch", t.prefetch, 0, 256),
-            ("log_every", t.log_every, 1, 1_000_000),
-            ("validation_samples", t.validation_samples, 0, 100_000),
-        ];
-        if let Some((key, value, least, most)) =
-            counts.into_iter().find(|(_, value, least, most)| value < least || value > most)
-        {
-            return Some((format!("training.{key}"), format!("is {value}, must be {least} to {most}")));
-        }
-        let two = &self.stage2;
+        let (t, two) = (&self.training, &self.stage2);
+        let lpips = two.lpips.as_ref();
         let ranges = [
+            ("training.steps", t.steps as f64, 1.0, 1e8),
+            ("training.batch", t.batch as f64, 1.0, 4096.0),
+            ("training.accumulate", t.accumulate as f64, 1.0, 4096.0),
+            ("training.workers", t.workers as f64, 1.0, 256.0),
+            ("training.prefetch", t.prefetch as f64, 0.0, 256.0),
+            ("training.log_every", t.log_every as f64, 1.0, 1e6),
+            ("training.validation_samples", t.validation_samples as f64, 0.0, 1e5),
             ("training.clip", t.clip, 1e-9, 1e9),
             ("training.ema_decay", t.ema_decay, 0.0, 0.999_999),
             ("stage1.confidence_weight", self.stage1.confidence_weight, 0.0, 1e6),
@@ -274,6 +272,8 @@ impl TrainConfig {
             ("stage2.anisotropy_limit", two.anisotropy_limit, 1.0, 1e6),
             ("stage2.point_noise", two.point_noise, 0.0, 1.0),
             ("stage2.points_weight", two.points_weight, 0.0, 1e6),
+            ("stage2.lpips.weight", lpips.map_or(0.0, |lpips| lpips.weight), 0.0, 1e6),
+            ("stage2.lpips.after", lpips.map_or(0.0, |lpips| lpips.after), 0.0, 1.0),
         ];
         if let Some((key, value, least, most)) =
             ranges.into_iter().find(|(_, value, least, most)| !(*least..=*most).contains(value))
@@ -284,46 +284,36 @@ impl TrainConfig {
             return Some(("network.conf_mode".into(), "must be \"sigmoid\" to be trained".into()));
         }
         if two.curriculum && !self.network.side_heads {
-            let message = "begins with the sides alone, which `network.side_heads = false` leaves out";
+            let message =
+                "must be false beside `network.side_heads = false`: the curriculum begins with the sides";
             return Some(("stage2.curriculum".into(), message.into()));
         }
         if two.points_weight > 0.0 && two.point_noise > 0.0 {
-            let message = "must be 0 beside `stage2.points_weight`: what is trained makes errors of its own";
+            let message =
+                "must be 0 beside `stage2.points_weight`: a predictor in training has errors of its own";
             return Some(("stage2.point_noise".into(), message.into()));
         }
         if two.points_weight > 0.0 && two.curriculum {
             let message = "must be 0 beside `stage2.curriculum = true`, which renders parts of a person";
             return Some(("stage2.points_weight".into(), message.into()));
         }
-        if let Some(lpips) = &two.lpips {
-            if !(0.0..=1e6).contains(&lpips.weight) || !(0.0..=1.0).contains(&lpips.after) {
-                let message = format!(
-                    "weight is {}, must be 0 to 1e6; after is {}, must be 0 to 1",
-                    lpips.weight, lpips.after
-                );
-                return Some(("stage2.lpips".into(), message));
-            }
-            if lpips.files.is_empty() {
-                return Some((
-                    "stage2.lpips.files".into(),
-                    "must name AlexNet and the learned layers".into(),
-                ));
-            }
-            if self.network.resolution < MIN_SIDE {
-                let message = format!("needs network.resolution of {MIN_SIDE} at least");
-                return Some(("stage2.lpips".into(), message));
-            }
+        if lpips.is_some_and(|lpips| lpips.files.is_empty()) {
+            return Some(("stage2.lpips.files".into(), "must name AlexNet and the learned layers".into()));
+        }
+        if lpips.is_some() && self.network.resolution < MIN_SIDE {
+            let message = format!("needs `network.resolution` of at least {MIN_SIDE}");
+            return Some(("stage2.lpips".into(), message));
         }
         if two.point_map_cache.as_ref().is_some_and(|folder| folder.as_os_str().is_empty()) {
             return Some(("stage2.point_map_cache".into(), "must name a folder".into()));
         }
         if two.point_map_cache.is_some() && two.points_weight > 0.0 {
-            let message = "needs a predictor that stays as it is, which `stage2.points_weight = 0` means";
+            let message = "needs a frozen predictor, `stage2.points_weight = 0`";
             return Some(("stage2.point_map_cache".into(), message.into()));
         }
         if two.point_map_cache.is_some() && self.samples.augment.changes_photographs() {
-            let message = "needs photographs that stay as they are, for which exposure, white_balance, mask_erosion, \
-                           mask_dilation and jpeg_quality of `samples.augment` are 0 and background is false";
+            let message = "needs photographs that do not change: exposure, white_balance, mask_erosion, mask_dilation \
+                           and jpeg_quality of `samples.augment` must be 0, and background false";
             return Some(("stage2.point_map_cache".into(), message.into()));
         }
         if let Some((key, message)) = self.samples.problem() {
@@ -356,7 +346,17 @@ mod tests {
         }
     }
 
-    /// What nothing is said about is as published.
+    #[test]
+    fn former_names_are_refused_with_the_present_ones() {
+        for (old, new) in TrainConfig::RENAMED {
+            let refused =
+                TrainConfig::from_toml("", "x", &[format!("{old}=1")]).expect_err("former").to_string();
+            assert!(refused.ends_with(&format!("`{old}` is now called `{new}`")), "{refused}");
+            assert_ne!(old, new);
+        }
+    }
+
+    /// Keys that the files leave out have the published values.
     #[test]
     fn full_is_the_papers() {
         let published = TrainConfig {

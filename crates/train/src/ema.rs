@@ -1,4 +1,4 @@
-//! Weights averaged over the last steps, which see people they were not trained on better than the last ones do.
+//! Weights averaged over the last steps. On held-out people they are better than the last weights.
 
 use burn::tensor::{Device, Tensor};
 use rayon::prelude::*;
@@ -11,19 +11,19 @@ const PIECE: usize = 1 << 14;
 
 /// An exponential moving average.
 pub struct Average {
-    /// Share of the past per step, once there is enough of it.
+    /// Share of the average that a step keeps, after the first steps.
     decay: f64,
     /// The averages.
     pub rows: Rows,
 }
 
 impl Average {
-    /// Begins at `rows`.
+    /// Begins with `rows`.
     pub fn new(decay: f64, rows: Rows) -> Self {
         Self { decay, rows }
     }
 
-    /// Takes in the weights after `step` steps. At first the past counts less: it is mostly the start.
+    /// Adds the weights after `step` steps. The first steps keep less of the average, since it is mostly the initial weights.
     pub fn update(&mut self, step: u64, rows: Rows) {
         let decay = self.decay.min((1.0 + step as f64) / (10.0 + step as f64));
         for (name, new) in rows {

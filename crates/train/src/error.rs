@@ -1,11 +1,11 @@
-//! What can go wrong in a training.
+//! Errors of a training.
 
 use snapsnap_base::FileError;
 use snapsnap_eval::EvalError;
 use snapsnap_net::weights::WeightsError;
 use snapsnap_splat::SplatError;
 
-/// Why a training could not begin or go on.
+/// A training that cannot begin or continue.
 #[derive(Debug, thiserror::Error)]
 pub enum TrainError {
     /// Data sets, samples, logs.
@@ -17,20 +17,20 @@ pub enum TrainError {
     /// Rendering.
     #[error(transparent)]
     Splat(#[from] SplatError),
-    /// Comparing with the truth.
+    /// Comparison with the ground truth.
     #[error(transparent)]
     Eval(#[from] EvalError),
-    /// What was asked for does not fit together.
+    /// Settings that do not fit one another or the data.
     #[error("{0}")]
     Unsuitable(String),
-    /// Too many steps in a row could not be made.
+    /// Too many failed steps in a row.
     #[error("{count} steps in a row could not be made, the last one, {step}, because {why}")]
     Stuck {
         /// Steps in a row.
         count: u64,
         /// The last one.
         step: u64,
-        /// What was wrong with it, and which samples it was made of.
+        /// Its error and its samples.
         why: String,
     },
 }

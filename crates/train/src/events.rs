@@ -1,16 +1,16 @@
-//! TensorBoard's event files: records of length, data and checksums, the data being a protocol buffer with a time, a step
-//! and named values. (The crates that write them need protobuf's compiler or have not been kept.)
+//! TensorBoard's event files. A record is a length, data and checksums. The data is a protocol buffer with a time, a step
+//! and named values. (Crates that write such files need protobuf's compiler or are no longer maintained.)
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, Write};
 use std::path::Path;
 use std::time::{SystemTime, UNIX_EPOCH};
 
-/// An event file that is being written.
+/// An open event file.
 pub struct Events(File);
 
 impl Events {
-    /// Begins a file anew.
+    /// Makes the file, or empties it.
     ///
     /// # Errors
     /// The operating system's refusal.
@@ -24,7 +24,7 @@ impl Events {
         Ok(events)
     }
 
-    /// Values of a step.
+    /// Adds the values of a step.
     ///
     /// # Errors
     /// The operating system's refusal.
@@ -108,13 +108,13 @@ mod tests {
     }
 
     #[test]
-    fn records_hold_what_was_added() {
+    fn records_contain_the_values() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("events");
         let mut events = Events::create(&path).expect("writes");
         events.add(300, [("loss", 0.5)].into_iter()).expect("writes");
         let bytes = std::fs::read(&path).expect("there");
-        // Length 8 + 4, time 9, version 2 + 13, checksum 4: then the second record.
+        // The second record comes after length 8 + 4, time 9, version 2 + 13 and checksum 4.
         let second = &bytes[12 + 9 + 15 + 4..];
         let length = u64::from_le_bytes(second[..8].try_into().expect("eight")) as usize;
         let data = &second[12..12 + length];

@@ -1,4 +1,4 @@
-//! Samples that are the same in every validation, and what all stages ask of data sets.
+//! Samples that are the same in every validation, and checks of data sets.
 
 use std::sync::Arc;
 
@@ -10,15 +10,15 @@ use snapsnap_data::sample::{Augment, Joined, SampleConfig};
 use crate::TrainError;
 use crate::config::{TrainConfig, ValidationSplit};
 
-/// Samples of the split to validate on, of all data sets that have it.
+/// Samples of validations, from all data sets with the configured split.
 pub(crate) struct Fixed<I> {
     samples: Joined<I>,
-    /// How many of them are used.
+    /// Number of samples that are used.
     pub count: usize,
 }
 
 impl<I: Send + Sync + 'static> Fixed<I> {
-    /// `samples` makes those of a data set.
+    /// `samples` makes the samples of one data set.
     pub fn new(
         folders: &[Arc<Folder>],
         config: &TrainConfig,
@@ -35,7 +35,7 @@ impl<I: Send + Sync + 'static> Fixed<I> {
             people += count;
             there.extend((count > 0).then_some(folder));
         }
-        // Photographs as they are, and enough samples of everybody.
+        // Photographs without augmentation, and enough samples of each person.
         let fixed = SampleConfig {
             repeat: wished.div_ceil(people.max(1)).max(1),
             augment: Augment::none(),
@@ -48,7 +48,7 @@ impl<I: Send + Sync + 'static> Fixed<I> {
         Ok(Self { samples, count })
     }
 
-    /// So many of them, spread over all data sets.
+    /// Indices of `count` samples, spread over all data sets.
     pub fn indices(&self, count: usize) -> impl Iterator<Item = usize> {
         let (len, count) = (self.samples.len(), count.min(self.count));
         (0..count).map(move |i| i * len / count)

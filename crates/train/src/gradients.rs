@@ -1,4 +1,4 @@
-//! All gradients of a step together: their norm, and its limit.
+//! The gradients of a step, their common norm, and its limit.
 
 use burn::module::Param;
 use burn::tensor::{Gradients, Tensor};
@@ -36,18 +36,17 @@ pub fn add(sum: &mut Rows, gradients: Rows) {
     }
 }
 
-/// The Euclidean norm of all gradients together. Not finite if one of them is not.
+/// The Euclidean norm of all gradients together. It is not finite if a gradient is not.
 pub fn norm(gradients: &Rows) -> f64 {
     let sums: Vec<_> = gradients.values().map(|gradient| gradient.clone().square().sum()).collect();
     if sums.is_empty() {
         return 0.0;
     }
-    // Read back once, and added in f64.
+    // One read-back, and a sum in f64.
     host(Tensor::cat(sums, 0)).into_iter().map(f64::from).sum::<f64>().sqrt()
 }
 
-/// The factor by which PyTorch's `clip_grad_norm_` multiplies gradients of this norm to limit it. `None` where it is not
-/// finite: no step can be made of such gradients.
+/// Factor of PyTorch's `clip_grad_norm_` for gradients of this norm; `None` for a norm that is not finite.
 pub fn clip_factor(norm: f64, limit: f64) -> Option<f64> {
     /// PyTorch's guard against a division by 0.
     const EPSILON: f64 = 1e-6;

@@ -1,10 +1,9 @@
-//! One step after another: samples → loss → gradients → weights. No file is written here.
+//! Steps of a training: samples → loss → gradients → weights. This module writes no files.
 
 use std::collections::BTreeMap;
 use std::panic::resume_unwind;
 use std::thread;
 
-use burn::data::dataloader::batcher::Batcher;
 use burn::data::dataset::Dataset;
 use burn::tensor::{Device, Tensor};
 use snapsnap_data::sample::{Batches, Loader};
@@ -19,7 +18,7 @@ use crate::progress::Progress;
 use crate::task::{Moment, Task};
 use crate::{TrainError, gradients};
 
-/// What is trained, and how far it has come.
+/// A training's networks, optimiser and progress.
 pub(crate) struct Learner<'a, T: Task> {
     pub task: &'a T,
     pub config: &'a TrainConfig,
@@ -27,16 +26,16 @@ pub(crate) struct Learner<'a, T: Task> {
     pub average: Option<Average>,
     pub optimizer: Optimizer,
     pub progress: Progress,
-    /// Those that train, with gradients.
+    /// Training devices, with gradients.
     devices: &'a [Device],
     samples: Samples<'a, T>,
 }
 
-/// Why there was no step, and which samples it would have been made of.
+/// Reason of a skipped step, with its samples.
 pub(crate) type Skipped = String;
 
 impl<'a, T: Task> Learner<'a, T> {
-    /// At the beginning of a run; `networks` are on the first of the devices.
+    /// The beginning of a run. `networks` are on the first device.
     pub fn new(task: &'a T, config: &'a TrainConfig, networks: Networks, devices: &'a [Device]) -> Self {
         let share = config.training.ema_decay;
         Self {
@@ -51,7 +50,7 @@ impl<'a, T: Task> Learner<'a, T> {
         }
     }
 
-    /// The averaged networks, or the networks themselves; not tracked.
+    /// The averaged networks, or the networks themselves, without gradients.
     pub fn averaged(&self) -> Networks {
         let networks = self.networks.valid();
         match &self.average {
@@ -60,10 +59,10 @@ impl<'a, T: Task> Learner<'a, T> {
         }
     }
 
-    /// One step: what there is to log of it, or why it was skipped. Either way it counts.
+    /// Makes one step. Returns its values for the log, or the reason why it was skipped. A skipped step counts as well.
     ///
     /// # Errors
-    /// [`TrainError`] if the task cannot go on.
+    /// [`TrainError`] if the training cannot continue.
     pub fn step(&mut self) -> Result<Result<BTreeMap<String, f64>, Skipped>, TrainError> {
         let step = self.progress.step;
         let made = self.update(step)?;
@@ -88,17 +87,15 @@ impl<'a, T: Task> Learner<'a, T> {
         for batch in 0..t.accumulate {
             let items = match self.samples.get(step * t.accumulate as u64 + batch as u64) {
                 Ok(items) => items,
-                // Names the file that is to blame.
+                // The reason names the damaged file.
                 Err(why) => return Ok(Err(why)),
             };
             all.extend(items.iter().map(|item| T::name(item).to_owned()));
             let at = Moment { step, batch: batch as u64, device: 0 };
             let how = How { precision: t.precision, scale, share: 1.0 / t.accumulate as f64 };
             let made = match on_devices(self.task, &self.networks, self.devices, items, at, how) {
-                // A scene that the rasteriser cannot hold is a sample's affair.
-                Err(TrainError::Splat(e)) => {
-                    return skipped(&e.to_string(), &all);
-                }
+                // A scene that the rasteriser refuses costs the sample, not the run.
+                Err(TrainError::Splat(e)) => return skipped(&e.to_string(), &all),
                 made => made?,
             };
             if made.values.is_empty() {
@@ -132,25 +129,25 @@ impl<'a, T: Task> Learner<'a, T> {
     }
 }
 
-/// Loss parts by name, the loss among them, or none where nothing could be trained on; and gradients, unless a loss was not
-/// finite.
+/// Result of a batch: the loss and its parts by name, none if no sample shows a person; and the gradients, unless a loss was
+/// not finite.
 struct Made {
     values: BTreeMap<&'static str, f64>,
     gradients: Option<Rows>,
 }
 
-/// How a batch is computed.
+/// Numerical settings of a batch.
 #[derive(Debug, Clone, Copy)]
 struct How {
     precision: Precision,
-    /// What the loss is multiplied by, and its gradients are divided by.
+    /// Factor of the loss, by which its gradients are divided.
     scale: f64,
-    /// The batch's share in its step.
+    /// The batch's share of its step.
     share: f64,
 }
 
-/// Loss and gradients of a batch, times its share: on the one device, or of equal parts of the batch on all of them at
-/// once, with gradients and losses averaged on the first. (Burn has collectives for CUDA alone; copies go anywhere.)
+/// Loss and gradients of a batch, times its share. Several devices compute equal parts of the batch at once, and the first
+/// device averages losses and gradients. (Burn has collectives for CUDA only. Copies work on every device.)
 fn on_devices<T: Task>(
     task: &T,
     networks: &Networks,
@@ -229,23 +226,14 @@ fn on_device<T: Task>(
     Ok(Made { values, gradients: Some(rows) })
 }
 
-/// Batches, pass after pass.
+/// Batches of all passes.
 struct Samples<'a, T: Task> {
     task: &'a T,
     config: &'a TrainConfig,
-    /// Batches of one pass.
+    /// Number of batches of a pass.
     per_pass: u64,
-    /// The pass that is under way, and the number of its next batch since the beginning of the run.
-    open: Option<(Batches<Vec<T::Item>>, u64)>,
-}
-
-/// Leaves items as they are.
-struct Together;
-
-impl<I: Send + Sync> Batcher<I, Vec<I>> for Together {
-    fn batch(&self, items: Vec<I>, _device: &Device) -> Vec<I> {
-        items
-    }
+    /// The current pass, and the number of its next batch since the beginning of the run.
+    open: Option<(Batches<T::Item>, u64)>,
 }
 
 impl<'a, T: Task> Samples<'a, T> {
@@ -254,15 +242,15 @@ impl<'a, T: Task> Samples<'a, T> {
         Self { task, config, per_pass, open: None }
     }
 
-    /// A batch by its number since the beginning of the run, or why there is none. What each holds follows from its number
-    /// alone.
+    /// A batch by its number since the beginning of the run, or the reason why it cannot be loaded. Its content follows from
+    /// the number alone.
     fn get(&mut self, number: u64) -> Result<Vec<T::Item>, String> {
         let (pass, place) = (number / self.per_pass, number % self.per_pass);
         let mut open = self.open.take().filter(|(_, next)| *next == number && place > 0);
         let (batches, next) = open.get_or_insert_with(|| {
             let t = &self.config.training;
             let samples = self.task.samples(pass);
-            let loader = Loader::new(samples, Together, t.batch, t.workers, t.prefetch, &Device::flex());
+            let loader = Loader::new(samples, t.batch, t.workers, t.prefetch);
             let loader = if t.shuffle { loader.shuffled(t.seed) } else { loader };
             (loader.from_pass(pass).batches(place as usize), number)
         });

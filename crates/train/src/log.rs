@@ -1,4 +1,4 @@
-//! What a run leaves behind for people: `log.jsonl`, TensorBoard's events.
+//! Logs of a run: `log.jsonl` and TensorBoard's events.
 
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
@@ -6,12 +6,11 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
-use snapsnap_base::FileError;
-use snapsnap_base::file;
+use snapsnap_base::{FileError, file};
 
 use crate::events::Events;
 
-/// Longest log that is read when a run goes on.
+/// Longest log that is read, in bytes.
 const MOST_BYTES: u64 = 1 << 30;
 
 /// One line of `log.jsonl`.
@@ -21,8 +20,7 @@ pub struct Line {
     pub step: u64,
     /// Seconds of training so far, all sessions together.
     pub seconds: f64,
-    /// What was measured, by name: loss parts, learning rate, gradient norm, or, as `validation/…`, what a validation
-    /// found.
+    /// Measurements by name: parts of the loss, learning rate and gradient norm, or, as `validation/…`, those of a validation.
     pub values: BTreeMap<String, f64>,
 }
 
@@ -36,8 +34,8 @@ pub struct Log {
 }
 
 impl Log {
-    /// Begins the logs of the run in `folder`, or goes on after its step `step`; later lines, of a session that was killed,
-    /// are dropped.
+    /// Begins the logs of the run in `folder`, or continues them after step `step`. Later lines of a killed session are
+    /// dropped.
     ///
     /// # Errors
     /// [`FileError`] if a file cannot be read or written.
@@ -46,7 +44,7 @@ impl Log {
         let (mut lines, mut kept) = (Vec::new(), String::new());
         if step > 0 && path.exists() {
             let text = file::read_text(&path, MOST_BYTES).map_err(FileError::read(&path))?;
-            // The last line of a killed session may be torn.
+            // The last line of a killed session may be incomplete.
             for line in text.lines() {
                 if let Some(read) = serde_json::from_str(line).ok().filter(|read: &Line| read.step <= step) {
                     lines.push(read);

@@ -1,4 +1,4 @@
-//! What is being trained: the point predictor, the regressors, or both, with one set of names.
+//! The networks of a training: the point predictor, the regressors, or both, with one set of names.
 
 use std::collections::BTreeMap;
 
@@ -15,7 +15,7 @@ use snapsnap_ops::host;
 pub struct Networks {
     /// The point predictor, if it is trained.
     pub predictor: Option<PointPredictor>,
-    /// The regressors, if they are trained: one, or one for front and back and one for the sides.
+    /// The regressors, if they are trained: one for all views, or one for front and back and one for the sides.
     pub regressors: Vec<Regressor>,
 }
 
@@ -43,7 +43,7 @@ impl Networks {
         }
     }
 
-    /// The same networks, not tracked.
+    /// The same networks without gradients.
     pub fn valid(&self) -> Self {
         Self {
             predictor: self.predictor.as_ref().map(Module::valid),
@@ -51,7 +51,7 @@ impl Networks {
         }
     }
 
-    /// The same networks on another device, tracked as they are here.
+    /// The same networks on another device, with gradients if they have them here.
     pub fn fork(&self, device: &Device) -> Self {
         Self {
             predictor: self.predictor.clone().map(|predictor| predictor.fork(device)),
@@ -72,7 +72,7 @@ impl Networks {
         collect.0
     }
 
-    /// The same networks with other values; parameters that are not among them keep theirs.
+    /// The same networks with the values in `rows`. Other parameters keep their values.
     pub fn with_rows(self, rows: &Rows) -> Self {
         struct Replace<'a>(&'a Rows);
         impl NamedMapper for Replace<'_> {
@@ -99,7 +99,7 @@ impl Networks {
         collect.0
     }
 
-    /// All values as checkpoints lay them out.
+    /// All values in the layout of checkpoints.
     pub fn checkpoint(&self) -> BTreeMap<String, Vec<f32>> {
         struct Collect(BTreeMap<String, Vec<f32>>);
         impl NamedVisitor for Collect {

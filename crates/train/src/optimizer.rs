@@ -26,9 +26,9 @@ pub struct OptimizerConfig {
     pub beta2: f64,
     /// Added to the root of the squares' mean.
     pub epsilon: f64,
-    /// Share of a weight that a step at rate 1 would take away.
+    /// Share of a weight that a step at rate 1 would remove.
     pub weight_decay: f64,
-    /// Whether norms, biases and δ decay as well, as in the published code.
+    /// Whether norms, biases and δ decay as well. They do in the published code.
     pub decay_all: bool,
     /// Muon for hidden matrices and kernels.
     pub muon: Option<MuonSettings>,
@@ -38,16 +38,16 @@ pub struct OptimizerConfig {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct MuonSettings {
-    /// Highest learning rate; updates are scaled to the size of AdamW's.
+    /// Highest learning rate. Updates are scaled to the size of AdamW's updates.
     pub rate: f64,
-    /// Share of the past in the direction of a step.
+    /// Share of the former velocity in the direction of a step.
     pub momentum: f64,
-    /// As AdamW's.
+    /// As in AdamW.
     pub weight_decay: f64,
 }
 
 impl Default for OptimizerConfig {
-    /// The published one.
+    /// The published optimiser.
     fn default() -> Self {
         Self {
             rate: 1e-4,
@@ -89,27 +89,27 @@ impl OptimizerConfig {
         Some((key, format!("is {value}, must be at least 0 and less than {limit}")))
     }
 
-    /// An optimiser that has made no step yet.
+    /// An optimiser before its first step.
     pub fn init(&self) -> Optimizer {
         Optimizer { config: self.clone(), states: BTreeMap::new() }
     }
 }
 
-/// What an optimiser remembers of a parameter.
+/// State of the optimiser for one parameter.
 #[derive(Clone)]
-#[allow(clippy::large_enum_variant, reason = "what it points at is larger by far")]
+#[allow(clippy::large_enum_variant, reason = "the tensors' memory is far larger")]
 pub(crate) enum State {
     AdamW { time: u64, mean: Tensor<1>, squares: Tensor<1> },
     Muon { velocity: Tensor<1> },
 }
 
-/// An optimiser in the middle of a training.
+/// An optimiser with its state.
 pub struct Optimizer {
     config: OptimizerConfig,
     states: BTreeMap<String, State>,
 }
 
-/// Whether a parameter is a matrix or a kernel between the first layer and the last ones.
+/// Whether a parameter is a matrix or a kernel between the first layer and the last layers.
 fn is_hidden(name: &str, rank: usize) -> bool {
     /// Parts of the names of first and last layers.
     const OUTER: [&str; 5] = ["patch_embed.", ".dpt.head.4.", "conv_in.", "conv_out.", "gs_conv."];
@@ -129,8 +129,8 @@ struct Work {
 }
 
 impl Optimizer {
-    /// One step of all parameters that have a gradient, each multiplied by `factor` first, at `share` of the highest
-    /// rates.
+    /// One step of all parameters that have a gradient, at `share` of the highest rates. Gradients are multiplied by `factor`
+    /// first.
     pub fn step(&mut self, share: f64, networks: Networks, mut gradients: Rows, factor: f64) -> Networks {
         let mut shapes = networks.shapes();
         let rows = networks.rows().into_iter();
@@ -141,7 +141,7 @@ impl Optimizer {
         });
         let work: Vec<_> = work.collect();
         let one = |work: Work| self.step_one(share, work, factor);
-        // Parameters are many and small: on the CPU all cores take some. Other devices order work by the calling thread.
+        // Parameters are many and small. On the CPU, cores share them. Other devices order work by the calling thread.
         let is_cpu = work.first().is_some_and(|work| work.values.device() == Device::flex());
         let done: Vec<_> = if is_cpu {
             work.into_par_iter().with_max_len(1).map(one).collect()
@@ -164,7 +164,7 @@ impl Optimizer {
                     Some(State::Muon { velocity }) => Some(velocity),
                     _ => None,
                 };
-                // Kernels `[out, in, k, k]` are taken for matrices `[out, in·k·k]`.
+                // Kernels `[out, in, k, k]` become matrices `[out, in·k·k]`.
                 let size = [shape[0], shape[1..].iter().product()];
                 muon(settings, share, values, gradient, factor, velocity, size)
             }
@@ -176,8 +176,8 @@ impl Optimizer {
         (name, values, state)
     }
 
-    /// AdamW (Loshchilov and Hutter). Burn's corrects the moments' bias in f32, which makes the second step 1.5e-5 too long
-    /// or too short; the published steps cannot be followed with it.
+    /// AdamW (Loshchilov and Hutter). Burn's AdamW corrects the moments' bias in f32, so that its second step differs from
+    /// PyTorch's by 1.5e-5.
     pub(crate) fn adamw(
         &self,
         share: f64,
@@ -228,7 +228,7 @@ impl Optimizer {
         (values * kept - mean.clone() * pace / length, State::AdamW { time, mean, squares })
     }
 
-    /// What a checkpoint needs: rows `KIND/NAME`, and AdamW's steps so far by name.
+    /// State for a checkpoint: rows `KIND/NAME`, and the number of AdamW's steps by name.
     pub fn record(&self) -> (Rows, BTreeMap<String, u64>) {
         let (mut rows, mut times) = (Rows::new(), BTreeMap::new());
         for (name, state) in &self.states {
@@ -246,7 +246,7 @@ impl Optimizer {
         (rows, times)
     }
 
-    /// Goes on from a checkpoint's record; what belongs to no parameter is left out.
+    /// Restores the state from a checkpoint. Rows of unknown parameters are ignored.
     pub fn restore(
         &mut self,
         networks: &Networks,
@@ -267,8 +267,8 @@ impl Optimizer {
     }
 }
 
-/// Muon (Jordan et al.): a step along the orthogonalised momentum, looked ahead as Nesterov's, as long as AdamW's steps are
-/// (Liu et al., "Muon is scalable", the factor of 0.2·√(longest side)).
+/// Muon (Jordan et al.): a step along the orthogonalised Nesterov momentum. Its factor 0.2·√(longest side) makes it as long as
+/// a step of AdamW (Liu et al., "Muon is scalable").
 fn muon(
     settings: &MuonSettings,
     share: f64,
@@ -305,7 +305,7 @@ fn muon(
     (row(values, &device), State::Muon { velocity: row(velocity, &device) })
 }
 
-/// As [`orthogonalised`], on any device.
+/// [`orthogonalised`] on any device.
 fn orthogonalised_tensor(x: Tensor<2>) -> Tensor<2> {
     let [rows, columns] = x.dims();
     if rows > columns {
@@ -328,7 +328,7 @@ mod tests {
     use burn::optim::{AdjustLrFn, MuonConfig, Optimizer as _};
     use burn::tensor::Distribution;
 
-    /// Burn's own Muon, which takes matrices only, is the yardstick of both roads.
+    /// Both implementations agree with Burn's Muon, which takes matrices only.
     #[test]
     fn muon_is_burns() {
         let settings = MuonSettings { rate: 0.01, momentum: 0.9, weight_decay: 0.02 };
@@ -353,7 +353,7 @@ mod tests {
                 ours = new;
                 velocity = match state {
                     State::Muon { velocity } => Some(velocity),
-                    State::AdamW { .. } => panic!("Muon's state is Muon's"),
+                    State::AdamW { .. } => panic!("not a state of Muon"),
                 };
             }
             let (ours, theirs) = (host(ours), host(values));

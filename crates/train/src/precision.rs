@@ -1,53 +1,53 @@
-//! Steps in 16 bits: the point predictor's matrix products and convolutions, and what they keep for the backward pass. Weights,
-//! moments and losses are left alone.
+//! Steps in 16 bits: matrix products and convolutions of the point predictor, and their intermediate results for the backward
+//! pass. Weights, moments and losses stay in 32 bits.
 
 use serde::{Deserialize, Serialize};
 pub use snapsnap_net::precision::Precision;
 
 use crate::networks::Networks;
 
-/// The networks with a predictor in this precision; gradients lead back to the one that was given.
+/// The networks with a predictor in this precision. Gradients flow back to the given networks.
 pub fn lower(precision: Precision, networks: &Networks) -> Networks {
     let mut networks = networks.clone();
     networks.predictor = networks.predictor.map(|predictor| precision.lower(predictor));
     networks
 }
 
-/// What the loss is multiplied by before it is differentiated, and its gradients are divided by: halved where a gradient
-/// is not finite, doubled after long without.
+/// Factor of the loss before the backward pass; gradients are divided by it. It is halved after a gradient that is not finite,
+/// and doubled after many steps without one.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LossScale {
     /// A power of two.
     pub factor: f64,
-    /// Steps since it was changed.
+    /// Steps since the last change.
     pub steps: u64,
 }
 
 impl Default for LossScale {
-    /// At the beginning of a training.
+    /// The initial factor.
     fn default() -> Self {
         Self { factor: Self::MOST, steps: 0 }
     }
 }
 
 impl LossScale {
-    /// Where a training begins, and the most there is: 1 is reached before twenty failed steps in a row end a run.
+    /// Initial and largest factor. Sixteen failed steps reduce it to 1, and twenty in a row end a run.
     const MOST: f64 = 65_536.0;
-    /// Steps until a larger one is tried.
-    const PATIENCE: u64 = 2000;
+    /// Steps before the factor is doubled.
+    const INTERVAL: u64 = 2000;
 
-    /// Whether a training can have come to this.
+    /// Whether a training can have this state.
     pub fn is_sound(&self) -> bool {
-        (1.0..=Self::MOST).contains(&self.factor) && self.steps < Self::PATIENCE
+        (1.0..=Self::MOST).contains(&self.factor) && self.steps < Self::INTERVAL
     }
 
-    /// After a step that was made, or was not because of its gradients.
+    /// Records a step, or, with `made` false, one that was skipped because of its gradients.
     pub fn update(&mut self, made: bool) {
         self.steps += 1;
         if !made {
             *self = Self { factor: (self.factor / 2.0).max(1.0), steps: 0 };
-        } else if self.steps >= Self::PATIENCE {
+        } else if self.steps >= Self::INTERVAL {
             *self = Self { factor: (self.factor * 2.0).min(Self::MOST), steps: 0 };
         }
     }

@@ -1,4 +1,4 @@
-//! How far a run has come.
+//! Progress of a run.
 
 use std::collections::BTreeMap;
 
@@ -6,25 +6,25 @@ use serde::{Deserialize, Serialize};
 
 use crate::precision::LossScale;
 
-/// How far a run has come.
+/// Progress of a run.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Progress {
-    /// Which stage is trained, 1 or 2.
+    /// Stage of the training, 1 or 2.
     pub stage: u32,
-    /// Steps so far, those that were skipped included.
+    /// Steps so far, including skipped ones.
     pub step: u64,
-    /// Steps that were skipped because a loss or gradient was not finite, or a sample could not be read.
+    /// Steps that were skipped because a loss or gradient was not finite, or because a sample could not be read.
     pub skipped: u64,
-    /// Those of them that came one after another up to here.
+    /// Skipped steps since the last one that was made.
     pub skipped_in_a_row: u64,
-    /// Step of the best validation, and the bits of its score, which decimals might change.
+    /// Step of the best validation, and the bits of its score, since decimals might round it.
     pub best: Option<(u64, u64)>,
-    /// The step at which the run ended with a validation and a preview, 0 while it has not.
+    /// Step after which the final validation and preview were made; 0 before.
     #[serde(default)]
     pub shown: u64,
-    /// What the loss is scaled by, in f16.
+    /// Scale of the loss, in f16.
     pub loss_scale: Option<LossScale>,
-    /// AdamW's steps so far by parameter.
+    /// Number of AdamW's steps by parameter.
     pub times: BTreeMap<String, u64>,
 }

@@ -11,26 +11,26 @@ pub enum Schedule {
     /// PyTorch's `OneCycleLR` with cosine annealing, as in the published code
     /// (docs/method.md, "Optimisation and schedules").
     OneCycle {
-        /// Steps that the cycle is longer than the run.
+        /// Number of steps by which the cycle is longer than the run.
         overhang: usize,
-        /// Share of the steps that rise.
+        /// Share of the steps in which the rate rises.
         rise: f64,
-        /// The highest rate over the first.
+        /// The highest rate divided by the first.
         start_divisor: f64,
-        /// The first rate over the last.
+        /// The first rate divided by the last.
         end_divisor: f64,
     },
     /// A linear rise, then half a cosine.
     Cosine {
-        /// Steps that rise.
+        /// Steps in which the rate rises.
         warm_up: usize,
-        /// The last rate over the highest.
+        /// The last rate divided by the highest.
         end: f64,
     },
 }
 
 impl Schedule {
-    /// That of the published code.
+    /// The schedule of the published code.
     pub fn published() -> Self {
         Self::OneCycle { overhang: 100, rise: 0.01, start_divisor: 25.0, end_divisor: 1e4 }
     }
@@ -49,7 +49,7 @@ impl Schedule {
         }
     }
 
-    /// Share of the highest rate at a step of a run of `steps`; beyond the last step the last share.
+    /// Share of the highest rate at a step of a run of `steps`. Later steps have the share of the last.
     pub fn share(&self, step: usize, steps: usize) -> f64 {
         let anneal = |from: f64, to: f64, progress: f64| {
             to + (from - to) / 2.0 * (1.0 + (PI * progress.clamp(0.0, 1.0)).cos())
@@ -100,7 +100,7 @@ mod tests {
     }
 
     #[test]
-    fn cosine_rises_and_ends_where_it_should() {
+    fn cosine_has_its_first_highest_and_last_rate() {
         let share = |step| Schedule::Cosine { warm_up: 99, end: 1e-3 }.share(step, 1000);
         assert!((share(0) - 0.01).abs() < 1e-12 && (share(98) - 0.99).abs() < 1e-12);
         assert!((share(99) - 1.0).abs() < 1e-12 && (share(999) - 1e-3).abs() < 1e-12);

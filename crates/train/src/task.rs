@@ -1,4 +1,4 @@
-//! What a stage of the training is to the loop that runs it.
+//! The interface between a stage of the training and the training loop.
 
 use std::collections::BTreeMap;
 
@@ -9,34 +9,34 @@ use snapsnap_data::sample::Joined;
 use crate::TrainError;
 use crate::networks::Networks;
 
-/// One of the summands of a loss.
+/// A part of a loss.
 #[derive(Debug, Clone)]
 pub struct Part {
-    /// For logs.
+    /// Name in logs.
     pub name: &'static str,
-    /// Its factor in the sum.
+    /// Its weight in the sum.
     pub weight: f64,
     /// Its value `[1]`.
     pub value: Tensor<1>,
 }
 
-/// When a batch is computed.
+/// Place of a batch in the training.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Moment {
-    /// Steps before this one.
+    /// Number of earlier steps.
     pub step: u64,
-    /// Batches of this step before this one.
+    /// Number of earlier batches of this step.
     pub batch: u64,
-    /// Number of the device among those that train.
+    /// Index of the device among the training devices.
     pub device: usize,
 }
 
-/// What a validation found.
+/// Result of a validation.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Validation {
-    /// What the best weights are chosen by: less is better.
+    /// Score by which the best weights are chosen. Lower is better.
     pub score: f64,
-    /// Figures with their units, for people.
+    /// Named figures for logs.
     pub figures: Vec<(&'static str, f64)>,
 }
 
@@ -48,14 +48,13 @@ pub trait Task: Sync {
     /// 1 or 2.
     const STAGE: u32;
 
-    /// The samples of a pass over the data; every pass makes other random choices.
+    /// The samples of a pass over the data. Each pass has its own random choices.
     fn samples(&self, pass: u64) -> Joined<Self::Item>;
 
-    /// What a sample was made of.
+    /// Name of a sample: its data set, subject and view.
     fn name(item: &Self::Item) -> &str;
 
-    /// The loss of a batch, computed where `networks` are: on the moment's device. Empty if nothing of the batch can be
-    /// trained on.
+    /// Parts of a batch's loss, computed on the device of `networks` and `at`. Empty if no sample of the batch shows a person.
     ///
     /// # Errors
     /// [`TrainError`] if the batch cannot be used.
@@ -66,19 +65,20 @@ pub trait Task: Sync {
         at: Moment,
     ) -> Result<Vec<Part>, TrainError>;
 
-    /// Compares what the networks, which are not tracked and on the first device, make of people set apart; `None` if there are none.
+    /// Compares predictions for held-out people with the ground truth; `None` without such people. `networks` have no gradients
+    /// and are on the first device.
     ///
     /// # Errors
     /// [`TrainError`] if a sample cannot be read.
     fn validate(&self, networks: &Networks) -> Result<Option<Validation>, TrainError>;
 
-    /// A picture of what the networks, which are not tracked and on the first device, make of a few samples.
+    /// A picture of the predictions for a few samples. `networks` are as in [`Self::validate`].
     ///
     /// # Errors
     /// [`TrainError`] if a sample cannot be read.
     fn preview(&self, networks: &Networks) -> Result<Option<RgbImage>, TrainError>;
 
-    /// Weights to be written beside the trained ones, as checkpoints lay them out.
+    /// Frozen weights that are written beside the trained ones, in the layout of checkpoints.
     fn frozen(&self, _networks: &Networks) -> BTreeMap<String, Vec<f32>> {
         BTreeMap::new()
     }

@@ -1,5 +1,5 @@
-//! A data loader with workers whose memory is bounded, and whose batches come in the same order however many workers there
-//! are. (Burn's own keeps up to 100 batches per iterator and mixes the workers' orders.)
+//! A data loader with bounded memory, whose order does not depend on the number of workers. (Burn's loader keeps up to 100
+//! batches per iterator and mixes the orders of its workers.)
 
 use std::collections::BTreeMap;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -8,88 +8,59 @@ use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::{Builder, JoinHandle};
 
-use burn::data::dataloader::batcher::Batcher;
-use burn::data::dataloader::{DataLoader, DataLoaderIterator, Progress};
 use burn::data::dataset::{Dataset, DatasetError};
-use burn::tensor::Device;
 use rand::seq::SliceRandom;
 
 use snapsnap_base::random::stream;
 
-/// Loads batches of items of type `I` as `O`.
-pub struct Loader<I, O> {
+/// Loads batches of items of type `I`.
+pub struct Loader<I> {
     dataset: Arc<dyn Dataset<I>>,
-    batcher: Arc<dyn Batcher<I, O>>,
     batch: usize,
     workers: usize,
     prefetch: usize,
-    /// Seed of the order, if it is random; every pass has another.
+    /// Seed of the order, if it is random. Every pass has its own order.
     shuffle: Option<u64>,
-    device: Device,
-    /// Items that are loaded.
-    range: std::ops::Range<usize>,
     passes: AtomicU64,
 }
 
-impl<I: 'static, O: 'static> Loader<I, O> {
-    /// Batches of `batch` items on `device`, made by `workers` threads; ready or in the making are at most
-    /// `workers + prefetch`. The last batch may be smaller.
+impl<I: 'static> Loader<I> {
+    /// Batches of `batch` items, loaded by `workers` threads. At most `workers + prefetch` batches are loaded before they are
+    /// taken. The last batch may be smaller.
     ///
     /// # Panics
     /// If `batch` or `workers` is 0.
-    pub fn new(
-        dataset: impl Dataset<I> + 'static,
-        batcher: impl Batcher<I, O> + 'static,
-        batch: usize,
-        workers: usize,
-        prefetch: usize,
-        device: &Device,
-    ) -> Self {
+    pub fn new(dataset: impl Dataset<I> + 'static, batch: usize, workers: usize, prefetch: usize) -> Self {
         assert!(batch > 0 && workers > 0, "{batch} items by {workers} workers");
-        let range = 0..dataset.len();
         Self {
             dataset: Arc::new(dataset),
-            batcher: Arc::new(batcher),
             batch,
             workers,
             prefetch,
             shuffle: None,
-            device: device.clone(),
-            range,
             passes: AtomicU64::new(0),
         }
     }
 
-    /// In random order, another in every pass.
+    /// The loader with a random order, a new one in every pass.
     pub fn shuffled(mut self, seed: u64) -> Self {
         self.shuffle = Some(seed);
         self
     }
 
-    /// Begins with the order of this pass, as a training that goes on does.
+    /// The loader with this pass as its next one.
     pub fn from_pass(self, pass: u64) -> Self {
         self.passes.store(pass, Ordering::Relaxed);
         self
     }
-
-    fn with(&self, device: &Device, range: std::ops::Range<usize>) -> Self {
-        Self {
-            dataset: self.dataset.clone(),
-            batcher: self.batcher.clone(),
-            device: device.clone(),
-            range,
-            passes: AtomicU64::new(self.passes.load(Ordering::Relaxed)),
-            ..*self
-        }
-    }
 }
 
-/// What workers and the consumer share.
+/// State that the workers and the consumer share.
 #[derive(Default)]
 struct Turn {
-    /// Batch that the next free worker makes.
+    /// The batch for the next free worker.
     next: usize,
-    /// Batches that were taken.
+    /// Number of taken batches.
     taken: usize,
     stop: bool,
 }
@@ -105,7 +76,7 @@ impl Turns {
         self.turn.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The batch that a worker is to make, once it may.
+    /// Waits until a worker may load another batch, and returns its number; `None` at the end.
     fn claim(&self, total: usize, ahead: usize) -> Option<usize> {
         let mut turn = self.lock();
         while !turn.stop && turn.next < total && turn.next >= turn.taken + ahead {
@@ -119,24 +90,24 @@ impl Turns {
     }
 }
 
-type Made<O> = Result<O, DatasetError>;
+type Loaded<I> = Result<Vec<I>, DatasetError>;
 
 /// Batches of one pass, in their order.
-pub struct Batches<O> {
+pub struct Batches<I> {
     turns: Arc<Turns>,
-    made: Receiver<(usize, Made<O>)>,
-    /// Made before their turn.
-    early: BTreeMap<usize, Made<O>>,
+    loaded: Receiver<(usize, Loaded<I>)>,
+    /// Batches that were loaded before their turn.
+    early: BTreeMap<usize, Loaded<I>>,
     workers: Vec<JoinHandle<()>>,
     batch: usize,
     items: usize,
     taken: usize,
 }
 
-impl<I: Send + Sync + 'static, O: Send + 'static> Loader<I, O> {
-    /// The next pass without its first `skipped` batches, as a training that goes on needs it.
-    pub fn batches(&self, skipped: usize) -> Batches<O> {
-        let mut order: Vec<usize> = self.range.clone().collect();
+impl<I: Send + Sync + 'static> Loader<I> {
+    /// The next pass without its first `skipped` batches.
+    pub fn batches(&self, skipped: usize) -> Batches<I> {
+        let mut order: Vec<usize> = (0..self.dataset.len()).collect();
         if let Some(seed) = self.shuffle {
             let pass = self.passes.fetch_add(1, Ordering::Relaxed);
             order.shuffle(&mut stream(&format!("order/{seed}/{pass}")));
@@ -144,100 +115,70 @@ impl<I: Send + Sync + 'static, O: Send + 'static> Loader<I, O> {
         order.drain(..(skipped * self.batch).min(order.len()));
         let order = Arc::new(order);
         let turns = Arc::new(Turns::default());
-        let (sender, made) = channel();
-        let ahead = self.workers + self.prefetch;
+        let (sender, loaded) = channel();
+        let (batch, ahead) = (self.batch, self.workers + self.prefetch);
         let workers = (0..self.workers)
             .map(|worker| {
                 let (turns, order, sender) = (turns.clone(), order.clone(), sender.clone());
-                let (dataset, batcher) = (self.dataset.clone(), self.batcher.clone());
-                let (batch, device) = (self.batch, self.device.clone());
-                let work = move || work(&turns, &order, batch, ahead, &*dataset, &*batcher, &device, &sender);
+                let dataset = self.dataset.clone();
+                let work = move || work(&turns, &order, batch, ahead, &*dataset, &sender);
                 Builder::new().name(format!("loader-{worker}")).spawn(work).expect("a thread starts")
             })
             .collect();
         let items = order.len();
-        Batches { turns, made, early: BTreeMap::new(), workers, batch: self.batch, items, taken: 0 }
+        Batches { turns, loaded, early: BTreeMap::new(), workers, batch, items, taken: 0 }
     }
 }
 
-#[allow(clippy::too_many_arguments, reason = "a thread's whole world")]
-fn work<I, O>(
+fn work<I>(
     turns: &Turns,
     order: &[usize],
     batch: usize,
     ahead: usize,
     dataset: &dyn Dataset<I>,
-    batcher: &dyn Batcher<I, O>,
-    device: &Device,
-    sender: &Sender<(usize, Made<O>)>,
+    sender: &Sender<(usize, Loaded<I>)>,
 ) {
     while let Some(claimed) = turns.claim(order.len().div_ceil(batch), ahead) {
         let rows: Vec<usize> = order[claimed * batch..].iter().take(batch).copied().collect();
         let named = format!("a loader's worker panicked, at samples {rows:?}");
-        let make = || dataset.get_many(rows).map(|items| batcher.batch(items, device));
-        // A worker that dies would leave the consumer waiting for ever.
-        let made = catch_unwind(AssertUnwindSafe(make))
+        // Without its answer the consumer would wait for ever.
+        let loaded = catch_unwind(AssertUnwindSafe(|| dataset.get_many(rows)))
             .unwrap_or_else(|_| Err(DatasetError::new(std::io::Error::other(named))));
-        if sender.send((claimed, made)).is_err() {
+        if sender.send((claimed, loaded)).is_err() {
             return;
         }
     }
 }
 
-impl<O> Iterator for Batches<O> {
-    type Item = Made<O>;
+impl<I> Iterator for Batches<I> {
+    type Item = Loaded<I>;
 
-    fn next(&mut self) -> Option<Made<O>> {
+    fn next(&mut self) -> Option<Loaded<I>> {
         if self.taken * self.batch >= self.items {
             return None;
         }
-        let made = loop {
-            if let Some(made) = self.early.remove(&self.taken) {
-                break made;
+        let loaded = loop {
+            if let Some(loaded) = self.early.remove(&self.taken) {
+                break loaded;
             }
-            let (place, made) = self.made.recv().ok()?;
-            self.early.insert(place, made);
+            let (place, loaded) = self.loaded.recv().ok()?;
+            self.early.insert(place, loaded);
         };
         self.taken += 1;
         self.turns.lock().taken = self.taken;
         self.turns.moved.notify_all();
-        Some(made)
+        Some(loaded)
     }
 }
 
-impl<O> DataLoaderIterator<O> for Batches<O> {
-    fn progress(&self) -> Progress {
-        Progress::new((self.taken * self.batch).min(self.items), self.items, Some("items".to_owned()))
-    }
-}
-
-impl<O> Drop for Batches<O> {
+impl<I> Drop for Batches<I> {
     fn drop(&mut self) {
         self.turns.lock().stop = true;
         self.turns.moved.notify_all();
         for worker in self.workers.drain(..) {
-            // Its panics were caught.
+            // Panics of its items were caught.
             let _ = worker.join();
         }
-    }
-}
-
-impl<I: Send + Sync + 'static, O: Send + 'static> DataLoader<O> for Loader<I, O> {
-    fn iter<'a>(&'a self) -> Box<dyn DataLoaderIterator<O> + 'a> {
-        Box::new(self.batches(0))
-    }
-
-    fn num_items(&self) -> usize {
-        self.range.len()
-    }
-
-    fn to_device(&self, device: &Device) -> Arc<dyn DataLoader<O>> {
-        Arc::new(self.with(device, self.range.clone()))
-    }
-
-    fn slice(&self, start: usize, end: usize) -> Arc<dyn DataLoader<O>> {
-        let at = |place: usize| (self.range.start + place).min(self.range.end);
-        Arc::new(self.with(&self.device, at(start)..at(end)))
     }
 }
 
@@ -248,7 +189,7 @@ mod tests {
 
     use super::*;
 
-    /// Numbers; some are broken.
+    /// Numbers, one of which may be broken.
     struct Numbers {
         count: usize,
         broken: Option<usize>,
@@ -282,46 +223,32 @@ mod tests {
         }
     }
 
-    struct Together;
-
-    impl Batcher<Held, Vec<Held>> for Together {
-        fn batch(&self, items: Vec<Held>, _device: &Device) -> Vec<Held> {
-            items
-        }
-    }
-
-    fn loader(
-        count: usize,
-        workers: usize,
-        broken: Option<usize>,
-    ) -> (Loader<Held, Vec<Held>>, Arc<AtomicUsize>) {
+    fn loader(count: usize, workers: usize, broken: Option<usize>) -> (Loader<Held>, Arc<AtomicUsize>) {
         let most = Arc::new(AtomicUsize::new(0));
         let numbers = Numbers { count, broken, alive: Arc::default(), most: most.clone() };
-        (Loader::new(numbers, Together, 4, workers, 2, &Device::flex()), most)
+        (Loader::new(numbers, 4, workers, 2), most)
     }
 
-    fn order(loader: &dyn DataLoader<Vec<Held>>) -> Vec<usize> {
-        loader.iter().flat_map(|batch| batch.expect("whole")).map(|held| held.0).collect()
+    fn order(batches: Batches<Held>) -> Vec<usize> {
+        batches.flat_map(|batch| batch.expect("whole")).map(|held| held.0).collect()
     }
 
     #[test]
-    fn batches_come_in_order_whatever_the_workers() {
+    fn the_order_of_batches_does_not_depend_on_the_workers() {
         for workers in [1, 2, 5] {
             let (loader, _) = loader(103, workers, None);
-            assert_eq!(order(&loader), (0..103).collect::<Vec<_>>());
-            assert_eq!(order(&*loader.slice(10, 20)), (10..20).collect::<Vec<_>>());
+            assert_eq!(order(loader.batches(0)), (0..103).collect::<Vec<_>>());
         }
         let shuffled = |workers: usize| {
             let loader = loader(50, workers, None).0.shuffled(7);
-            [order(&loader), order(&loader)]
+            [order(loader.batches(0)), order(loader.batches(0))]
         };
         let [first, second] = shuffled(1);
         let later = loader(50, 2, None).0.shuffled(7).from_pass(1);
-        assert_eq!(order(&later), second);
+        assert_eq!(order(later.batches(0)), second);
         // In the middle of a pass, too.
         let rest = loader(50, 3, None).0.shuffled(7).from_pass(1).batches(5);
-        let rest: Vec<usize> = rest.flat_map(|batch| batch.expect("whole")).map(|held| held.0).collect();
-        assert_eq!(rest, second[20..]);
+        assert_eq!(order(rest), second[20..]);
         assert_eq!(loader(50, 2, None).0.batches(13).count(), 0);
         assert_eq!([first.clone(), second.clone()], shuffled(3));
         assert_ne!(first, second);
@@ -331,13 +258,13 @@ mod tests {
     }
 
     #[test]
-    fn no_more_items_are_alive_than_was_asked_for() {
+    fn the_number_of_loaded_items_is_bounded() {
         let (loader, most) = loader(400, 3, None);
-        for batch in loader.iter() {
+        for batch in loader.batches(0) {
             std::thread::sleep(Duration::from_millis(1));
             drop(batch);
         }
-        // Batches of 4: three in the making, two ready, one taken.
+        // Batches of 4: three that are being loaded, two loaded, one taken.
         let most = most.load(Ordering::SeqCst);
         assert!(most <= 4 * 6, "{most}");
     }
@@ -345,14 +272,14 @@ mod tests {
     #[test]
     fn errors_and_panics_reach_the_consumer_and_the_rest_goes_on() {
         let (loader, _) = loader(40, 2, Some(9));
-        let results: Vec<_> = loader.iter().collect();
+        let results: Vec<_> = loader.batches(0).collect();
         assert_eq!(results.len(), 10);
         assert_eq!(results[2].as_ref().expect_err("broken").to_string(), "item 9 is broken");
         assert_eq!(results.iter().filter(|r| r.is_err()).count(), 1);
         let (loader, _) = self::loader(40, 2, Some(1009));
-        let results: Vec<_> = loader.iter().collect();
+        let results: Vec<_> = loader.batches(0).collect();
         assert!(results[2].as_ref().expect_err("panicked").to_string().contains("panicked"));
-        // Left early, the workers end as well.
-        drop(loader.iter().next());
+        // Workers of a dropped iterator end as well.
+        drop(loader.batches(0).next());
     }
 }

@@ -1,5 +1,4 @@
-//! Training samples: Burn data sets of stage 1 and stage 2, their batches, and a loader
-//! (docs/method.md, "Samples").
+//! Training samples: Burn data sets of both stages, batches, and a loader (docs/method.md, "Samples").
 
 mod augment;
 mod handling;
@@ -30,7 +29,7 @@ pub use loader::{Batches, Loader};
 use snapsnap_base::FileError;
 use snapsnap_base::random::stream;
 pub use stage1::{Stage1, Stage1Batch, Stage1Batcher, Stage1Item};
-pub use stage2::{Stage2, Stage2Batch, Stage2Batcher, Stage2Item};
+pub use stage2::{Stage2, Stage2Item};
 pub use test_set::{Test, TestItem};
 
 /// Coverage from which a pixel belongs to the person, in 8 bits.
@@ -48,7 +47,7 @@ pub struct SampleConfig {
     /// How far from the subject's own front, in degrees, the front photograph may be taken; 180: from anywhere.
     pub front_within_degrees: f32,
     /// Stage 2: random views to be compared, beside the two side views.
-    pub supervision: usize,
+    pub random_targets: usize,
     /// Stage 2: compare at twice the side, where the data set has it.
     pub high_resolution: bool,
     /// Stage 2: also the points that four views see, for the point loss.
@@ -72,7 +71,7 @@ impl Default for SampleConfig {
             compat: false,
             repeat: 50,
             front_within_degrees: 180.0,
-            supervision: 3,
+            random_targets: 3,
             high_resolution: false,
             points: false,
             placed_share: 0.0,
@@ -101,8 +100,8 @@ impl SampleConfig {
         if self.compat && self.front_within_degrees != 180.0 {
             return Some(("front_within_degrees".into(), "must be 180 beside `compat = true`".into()));
         }
-        if self.supervision > 64 {
-            return Some(("supervision".into(), format!("is {}, must be 0 to 64", self.supervision)));
+        if self.random_targets > 64 {
+            return Some(("random_targets".into(), format!("is {}, must be 0 to 64", self.random_targets)));
         }
         if self.compat && self.augment != Augment::none() {
             return Some(("augment".into(), "must be off beside `compat = true`".into()));

@@ -2,14 +2,12 @@
 
 use std::sync::Arc;
 
-use burn::data::dataloader::batcher::Batcher;
 use burn::data::dataset::{Dataset, DatasetError};
-use burn::tensor::{Device, Tensor};
 use rand::Rng;
 use snapsnap_splat::Camera;
 
 use super::place::Four;
-use super::{SampleConfig, Source, together};
+use super::{SampleConfig, Source};
 use crate::dataset::{Folder, Layout, Split};
 use snapsnap_base::FileError;
 
@@ -49,25 +47,6 @@ pub struct Stage2Item {
     pub background: [f32; 3],
 }
 
-/// A batch of B samples on a device; cameras stay on the host.
-#[derive(Debug, Clone)]
-pub struct Stage2Batch {
-    /// `[B,2,3,H,W]`.
-    pub images: Tensor<5>,
-    /// `[B,2,H,W]`.
-    pub masks: Tensor<4>,
-    /// Front, back, right and left of each sample.
-    pub cameras: Vec<[Camera; 4]>,
-    /// `[B,V,3,h,w]`.
-    pub targets: Tensor<5>,
-    /// `[B,V,h,w]` share of the person.
-    pub target_masks: Tensor<4>,
-    /// V cameras of each sample.
-    pub target_cameras: Vec<Vec<Camera>>,
-    /// Colour behind each sample.
-    pub backgrounds: Vec<[f32; 3]>,
-}
-
 impl Stage2 {
     /// The samples of a split.
     ///
@@ -103,7 +82,8 @@ impl Stage2 {
         let order = [front, back, right, left];
         let camera = |view: usize| folder.camera(*split, subject, view).map(|stored| source.camera(&stored));
         let mut cameras = [camera(front)?, camera(back)?, camera(right)?, camera(left)?];
-        let random_views = (0..config.supervision).map(|_| random.random_range(0..count)).collect::<Vec<_>>();
+        let random_views =
+            (0..config.random_targets).map(|_| random.random_range(0..count)).collect::<Vec<_>>();
         let background =
             if config.augment.background_color { [(); 3].map(|()| random.random()) } else { [0.0; 3] };
         let scale = if config.high_resolution { 2 } else { 1 };
@@ -156,31 +136,5 @@ impl Dataset<Stage2Item> for Stage2 {
 
     fn len(&self) -> usize {
         self.0.len()
-    }
-}
-
-/// Puts samples together.
-#[derive(Debug, Clone, Copy)]
-pub struct Stage2Batcher;
-
-impl Batcher<Stage2Item, Stage2Batch> for Stage2Batcher {
-    fn batch(&self, items: Vec<Stage2Item>, device: &Device) -> Stage2Batch {
-        let b = items.len();
-        let (side, target_side) = items.first().map_or((0, 0), |item| (item.side, item.target_side));
-        let views = items.first().map_or(0, |item| item.target_cameras.len());
-        Stage2Batch {
-            images: together(&items, |item| &item.images, [b, 2, 3, side, side], device),
-            masks: together(&items, |item| &item.masks, [b, 2, side, side], device),
-            targets: together(&items, |item| &item.targets, [b, views, 3, target_side, target_side], device),
-            target_masks: together(
-                &items,
-                |item| &item.target_masks,
-                [b, views, target_side, target_side],
-                device,
-            ),
-            cameras: items.iter().map(|item| item.cameras).collect(),
-            backgrounds: items.iter().map(|item| item.background).collect(),
-            target_cameras: items.into_iter().map(|item| item.target_cameras).collect(),
-        }
     }
 }

@@ -7,8 +7,6 @@ mod backward;
 mod forward;
 mod layout;
 #[cfg(test)]
-mod reference;
-#[cfg(test)]
 mod tests;
 
 pub use backward::Gradients;

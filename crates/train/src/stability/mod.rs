@@ -46,7 +46,7 @@ start = "geometric"
 [mode]
 compat = false
 [samples]
-supervision = 1
+random_targets = 1
 [training]
 steps = 24
 batch = 2

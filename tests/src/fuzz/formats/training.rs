@@ -14,7 +14,7 @@ folders = ["in/set"]
 
 [samples]
 repeat = 2
-supervision = 1
+random_targets = 1
 front_within_degrees = 180.0
 
 [samples.augment]
@@ -82,7 +82,7 @@ pub const FORMATS: &[Format] = &[
         name: "train-config-stage2",
         command: "train-stage2 --config in/t.toml --weights in/w.safetensors --device cpu --dry-run \
                   --set training.batch=1 --set training.accumulate=1 --set training.workers=1 \
-                  --set training.validation_samples=1 --set samples.supervision=1",
+                  --set training.validation_samples=1 --set samples.random_targets=1",
         ..REHEARSAL
     },
 ];

@@ -11,7 +11,7 @@ use crate::say;
 
 #[derive(Args)]
 pub struct Arguments {
-    /// Folder of the data set: ours, or one that the authors' tools wrote.
+    /// Folder of the data set, in this program's layout or in that of the authors' tools.
     dataset: PathBuf,
 }
 

@@ -10,7 +10,7 @@ use crate::failure::Failure;
 
 #[derive(Args)]
 pub struct Arguments {
-    /// MakeHuman's folder `data`, or a checkout that has it.
+    /// MakeHuman's folder `data`, or a checkout that contains it.
     folder: PathBuf,
     #[command(flatten)]
     common: Common,

@@ -1,4 +1,4 @@
-//! `snapsnap prepare`: people, from files or generated, become data sets.
+//! `snapsnap prepare`: renders data sets of scanned or generated people.
 
 mod check;
 mod makehuman;
@@ -27,7 +27,7 @@ use crate::{output, say};
 
 /// Name of the config in force, beside the data.
 const CONFIG: &str = "prepare.config.toml";
-/// Most people of one call: subjects have four digits, or a few more.
+/// Most people of one call.
 const MAX_SUBJECTS: usize = 1_000_000;
 
 #[derive(Args)]
@@ -43,7 +43,7 @@ enum Kind {
         after_help = "Example: snapsnap prepare scan path/to/scans --split train --config configs/data/small.toml -o people/scans"
     )]
     Scan(scan::Arguments),
-    /// Make people of simple shapes, with cloth full of detail.
+    /// Make people of simple shapes in clothes with fine patterns.
     #[command(
         after_help = "Example: snapsnap prepare synth --subjects 300 --seed 1 --config configs/data/small.toml -o people/synth"
     )]
@@ -53,7 +53,7 @@ enum Kind {
         after_help = "Example: snapsnap prepare makehuman path/to/makehuman/data --subjects 300 --seed 2 -o people/makehuman"
     )]
     Makehuman(makehuman::Arguments),
-    /// List what is wrong with a data set.
+    /// List the faults of a data set.
     #[command(after_help = "Example: snapsnap prepare check people/synth")]
     Check(check::Arguments),
 }
@@ -69,11 +69,11 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
 
 #[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum SplitArgument {
-    /// To learn from.
+    /// For training.
     Train,
-    /// To choose among what was learned.
+    /// For the choice of the best weights.
     Val,
-    /// To report on.
+    /// For reports.
     Test,
 }
 
@@ -87,10 +87,10 @@ impl From<SplitArgument> for Split {
     }
 }
 
-/// What every way of making a data set is told.
+/// Options of all commands that make a data set.
 #[derive(Args)]
 struct Common {
-    /// Folder of the data set; subjects that are there already are kept.
+    /// Folder of the data set. Subjects that it contains already are kept.
     #[arg(short, long, value_name = "DATASET")]
     output: PathBuf,
     /// Views and cameras, as in configs/data [default: 24 views of 1024 pixels, lossless].
@@ -99,19 +99,19 @@ struct Common {
     /// Override one config key; may be repeated.
     #[arg(long, value_name = "SECTION.KEY=VALUE")]
     set: Vec<String>,
-    /// Decides everything that is random.
+    /// Seed of everything that is random.
     #[arg(long, default_value_t = 1)]
     seed: u64,
     /// Only every n-th subject, from the i-th (counted from 0): to share the work among machines.
     #[arg(long, value_name = "i/n", default_value = "0/1")]
     shard: Shard,
-    /// Also put front, back and side of the first subjects into one picture.
+    /// Also write one picture of the first subjects' front, back and side.
     #[arg(long, value_name = "SHEET.png")]
     preview: Option<PathBuf>,
 }
 
 impl Common {
-    /// Where a subject's pictures are, or would be.
+    /// Folder of a subject's pictures.
     fn pictures(&self, split: Split, subject: &str) -> PathBuf {
         self.output.join(split.name()).join("img").join(subject)
     }
@@ -124,7 +124,7 @@ impl Common {
     }
 }
 
-/// Refuses a sheet that is no PNG, or lies where it might replace what is worked on.
+/// Refuses a sheet that is no PNG, or that lies in the data set or in its source.
 fn check_preview(sheet: &Path, common: &Common, inputs: &[&Path]) -> Result<(), Failure> {
     let wrong = |problem: &str| Err(Failure::Input(format!("--preview {}: {problem}", sheet.display())));
     if !sheet.extension().is_some_and(|e| e.eq_ignore_ascii_case("png")) {
@@ -134,7 +134,7 @@ fn check_preview(sheet: &Path, common: &Common, inputs: &[&Path]) -> Result<(), 
     let folder = sheet.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let folder = folder.canonicalize().unwrap_or_else(|_| folder.to_owned());
     for taken in inputs.iter().copied().chain([common.output.as_path()]) {
-        // Beside a scan lie its materials and textures.
+        // The folder of a scan contains its materials and textures.
         let taken = if taken.is_file() { taken.parent().unwrap_or(taken) } else { taken };
         let taken = if taken.as_os_str().is_empty() { Path::new(".") } else { taken };
         if taken.canonicalize().is_ok_and(|taken| taken.is_dir() && folder.starts_with(taken)) {
@@ -149,20 +149,20 @@ struct Work {
     split: Split,
     /// Its name in the data set.
     subject: String,
-    /// Its name among all subjects that were ever made: what is random about it follows from this.
+    /// Its name among the subjects of all data sets. It seeds everything that is random about the subject.
     identity: String,
 }
 
 /// A subject, standing at the origin.
 struct Person {
     mesh: Mesh,
-    /// Where it faces, degrees around y.
+    /// Direction in which it faces, degrees around y.
     yaw_degrees: f64,
-    /// What it was made of.
+    /// Its source.
     origin: PathBuf,
 }
 
-/// Makes this shard's subjects, those that are not there yet. What cannot be made is reported and left out.
+/// Makes this shard's missing subjects. A subject that cannot be made is reported and left out.
 fn make(
     common: &Common,
     quiet: bool,
@@ -200,9 +200,9 @@ fn make(
         match made {
             Ok(Made::Whole) => {}
             Ok(Made::Elsewhere) => elsewhere += 1,
-            // The program is being ended: it stops here, without a word about the subject.
+            // The program is ending. The subject's error is no fault of the subject.
             Err(_) if file::is_ending() => std::thread::sleep(Duration::from_secs(60)),
-            // Nothing more can be written: to go on would only repeat it.
+            // The next subjects could not be written either.
             Err(e @ FileError::Write { .. }) => return Err(e.into()),
             Err(e) => {
                 failed += 1;
@@ -232,21 +232,21 @@ fn make(
     Ok(())
 }
 
-/// What the makers of people are told beside it.
+/// Options of the commands that generate people.
 #[derive(Args)]
 struct Generate {
-    /// How many people.
+    /// Number of people.
     #[arg(long, value_name = "N", default_value_t = 100)]
     subjects: usize,
-    /// What they are for; the people of one split are never those of another.
+    /// Split of the people. Different splits have different people.
     #[arg(long, value_enum, default_value = "train")]
     split: SplitArgument,
-    /// Also keep each person as a scan, OBJ with texture, in scans/SPLIT/ID below the data set.
+    /// Also write each person as a scan, OBJ with texture, to scans/SPLIT/ID in the data set.
     #[arg(long)]
     save_scans: bool,
 }
 
-/// Makes people by their names.
+/// Generates people from their names.
 fn generate(
     common: &Common,
     generate: &Generate,
@@ -272,7 +272,7 @@ fn generate(
         let Work { split, subject, .. } = work;
         common.output.join("scans").join(split.name()).join(subject).join(format!("{subject}.obj"))
     };
-    // What is there may have been changed by hand.
+    // A scan that exists may have been edited.
     let is_due = |work: &Work| generate.save_scans && !scan(work).exists();
     let made = make(common, quiet, &source, inputs, &works, |_, work| {
         let mut mesh = person(&work.identity)?;
@@ -282,7 +282,7 @@ fn generate(
         place(&mut mesh, work, Collection::Other, &common.output)?;
         Ok(Person { mesh, yaw_degrees: 0.0, origin: common.output.clone() })
     });
-    // Subjects that were there before, without their scans.
+    // Older subjects without scans.
     let there = |work: &Work| common.pictures(work.split, &work.subject).is_dir();
     let mine = works
         .iter()
@@ -301,10 +301,9 @@ fn generate(
     made
 }
 
-/// Stands the mesh up for the cameras; training subjects not quite in the middle, as their names decide.
+/// Normalises the mesh for the cameras. Training subjects get a random offset, seeded by their names.
 fn place(mesh: &mut Mesh, work: &Work, collection: Collection, origin: &Path) -> Result<(), FileError> {
     let mut random = stream(&format!("place/{}", work.identity));
     let jitter = (work.split == Split::Train).then_some(&mut random);
-    normalise(mesh, collection, jitter)
-        .map_err(|e| FileError::Unsuitable { path: origin.to_owned(), message: e.to_string() })
+    normalise(mesh, collection, jitter).map_err(|e| FileError::unsuitable(origin, e))
 }

@@ -1,4 +1,4 @@
-//! A sheet of subjects, each from the front, the back and a side.
+//! A sheet of subjects, each seen from the front, the back and a side.
 
 use std::path::Path;
 
@@ -10,14 +10,14 @@ use crate::pictures::{sheet, write_png};
 
 /// Side of a subject's picture in pixels.
 const SIDE: u32 = 192;
-/// Most subjects on a sheet.
+/// Largest number of subjects on a sheet.
 const MOST: usize = 48;
 /// Pictures in a row: three subjects.
 const COLUMNS: u32 = 9;
 /// Colour of the background.
 const BACKGROUND: [u8; 3] = [235; 3];
 
-/// Writes the sheet of the first of these subjects, of which there is one at least.
+/// Writes a sheet of the first of these subjects. There must be at least one.
 pub fn write(path: &Path, folder: &Folder, subjects: &[(Split, &str)]) -> Result<(), Failure> {
     let views = folder.description().views;
     let mut pictures = Vec::new();
@@ -30,14 +30,14 @@ pub fn write(path: &Path, folder: &Folder, subjects: &[(Split, &str)]) -> Result
     write_png(path, &sheet(&pictures, COLUMNS.min(pictures.len() as u32)))
 }
 
-/// On the background, smaller, without the margin around.
+/// The view over the background colour, without its margin, resized to the sheet's pictures.
 fn shrink(color: &RgbImage, mask: &image::GrayImage) -> RgbImage {
     let over = RgbImage::from_fn(color.width(), color.height(), |x, y| {
         let (c, a) = (color.get_pixel(x, y).0, u32::from(mask.get_pixel(x, y).0[0]));
         let mix = |i: usize| (u32::from(c[i]) * a + u32::from(BACKGROUND[i]) * (255 - a)).div_ceil(255) as u8;
         image::Rgb([mix(0), mix(1), mix(2)])
     });
-    // With the published cameras people reach from row 124 to 863 of 1024, and as far aside with their arms.
+    // With the published cameras people cover rows 124 to 863 of 1024. Their arms need as many columns.
     let side = SIDE * 16 / 14;
     let small = imageops::resize(&over, side, side, imageops::FilterType::Triangle);
     imageops::crop_imm(&small, (side - SIDE) / 2, (side - SIDE) / 2, SIDE, SIDE).to_image()

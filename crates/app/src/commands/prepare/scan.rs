@@ -16,10 +16,10 @@ use crate::say;
 
 #[derive(Clone, Copy, ValueEnum)]
 enum CollectionArgument {
-    /// Subjects 0 to 525; those of the published list become val.
+    /// Subjects 0 to 525. Subjects of the published validation list become val.
     #[value(name = "thuman2.0")]
     Thuman20,
-    /// THuman2.0 and what was added; the published loose subjects become test.
+    /// THuman2.0 and the subjects from 526 on. The published subjects in loose clothes become test.
     #[value(name = "thuman2.1")]
     Thuman21,
     #[value(name = "customhumans")]
@@ -51,17 +51,17 @@ pub struct Arguments {
     source: PathBuf,
     #[command(flatten)]
     common: Common,
-    /// The set that the scans come from, for its axes, places and lists of subjects.
+    /// Collection of the scans. It decides axes, positions and splits.
     #[arg(long, value_enum, default_value = "other")]
     collection: CollectionArgument,
-    /// Folder of SMPL-X parameters, ID/smplx_param.pkl or ID.pkl or .json, that say which way each subject faces; without
-    /// it they are looked for beside each scan.
+    /// Folder of SMPL-X parameters (ID/smplx_param.pkl, ID.pkl or .json), which contain the direction that a subject faces
+    /// [default: the scan's folder].
     #[arg(long, value_name = "DIR")]
     smplx: Option<PathBuf>,
-    /// Put all subjects there [default: as the set's published lists say; the first 100 of 2K2K and all of 4D-Dress test, others train].
+    /// Split of all subjects [default: the published lists; the first 100 of 2K2K and all of 4D-Dress test, others train].
     #[arg(long, value_enum)]
     split: Option<SplitArgument>,
-    /// Leave out the subjects of the other splits.
+    /// Leave out the subjects of other splits.
     #[arg(long, value_enum, value_name = "SPLIT", conflicts_with = "split")]
     only: Option<SplitArgument>,
 }
@@ -82,8 +82,8 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
         .filter(|(_, work)| only.is_none_or(|only| work.split == only))
         .unzip();
     if works.is_empty() {
-        let message = "none of its scans is in the split that --only names".to_owned();
-        return Err(FileError::Unsuitable { path: arguments.source.clone(), message }.into());
+        let message = "none of its scans is in the split that --only names";
+        return Err(FileError::unsuitable(&arguments.source, message).into());
     }
     let description = describe(arguments);
     let mut inputs = vec![arguments.source.as_path()];
@@ -91,11 +91,11 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let unknown = Cell::new(0);
     let made = make(&arguments.common, quiet, &description, &inputs, &works, |place, work| {
         let path = &sources[place].path;
-        // A person in two splits would be tested on after having been learned.
+        // A test of a person who was trained on would not be fair.
         let is_in = |split: Split| arguments.common.pictures(split, &work.subject).exists();
         if let Some(other) = Split::ALL.into_iter().find(|other| *other != work.split && is_in(*other)) {
             let message = format!("subject {} is in {other} already", work.subject);
-            return Err(FileError::Unsuitable { path: path.clone(), message });
+            return Err(FileError::unsuitable(path, message));
         }
         let collection = collection.of(&work.subject);
         let parameters = parameters(path, &work.subject, arguments.smplx.as_deref())?;
@@ -113,16 +113,16 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     });
     if unknown.get() > 0 {
         say::err(&format!(
-            "{} subjects have no SMPL-X parameters and were taken to face +z; with --smplx make them anew, in another folder",
+            "{} subjects have no SMPL-X parameters and are assumed to face +z; with --smplx, make them again in another folder",
             unknown.get()
         ));
     }
     made
 }
 
-/// What the data set's description says of its source: all that decides what the subjects are.
+/// The source in the data set's description: everything on which the subjects depend.
 fn describe(arguments: &Arguments) -> String {
-    // Where the folder lies differs from machine to machine.
+    // Without the path, which differs from machine to machine.
     let path = arguments.source.canonicalize().unwrap_or_else(|_| arguments.source.clone());
     let name = path.file_name().unwrap_or_default().to_string_lossy();
     let collection =
@@ -131,7 +131,7 @@ fn describe(arguments: &Arguments) -> String {
     format!("scans of {name} ({collection}{smplx}), seed {}", arguments.common.seed)
 }
 
-/// The subject's SMPL-X parameters; an error if a folder of them was named and has none.
+/// Path of the subject's SMPL-X parameters. It is an error if `folder` is given and has none.
 fn parameters(scan: &Path, subject: &str, folder: Option<&Path>) -> Result<Option<PathBuf>, FileError> {
     let stem = scan.file_stem().unwrap_or_default();
     let names = [stem.to_string_lossy().into_owned(), subject.to_owned()];
@@ -149,10 +149,9 @@ fn parameters(scan: &Path, subject: &str, folder: Option<&Path>) -> Result<Optio
     }
     let found = candidates.into_iter().find(|path| path.is_file());
     match (folder, &found) {
-        (Some(folder), None) => Err(FileError::Unsuitable {
-            path: folder.to_owned(),
-            message: format!("has no SMPL-X parameters of subject {subject}"),
-        }),
+        (Some(folder), None) => {
+            Err(FileError::unsuitable(folder, format!("has no SMPL-X parameters of subject {subject}")))
+        }
         _ => Ok(found),
     }
 }

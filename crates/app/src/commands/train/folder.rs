@@ -1,9 +1,10 @@
-//! The folder of a run: who may write into it, and the config that it was begun with.
+//! The folder of a run: its lock and its config.
 
 use std::fs::{self, File, OpenOptions, TryLockError};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use snapsnap_base::config::Schema;
 use snapsnap_data::dataset::Folder;
 use snapsnap_train::config::TrainConfig;
 use snapsnap_train::run::{BEST, CONFIG, LAST, STATE};
@@ -11,9 +12,8 @@ use snapsnap_train::run::{BEST, CONFIG, LAST, STATE};
 use super::super::outside_data;
 use super::Arguments;
 use crate::failure::Failure;
-use snapsnap_base::config::Schema;
 
-/// The config of a run: of --config, or of the run that goes on, with what the command line says on top.
+/// The config of a run: the file --config, or the config of the run that is continued, under the options of the command line.
 pub fn config(arguments: &Arguments) -> Result<TrainConfig, Failure> {
     let own = arguments.output.as_ref().map(|run| run.join(CONFIG));
     let path = match (&arguments.config, own) {
@@ -21,16 +21,16 @@ pub fn config(arguments: &Arguments) -> Result<TrainConfig, Failure> {
         (None, Some(path)) => path,
         (None, None) => return Err(Failure::Input("give --config TOML".into())),
     };
-    let mut config = read(&path, &arguments.set)?;
+    let mut config = TrainConfig::from_file(&path, &arguments.set)?;
     if !arguments.data.is_empty() {
         config.data.folders.clone_from(&arguments.data);
     }
     if let Some(weights) = &arguments.weights {
-        config.training.start = Some(weights.clone());
+        config.training.weights = Some(weights.clone());
     }
-    // Whole paths: a run may go on from another folder.
+    // Absolute paths, since a run may be continued from another working directory.
     let lpips = config.stage2.lpips.iter_mut().flat_map(|lpips| &mut lpips.files);
-    let others = config.training.start.iter_mut().chain(&mut config.stage2.point_map_cache).chain(lpips);
+    let others = config.training.weights.iter_mut().chain(&mut config.stage2.point_map_cache).chain(lpips);
     let paths = config.data.folders.iter_mut().chain(others);
     for path in paths {
         *path = std::path::absolute(&*path).unwrap_or_else(|_| path.clone());
@@ -43,11 +43,7 @@ pub fn config(arguments: &Arguments) -> Result<TrainConfig, Failure> {
     Ok(config)
 }
 
-fn read(path: &Path, overrides: &[String]) -> Result<TrainConfig, Failure> {
-    Ok(TrainConfig::from_file(path, overrides)?)
-}
-
-/// The folder of a run, which nobody else writes into.
+/// The locked folder of a run.
 pub struct RunFolder {
     path: PathBuf,
     /// Locked until it is dropped.
@@ -55,10 +51,11 @@ pub struct RunFolder {
 }
 
 impl RunFolder {
-    /// Makes or enters the folder.
+    /// Makes or opens the folder, and locks it.
     ///
     /// # Errors
-    /// [`Failure::Input`] if it holds a run that is not to go on, one of other networks, or one that is under way.
+    /// [`Failure::Input`] if the folder contains a run that is not to be continued, one of other networks, or one that another
+    /// process is training.
     pub fn open(
         path: &Path,
         arguments: &Arguments,
@@ -71,7 +68,7 @@ impl RunFolder {
         let lock = path.join("lock");
         let file = OpenOptions::new().create(true).truncate(false).write(true).open(&lock);
         let file = file.map_err(|e| Failure::cannot_write(&lock, &e))?;
-        // Where the file system has no locks, nobody is kept out.
+        // Some file systems have no locks. The run goes on without one.
         if matches!(file.try_lock(), Err(TryLockError::WouldBlock)) {
             return Err(wrong("is being trained by another process"));
         }
@@ -79,20 +76,20 @@ impl RunFolder {
         let same = |a: &Path, b: &Path| super::super::is_same_file(a, b);
         if path.join(STATE).exists() {
             if !arguments.resume {
-                return Err(wrong("holds a run: add --resume to go on, or give another folder"));
+                return Err(wrong("contains a run: add --resume to continue it, or give another folder"));
             }
-            if read(&own, &[])?.networks() != config.networks() {
+            if TrainConfig::from_file(&own, &[])?.networks() != config.networks() {
                 return Err(wrong(
                     "was begun with other [network], [regressor] or [mode] sections (its config.toml): give \
                      another folder",
                 ));
             }
         } else {
-            // Of a run that never came to a checkpoint nothing is lost, unless it is what this one begins with.
+            // A run without a checkpoint may be replaced, unless the new run begins with one of its files.
             if own.exists() {
-                read(&own, &[]).map_err(|_| wrong("holds a config.toml of something else"))?;
+                TrainConfig::from_file(&own, &[])?;
             }
-            let start = config.training.start.as_deref().into_iter();
+            let start = config.training.weights.as_deref().into_iter();
             let lpips = config.stage2.lpips.iter().flat_map(|lpips| &lpips.files).map(PathBuf::as_path);
             let mut inputs = start.chain(arguments.config.as_deref()).chain(lpips);
             if let Some(input) =
@@ -106,7 +103,7 @@ impl RunFolder {
         Ok(Self { path: path.to_owned(), _lock: file })
     }
 
-    /// Where it is.
+    /// Its path.
     pub fn path(&self) -> &Path {
         &self.path
     }

@@ -28,44 +28,44 @@ use report::Reporter;
 
 #[derive(Args)]
 pub struct Arguments {
-    /// Networks, data and steps, as in configs/*/stage1.toml and stage2.toml; with --resume the run's own.
+    /// Networks, data and steps, as in configs/*/stage1.toml and stage2.toml [default with --resume: the run's config].
     #[arg(long, value_name = "TOML", required_unless_present = "resume")]
     config: Option<PathBuf>,
     /// Override one config key; may be repeated.
     #[arg(long, value_name = "SECTION.KEY=VALUE")]
     set: Vec<String>,
-    /// Data sets whose people are mixed [default: data.folders of the config].
+    /// Data sets; their people are mixed [default: data.folders of the config].
     #[arg(long, value_name = "DATASET", num_args = 1..)]
     data: Vec<PathBuf>,
     /// Folder of the run: its config, weights, state, logs and previews.
     #[arg(short, long, value_name = "RUN", required_unless_present = "dry_run")]
     output: Option<PathBuf>,
-    /// Weight file to begin with [default: training.start of the config; stage 1: random weights].
+    /// Weight file to begin with [default: training.weights of the config; stage 1: random weights].
     #[arg(long, value_name = "FILE")]
     weights: Option<PathBuf>,
-    /// End this session after so many minutes; --resume goes on.
+    /// End this session after so many minutes. --resume continues the run.
     #[arg(long, value_name = "M")]
     minutes: Option<f64>,
-    /// Go on where the run in this folder ended, or begin it.
+    /// Continue the run in this folder, or begin it.
     #[arg(long)]
     resume: bool,
-    /// Check config and data, make a few steps without writing anything, and say how long the run will take.
+    /// Check config and data, make a few steps without writing anything, and print how long the run will take.
     #[arg(long)]
     dry_run: bool,
-    /// auto, cpu, ndarray, wgpu, vulkan, cuda or metal; wgpu:1 is the second adapter. Several, with commas between them,
+    /// auto, cpu, ndarray, wgpu, vulkan, cuda or metal; wgpu:1 is the second adapter. Several devices, separated by commas,
     /// share every batch.
     #[arg(long, default_value = "auto")]
     device: String,
 }
 
 impl Arguments {
-    /// The run that goes on, if there is one.
+    /// The folder of the run that is continued, if there is one.
     fn begun(&self) -> Option<&Path> {
         self.output.as_deref().filter(|run| self.resume && run.join(STATE).exists())
     }
 }
 
-/// A training that can begin.
+/// A training with its data and devices.
 struct Plan<'a> {
     arguments: &'a Arguments,
     config: TrainConfig,
@@ -81,7 +81,7 @@ pub fn stage1(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     plan.check_validation(task.validation_samples());
     plan.run(&task, |tracked| {
         let networks = plan.config.networks();
-        // A run that goes on has its weights in its state.
+        // The state of a continued run contains its weights.
         let predictor = match plan.start().filter(|_| arguments.begun().is_none()) {
             Some(path) => open(path, &plan.config)?.point_predictor(tracked)?,
             None => random_predictor(&networks, plan.config.training.seed, tracked),
@@ -92,11 +92,11 @@ pub fn stage1(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
 
 pub fn stage2(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let plan = Plan::new(arguments, quiet)?;
-    // A run that goes on has its point predictor beside its state.
+    // The latest weights of a continued run contain its point predictor.
     let start = arguments.begun().map(|run| run.join(LAST)).or_else(|| plan.start().map(Path::to_owned));
     let Some(start) = start else {
         let message = "stage 2 needs a trained point predictor: give --weights FILE, as train-stage1 writes it, or \
-                       training.start in the config";
+                       training.weights in the config";
         return Err(Failure::Input(message.into()));
     };
     let weights = open(&start, &plan.config)?;
@@ -119,7 +119,7 @@ pub fn stage2(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     })
 }
 
-/// Opens the weights to begin with, which must fit the config.
+/// Opens the weights to begin with. They must fit the config.
 fn open(path: &Path, config: &TrainConfig) -> Result<WeightFile, Failure> {
     Ok(WeightFile::open(path, Some(config.networks()))?)
 }
@@ -132,7 +132,7 @@ impl<'a> Plan<'a> {
         let mut config = folder::config(arguments)?;
         if arguments.dry_run {
             config.stage2.point_map_cache = None;
-            // What counts late takes time and memory as well.
+            // The estimate includes the steps with the perceptual distance.
             config.stage2.lpips.iter_mut().for_each(|lpips| lpips.after = 0.0);
         }
         if config.data.folders.is_empty() {
@@ -159,13 +159,13 @@ impl<'a> Plan<'a> {
         for (name, device) in arguments.device.split(',').zip(&devices) {
             if !device.supports_dtype(precision.dtype()) {
                 let message = format!(
-                    "--device {name}: does not compute in {}, which training.precision asks for; f32 goes everywhere",
+                    "--device {name}: does not compute in {}: set training.precision to f32",
                     precision.name()
                 );
                 return Err(Failure::Input(message));
             }
         }
-        let tracked = |device: Device| match config.training.checkpointing {
+        let tracked = |device: Device| match config.training.gradient_checkpointing {
             true => device.autodiff().gradient_checkpointing(),
             false => device.autodiff(),
         };
@@ -176,14 +176,14 @@ impl<'a> Plan<'a> {
     fn check_validation(&self, samples: usize) {
         if samples == 0 && self.config.training.validation_samples > 0 && !self.quiet {
             say::err(
-                "note: no data set has people to validate on (split val): only the latest weights are kept",
+                "note: no data set has held-out people (split val) for validations: only the latest weights are kept",
             );
         }
     }
 
     /// Weights to begin with.
     fn start(&self) -> Option<&Path> {
-        self.config.training.start.as_deref()
+        self.config.training.weights.as_deref()
     }
 
     /// A rehearsal, or a session in the run's folder.
@@ -218,20 +218,20 @@ impl<'a> Plan<'a> {
     }
 }
 
-/// Bytes that a training takes at least: weights, gradients, two moments and averages, samples, and the last layers of the
-/// heads. What it really takes, --dry-run measures.
+/// Lower bound of a training's memory in bytes: weights, gradients, two moments and averages, samples, and the last layers
+/// of the heads. --dry-run measures the actual memory.
 fn least_memory(config: &TrainConfig) -> u64 {
     let (n, batch) = (&config.network, config.training.batch as u64);
     let parameters = schema::parameters(&config.networks(), Part::PointPredictor) as u64;
-    // Two photographs with masks, four maps of points and where they are valid; as they are loaded and as they are used.
+    // Two photographs with masks and four point maps with masks, each as loaded and as used.
     let sample = 2 * (2 * 4 + 4 * 4) * n.resolution.pow(2) as u64;
-    // A window of the canvas may be a tenth of it.
+    // A window may be as small as a tenth of the canvas.
     let share = if n.window { 10 } else { 1 };
     let heads = 4 * (2 * n.last_dim + n.feature_dim) as u64 * n.net_resolution.pow(2) as u64 / share;
     4 * (5 * parameters + batch * (sample + heads))
 }
 
-/// What a person wants to know and do next.
+/// Prints the outcome of a session and the next commands.
 fn summarise(stage: u32, folder: &Path, outcome: &Outcome, session: Duration) {
     let run = folder.display();
     let state = if outcome.finished { "finished" } else { "interrupted" };
@@ -254,7 +254,7 @@ fn summarise(stage: u32, folder: &Path, outcome: &Outcome, session: Duration) {
     };
     say::out(&format!("curves: {run}/curves.svg; TensorBoard: tensorboard --logdir {run}"));
     if !outcome.finished {
-        say::out(&format!("go on:   snapsnap train-stage{stage} --resume -o {run}"));
+        say::out(&format!("resume:  snapsnap train-stage{stage} --resume -o {run}"));
     }
     let next = match stage {
         1 => format!("snapsnap train-stage2 --config CONFIG --weights {run}/{weights} -o RUN2"),

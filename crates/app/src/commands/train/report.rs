@@ -1,4 +1,4 @@
-//! What a person sees of a training.
+//! Progress of a training on the terminal.
 
 use std::io::IsTerminal;
 use std::time::{Duration, Instant};
@@ -15,13 +15,13 @@ use crate::{device, memory, say};
 /// Seconds between two plain lines.
 const PAUSE: Duration = Duration::from_secs(10);
 
-/// A bar on a terminal, plain lines elsewhere, nothing with --quiet.
+/// Prints a bar on a terminal, plain lines elsewhere, and nothing with --quiet.
 pub struct Reporter {
     bar: Option<ProgressBar>,
     quiet: bool,
     start: Instant,
     limit: Option<Duration>,
-    /// Steps before this session, once known.
+    /// The first step that was logged.
     first: Option<u64>,
     printed: Option<Instant>,
 }
@@ -45,7 +45,7 @@ impl Reporter {
         }
     }
 
-    /// Until the end of the run, or of the session where that comes first.
+    /// Time until the end of the run or of the session, whichever is first.
     fn left(&self, line: &Line, steps: u64) -> String {
         let rate = line.values.get("steps_per_second").copied().unwrap_or_default();
         let run = (steps.saturating_sub(line.step)) as f64 / rate.max(1e-9);
@@ -63,7 +63,7 @@ impl Watch for Reporter {
             return;
         }
         let value = |name: &str| line.values.get(name).copied().unwrap_or_default();
-        /// What is not a part of the loss.
+        /// Values that are not parts of the loss.
         const OTHERS: [&str; 5] = ["loss", "norm", "rate", "samples_per_second", "steps_per_second"];
         let parts: Vec<String> = line
             .values
@@ -118,7 +118,7 @@ fn clock(seconds: f64) -> String {
     format!("{}:{:02}:{:02}", seconds / 3600, seconds / 60 % 60, seconds % 60)
 }
 
-/// Says what a run would take.
+/// Prints the time and memory that a run would take.
 pub fn rehearsed(config: &TrainConfig, on: &Device, rehearsal: Rehearsal) {
     let t = &config.training;
     let step = rehearsal.step.as_secs_f64();

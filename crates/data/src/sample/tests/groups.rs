@@ -45,7 +45,7 @@ fn sides_of_groups_are_seen_from_where_the_front_says() {
         assert!(seen > 100 && worst < 1e-3, "{seen} points, {worst} px");
     }
     assert!(fronts.iter().all(|first| [0, 4].contains(first)) && fronts.contains(&0) && fronts.contains(&4));
-    let stage2 = Stage2::new(folder.clone(), TRAIN, SampleConfig { supervision: 2, ..samples.clone() });
+    let stage2 = Stage2::new(folder.clone(), TRAIN, SampleConfig { random_targets: 2, ..samples.clone() });
     let item = stage2.expect("samples").sample(0).expect("a sample");
     let apart = item.cameras[2].centre() - item.cameras[0].turned(90.0).centre();
     assert!(apart.length() < 1e-9, "{apart}");

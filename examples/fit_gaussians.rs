@@ -1,0 +1,118 @@
+//! Gradient descent through the differentiable renderer: random Gaussians are fitted to pictures of a scene.
+//!
+//! ```sh
+//! cargo run --release --example fit_gaussians             # 300 steps, seconds on a CPU
+//! cargo run --release --example fit_gaussians -- 1000
+//! ```
+//!
+//! The pictures are renders of known Gaussians from eight cameras. A ninth camera measures the result from an unseen view.
+
+use std::error::Error;
+
+use burn::module::{Module, Param};
+use burn::optim::{AdamConfig, GradientsParams};
+use burn::tensor::activation::sigmoid;
+use burn::tensor::{Device, Distribution, Tensor};
+use snapsnap_splat::{Camera, Gaussians, RenderOptions, SplatError, render};
+
+/// Gaussians that are fitted.
+const COUNT: usize = 400;
+/// Gaussians of the scene.
+const TRUE_COUNT: usize = 60;
+/// Side of the pictures in pixels.
+const SIZE: u32 = 64;
+const VIEWS: usize = 8;
+/// Views that a step compares.
+const BATCH: usize = 2;
+
+/// Uniformly random values.
+fn uniform(size: [usize; 2], low: f64, high: f64, device: &Device) -> Tensor<2> {
+    Tensor::random(size, Distribution::Uniform(low, high), device)
+}
+
+/// The point that all cameras look at, metres: `[1, 3]`.
+fn centre(device: &Device) -> Tensor<2> {
+    Tensor::from_floats([[0.0, 0.85, 0.0]], device)
+}
+
+/// Coloured blobs in a cube of 0.8 m.
+fn scene(device: &Device) -> Result<Gaussians, SplatError> {
+    Gaussians::new(
+        uniform([TRUE_COUNT, 3], -0.4, 0.4, device) + centre(device),
+        uniform([TRUE_COUNT, 4], -1.0, 1.0, device),
+        uniform([TRUE_COUNT, 3], 0.04, 0.12, device),
+        Tensor::full([TRUE_COUNT], 0.9, device),
+        uniform([TRUE_COUNT, 3], 0.0, 1.0, device),
+    )
+}
+
+/// The parameters: Gaussians before their activations, so that every value is allowed.
+#[derive(Module, Debug)]
+struct Model {
+    means: Param<Tensor<2>>,
+    rotations: Param<Tensor<2>>,
+    log_scales: Param<Tensor<2>>,
+    opacity_logits: Param<Tensor<1>>,
+    color_logits: Param<Tensor<2>>,
+}
+
+impl Model {
+    fn random(device: &Device) -> Self {
+        Self {
+            means: Param::from_tensor(uniform([COUNT, 3], -0.5, 0.5, device) + centre(device)),
+            rotations: Param::from_tensor(uniform([COUNT, 4], -1.0, 1.0, device)),
+            log_scales: Param::from_tensor(uniform([COUNT, 3], -3.5, -2.5, device)),
+            opacity_logits: Param::from_tensor(Tensor::full([COUNT], -1.0, device)),
+            color_logits: Param::from_tensor(uniform([COUNT, 3], -1.0, 1.0, device)),
+        }
+    }
+
+    fn gaussians(&self) -> Result<Gaussians, SplatError> {
+        Gaussians::new(
+            self.means.val(),
+            self.rotations.val(),
+            self.log_scales.val().exp(),
+            sigmoid(self.opacity_logits.val()),
+            sigmoid(self.color_logits.val()),
+        )
+    }
+}
+
+/// Pictures `[V,H,W,3]` of the Gaussians.
+fn pictures(gaussians: &Gaussians, cameras: &[Camera]) -> Result<Tensor<4>, SplatError> {
+    Ok(render(gaussians, cameras, &RenderOptions::inria())?.color)
+}
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let steps: usize = std::env::args().nth(1).map_or(Ok(300), |text| text.parse())?;
+    let device = Device::flex();
+    let tracking = device.clone().autodiff();
+    device.seed(1);
+
+    let scene = scene(&device)?;
+    let cameras = Camera::orbit(VIEWS, SIZE, SIZE);
+    let unseen = [Camera::orbit_at_yaw_degrees(180.0 / VIEWS as f64, SIZE)];
+    let truth = Tensor::<4>::from_data(pictures(&scene, &cameras)?.into_data(), &tracking);
+    let unseen_truth = pictures(&scene, &unseen)?;
+    let psnr = |model: &Model| -> Result<f32, SplatError> {
+        let error = pictures(&model.gaussians()?, &unseen)?.inner() - unseen_truth.clone();
+        Ok(-10.0 * error.square().mean().into_scalar::<f32>().log10())
+    };
+
+    let mut model = Model::random(&tracking);
+    let before = psnr(&model)?;
+    let mut adam = AdamConfig::new().with_epsilon(1e-15).init();
+    for step in 0..steps {
+        let first = step * BATCH % VIEWS;
+        let found = pictures(&model.gaussians()?, &cameras[first..first + BATCH])?;
+        let loss = (found - truth.clone().narrow(0, first, BATCH)).square().mean();
+        if step % 50 == 0 {
+            println!("step {step}: loss {:.5}", loss.clone().into_scalar::<f32>());
+        }
+        let gradients = GradientsParams::from_grads(loss.backward(), &model);
+        let rate = 0.02 * 0.05_f64.powf(step as f64 / steps as f64);
+        model = adam.step(rate, model, gradients);
+    }
+    println!("unseen view: {before:.2} dB before, {:.2} dB after", psnr(&model)?);
+    Ok(())
+}

@@ -1,0 +1,44 @@
+//! Two photographs of a person become Gaussians in a PLY file, with the default weights.
+//!
+//! ```sh
+//! cargo run --release --example reconstruct                            # the sample pair → human.ply
+//! cargo run --release --example reconstruct -- FRONT.png BACK.png OUT.ply
+//! ```
+//!
+//! The photographs need transparent backgrounds. The result has the same bytes as that of `snapsnap reconstruct`.
+
+use std::error::Error;
+use std::path::{Path, PathBuf};
+
+use burn::tensor::Device;
+use snapsnap_data::photo::{self, Canvas, Placement};
+use snapsnap_net::weights::WeightFile;
+use snapsnap_net::{Photograph, Reconstructor};
+use snapsnap_splat::scene;
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let assets = Path::new(env!("CARGO_MANIFEST_DIR")).join("../assets");
+    let mut arguments = std::env::args().skip(1).map(PathBuf::from);
+    let mut argument = |default: PathBuf| arguments.next().unwrap_or(default);
+    let photographs = [argument(assets.join("sample/front.png")), argument(assets.join("sample/back.png"))];
+    let output = argument("human.ply".into());
+
+    let weights = WeightFile::open(&assets.join("weights/default.safetensors"), None)?;
+    let reconstructor = Reconstructor::load(&weights, &Device::flex())?;
+    let config = reconstructor.config();
+
+    // Each person is scaled and moved to the place that the networks were trained for.
+    let placement = Placement::Training { height: config.person_height() };
+    let paths = photographs.each_ref().map(PathBuf::as_path);
+    let canvases = photo::load(paths, [None, None], config.network.resolution, placement)?;
+    let [front, back] = canvases.map(|Canvas { rgb, mask, valid, .. }| Photograph { rgb, mask, valid });
+
+    let result = reconstructor.reconstruct(&front, &back, &|module| println!("{module}"));
+    for (module, time) in &result.times {
+        println!("{module:<26} {:>8.1} ms", 1e3 * time.as_secs_f64());
+    }
+    let gaussians = result.in_world(config);
+    scene::write(&gaussians, &output)?;
+    println!("{} Gaussians: {}", gaussians.len(), output.display());
+    Ok(())
+}
