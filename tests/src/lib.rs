@@ -16,8 +16,8 @@ use std::sync::OnceLock;
 use burn::tensor::{Device, DeviceKind, DeviceType, Tensor, TensorData};
 use safetensors::SafeTensors;
 
-/// A training of thousands of parameters on pictures of 64²: attention, all kinds of convolutions, resizing, windows and
-/// anchors are in it.
+/// A training of thousands of parameters on pictures of 64²: attention, all kinds of convolutions, resizing, windows
+/// and anchors are in it.
 pub const TRAINING: &str = r#"
 [network]
 enc_dim = 16
@@ -176,7 +176,8 @@ pub fn data(name: &str) -> PathBuf {
     root().join("tests/data").join(name)
 }
 
-/// A file or folder of reference numbers (tests/data/README.md); `SNAPSNAP_FIXTURES` names another folder that has them.
+/// A file or folder of reference numbers (tests/data/README.md); `SNAPSNAP_FIXTURES` names another folder that has
+/// them.
 ///
 /// # Panics
 /// If it is missing.
@@ -187,8 +188,8 @@ pub fn fixture(name: &str) -> PathBuf {
     path
 }
 
-/// How many values of each tensor the repository's fixtures of gradients and trained weights have at least, if the tensor has
-/// as many: they are cut to their first values.
+/// How many values of each tensor the repository's fixtures of gradients and trained weights have at least, if the
+/// tensor has as many: they are cut to their first values.
 pub const FIXTURE_VALUES: usize = 512;
 
 /// Relative L2 error of `got` where `expected` has values: the first ones of a tensor, or all.

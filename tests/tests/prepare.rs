@@ -1,5 +1,5 @@
-//! `snapsnap prepare` as a user types it: people and scans become data sets, what is broken is named, and what was begun is
-//! finished.
+//! `snapsnap prepare` as a user types it: people and scans become data sets, what is broken is named, and what was
+//! begun is finished.
 
 use std::collections::BTreeMap;
 use std::fs;

@@ -1,4 +1,4 @@
-//! `cargo xtask bundle`: everything that another machine needs to test and measure the project, without cargo.
+//! `cargo xtask bundle`: an archive that tests and measures the project on a machine without cargo.
 
 use std::fs;
 use std::io;
@@ -7,12 +7,12 @@ use std::process::{Command, Stdio};
 
 use crate::cargo;
 
-/// The script that runs everything.
+/// The script that runs the programs of the archive.
 const RUN: &str = include_str!("run.sh");
 /// Files and folders that the programs read.
 const DATA: [&str; 4] = ["configs", "tests/data", "README.md", "LICENSE"];
 
-/// What `bundle` was told.
+/// Options of `bundle`.
 pub struct Options {
     /// Features of the program, comma-separated.
     pub features: Option<String>,
@@ -44,7 +44,7 @@ pub fn bundle(options: &Options) -> Result<(), String> {
         ("numerical", build(options, &["test", "--no-run", "--test", "numerical"])?),
         ("splat", build(options, &["bench", "--no-run", "--bench", "splat"])?),
     ];
-    // Never beside the archive, where somebody may have unpacked one.
+    // Not beside the archive: a folder of this name may be an unpacked bundle.
     let folder = Path::new("target/bundle/snapsnap-bundle").to_owned();
     if folder.exists() {
         fs::remove_dir_all(&folder).map_err(failed(&folder))?;
@@ -77,8 +77,8 @@ pub fn bundle(options: &Options) -> Result<(), String> {
     Ok(())
 }
 
-/// Builds one program of the workspace and returns where it is. Other features have a target folder of their own, since
-/// they would otherwise take turns with the plain build.
+/// Builds one program of the workspace and returns its path. Other features have a target folder of their own, so that
+/// they do not replace the plain build.
 fn build(options: &Options, command: &[&str]) -> Result<PathBuf, String> {
     let mut build = cargo(&command[..1]);
     // `cargo bench` takes the release profile by itself.
@@ -104,7 +104,7 @@ fn failed(what: &Path) -> impl Fn(io::Error) -> String {
     move |e| format!("{}: {e}", what.display())
 }
 
-/// Copies a file, or a folder with all that is in it.
+/// Copies a file, or a folder with its content.
 fn copy(from: &Path, to: &Path) -> Result<(), String> {
     if !from.is_dir() {
         fs::create_dir_all(to.parent().unwrap_or(Path::new("."))).map_err(failed(to))?;
@@ -117,12 +117,12 @@ fn copy(from: &Path, to: &Path) -> Result<(), String> {
     Ok(())
 }
 
-/// An archive of the folder, compressed as its name says.
+/// Packs the folder. The ending of `output` selects the compression.
 fn pack(folder: &Path, output: &Path) -> Result<(), String> {
     let parent = folder.parent().unwrap_or(Path::new("."));
     let name = folder.file_name().unwrap_or_default();
     let mut tar = Command::new("tar");
-    // The programs hold much of the same code: a window that spans them all finds it.
+    // The programs share much code. A window that spans all of them stores it once.
     tar.env("XZ_OPT", "-6 --lzma2=preset=6,dict=256MiB -T1");
     let status = tar.arg("-caf").arg(output).arg("-C").arg(parent).arg(name).status();
     match status {
@@ -132,7 +132,7 @@ fn pack(folder: &Path, output: &Path) -> Result<(), String> {
     }
 }
 
-/// The commit that is built, marked where files differ from it.
+/// The commit, marked as dirty if files differ from it.
 fn commit() -> String {
     let git = Command::new("git").args(["describe", "--always", "--dirty"]).output();
     let text = git.ok().filter(|output| output.status.success()).map(|output| output.stdout);

@@ -12,10 +12,10 @@ Damaged files of every format that the program reads: each must be read whole or
   --minutes N         as many cases as fit into N minutes, all formats in turn [default: the suite's short run]
   --only FORMAT       only formats whose names begin so; names are in tests/src/fuzz/formats
   --from SEED         the first seed of a run with --minutes [default: 0]
-  --report FILE.md    write what was done and found
-  --case FORMAT:SEED  one case again; its files are kept, and their folder named";
+  --report FILE.md    write a report of the cases and failures
+  --case FORMAT:SEED  one case again; its files are kept, and their folder is printed";
 
-/// Options, and the variables in which the test reads them.
+/// Options and the environment variables that pass them to the test.
 const OPTIONS: [(&str, &str); 5] = [
     ("--minutes", "SNAPSNAP_FUZZ_MINUTES"),
     ("--only", "SNAPSNAP_FUZZ_ONLY"),
@@ -24,14 +24,14 @@ const OPTIONS: [(&str, &str); 5] = [
     ("--case", "SNAPSNAP_FUZZ_CASE"),
 ];
 
-/// Whether nothing failed.
+/// Runs the test; returns whether nothing failed.
 pub fn run(arguments: &[String]) -> bool {
     if arguments.iter().any(|argument| argument == "--help" || argument == "-h") {
         println!("{USAGE}");
         return true;
     }
     let mut command = cargo(&["test", "--release", "--workspace", "--test", "fuzz", "--", "--nocapture"]);
-    // A failure is told by its case, not by where the test noticed it.
+    // A failure is identified by its case. The test's backtrace adds nothing.
     command.env("RUST_BACKTRACE", "0");
     command.env("SNAPSNAP_FUZZ_COMMAND", format!("cargo xtask fuzz {}", arguments.join(" ")).trim_end());
     for pair in arguments.chunks(2) {

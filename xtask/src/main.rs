@@ -12,8 +12,8 @@ const USAGE: &str = "usage: cargo xtask test [FILTERâ€¦] | lint | dist [OPTIONâ€
 
   test     the whole suite on flex, then the numerical tests on ndarray and wgpu
   lint     formatting, clippy and documentation, warnings refused
-  dist     the smallest program, target/dist/snapsnap; takes cargo's options, 20 minutes, and slower pictures
-           (docs/inference.md)
+  dist     the smallest program, target/dist/snapsnap, in 20 minutes; it reads pictures more slowly (docs/inference.md);
+           options are cargo's
   fuzz     damaged files of every format that the program reads; see cargo xtask fuzz --help
   bundle   [--features vulkan] [-o FILE.tar.xz]: program, tests, benchmark and a script that runs them and writes a
            report, for a machine without cargo
@@ -78,7 +78,7 @@ fn lint() -> bool {
 fn dist(options: &[String]) -> bool {
     let mut build = cargo(&["rustc", "--profile", "dist", "--package", "snapsnap", "--bin", "snapsnap"]);
     build.args(options).args(["--", "-C", "strip=symbols"]);
-    // What the loader has to relocate is listed in a fraction of the room; needs glibc 2.36.
+    // Packed relocations take a fraction of the space. They need glibc 2.36.
     if cfg!(target_os = "linux") {
         build.args(["-C", "link-arg=-Wl,-z,pack-relative-relocs"]);
     }

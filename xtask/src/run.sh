@@ -8,10 +8,10 @@ mkdir -p "$out" || exit 1
 export SNAPSNAP_ROOT="$PWD" SNAPSNAP_PROGRAM="$PWD/bin/snapsnap" XDG_RUNTIME_DIR="${XDG_RUNTIME_DIR:-/tmp}"
 report="$out/report.md"
 failed=0
-# The tests call the processor by its backend's name, and know no numbers.
+# The tests name the CPU by its backend, and devices without an index.
 case $device in cpu) tested=flex ;; *) tested=${device%%:*} ;; esac
 
-# part NAME FILE COMMAND…: runs it, keeps all it prints in FILE, and notes how it ended and how long it took.
+# part NAME FILE COMMAND…: runs the command, keeps its output in FILE, and reports its exit code and time.
 part() {
   name=$1 log=$2
   shift 2
@@ -19,7 +19,7 @@ part() {
   "$@" >"$out/$log" 2>&1
   code=$?
   [ $code -eq 0 ] || failed=1
-  { echo; echo "## $name"; echo; echo "\`$*\`: exit code $code, $(($(date +%s) - start)) s; all of it: $log"; echo; } >>"$report"
+  { echo; echo "## $name"; echo; echo "\`$*\`: exit code $code, $(($(date +%s) - start)) s; full output: $log"; echo; } >>"$report"
   echo "$name: exit code $code"
 }
 
@@ -30,7 +30,7 @@ part() {
   command -v nvidia-smi >/dev/null && nvidia-smi --query-gpu=name,driver_version,memory.total --format=csv,noheader
 } >"$report"
 
-# Twice: the first run on an adapter chooses its kernels by trial.
+# Two runs: the first one on an adapter selects kernels by trial.
 for run in 1 2; do
   part "Numerical tests, run $run" "numerical-$run.log" \
     env SNAPSNAP_TEST_DEVICE="$tested" SNAPSNAP_REQUIRE_WGPU=1 bin/numerical --show-output

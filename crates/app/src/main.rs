@@ -1,4 +1,10 @@
-//! The command line of snapsnap: one file per subcommand, which parses, calls and reports.
+//! snapsnap turns two photographs of a person into 3D Gaussians. This crate is its command line, one file per subcommand.
+//!
+//! The other crates are libraries. [`snapsnap_net::Reconstructor`] turns photographs into Gaussians. [`snapsnap_splat::render`]
+//! is the differentiable renderer. [`snapsnap_train::points`] has the losses of stage 1. The folder `examples` of the
+//! repository has a program for each: `cargo run --release --example reconstruct`, `fit_gaussians` or `train_predictor`.
+// Only rustdoc reads the page, so that a change of it builds nothing.
+#![cfg_attr(doc, doc = "\n", doc = include_str!("../../../docs/architecture.md"))]
 
 mod commands;
 mod device;

@@ -1,5 +1,5 @@
-//! Samples per second and memory of the loader: `cargo bench --workspace --bench samples -- [--full]`. `--full` also measures
-//! the memory of 10,000 samples.
+//! Samples per second and memory of the loader: `cargo bench --workspace --bench samples -- [--full]`. `--full` also
+//! measures the memory of 10,000 samples.
 
 use std::sync::Arc;
 use std::time::Instant;

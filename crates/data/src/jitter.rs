@@ -1,17 +1,17 @@
-//! How cameras stray from the training orbit.
+//! Random deviations of cameras from the training orbit.
 
 use glam::DVec3;
 use rand::Rng;
 use serde::{Deserialize, Serialize};
 use snapsnap_splat::Orbit;
 
-/// How cameras stray, evenly within ± each value: all views of a subject together (`rig`), and each by itself (`view`).
+/// Uniform deviations of cameras within ± each value.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct JitterConfig {
     /// All views of a subject together.
     pub rig: Jitter,
-    /// Each view by itself.
+    /// Each view separately.
     pub view: Jitter,
 }
 
@@ -19,17 +19,17 @@ pub struct JitterConfig {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Jitter {
-    /// Around the subject, degrees.
+    /// Angle around the subject in degrees.
     pub yaw: f64,
-    /// Up and down, degrees.
+    /// Angle up and down in degrees.
     pub pitch: f64,
-    /// Around the optical axis, degrees.
+    /// Angle around the optical axis in degrees.
     pub roll: f64,
-    /// Metres.
+    /// Distance in metres.
     pub distance: f64,
     /// Share of the focal length.
     pub focal: f64,
-    /// Of the point looked at, metres per axis.
+    /// Position of the target point in metres, per axis.
     pub look_at: f64,
 }
 
@@ -51,7 +51,7 @@ impl Jitter {
             ("yaw", yaw, 180.0),
             ("pitch", pitch, 80.0),
             ("roll", roll, 180.0),
-            // Beyond these the camera would stand in the subject, or see nothing of it.
+            // Larger deviations would put the camera into the subject, or the subject out of view.
             ("distance", distance, 0.7),
             ("focal", focal, 0.5),
             ("look_at", look_at, 0.5),
@@ -61,7 +61,7 @@ impl Jitter {
         Some((key, format!("is {value}, must be 0 to {limit}")))
     }
 
-    /// How far both can stray together.
+    /// Sum of both deviations.
     fn plus(&self, other: &Self) -> Self {
         Self {
             yaw: 0.0,
@@ -73,9 +73,9 @@ impl Jitter {
         }
     }
 
-    /// Moves a camera, at random.
+    /// Moves a camera at random.
     pub(crate) fn apply(&self, orbit: &mut Orbit, random: &mut impl Rng) {
-        // Drawn even where the range is 0, so that one range does not change what another draws.
+        // A range of 0 draws a number as well, so that the other ranges' numbers do not depend on it.
         let mut stray = |range: f64| range * random.random_range(-1.0..1.0);
         orbit.yaw_degrees += stray(self.yaw);
         orbit.pitch_degrees += stray(self.pitch);

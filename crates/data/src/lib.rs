@@ -1,4 +1,4 @@
-//! Training data and photographs: scans and made people → rendered views → data-set folders → samples.
+//! Photographs and training data: scans and generated people → rendered views → data sets → samples.
 
 pub mod dataset;
 mod jitter;

@@ -1,4 +1,4 @@
-//! A photograph and its mask → a square canvas with the person where the networks expect one.
+//! A photograph and its mask → a square canvas, with the person at the networks' place and size.
 
 mod placing;
 #[cfg(test)]
@@ -15,25 +15,24 @@ use snapsnap_mesh::picture::{self, MAX_BYTES};
 pub use placing::{Mapping, place};
 use placing::{Standing, placed, together};
 
-/// Photographs below this side are refused: nothing of a person is left.
+/// Least side of a photograph in pixels.
 const MIN_SIDE: u32 = 64;
-/// From this share of the person on, a pixel counts as the person's.
+/// Least share of the person in a pixel of the person.
 const THRESHOLD: f32 = 0.5;
-/// Canvas side that heights and rows refer to.
+/// Canvas side to which heights and rows refer.
 const REFERENCE_SIDE: f32 = 1024.0;
 
-/// How a photograph gets onto its canvas.
+/// Placement of a photograph on its canvas.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Placement {
-    /// The picture already is the canvas.
+    /// The picture is the canvas.
     AsIs,
-    /// The person's box is scaled, antialiased, and put where the training subjects stand.
+    /// The person's box is resized with antialiasing, to the place of the training subjects.
     Training {
         /// Height of the person in pixels of a canvas of 1024.
         height: usize,
     },
-    /// The published demo's recipe: in the middle, sampled without antialiasing, and only pixels that the mask holds
-    /// completely are valid.
+    /// As in the published demo: centred, resized without antialiasing, and valid only for pixels with a full mask.
     Demo {
         /// Height of the person in pixels of a canvas of 1024.
         height: usize,
@@ -49,19 +48,20 @@ pub struct Canvas {
     pub mask: Vec<f32>,
     /// `[S, S]`: whether the pixel belongs to the person.
     pub valid: Vec<bool>,
-    /// Where its pixels came from.
+    /// Map from the photograph to the canvas.
     pub mapping: Mapping,
-    /// What was done, for a person to read.
+    /// The placement in words.
     pub report: String,
 }
 
-/// Loads the photographs of front and back and puts each on a canvas of `side` pixels. The person is given by the `masks` files
-/// (white: person) or, without one, by the picture's alpha channel. With [`Placement::Training`], photographs that were taken
-/// from one place, as far as sizes and boxes tell, are scaled and moved alike, so that both still show the same size.
+/// Loads the photographs of front and back and places each on a canvas of `side` pixels. The mask of the person is the
+/// file in `masks` (white: person) or, without one, the picture's alpha channel. With [`Placement::Training`],
+/// photographs whose sizes and boxes agree are taken for photographs from one place. They get the same scale and
+/// offset.
 ///
 /// # Errors
-/// [`FileError`]: unreadable files, a mask of another size, an empty mask, no mask at all, a picture below 64 pixels
-/// or of a single colour, or, with [`Placement::AsIs`], of another size than the canvas.
+/// [`FileError`]: unreadable files, a mask of another size, an empty or missing mask, a picture below 64 pixels or of a
+/// single colour, or, with [`Placement::AsIs`], of another size than the canvas.
 pub fn load(
     paths: [&Path; 2],
     masks: [Option<&Path>; 2],
@@ -79,12 +79,12 @@ pub fn load(
 
 /// A photograph without its background.
 struct Cutout<'a> {
-    /// Where an empty mask would be found.
+    /// File of the mask.
     mask_path: &'a Path,
     rgb: RgbImage,
     mask: GrayImage,
     person: Rect,
-    /// What it is, for a person to read.
+    /// The picture's and the box's size in words.
     source: String,
 }
 
@@ -101,7 +101,7 @@ impl<'a> Cutout<'a> {
         if placement == Placement::AsIs {
             if (width as usize, height as usize) != (side, side) {
                 return Err(refuse(format!(
-                    "is {width}×{height}, --as-is wants the canvas itself, {side}×{side}"
+                    "is {width}×{height}, --as-is needs a picture of the canvas's size, {side}×{side}"
                 )));
             }
         } else if width.min(height) < MIN_SIDE {
@@ -126,7 +126,7 @@ impl<'a> Cutout<'a> {
             None => (alpha(&picture).map_err(refuse)?, path),
         };
         let rgb = picture.into_rgb8();
-        // The demo takes whatever the mask touches; a lossy mask touches much that is not the person.
+        // The demo includes every pixel that is not 0. Lossy masks have many such pixels outside the person.
         let least = if matches!(placement, Placement::Demo { .. }) { 1 } else { u8::MAX.div_ceil(2) };
         let person = Rect::around(&mask, least).ok_or_else(|| nobody(mask_path, placement))?;
         if is_single_colour(&rgb, &mask) {
@@ -139,7 +139,7 @@ impl<'a> Cutout<'a> {
         Ok(Self { mask_path, rgb, mask, person, source })
     }
 
-    /// On its canvas: its own person's box, or one that is common to both photographs.
+    /// Places the photograph by the person's box, or by the common box of both photographs.
     fn canvas(
         self,
         common: Option<Standing>,
@@ -166,7 +166,7 @@ fn nobody(mask_path: &Path, placement: Placement) -> FileError {
     FileError::Unsuitable { path: mask_path.to_owned(), message }
 }
 
-/// A mask picture's brightness, on black where it is transparent.
+/// A mask picture's brightness, black where it is transparent.
 fn grey(picture: &DynamicImage) -> GrayImage {
     let pixels = picture.to_luma_alpha8();
     GrayImage::from_fn(pixels.width(), pixels.height(), |x, y| {
@@ -183,7 +183,7 @@ fn alpha(picture: &DynamicImage) -> Result<GrayImage, String> {
                 .into(),
         );
     }
-    // As it mostly is: without a copy.
+    // The usual case needs no copy.
     let converted;
     let rgba = match picture {
         DynamicImage::ImageRgba8(rgba) => rgba,
@@ -217,7 +217,7 @@ pub(crate) struct Rect {
 }
 
 impl Rect {
-    /// The tight box of the pixels whose mask is at least `least`.
+    /// The smallest box around the pixels whose mask is at least `least`.
     pub fn around(mask: &GrayImage, least: u8) -> Option<Self> {
         let set = mask.enumerate_pixels().filter(|(_, _, p)| p[0] >= least);
         let bounds = set.fold(None, |bounds, (x, y, _)| {
@@ -227,7 +227,7 @@ impl Rect {
         bounds.map(|(x0, y0, x1, y1)| Self { x: x0, y: y0, width: x1 - x0 + 1, height: y1 - y0 + 1 })
     }
 
-    /// The part of this box within `reach` (x, y) pixels of `inner`, which it contains.
+    /// The part of this box within `reach` (x, y) pixels of the box `inner` inside it.
     fn clipped_around(self, inner: Self, [reach_x, reach_y]: [u32; 2]) -> Self {
         let (x, y) =
             (self.x.max(inner.x.saturating_sub(reach_x)), self.y.max(inner.y.saturating_sub(reach_y)));
@@ -237,7 +237,7 @@ impl Rect {
     }
 }
 
-/// The picture without any change of size (docs/method.md, "Photographs on the canvas").
+/// The picture without a resize (docs/method.md, "Photographs on the canvas").
 fn on_canvas(rgb: &RgbImage, mask: &GrayImage, side: usize, report: String) -> Canvas {
     let area = side * side;
     let mask: Vec<f32> = mask.pixels().map(|p| unit(p[0])).collect();
@@ -251,8 +251,8 @@ fn on_canvas(rgb: &RgbImage, mask: &GrayImage, side: usize, report: String) -> C
     Canvas { rgb: values, mask, valid, mapping: Mapping::AS_IT_IS, report }
 }
 
-/// The published demo's recipe with its quirks: the box loses its last row and column, sampling is plain bilinear,
-/// colours are not multiplied by the mask but cut at ½, and only pixels with a full mask are valid.
+/// The placement of the published demo with its quirks. The box loses its last row and column, sampling is bilinear,
+/// colours are cut at half coverage instead of multiplied by it, and only pixels with a full mask are valid.
 fn placed_as_demo(
     rgb: &RgbImage,
     mask: &GrayImage,
@@ -263,7 +263,7 @@ fn placed_as_demo(
     let person = Rect { width: (person.width - 1).max(1), height: (person.height - 1).max(1), ..person };
     let height = ((height as f32 / REFERENCE_SIDE * side as f32).round() as usize).clamp(1, side);
     let scaled = person.width as usize * height / person.height as usize;
-    // The demo fails on a person wider than its canvas; ours gets smaller.
+    // The demo fails on a person wider than its canvas. Here the person gets smaller.
     let height =
         if scaled > side { (person.height as usize * side / person.width as usize).max(1) } else { height };
     let width = (scaled / 2 * 2).clamp(2.min(side), side / 2 * 2);
@@ -289,8 +289,8 @@ fn placed_as_demo(
     Canvas { rgb: values, mask: on_canvas, valid, mapping, report }
 }
 
-/// Red, green, blue (through `color`, which also gets the mask's value) and mask of the person's box, resized to `size`
-/// (rows, columns). One after the other: a plane in f32 is as large as the whole picture in bytes.
+/// Red, green, blue and mask of the person's box, resized to `size` (rows, columns). `color` converts a colour and the
+/// mask's value. Planes are made one by one, since a plane in f32 takes as much memory as the picture.
 fn planes(
     rgb: &RgbImage,
     mask: &GrayImage,

@@ -1,4 +1,4 @@
-//! From a mesh to a subject of a data set: which cameras, which names, which machine.
+//! From a mesh to a subject of a data set: cameras, names and shards.
 
 use std::path::Path;
 use std::str::FromStr;
@@ -17,42 +17,42 @@ use snapsnap_base::random::stream;
 use snapsnap_mesh::mesh::Mesh;
 use snapsnap_mesh::view::{Lights, Renderer, ViewOptions};
 
-/// How subjects become views: `configs/data/*.toml`.
+/// Config of a data set: `configs/data/*.toml`.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DataConfig {
-    /// Which views.
+    /// Views.
     pub views: ViewsConfig,
-    /// How cameras stray from the training orbit.
+    /// Deviations of cameras from the training orbit.
     pub jitter: JitterConfig,
 }
 
-/// Which views.
+/// The section `[views]`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ViewsConfig {
     /// Views of each subject.
     pub count: usize,
-    /// Evenly around it, or in fours of front, back and both sides.
+    /// Evenly around the subject, or in groups of front, back and both sides.
     pub arrangement: Arrangement,
-    /// In groups: how far from the subject's own front, in degrees, their fronts are.
+    /// Groups: largest angle, in degrees, between a group's front and the subject's own front.
     pub front_within_degrees: f64,
-    /// Degrees that all cameras stand higher up than the published ones, which look down by eight.
+    /// Added to the published cameras' pitch, which is 8° downwards. In degrees.
     pub pitch: f64,
-    /// How many times as far away as the published ones they stand.
+    /// Factor of the published cameras' distance.
     pub distance: f64,
     /// Side in pixels.
     pub resolution: u32,
-    /// Whether each view is drawn at twice the side as well, for stage 2's supervision.
+    /// Whether each view is rendered at twice the side as well, for stage 2's targets.
     pub high_resolution: bool,
     /// Samples per pixel along each axis, 1 to 6.
     pub samples_per_axis: usize,
-    /// How views are stored.
+    /// Layout of the stored views.
     pub layout: Layout,
 }
 
 impl Default for ViewsConfig {
-    /// The published cameras in our exact layout.
+    /// The published cameras in the exact layout.
     fn default() -> Self {
         Self {
             count: 24,
@@ -88,7 +88,7 @@ impl Schema for DataConfig {
             return Some(("views.count".into(), format!("is {count}, must be a multiple of 4 in groups")));
         }
         if arrangement == Arrangement::Groups && layout == Layout::Authors {
-            let message = "is \"groups\", which the authors' layout has no place for".into();
+            let message = "is \"groups\", which the authors' layout does not support".into();
             return Some(("views.arrangement".into(), message));
         }
         if !(0.0..=180.0).contains(&front_within_degrees) {
@@ -111,13 +111,12 @@ impl Schema for DataConfig {
             let message = format!("is {samples_per_axis}, must be 1 to 6");
             return Some(("views.samples_per_axis".into(), message));
         }
-        let jitter = self.jitter.problem().map(|(key, message)| (format!("jitter.{key}"), message));
-        jitter
+        self.jitter.problem().map(|(key, message)| (format!("jitter.{key}"), message))
     }
 }
 
 impl DataConfig {
-    /// What a data set made with this config says of itself.
+    /// Description of a data set with this config.
     pub fn description(&self, source: &str) -> Description {
         let ViewsConfig { count, arrangement, resolution, high_resolution, layout, .. } = self.views;
         Description {
@@ -151,7 +150,7 @@ impl DataConfig {
             .collect()
     }
 
-    /// Where a camera stands that does not stray.
+    /// The orbit of a camera without deviations.
     fn orbit(&self, yaw_degrees: f64) -> Orbit {
         let published = Orbit::default();
         Orbit {
@@ -162,7 +161,7 @@ impl DataConfig {
         }
     }
 
-    /// Cameras of a front photograph, of one of the back, and of both sides as the front's own would see them from there.
+    /// Cameras of a group. The sides' cameras are exact quarter turns of the front camera.
     fn group(&self, yaw_degrees: f64, random: &mut impl Rng) -> [Camera; 4] {
         let ViewsConfig { front_within_degrees, resolution, .. } = self.views;
         let mut front = self.orbit(yaw_degrees);
@@ -174,10 +173,10 @@ impl DataConfig {
         [front, back.camera(resolution), front.turned(90.0), front.turned(270.0)]
     }
 
-    /// Draws and adds a subject. `mesh` stands on the floor at the origin.
+    /// Renders a subject and adds it to the data set. `mesh` stands on the floor at the origin.
     ///
     /// # Errors
-    /// [`FileError`] for a mesh that cannot be drawn or that a camera does not see, naming its origin, and for files that
+    /// [`FileError`] for a mesh that cannot be rendered or is outside a view, with its origin, and for files that
     /// cannot be written.
     pub fn add(&self, folder: &Folder, subject: &Subject, mesh: &Mesh) -> Result<Made, FileError> {
         let Subject { split, name, identity, yaw_degrees, origin } = *subject;
@@ -188,29 +187,29 @@ impl DataConfig {
     }
 }
 
-/// A subject to be added.
+/// A subject that is added to a data set.
 #[derive(Debug, Clone, Copy)]
 pub struct Subject<'a> {
-    /// Where it belongs.
+    /// Its split.
     pub split: Split,
     /// Its name in the data set.
     pub name: &'a str,
-    /// Its name among all data sets, which decides what is random about its cameras.
+    /// Its name among all data sets, which seeds the random deviations of its cameras.
     pub identity: &'a str,
-    /// Where it faces, around y.
+    /// Direction in which it faces, around y.
     pub yaw_degrees: f64,
-    /// What it was made of: the file that errors name.
+    /// Its source, for error messages.
     pub origin: &'a Path,
 }
 
 impl<'a> Subject<'a> {
-    /// A subject that faces +z, of no file.
+    /// A subject that faces +z, without a source file.
     pub fn plain(split: Split, name: &'a str) -> Self {
         Self { split, name, identity: name, yaw_degrees: 0.0, origin: Path::new(name) }
     }
 }
 
-/// One of several machines that share the work: `i/n`, from 0.
+/// One of several machines that share the work: `i/n`, with i from 0.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Shard {
     index: usize,
@@ -224,7 +223,7 @@ impl Default for Shard {
 }
 
 impl Shard {
-    /// Whether the subject at this place is this machine's.
+    /// Whether the subject with this index belongs to this shard.
     pub fn has(self, place: usize) -> bool {
         place % self.count == self.index
     }
@@ -256,7 +255,7 @@ mod tests {
     }
 
     #[test]
-    fn cameras_stand_as_much_higher_and_further_away_as_they_are_told() {
+    fn pitch_and_distance_move_the_cameras() {
         let mut config = DataConfig::default();
         (config.views.pitch, config.views.distance) = (10.0, 1.2);
         assert_eq!(config.refusal(), None);
@@ -270,7 +269,7 @@ mod tests {
     }
 
     #[test]
-    fn sides_of_a_group_are_the_fronts_own_camera_a_quarter_turn_on() {
+    fn side_cameras_of_a_group_are_quarter_turns_of_its_front_camera() {
         let mut config = DataConfig::default();
         (config.views.arrangement, config.views.count) = (Arrangement::Groups, 12);
         config.jitter.rig = Jitter { pitch: 6.0, distance: 0.1, roll: 2.0, ..Jitter::default() };

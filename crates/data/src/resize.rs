@@ -1,19 +1,19 @@
-//! Changing the size of one plane of values.
+//! Resizing of one plane of values.
 
 use image::imageops::{self, FilterType};
 use image::{ImageBuffer, Luma};
 use snapsnap_base::bilinear::taps;
 
-/// How samples are weighted.
+/// Filter of a resize.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Filter {
     /// The image crate's Lanczos filter, antialiased when shrinking.
     Lanczos3,
-    /// Four samples around the centre of each target pixel, edges repeated; aliases when shrinking.
+    /// The four samples around each target pixel's centre, with repeated edges. It aliases when shrinking.
     Bilinear,
 }
 
-/// Resizes `values` of `from` (rows, columns) to `to`; values lie in [0, 1] before and after.
+/// Resizes `values` of `from` (rows, columns) to `to`. Values are in [0, 1].
 pub fn resize(values: Vec<f32>, from: [usize; 2], to: [usize; 2], filter: Filter) -> Vec<f32> {
     match filter {
         Filter::Bilinear => bilinear(&values, from, to),

@@ -1,4 +1,4 @@
-//! Scans of people: where the known sets keep which subject, and how a scan is stood up for the cameras.
+//! Scans of people: the collections' files and splits, and the normalisation of scans.
 
 use std::collections::HashSet;
 use std::fs;
@@ -16,16 +16,16 @@ use snapsnap_mesh::mesh::{Mesh, MeshError};
 /// Height of a normalised subject in metres (docs/method.md, "Scans"). Real stature is lost on purpose: two photographs
 /// do not show it.
 pub const HEIGHT: f32 = 1.8;
-/// Training subjects are up to this much taller or shorter.
+/// Largest random change of a training subject's height, in metres.
 const HEIGHT_JITTER: f32 = 0.05;
 
-/// A collection of scans, each with conventions of its own.
+/// A collection of scans with its conventions.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Collection {
     /// THuman2.0: subjects 0 to 525.
     #[serde(rename = "thuman2.0")]
     Thuman20,
-    /// THuman2.1's further subjects, from 526.
+    /// THuman2.1: THuman2.0 and the subjects from 526 on.
     #[serde(rename = "thuman2.1")]
     Thuman21,
     /// CustomHumans.
@@ -37,7 +37,7 @@ pub enum Collection {
     /// 4D-Dress.
     #[serde(rename = "4d-dress")]
     FourDDress,
-    /// Any other: y up, facing +z.
+    /// Other scans: y up, facing +z.
     #[serde(rename = "other")]
     Other,
 }
@@ -55,7 +55,7 @@ impl Collection {
         }
     }
 
-    /// The conventions of one subject: THuman2.1 includes THuman2.0, whose axes are others.
+    /// The collection of one subject. THuman2.1 includes THuman2.0, which has other axes.
     pub fn of(self, subject: &str) -> Self {
         match (self, subject.parse::<u32>()) {
             (Self::Thuman21, Ok(id)) if id < 526 => Self::Thuman20,
@@ -63,13 +63,13 @@ impl Collection {
         }
     }
 
-    /// Whether SMPL-X parameters give the direction that its subjects face. Those of the other sets face +z
+    /// Whether SMPL-X parameters contain the direction that its subjects face. Subjects of other collections face +z
     /// (docs/method.md, "Cameras").
     pub fn has_orientation(self) -> bool {
         matches!(self, Self::Thuman20 | Self::Thuman21)
     }
 
-    /// Turns the set's axes into ours (y up).
+    /// Rotation from the collection's axes to y up.
     fn axes(self) -> Mat3 {
         match self {
             // The matrix with rows (0, −1, 0), (0, 0, 1), (−1, 0, 0) (docs/method.md, "Scans").
@@ -78,13 +78,13 @@ impl Collection {
         }
     }
 
-    /// Whether subjects stand anywhere in the set, and are moved to the middle by the mean of their vertices.
+    /// Whether subjects are moved so that the mean of their vertices is on the y axis.
     fn is_centred(self) -> bool {
         matches!(self, Self::TwoK2K | Self::FourDDress)
     }
 }
 
-/// Subjects of THuman2.0 that are never trained on.
+/// Subjects of THuman2.0 for validation.
 pub const VALIDATION: [u32; 100] = [
     0, 1, 2, 3, 6, 9, 12, 18, 19, 21, 23, 24, 25, 30, 36, 42, 48, 54, 60, 66, 68, 72, 78, 84, 90, 96, 102,
     108, 114, 120, 126, 132, 138, 144, 150, 156, 162, 168, 174, 180, 186, 192, 198, 204, 210, 216, 222, 228,
@@ -93,17 +93,17 @@ pub const VALIDATION: [u32; 100] = [
     480, 486, 492, 498, 504, 510, 516, 518, 522, 523,
 ];
 
-/// Subjects of THuman2.1 in loose clothing, for testing: to be left out of training.
+/// Subjects of THuman2.1 in loose clothes, for testing.
 pub const LOOSE: [u32; 50] = [
     2397, 1685, 2396, 2398, 2414, 2403, 1678, 2252, 835, 1403, 2251, 836, 951, 1321, 2410, 1679, 2199, 1391,
     2264, 1350, 1982, 1981, 1122, 2413, 1819, 1043, 1267, 2186, 865, 2148, 1392, 2092, 2198, 2409, 839, 2250,
     1681, 837, 2109, 1398, 1115, 659, 1123, 1816, 2230, 1693, 1367, 713, 2258, 1124,
 ];
 
-/// How many subjects of 2K2K's training set are tested on: the first.
+/// Number of subjects at the beginning of 2K2K's training set that are for testing.
 const TESTED_2K2K: usize = 100;
 
-/// A scan's file and the subject that it becomes.
+/// A scan's file and its subject.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Source {
     /// Name of the subject.
@@ -112,15 +112,15 @@ pub struct Source {
     pub path: PathBuf,
 }
 
-/// Deepest folder below the given one that is searched for scans.
+/// Largest depth of folders in the search for scans.
 const MAX_DEPTH: usize = 4;
 
-/// The scans below `root`, or `root` itself, in the order of their paths. A folder that holds a scan of its own name
-/// (`0001/0001.obj`) holds nothing else. A subject is called as its file, if that is a
-/// number, or else as its folder and its file; numbers get four digits, as the authors' loader wants them.
+/// The scans below `root`, or `root` itself, in the order of their paths. In a folder with a scan of its own name
+/// (`0001/0001.obj`), other files are ignored. A subject has the name of its file, or, if that is no number, of its
+/// folder and its file. Numbers get four digits, as in the authors' loader.
 ///
 /// # Errors
-/// [`FileError`] if `root` cannot be read, holds no scan, or two scans would be the same subject.
+/// [`FileError`] if `root` cannot be read, contains no scan, or contains two scans of one subject.
 pub fn find(root: &Path) -> Result<Vec<Source>, FileError> {
     let mut paths = Vec::new();
     if root.is_file() {
@@ -136,8 +136,8 @@ pub fn find(root: &Path) -> Result<Vec<Source>, FileError> {
     let mut sources: Vec<Source> = Vec::new();
     for path in &paths {
         let (name, folder) = (stem(path), path.parent().unwrap_or(root));
-        let tells = folder == root || root == path || stem(folder) == name || name.parse::<u32>().is_ok();
-        let name = if tells { name } else { format!("{}-{name}", stem(folder)) };
+        let is_unique = folder == root || root == path || stem(folder) == name || name.parse::<u32>().is_ok();
+        let name = if is_unique { name } else { format!("{}-{name}", stem(folder)) };
         let subject =
             name.parse::<u32>().map_or_else(|_| subject_name(&name), |number| format!("{number:04}"));
         if let Some(other) = sources.iter().find(|other| other.subject == subject) {
@@ -149,7 +149,7 @@ pub fn find(root: &Path) -> Result<Vec<Source>, FileError> {
     Ok(sources)
 }
 
-/// A name that is one folder on every system, and one that is not hidden.
+/// A valid folder name on every system, and not a hidden one.
 fn subject_name(name: &str) -> String {
     let fine = |c: char| c.is_alphanumeric() || "-_. ".contains(c);
     let name: String = name.chars().take(60).map(|c| if fine(c) { c } else { '_' }).collect();
@@ -164,7 +164,7 @@ fn search(
     visited: &mut HashSet<PathBuf>,
     found: &mut Vec<PathBuf>,
 ) -> Result<(), FileError> {
-    // Links may lead round in circles.
+    // Links may form a circle.
     if !visited.insert(folder.canonicalize().unwrap_or_else(|_| folder.to_owned())) {
         return Ok(());
     }
@@ -184,7 +184,7 @@ fn search(
     }
     for path in entries {
         let hidden = path.file_name().is_some_and(|name| name.to_string_lossy().starts_with('.'));
-        // Some systems leave hidden files beside those they copy.
+        // Some systems add hidden files to copied folders.
         if hidden {
             continue;
         }
@@ -197,8 +197,8 @@ fn search(
     Ok(())
 }
 
-/// Normalises a scan: axes, height, feet on y = 0 (docs/method.md, "Scans"). `jitter`, for training, changes the height
-/// and moves the scan a little sideways.
+/// Normalises a scan: axes, height, and feet on y = 0 (docs/method.md, "Scans"). For training, `jitter` changes the
+/// height a little and moves the scan sideways.
 ///
 /// # Errors
 /// [`MeshError::NoHeight`].
@@ -210,7 +210,7 @@ pub fn normalise(
     let axes = collection.axes();
     mesh.positions.iter_mut().for_each(|p| *p = axes * *p);
     let (low, high) = mesh.bounds();
-    // Written so that a NaN and an empty mesh fail as well.
+    // The condition also fails for NaN and for an empty mesh.
     if !(high.y - low.y > 0.0 && (high - low).is_finite()) {
         return Err(MeshError::NoHeight);
     }
@@ -297,7 +297,7 @@ mod tests {
     }
 
     #[test]
-    fn subjects_are_called_what_a_folder_can_be_called() {
+    fn names_of_subjects_are_valid_names_of_folders() {
         let names = ["a.b", ".hid", ".", "..", "...", "", "a/b", "ä 人-1", "\u{1b}[31m"];
         let expected = ["a.b", "_hid", "_", "__", "___", "_", "a_b", "ä 人-1", "__31m"];
         assert_eq!(names.map(subject_name), expected);
@@ -323,7 +323,7 @@ mod tests {
     }
 
     #[test]
-    fn a_scan_stands_on_the_floor_at_its_height() {
+    fn a_normalised_scan_stands_on_the_floor_at_its_height() {
         let mut mesh = cloud(&[[0.2, -3.0, 0.1], [0.4, 9.0, -0.3]]);
         normalise(&mut mesh, Collection::Thuman20, none()).expect("has height");
         let (low, high) = mesh.bounds();
@@ -380,7 +380,7 @@ mod tests {
         assert!(furthest > 0.09);
     }
 
-    /// Wherever the file of a person is cut, but for its very end, that is noticed.
+    /// A file that is cut anywhere but at its very end is refused.
     #[test]
     fn a_scan_that_is_cut_short_is_refused() {
         let folder = tempfile::tempdir().expect("temporary folder");
@@ -389,7 +389,7 @@ mod tests {
         let bytes = fs::read(&whole).expect("reads");
         let path = folder.path().join("cut.obj");
         for percent in [1, 20, 40, 50, 60, 70, 80, 90, 95] {
-            // At the end of a line: nothing else tells that more should come.
+            // A cut at the end of a line leaves no broken line behind.
             let end = bytes.len() * percent / 100;
             let end = bytes[..end].iter().rposition(|b| *b == b'\n').map_or(0, |at| at + 1);
             fs::write(&path, &bytes[..end]).expect("writes");

@@ -1,7 +1,7 @@
-//! Which way a scan faces, from its SMPL-X parameters: `smplx_param.pkl` as THuman publishes them, or JSON.
+//! The direction that a scan faces, from its SMPL-X parameters: THuman's `smplx_param.pkl`, or JSON.
 //!
-//! A pickle is a program for a stack machine that may call anything. This one calls nothing: what would be a call is kept
-//! as data, and NumPy's arrays are recognised among them.
+//! A pickle is a program for a stack machine that may call any function. This machine calls none. It keeps calls as
+//! data, among which NumPy's arrays are recognised.
 
 use std::cell::RefCell;
 use std::path::Path;
@@ -12,17 +12,17 @@ use serde_json::Value as Json;
 use snapsnap_base::FileError;
 use snapsnap_base::file;
 
-/// Largest file that is read; parameters take a few kilobytes.
+/// Largest file that is read, in bytes. Parameters take a few kilobytes.
 const MAX_BYTES: u64 = 16 << 20;
-/// Most operations of a pickle; parameters take a few hundred.
+/// Largest number of operations of a pickle. Parameters take a few hundred.
 const MAX_OPERATIONS: usize = 10_000;
-/// Most lists and numbers of a parameter.
+/// Largest number of lists and numbers in a parameter.
 const MAX_NODES: usize = 100;
-/// The parameter that says where the body faces: an axis times an angle in radians.
+/// The parameter of the body's orientation: an axis times an angle in radians.
 const ORIENTATION: &str = "global_orient";
 
-/// The yaw in degrees, around +y, by which the body faces away from +z: the second component of `global_orient`, taken
-/// for a pure rotation around y as in the published code (docs/method.md, "Cameras").
+/// Angle in degrees, around +y, from +z to the direction that the body faces. As in the published code, `global_orient`
+/// is taken for a pure rotation around y, the angle of which is its second component (docs/method.md, "Cameras").
 ///
 /// # Errors
 /// [`FileError`] for files that are no such parameters.
@@ -44,7 +44,7 @@ pub fn yaw_degrees(path: &Path) -> Result<f64, FileError> {
 fn from_json(bytes: &[u8]) -> Result<Vec<f64>, String> {
     let json: Json = serde_json::from_slice(bytes).map_err(|e| e.to_string())?;
     let mut value = json.get(ORIENTATION).ok_or_else(|| format!("`{ORIENTATION}` is missing"))?;
-    // Exporters wrap it in a batch of one.
+    // Some exporters write a batch of one.
     while let Some([Json::Array(_)]) = value.as_array().map(Vec::as_slice) {
         value = &value[0];
     }
@@ -61,7 +61,7 @@ fn from_pickle(bytes: &[u8]) -> Result<Vec<f64>, String> {
     numbers(value, &mut { MAX_NODES }).ok_or_else(|| format!("`{ORIENTATION}` is no array of numbers"))
 }
 
-/// What a pickle builds. Containers are shared, as in Python.
+/// A value of a pickle. Containers are shared, as in Python.
 #[derive(Clone, Debug)]
 enum Value {
     None,
@@ -73,7 +73,7 @@ enum Value {
     List(Rc<RefCell<Vec<Value>>>),
     /// Keys and values in turn.
     Dict(Rc<RefCell<Vec<Value>>>),
-    /// What a call would give: who is called, with what, and the state that is set afterwards.
+    /// A call: its function, its arguments, and the state that is set afterwards.
     Object(Rc<RefCell<Vec<Value>>>),
 }
 
@@ -83,7 +83,7 @@ fn shared(values: Vec<Value>) -> Rc<RefCell<Vec<Value>>> {
 
 /// The numbers of a NumPy array or scalar, or of a list, in order.
 fn numbers(value: &Value, nodes: &mut usize) -> Option<Vec<f64>> {
-    // Lists that hold one another many times unfold without end.
+    // The number of values of lists inside one another may be exponential.
     *nodes = nodes.checked_sub(1)?;
     match value {
         Value::Number(number) => Some(vec![*number]),
@@ -133,11 +133,11 @@ fn numbers(value: &Value, nodes: &mut usize) -> Option<Vec<f64>> {
     }
 }
 
-/// Bytes, or what Python 3 writes for them in protocol 2: a call that encodes text as Latin-1.
+/// Bytes. In protocol 2, Python 3 writes them as a call that encodes text as Latin-1.
 fn raw(value: &Value) -> Option<Rc<[u8]>> {
     match value {
         Value::Bytes(bytes) => Some(bytes.clone()),
-        // Python 2's strings, where they happen to be text.
+        // Strings of Python 2 that are valid text.
         Value::Text(text) => Some(text.as_bytes().into()),
         Value::Object(parts) => {
             let parts = parts.borrow();
@@ -152,7 +152,7 @@ fn raw(value: &Value) -> Option<Rc<[u8]>> {
     }
 }
 
-/// Runs a pickle of protocol 2 to 5 as far as parameters need it.
+/// Runs a pickle of protocol 2 to 5 with the operations of SMPL-X parameters.
 fn unpickle(bytes: &[u8]) -> Result<Value, String> {
     let mut machine = Machine { rest: bytes, stack: Vec::new(), memo: Vec::new() };
     for _ in 0..MAX_OPERATIONS {
@@ -178,7 +178,7 @@ impl<'a> Machine<'a> {
         Ok(taken)
     }
 
-    /// A whole number of `bytes` bytes, lowest first.
+    /// A little-endian integer of `bytes` bytes.
     fn whole(&mut self, bytes: usize) -> Result<usize, String> {
         let taken = self.take(bytes)?;
         Ok(taken.iter().rev().fold(0, |sum, byte| sum << 8 | usize::from(*byte)))
@@ -243,7 +243,7 @@ impl<'a> Machine<'a> {
 
     fn run(&mut self, operation: u8) -> Result<(), String> {
         let value = match operation {
-            // Protocol and frame: nothing to do.
+            // Protocol and frame are ignored.
             0x80 => return self.take(1).map(drop),
             0x95 => return self.take(8).map(drop),
             b'(' => Value::Mark,
@@ -317,7 +317,7 @@ impl<'a> Machine<'a> {
                 self.last(2)?;
                 Value::Text("a name".into())
             }
-            // A call, or a new object: who and with what.
+            // A call, or a new object: function and arguments.
             b'R' | 0x81 => Value::Object(shared(self.last(2)?)),
             b'b' => {
                 let state = self.pop()?;
@@ -354,7 +354,7 @@ mod tests {
         yaw_degrees(&path).map_err(|e| e.to_string())
     }
 
-    /// Dictionaries of NumPy arrays, written by Python's `pickle` with `global_orient` = [[0.25, −1.5, 0.125]].
+    /// Dictionaries of NumPy arrays from Python's `pickle`, with `global_orient` = [[0.25, −1.5, 0.125]].
     const PICKLES: [&[u8]; 3] = [
         include_bytes!("../tests/smplx/protocol2.pkl"),
         include_bytes!("../tests/smplx/protocol4.pkl"),
@@ -380,7 +380,7 @@ mod tests {
         assert!(message(b"t.").ends_with("a mark is missing"));
         assert!(message(&[b'('; 20_000]).contains("more than 10000 steps"));
         assert!(message(b"\x80\x04\x95").ends_with("it is cut off"));
-        // A dictionary that holds itself.
+        // A dictionary that contains itself.
         assert!(message(b"}q\x00X\x0d\x00\x00\x00global_orienth\x00s.").contains("no array of numbers"));
     }
 

@@ -11,7 +11,7 @@ use crate::scan::{Collection, normalise};
 use snapsnap_mesh::mesh::{Face, Material, Mesh};
 use snapsnap_people::synth;
 
-/// One synthetic person, standing where the cameras look.
+/// One synthetic person in front of the cameras.
 pub fn person() -> &'static Mesh {
     static PERSON: OnceLock<Mesh> = OnceLock::new();
     PERSON.get_or_init(|| {
@@ -21,7 +21,7 @@ pub fn person() -> &'static Mesh {
     })
 }
 
-/// A rectangle that leans, seen from in front and from behind: its points satisfy `normal · p = 0.9`.
+/// An inclined rectangle, visible from both sides. Its points satisfy `normal · p = 0.9`.
 pub fn rectangle() -> (Mesh, Vec3) {
     let (right, up) = (Vec3::new(0.8, 0.0, 0.25), Vec3::new(0.1, 0.9, 0.2));
     let centre = Vec3::new(0.0, 0.9, 0.05);
@@ -38,7 +38,7 @@ pub fn rectangle() -> (Mesh, Vec3) {
     (mesh, normal * (0.9 / normal.dot(centre)))
 }
 
-/// Middle and half the size of [`block`]: no turn of the camera makes another of its views.
+/// Centre and half size of [`block`]. No two of its views are equal.
 pub const BLOCK: (Vec3, Vec3) = (Vec3::new(0.06, 0.9, 0.03), Vec3::new(0.3, 0.8, 0.17));
 
 /// A block whose six sides face along the axes.
@@ -55,14 +55,14 @@ pub fn block() -> Mesh {
     }
 }
 
-/// How far a point lies from the surface of [`block`].
+/// Distance of a point from the surface of [`block`].
 pub fn off_block(p: Vec3) -> f32 {
     let (middle, half) = BLOCK;
     let out = (p - middle).abs() - half;
     (out.max(Vec3::ZERO).length() + out.max_element().min(0.0)).abs()
 }
 
-/// A data set of `subjects` times the same mesh, in train.
+/// A data set with `subjects` copies of a mesh in train.
 pub fn data_set(
     mesh: &Mesh,
     layout: Layout,

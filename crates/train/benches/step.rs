@@ -1,8 +1,9 @@
 //! A training step, forward and backward, of the small predictor (`configs/small`, 256², batch 2) and of the regressor
 //! (two views of 256²): `cargo bench --workspace --bench step`. `docs/step_pytorch.py` runs PyTorch's beside it.
 //!
-//! Arguments: seconds per measurement (20), side (256), batch (2); `tiny` or `full` for that folder of `configs`; `whole` to leave out
-//! what is partly frozen; `predictor` or `regressor` for one alone, so that the most memory that is said to be used is its own.
+//! Arguments: seconds per measurement (20), side (256), batch (2); `tiny` or `full` for that folder of `configs`;
+//! `whole` to leave out what is partly frozen; `predictor` or `regressor` for one alone, so that the most memory that
+//! is said to be used is its own.
 
 use std::hint::black_box;
 use std::time::{Duration, Instant};

@@ -1,5 +1,5 @@
-//! The state of a run in one file, written whole or not at all: weights, averages, the optimiser's state and the progress.
-//! Everything random follows from the seed and the step.
+//! The state of a run in one file, written whole or not at all: weights, averages, the optimiser's state and the
+//! progress. Everything random follows from the seed and the step.
 
 use std::collections::{BTreeMap, HashMap};
 use std::path::Path;

@@ -57,10 +57,11 @@ pub struct TrainingConfig {
     pub accumulate: usize,
     /// Largest norm of all gradients together. Larger gradients are scaled down to it.
     pub clip: f64,
-    /// Decay of the exponential moving average of the weights. The average is validated and written; 0: the weights themselves.
+    /// Decay of the exponential moving average of the weights. The average is validated and written; 0: the weights
+    /// themselves.
     pub ema_decay: f64,
-    /// Weight file to begin with, trained by this program or imported. `--weights` replaces it. Without one, stage 1 begins
-    /// with random weights.
+    /// Weight file to begin with, trained by this program or imported. `--weights` replaces it. Without one, stage 1
+    /// begins with random weights.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub weights: Option<PathBuf>,
     /// Seed of random weights and of the order of samples.
@@ -85,8 +86,8 @@ pub struct TrainingConfig {
     pub preview_every: usize,
     /// Number format of the point predictor's layers. The device must support it.
     pub precision: Precision,
-    /// Whether the backward pass computes cheap intermediate results again instead of keeping them. Operators with a backward pass of
-    /// their own ignore it.
+    /// Whether the backward pass computes cheap intermediate results again instead of keeping them. Operators with a
+    /// backward pass of their own ignore it.
     pub gradient_checkpointing: bool,
 }
 
@@ -114,7 +115,8 @@ pub struct Stage1Config {
 pub struct Stage2Config {
     /// β: the share of the L1 loss. The rest is the share of the structural dissimilarity.
     pub l1_share: f64,
-    /// Whether views follow the published curriculum: the sides with a penalty on scales, then front and back, then all.
+    /// Whether views follow the published curriculum: the sides with a penalty on scales, then front and back, then
+    /// all.
     pub curriculum: bool,
     /// Weight of the mean absolute difference of coverage and mask.
     pub alpha_weight: f64,
@@ -123,8 +125,8 @@ pub struct Stage2Config {
     pub anisotropy_weight: f64,
     /// Largest ratio of the longest to the shortest axis without a penalty.
     pub anisotropy_limit: f64,
-    /// Standard deviation, in metres, of random shifts of the predicted points. The frozen predictor's points are better for
-    /// the people that it was trained on than for others.
+    /// Standard deviation, in metres, of random shifts of the predicted points. The frozen predictor's points are
+    /// better for the people that it was trained on than for others.
     pub point_noise: f64,
     /// Perceptual distance, in the last steps.
     #[serde(skip_serializing_if = "Option::is_none")]

@@ -23,7 +23,8 @@ impl Average {
         Self { decay, rows }
     }
 
-    /// Adds the weights after `step` steps. The first steps keep less of the average, since it is mostly the initial weights.
+    /// Adds the weights after `step` steps. The first steps keep less of the average, since it is mostly the initial
+    /// weights.
     pub fn update(&mut self, step: u64, rows: Rows) {
         let decay = self.decay.min((1.0 + step as f64) / (10.0 + step as f64));
         for (name, new) in rows {

@@ -1,5 +1,5 @@
-//! TensorBoard's event files. A record is a length, data and checksums. The data is a protocol buffer with a time, a step
-//! and named values. (Crates that write such files need protobuf's compiler or are no longer maintained.)
+//! TensorBoard's event files. A record is a length, data and checksums. The data is a protocol buffer with a time, a
+//! step and named values. (Crates that write such files need protobuf's compiler or are no longer maintained.)
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, Write};

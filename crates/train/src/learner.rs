@@ -129,8 +129,8 @@ impl<'a, T: Task> Learner<'a, T> {
     }
 }
 
-/// Result of a batch: the loss and its parts by name, none if no sample shows a person; and the gradients, unless a loss was
-/// not finite.
+/// Result of a batch: the loss and its parts by name, none if no sample shows a person; and the gradients, unless a
+/// loss was not finite.
 struct Made {
     values: BTreeMap<&'static str, f64>,
     gradients: Option<Rows>,
@@ -146,8 +146,8 @@ struct How {
     share: f64,
 }
 
-/// Loss and gradients of a batch, times its share. Several devices compute equal parts of the batch at once, and the first
-/// device averages losses and gradients. (Burn has collectives for CUDA only. Copies work on every device.)
+/// Loss and gradients of a batch, times its share. Several devices compute equal parts of the batch at once, and the
+/// first device averages losses and gradients. (Burn has collectives for CUDA only. Copies work on every device.)
 fn on_devices<T: Task>(
     task: &T,
     networks: &Networks,
@@ -242,8 +242,8 @@ impl<'a, T: Task> Samples<'a, T> {
         Self { task, config, per_pass, open: None }
     }
 
-    /// A batch by its number since the beginning of the run, or the reason why it cannot be loaded. Its content follows from
-    /// the number alone.
+    /// A batch by its number since the beginning of the run, or the reason why it cannot be loaded. Its content follows
+    /// from the number alone.
     fn get(&mut self, number: u64) -> Result<Vec<T::Item>, String> {
         let (pass, place) = (number / self.per_pass, number % self.per_pass);
         let mut open = self.open.take().filter(|(_, next)| *next == number && place > 0);

@@ -20,7 +20,8 @@ pub struct Line {
     pub step: u64,
     /// Seconds of training so far, all sessions together.
     pub seconds: f64,
-    /// Measurements by name: parts of the loss, learning rate and gradient norm, or, as `validation/…`, those of a validation.
+    /// Measurements by name: parts of the loss, learning rate and gradient norm, or, as `validation/…`, those of a
+    /// validation.
     pub values: BTreeMap<String, f64>,
 }
 

@@ -129,8 +129,8 @@ struct Work {
 }
 
 impl Optimizer {
-    /// One step of all parameters that have a gradient, at `share` of the highest rates. Gradients are multiplied by `factor`
-    /// first.
+    /// One step of all parameters that have a gradient, at `share` of the highest rates. Gradients are multiplied by
+    /// `factor` first.
     pub fn step(&mut self, share: f64, networks: Networks, mut gradients: Rows, factor: f64) -> Networks {
         let mut shapes = networks.shapes();
         let rows = networks.rows().into_iter();
@@ -176,8 +176,8 @@ impl Optimizer {
         (name, values, state)
     }
 
-    /// AdamW (Loshchilov and Hutter). Burn's AdamW corrects the moments' bias in f32, so that its second step differs from
-    /// PyTorch's by 1.5e-5.
+    /// AdamW (Loshchilov and Hutter). Burn's AdamW corrects the moments' bias in f32, so that its second step differs
+    /// from PyTorch's by 1.5e-5.
     pub(crate) fn adamw(
         &self,
         share: f64,
@@ -267,8 +267,8 @@ impl Optimizer {
     }
 }
 
-/// Muon (Jordan et al.): a step along the orthogonalised Nesterov momentum. Its factor 0.2·√(longest side) makes it as long as
-/// a step of AdamW (Liu et al., "Muon is scalable").
+/// Muon (Jordan et al.): a step along the orthogonalised Nesterov momentum. Its factor 0.2·√(longest side) makes it as
+/// long as a step of AdamW (Liu et al., "Muon is scalable").
 fn muon(
     settings: &MuonSettings,
     share: f64,

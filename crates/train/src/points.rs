@@ -9,8 +9,8 @@ use snapsnap_ops::host;
 
 /// Squares of distances below this have no gradient: the direction of so small an error is noise.
 const MIN_SQUARE: f64 = 1e-24;
-/// Probabilities are no less than this, the least that f32 has in full: PyTorch's binary cross-entropy takes e⁻¹⁰⁰. Below it
-/// there is no gradient; that of log 0 would not be a number.
+/// Probabilities are no less than this, the least that f32 has in full: PyTorch's binary cross-entropy takes e⁻¹⁰⁰.
+/// Below it there is no gradient; that of log 0 would not be a number.
 const MIN_PROBABILITY: f64 = 1.2e-38;
 
 /// What stage 1 is trained on.
@@ -32,8 +32,8 @@ pub struct Prediction {
 }
 
 impl Prediction {
-    /// The same as inference takes it, on the whole canvas; what lies outside is 0. `masks` `[B,2,S,S]` are those of the
-    /// photographs.
+    /// The same as inference takes it, on the whole canvas; what lies outside is 0. `masks` `[B,2,S,S]` are those of
+    /// the photographs.
     pub fn on_canvas(self, config: &NetworkConfig, masks: &Tensor<4>) -> Vec<(View, PointMap)> {
         let placed = |(view, map): (View, PointMap)| {
             let mask = mask_of(view, masks);
@@ -54,8 +54,8 @@ pub(crate) fn window(config: &Config, masks: &[f32], side: usize) -> Window {
     Window::of_predictor(config, masks.chunks_exact(side * side))
 }
 
-/// Point maps as training sees them: front and back `[B,2,3,S,S]` in [−1, 1] and their masks `[B,2,S,S]`, which decide the
-/// window and `mask-aware` interpolation.
+/// Point maps as training sees them: front and back `[B,2,3,S,S]` in [−1, 1] and their masks `[B,2,S,S]`, which decide
+/// the window and `mask-aware` interpolation.
 pub fn predict(
     predictor: &PointPredictor,
     config: &Config,

@@ -1,5 +1,5 @@
-//! Steps in 16 bits: matrix products and convolutions of the point predictor, and their intermediate results for the backward
-//! pass. Weights, moments and losses stay in 32 bits.
+//! Steps in 16 bits: matrix products and convolutions of the point predictor, and their intermediate results for the
+//! backward pass. Weights, moments and losses stay in 32 bits.
 
 use serde::{Deserialize, Serialize};
 pub use snapsnap_net::precision::Precision;
@@ -13,8 +13,8 @@ pub fn lower(precision: Precision, networks: &Networks) -> Networks {
     networks
 }
 
-/// Factor of the loss before the backward pass; gradients are divided by it. It is halved after a gradient that is not finite,
-/// and doubled after many steps without one.
+/// Factor of the loss before the backward pass; gradients are divided by it. It is halved after a gradient that is not
+/// finite, and doubled after many steps without one.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LossScale {

@@ -54,7 +54,8 @@ pub trait Task: Sync {
     /// Name of a sample: its data set, subject and view.
     fn name(item: &Self::Item) -> &str;
 
-    /// Parts of a batch's loss, computed on the device of `networks` and `at`. Empty if no sample of the batch shows a person.
+    /// Parts of a batch's loss, computed on the device of `networks` and `at`. Empty if no sample of the batch shows a
+    /// person.
     ///
     /// # Errors
     /// [`TrainError`] if the batch cannot be used.
@@ -65,8 +66,8 @@ pub trait Task: Sync {
         at: Moment,
     ) -> Result<Vec<Part>, TrainError>;
 
-    /// Compares predictions for held-out people with the ground truth; `None` without such people. `networks` have no gradients
-    /// and are on the first device.
+    /// Compares predictions for held-out people with the ground truth; `None` without such people. `networks` have no
+    /// gradients and are on the first device.
     ///
     /// # Errors
     /// [`TrainError`] if a sample cannot be read.

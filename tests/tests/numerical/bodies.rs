@@ -1,4 +1,4 @@
-//! What a point predictor sees, and the convolutional one: the same on every device, and what each key says.
+//! Inputs of the point predictor, its convolutional body, and the keys of the network.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use snapsnap_net::config::Config;
@@ -16,7 +16,7 @@ const CONVOLUTION: [&str; 4] = [
     "network.ray_channels=true",
 ];
 
-/// The device, unless it is one where kernels are compiled for minutes: what a key says is the same everywhere.
+/// The device, unless it is a software adapter: compiling kernels takes minutes there, and keys act alike on every device.
 fn real_device() -> Option<Device> {
     let device = device()?;
     if is_software(&device) {
@@ -57,7 +57,7 @@ fn a_convolution_is_the_same_on_every_device_and_for_every_patch() {
             let error = relative_error(got, expected);
             assert!(error < 1e-4, "patch {patch}, {view:?}: {error:e}");
         }
-        // No two views are the same network's.
+        // Every view has layers of its own.
         (0..4).for_each(|i| assert_different("views", &expected[i].1, &expected[(i + 1) % 4].1));
     }
     let config = config(&[&CONVOLUTION[..], &["network.side_heads=false"]].concat());
@@ -84,7 +84,7 @@ fn every_view_depends_on_both_photographs() {
     }
 }
 
-/// Whoever sees the back in a mirror sees what another sees of a back that is mirrored.
+/// `network.mirror` gives the same as a mirrored photograph of the back without this key.
 #[test]
 fn a_mirrored_back_is_the_back_of_a_mirrored_photograph() {
     let Some(device) = real_device() else { return };
@@ -99,12 +99,12 @@ fn a_mirrored_back_is_the_back_of_a_mirrored_photograph() {
         let flipped = |x: &Tensor<4>| Tensor::cat(vec![half(x, 0), half(x, 1).flip([3])], 0);
         let seen = Input::new(&mirrored, colors.clone(), masks.clone(), &window);
         let mut other = Input::new(&plain, flipped(&colors), flipped(&masks), &window);
-        // Where a pixel lies the back's own camera knows: in front's directions the mirror image of what it would be.
+        // Rays are those of the back's own camera, so the mirrored photograph needs the opposite x.
         let rays = other.images.clone().narrow(1, 4, 1);
         let rays = Tensor::cat(vec![half(&rays, 0), -half(&rays, 1)], 0);
         let [_, _, h, w] = other.images.dims();
         other.images = other.images.slice_assign([0..2, 4..5, 0..h, 0..w], rays);
-        assert_same("what is seen", &values(seen.images.clone()), &values(other.images.clone()));
+        assert_same("input", &values(seen.images.clone()), &values(other.images.clone()));
         let net = |config: &Config| random_predictor(config, 5, &device);
         let (a, b) = (net(&mirrored).forward(seen), net(&plain).forward(other));
         for ((view, a), (_, b)) in a.into_iter().zip(b) {
@@ -114,9 +114,9 @@ fn a_mirrored_back_is_the_back_of_a_mirrored_photograph() {
     }
 }
 
-/// Whoever looks at somebody and at the mirror image makes of a mirror image the mirror image, to the last bit but for sums' order.
+/// With `network.both_ways` the prediction of mirrored photographs is the mirrored prediction, but for the order of sums.
 #[test]
-fn what_is_seen_both_ways_has_no_left_and_right_of_its_own() {
+fn predictions_of_both_ways_are_symmetric() {
     let Some(device) = real_device() else { return };
     for body in [&CONVOLUTION[..], &["network.mask_channel=true", "network.ray_channels=true"]] {
         let one = config(&[body, &["network.mirror=true"]].concat());
@@ -144,7 +144,7 @@ fn what_is_seen_both_ways_has_no_left_and_right_of_its_own() {
             let got = [values(map.points.clone()), values(map.conf.clone())].concat();
             let error = relative_error(&got, &mirrored(&flipped[other].1));
             assert!(error < 1e-6, "{view:?}: {error:e}");
-            // And it is the mean of what both would be alone.
+            // It is the mean of the two single predictions.
             let alone = &once[*view as usize].1;
             let alone = [values(alone.points.clone()), values(alone.conf.clone())].concat();
             let mean: Vec<f32> =
@@ -159,7 +159,7 @@ fn what_is_seen_both_ways_has_no_left_and_right_of_its_own() {
 /// The nominal cameras' focal length is 0.8 of the canvas, their axis 25 of 1024 pixels below its middle
 /// (docs/method.md, "Cameras").
 #[test]
-fn channels_say_how_much_of_a_pixel_is_the_person_and_where_it_lies() {
+fn channels_hold_the_share_of_the_person_and_the_ray() {
     let device = Device::flex();
     let config = config(&["network.mask_channel=true", "network.ray_channels=true"]);
     let side = config.network.resolution;
@@ -171,7 +171,7 @@ fn channels_say_how_much_of_a_pixel_is_the_person_and_where_it_lies() {
     let at = |photograph: usize, channel: usize, row: usize, column: usize| {
         values(input.images.clone())[((photograph * 6 + channel) * 32 + row) * 32 + column]
     };
-    // Two canvas pixels to one, of which one column is the person's.
+    // A network pixel covers 2×2 canvas pixels; one of their two columns belongs to the person.
     assert_eq!((at(0, 3, 0, 0), at(0, 3, 31, 1)), (0.5, 1.0));
     let near = |a: f32, b: f32| assert!((a - b).abs() < 1e-6, "{a} {b}");
     near(at(0, 4, 5, 31), (127.0 / 128.0 - 0.5) / 0.8);
@@ -181,15 +181,16 @@ fn channels_say_how_much_of_a_pixel_is_the_person_and_where_it_lies() {
     near(at(1, 5, 0, 7), down);
 }
 
-/// What the left-out tokens would have shown does not matter, and where none is left out nothing changes.
+/// The pixels of dropped tokens have no influence. Without a dropped token nothing changes.
 #[test]
-fn tokens_that_show_nobody_are_left_out() {
+fn tokens_without_a_person_are_dropped() {
     let Some(device) = real_device() else { return };
     let dropping = config(&["network.drop_empty=true"]);
     let (side, patch) = (dropping.network.net_resolution, dropping.network.patch);
     let net = random_predictor(&dropping, 5, &device);
     let grid = side / patch;
-    // Somebody in all of the first photograph's tokens but the first column's, and in one pixel of that of the second's.
+    // The first photograph shows the person in all tokens but those of the first column. The second shows one pixel in that
+    // column.
     let mut masks = vec![0.0; 2 * side * side];
     for row in 0..side {
         masks[row * side + patch..(row + 1) * side].fill(1.0);
@@ -216,16 +217,16 @@ fn tokens_that_show_nobody_are_left_out() {
     let everybody = Tensor::<4>::ones([2, 1, side, side], &device);
     assert_eq!(Grid::of_persons(&everybody, patch), whole);
     assert_eq!(Grid::of_persons(&Tensor::<4>::zeros([2, 1, side, side], &device), patch), whole);
-    // Every token of the grid by its number is the whole grid.
+    // A list of all tokens is the whole grid.
     let all = Grid { kept: Some((0..grid * grid).collect()), ..whole.clone() };
     for ((view, a), (_, b)) in with(&one, &all).iter().zip(&with(&one, &whole)) {
         assert_same(&format!("{view:?} with all"), a, b);
     }
 }
 
-/// The plan counts the input's channels and the tokens that were left out, and every pixel of a photograph becomes a Gaussian.
+/// The plan counts channels and dropped tokens. Every valid pixel of a photograph becomes a Gaussian.
 #[test]
-fn the_plan_of_a_reconstruction_names_what_it_left_out() {
+fn the_plan_of_a_reconstruction_names_channels_window_and_dropped_tokens() {
     let Some(device) = device() else { return };
     for (body, drops_tokens) in [
         (&["network.drop_empty=true", "network.head=linear", "network.patch=8"][..], true),
@@ -246,7 +247,7 @@ fn the_plan_of_a_reconstruction_names_what_it_left_out() {
         let photographs = [photograph(side, 1), photograph(side, 2)];
         let made = model.reconstruct(&photographs[0], &photographs[1], &|_| ());
         let has = |text: &str| made.plan.iter().any(|line| line.contains(text));
-        // Colours, the mask and two of the ray; the person's window is less than the canvas.
+        // Three colours, the mask, and two of the ray. The person's window is smaller than the canvas.
         assert!(has("tokens each, 6 channels") && has(", the person's window"), "{:?}", made.plan);
         assert_eq!(has("tokens left out"), drops_tokens, "{:?}", made.plan);
         for (photograph, valid) in photographs.iter().zip(&made.valid) {

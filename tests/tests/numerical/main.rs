@@ -1,5 +1,5 @@
-//! What must be right on every device: parity with reference numbers, properties of the networks, the splatting operation.
-//! One program, so that it can be taken to a machine that cannot build it (`cargo xtask bundle`).
+//! Tests of every device: parity with reference numbers, properties of the networks, the splatting operation, training.
+//! They are one program, so that `cargo xtask bundle` can pack them for a machine without cargo.
 
 mod bodies;
 mod networks;
@@ -11,3 +11,9 @@ mod splat_invariants;
 mod splat_oracle;
 mod steps;
 mod training;
+
+/// |`found` − `expected`|. A NaN is infinitely far away: `max` would pass over it.
+fn distance(found: f64, expected: f64) -> f64 {
+    let distance = (found - expected).abs();
+    if distance.is_nan() { f64::INFINITY } else { distance }
+}

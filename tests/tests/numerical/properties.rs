@@ -1,4 +1,4 @@
-//! What must hold whatever the weights: symmetries of the networks, and indifference to what is not the person.
+//! Properties of the networks that hold for any weights.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use snapsnap_base::config::Schema;
@@ -192,14 +192,14 @@ fn concatenation_puts_the_front_first() {
     let right = |front: Tensor<3>, back: Tensor<3>| {
         net.transformer().raw_points(View::Right, &[maps(front), maps(back)], &Grid::whole([2, 2]))
     };
-    // A linear head is affine: the two halves' contributions add up, and they are different matrices.
+    // A linear head is affine: the contributions of both halves add up. Their matrices differ.
     let both = values(right(tokens(1), tokens(2)) + right(zero(), zero()));
     let halves = values(right(tokens(1), zero()) + right(zero(), tokens(2)));
     assert!(relative_error(&both, &halves) < 1e-5);
     assert!(relative_error(&values(right(tokens(1), zero())), &values(right(zero(), tokens(1)))) > 0.1);
 }
 
-/// Points of up to e⁶⁰ units (‖(35, 35, 35)‖ ≈ 60): squares overflow on the way, the Gaussians must not.
+/// Points of up to e⁶⁰ units (‖(35, 35, 35)‖ ≈ 60). Their squares overflow, the Gaussians must not.
 #[test]
 fn points_of_extreme_size_give_finite_gaussians() {
     let Some(device) = device() else { return };
@@ -240,7 +240,7 @@ fn swapping_two_heads_weights_swaps_their_outputs() {
     let (file, weights) = weights(&config, 7);
     let bytes = std::fs::read(file.path()).expect("read");
     let header = u64::from_le_bytes(bytes[..8].try_into().expect("8 bytes")) as usize;
-    // The same length, so that the data stay where they are.
+    // Names of equal length leave the data in place.
     let names = std::str::from_utf8(&bytes[8..8 + header]).expect("JSON");
     let swapped =
         names.replace("downstream_head3", "downstream_headX").replace("downstream_head4", "downstream_head3");
@@ -264,14 +264,14 @@ fn swapping_two_heads_weights_swaps_their_outputs() {
     assert_same("front", &before[view(View::Front)], &after[view(View::Front)]);
 }
 
-/// Two photographs without channels of their own beside the colours, for patches of 16 pixels.
+/// Two photographs of three channels, for patches of 16 pixels.
 fn pair(front: Tensor<4>, back: Tensor<4>) -> Input {
     let [_, _, h, w] = front.dims();
     Input { images: Tensor::cat(vec![front, back], 0), grid: Grid::whole([h / 16, w / 16]) }
 }
 
 #[test]
-fn every_fusion_head_and_view_count_runs_on_sizes_that_are_no_squares() {
+fn every_fusion_and_head_gives_points_of_its_own_on_oblong_pictures() {
     let Some(device) = device() else { return };
     let image =
         |seed| Tensor::<4>::from_data(TensorData::new(noise(3 * 48 * 80, seed), [1, 3, 48, 80]), &device);
@@ -296,7 +296,7 @@ fn every_fusion_head_and_view_count_runs_on_sizes_that_are_no_squares() {
     }
 }
 
-/// If the back's tokens are the front's mirrored, mirroring them back and averaging gives the front's tokens.
+/// If the back's tokens are the mirrored front tokens, `mirror-mean` gives the front tokens.
 #[test]
 fn mirror_mean_undoes_a_mirror_image() {
     let Some(device) = device() else { return };
@@ -352,7 +352,7 @@ fn cropping_changes_nothing_inside_the_mask_with_frozen_statistics() {
     let error = relative_error(&cropped(&padded), &expected);
     println!("cropped with a margin of {RECEPTIVE_RADIUS} pixels: relative error {error:.2e}");
     assert!(error < 1e-6, "{error:e}");
-    // Without the margin the difference shows, so the test can fail.
+    // Without the margin there is a difference, so the test can fail.
     let tight = Window { rows: 168..216, columns: 160..192 };
     let error = relative_error(&cropped(&tight), &expected);
     println!("cropped without a margin: relative error {error:.2e}");
@@ -368,11 +368,13 @@ fn the_worlds_frames_are_upright_or_the_demos_mirror_image() {
         (values(result.gaussians.means.clone()), values(result.in_world(&config).means))
     };
     let (camera, world) = point(&["mode.compat=true"]);
+    assert!(!camera.is_empty() && camera.len() == world.len());
     for (c, w) in camera.chunks_exact(3).zip(world.chunks_exact(3)) {
         let expected = [-c[0], -c[1], 2.0 - c[2]];
         assert!(w.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-5), "{c:?} {w:?}");
     }
     let (camera, world) = point(&[]);
+    assert!(!camera.is_empty() && camera.len() == world.len());
     let rig = snapsnap_splat::Camera::orbit_at_yaw_degrees(0.0, 128).world_to_camera.inverse();
     for (c, w) in camera.chunks_exact(3).zip(world.chunks_exact(3)) {
         let expected = rig.apply(glam::DVec3::new(c[0].into(), c[1].into(), c[2].into()));

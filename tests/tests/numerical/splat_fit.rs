@@ -1,4 +1,4 @@
-//! Gradient descent through the splatting operation: random Gaussians become a given scene.
+//! Gradient descent through the splatting operation: random Gaussians are fitted to a scene.
 
 use burn::module::{Module, Param};
 use burn::optim::{AdamConfig, GradientsParams};
@@ -65,7 +65,7 @@ fn target() -> HostScene {
     HostScene { gaussians: (0..60).map(gaussian).collect(), background: [0.0; 3] }
 }
 
-/// Loss of each step, and the PSNR of a view that was never trained on, before and after.
+/// Loss of each step, and the PSNR of an unseen view before and after.
 fn fit(device: &Device) -> (Vec<f32>, f32, f32) {
     let orbit = |i: f64| Camera::orbit_at_yaw_degrees(i * 360.0 / VIEWS as f64, SIZE);
     let cameras: Vec<Camera> = (0..VIEWS).map(|i| orbit(i as f64)).collect();
@@ -100,10 +100,10 @@ fn fit(device: &Device) -> (Vec<f32>, f32, f32) {
 }
 
 #[test]
-fn random_gaussians_become_a_given_scene() {
+fn random_gaussians_are_fitted_to_a_scene() {
     let Some(device) = device() else { return };
     let (losses, before, after) = fit(&device);
-    println!("held-out view: {before:.2} dB before, {after:.2} dB after {STEPS} steps");
+    println!("unseen view: {before:.2} dB before, {after:.2} dB after {STEPS} steps");
     assert!(before < 20.0, "nothing to learn: {before} dB");
     assert!(after > 30.0, "{after} dB");
     if device_name() == "wgpu" {
@@ -111,7 +111,7 @@ fn random_gaussians_become_a_given_scene() {
         let worst = losses.iter().zip(&expected).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
         let relative = losses.iter().zip(&expected).map(|(a, b)| (a / b - 1.0).abs()).fold(0.0, f32::max);
         println!("against the CPU: loss within {worst:.1e}, relatively {relative:.1e}; {cpu:.2} dB there");
-        // Rounding grows along the way, but the descent is the same: to 1e-3 of where it starts.
+        // Rounding grows along the way. Both descents agree to 1e-3 of the first loss.
         assert!(worst < 1e-3 * expected[0] && (after - cpu).abs() < 0.3);
     }
 }

@@ -1,10 +1,12 @@
-//! The splatting operation against the f64 reference renders and gradients of `fixtures/splat`.
+//! The splatting operation against the f64 reference renders and gradients of `tests/data/splat`.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use snapsnap_splat::{Camera, Gaussians, RenderOptions, cameras, render};
 use snapsnap_tests::{Numbers, device, fixture, values};
 
-/// One fixture on one device: what was rendered and what its gradients were.
+use crate::distance;
+
+/// One fixture: inputs, expected pictures and gradients.
 struct Case {
     numbers: Numbers,
     cameras: Vec<Camera>,
@@ -63,7 +65,7 @@ impl Case {
                 let found: Vec<f32> = values(got.clone());
                 for (at, (f, e)) in found.iter().zip(&expected).enumerate() {
                     if banded[at / channels] == 0 {
-                        worst = worst.max((f64::from(*f) - e).abs());
+                        worst = worst.max(distance(f64::from(*f), *e));
                     }
                 }
                 let (_, upstream) = n.f32(&format!("grad_{part}.{i}"));

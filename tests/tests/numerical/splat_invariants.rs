@@ -1,4 +1,4 @@
-//! What must hold for every scene, and what no input may do.
+//! Invariants of the splatting operation for every scene, and its behaviour on extreme input.
 
 use burn::tensor::{Device, Tensor};
 use snapsnap_splat::{Camera, Counts, Gaussians, MAX_SIDE, RenderOptions, SplatError, render};
@@ -145,7 +145,7 @@ fn the_image_is_linear_in_the_background() {
 }
 
 #[test]
-fn views_together_are_views_alone() {
+fn several_views_are_the_same_as_each_alone() {
     let Some(device) = device() else { return };
     let host = random_scene(60, 9);
     let options = RenderOptions { antialiased: true, ..RenderOptions::gsplat_1_5() };
@@ -175,9 +175,9 @@ fn views_together_are_views_alone() {
     assert!(difference.sqrt() < 1e-6 * norm.sqrt(), "{difference} {norm}");
 }
 
-/// With only the colours tracked the colours' gradient is the same, and there is no other.
+/// With one input tracked, its gradient is the same as with all, and the other inputs have none.
 #[test]
-fn inputs_that_nobody_tracks_get_no_gradient() {
+fn untracked_inputs_get_no_gradient() {
     let Some(device) = device() else { return };
     let host = random_scene(80, 10);
     let cameras = [forward_camera(50, 37)];
@@ -221,9 +221,9 @@ fn inputs_that_nobody_tracks_get_no_gradient() {
     assert!(expected.iter().any(|g| *g != 0.0));
 }
 
-/// A Gaussian with a number that is none is as if it were not there: to the last bit, for pixels and the others' gradients.
+/// A Gaussian with a NaN or an infinity changes no bit of the pixels and of the other gradients.
 #[test]
-fn a_poisoned_gaussian_is_left_out() {
+fn a_gaussian_that_is_not_finite_is_left_out() {
     let Some(device) = device() else { return };
     let camera = [forward_camera(31, 23)];
     let clean = random_scene(30, 13);
@@ -232,7 +232,10 @@ fn a_poisoned_gaussian_is_left_out() {
     for antialiased in [false, true] {
         let options = RenderOptions { antialiased, ..RenderOptions::inria() };
         let expected = pass(&without, &camera, &options, &device);
-        assert!(expected.image != pass(&clean, &camera, &options, &device).image, "it is seen when sound");
+        assert!(
+            expected.image != pass(&clean, &camera, &options, &device).image,
+            "it is visible without the NaN"
+        );
         for place in 0..14 {
             for value in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
                 let mut host = clean.clone();
@@ -248,9 +251,9 @@ fn a_poisoned_gaussian_is_left_out() {
     }
 }
 
-/// Whatever Gaussians hold, pixels and gradients stay finite, and everyone is counted.
+/// Pixels and gradients stay finite for any values, and every Gaussian is counted once.
 #[test]
-fn poison_stays_where_it_is() {
+fn extreme_values_do_not_spread() {
     let Some(device) = device() else { return };
     let poison = [
         f32::NAN,
@@ -277,7 +280,7 @@ fn poison_stays_where_it_is() {
             let mut host = clean.clone();
             for (i, value) in poison.iter().enumerate() {
                 host.gaussians[2 * i][round] = *value;
-                // And now and then a second one.
+                // Three in ten have a second extreme value.
                 if random.uniform() < 0.3 {
                     let at = (random.uniform() * 14.0) as usize;
                     host.gaussians[2 * i][at] = poison[(random.uniform() * 13.0) as usize];
@@ -295,7 +298,7 @@ fn poison_stays_where_it_is() {
             assert_eq!(
                 all + culled.degenerate + culled.invalid,
                 30,
-                "round {round}: everyone is counted once"
+                "round {round}: every Gaussian is counted once"
             );
         }
     }
@@ -322,7 +325,7 @@ fn many_full_screen_splats() {
         "an average of random colours"
     );
     assert!(pass.gradient.iter().flatten().all(|g| g.is_finite()));
-    // Pixels close after some hundred splats; the rest has no gradient.
+    // Pixels close after some hundred splats. The splats behind have no gradient.
     let seen = pass.gradient.iter().filter(|g| g.iter().any(|v| *v != 0.0)).count();
     assert!((300..2000).contains(&seen), "{seen}");
 }
@@ -349,7 +352,7 @@ fn more_than_65535_tiles() {
 }
 
 #[test]
-fn what_cannot_be_rendered_is_refused() {
+fn unusable_cameras_and_options_are_refused() {
     let Some(device) = device() else { return };
     let gaussians = random_scene(3, 1).on(&device).gaussians();
     let camera = forward_camera(8, 8);
@@ -372,7 +375,7 @@ fn what_cannot_be_rendered_is_refused() {
     refused(&[camera], RenderOptions { background, ..inria() }, "background");
 }
 
-/// An image that no memory holds is an error, not the end of the process.
+/// An image beyond all memory is an error and does not end the process.
 #[test]
 fn images_beyond_all_memory_are_refused() {
     let Some(device) = device() else { return };
@@ -402,7 +405,7 @@ fn double_precision_inputs_give_the_same_image() {
     assert!(image(&single) == image(&double));
 }
 
-/// Pairs of splats and tiles beyond what fits are counted, not computed.
+/// Pairs of splats and tiles beyond the limit are counted, not computed.
 #[test]
 fn too_many_intersections_are_refused() {
     let Some(device) = device() else { return };
@@ -422,7 +425,7 @@ fn too_many_intersections_are_refused() {
     }
 }
 
-/// The count is exact beyond 32 bits' halves, with few tiles per splat as with many.
+/// The count is exact beyond 2³⁰, with few tiles per splat as with many.
 #[test]
 fn intersections_of_many_small_counts_are_refused_too() {
     let Some(device) = device() else { return };

@@ -6,6 +6,8 @@ use snapsnap_splat::{Camera, RenderOptions, cameras, sh};
 use snapsnap_tests::scenes::{HostScene, Random, forward_camera, random_scene, random_upstream};
 use snapsnap_tests::{Numbers, device, device_name, fixture, values};
 
+use crate::distance;
+
 /// Names of the 14 numbers of a Gaussian, and where each name's numbers lie.
 const PARTS: [(&str, std::ops::Range<usize>); 5] =
     [("means", 0..3), ("rotations", 3..7), ("scales", 7..10), ("opacities", 10..11), ("colors", 11..14)];
@@ -32,7 +34,7 @@ fn preset(numbers: &Numbers) -> RenderOptions {
     RenderOptions { antialiased: numbers.metadata("antialiased") == "true", ..preset }
 }
 
-/// The oracle needs no device: once is enough.
+/// The oracle uses no device, so its own tests run once, on flex.
 fn once() -> bool {
     device_name() == "flex"
 }
@@ -83,13 +85,13 @@ fn worst<'a>(
     for (p, found) in found.enumerate().filter(|(p, _)| !banded[*p]) {
         let expected = [color[3 * p], color[3 * p + 1], color[3 * p + 2], alpha[p], depth[p]];
         for (f, e) in found.iter().zip(expected) {
-            worst = worst.max((f - e).abs());
+            worst = worst.max(distance(*f, e));
         }
     }
     worst
 }
 
-/// Pixels of all fixtures, and gradients of those that are quick enough.
+/// Compares pixels of all fixtures, and gradients of the small ones.
 #[test]
 fn the_oracle_agrees_with_the_fixtures() {
     for name in FIXTURES.into_iter().filter(|_| once()) {
@@ -131,7 +133,7 @@ fn the_oracle_agrees_with_the_fixtures() {
     }
 }
 
-/// The textbook formulas in f32 beside the operation, on every fixture.
+/// Compares the operation and the textbook formulas in f32 with every fixture.
 #[test]
 fn the_operation_is_more_accurate_than_plain_f32() {
     let Some(device) = device() else { return };
@@ -156,8 +158,7 @@ fn the_operation_is_more_accurate_than_plain_f32() {
     }
 }
 
-/// With the smooth cut-off the image is differentiable, so that differences must agree with the dual numbers, for every
-/// single input.
+/// With the smooth cut-off the image is differentiable. Differences agree with the dual numbers for every single input.
 #[test]
 fn the_oracles_gradients_agree_with_finite_differences() {
     if !once() {
@@ -226,7 +227,7 @@ fn check(name: &str, host: &HostScene, camera: &Camera, options: &RenderOptions)
     for (pixel, (found, expected)) in pass.image.chunks(5).zip(&expected).enumerate() {
         for (f, e) in found.iter().zip(expected.channels()) {
             if !banded[pixel] {
-                worst = worst.max((f64::from(*f) - e).abs());
+                worst = worst.max(distance(f64::from(*f), e));
             }
         }
     }
@@ -242,8 +243,7 @@ fn check(name: &str, host: &HostScene, camera: &Camera, options: &RenderOptions)
     let mut plain_worst = 0.0_f64;
     for ((found, expected), _) in plain.iter().zip(&expected).zip(&banded).filter(|(_, banded)| !**banded) {
         for (f, e) in found.channels().iter().zip(expected.channels()) {
-            // A NaN counts as entirely wrong.
-            plain_worst = plain_worst.max((f64::from(*f) - e).abs().min(9.0));
+            plain_worst = plain_worst.max(distance(f64::from(*f), e).min(9.0));
         }
     }
     let mut report = format!("{name}: pixels {worst:.0e} (plain formulas {plain_worst:.0e})");
@@ -251,7 +251,7 @@ fn check(name: &str, host: &HostScene, camera: &Camera, options: &RenderOptions)
         let (error, angle) = compare(&flat(&found, &range), &flat(&gradient.gaussians, &range));
         report += &format!(", {part} {error:.0e}");
         assert!(error < 1e-3 && angle < 1e-5, "{name}: gradient of {part}: {error:e}, 1 - cosine {angle:e}");
-        // Where the oracle has exactly zero, so has the operation.
+        // Gradients that are zero in the oracle are exactly zero.
         for (f, e) in found.iter().zip(&gradient.gaussians) {
             if e[range.clone()].iter().all(|e| *e == 0.0) {
                 assert!(f[range.clone()].iter().all(|f| *f == 0.0), "{name}: {part} of an unseen Gaussian");
@@ -278,7 +278,7 @@ fn presets_and_antialiasing() {
             let options = RenderOptions { antialiased, ..preset.clone() };
             let name = format!("{name}, antialiased {antialiased}");
             check(&name, &random_scene(30, 11), &forward_camera(40, 33), &options);
-            // Below a pixel, where antialiasing matters most.
+            // Antialiasing matters most for splats below a pixel.
             let mut tiny = random_scene(30, 12);
             tiny.gaussians.iter_mut().for_each(|g| (7..10).for_each(|k| g[k] *= 0.05));
             check(&format!("{name}, tiny"), &tiny, &forward_camera(40, 33), &options);
@@ -332,7 +332,7 @@ fn beyond_the_border() {
     check("beyond the border", &host, &forward_camera(40, 33), &RenderOptions::inria());
 }
 
-/// Where no cut-off is met, finite differences of the operation itself, over every input.
+/// Finite differences of the operation itself over every input, in a scene that meets no cut-off.
 #[test]
 fn finite_differences_of_the_operation() {
     let Some(device) = device() else { return };
@@ -368,7 +368,7 @@ fn finite_differences_of_the_operation() {
             };
             let difference = (at(step) - at(-step)) / (2.0 * f64::from(step));
             let analytic = f64::from(pass.gradient[i][k]);
-            // f32 leaves 1e-6 of a sum over a thousand numbers, divided by the step; the rest is the third derivative.
+            // f32 rounds a sum of a thousand numbers by 1e-6, divided by the step. The rest is the third derivative.
             let bound = 1e-3 * f64::from(scale(k)) + 0.02 * analytic.abs() + 1e-6 / f64::from(step);
             assert!(
                 (analytic - difference).abs() < bound,

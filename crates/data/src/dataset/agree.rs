@@ -1,4 +1,4 @@
-//! Whether the views of a subject fit one another: what one sees must lie within the person's outline in the others.
+//! Consistency of a subject's views: points of one view must lie within the person's silhouette in the others.
 
 use glam::{DVec2, DVec3};
 use image::GrayImage;
@@ -6,21 +6,21 @@ use snapsnap_splat::{Camera, RigidTransform};
 
 use super::stored::{StoredView, unproject};
 
-/// Side of an outline in cells, at most: what is compared is coarser than the pictures.
+/// Largest side of a silhouette in cells. Silhouettes are coarser than the pictures.
 const CELLS: u32 = 256;
 /// Pictures with a shorter side are too coarse to compare.
 pub const LEAST_SIDE: u32 = 64;
-/// Most points of a view that are tried.
+/// Largest number of points of a view that are tested.
 const POINTS: usize = 2000;
-/// Share of them that may lie outside: single pixels of one view may be too thin for another.
+/// Largest share of points outside the silhouette. Parts as thin as a pixel may be missing in another view.
 const OUTSIDE: f64 = 0.08;
 
-/// What one view says of its subject.
+/// Points and silhouette of a view.
 pub struct Seen {
     camera: Camera,
     /// World points, metres.
     points: Vec<DVec3>,
-    /// `[side,side]` where the person is, one cell wider all around than it is.
+    /// `[side,side]` silhouette of the person, widened by one cell.
     outline: Vec<bool>,
     side: u32,
     /// Whether the picture cuts the person off.
@@ -61,7 +61,7 @@ impl Seen {
         Self { camera: *camera, points, outline, side, is_cut }
     }
 
-    /// Share of the points of `other` that lie outside the person here.
+    /// Share of the points of `other` outside this silhouette.
     fn outside(&self, other: &Self) -> f64 {
         let (mut tried, mut outside) = (0, 0);
         for point in &other.points {
@@ -85,7 +85,7 @@ impl Seen {
     }
 }
 
-/// Pairs of views, `step` places apart, that do not fit one another: a camera or a depth map of theirs is wrong.
+/// Messages for pairs of views, `step` places apart, that do not fit one another.
 pub fn disagreements(views: &[Option<Seen>], step: usize) -> impl Iterator<Item = String> {
     let count = views.len();
     let pairs = if count > 2 { count } else { count.saturating_sub(1) };
@@ -96,7 +96,7 @@ pub fn disagreements(views: &[Option<Seen>], step: usize) -> impl Iterator<Item 
         (share > OUTSIDE).then(|| {
             let percent = 100.0 * share;
             format!(
-                "views {a} and {b} do not fit one another: {percent:.0} % of what one sees lies outside the person in \
+                "views {a} and {b} do not fit one another: {percent:.0} % of the points of one lie outside the person in \
                  the other; a camera or a depth map is wrong"
             )
         })

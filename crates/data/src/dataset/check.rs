@@ -1,4 +1,4 @@
-//! What is wrong with a data set.
+//! Faults of a data set.
 
 use std::collections::{BTreeSet, HashSet};
 use std::fs;
@@ -11,24 +11,24 @@ use super::write::UNFINISHED;
 use super::{Arrangement, Description, Folder, Layout, Split, split_alpha};
 use snapsnap_base::FileError;
 
-/// Share of the person that may have no depth: scans have gaps that are narrower than a pixel.
+/// Largest share of the person without depth. Scans have gaps narrower than a pixel.
 const HOLES: f64 = 0.01;
 
-/// What was looked at and found.
+/// Result of a check.
 #[derive(Debug, Default)]
 pub struct Checked {
-    /// Subjects that were looked at.
+    /// Checked subjects.
     pub subjects: usize,
-    /// Views that were looked at.
+    /// Checked views.
     pub views: usize,
-    /// One line per fault: file and what is wrong.
+    /// One line per fault, with its file.
     pub problems: Vec<String>,
 }
 
-/// Reads everything in a data set; `progress` is told how many of how many subjects are done.
+/// Reads all files of a data set. Calls `progress` with the number of checked subjects and of all subjects.
 ///
 /// # Errors
-/// [`FileError`] if `root` is no data set at all; every other fault is a line of the result.
+/// [`FileError`] if `root` is no data set. Every other fault is a line of the result.
 pub fn check(root: &Path, mut progress: impl FnMut(usize, usize)) -> Result<Checked, FileError> {
     let folder = Folder::open(root)?;
     let mut checked = Checked::default();
@@ -42,10 +42,10 @@ pub fn check(root: &Path, mut progress: impl FnMut(usize, usize)) -> Result<Chec
         checked.problems.push(format!("{}: there is no subject", root.display()));
     }
     let path = root.join(UNFINISHED);
-    // The mark of a killed run alone is no fault: the next run takes it over.
+    // A killed run's lock file alone is no fault. The next run removes it.
     if fs::read_dir(&path).is_ok_and(|entries| entries.flatten().any(|entry| entry.path().is_dir())) {
         checked.problems.push(format!(
-            "{}: a run is at work, or was killed: the next one clears this away",
+            "{}: a run is in progress or was killed; the next run removes this folder",
             path.display()
         ));
     }
@@ -63,7 +63,7 @@ pub fn check(root: &Path, mut progress: impl FnMut(usize, usize)) -> Result<Chec
         let mut said = HashSet::new();
         checked.problems.extend(problems.into_iter().flatten().filter(|p| said.insert(p.clone())));
         let at = folder.path(*split, "img", subject);
-        // A quarter turn on; in groups, from a photograph to a side.
+        // A quarter turn; in groups, from a photograph to a side.
         let step = match folder.description().arrangement {
             Arrangement::Ring => (seen.len() / 4).max(1),
             Arrangement::Groups => 2,
@@ -92,7 +92,7 @@ fn orphans(folder: &Folder, split: Option<Split>, subjects: &[String]) -> Vec<St
     problems
 }
 
-/// Files that belong to no view: the set has more views than its description says.
+/// Files of no view in the description.
 fn unexpected(folder: &Folder, split: Option<Split>, subject: &str) -> Vec<String> {
     let views = folder.description().views;
     let mut extra = BTreeSet::new();
@@ -109,7 +109,7 @@ fn unexpected(folder: &Folder, split: Option<Split>, subject: &str) -> Vec<Strin
     extra.into_iter().collect()
 }
 
-/// What is wrong with one view, each of its files apart; and what it sees, if all of them can be read.
+/// Faults of one view's files, and its points and silhouette if all files can be read.
 fn faults(folder: &Folder, split: Option<Split>, subject: &str, view: usize) -> (Vec<String>, Option<Seen>) {
     let mut problems = Vec::new();
     let mut keep = |e: FileError| problems.push(e.to_string());
@@ -133,7 +133,7 @@ fn faults(folder: &Folder, split: Option<Split>, subject: &str, view: usize) -> 
         report("its mask is empty".into());
     }
     let (Some(mask), Some(depth)) = (mask, depth) else { return (problems, None) };
-    // At the outline coverage and sample may part by a pixel; inside they agree.
+    // Coverage and depth sample may differ by a pixel at the silhouette, but not inside it.
     let (width, height) = mask.dimensions();
     let inside = |x: u32, y: u32| {
         (x.saturating_sub(1)..=(x + 1).min(width - 1))
@@ -146,7 +146,7 @@ fn faults(folder: &Folder, split: Option<Split>, subject: &str, view: usize) -> 
     if missing > 4 && missing as f64 > HOLES * person.unwrap_or(0) as f64 {
         report(format!("{missing} pixels of the person have no depth"));
     }
-    // Nothing can be said of an empty view, and little of a tiny one.
+    // Empty and tiny views cannot be compared.
     let camera = camera.filter(|_| person != Some(0) && width >= LEAST_SIDE);
     let seen = camera.map(|camera| Seen::new(&folder.exact_camera(&camera), &mask, depth));
     (problems, seen)

@@ -1,4 +1,4 @@
-//! What a data set says of itself.
+//! The description of a data set, `dataset.toml`.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
@@ -10,35 +10,35 @@ use crate::JitterConfig;
 use snapsnap_base::FileError;
 use snapsnap_base::file;
 
-/// Name of the file that describes a folder.
+/// Name of the description's file.
 pub const DESCRIPTION: &str = "dataset.toml";
-/// Largest description that is read.
+/// Largest description that is read, in bytes.
 const MAX_DESCRIPTION: u64 = 1 << 20;
-/// Most views of a subject.
+/// Largest number of views of a subject.
 pub const MAX_VIEWS: usize = 4096;
 /// Largest side of a view.
 pub const MAX_RESOLUTION: u32 = 8192;
 
-/// How views are stored.
+/// Layout of the stored views.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Layout {
-    /// JPEG, depth in 16 bits, sampled at the pixels' corners: what the authors' tools write and read.
+    /// The layout of the authors' tools: JPEG, depth in 16 bits, sampled at the pixels' corners.
     Authors,
     /// Lossless, depth in f32, sampled at the pixels' centres.
     Exact,
 }
 
-/// How the views of a subject lie around it.
+/// Arrangement of a subject's views.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Arrangement {
-    /// Evenly around the subject, each straying by itself: any may be the front, the opposite one is its back.
+    /// Evenly around the subject, with independent deviations. Any view may be the front. The opposite view is its
+    /// back.
     #[default]
     Ring,
-    /// In fours: a front photograph, one of the back whose camera deviates, and the right and left sides exactly a
-    /// quarter turn from the front's own camera. The sides' view thereby follows from the front
-    /// (docs/method.md, "Samples").
+    /// In groups of four: a front, a back whose camera deviates, and the right and left sides at exact quarter turns of
+    /// the front camera. The sides' cameras thereby follow from the front (docs/method.md, "Samples").
     Groups,
 }
 
@@ -48,7 +48,7 @@ impl Arrangement {
         *self == Self::Ring
     }
 
-    /// The views of a sample whose front is `first`, of `count` views: front, back, right, left.
+    /// Front, back, right and left of a sample whose front is view `first` of `count`.
     pub fn four(self, first: usize, count: usize) -> [usize; 4] {
         match self {
             Self::Ring => [0, 2, 1, 3].map(|quarter| (first + quarter * count / 4) % count),
@@ -57,15 +57,15 @@ impl Arrangement {
     }
 }
 
-/// What a data set is kept for. Subjects of different splits are different people.
+/// Purpose of a subject. Different splits have different people.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Split {
-    /// To learn from.
+    /// For training.
     Train,
-    /// To choose among what was learned.
+    /// For the choice of the best weights.
     Val,
-    /// To report on.
+    /// For reports.
     Test,
 }
 
@@ -89,38 +89,38 @@ impl fmt::Display for Split {
     }
 }
 
-/// What `dataset.toml` says.
+/// The content of `dataset.toml`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Description {
-    /// How views are stored.
+    /// Layout of the stored views.
     pub layout: Layout,
     /// Views of each subject.
     pub views: usize,
-    /// How they lie around it.
+    /// Their arrangement around it.
     #[serde(default, skip_serializing_if = "Arrangement::is_ring")]
     pub arrangement: Arrangement,
     /// Side of a view in pixels.
     pub resolution: u32,
-    /// Whether each view is there at twice the side as well.
+    /// Whether each view is stored at twice the side as well.
     pub high_resolution: bool,
-    /// Where in the first pixel the camera's coordinates (0, 0) and (½, ½) put its sample: 0 in the authors' sets, ½ in
-    /// ours. Points from depth are half a pixel off where this is not heeded.
+    /// Camera coordinates of the first pixel's sample: 0 in the authors' sets, ½ in the exact layout. Points from depth
+    /// are half a pixel off without this correction.
     pub pixel_centre: f64,
-    /// What the subjects are and how they were made.
+    /// Source of the subjects.
     pub source: String,
-    /// With which cameras and how finely they were drawn, where that is known.
+    /// Sampling and cameras of the renders, if known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub drawn: Option<Drawn>,
 }
 
-/// How views were drawn.
+/// Settings of the renders.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Drawn {
     /// Samples per pixel along each axis.
     pub samples: usize,
-    /// How cameras strayed.
+    /// Deviations of the cameras.
     pub jitter: JitterConfig,
 }
 
@@ -156,7 +156,7 @@ pub fn read(path: &Path) -> Result<Description, FileError> {
     }
 }
 
-/// What the one description says and the other does not, key by key.
+/// Differences between two descriptions, key by key.
 pub fn differences(there: &Description, wanted: &Description) -> String {
     let keys = |d: &Description| {
         let table = toml::Table::try_from(d).expect("the description has only TOML types");

@@ -22,17 +22,17 @@ use snapsnap_mesh::view::View;
 
 /// Stored depths of the authors' layout are ⌊2¹⁵/z⌋ (docs/method.md, "Layouts").
 const INVERSE_DEPTH_UNIT: f64 = 32_768.0;
-/// What is not further than this, in metres, has no number there.
+/// Nearest depth in metres that the authors' layout can store.
 pub const NEAREST: f32 = 0.5;
 /// Quality of JPEGs in the authors' layout.
 const JPEG_QUALITY: u8 = 95;
 /// Name of the array in a depth file.
 const DEPTH: &str = "depth";
-/// Largest `.npy` that is read: a depth map of the largest view.
+/// Largest `.npy` that is read, in bytes: a depth map of the largest view.
 const MAX_NPY: u64 = MAX_RESOLUTION as u64 * MAX_RESOLUTION as u64 * 4 + 4096;
 
 fn write(path: &Path, bytes: &[u8]) -> Result<(), FileError> {
-    // Inside a subject's temporary folder: what is half-written is never seen.
+    // The file is in a subject's temporary folder, which is renamed when it is complete.
     std::fs::write(path, bytes).map_err(FileError::write(path))
 }
 
@@ -53,13 +53,13 @@ fn to_byte(value: f32) -> u8 {
     (value.clamp(0.0, 1.0) * 255.0).round() as u8
 }
 
-/// A pixel's own colour: a view's is multiplied by its coverage.
+/// A pixel's straight colour. Colours of a view are multiplied by coverage.
 fn straight(view: &View, pixel: usize) -> [u8; 3] {
     let alpha = view.alpha[pixel];
     if alpha > 0.0 { view.color[pixel].map(|c| to_byte(c / alpha)) } else { [0; 3] }
 }
 
-/// Straight colours and coverage.
+/// Writes straight colours and coverage.
 pub fn write_rgba(path: &Path, view: &View) -> Result<(), FileError> {
     let bytes: Vec<u8> = (0..view.alpha.len())
         .flat_map(|pixel| {
@@ -70,7 +70,7 @@ pub fn write_rgba(path: &Path, view: &View) -> Result<(), FileError> {
     write_png(path, &bytes, (view.width, view.height), ExtendedColorType::Rgba8)
 }
 
-/// Straight colours where the pixel's sample sees something, black elsewhere.
+/// Writes straight colours of pixels with depth, and black for others.
 pub fn write_jpeg(path: &Path, view: &View) -> Result<(), FileError> {
     let picture = RgbImage::from_fn(view.width as u32, view.height as u32, |x, y| {
         let pixel = y as usize * view.width + x as usize;
@@ -81,22 +81,22 @@ pub fn write_jpeg(path: &Path, view: &View) -> Result<(), FileError> {
     write(path, &out)
 }
 
-/// White in three channels where the pixel's sample sees something.
+/// Writes white in three channels for pixels with depth, and black for others.
 pub fn write_mask(path: &Path, view: &View) -> Result<(), FileError> {
     let bytes: Vec<u8> = view.depth.iter().flat_map(|z| [if *z > 0.0 { 255 } else { 0 }; 3]).collect();
     write_png(path, &bytes, (view.width, view.height), ExtendedColorType::Rgb8)
 }
 
-/// ⌊2¹⁵/z⌋ in 16 bits, 0 for the background.
+/// Writes ⌊2¹⁵/z⌋ in 16 bits, 0 for the background.
 pub fn write_inverse_depth(path: &Path, view: &View) -> Result<(), FileError> {
-    // What is nearer than `NEAREST` saturates; data sets refuse it.
+    // Depths below `NEAREST` would saturate. `write_subject` refuses them.
     let stored = |z: f32| if z > 0.0 { (INVERSE_DEPTH_UNIT / f64::from(z)).floor() as u16 } else { 0 };
     let bytes: Vec<u8> = view.depth.iter().flat_map(|z| stored(*z).to_ne_bytes()).collect();
     write_png(path, &bytes, (view.width, view.height), ExtendedColorType::L16)
 }
 
-/// Whether an `.npy` is as long as the shape in its header says, at four bytes per number at least: its reader makes room
-/// before it looks.
+/// Whether an `.npy` is long enough for the shape in its header, at four bytes per number. Its reader allocates memory
+/// before it checks this.
 fn holds_its_shape(npy: &[u8]) -> bool {
     let length =
         |bytes: Option<&[u8]>| Some(bytes?.iter().rev().fold(0, |sum, b| sum << 8 | usize::from(*b)));
@@ -121,7 +121,7 @@ fn holds_its_shape(npy: &[u8]) -> bool {
 /// Depths in metres and their shape.
 type Depth = (Vec<f32>, [u32; 2]);
 
-/// Undoes [`write_inverse_depth`].
+/// Reads a file of [`write_inverse_depth`].
 pub fn read_inverse_depth(path: &Path) -> Result<Depth, FileError> {
     let picture = decode(path, MAX_BYTES)?;
     if picture.color() != image::ColorType::L16 {
@@ -134,7 +134,7 @@ pub fn read_inverse_depth(path: &Path) -> Result<Depth, FileError> {
     Ok((stored.into_raw().into_iter().map(depth).collect(), shape))
 }
 
-/// f32 metres, compressed without loss; NumPy's `load` reads it.
+/// Writes f32 metres, compressed without loss. NumPy's `load` reads the file.
 pub fn write_depth(path: &Path, view: &View) -> Result<(), FileError> {
     let array = ArrayView2::from_shape((view.height, view.width), &view.depth).expect("one depth per pixel");
     let mut npy = Vec::new();
@@ -149,17 +149,17 @@ pub fn write_depth(path: &Path, view: &View) -> Result<(), FileError> {
     write(path, packed.map_err(|e| FileError::unsuitable(path, e))?.get_ref())
 }
 
-/// Undoes [`write_depth`].
+/// Reads a file of [`write_depth`].
 pub fn read_depth(path: &Path) -> Result<Depth, FileError> {
     let wrong = |e: &dyn std::fmt::Display| FileError::unsuitable(path, format!("is no depth map: {e}"));
     let mut archive = ZipArchive::new(BufReader::new(file::open(path).map_err(FileError::read(path))?))
         .map_err(|e| wrong(&e))?;
     let entry = archive.by_name(&format!("{DEPTH}.npy")).map_err(|e| wrong(&e))?;
     let mut npy = Vec::new();
-    // What is longer than the largest depth map is cut off, and refused for that.
+    // An entry longer than the largest depth map is cut off here and refused below.
     entry.take(MAX_NPY).read_to_end(&mut npy).map_err(|e| wrong(&e))?;
     if !holds_its_shape(&npy) {
-        return Err(wrong(&"its header promises more than it holds"));
+        return Err(wrong(&"its header announces more numbers than it contains"));
     }
     let array = Array2::<f32>::read_npy(npy.as_slice()).map_err(|e| wrong(&e))?;
     let (height, width) = array.dim();
@@ -167,7 +167,7 @@ pub fn read_depth(path: &Path) -> Result<Depth, FileError> {
     Ok((array.into_raw_vec_and_offset().0, [height as u32, width as u32]))
 }
 
-/// Intrinsic 3×3 and extrinsic 3×4 matrix (world → camera), as stored.
+/// Writes the intrinsic 3×3 and the extrinsic 3×4 matrix (world → camera).
 pub fn write_camera(folder: &Path, view: usize, camera: &Camera) -> Result<(), FileError> {
     let Camera { focal: f, principal_point: c, world_to_camera, .. } = *camera;
     let intrinsic = [[f.x, 0.0, c.x], [0.0, f.y, c.y], [0.0, 0.0, 1.0]];
@@ -186,7 +186,7 @@ pub fn write_camera(folder: &Path, view: usize, camera: &Camera) -> Result<(), F
     save("extrinsic", ndarray::arr2(&extrinsic))
 }
 
-/// Undoes [`write_camera`]; the authors' tools store some matrices in f32.
+/// Reads a file of [`write_camera`]. The authors' tools store some matrices in f32.
 pub fn read_camera(folder: &Path, view: usize, side: u32) -> Result<Camera, FileError> {
     let load = |name: &str, shape: (usize, usize)| {
         let path = folder.join(format!("{view}_{name}.npy"));
@@ -194,7 +194,10 @@ pub fn read_camera(folder: &Path, view: usize, side: u32) -> Result<Camera, File
         let cannot = FileError::read(&path);
         file::open(&path).map_err(&cannot)?.take(4096).read_to_end(&mut bytes).map_err(cannot)?;
         if !holds_its_shape(&bytes) {
-            return Err(FileError::unsuitable(&path, "is no matrix: its header promises more than it holds"));
+            return Err(FileError::unsuitable(
+                &path,
+                "is no matrix: its header announces more numbers than it contains",
+            ));
         }
         let matrix = Array2::<f64>::read_npy(bytes.as_slice())
             .or_else(|e| Array2::<f32>::read_npy(bytes.as_slice()).map(|m| m.mapv(f64::from)).map_err(|_| e));

@@ -1,4 +1,4 @@
-//! Data-set folders: rendered views of many subjects, in the layout of the authors' tools or in our exact one
+//! Data-set folders: rendered views of many subjects, in the layout of the authors' tools or in the exact layout
 //! (docs/method.md, "Layouts").
 //!
 //! ```text
@@ -11,8 +11,8 @@
 //!   └ parm/S/v_intrinsic.npy, v_extrinsic.npy
 //! ```
 //!
-//! A subject appears whole or not at all: it is written under another name and its `img` folder, which says that the
-//! subject is there, is renamed last.
+//! A subject is added whole or not at all: it is written under another name, and its `img` folder, which marks a
+//! subject, is renamed last.
 
 mod agree;
 mod check;
@@ -49,10 +49,10 @@ pub struct Folder {
 }
 
 impl Folder {
-    /// Opens a data set. Without a `dataset.toml` it is taken for one that the authors' tools wrote.
+    /// Opens a data set. Without a `dataset.toml` it must be in the layout of the authors' tools.
     ///
     /// # Errors
-    /// [`FileError`]: no folder, a `dataset.toml` that is wrong, or neither one nor the authors' layout.
+    /// [`FileError`]: no folder, a wrong `dataset.toml`, or neither a `dataset.toml` nor the authors' layout.
     pub fn open(root: &Path) -> Result<Self, FileError> {
         let path = root.join(DESCRIPTION);
         if path.is_file() {
@@ -94,11 +94,11 @@ impl Folder {
         Ok(folder)
     }
 
-    /// Opens the folder `root` for writing subjects into it, making it if it is not there.
+    /// Opens the folder `root` for new subjects, and makes it if necessary.
     ///
     /// # Errors
-    /// [`FileError`] if it cannot be made, holds a data set of another kind, or, in the authors' layout, if its name does
-    /// not say how many views there are: the authors' loader reads the number there.
+    /// [`FileError`] if it cannot be made or contains another kind of data set. In the authors' layout, its name must
+    /// end in the number of views, which the authors' loader reads there.
     pub fn create(root: &Path, description: Description) -> Result<Self, FileError> {
         if let Some(problem) = description.problem() {
             return Err(FileError::unsuitable(root, problem));
@@ -130,17 +130,17 @@ impl Folder {
         Ok(Self { root: root.to_owned(), description })
     }
 
-    /// The folder itself.
+    /// The folder's path.
     pub fn root(&self) -> &Path {
         &self.root
     }
 
-    /// What is in it.
+    /// Description of the data set.
     pub fn description(&self) -> &Description {
         &self.description
     }
 
-    /// The splits that are there; `None` where subjects lie in the root itself, as in the authors' test sets.
+    /// The splits of the data set; `None` is the root itself, as in the authors' test sets.
     pub fn splits(&self) -> Vec<Option<Split>> {
         let there = |split: &Option<Split>| self.split_path(*split).join("img").is_dir();
         std::iter::once(None).chain(Split::ALL.map(Some)).filter(there).collect()
@@ -149,7 +149,7 @@ impl Folder {
     /// Names of the subjects of a split, in order.
     ///
     /// # Errors
-    /// [`FileError::Read`] if the split is not there.
+    /// [`FileError::Read`] for a missing split.
     pub fn subjects(&self, split: Option<Split>) -> Result<Vec<String>, FileError> {
         let folder = self.split_path(split).join("img");
         let mut subjects = Vec::new();
@@ -167,13 +167,13 @@ impl Folder {
     /// Reads one view.
     ///
     /// # Errors
-    /// [`FileError`] naming the file that is missing, damaged, or of another size than the set's.
+    /// [`FileError`] for a file that is missing, damaged or of another size than the data set's.
     pub fn view(&self, split: Option<Split>, subject: &str, view: usize) -> Result<StoredView, FileError> {
         let (color, mask) = self.picture(split, subject, view, false)?;
         Ok(StoredView { color, mask, ..self.depth(split, subject, view)? })
     }
 
-    /// Reads one view without its picture: colours and mask are empty.
+    /// Reads one view without its picture. Colours and mask are empty.
     ///
     /// # Errors
     /// As [`Self::view`].
@@ -222,7 +222,7 @@ impl Folder {
         Ok((picture.into_rgb8(), mask))
     }
 
-    /// The picture file of a view; in the exact layout it holds the mask as well.
+    /// The picture file of a view. In the exact layout it contains the mask as well.
     fn file(
         &self,
         split: Option<Split>,
@@ -246,7 +246,7 @@ impl Folder {
         Ok(mask)
     }
 
-    /// Reads the camera of a view, in the pixel coordinates that [`Description::pixel_centre`] says.
+    /// Reads the camera of a view, in the pixel coordinates of [`Description::pixel_centre`].
     ///
     /// # Errors
     /// As [`Self::view`].
@@ -277,7 +277,7 @@ impl Folder {
         }
     }
 
-    /// A stored camera in our coordinates, in which the first pixel's sample lies at (½, ½).
+    /// A stored camera in coordinates in which the first pixel's sample is at (½, ½).
     pub fn exact_camera(&self, stored: &Camera) -> Camera {
         let shift = DVec2::splat(0.5 - self.description.pixel_centre);
         Camera { principal_point: stored.principal_point + shift, ..*stored }
@@ -291,7 +291,7 @@ impl Folder {
         Err(FileError::unsuitable(path, message))
     }
 
-    /// Name of a view's picture, mask or depth, by the folder that it lies in.
+    /// File name of a view's picture, mask or depth, by the name of its folder.
     fn file_name(&self, kind: &str, view: impl Display) -> String {
         let ending = match (kind, self.description.layout) {
             ("depth", Layout::Exact) => "npz",
@@ -313,7 +313,7 @@ impl Folder {
     }
 }
 
-/// Colours and coverage of a picture that holds both.
+/// Colours and coverage of a picture with alpha.
 fn split_alpha(picture: DynamicImage) -> (RgbImage, GrayImage) {
     let rgba = picture.into_rgba8();
     let mask =
@@ -321,7 +321,7 @@ fn split_alpha(picture: DynamicImage) -> (RgbImage, GrayImage) {
     (DynamicImage::ImageRgba8(rgba).into_rgb8(), mask)
 }
 
-/// The number behind the last underscore of the folder's name.
+/// The number after the last underscore of the folder's name.
 fn views_in_name(root: &Path) -> Option<usize> {
     let name = root.canonicalize().unwrap_or_else(|_| root.to_owned());
     let name = name.file_name()?.to_string_lossy().into_owned();

@@ -1,4 +1,4 @@
-//! A view as it is stored, and the points that its depths are.
+//! A stored view, and the points of its depth map.
 
 use glam::DVec3;
 use image::{GrayImage, RgbImage};
@@ -7,18 +7,18 @@ use snapsnap_splat::Camera;
 /// One stored view.
 #[derive(Debug, Clone)]
 pub struct StoredView {
-    /// `[H,W]` colours; meaningless where the mask is 0.
+    /// `[H,W]` colours, undefined where the mask is 0.
     pub color: RgbImage,
     /// `[H,W]` coverage.
     pub mask: GrayImage,
-    /// `[H,W]` metres along the optical axis; 0 where nothing was seen.
+    /// `[H,W]` metres along the optical axis; 0 for the background.
     pub depth: Vec<f32>,
-    /// As stored: pixel coordinates follow [`super::Description::pixel_centre`].
+    /// The stored camera, in the pixel coordinates of [`super::Description::pixel_centre`].
     pub camera: Camera,
 }
 
-/// Points `[H,W,3]` of a depth map in the frame of `to`, metres: each pixel's centre, at +½ in the coordinates of `camera`,
-/// moved along its ray to the stored depth. Where there is no depth it is taken for `far`.
+/// Points `[H,W,3]` of a depth map in the frame of `to`, in metres. A pixel's ray passes through its centre, at +½ in
+/// the coordinates of `camera`. The background has the depth `far`.
 pub fn unproject(view: &StoredView, camera: &Camera, to: &Camera, far: f32) -> Vec<f32> {
     let width = camera.width as usize;
     let there = camera.world_to_camera.inverse().then(&to.world_to_camera);

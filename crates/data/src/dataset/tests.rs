@@ -31,7 +31,7 @@ fn what_was_written_is_read_again() {
     }
 }
 
-/// The authors' folders have no description, and test sets no splits.
+/// The authors' folders have no description, and their test sets no splits.
 #[test]
 fn folders_of_the_authors_tools_are_recognised() {
     let (_temporary, written) = small(Layout::Authors);
@@ -61,7 +61,7 @@ fn folders_of_the_authors_tools_are_recognised() {
 }
 
 #[test]
-fn the_authors_folder_must_be_called_as_their_loader_wants_it() {
+fn the_authors_layout_needs_the_number_of_views_in_the_folders_name() {
     let temporary = tempfile::tempdir().expect("temporary folder");
     let mut config = DataConfig::default();
     config.views.layout = Layout::Authors;
@@ -79,9 +79,9 @@ fn a_killed_run_leaves_no_half_subject() {
     let root = folder.root();
     folder.tidy();
     assert!(!root.join(".unfinished").exists());
-    // As if killed while drawing, and while moving into place.
+    // The state after a kill during rendering, and during the move.
     fs::create_dir_all(root.join(".unfinished/train-0002/img")).expect("make");
-    // As if killed between the last move and the end.
+    // The state after a kill between the last move and the end.
     fs::write(root.join(".unfinished/train-0001.lock"), "").expect("write");
     fs::create_dir_all(root.join("train/depth/0002")).expect("make");
     fs::write(root.join("train/depth/0002/stale.npz"), "").expect("write");
@@ -94,7 +94,7 @@ fn a_killed_run_leaves_no_half_subject() {
         crate::prepare::ViewsConfig { count: 4, resolution: 64, high_resolution: true, ..config.views };
     config.add(&folder, &Subject::plain(Split::Train, "0002"), &rectangle().0).expect("adds");
     assert!(folder.has(Split::Train, "0002"));
-    // What another run is making at this moment is left to it.
+    // A subject of a run in progress is not touched.
     fs::remove_dir_all(root.join("train/img/0002")).expect("remove");
     fs::create_dir_all(root.join(".unfinished")).expect("make");
     let lock = fs::File::create(root.join(".unfinished/train-0002.lock")).expect("create");
@@ -108,7 +108,7 @@ fn a_killed_run_leaves_no_half_subject() {
     assert!(check(root, |_, _| {}).expect("checks").problems.is_empty());
 }
 
-/// Every fault is found, and none hides another.
+/// A fault does not hide another.
 #[test]
 fn a_check_lists_everything_that_is_wrong() {
     let (_temporary, folder) = small(Layout::Exact);
@@ -133,7 +133,7 @@ fn a_check_lists_everything_that_is_wrong() {
     let cameras = at("cameras/0000.json");
     let text = fs::read_to_string(&cameras).expect("read").replacen("64", "65", 1);
     fs::write(&cameras, text).expect("write");
-    // A view of which nothing is left.
+    // A view without any file.
     fs::remove_file(at("img/0000/3.png")).expect("remove");
     fs::remove_file(at("img/0000/3_hr.png")).expect("remove");
     fs::remove_file(at("depth/0000/3.npz")).expect("remove");
@@ -159,7 +159,7 @@ fn a_check_lists_everything_that_is_wrong() {
         assert!(problems.iter().any(|problem| problem.contains(words)), "{words}: {problems:#?}");
     }
     assert_eq!(problems.len(), expected.len(), "{problems:#?}");
-    // Too many cameras: said once, not with each view.
+    // Too many cameras are one fault, not one per view.
     let text = fs::read_to_string(at("cameras/0001.json")).expect("read");
     let mut all: Vec<serde_json::Value> = serde_json::from_str(&text).expect("a list");
     all.push(all[0].clone());
@@ -173,7 +173,7 @@ fn a_check_lists_everything_that_is_wrong() {
     assert!(error.contains(DESCRIPTION) && error.contains("resolution"), "{error}");
 }
 
-/// What is too near for 16 bits of inverse depth is refused, not stored as something else.
+/// Depths that 16 bits of inverse depth cannot store are refused.
 #[test]
 fn nearer_than_the_authors_layout_can_say_is_refused() {
     let mut wall = crate::testing::block();
@@ -196,7 +196,7 @@ fn nearer_than_the_authors_layout_can_say_is_refused() {
     config.add(&folder, &Subject::plain(Split::Train, "0000"), &wall).expect("f32 can say it");
 }
 
-/// Each file of the authors' layout is looked at, whatever is wrong with the others.
+/// Each file of the authors' layout is checked, whatever the faults of the others.
 #[test]
 fn a_check_looks_at_every_file_of_the_authors_layout() {
     let (_temporary, folder) = small(Layout::Authors);
@@ -220,7 +220,7 @@ fn a_check_looks_at_every_file_of_the_authors_layout() {
     assert_eq!(problems.len(), files.len(), "{problems:#?}");
 }
 
-/// A camera that is sound by itself but not the one that drew the view.
+/// Cameras that are valid, but not those of the renders.
 #[test]
 fn a_check_sees_cameras_that_do_not_fit_their_views() {
     type Change = fn(&mut Camera);
@@ -258,9 +258,9 @@ fn a_check_sees_cameras_that_do_not_fit_their_views() {
     }
 }
 
-/// A killed run's mark alone is no fault, its unfinished subject is; and no name leads out of the data set.
+/// A killed run's lock file is no fault, but its unfinished subject is. Names cannot lead out of the data set.
 #[test]
-fn what_a_killed_run_leaves_and_what_subjects_are_called() {
+fn unfinished_subjects_are_faults_and_names_are_checked() {
     let (_temporary, folder) = small(Layout::Exact);
     let unfinished = folder.root().join(".unfinished");
     fs::create_dir_all(&unfinished).expect("makes");
@@ -279,7 +279,7 @@ fn what_a_killed_run_leaves_and_what_subjects_are_called() {
     }
     let all = folder.subjects(TRAIN).expect("lists");
     assert!(all.iter().all(|subject| folder.has(Split::Train, subject)), "{all:?}");
-    // Errors name what the subject was made of.
+    // Errors name the subject's source.
     let mut away = rectangle().0;
     away.positions.iter_mut().for_each(|p| p.x += 50.0);
     let subject = Subject { origin: Path::new("scans/p.obj"), ..Subject::plain(Split::Train, "p") };

@@ -13,7 +13,7 @@ use super::{Folder, Layout, Split, files};
 use snapsnap_base::FileError;
 use snapsnap_mesh::view::View;
 
-/// Refuses names that lead elsewhere than to a subject's own folders, or to hidden ones.
+/// Refuses names of other folders than the subject's own, and hidden names.
 fn check_name(subject: &str) -> Result<(), String> {
     if subject.is_empty() || subject.starts_with('.') || subject.contains(['/', '\\']) {
         return Err(format!("`{}` is no name of a subject", quoted(subject)));
@@ -21,20 +21,20 @@ fn check_name(subject: &str) -> Result<(), String> {
     Ok(())
 }
 
-/// Subjects in the making, in the data set's root.
+/// Folder of unfinished subjects in the data set's root.
 pub(super) const UNFINISHED: &str = ".unfinished";
 
-/// What became of a subject that was to be written.
+/// Outcome of a write.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Made {
-    /// It is there now, or another run has made it meanwhile.
+    /// The subject is complete.
     Whole,
-    /// Another run is making it at this moment.
+    /// Another run is writing the subject.
     Elsewhere,
 }
 
 impl Folder {
-    /// Whether the subject is there, whole: every kind of file, up to the last view.
+    /// Whether the subject is complete: every kind of file, up to the last view.
     pub fn has(&self, split: Split, subject: &str) -> bool {
         let last = self.description.views - 1;
         self.kinds().into_iter().all(|kind| match kind {
@@ -44,15 +44,15 @@ impl Folder {
         })
     }
 
-    /// Adds a subject, made of the file `origin`: `draw` gives what each of `cameras` (pixel centres at +½, side of the set) sees. The subject
-    /// appears when everything is written; runs that work on one data set leave each other's subjects alone.
+    /// Adds a subject from the source `origin`. `draw` renders the view of each of `cameras` (pixel centres at +½, side
+    /// of the set). The subject appears when all files are written. Several runs may write into one data set at once.
     ///
     /// # Errors
-    /// [`FileError::Write`]; [`FileError::Unsuitable`] if a camera sees nothing, or, in the authors' layout,
-    /// something within half a metre.
+    /// [`FileError::Write`]; [`FileError::Unsuitable`] for an empty view, or, in the authors' layout, for a depth below
+    /// half a metre.
     ///
     /// # Panics
-    /// If there are more or fewer cameras than the set has views, or one of another size.
+    /// If the number or the size of the cameras differs from the set's views.
     pub fn write_subject(
         &self,
         split: Split,
@@ -69,12 +69,12 @@ impl Folder {
         let unfinished = self.root.join(UNFINISHED);
         fs::create_dir_all(&unfinished).map_err(FileError::write(&unfinished))?;
         let temporary = unfinished.join(format!("{split}-{subject}"));
-        // The system frees the lock of a run that was killed.
+        // The system releases the lock of a killed run.
         let mark = unfinished.join(format!("{split}-{subject}.lock"));
         let lock = fs::File::create(&mark).map_err(FileError::write(&mark))?;
         match lock.try_lock() {
             Err(TryLockError::WouldBlock) => return Ok(Made::Elsewhere),
-            // Some file systems know no locks: nothing keeps two runs apart there.
+            // Some file systems have no locks. Two runs may then write the same subject.
             Err(TryLockError::Error(_)) | Ok(()) => {}
         }
         let mark = file::unfinished_file(&mark);
@@ -82,7 +82,7 @@ impl Folder {
             mark.remove();
             return Ok(Made::Whole);
         }
-        // Left by a run that was killed.
+        // Files of a killed run.
         match fs::remove_dir_all(&temporary) {
             Err(e) if e.kind() != io::ErrorKind::NotFound => return Err(FileError::write(&temporary)(e)),
             _ => {}
@@ -90,21 +90,20 @@ impl Folder {
         let guard = file::unfinished_folder(&temporary).map_err(FileError::write(&temporary))?;
         let made = self.write_into(&temporary, subject, origin, cameras, &draw);
         let made = made.and_then(|()| self.reveal(&temporary, split, subject));
-        // Whether it went well or not, nothing stays. Other runs may be at work beside it: the folder around is theirs too.
+        // The folder around it stays, since other runs may use it.
         let _ = fs::remove_dir_all(&temporary);
         drop(guard);
         mark.remove();
         made.map(|()| Made::Whole)
     }
 
-    /// Removes what runs leave that were killed; what another run is at work on stays.
+    /// Removes the files of killed runs. Files of runs in progress stay.
     pub fn tidy(&self) {
         let unfinished = self.root.join(UNFINISHED);
         for mark in fs::read_dir(&unfinished).into_iter().flatten().flatten().map(|entry| entry.path()) {
             let is_mark = mark.extension().is_some_and(|extension| extension == "lock");
-            // Held by whoever is at work; the system frees those of the dead.
             let Ok(lock) = fs::File::open(&mark) else { continue };
-            // Held until what it marks is gone.
+            // A run in progress holds its lock. This one is held until the folder is removed.
             if is_mark && lock.try_lock().is_ok() {
                 let _ = fs::remove_dir_all(mark.with_extension(""));
                 let _ = fs::remove_file(&mark);
@@ -113,7 +112,7 @@ impl Folder {
         let _ = fs::remove_dir(unfinished);
     }
 
-    /// Draws and writes every view below `folder`.
+    /// Renders and writes every view into `folder`.
     fn write_into(
         &self,
         folder: &Path,
@@ -131,10 +130,11 @@ impl Folder {
             if drawn.depth.iter().all(|z| *z == 0.0) {
                 return Err(FileError::unsuitable(origin, format!("view {view} sees nothing of {subject}")));
             }
-            if self.description.layout == Layout::Authors && drawn.depth.iter().any(|z| *z > 0.0 && *z <= files::NEAREST)
+            if self.description.layout == Layout::Authors
+                && drawn.depth.iter().any(|z| *z > 0.0 && *z <= files::NEAREST)
             {
                 let message = format!(
-                    "view {view} sees {subject} within half a metre, for which the authors' layout has no number"
+                    "view {view} sees {subject} within half a metre, which the authors' layout cannot store"
                 );
                 return Err(FileError::unsuitable(origin, message));
             }
@@ -157,7 +157,7 @@ impl Folder {
                 Layout::Exact => files::write_depth(&at("depth"), &drawn),
             }
         });
-        // The first view's problem is told, whichever was found first.
+        // The error of the first failed view, whatever the order of the threads.
         views.collect::<Vec<_>>().into_iter().collect::<Result<(), _>>()?;
         if self.description.layout == Layout::Exact {
             let path = folder.join("cameras").join(format!("{subject}.json"));
@@ -166,7 +166,7 @@ impl Folder {
         Ok(())
     }
 
-    /// Moves a finished subject to its place, `img` last.
+    /// Moves a complete subject to its place, `img` last.
     fn reveal(&self, temporary: &Path, split: Split, subject: &str) -> Result<(), FileError> {
         let mut kinds = self.kinds();
         kinds.reverse();
@@ -180,7 +180,7 @@ impl Folder {
             };
             let parent = to.parent().unwrap_or(&self.root);
             fs::create_dir_all(parent).map_err(FileError::write(parent))?;
-            // A run that was killed in between left it, or a part of it was removed: the subject was not whole.
+            // A part of a subject that is not complete.
             if to.is_dir() {
                 fs::remove_dir_all(&to).map_err(FileError::write(&to))?;
             }
@@ -189,7 +189,7 @@ impl Folder {
         Ok(())
     }
 
-    /// What a subject consists of, `img` first.
+    /// The kinds of a subject's files, `img` first.
     pub(super) fn kinds(&self) -> Vec<&'static str> {
         match self.description.layout {
             Layout::Authors => vec!["img", "mask", "depth", "parm"],

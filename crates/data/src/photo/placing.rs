@@ -1,4 +1,4 @@
-//! Photographs put where the training subjects stand: each by the person's own box, or both alike.
+//! Placement of photographs at the training subjects' place and size, separately or together.
 
 use glam::DVec2;
 use image::{GenericImageView, GrayImage, RgbImage, imageops};
@@ -6,24 +6,24 @@ use image::{GenericImageView, GrayImage, RgbImage, imageops};
 use super::{Canvas, REFERENCE_SIDE, Rect, THRESHOLD, planes, unit};
 use crate::resize::Filter;
 
-/// Row of a training subject's middle on a canvas of 1024. The subject covers rows 124.39 to 862.52
+/// Middle row of a training subject on a canvas of 1024. The subject covers rows 124.39 to 862.52
 /// (docs/method.md, "Cameras").
 const TRAINING_CENTRE: f32 = 493.5;
 
-/// Where a photograph's pixels come to lie on a canvas, both with pixel centres at +½.
+/// Map from a photograph's pixels to a canvas, both with pixel centres at +½.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Mapping {
     /// Canvas pixels per pixel of the photograph, across and down.
     pub scale: DVec2,
-    /// Where the photograph's origin lies on the canvas.
+    /// Place of the photograph's origin on the canvas.
     pub origin: DVec2,
 }
 
 impl Mapping {
-    /// Of a photograph that is the canvas.
+    /// The map of a photograph that is the canvas.
     pub const AS_IT_IS: Self = Self { scale: DVec2::ONE, origin: DVec2::ZERO };
 
-    /// Of the box `person` that comes to lie at `left` and `top` with this size.
+    /// The map of the box `person` to the place `left`, `top` and this size.
     pub(super) fn of(person: Rect, [left, top]: [usize; 2], [width, height]: [usize; 2]) -> Self {
         let size = |width: u32, height: u32| DVec2::new(f64::from(width), f64::from(height));
         let scale = DVec2::new(width as f64, height as f64) / size(person.width, person.height);
@@ -50,7 +50,7 @@ impl Fit {
     fn new(Standing { person, axis }: Standing, [height, side]: [usize; 2]) -> Self {
         let canvas = side as f32;
         let by_height = height as f32 / REFERENCE_SIDE * canvas / person.height as f32;
-        // Somebody with outstretched arms may be wider than high.
+        // A person with outstretched arms may be wider than high.
         let (before, behind) = (axis - person.x as f32, (person.x + person.width) as f32 - axis);
         let scale = by_height.min(canvas / 2.0 / before.max(behind));
         let size = |length: u32| ((length as f32 * scale).round() as usize).clamp(1, side);
@@ -62,28 +62,30 @@ impl Fit {
     }
 }
 
-/// What comes to lie where the training subjects stand.
+/// The box that is placed, and its axis.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Standing {
     person: Rect,
-    /// Column that comes to lie in the middle of the canvas.
+    /// Column that is placed in the middle of the canvas.
     axis: f32,
 }
 
 impl Standing {
-    /// Somebody of whom nothing else is known: the middle of the box.
+    /// A person in a single photograph. The axis is the middle of the box.
     pub(super) fn alone(person: Rect) -> Self {
         Self { person, axis: person.x as f32 + person.width as f32 / 2.0 }
     }
 }
 
-/// The box around the person in both photographs, if they look as if taken from one place: of one size, the person about as high in
-/// both, and about as far right. Whoever turns on the spot has as much on the left of the axis in front as on the right
-/// behind.
+/// The box around the person in both photographs, if they are taken from one place: if their sizes are equal, and the
+/// person's heights and columns nearly so. A person who turns on the spot has the same share left of the axis in front
+/// as right of it behind.
 pub(super) fn together(masks: [&GrayImage; 2], people: [Rect; 2]) -> Option<Standing> {
-    /// Towards a camera that looks down, toes reach lower than heels: up to a tenth of the height, and somebody moves a little.
+    /// Largest ratio of the heights. In a camera that looks down, toes reach lower than heels by up to a tenth of the
+    /// height. A person also moves a little.
     const TALLER: f32 = 1.2;
-    /// Of the height. Half of a person is on either side of a line close to the axis, wherever the arms are.
+    /// Largest distance of the median columns, as a share of the height. They are close to the axis in every pose of
+    /// the arms.
     const ASIDE: f32 = 0.1;
     let [a, b] = people;
     let ratio = a.height as f32 / b.height as f32;
@@ -100,7 +102,7 @@ pub(super) fn together(masks: [&GrayImage; 2], people: [Rect; 2]) -> Option<Stan
     })
 }
 
-/// The column of a box that has half of the person in it on its left.
+/// The median column of the person in a box.
 fn median_column(mask: &GrayImage, person: Rect) -> u32 {
     let inside = imageops::crop_imm(mask, person.x, person.y, person.width, person.height);
     let mut columns = vec![0_u64; person.width as usize];
@@ -114,8 +116,8 @@ fn median_column(mask: &GrayImage, person: Rect) -> u32 {
     person.x + before.count() as u32
 }
 
-/// Puts photographs on canvases of `side` pixels as [`super::Placement::Training`] does, two of them together if they look as if taken
-/// from one place; `None` if a mask shows nobody.
+/// Places photographs on canvases of `side` pixels as [`super::Placement::Training`] does, two photographs from one
+/// place together; `None` if a mask is empty.
 pub fn place(photographs: &[(&RgbImage, &GrayImage)], height: usize, side: usize) -> Option<Vec<Canvas>> {
     let people = photographs.iter().map(|(_, mask)| Rect::around(mask, u8::MAX.div_ceil(2)));
     let people: Vec<Rect> = people.collect::<Option<_>>()?;
@@ -129,8 +131,7 @@ pub fn place(photographs: &[(&RgbImage, &GrayImage)], height: usize, side: usize
     Some(photographs.iter().zip(&people).map(placed).collect())
 }
 
-/// The box at the size and place of the training subjects; what of a soft edge lies outside the box comes
-/// along.
+/// Places the box at the size and place of the training subjects, with soft edges outside the box.
 pub(super) fn placed(
     rgb: &RgbImage,
     mask: &GrayImage,
@@ -143,8 +144,8 @@ pub(super) fn placed(
     let person = standing.person;
     let mapping = Mapping::of(person, [left, top], [width, height]);
 
-    // Everything the mask touches and the canvas can hold, and where it comes to lie relative to the person's box. A
-    // speck far away must not be enlarged with a small person.
+    // The box of all pixels with any coverage, cut to the reach of the canvas, and its place relative to the person's
+    // box. Without the cut a distant speck would be enlarged with a small person.
     let (sx, sy) = (width as f32 / person.width as f32, height as f32 / person.height as f32);
     let reach = |scale: f32| (canvas / scale).ceil() as u32;
     let touched = Rect::around(mask, 1).expect("the person's box is not empty");
@@ -155,7 +156,7 @@ pub(super) fn placed(
     let x0 = left as i64 - apart(person.x, touched.x, sx);
     let y0 = top as i64 - apart(person.y, touched.y, sy);
 
-    // Colours travel multiplied by the mask, so that what lies behind the person never bleeds in.
+    // Colours are resized after multiplication by the mask, so that the background does not bleed into them.
     let premultiplied = |color, m| unit(color) * unit(m);
     let [r, g, b, m] = planes(rgb, mask, touched, premultiplied, [high, wide], Filter::Lanczos3);
     let area = side * side;

@@ -1,4 +1,4 @@
-//! Where the person comes to lie, and what happens to edges and extremes.
+//! Placement of the person, soft edges and extreme sizes.
 
 use super::*;
 use image::{Rgba, RgbaImage};
@@ -6,7 +6,7 @@ use image::{Rgba, RgbaImage};
 const SIDE: usize = 256;
 
 /// A person of 40 × 80 pixels in a picture of 100 × 120: upper left red, upper right green, lower left blue, lower
-/// right white; what surrounds it is bright, transparent noise.
+/// right white. The surroundings are bright, transparent noise.
 fn quarters() -> tempfile::NamedTempFile {
     let picture =
         RgbaImage::from_fn(100, 120, |x, y| match ((10..50).contains(&x), (30..110).contains(&y)) {
@@ -23,7 +23,7 @@ fn quarters() -> tempfile::NamedTempFile {
     file
 }
 
-/// A photograph on its canvas, beside itself.
+/// The canvas of a photograph that is front and back.
 fn one(path: &Path, placement: Placement) -> Result<Canvas, FileError> {
     load([path, path], [None; 2], SIDE, placement).map(|[canvas, _]| canvas)
 }
@@ -103,7 +103,7 @@ fn a_person_wider_than_the_canvas_gets_smaller_not_narrower() {
     }
 }
 
-/// Enlarging everything the mask touches would need a plane of 370,000 × 370,000 pixels here.
+/// The enlarged box of the whole mask would have 370,000 × 370,000 pixels.
 #[test]
 fn a_speck_far_from_a_tiny_person_costs_nothing() {
     let picture = RgbaImage::from_fn(1000, 1000, |x, y| {
@@ -121,8 +121,8 @@ fn a_speck_far_from_a_tiny_person_costs_nothing() {
     assert!((170 * 170..200 * 200).contains(&valid), "{valid}");
 }
 
-/// Of two photographs from one place both show the same scale and the axis in the middle; of two that differ in size, or in how
-/// large the person is, each has its own.
+/// Two photographs from one place get the same scale, with the axis in the middle. Photographs of different sizes, or
+/// with different heights of the person, are placed separately.
 #[test]
 fn photographs_from_one_place_are_placed_together() {
     let person = |size: (u32, u32), x: u32, y: u32, height: u32| {

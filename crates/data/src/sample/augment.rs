@@ -1,4 +1,4 @@
-//! Changes to photographs, so that a network learned from renders meets what cameras and masks do.
+//! Augmentation: changes to rendered photographs that imitate cameras and masks.
 
 use std::io::Cursor;
 
@@ -8,7 +8,7 @@ use image::{GrayImage, Rgb, RgbImage};
 use rand::Rng;
 use serde::{Deserialize, Serialize};
 
-/// Ranges; 0 or false leaves a change out. Front and back are changed each by itself.
+/// Ranges of the changes; 0 or false disables one. Front and back are changed independently.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Augment {
@@ -16,22 +16,22 @@ pub struct Augment {
     pub exposure: f32,
     /// Red and blue against green, up to this share.
     pub white_balance: f32,
-    /// Masks that are too small, by up to so many pixels.
+    /// Largest error of masks that are too small, in pixels.
     pub mask_erosion: f32,
-    /// Masks that are too large, by up to so many pixels.
+    /// Largest error of masks that are too large, in pixels.
     pub mask_dilation: f32,
-    /// Lowest JPEG quality of photographs, 1 to 100; 0: never compressed.
+    /// Lowest JPEG quality of photographs, 1 to 100; 0: no compression.
     pub jpeg_quality: u8,
-    /// Photographs before random backgrounds, which shine through where masks are soft or too large.
+    /// Whether photographs have random backgrounds, which are visible through soft or too large masks.
     pub background: bool,
-    /// Stage 2: views are compared over a random colour instead of black.
+    /// Stage 2: whether targets have a random colour instead of black as their background.
     pub background_color: bool,
     /// Stage 1: half of the samples are mirrored, which makes two people of each.
     pub flip: bool,
 }
 
 impl Default for Augment {
-    /// Ours.
+    /// Augmentation of this program's trainings.
     fn default() -> Self {
         Self {
             exposure: 0.15,
@@ -47,7 +47,7 @@ impl Default for Augment {
 }
 
 impl Augment {
-    /// Nothing is changed.
+    /// No augmentation.
     pub fn none() -> Self {
         Self {
             exposure: 0.0,
@@ -143,17 +143,17 @@ fn compressed(picture: RgbImage, quality: u8) -> RgbImage {
     let decoded = image::ImageReader::with_format(Cursor::new(&bytes), image::ImageFormat::Jpeg).decode();
     match (done, decoded) {
         (Ok(()), Ok(decoded)) => decoded.into_rgb8(),
-        // Only if memory runs out; then the picture stays as it is.
+        // It fails only without memory. The picture then stays uncompressed.
         _ => picture,
     }
 }
 
-/// The mask with its outline moved outwards by `reach` pixels, or inwards where that is negative.
+/// The mask with its outline moved outwards by `reach` pixels, or inwards if `reach` is negative.
 pub(super) fn moved(mask: &GrayImage, reach: f32) -> GrayImage {
     let radius = reach.abs();
     let (width, height) = (i64::from(mask.width()), i64::from(mask.height()));
     let whole = radius.ceil() as i64;
-    // Pixels of a disc, each with the share of it that the radius reaches.
+    // Pixels of a disc, with the share of each that lies within the radius.
     let disc: Vec<(i64, i64, f32)> = (-whole..=whole)
         .flat_map(|y| (-whole..=whole).map(move |x| (x, y)))
         .map(|(x, y)| (x, y, (radius + 1.0 - ((x * x + y * y) as f32).sqrt()).clamp(0.0, 1.0)))
@@ -165,7 +165,7 @@ pub(super) fn moved(mask: &GrayImage, reach: f32) -> GrayImage {
         let value = if inside { mask.as_raw()[(y * width + x) as usize] } else { 0 };
         if dilate { value } else { 255 - value }
     };
-    // Squares that hold anything at all; a disc reaches into a square or its neighbours.
+    // Squares that are not empty. A disc reaches at most into the neighbours of its square.
     let square = whole.max(8);
     let squares = [width, height].map(|side| side.div_euclid(square) + 1);
     let mut filled = vec![false; (squares[0] * squares[1]) as usize];
@@ -178,7 +178,7 @@ pub(super) fn moved(mask: &GrayImage, reach: f32) -> GrayImage {
         let (x, y) = (x / square, y / square);
         (y - 1..=y + 1).any(|y| {
             (x - 1..=x + 1).any(|x| {
-                // Outside the picture a mask is empty, which is what erosion grows.
+                // A mask is empty outside the picture. Erosion grows this outside.
                 let inside = (0..squares[0]).contains(&x) && (0..squares[1]).contains(&y);
                 if inside { filled[(y * squares[0] + x) as usize] } else { !dilate }
             })
@@ -187,7 +187,7 @@ pub(super) fn moved(mask: &GrayImage, reach: f32) -> GrayImage {
     GrayImage::from_fn(mask.width(), mask.height(), |x, y| {
         let (x, y) = (i64::from(x), i64::from(y));
         let here = at(x, y);
-        // Most of a picture is far from the outline, and what is whole cannot grow.
+        // Most pixels are far from the outline. A full pixel cannot grow.
         let value = if here == 255 || !near(x, y) {
             here
         } else {
@@ -214,7 +214,7 @@ mod tests {
     }
 
     #[test]
-    fn outlines_move_by_the_asked_distance() {
+    fn outlines_move_by_the_given_distance() {
         let radius_of = |mask: &GrayImage| (area(mask) / std::f32::consts::PI).sqrt();
         let before = radius_of(&disc(16.0));
         for reach in [-2.5, -1.0, -0.5, 0.5, 1.0, 2.5] {
@@ -224,7 +224,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_changed_unless_asked() {
+    fn only_the_configured_changes_are_made() {
         let color = RgbImage::from_fn(64, 64, |x, y| Rgb([x as u8, y as u8, 77]));
         let mask = disc(20.0);
         let mut random = stream("a");
@@ -232,7 +232,7 @@ mod tests {
         let (changed, moved) = Augment::default().apply(&color, &mask, &mut random);
         assert_ne!(changed, color);
         assert_ne!(moved, mask);
-        // What is chosen does not depend on what else is asked for.
+        // A random choice does not depend on the other changes.
         let only = Augment { exposure: 0.5, ..Augment::none() };
         let (brighter, same) = only.apply(&color, &mask, &mut stream("b"));
         assert_eq!(same, mask);

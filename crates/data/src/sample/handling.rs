@@ -1,4 +1,4 @@
-//! What a user's photographs are like, and a data set's own views are not.
+//! Properties of a user's photographs that a data set's views do not have.
 
 use glam::{DVec2, DVec3};
 use image::{GrayImage, RgbImage};
@@ -12,18 +12,19 @@ use snapsnap_splat::{Camera, RigidTransform};
 /// Canvas side that lengths refer to.
 const REFERENCE_SIDE: f32 = 1024.0;
 
-/// What is done to photographs before a model sees them: the section `[photographs]` of an evaluation.
+/// Changes to photographs before they become a model's input: the section `[photographs]` of an evaluation.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Handling {
-    /// They are put on their canvas as a user's are, the person so many pixels of 1024 high, and what comes out is moved to
-    /// where the photographs' own cameras see it; 0: they are the canvas already.
+    /// Height, in pixels of 1024, of people who are placed on their canvas like a user's. The result is moved back into
+    /// the photographs' own cameras' views. 0: photographs are the canvas already.
     pub place: usize,
-    /// The first is so many stops brighter than the others, half of it each way.
+    /// Difference of exposure, in stops, between the first photograph and the others. Each is changed by half of it.
     pub exposure: f32,
-    /// Masks are too large by so many pixels of 1024, or, below 0, too small.
+    /// Error of the masks in pixels of 1024: above 0 they are too large, below 0 too small.
     pub mask: f32,
-    /// The frame cuts off so much of the person's width: on the left of the first, on the right of the others.
+    /// Share of the person's width that the frame cuts off, on the left of the first photograph and on the right of the
+    /// others.
     pub cut: f32,
 }
 
@@ -42,7 +43,7 @@ impl Handling {
         Some((key, format!("is {value}, must be {} to {}", range.start(), range.end())))
     }
 
-    /// The photograph `place` of a person, and its mask.
+    /// The changed photograph number `place` of a person, and its mask.
     pub(super) fn apply(
         &self,
         place: usize,
@@ -69,13 +70,13 @@ impl Handling {
         (color, mask)
     }
 
-    /// From the nominal camera's frame, in which placed photographs' points lie, to that of the `camera` that took the first one,
-    /// whose pixels came onto the canvas by `mapping`: a scale, since how large somebody is, or how far away, no photograph
-    /// tells and only the known camera does, and then the shift after which the points `[S, S, 3]`, metres, of the canvas's pixels
-    /// lie on the rays by which that camera saw them.
+    /// Scale and transform from the nominal camera's frame, which is the frame of placed photographs' points, to the
+    /// frame of the `camera` of the first photograph. `mapping` maps that photograph's pixels to the canvas. The scale
+    /// comes from the known camera, since photographs do not show size and distance. The shift then moves the canvas's
+    /// points `[S, S, 3]`, in metres, onto the rays of that camera.
     pub fn back(mapping: &Mapping, camera: &Camera, points: &[f32], valid: &[bool]) -> (f64, RigidTransform) {
         let side = f64::from(valid.len() as u32).sqrt() as usize;
-        // The canvas may be of another size than the photograph that was placed.
+        // The canvas may have another size than the photograph.
         let shrunk = f64::from(camera.width) / side as f64;
         let scale = scale_of(mapping, camera);
         let seen = valid.iter().enumerate().filter(|(_, valid)| **valid).map(|(pixel, _)| {

@@ -2,11 +2,11 @@
 
 use burn::data::dataset::{Dataset, DatasetError};
 
-/// The items of all data sets, one set after the other.
+/// The items of all data sets, one set after another.
 pub struct Joined<I>(Vec<Box<dyn Dataset<I>>>);
 
 impl<I> Joined<I> {
-    /// Puts data sets together.
+    /// Joins data sets.
     pub fn new(sets: Vec<Box<dyn Dataset<I>>>) -> Self {
         Self(sets)
     }

@@ -1,5 +1,5 @@
-//! A data loader with bounded memory, whose order does not depend on the number of workers. (Burn's loader keeps up to 100
-//! batches per iterator and mixes the orders of its workers.)
+//! A data loader with bounded memory, whose order does not depend on the number of workers. (Burn's loader keeps up to
+//! 100 batches per iterator and mixes the orders of its workers.)
 
 use std::collections::BTreeMap;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -25,8 +25,8 @@ pub struct Loader<I> {
 }
 
 impl<I: 'static> Loader<I> {
-    /// Batches of `batch` items, loaded by `workers` threads. At most `workers + prefetch` batches are loaded before they are
-    /// taken. The last batch may be smaller.
+    /// Batches of `batch` items, loaded by `workers` threads. At most `workers + prefetch` batches are loaded before
+    /// they are taken. The last batch may be smaller.
     ///
     /// # Panics
     /// If `batch` or `workers` is 0.

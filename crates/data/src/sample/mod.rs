@@ -13,7 +13,6 @@ mod tests;
 
 use std::sync::Arc;
 
-use burn::tensor::{Device, Tensor, TensorData};
 use image::{GrayImage, RgbImage};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
@@ -32,40 +31,41 @@ pub use stage1::{Stage1, Stage1Batch, Stage1Batcher, Stage1Item};
 pub use stage2::{Stage2, Stage2Item};
 pub use test_set::{Test, TestItem};
 
-/// Coverage from which a pixel belongs to the person, in 8 bits.
+/// Least coverage of a pixel of the person, in 8 bits.
 const INSIDE: u8 = 128;
 
-/// How samples are made: the section `[samples]` of a training config.
+/// The section `[samples]` of a training config.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SampleConfig {
-    /// Every quirk of the published loader: points half a pixel off in sets whose samples lie at the pixels' corners,
-    /// black background, nothing augmented.
+    /// Whether samples have every quirk of the published loader: points half a pixel off in sets that are sampled at
+    /// the pixels' corners, a black background, and no augmentation.
     pub compat: bool,
-    /// How often each subject comes in an epoch.
+    /// Samples of each subject in an epoch.
     pub repeat: usize,
-    /// How far from the subject's own front, in degrees, the front photograph may be taken; 180: from anywhere.
+    /// Largest angle, in degrees, between the front photograph and the subject's own front; 180: any view is a front.
     pub front_within_degrees: f32,
-    /// Stage 2: random views to be compared, beside the two side views.
+    /// Stage 2: number of random target views, beside the two side views.
     pub random_targets: usize,
-    /// Stage 2: compare at twice the side, where the data set has it.
+    /// Stage 2: whether targets have twice the side. The data set must contain such views.
     pub high_resolution: bool,
-    /// Stage 2: also the points that four views see, for the point loss.
+    /// Stage 2: whether samples contain the points of four views for stage 1's loss: `stage2.points_weight`.
+    #[serde(skip)]
     pub points: bool,
-    /// Share of the samples whose photographs are put on their canvas as a user's are, and whose points are scaled and moved to
-    /// where the nominal cameras see them.
+    /// Share of the samples whose photographs are placed on their canvas like a user's photographs. Their points are
+    /// scaled and moved into the nominal cameras' views.
     pub placed_share: f32,
-    /// How high a person is then, in pixels of a canvas of 1024: `mode.person_height`.
+    /// Height of a placed person in pixels of a canvas of 1024: `mode.person_height`.
     #[serde(skip)]
     pub person_height: usize,
-    /// Decides everything that is random.
+    /// Seed of everything that is random.
     pub seed: u64,
     /// Changes to the two input photographs.
     pub augment: Augment,
 }
 
 impl Default for SampleConfig {
-    /// Ours.
+    /// Samples of this program's trainings.
     fn default() -> Self {
         Self {
             compat: false,
@@ -83,7 +83,7 @@ impl Default for SampleConfig {
 }
 
 impl SampleConfig {
-    /// The published loader.
+    /// Samples of the published loader.
     pub fn compat() -> Self {
         Self { compat: true, high_resolution: true, augment: Augment::none(), ..Self::default() }
     }
@@ -116,7 +116,7 @@ impl SampleConfig {
     }
 }
 
-/// What both stages share: a split of a data set and how to make samples of it.
+/// A split of a data set and the config of its samples, for all stages.
 #[derive(Debug, Clone)]
 struct Source {
     folder: Arc<Folder>,
@@ -127,7 +127,7 @@ struct Source {
 }
 
 impl Source {
-    /// `parts`: into how many equal parts views are taken from the circle.
+    /// The number of views must be a multiple of `parts`.
     fn new(
         folder: Arc<Folder>,
         split: Option<Split>,
@@ -140,16 +140,15 @@ impl Source {
         }
         let views = folder.description().views;
         if !views.is_multiple_of(parts) {
-            let who = if parts == 4 { "front, back and sides" } else { "front and back" };
-            return Err(wrong(format!("has {views} views; {who} need a multiple of {parts}")));
+            return Err(wrong(format!(
+                "has {views} views; front, back and sides need a multiple of {parts}"
+            )));
         }
         if config.compat && folder.description().arrangement != Arrangement::Ring {
-            return Err(wrong(
-                "is arranged in groups, which the published loader (`compat`) does not know".into(),
-            ));
+            return Err(wrong("is arranged in groups, which `compat = true` does not support".into()));
         }
         if config.high_resolution && !folder.description().high_resolution {
-            return Err(wrong("has no views at twice the side, which `high_resolution` asks for".into()));
+            return Err(wrong("has no views at twice the side, which `high_resolution` needs".into()));
         }
         let subjects = folder.subjects(split)?;
         if subjects.is_empty() {
@@ -162,20 +161,20 @@ impl Source {
         self.subjects.len() * self.config.repeat
     }
 
-    /// The subject of a sample and its random stream. Subjects come one after another, as in the published code.
+    /// The subject of a sample and its random stream. As in the published code, subjects take turns.
     fn subject(&self, stage: u32, index: usize) -> (&str, ChaCha8Rng) {
         let subject = &self.subjects[index % self.subjects.len()];
         let random = stream(&format!("sample/{stage}/{}/{}/{index}", self.config.seed, self.epoch));
         (subject, random)
     }
 
-    /// A view for the front photograph; of groups any group's, which lie as they were prepared.
+    /// A view for the front photograph, or the front of a random group.
     fn front(&self, random: &mut impl Rng) -> usize {
         let count = self.folder.description().views;
         if self.folder.description().arrangement == Arrangement::Groups {
             return 4 * random.random_range(0..count / 4);
         }
-        // View 0 is the subject's own front, and the views go round evenly.
+        // View 0 is the subject's own front. Views are evenly spaced.
         let reach = (f64::from(self.config.front_within_degrees) * count as f64 / 360.0 + 1e-6) as usize;
         if 2 * reach >= count {
             return random.random_range(0..count);
@@ -183,7 +182,7 @@ impl Source {
         (count + random.random_range(0..=2 * reach) - reach) % count
     }
 
-    /// A view; without its picture where that is not needed.
+    /// A view, with its picture or without.
     fn view_for(&self, subject: &str, view: usize, picture: bool) -> Result<StoredView, FileError> {
         if picture {
             self.folder.view(self.split, subject, view)
@@ -192,13 +191,12 @@ impl Source {
         }
     }
 
-    /// The camera by which depths become points: the true one, or, with `compat`, the stored one as the published code
-    /// reads it.
+    /// The camera that unprojects depths: the exact camera, or, with `compat`, the stored one as in the published code.
     fn camera(&self, stored: &Camera) -> Camera {
         if self.config.compat { *stored } else { self.folder.exact_camera(stored) }
     }
 
-    /// What a view sees, to be compared with: `[3,h,w]` in [0, 1], over a colour, and the share of the person `[h,w]`.
+    /// A target view: `[3,h,w]` in [0, 1] over a colour, and the share of the person `[h,w]`.
     fn target(
         &self,
         subject: &str,
@@ -207,7 +205,7 @@ impl Source {
         background: [f32; 3],
     ) -> Result<(Vec<f32>, Vec<f32>), FileError> {
         let (color, mask) = self.folder.picture(self.split, subject, view, high_resolution)?;
-        // The authors' pictures are over black already, and their masks half as fine as the larger ones.
+        // The authors' pictures are over black already. Their masks have half the side of the larger pictures.
         let is_done = self.folder.description().layout == Layout::Authors && background == [0.0; 3];
         let value = |c: u8, a: u8, behind: f32| {
             let a = if is_done { 1.0 } else { f32::from(a) / 255.0 };
@@ -221,7 +219,7 @@ impl Source {
         Ok(((0..3).flat_map(pixels).collect(), share))
     }
 
-    /// Photographs of front and back as the networks see them.
+    /// Photographs of front and back as the networks' input.
     fn photographs(
         &self,
         views: [(&RgbImage, &GrayImage); 2],
@@ -233,9 +231,9 @@ impl Source {
         Photograph::all(&changed, if is_placed { self.config.person_height } else { 0 }, self.config.compat)
     }
 
-    /// Whether a sample's photographs are placed as a user's are.
+    /// Whether a sample's photographs are placed like a user's.
     fn is_placed(&self, random: &mut impl Rng) -> bool {
-        // Nothing is drawn where nothing is open.
+        // A share of 0 draws no random number, so that it leaves the others as they are.
         match self.config.placed_share {
             0.0 => false,
             share => random.random::<f32>() < share,
@@ -247,20 +245,20 @@ impl Source {
 struct Photograph {
     /// `[3,H,W]` in [−1, 1] times the mask.
     image: Vec<f32>,
-    /// `[H,W]` the person's share as the mask sees it; the published code's is 1 or 0.
+    /// `[H,W]` share of the person. In the published code it is 1 or 0.
     mask: Vec<f32>,
     mapping: Mapping,
 }
 
 impl Photograph {
-    /// Photographs of a person as the networks see them: put on their canvas as a user's are, with the person so many pixels of 1024
-    /// high, or, with 0, as they are.
+    /// Photographs of a person as the networks' input. They are placed on their canvas like a user's, with a person of
+    /// `height` pixels of 1024. With 0 they are used unchanged.
     fn all(photographs: &[(&RgbImage, &GrayImage)], height: usize, compat: bool) -> Vec<Self> {
         let side = photographs.first().map_or(0, |(color, _)| color.width() as usize);
         let placed = (height > 0).then(|| place(photographs, height, side)).flatten();
         let mut photographs: Vec<Self> = match placed {
             Some(canvases) => canvases.into_iter().map(Self::of_canvas).collect(),
-            None => photographs.iter().map(|(color, mask)| Self::as_it_is(color, mask)).collect(),
+            None => photographs.iter().map(|(color, mask)| Self::unchanged(color, mask)).collect(),
         };
         if compat {
             let inside = |share: f32| f32::from(u8::from(share >= f32::from(INSIDE) / 255.0));
@@ -270,7 +268,7 @@ impl Photograph {
         photographs
     }
 
-    /// Images and masks, one after another.
+    /// All images, and all masks.
     fn joined(photographs: Vec<Self>) -> (Vec<f32>, Vec<f32>) {
         let (images, masks): (Vec<_>, Vec<_>) =
             photographs.into_iter().map(|photograph| (photograph.image, photograph.mask)).unzip();
@@ -281,7 +279,7 @@ impl Photograph {
         Self { image: canvas.rgb, mask: canvas.mask, mapping: canvas.mapping }
     }
 
-    fn as_it_is(color: &RgbImage, mask: &GrayImage) -> Self {
+    fn unchanged(color: &RgbImage, mask: &GrayImage) -> Self {
         // Channels first; the background is 0.
         let channel = |channel: usize| {
             let pixels = color.pixels().zip(mask.pixels());
@@ -295,15 +293,4 @@ impl Photograph {
             mapping: Mapping::AS_IT_IS,
         }
     }
-}
-
-/// One field of all items of a batch, as one tensor.
-fn together<I, const D: usize>(
-    items: &[I],
-    of: fn(&I) -> &Vec<f32>,
-    shape: [usize; D],
-    device: &Device,
-) -> Tensor<D> {
-    let values: Vec<f32> = items.iter().flat_map(|item| of(item).iter().copied()).collect();
-    Tensor::from_data(TensorData::new(values, shape), device)
 }

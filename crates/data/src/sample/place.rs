@@ -15,20 +15,19 @@ use crate::photo::Mapping;
 
 /// Depth that the published code gives the background: 1/(0 + 10⁻⁸).
 const COMPAT_FAR: f32 = 1e8;
-/// How often a side pixel's depth is looked up where its last one leads.
+/// Iterations of the search for a side pixel's depth.
 const LOOKUPS: usize = 3;
 
-/// Two photographs and what four views see.
+/// Two photographs and the points of four views.
 pub(super) struct Four {
     /// `[2,3,H,W]` front and back in [−1, 1] times the mask.
     pub images: Vec<f32>,
-    /// `[2,H,W]` share of the person as the input masks see it; with `compat` 1 or 0.
+    /// `[2,H,W]` share of the person in the input masks; with `compat` 1 or 0.
     pub masks: Vec<f32>,
-    /// `[4,H,W,3]` metres in the front's frame, and where there are any `[4,H,W]`.
+    /// `[4,H,W,3]` in metres in the front's frame, and their validity `[4,H,W]`.
     pub points: Vec<f32>,
     pub valid: Vec<f32>,
-    /// The front's camera, in whose frame the points are once they are multiplied by `scale`: where they were moved, it was
-    /// moved with them.
+    /// The front camera. The points times `scale` are in its frame: it moves with placed points.
     pub front: Camera,
     pub scale: f64,
 }
@@ -81,7 +80,7 @@ impl Source {
         Ok(Four { images, masks, points, valid, front, scale })
     }
 
-    /// The pictures of front and back alone, where no points are asked for and none are needed.
+    /// The photographs of front and back without points.
     pub(super) fn two(
         &self,
         pictures: [&(RgbImage, GrayImage); 2],
@@ -92,7 +91,7 @@ impl Source {
     }
 }
 
-/// Points of a canvas's pixels, row by row, in the front's frame, where there are any.
+/// Points of a canvas's pixels, row by row, in the front's frame; `None` for pixels without a point.
 type Seen = Vec<Option<DVec3>>;
 
 /// A view and its camera.
@@ -103,7 +102,7 @@ struct Sight<'a> {
 }
 
 impl Sight<'_> {
-    /// The point at a place of the view, in the camera's frame: that of its pixel's depth.
+    /// The point at a place of the view, from its pixel's depth, in the camera's frame.
     fn point(&self, place: DVec2) -> Option<DVec3> {
         let side = self.camera.width as usize;
         let (column, row) = (place.x.floor(), place.y.floor());
@@ -115,15 +114,15 @@ impl Sight<'_> {
         (z > 0.0).then(|| f64::from(z) * ray.extend(1.0))
     }
 
-    /// What the view sees at the pixels of a canvas that it was put on.
+    /// The view's points at the pixels of its canvas.
     fn through(&self, mapping: &Mapping, front: &Camera, scale: f64) -> Seen {
         let to_front = self.camera.world_to_camera.inverse().then(&front.world_to_camera);
         let seen = |place| self.point(mapping.source(place)).map(|p| to_front.apply(p) / scale);
         centres(self.camera.width).map(seen).collect()
     }
 
-    /// What the nominal camera `degrees` around the body's axis from the front's sees, as it would stand in the frame of
-    /// `front`: points that the view saw, each at the pixel that it projects to.
+    /// The view's points at the pixels of the nominal camera that stands `degrees` around the body's axis from the
+    /// front's, in the frame of `front`.
     fn as_nominal(&self, front: &Camera, scale: f64, degrees: f64) -> Seen {
         let [nominal, nominal_front] =
             [degrees, 0.0].map(|yaw| Camera::orbit_at_yaw_degrees(yaw, self.camera.width));
@@ -159,16 +158,16 @@ fn centres(side: u32) -> impl Iterator<Item = DVec2> {
     (0..side).flat_map(move |row| (0..side).map(move |column| DVec2::new(column.into(), row.into()) + 0.5))
 }
 
-/// How many times as large as a nominal camera's what a camera sees is, if its photograph came onto the canvas by `mapping`: as
-/// much as its distance from the body's axis and its pixels are other than a nominal camera's.
+/// Scale of a camera's points relative to a nominal camera's, if `mapping` maps its photograph to the canvas. It is the
+/// ratio of the distances from the body's axis times the ratio of the pixel sizes.
 pub(super) fn scale_of(mapping: &Mapping, camera: &Camera) -> f64 {
     let nominal = Orbit::default();
     let distance = camera.world_to_camera.apply(nominal.centre).z / nominal.radius;
     distance * nominal.focal * f64::from(camera.width) / camera.focal.y / mapping.scale.y
 }
 
-/// The shift t, in metres, after which points p project best where the rays `(x/z, y/z)` beside them go: the least squares of
-/// t_x − r_x·t_z = r_x·z − x and the same downwards.
+/// The shift t, in metres, that moves points p onto their rays r = `(x/z, y/z)`: the least-squares solution of
+/// t_x − r_x·t_z = r_x·z − x, and of the same equation for y.
 pub(super) fn shift(seen: impl Iterator<Item = (DVec2, DVec3)>) -> DVec3 {
     let (mut matrix, mut right) = (DMat3::ZERO, DVec3::ZERO);
     for (ray, point) in seen {
@@ -180,6 +179,6 @@ pub(super) fn shift(seen: impl Iterator<Item = (DVec2, DVec3)>) -> DVec3 {
             right += row * value;
         }
     }
-    // A single point, or none, tells no distance.
+    // One point is not enough for a distance.
     if matrix.determinant().abs() < 1e-9 { DVec3::ZERO } else { matrix.inverse() * right }
 }

@@ -1,19 +1,19 @@
-//! Stage 1: two opposite photographs, and the points that four views around see.
+//! Stage 1: two opposite photographs, and the points of four views.
 
 use std::sync::Arc;
 
 use burn::data::dataloader::batcher::Batcher;
 use burn::data::dataset::{Dataset, DatasetError};
-use burn::tensor::{Device, Tensor};
+use burn::tensor::{Device, Tensor, TensorData};
 use rand::Rng;
 
 use super::place::Four;
-use super::{SampleConfig, Source, together};
+use super::{SampleConfig, Source};
 use crate::dataset::{Folder, Split};
 use snapsnap_base::FileError;
 
-/// Samples of stage 1 (docs/method.md, "Samples"): any view is the front, the opposite one the back, those at right
-/// angles the sides.
+/// Samples of stage 1 (docs/method.md, "Samples"). Any view is the front, the opposite view the back. Views at right
+/// angles are the sides.
 #[derive(Debug, Clone)]
 pub struct Stage1(Source);
 
@@ -26,11 +26,11 @@ pub struct Stage1Item {
     pub side: usize,
     /// `[2,3,H,W]` front and back in [−1, 1] times the mask.
     pub images: Vec<f32>,
-    /// `[2,H,W]` share of the person as the input masks see it; with `compat` 1 or 0.
+    /// `[2,H,W]` share of the person in the input masks; with `compat` 1 or 0.
     pub masks: Vec<f32>,
-    /// `[4,H,W,3]` points that front, back, right and left see, metres in the front camera's frame.
+    /// `[4,H,W,3]` points of front, back, right and left, in metres in the front camera's frame.
     pub points: Vec<f32>,
-    /// `[4,H,W]` 1 where a point is one.
+    /// `[4,H,W]` 1 for pixels that have a point, 0 for others.
     pub valid: Vec<f32>,
 }
 
@@ -54,11 +54,11 @@ impl Stage1 {
     /// [`FileError`] if the split has no subject, the number of views is no multiple of 4, or the config contradicts
     /// itself or the data set.
     pub fn new(folder: Arc<Folder>, split: Option<Split>, config: SampleConfig) -> Result<Self, FileError> {
-        // High resolution is stage 2's.
+        // Only stage 2 has targets of high resolution.
         Source::new(folder, split, SampleConfig { high_resolution: false, ..config }, 4).map(Self)
     }
 
-    /// The same subjects with other random choices.
+    /// The same subjects with the random choices of another epoch.
     pub fn with_epoch(&self, epoch: u64) -> Self {
         Self(Source { epoch, ..self.0.clone() })
     }
@@ -80,7 +80,7 @@ impl Stage1 {
             source.four(subject, &order, is_placed, &mut random)?;
         let mut item = Stage1Item { name: String::new(), side, images, masks, points, valid };
         if source.config.augment.flip && random.random() {
-            item.mirror();
+            item.flip();
         }
         item.name = format!("{}: {subject}, view {first}", source.folder.root().display());
         Ok(item)
@@ -88,8 +88,8 @@ impl Stage1 {
 }
 
 impl Stage1Item {
-    /// The same seen in a mirror: left is right, and so are the sides.
-    fn mirror(&mut self) {
+    /// Mirrors the sample: left becomes right, also for the sides.
+    fn flip(&mut self) {
         let (side, area) = (self.side, self.side * self.side);
         for image in [&mut self.images, &mut self.masks, &mut self.valid] {
             image.chunks_exact_mut(side).for_each(<[f32]>::reverse);
@@ -118,7 +118,7 @@ impl Dataset<Stage1Item> for Stage1 {
     }
 }
 
-/// Puts samples together.
+/// Makes batches of samples.
 #[derive(Debug, Clone, Copy)]
 pub struct Stage1Batcher;
 
@@ -126,10 +126,21 @@ impl Batcher<Stage1Item, Stage1Batch> for Stage1Batcher {
     fn batch(&self, items: Vec<Stage1Item>, device: &Device) -> Stage1Batch {
         let (b, side) = (items.len(), items.first().map_or(0, |item| item.side));
         Stage1Batch {
-            images: together(&items, |item| &item.images, [b, 2, 3, side, side], device),
-            masks: together(&items, |item| &item.masks, [b, 2, side, side], device),
-            points: together(&items, |item| &item.points, [b, 4, side, side, 3], device),
-            valid: together(&items, |item| &item.valid, [b, 4, side, side], device),
+            images: stacked(&items, |item| &item.images, [b, 2, 3, side, side], device),
+            masks: stacked(&items, |item| &item.masks, [b, 2, side, side], device),
+            points: stacked(&items, |item| &item.points, [b, 4, side, side, 3], device),
+            valid: stacked(&items, |item| &item.valid, [b, 4, side, side], device),
         }
     }
+}
+
+/// One field of all items as one tensor.
+fn stacked<const D: usize>(
+    items: &[Stage1Item],
+    of: fn(&Stage1Item) -> &Vec<f32>,
+    shape: [usize; D],
+    device: &Device,
+) -> Tensor<D> {
+    let values: Vec<f32> = items.iter().flat_map(|item| of(item).iter().copied()).collect();
+    Tensor::from_data(TensorData::new(values, shape), device)
 }

@@ -1,4 +1,4 @@
-//! Stage 2: front and back photographs, and views to compare the rendered Gaussians with.
+//! Stage 2: front and back photographs, and target views of the rendered Gaussians.
 
 use std::sync::Arc;
 
@@ -16,7 +16,7 @@ use snapsnap_base::FileError;
 #[derive(Debug, Clone)]
 pub struct Stage2(Source);
 
-/// One sample; H and W are the side of the data set's views, h and w that of the views to compare.
+/// One sample; H and W are the side of the data set's views, h and w the side of the targets.
 #[derive(Debug, Clone)]
 pub struct Stage2Item {
     /// Data set, subject and front view, for messages.
@@ -25,23 +25,23 @@ pub struct Stage2Item {
     pub side: usize,
     /// `[2,3,H,W]` front and back in [−1, 1] times the mask.
     pub images: Vec<f32>,
-    /// `[2,H,W]` share of the person as the input masks see it; with `compat` 1 or 0.
+    /// `[2,H,W]` share of the person in the input masks; with `compat` 1 or 0.
     pub masks: Vec<f32>,
-    /// Cameras of front, back, right and left, side H; the front's where its points were moved to, with `place`.
+    /// Cameras of front, back, right and left, side H. The front camera of a placed sample is moved with its points.
     pub cameras: [Camera; 4],
-    /// How many times as large the person is as the points say, with `place`.
+    /// Scale of a placed sample: the person's size in metres over the size of the points.
     pub scale: f64,
-    /// `[4,H,W,3]` points that they see, metres in the front camera's frame; empty unless the config asks for them.
+    /// `[4,H,W,3]` points of these views, in metres in the front camera's frame; empty without `points` of the config.
     pub points: Vec<f32>,
-    /// `[4,H,W]` 1 where a point is one; empty likewise.
+    /// `[4,H,W]` 1 for pixels that have a point, 0 for others; empty like `points`.
     pub valid: Vec<f32>,
     /// h and w.
     pub target_side: usize,
-    /// `[V,3,h,w]` views to compare in [0, 1], over `background`: the random ones, then right and left.
+    /// `[V,3,h,w]` targets in [0, 1] over `background`: random views, then right and left.
     pub targets: Vec<f32>,
-    /// `[V,h,w]` share of the person in each of their pixels.
+    /// `[V,h,w]` share of the person in the targets' pixels.
     pub target_masks: Vec<f32>,
-    /// Their cameras.
+    /// Cameras of the targets.
     pub target_cameras: Vec<Camera>,
     /// Colour behind the person.
     pub background: [f32; 3],
@@ -62,7 +62,7 @@ impl Stage2 {
         Source::new(folder, split, config, 4).map(Self)
     }
 
-    /// The same subjects with other random choices.
+    /// The same subjects with the random choices of another epoch.
     pub fn with_epoch(&self, epoch: u64) -> Self {
         Self(Source { epoch, ..self.0.clone() })
     }
@@ -93,7 +93,7 @@ impl Stage2 {
             let (target, mask) = source.target(subject, view, config.high_resolution, background)?;
             targets.extend(target);
             target_masks.extend(mask);
-            // Sampled where the stored picture is, at its own size.
+            // The camera at the size of the stored picture.
             let stored = folder.camera(*split, subject, view)?.resized(target_side, target_side);
             target_cameras.push(source.camera(&stored));
         }

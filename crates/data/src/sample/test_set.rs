@@ -1,4 +1,4 @@
-//! The test: some photographs of a subject, and every view around it to compare.
+//! Test sets: some photographs of a subject, and all of its views as ground truth.
 
 use std::sync::Arc;
 
@@ -21,18 +21,18 @@ pub struct TestItem {
     pub subject: String,
     /// H and W.
     pub side: usize,
-    /// `[N,3,H,W]` the photographs that go in, in [−1, 1] times the mask.
+    /// `[N,3,H,W]` input photographs in [−1, 1] times the mask.
     pub images: Vec<f32>,
-    /// `[N,H,W]` share of the person as the input masks see it; with `compat` 1 or 0.
+    /// `[N,H,W]` share of the person in the input masks; with `compat` 1 or 0.
     pub masks: Vec<f32>,
-    /// Where the photographs' pixels came from.
+    /// Places of the photographs on their canvases.
     pub mappings: Vec<Mapping>,
     /// Cameras of all views.
     pub cameras: Vec<Camera>,
 }
 
 impl Test {
-    /// The subjects of a split; `None` where they lie in the root itself, as in the authors' test sets.
+    /// The subjects of a split; `None` is the root itself, as in the authors' test sets.
     ///
     /// # Errors
     /// [`FileError`] if the split has no subject, or the config contradicts itself.
@@ -46,7 +46,7 @@ impl Test {
         self.0.len()
     }
 
-    /// Whether there is none; never true.
+    /// Whether the set is empty. It never is.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
@@ -56,7 +56,7 @@ impl Test {
         &self.0.subjects[index]
     }
 
-    /// One subject with the photographs of some of its views, changed as `handling` says.
+    /// One subject with the photographs of some of its views, changed by `handling`.
     ///
     /// # Errors
     /// [`FileError`] for files that are missing or damaged.
@@ -85,8 +85,8 @@ impl Test {
         })
     }
 
-    /// What a view of the subject `index` sees, `[3,H,W]` in [0, 1] over `background`, and the share of the person `[H,W]`.
-    /// One at a time, for thirty take four hundred megabytes.
+    /// Ground truth of a view: `[3,H,W]` in [0, 1] over `background`, and the share of the person `[H,W]`. Thirty views
+    /// of one subject would take 400 MB.
     ///
     /// # Errors
     /// As [`Self::sample`].
@@ -99,7 +99,7 @@ impl Test {
         self.0.target(self.0.subject(3, index).0, view, false, background)
     }
 
-    /// Points that some views of a subject see, `[V,H,W,3]` metres in the first one's frame, and where there are any
+    /// Points of some views of a subject, `[V,H,W,3]` in metres in the first view's frame, and their validity
     /// `[V,H,W]`, 0 or 1.
     ///
     /// # Errors

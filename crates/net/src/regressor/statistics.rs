@@ -18,9 +18,10 @@ impl Statistics {
         Self::default()
     }
 
-    /// These statistics, to be used instead of new ones by one pass over the same number of images.
+    /// These statistics as constants without gradients, for one pass over the same number of images.
     pub fn frozen(&self) -> Self {
-        Self { layers: self.layers.clone(), next: Some(0) }
+        let constant = |layer: &[Tensor<2>; 2]| layer.each_ref().map(|x| x.clone().detach());
+        Self { layers: self.layers.iter().map(constant).collect(), next: Some(0) }
     }
 
     /// Frozen statistics of all images on the host, layer by layer: means and reciprocal standard deviations.

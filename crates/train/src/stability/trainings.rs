@@ -95,7 +95,8 @@ fn trained<T: Task>(
     Ok((outcome, watch.finite))
 }
 
-/// A data set of people as they should not be photographed: nearly black, over-exposed, 1 % and nearly all of the frame.
+/// A data set of people as they should not be photographed: nearly black, over-exposed, 1 % and nearly all of the
+/// frame.
 fn extreme_people(root: &Path) -> Result<Arc<Folder>, TrainError> {
     let mut data = DataConfig::default();
     (data.views.count, data.views.resolution) = (4, 64);

@@ -35,8 +35,8 @@ impl Frozen {
         Self { networks, lowered, precision, maps }
     }
 
-    /// What it makes of a sample's photographs: in a step on one of the devices, which is given by its place and as it is
-    /// without gradients, or, with no place, for a validation, in f32.
+    /// What it makes of a sample's photographs: in a step on one of the devices, which is given by its place and as it
+    /// is without gradients, or, with no place, for a validation, in f32.
     pub fn predict(
         &self,
         config: &Config,

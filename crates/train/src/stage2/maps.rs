@@ -24,9 +24,9 @@ use crate::precision::Precision;
 /// Metadata key of the checksum of a file's values.
 const CHECKSUM: &str = "snapsnap.checksum";
 
-/// Folder of one predictor's point maps, a file for each pair of photographs. Names follow from the program's version, from
-/// what the predictor is, from its weights, from the photographs, and from where and how they are computed: what is out
-/// of date is not found.
+/// Folder of one predictor's point maps, a file for each pair of photographs. Names follow from the program's version,
+/// from what the predictor is, from its weights, from the photographs, and from where and how they are computed: what
+/// is out of date is not found.
 pub(super) struct Maps {
     folder: PathBuf,
     views: Vec<View>,
@@ -46,8 +46,8 @@ impl Maps {
         Self { folder: root.join(name(hash)), views: predictor.views().to_vec() }
     }
 
-    /// The point maps of a sample's photographs, computed in `precision` on `device`: those that are there, or else what
-    /// `predict` makes, which is kept. A file that is damaged is made again.
+    /// The point maps of a sample's photographs, computed in `precision` on `device`: those that are there, or else
+    /// what `predict` makes, which is kept. A file that is damaged is made again.
     ///
     /// # Errors
     /// [`TrainError`] if they cannot be written.

@@ -113,8 +113,8 @@ impl GaussianTask {
         self.validation.count
     }
 
-    /// What the point predictor, the one that is trained or the frozen one, makes of a sample's photographs: in a step on
-    /// one of the devices, by its place, or, with none, for a validation, in f32.
+    /// What the point predictor, the one that is trained or the frozen one, makes of a sample's photographs: in a step
+    /// on one of the devices, by its place, or, with none, for a validation, in f32.
     fn predict(
         &self,
         networks: &Networks,

@@ -125,8 +125,8 @@ pub(super) fn targets(item: &Stage2Item, views: &[usize], device: &Device) -> (T
     (Tensor::from_data(pictures, device), Tensor::from_data(masks, device))
 }
 
-/// Mean over Gaussians with these `scales` `[N,3]` of ln(longest / shortest axis) − ln(limit), where that is positive. (A mean
-/// penalty on scales alone misses the few that are too long.)
+/// Mean over Gaussians with these `scales` `[N,3]` of ln(longest / shortest axis) − ln(limit), where that is positive.
+/// (A mean penalty on scales alone misses the few that are too long.)
 pub fn anisotropy_penalty(scales: &Tensor<2>, limit: f64) -> Tensor<1> {
     let logs = scales.clone().clamp_min(1e-12).log();
     let ratio = logs.clone().max_dim(1) - logs.min_dim(1);

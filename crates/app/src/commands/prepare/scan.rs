@@ -54,11 +54,12 @@ pub struct Arguments {
     /// Collection of the scans. It decides axes, positions and splits.
     #[arg(long, value_enum, default_value = "other")]
     collection: CollectionArgument,
-    /// Folder of SMPL-X parameters (ID/smplx_param.pkl, ID.pkl or .json), which contain the direction that a subject faces
-    /// [default: the scan's folder].
+    /// Folder of SMPL-X parameters (ID/smplx_param.pkl, ID.pkl or .json), which contain the direction that a subject
+    /// faces [default: the scan's folder].
     #[arg(long, value_name = "DIR")]
     smplx: Option<PathBuf>,
-    /// Split of all subjects [default: the published lists; the first 100 of 2K2K and all of 4D-Dress test, others train].
+    /// Split of all subjects [default: the published lists; the first 100 of 2K2K and all of 4D-Dress test, others
+    /// train].
     #[arg(long, value_enum)]
     split: Option<SplitArgument>,
     /// Leave out the subjects of other splits.

@@ -13,7 +13,8 @@ use super::super::outside_data;
 use super::Arguments;
 use crate::failure::Failure;
 
-/// The config of a run: the file --config, or the config of the run that is continued, under the options of the command line.
+/// The config of a run: the file --config, or the config of the run that is continued, under the options of the command
+/// line.
 pub fn config(arguments: &Arguments) -> Result<TrainConfig, Failure> {
     let own = arguments.output.as_ref().map(|run| run.join(CONFIG));
     let path = match (&arguments.config, own) {
@@ -54,8 +55,8 @@ impl RunFolder {
     /// Makes or opens the folder, and locks it.
     ///
     /// # Errors
-    /// [`Failure::Input`] if the folder contains a run that is not to be continued, one of other networks, or one that another
-    /// process is training.
+    /// [`Failure::Input`] if the folder contains a run that is not to be continued, one of other networks, or one that
+    /// another process is training.
     pub fn open(
         path: &Path,
         arguments: &Arguments,

@@ -52,8 +52,8 @@ pub struct Arguments {
     /// Check config and data, make a few steps without writing anything, and print how long the run will take.
     #[arg(long)]
     dry_run: bool,
-    /// auto, cpu, ndarray, wgpu, vulkan, cuda or metal; wgpu:1 is the second adapter. Several devices, separated by commas,
-    /// share every batch.
+    /// auto, cpu, ndarray, wgpu, vulkan, cuda or metal; wgpu:1 is the second adapter. Several devices, separated by
+    /// commas, share every batch.
     #[arg(long, default_value = "auto")]
     device: String,
 }
@@ -218,8 +218,8 @@ impl<'a> Plan<'a> {
     }
 }
 
-/// Lower bound of a training's memory in bytes: weights, gradients, two moments and averages, samples, and the last layers
-/// of the heads. --dry-run measures the actual memory.
+/// Lower bound of a training's memory in bytes: weights, gradients, two moments and averages, samples, and the last
+/// layers of the heads. --dry-run measures the actual memory.
 fn least_memory(config: &TrainConfig) -> u64 {
     let (n, batch) = (&config.network, config.training.batch as u64);
     let parameters = schema::parameters(&config.networks(), Part::PointPredictor) as u64;

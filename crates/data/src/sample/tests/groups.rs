@@ -5,10 +5,10 @@ use crate::Jitter;
 use crate::dataset::check;
 use crate::prepare::{DataConfig, Subject};
 
-/// Of each side a pixel's point lies on the pixel's ray from a camera that stands a quarter turn from the front's own, as the
-/// front's frame has it: what the sides see follows from the front, however its camera strayed.
+/// A side's points lie on its pixels' rays from a camera at a quarter turn of the front camera. The sides' cameras
+/// follow from the front camera, whatever its deviation.
 #[test]
-fn sides_of_groups_are_seen_from_where_the_front_says() {
+fn side_cameras_of_groups_follow_from_the_front_camera() {
     let temporary = tempfile::tempdir().expect("temporary folder");
     let mut config = DataConfig::default();
     (config.views.count, config.views.resolution) = (8, 64);
@@ -52,10 +52,10 @@ fn sides_of_groups_are_seen_from_where_the_front_says() {
     assert!(Stage1::new(folder, TRAIN, SampleConfig::compat()).is_err());
 }
 
-/// Photographs are put where a user's are; the points of the front project where its pixels lie, those of the sides where the
-/// nominal cameras see them; and the front's camera, moved with them, still tells where they are in the world.
+/// Photographs of placed samples have the place and size of a user's. The front's points project to their pixels, the
+/// sides' points to their pixels in the nominal cameras. The moved front camera transforms them to the world.
 #[test]
-fn placed_samples_lie_where_the_nominal_cameras_see_them() {
+fn placed_samples_fit_the_nominal_cameras() {
     let temporary = tempfile::tempdir().expect("temporary folder");
     let mut config = DataConfig::default();
     (config.views.count, config.views.resolution) = (4, 128);
@@ -77,14 +77,14 @@ fn placed_samples_lie_where_the_nominal_cameras_see_them() {
     let first = Stage1::new(folder.clone(), TRAIN, samples).expect("samples").sample(0).expect("a sample");
     assert_eq!((&first.points, &first.images), (&item.points, &item.images));
     let side = 128;
-    // Both together are as high as a user's.
+    // Both photographs together have the height of a user's.
     let seen: Vec<usize> = (0..2 * side * side).filter(|i| item.masks[*i] > 0.5).collect();
     let rows = || seen.iter().map(|i| i / side % side);
     let height = rows().max().expect("a person") + 1 - rows().min().expect("a person");
     assert_eq!(height, (700.0 / 1024.0 * side as f32).round() as usize);
     let around = Camera::orbit_at_yaw_degrees(0.0, side as u32).world_to_camera.inverse();
-    // The front's points keep the perspective of their own distance; in a side, of pixels at an edge one may be taken for the
-    // next. Where nothing was moved, it is twenty pixels.
+    // The front's points keep the perspective of their distance. At edges, a side's pixel may have its neighbour's
+    // point. Without placement, points are twenty pixels off.
     for (view, degrees) in [(0, 0.0), (2, 90.0), (3, 270.0)] {
         let camera = Camera::orbit_at_yaw_degrees(degrees, side as u32);
         let (mut sum, mut most, mut seen) = (0.0, 0.0_f64, 0);
@@ -99,7 +99,7 @@ fn placed_samples_lie_where_the_nominal_cameras_see_them() {
         let mean = sum / f64::from(seen);
         assert!(seen > 300 && mean < 0.5 && most < 6.0, "view {view}: {seen} points, {mean}, {most} px");
     }
-    // Whoever knows the true camera finds the way back.
+    // The true camera inverts the placement.
     let test = Test::new(
         folder.clone(),
         TRAIN,
@@ -113,7 +113,7 @@ fn placed_samples_lie_where_the_nominal_cameras_see_them() {
     let moved = item.cameras[0].world_to_camera.translation - shown.cameras[0].world_to_camera.translation;
     assert!(moved.length() > 0.02 && (back.translation + moved).length() < 1e-4, "{back:?}, {moved}");
     assert!((scale - item.scale).abs() < 1e-12 && (scale - 1.0).abs() > 0.02, "{scale}");
-    // A point of the front's in the world lies on the surface that the stored depths tell of.
+    // World points of the front lie on the surface of the stored depths.
     let stored = folder.depth(TRAIN, "0000", 0).expect("reads");
     let to_world = item.cameras[0].world_to_camera.inverse();
     let mut off = Vec::new();
@@ -124,7 +124,7 @@ fn placed_samples_lie_where_the_nominal_cameras_see_them() {
         let there = stored.depth[place.y as usize * side + place.x as usize];
         off.push((f64::from(there) - depth).abs());
     }
-    // Some lie on the very edge between two pixels.
+    // Some points lie on the edge between two pixels.
     let wrong = off.iter().filter(|off| **off > 1e-4).count();
     assert!(wrong * 20 < off.len(), "{wrong} of {} points", off.len());
 }

@@ -16,7 +16,7 @@ fn points_of(values: &[f32]) -> impl Iterator<Item = Vec3> {
     values.chunks_exact(3).map(Vec3::from_slice)
 }
 
-/// The world points that a view sees.
+/// The world points of a view.
 fn world(folder: &Folder, view: usize, compat: bool) -> Vec<Vec3> {
     let stored = folder.depth(TRAIN, "0000", view).expect("reads");
     let camera = if compat { stored.camera } else { folder.exact_camera(&stored.camera) };
@@ -31,7 +31,7 @@ fn median(mut values: Vec<f32>) -> f32 {
     values[values.len() / 2]
 }
 
-/// A plane, rendered, stored and read: every point of every view lies on it.
+/// Every point of every view of a plane lies on the plane.
 #[test]
 fn points_lie_on_the_surface_that_was_rendered() {
     let (mesh, normal) = rectangle();
@@ -48,8 +48,8 @@ fn points_lie_on_the_surface_that_was_rendered() {
     }
 }
 
-/// A pixel of one view, moved to its depth, seen from another view, moved to the depth there, and seen from the first view
-/// again, is back in its place.
+/// A pixel of one view is unprojected, projected into another view, unprojected with the depth there, and projected
+/// back. It returns to its place.
 #[test]
 fn depth_of_one_view_projects_into_another() {
     let (_temporary, folder) = data_set(person(), Layout::Exact, 512, 24, false, 1);
@@ -66,7 +66,7 @@ fn depth_of_one_view_projects_into_another() {
             let depth =
                 |dx: usize, dy: usize| f64::from(stored.depth[(y as usize + dy) * 512 + x as usize + dx]);
             let around = [depth(0, 0), depth(1, 0), depth(0, 1), depth(1, 1)];
-            // Where the other view sees one smooth surface, and nothing in front of the point.
+            // Only points on smooth parts of the other view, without a surface in front of them.
             let (low, high) = around.iter().fold((f64::MAX, 0.0_f64), |(l, h), d| (l.min(*d), h.max(*d)));
             if low == 0.0 || high - low > 0.01 || z - high > 0.02 {
                 continue;
@@ -90,7 +90,7 @@ fn depth_of_one_view_projects_into_another() {
     }
 }
 
-/// Distances between the points that two views at right angles both see: the median, metres.
+/// Median distance in metres between the common points of two views at right angles.
 fn between(folder: &Folder, views: [usize; 2], compat: bool) -> f32 {
     let [a, b] = views.map(|view| world(folder, view, compat));
     let points: Vec<[f32; 3]> = b.iter().map(|p| p.to_array()).collect();
@@ -100,8 +100,8 @@ fn between(folder: &Folder, views: [usize; 2], compat: bool) -> f32 {
     median(found.iter().map(|f| f.distance.sqrt()).filter(|d| *d < 0.01).collect())
 }
 
-/// Distances of one view's points from the surface that another view sees around the nearest of its own: the median,
-/// metres. Unlike [`between`] this does not depend on how dense the points are.
+/// Median distance in metres of one view's points from the tangent plane of another view at its nearest point. Unlike
+/// [`between`], it does not depend on the density of the points.
 fn off_surface(folder: &Folder, views: [usize; 2]) -> f32 {
     let stored = folder.depth(TRAIN, "0000", views[1]).expect("reads");
     let mut origin = stored.camera;
@@ -133,9 +133,9 @@ fn off_surface(folder: &Folder, views: [usize; 2]) -> f32 {
     )
 }
 
-/// Front, back and side clouds agree in the exact layout, as far as their points are dense (2.4 mm apart in views of 1024
-/// pixels, half of that in views of 2048); as the published code reads the authors' layout, each is moved by half a pixel
-/// along its own camera's axes.
+/// Point clouds of front, back and sides agree in the exact layout up to the spacing of their points: 2.4 mm in views
+/// of 1024 pixels, half of that in views of 2048. In the published code, each cloud of the authors' layout is half a
+/// pixel off along its camera's axes.
 #[test]
 fn clouds_agree_and_show_the_published_shift() {
     for (resolution, bound) in [(1024, 2e-3), (2048, 1e-3)] {
@@ -202,15 +202,15 @@ fn stage_one_samples_are_those_of_the_published_loader() {
             depths.push(p.z);
         }
         assert!((median(depths) - 2.0).abs() < 0.3);
-        // The back's points lie behind the front's: the person is as deep as people are.
+        // The back's points lie behind the front's, at a person's depth.
         let back = points_of(&item.points[3 * area..6 * area]).zip(&item.valid[area..2 * area]);
         let back = median(back.filter(|(_, v)| **v > 0.0).map(|(p, _)| p.z).collect());
         assert!((1.7..2.4).contains(&back), "{back}");
     }
 }
 
-/// Points of all four maps, taken out of the front camera's frame, lie on the block that was rendered, on the sides that
-/// front, back, right and left look at; read as published, they are half a pixel off (1 cm with 128 pixels).
+/// World points of all four maps lie on the rendered block, on the faces of front, back, right and left. In the
+/// published code, they are half a pixel off (1 cm with 128 pixels).
 #[test]
 fn stage_one_points_lie_on_the_subject_in_the_front_cameras_frame() {
     for (layout, compat, bound) in
@@ -272,7 +272,7 @@ fn our_samples_follow_their_seed_and_are_augmented() {
     let plain = make(SampleConfig { augment: Augment::none(), ..SampleConfig::default() });
     assert_ne!(images(&stage, 4), images(&plain, 4));
     assert_eq!(stage.sample(4).expect("reads").points, plain.sample(4).expect("reads").points);
-    // Every view is the front at some time.
+    // Every view is a front.
     let firsts: std::collections::HashSet<Vec<u32>> =
         (0..90).map(|i| images(&plain, i)[..3 * 64 * 64].iter().map(|v| v.to_bits()).collect()).collect();
     assert_eq!(firsts.len(), 8);
@@ -304,7 +304,7 @@ fn stage_two_samples_have_cameras_for_what_they_compare() {
         let corner = [0, 1, 2].map(|c| item.targets[c * 128 * 128]);
         assert_eq!(corner, item.background);
         assert_eq!(item.background == [0.0; 3], !high);
-        // The person's pixels are where the target's camera sees the person.
+        // The target's camera projects the person onto the person's pixels.
         for (view, camera) in item.target_cameras.iter().enumerate() {
             assert_eq!((camera.width, camera.height), (128, 128));
             let target = &item.targets[view * 3 * 128 * 128..][..128 * 128];
@@ -329,9 +329,9 @@ fn stage_two_samples_have_cameras_for_what_they_compare() {
     }
 }
 
-/// Thirty views, of which 0 and 15 go in, as in the published test.
+/// Thirty views, with 0 and 15 as the input, as in the published test.
 #[test]
-fn test_samples_are_the_views_that_were_asked_for() {
+fn test_samples_are_the_given_views() {
     for layout in [Layout::Exact, Layout::Authors] {
         let (_temporary, folder) = data_set(&block(), layout, 64, 30, false, 2);
         let refusal = Stage1::new(folder.clone(), TRAIN, SampleConfig::default()).map(drop).expect_err("30");
@@ -345,7 +345,7 @@ fn test_samples_are_the_views_that_were_asked_for() {
             let expected = Camera::orbit_at_yaw_degrees(yaw, 64).centre();
             assert!((item.cameras[view].centre() - expected).length() < 1e-9, "{view}");
         }
-        // What goes in is what is to be compared, but for the range of values.
+        // Input and ground truth of a view differ only in the range of values.
         let area = 64 * 64;
         for (place, view) in [(0, 0), (1, 15)] {
             let (target, share) = test.target(1, view, [0.25, 0.5, 0.75]).expect("reads");
@@ -394,11 +394,11 @@ fn contradictions_are_refused() {
         let config = SampleConfig { high_resolution: true, ..SampleConfig::default() };
         Stage2::new(folder, TRAIN, config).map(drop).expect_err("refused").to_string()
     };
-    assert!(refusal(Layout::Exact, false).contains("`high_resolution` asks for"));
+    assert!(refusal(Layout::Exact, false).contains("`high_resolution` needs"));
     assert!(refusal(Layout::Authors, true).contains("no masks at twice the side"));
 }
 
-/// A point that a mirrored view sees projects into it where the mirrored pixel is.
+/// Points of a mirrored sample belong to the mirrored pixels.
 #[test]
 fn mirrored_samples_are_those_of_a_mirrored_person() {
     let (_temporary, folder) = data_set(person(), Layout::Exact, 64, 4, false, 1);
