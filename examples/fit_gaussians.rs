@@ -1,7 +1,7 @@
 //! Gradient descent through the differentiable renderer: random Gaussians are fitted to pictures of a scene.
 //!
 //! ```sh
-//! cargo run --release --example fit_gaussians             # 300 steps, seconds on a CPU
+//! cargo run --release --example fit_gaussians             # 300 steps, about a second on a CPU
 //! cargo run --release --example fit_gaussians -- 1000
 //! ```
 //!

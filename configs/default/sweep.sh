@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
-# What each idea of the default networks brings, and what size costs (docs/weights.md): bash configs/default/sweep.sh MAKEHUMAN_DATA, in
-# the repository's root; ROWS="base small" trains these rows alone. What was interrupted goes on when it is run once more.
+# Effect of each part of the default networks, and of their size (docs/notes/weights.md): bash configs/default/sweep.sh MAKEHUMAN_DATA, in
+# the repository's root. ROWS="base small" trains these rows only. An interrupted sweep continues when it is started again.
 set -eu
 makehuman=$1
-# people FOLDER OPTION…: 100 of either kind to learn from and 16 to choose by.
+# people FOLDER OPTION…: 100 training people and 16 held-out people of each kind.
 people() {
   folder=people/sweep/$1
   shift
@@ -17,7 +17,7 @@ people groups --set views.arrangement=groups --set views.front_within_degrees=30
 people rings
 cargo xtask prepare synth --split test --subjects 6 --seed 3 --config configs/data/evaluation.toml --set views.count=12 -o people/sweep/test
 wanted() { case " ${ROWS-$1} " in *" $1 "*) ;; *) return 1 ;; esac; }
-# row NAME DATA OPTION…: stage 1, and of stage 2 one step, for a regressor that `bench` can run, where the network takes another time.
+# row NAME DATA OPTION…: stage 1, and, for networks with another run time, one step of stage 2, which gives `bench` a regressor.
 row() {
   name=$1 data="people/sweep/$2/synth people/sweep/$2/makehuman"
   wanted "$name" || return 0
@@ -49,7 +49,7 @@ row net-256 groups --set network.net_resolution=256 --set training.steps=100 --s
 row small groups --set 'network.layer_dims=[16,32,48,64]' --set network.enc_dim=64 --set network.dec_dim=64 --set network.last_dim=16
 row shallow groups --set network.enc_depth=3 --set network.dec_depth=2
 row large groups --set 'network.layer_dims=[48,96,144,192]' --set network.enc_dim=192 --set network.dec_dim=192 --set network.last_dim=48
-# regressor NAME OPTION…: stage 2 on the points of the first row.
+# regressor NAME OPTION…: stage 2 on the points of the row `base`.
 regressor() {
   name=$1
   wanted "$name" || return 0

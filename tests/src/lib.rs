@@ -16,31 +16,10 @@ use std::sync::OnceLock;
 use burn::tensor::{Device, DeviceKind, DeviceType, Tensor, TensorData};
 use safetensors::SafeTensors;
 
-/// A training of thousands of parameters on pictures of 64²: attention, all kinds of convolutions, resizing, windows
-/// and anchors are in it.
-pub const TRAINING: &str = r#"
-[network]
-enc_dim = 16
-enc_depth = 1
-enc_heads = 2
-dec_dim = 16
-dec_depth = 2
-dec_heads = 2
-layer_dims = [4, 4, 8, 8]
-feature_dim = 8
-last_dim = 4
-hooks = [0, 1, 1, 2]
-resolution = 64
-net_resolution = 64
-delta = 0.2
-anchor = "ray"
-window = true
-[regressor]
-start = "geometric"
-[mode]
-compat = false
-[samples]
-random_targets = 1
+/// A short training of small networks.
+pub const TRAINING: &str = concat!(
+    include_str!("../../crates/train/src/stability/small.toml"),
+    r#"
 [training]
 steps = 40
 batch = 2
@@ -63,7 +42,8 @@ end = 0.01
 alpha_weight = 0.5
 anisotropy_weight = 0.01
 point_noise = 0.01
-"#;
+"#
+);
 
 /// Name of the device that tests run on: `SNAPSNAP_TEST_DEVICE` = `flex` (default), `ndarray`, `wgpu`, or, where it is
 /// compiled in, `vulkan`.

@@ -8,7 +8,7 @@ use snapsnap_splat::scene;
 use snapsnap_tests::{refused, root, snapsnap, succeed};
 
 /// Worse than this on the person, seen from elsewhere, is no reconstruction: the photographs as flat cut-outs give 15 dB and
-/// less (docs/evaluation.md).
+/// less (docs/notes/evaluation.md).
 const LEAST_DB: f64 = 16.0;
 
 #[test]

@@ -12,7 +12,7 @@ use std::time::Instant;
 use snapsnap_tests::{data, root, shared, snapsnap, succeed, toml_config};
 
 /// In the order in which a reader meets them: each page's commands find what earlier ones made.
-const PAGES: [&str; 13] = [
+const PAGES: [&str; 21] = [
     "README.md",
     "CONTRIBUTING.md",
     "docs/training.md",
@@ -21,11 +21,19 @@ const PAGES: [&str; 13] = [
     "docs/evaluation.md",
     "docs/formats.md",
     "docs/architecture.md",
+    "docs/commands.md",
     "docs/inference.md",
     "docs/splat.md",
     "docs/data.md",
     "docs/fuzz.md",
     "datasets/README.md",
+    "docs/notes/training.md",
+    "docs/notes/weights.md",
+    "docs/notes/evaluation.md",
+    "docs/notes/inference.md",
+    "docs/notes/splat.md",
+    "docs/notes/data.md",
+    "docs/notes/look.md",
 ];
 /// Tasks of `cargo xtask` that are no commands of the program; the suite itself and its neighbours.
 const TASKS: [&str; 6] = ["test", "lint", "dist", "fuzz", "bundle", "help"];
@@ -111,7 +119,9 @@ fn look(words: &[String]) {
         }
         ["python", file, ..] => root().join(file).is_file(),
         ["cargo", "doc", ..] => true,
-        ["cargo", "install", "--path", folder] => root().join(folder).join("Cargo.toml").is_file(),
+        ["cargo", "install", "--locked", "--path", folder] => {
+            root().join(folder).join("Cargo.toml").is_file()
+        }
         ["cargo", "run", .., "--example", name] | ["cargo", "run", .., "--example", name, "--", _] => {
             root().join("examples").join(name).with_extension("rs").is_file()
         }

@@ -47,7 +47,8 @@ fn the_library_reconstructs_what_the_command_does() {
 fn fitted_gaussians_show_an_unseen_view() {
     let figures = figures(&succeed(&mut example("fit_gaussians")));
     let [before, after] = figures[..] else { panic!("{figures:?}") };
-    assert!(after > before + 6.0, "{before} dB before, {after} dB after");
+    // 19.5 dB before, 34.2 dB after.
+    assert!(before < 21.0 && after > 31.0, "{before} dB before, {after} dB after");
 }
 
 #[test]
@@ -56,7 +57,8 @@ fn a_trained_predictor_is_closer_to_a_held_out_person() {
     let weights = temporary.path().join("predictor.safetensors");
     let figures = figures(&succeed(example("train_predictor").arg("40").arg(&weights)));
     let [before, after] = figures[..] else { panic!("{figures:?}") };
-    assert!(after < before, "{before} mm before, {after} mm after");
+    // 138 mm before, 75 mm after 40 steps.
+    assert!(after < 0.7 * before, "{before} mm before, {after} mm after");
     let weights = WeightFile::open(&weights, None).expect("a weight file");
     weights.require(Part::PointPredictor).expect("a point predictor");
     weights.point_predictor(&Device::flex()).expect("finite weights");

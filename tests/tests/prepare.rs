@@ -1,5 +1,4 @@
-//! `snapsnap prepare` as a user types it: people and scans become data sets, what is broken is named, and what was
-//! begun is finished.
+//! `snapsnap prepare` as a user types it: data sets of people and scans, broken scans, and runs that are continued.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -9,9 +8,9 @@ use std::time::{Duration, Instant};
 
 use snapsnap_tests::{refused, root, shared, snapsnap, succeed};
 
-/// Small and few views.
+/// Settings of small and few views.
 const SMALL: [&str; 4] = ["--set", "views.count=4", "--set", "views.resolution=64"];
-/// Address space that a refusal may take, in kilobytes: a tenth of what the headers below promise.
+/// Limit of the address space in kilobytes: a tenth of the size in the headers below.
 const MEMORY: u64 = 3_000_000;
 
 fn prepare(kind: &str) -> Command {
@@ -55,12 +54,12 @@ fn synthetic_people_become_a_data_set_that_has_no_fault() {
     assert!(sheet.width() == 9 * 192 && colors.len() > 500, "{:?}", sheet.dimensions());
 }
 
-/// Both roads meet: people that were kept as scans, read again, give the same views.
+/// People that are written as scans and imported again give the same views.
 #[test]
-fn people_kept_as_scans_are_the_same_people() {
+fn saved_scans_are_of_the_same_people() {
     let temporary = tempfile::tempdir().expect("temporary folder");
     let (people, again) = (temporary.path().join("people"), temporary.path().join("again"));
-    // Nobody stands anywhere but in the middle in a test set.
+    // People of test sets have no random offset.
     succeed(synth(&people, "2").args(["--split", "test", "--save-scans"]));
     let scans = people.join("scans/test");
     succeed(prepare("scan").arg(&scans).arg("-o").arg(&again).args(SMALL).args(["--split", "test"]));
@@ -68,7 +67,7 @@ fn people_kept_as_scans_are_the_same_people() {
     assert_eq!(views(&again).len(), 2 * (4 + 4 + 1));
     assert!(views(&again) == views(&people), "the same bytes");
 
-    // Scans of subjects that are there already are kept as well.
+    // Scans of existing subjects are written as well.
     let before = files(&scans);
     fs::remove_dir_all(scans.join("0001")).expect("remove");
     succeed(synth(&people, "2").args(["--split", "test", "--save-scans"]));
@@ -80,7 +79,7 @@ fn shards_and_reruns_give_what_one_run_gives() {
     let temporary = tempfile::tempdir().expect("temporary folder");
     let (whole, shared) = (temporary.path().join("whole"), temporary.path().join("shared"));
     succeed(&mut synth(&whole, "4"));
-    // However many threads there are.
+    // The number of threads makes no difference.
     succeed(synth(&shared, "4").args(["--shard", "1/2"]).env("RAYON_NUM_THREADS", "1"));
     assert!(!shared.join("train/img/0000").exists() && shared.join("train/img/0003").exists());
     // A finished subject is left alone.
@@ -96,7 +95,7 @@ fn shards_and_reruns_give_what_one_run_gives() {
     assert!(message.contains("dataset.toml") && message.contains("another data set"), "{message}");
 }
 
-/// Killed at any moment, a run leaves whole subjects only, and another run does the rest.
+/// A killed run leaves complete subjects only, and the next run makes the others.
 #[test]
 #[cfg(unix)]
 fn a_killed_run_is_finished_by_the_next() {
@@ -105,7 +104,7 @@ fn a_killed_run_is_finished_by_the_next() {
     for signal in ["-INT", "-KILL"] {
         let mut child = synth(&folder, "6").stderr(Stdio::null()).spawn().expect("starts");
         let start = Instant::now();
-        // In the midst of a subject that is not the first of this run.
+        // During a subject that is not the first of this run.
         let before = count(&folder);
         while count(&folder) == before && start.elapsed() < Duration::from_secs(60) {
             std::thread::sleep(Duration::from_millis(5));
@@ -117,7 +116,7 @@ fn a_killed_run_is_finished_by_the_next() {
         if signal == "-INT" {
             let left = fs::read_dir(folder.join(".unfinished")).into_iter().flatten().flatten();
             let left: Vec<PathBuf> = left.map(|e| e.path()).filter(|path| path.is_dir()).collect();
-            assert!(left.is_empty(), "Ctrl-C removes what is half done: {left:?}");
+            assert!(left.is_empty(), "Ctrl-C removes unfinished subjects: {left:?}");
         }
     }
     succeed(&mut synth(&folder, "6"));
@@ -182,7 +181,7 @@ fn real_scans_with_several_materials_are_imported() {
     assert!(is_seen([55, 45, 140]) && is_seen([45, 75, 25]), "the skirt's colours");
 }
 
-/// Corrupt scans among sound ones: each is named with the reason, the rest is made, memory stays bounded.
+/// Each broken scan is named with the reason, the others are made, and memory is bounded.
 #[test]
 #[cfg(unix)]
 fn broken_scans_are_named_and_skipped() {
@@ -286,13 +285,14 @@ fn wrong_arguments_are_refused_before_any_work() {
     assert!(message.contains("is no MakeHuman data"), "{message}");
 }
 
-/// The configs that are shipped are understood, and say what their comments say.
+/// Every config in configs/data is valid.
 #[test]
 fn shipped_configs_are_understood() {
     let configs = root().join("configs/data");
     let temporary = tempfile::tempdir().expect("temporary folder");
-    for (name, folder) in [("published", "a_64_4"), ("training", "b"), ("evaluation", "c")] {
-        let folder = temporary.path().join(folder);
+    // The authors' layout needs the size and the number of views in the folder's name.
+    for name in ["published", "training", "evaluation", "small", "default"] {
+        let folder = temporary.path().join(format!("{name}_64_4"));
         let mut command = prepare("synth");
         command.args(["--subjects", "1", "--config"]).arg(configs.join(name).with_extension("toml"));
         succeed(command.arg("-o").arg(&folder).args(SMALL));

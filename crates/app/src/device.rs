@@ -117,11 +117,6 @@ fn gpus() -> Vec<(&'static str, DeviceType)> {
     ]
 }
 
-/// Whether the device is the processor, whose memory is the machine's.
-pub fn is_cpu(device: &Device) -> bool {
-    device.identity().is_none()
-}
-
 /// A device in words.
 pub fn describe(device: &Device) -> String {
     let Some(identity) = device.identity() else {

@@ -122,7 +122,7 @@ enum Command {
     /// Write a weight file back in the authors' layout.
     #[command(after_help = "Example: snapsnap export-weights weights.safetensors -o authors.safetensors")]
     ExportWeights(commands::export_weights::Arguments),
-    /// What this machine and this build have, and what mends what is missing.
+    /// List devices, features, weights and missing parts, each with its remedy.
     #[command(after_help = "Example: snapsnap doctor --json")]
     Doctor(commands::doctor::Arguments),
     /// Print completions for a shell.

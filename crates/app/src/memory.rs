@@ -6,7 +6,6 @@ use burn::tensor::Device;
 use snapsnap_net::weights::WeightFile;
 use sysinfo::{MemoryRefreshKind, RefreshKind, System};
 
-use crate::device;
 use crate::failure::Failure;
 
 /// Refuses work on the CPU that needs more bytes than this process can ever get; `what` and `mend` say what it is and
@@ -25,9 +24,14 @@ pub fn check(what: &str, needed: u64, mend: &str) -> Result<(), Failure> {
     Err(Failure::Input(message))
 }
 
+/// Whether the device is the processor, whose memory is the machine's.
+pub fn is_cpu(device: &Device) -> bool {
+    device.identity().is_none()
+}
+
 /// Refuses networks whose canvas this process can never compute on the CPU.
 pub fn check_networks(weights: &WeightFile, device: &Device) -> Result<(), Failure> {
-    if !device::is_cpu(device) {
+    if !is_cpu(device) {
         return Ok(());
     }
     let what = format!("a canvas of {0}×{0} pixels", weights.config.network.resolution);

@@ -61,7 +61,7 @@ impl ReportFolder {
         let outputs: Vec<PathBuf> = files.iter().map(|name| path.join(name)).collect();
         let there = outputs.iter().find(|file| file.symlink_metadata().is_ok());
         if let Some(file) = there.filter(|_| !is_report(path)) {
-            let message = "is there, and not a report's of ours: give another folder";
+            let message = "exists and belongs to no report of this program: give another folder";
             return Err(Failure::Input(format!("{}: {message}", file.display())));
         }
         let outputs: Vec<&Path> = outputs.iter().map(PathBuf::as_path).collect();

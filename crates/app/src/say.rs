@@ -29,7 +29,7 @@ pub fn json(text: &str) -> Result<(), Failure> {
     result(text.chars().map(escaped).chain(["\n".into()]).collect::<String>().as_bytes())
 }
 
-/// A text of our own on stdout, as it is: all of the command's result, so that a full disk is told. Whoever reads it may leave.
+/// Writes the whole result of a command to stdout, unchanged. A full disk is an error; a reader that closes the pipe is none.
 pub fn result(text: &[u8]) -> Result<(), Failure> {
     let mut stdout = std::io::stdout();
     match stdout.write_all(text).and_then(|()| stdout.flush()) {

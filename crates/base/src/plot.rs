@@ -9,6 +9,8 @@ const SIZE: (u32, u32) = (1000, 460);
 const NAMES: u32 = 220;
 /// Rows of a name.
 const ROW: i32 = 18;
+/// Largest number of points of a line that are marked. More marks would hide the line.
+const MARKS: usize = 100;
 
 /// A named line, or points that are not joined.
 pub struct Series {
@@ -97,7 +99,9 @@ fn draw(area: &Area, axes: &Axes, series: &[Series]) -> Drawn {
                 if s.line {
                     chart.draw_series(LineSeries::new(points(), &color))?;
                 }
-                chart.draw_series(points().map(|p| Circle::new(p, 3, color.filled())))?;
+                if !s.line || points().count() <= MARKS {
+                    chart.draw_series(points().map(|p| Circle::new(p, 3, color.filled())))?;
+                }
                 let row = 30 + ROW * i as i32;
                 names.draw(&Circle::new((8, row), 3, color.filled()))?;
                 names.draw(&Text::new(s.name.clone(), (18, row - 6), ("sans-serif", 13)))?;

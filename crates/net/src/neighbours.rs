@@ -1,7 +1,7 @@
 //! Exact nearest neighbours for millions of queries at a time, for any geometry.
 //!
 //! A k-d tree prunes by the distance to a *splitting plane*. That bound is useless for queries that are far from all points,
-//! and with random weights every side point is: kiddo 6.3 takes 17 s and more where this tree takes 0.1 s (docs/inference.md).
+//! and with random weights every side point is: kiddo 6.3 takes 17 s and more where this tree takes 0.1 s (docs/notes/inference.md).
 //!
 //! * Points lie in a binary tree of tight boxes; its leaves are [`LANES`] points side by side.
 //! * Queries are sorted into the same order, so that [`LANES`] neighbours in space descend the tree together. A box is entered

@@ -1,6 +1,6 @@
-//! Operators that Burn's CPU backends do slowly. Each is one function with two roads: kernels of our own on Burn's `flex`
-//! device, in training with gradients of their own, and plain tensor code on every other device and in 16 bits. Tests hold
-//! them together.
+//! Operators that are slow on Burn's CPU backends. Each is one function with two implementations: kernels of our own on Burn's
+//! `flex` device, with gradients of their own, and plain tensor code on every other device and in 16 bits. Tests compare the
+//! two.
 
 pub mod buffers;
 pub mod conv;

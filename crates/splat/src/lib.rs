@@ -13,6 +13,7 @@ mod render;
 pub mod scene;
 pub mod sh;
 mod spz;
+mod stored;
 mod vjp;
 
 pub use camera::{Camera, Orbit, RigidTransform};

@@ -6,7 +6,7 @@ mod read;
 
 use std::io::{self, Write};
 
-use crate::scene::Stored;
+use crate::stored::Stored;
 
 pub(crate) use read::read;
 

@@ -1,50 +1,14 @@
-//! Files of Gaussians, PLY or SPZ: which of the two a file is is told by its first bytes when it is read, and by its name when
-//! it is written.
+//! Files of Gaussians, PLY or SPZ. The first bytes of a file decide its kind when it is read, its name when it is written.
 
 use std::io::{self, Read, Write};
 use std::path::Path;
 
-use burn::tensor::{Device, Tensor, TensorData};
-
+use burn::tensor::Device;
 use snapsnap_base::{FileError, file};
 
-use crate::{Camera, Gaussians, SplatError, ply, sh, spz};
-
-/// Opacities are stored as logits; f32 saturates to ±∞ at 0 and 1, so they are kept this far away from both.
-const OPACITY_MARGIN: f32 = 1e-6;
-/// Scales are stored as logarithms; a scale that underflowed to 0 is stored as this many metres.
-const MIN_SCALE: f32 = 1e-10;
-
-/// A file's Gaussians.
-#[derive(Debug, Clone)]
-pub struct Loaded {
-    /// After activation; colours are those of SH degree 0, max(0, ½ + C₀·f_dc).
-    pub gaussians: Gaussians,
-    /// Coefficients `[N,K,3]` for [`sh::colors`], where the file has a degree above 0.
-    pub harmonics: Option<Tensor<3>>,
-}
-
-impl Loaded {
-    /// The Gaussians in the colours that a camera sees.
-    ///
-    /// # Errors
-    /// [`SplatError::Shape`] for coefficients of no degree.
-    pub fn seen_by(&self, camera: &Camera) -> Result<Gaussians, SplatError> {
-        let gaussians = self.gaussians.clone();
-        match &self.harmonics {
-            None => Ok(gaussians),
-            Some(harmonics) => {
-                Ok(Gaussians { colors: sh::colors(harmonics, &gaussians.means, camera)?, ..gaussians })
-            }
-        }
-    }
-}
-
-impl From<Gaussians> for Loaded {
-    fn from(gaussians: Gaussians) -> Self {
-        Self { gaussians, harmonics: None }
-    }
-}
+use crate::stored::Problem;
+pub use crate::stored::{Loaded, Stored};
+use crate::{Gaussians, SplatError, ply, spz};
 
 /// Kinds of files.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -72,102 +36,7 @@ impl Kind {
     }
 }
 
-/// Gaussians as files hold them, before activation, column by column: see [`Stored::COLUMNS`].
-#[derive(Debug, Clone)]
-pub struct Stored {
-    /// SH coefficients per channel: 1, 4, 9 or 16.
-    pub(crate) coefficients: usize,
-    /// [`Stored::COLUMNS`], then `f_rest_0` …: all of red's, green's, blue's. Equally long.
-    pub(crate) columns: Vec<Vec<f32>>,
-}
-
 impl Stored {
-    /// What is always there: centres in metres, quaternions (w, x, y, z), logarithms of standard deviations in metres, logits
-    /// of opacities, and the coefficients of SH degree 0.
-    pub const COLUMNS: [&str; 14] = [
-        "x", "y", "z", "rot_0", "rot_1", "rot_2", "rot_3", "scale_0", "scale_1", "scale_2", "opacity",
-        "f_dc_0", "f_dc_1", "f_dc_2",
-    ];
-
-    /// As a file would have them: colours as `(rgb − ½) / `[`sh::C0`].
-    ///
-    /// # Errors
-    /// [`SplatError::NotFinite`] for a NaN or an infinity in the tensors.
-    pub fn of(gaussians: &Gaussians) -> Result<Self, SplatError> {
-        let opacities = gaussians.opacities.clone().unsqueeze_dim::<2>(1);
-        let mut all = columns(&gaussians.means, "means", |v| v)?;
-        all.append(&mut columns(&gaussians.rotations, "rotations", |v| v)?);
-        all.append(&mut columns(&gaussians.scales, "scales", |v| v.max(MIN_SCALE).ln())?);
-        all.append(&mut columns(&opacities, "opacities", logit)?);
-        all.append(&mut columns(&gaussians.colors, "colors", |v| (v - 0.5) / sh::C0)?);
-        Ok(Self { coefficients: 1, columns: all })
-    }
-
-    /// Number of Gaussians.
-    pub fn len(&self) -> usize {
-        self.columns[0].len()
-    }
-
-    /// Whether there is no Gaussian at all.
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
-    }
-
-    /// SH degree, 0 to 3.
-    pub fn degree(&self) -> usize {
-        self.coefficients.isqrt() - 1
-    }
-
-    /// The coefficient that band `band` (0 to [`Self::coefficients`] − 1) has of a channel: a column.
-    pub(crate) fn band(&self, band: usize, channel: usize) -> &[f32] {
-        match band {
-            0 => &self.columns[11 + channel],
-            band => &self.columns[Self::COLUMNS.len() + channel * (self.coefficients - 1) + band - 1],
-        }
-    }
-
-    /// Drops every Gaussian that has a value that is not finite; returns how many there were.
-    pub fn drop_not_finite(&mut self) -> usize {
-        let whole = |i: usize| self.columns.iter().all(|column| column[i].is_finite());
-        let kept: Vec<bool> = (0..self.len()).map(whole).collect();
-        let dropped = kept.iter().filter(|kept| !**kept).count();
-        if dropped > 0 {
-            for column in &mut self.columns {
-                let mut kept = kept.iter();
-                column.retain(|_| *kept.next().expect("as long as the columns"));
-            }
-        }
-        dropped
-    }
-
-    /// Puts them onto `device`. Values that are not finite are kept, a render counts and leaves them out.
-    pub fn load(&self, device: &Device) -> Loaded {
-        let (n, k) = (self.len(), self.coefficients);
-        let rows = |count: usize, first: usize, f: fn(f32) -> f32| {
-            let all = (0..n).flat_map(|i| (first..first + count).map(move |c| (c, i)));
-            let values: Vec<f32> = all.map(|(c, i)| f(self.columns[c][i])).collect();
-            Tensor::<2>::from_data(TensorData::new(values, [n, count]), device)
-        };
-        let gaussians = Gaussians {
-            means: rows(3, 0, |v| v),
-            rotations: rows(4, 3, |v| v),
-            scales: rows(3, 7, f32::exp),
-            opacities: rows(1, 10, |v| 1.0 / (1.0 + (-v).exp())).squeeze_dim(1),
-            colors: rows(3, 11, |v| {
-                let color = 0.5 + sh::C0 * v;
-                // Not `max`: it would turn a NaN into black.
-                if color < 0.0 && color.is_finite() { 0.0 } else { color }
-            }),
-        };
-        let harmonics = (k > 1).then(|| {
-            let bands = |i: usize| (0..k).flat_map(move |band| (0..3).map(move |c| (i, band, c)));
-            let values: Vec<f32> =
-                (0..n).flat_map(bands).map(|(i, band, channel)| self.band(band, channel)[i]).collect();
-            Tensor::<3>::from_data(TensorData::new(values, [n, k, 3]), device)
-        });
-        Loaded { gaussians, harmonics }
-    }
-
     /// Reads a file of either kind.
     ///
     /// # Errors
@@ -258,24 +127,6 @@ pub fn write(gaussians: &Gaussians, path: &Path) -> Result<(), SplatError> {
     Stored::of(gaussians)?.write(path)
 }
 
-/// What keeps a file from being read.
-pub(crate) enum Problem {
-    Io(io::Error),
-    Content(String),
-}
-
-impl From<io::Error> for Problem {
-    fn from(e: io::Error) -> Self {
-        Self::Io(e)
-    }
-}
-
-impl From<String> for Problem {
-    fn from(problem: String) -> Self {
-        Self::Content(problem)
-    }
-}
-
 /// Reads until `buffer` is full or the input ends; returns how much there was.
 fn fill(input: &mut impl Read, buffer: &mut [u8]) -> io::Result<usize> {
     let mut length = 0;
@@ -288,19 +139,4 @@ fn fill(input: &mut impl Read, buffer: &mut [u8]) -> io::Result<usize> {
         }
     }
     Ok(length)
-}
-
-fn logit(opacity: f32) -> f32 {
-    let opacity = opacity.clamp(OPACITY_MARGIN, 1.0 - OPACITY_MARGIN);
-    (opacity / (1.0 - opacity)).ln()
-}
-
-fn columns(tensor: &Tensor<2>, field: &'static str, f: fn(f32) -> f32) -> Result<Vec<Vec<f32>>, SplatError> {
-    let width = tensor.dims()[1];
-    let values: Vec<f32> =
-        tensor.to_data().convert::<f32>().try_into_vec().expect("converted to f32 on this very line");
-    if let Some(at) = values.iter().position(|v| !v.is_finite()) {
-        return Err(SplatError::NotFinite { field, index: at / width });
-    }
-    Ok((0..width).map(|c| values.iter().skip(c).step_by(width).map(|&v| f(v)).collect()).collect())
 }

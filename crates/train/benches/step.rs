@@ -1,9 +1,9 @@
 //! A training step, forward and backward, of the small predictor (`configs/small`, 256², batch 2) and of the regressor
-//! (two views of 256²): `cargo bench --workspace --bench step`. `docs/step_pytorch.py` runs PyTorch's beside it.
+//! (two views of 256²): `cargo bench --workspace --bench step`. `docs/step_pytorch.py` measures PyTorch.
 //!
 //! Arguments: seconds per measurement (20), side (256), batch (2); `tiny` or `full` for that folder of `configs`;
-//! `whole` to leave out what is partly frozen; `predictor` or `regressor` for one alone, so that the most memory that
-//! is said to be used is its own.
+//! `whole` for no partly frozen networks; `predictor` or `regressor` for one network alone, so that the printed memory
+//! is its own.
 
 use std::hint::black_box;
 use std::time::{Duration, Instant};
@@ -45,11 +45,11 @@ fn main() {
     let arguments: Vec<f64> = std::env::args().filter_map(|argument| argument.parse().ok()).collect();
     let argument = |i: usize, default: f64| arguments.get(i).copied().unwrap_or(default);
     let (seconds, side, batch) = (argument(0, 20.0), argument(1, 256.0) as usize, argument(2, 2.0) as usize);
-    // On one of rayon's own threads: a caller from outside hands every operator over and waits.
+    // Other threads than rayon's would hand every operator over and wait.
     rayon::scope(|_| run(seconds, side, batch));
 }
 
-/// The predictor with all parameters frozen whose names begin with none of `trained`.
+/// The predictor with frozen parameters, except those whose names begin with one of `trained`.
 fn frozen(predictor: PointPredictor, trained: &[&str]) -> PointPredictor {
     struct Frozen<'a>(&'a [&'a str], Vec<ParamId>);
     impl NamedVisitor for Frozen<'_> {
@@ -68,7 +68,7 @@ fn asked_for(word: &str) -> bool {
     std::env::args().any(|argument| argument == word)
 }
 
-/// The most memory of the process so far, as Linux tells it.
+/// Peak memory of the process, on Linux.
 fn peak() -> String {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"));
@@ -86,7 +86,7 @@ fn run(seconds: f64, side: usize, batch: usize) {
     let threads = rayon::current_num_threads();
 
     let images = Tensor::<4>::random([2 * batch, 3, side, side], Distribution::Uniform(-1.0, 1.0), &device);
-    // What is frozen is not differentiated: the later the first trained layer, the less there is to do.
+    // Layers before the first trained one have no backward pass.
     for (what, trained) in [
         ("all trained", ""),
         ("decoders and heads trained", "dust3r.dec_,dust3r.decoder_embed,dust3r.downstream_,scale"),

@@ -332,20 +332,21 @@ impl TrainConfig {
 mod tests {
     use super::*;
 
-    fn read(size: &str, stage: u32) -> TrainConfig {
-        let path = format!("{}/../../configs/{size}/stage{stage}.toml", env!("CARGO_MANIFEST_DIR"));
+    fn read(name: &str) -> TrainConfig {
+        let path = format!("{}/../../configs/{name}.toml", env!("CARGO_MANIFEST_DIR"));
         TrainConfig::from_file(path.as_ref(), &[]).expect("makes sense")
     }
 
     #[test]
     fn all_configs_make_sense_and_both_stages_are_of_the_same_predictor() {
         for size in ["tiny", "small", "full", "default"] {
-            let [one, two] = [1, 2].map(|stage| read(size, stage));
+            let [one, two] = [1, 2].map(|stage| read(&format!("{size}/stage{stage}")));
             assert_eq!(one.network, two.network, "{size}");
             assert_eq!(one.mode, two.mode, "{size}");
             let again = TrainConfig::from_toml(&two.to_toml(), "itself", &[]).expect("its own");
             assert_eq!(again, two);
         }
+        assert_eq!(read("default/regressor").regressor, read("default/stage2").regressor);
     }
 
     #[test]
@@ -366,7 +367,7 @@ mod tests {
             samples: SampleConfig::compat(),
             ..TrainConfig::default()
         };
-        let [one, two] = [1, 2].map(|stage| read("full", stage));
+        let [one, two] = ["full/stage1", "full/stage2"].map(read);
         assert_eq!(one.networks().resolved(), published.networks().resolved());
         assert_eq!((&one.samples, &one.optimizer), (&published.samples, &published.optimizer));
         assert_eq!((one.schedule, &one.stage1), (published.schedule, &published.stage1));

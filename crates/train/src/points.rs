@@ -7,13 +7,13 @@ use snapsnap_net::config::{Config, NetworkConfig};
 use snapsnap_net::network::{Input, PointMap, PointPredictor, View};
 use snapsnap_ops::host;
 
-/// Squares of distances below this have no gradient: the direction of so small an error is noise.
+/// Least square of a distance with a gradient. The direction of a smaller error is noise.
 const MIN_SQUARE: f64 = 1e-24;
-/// Probabilities are no less than this, the least that f32 has in full: PyTorch's binary cross-entropy takes e⁻¹⁰⁰.
-/// Below it there is no gradient; that of log 0 would not be a number.
+/// Lower limit of probabilities: the smallest normal f32. (PyTorch's binary cross-entropy has e⁻¹⁰⁰.) Smaller
+/// probabilities have no gradient, since the gradient of log 0 is not finite.
 const MIN_PROBABILITY: f64 = 1.2e-38;
 
-/// What stage 1 is trained on.
+/// The losses of stage 1.
 #[derive(Debug, Clone)]
 pub struct Losses {
     /// Mean distance in metres per view, summed over the views: `[1]`.
@@ -22,7 +22,7 @@ pub struct Losses {
     pub confidence: Tensor<1>,
 }
 
-/// Point maps of all views, one after the other, on the window of the canvas that the predictor sees.
+/// Point maps of all views on the predictor's window of the canvas.
 #[derive(Debug, Clone)]
 pub struct Prediction {
     /// The window.
@@ -32,7 +32,7 @@ pub struct Prediction {
 }
 
 impl Prediction {
-    /// The same as inference takes it, on the whole canvas; what lies outside is 0. `masks` `[B,2,S,S]` are those of
+    /// The maps on the whole canvas, as in inference. They are 0 outside the window. `masks` `[B,2,S,S]` are those of
     /// the photographs.
     pub fn on_canvas(self, config: &NetworkConfig, masks: &Tensor<4>) -> Vec<(View, PointMap)> {
         let placed = |(view, map): (View, PointMap)| {
@@ -43,19 +43,19 @@ impl Prediction {
     }
 }
 
-/// A photograph's own mask `[B,1,S,S]` of both `[B,2,S,S]`.
+/// The mask `[B,1,S,S]` of a photograph; `None` for the sides.
 fn mask_of(view: View, masks: &Tensor<4>) -> Option<Tensor<4>> {
     ((view as usize) < 2).then(|| masks.clone().narrow(1, view as usize, 1))
 }
 
-/// The window of the canvas that the predictor sees of photographs with these masks `[.., S, S]`.
+/// The predictor's window for photographs with these masks `[.., S, S]`.
 pub(crate) fn window(config: &Config, masks: &[f32], side: usize) -> Window {
     let masks: Vec<bool> = masks.iter().map(|mask| *mask > 0.0).collect();
     Window::of_predictor(config, masks.chunks_exact(side * side))
 }
 
-/// Point maps as training sees them: front and back `[B,2,3,S,S]` in [−1, 1] and their masks `[B,2,S,S]`, which decide
-/// the window and `mask-aware` interpolation.
+/// Predicted point maps of front and back `[B,2,3,S,S]` in [−1, 1]. Their masks `[B,2,S,S]` decide the window and
+/// `mask-aware` interpolation.
 pub fn predict(
     predictor: &PointPredictor,
     config: &Config,
@@ -76,8 +76,9 @@ pub fn predict(
     Prediction { window, maps }
 }
 
-/// The losses of predicted maps: true points `[B,V,S,S,3]` in the front camera's frame, metres, and where there are any
-/// `[B,V,S,S]`, 0 or 1. Confidences must be probabilities. All samples' pixels are pooled.
+/// The losses of predicted maps. `points` `[B,V,S,S,3]` are the true points in metres in the front camera's frame, and
+/// `valid` `[B,V,S,S]`, 0 or 1, marks the pixels that have one. Confidences must be probabilities. The means are over
+/// the pixels of all samples.
 pub fn losses(prediction: &Prediction, points: &Tensor<5>, valid: &Tensor<4>) -> Losses {
     let Prediction { window, maps } = prediction;
     let (b, h, w) = (points.dims()[0], window.rows.len(), window.columns.len());
@@ -89,7 +90,7 @@ pub fn losses(prediction: &Prediction, points: &Tensor<5>, valid: &Tensor<4>) ->
         let there = inside.clone().greater_elem(0.5);
         let truth = points.clone().narrow(1, row, 1).narrow(2, window.rows.start, h);
         let truth = truth.narrow(3, window.columns.start, w).reshape([b, h, w, 3]);
-        // What is not there may be anything, 10⁸ metres or NaN, and must not reach the gradient.
+        // Invalid points may be 10⁸ metres or NaN. They must not reach the gradient.
         let nowhere = there.clone().bool_not().unsqueeze_dim::<4>(3).expand([b, h, w, 3]);
         let off = (map.points.clone() - truth).mask_fill(nowhere, 0.0);
         let distance = off.square().sum_dim(3).clamp_min(MIN_SQUARE).sqrt().reshape([b, h, w]);

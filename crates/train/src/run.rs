@@ -1,4 +1,4 @@
-//! A session of a run: steps, with validations, checkpoints, logs and previews in between.
+//! A session of a run: steps, validations, checkpoints, logs and previews.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -8,9 +8,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use burn::tensor::Device;
-use snapsnap_base::FileError;
 use snapsnap_base::config::Schema;
-use snapsnap_base::file;
+use snapsnap_base::{FileError, file};
 use snapsnap_eval::preview;
 use snapsnap_net::weights;
 
@@ -22,56 +21,56 @@ use crate::networks::Networks;
 use crate::task::{Task, Validation};
 use crate::{TrainError, curves};
 
-/// So many steps in a row may fail before a run gives up.
-const PATIENCE: u64 = 20;
+/// Number of failed steps in a row after which a run ends.
+const MAX_FAILURES: u64 = 20;
 
-/// Where the state of a run lies in its folder.
+/// State of a run, relative to its folder.
 pub const STATE: &str = "state/state.safetensors";
-/// Its config in force.
+/// Config of a run.
 pub const CONFIG: &str = "config.toml";
-/// The latest weights of a run.
+/// Latest weights of a run.
 pub const LAST: &str = "last.safetensors";
-/// The weights that did best in a validation.
+/// Weights of the best validation.
 pub const BEST: &str = "best.safetensors";
 
-/// How a session is made, beside the run's config.
+/// Settings of a session.
 pub struct Options<'a> {
-    /// The run's folder, which is there.
+    /// The run's folder. It must exist.
     pub folder: &'a Path,
-    /// Where it is computed: one device at least, with gradients.
+    /// Training devices, at least one, with gradients.
     pub devices: &'a [Device],
-    /// Ends the session after so long.
+    /// Time after which the session ends.
     pub limit: Option<Duration>,
-    /// Ends the session once it is set.
+    /// Flag that ends the session.
     pub stop: &'a AtomicBool,
 }
 
-/// What hears how a run goes.
+/// Receiver of a run's events.
 pub trait Watch {
-    /// A step was logged: the line of the log, how many steps there will be, and how many were skipped so far.
+    /// A step was logged. `steps` is the number of steps of the run, `skipped` the number of skipped steps so far.
     fn step(&mut self, line: &Line, steps: u64, skipped: u64);
-    /// A validation was made after so many steps.
+    /// A validation was made after `step` steps.
     fn validated(&mut self, step: u64, validation: &Validation);
-    /// Something that a person should know.
+    /// A message for the user.
     fn note(&mut self, message: &str);
 }
 
-/// How a session ended.
+/// Outcome of a session.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Outcome {
     /// Steps so far.
     pub step: u64,
     /// Whether all steps were made.
     pub finished: bool,
-    /// Steps that were skipped.
+    /// Skipped steps so far.
     pub skipped: u64,
     /// Step and score of the best validation.
     pub best: Option<(u64, f64)>,
-    /// Seconds of training, all sessions together.
+    /// Seconds of training in all sessions.
     pub seconds: f64,
 }
 
-/// Trains `networks`, freshly made, or goes on where the state in the run's folder says.
+/// Trains `networks`, or continues from the state in the run's folder.
 ///
 /// # Errors
 /// [`TrainError`] if data cannot be read, a file cannot be written, or twenty steps in a row failed.
@@ -89,7 +88,7 @@ pub fn train<T: Task>(
         session.step()?;
     }
     let progress = &session.learner.progress;
-    // A run that was finished before, its last validation and preview included, has nothing to write.
+    // A finished run with its final validation and preview has nothing to write.
     if progress.step > first || first < steps || progress.shown < progress.step {
         session.finish()?;
     }
@@ -103,16 +102,16 @@ pub fn train<T: Task>(
     })
 }
 
-/// What a step takes.
+/// Measured times of a training.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Rehearsal {
-    /// Mean time of a step, the first ones left out.
+    /// Mean time of a step, without the first steps.
     pub step: Duration,
-    /// Time of one validation, if there is one.
+    /// Time of a validation, if the run has validations.
     pub validation: Option<Duration>,
 }
 
-/// Makes a few steps without writing anything, and measures the last ones.
+/// Makes a few steps without writing anything, and measures the last of them.
 ///
 /// # Errors
 /// As [`train`].
@@ -122,7 +121,7 @@ pub fn rehearse<T: Task>(
     networks: Networks,
     devices: &[Device],
 ) -> Result<Rehearsal, TrainError> {
-    /// The first steps find their memory, and on a GPU their kernels.
+    /// First steps, which allocate memory and compile GPU kernels, and measured steps.
     const STEPS: [u32; 2] = [5, 5];
     let mut learner = Learner::new(task, config, networks, devices);
     let mut start = Instant::now();
@@ -133,8 +132,8 @@ pub fn rehearse<T: Task>(
         }
         match learner.step()? {
             Ok(_) => made += 1,
-            // The loss scale of f16 is found by trying.
-            Err(_) if learner.progress.loss_scale.is_some() && failed < PATIENCE => {
+            // In f16, the first steps reduce the loss scale.
+            Err(_) if learner.progress.loss_scale.is_some() && failed < MAX_FAILURES => {
                 (made, failed) = (0, failed + 1);
             }
             Err(skipped) => {
@@ -156,7 +155,7 @@ struct Session<'a, T: Task> {
     log: Log,
     /// Seconds of earlier sessions.
     before: f64,
-    /// When the last line was logged, and at which step.
+    /// Time and step of the last line of the log.
     logged: (Instant, u64),
 }
 
@@ -173,7 +172,7 @@ impl<'a, T: Task> Session<'a, T> {
         if state.exists() {
             checkpoint::load(&state, &mut learner, &options.devices[0].clone().inner())?;
         }
-        // Only now is it sure that the config goes with the run.
+        // The config is written after the state was loaded, which proves that it fits the run.
         let path = options.folder.join(CONFIG);
         let text = config.to_toml();
         if fs::read(&path).ok().as_deref() != Some(text.as_bytes()) {
@@ -194,10 +193,10 @@ impl<'a, T: Task> Session<'a, T> {
         self.before + self.start.elapsed().as_secs_f64()
     }
 
-    /// One step and what is due after it.
+    /// One step, and the validation, preview and checkpoint that are due after it.
     fn step(&mut self) -> Result<(), TrainError> {
         let t = &self.learner.config.training;
-        // What fails leaves everything as it was before the step.
+        // A failed step leaves the learner unchanged, so that its state can be saved.
         let made = self.learner.step().or_else(|failed| self.save().and(Err(failed)))?;
         let now = self.learner.progress.step;
         let due = |every: usize| every > 0 && now.is_multiple_of(every as u64);
@@ -207,8 +206,8 @@ impl<'a, T: Task> Session<'a, T> {
             Err(why) => {
                 let step = now - 1;
                 self.watch.note(&format!("step {step} skipped: {why}"));
-                if self.learner.progress.skipped_in_a_row >= PATIENCE {
-                    return Err(TrainError::Stuck { count: PATIENCE, step, why });
+                if self.learner.progress.skipped_in_a_row >= MAX_FAILURES {
+                    return Err(TrainError::Stuck { count: MAX_FAILURES, step, why });
                 }
             }
         }
@@ -229,7 +228,7 @@ impl<'a, T: Task> Session<'a, T> {
         Ok(())
     }
 
-    /// What a run's folder holds at the session's end.
+    /// The final validation and preview of a run, and the files of every session.
     fn finish(&mut self) -> Result<(), TrainError> {
         let is_last = self.learner.progress.step >= self.learner.config.training.steps as u64;
         let shown = if is_last { self.validate().and_then(|()| self.preview()) } else { Ok(()) };
@@ -240,7 +239,7 @@ impl<'a, T: Task> Session<'a, T> {
         shown
     }
 
-    /// People who cannot be read or rendered cost what they were to show, not the run.
+    /// Turns the error of a sample into a note. The validation or preview is lost, but the run continues.
     fn spared(&mut self, what: &str, shown: Result<(), TrainError>) -> Result<(), TrainError> {
         match shown {
             Err(e @ (TrainError::Unsuitable(_) | TrainError::Splat(_))) => {
@@ -273,7 +272,7 @@ impl<'a, T: Task> Session<'a, T> {
         }
         let named = validation.figures.iter().map(|(name, value)| (format!("validation/{name}"), *value));
         let score = ("validation/score".to_owned(), validation.score);
-        // What is not finite has no place in a log, and is never the best.
+        // JSON has no numbers that are not finite.
         let values = named.chain([score]).filter(|(_, value)| value.is_finite()).collect();
         self.log.add(Line { step, seconds: self.seconds(), values })?;
         self.watch.validated(step, &validation);
@@ -294,7 +293,7 @@ impl<'a, T: Task> Session<'a, T> {
         Ok(preview::write_png(&path, &sheet)?)
     }
 
-    /// Weights first: where there is a state, there are its weights as well.
+    /// Writes weights, state and curves. Weights are first, so that every state has its weights.
     fn save(&mut self) -> Result<(), TrainError> {
         self.write(&self.learner.averaged(), LAST)?;
         let path = self.options.folder.join(STATE);
@@ -306,9 +305,9 @@ impl<'a, T: Task> Session<'a, T> {
     }
 }
 
-/// Runs `work` where the CPU's operators are fastest: on one of rayon's own threads. (A caller from outside hands every
-/// operator over and waits.) On other devices, which order work by the calling thread, it stays where it is; so it does
-/// with several, whose threads would wait for the one that waits for them.
+/// Runs `work` on the best thread for its devices. For the CPU it is one of rayon's threads, since other threads hand
+/// every operator over and wait. Other devices order work by the calling thread. Several devices have threads of their
+/// own, which would wait for rayon's.
 pub fn on_best_thread<R: Send>(devices: &[Device], work: impl FnOnce() -> R + Send) -> R {
     if matches!(devices, [device] if device.clone().inner() == Device::flex()) {
         let mut result = None;

@@ -24,7 +24,7 @@ use snapsnap_eval::preview::{grid, heat, picture};
 
 /// Samples of a preview.
 const PREVIEWS: usize = 2;
-/// Error that a preview shows white, metres.
+/// Error in metres that is white in previews.
 const WORST: f32 = 0.2;
 
 /// The training of the point predictor.
@@ -34,14 +34,14 @@ pub struct PointTask {
     confidence: f64,
     sets: Vec<Stage1>,
     validation: Fixed<Stage1Item>,
-    /// Those that train, with gradients.
+    /// Training devices, with gradients.
     devices: Vec<Device>,
-    /// Where validations are made.
+    /// Device of validations.
     device: Device,
 }
 
 impl PointTask {
-    /// A training on these data sets and these devices, of which there is one at least and which have gradients.
+    /// A training on these data sets and devices. There must be at least one device, and devices must have gradients.
     ///
     /// # Errors
     /// [`TrainError`] if a data set cannot be used with this config.
@@ -68,7 +68,7 @@ impl PointTask {
         })
     }
 
-    /// Samples of a validation.
+    /// Number of samples of a validation.
     pub fn validation_samples(&self) -> usize {
         self.validation.count
     }
@@ -170,17 +170,17 @@ fn distance(a: [f32; 3], b: [f32; 3]) -> f32 {
     (0..3).map(|i| (a[i] - b[i]).powi(2)).sum::<f32>().sqrt()
 }
 
-/// A point in the front camera's frame as a colour: the published cameras have the body two metres away.
+/// Colour of a point in the front camera's frame. In the published cameras the body is two metres away.
 fn place_color([x, y, z]: [f32; 3]) -> [f32; 3] {
     [x / 1.8 + 0.5, y / 1.8 + 0.5, (z - 2.0) / 0.8 + 0.5]
 }
 
-/// Distances between predicted and true points, summed over people.
+/// Distances between predicted and true points, as sums over people.
 #[derive(Default)]
 struct Errors {
-    /// Per view: people that it sees, mean distances in metres, and those after each person's mean shift is removed.
+    /// Per view: number of people, mean distances in metres, and mean distances without each person's mean shift.
     views: [[f64; 3]; 4],
-    /// Side pixels that are both predicted and true, and that are either.
+    /// Numbers of side pixels in the intersection and in the union of prediction and ground truth.
     overlap: [f64; 2],
 }
 

@@ -71,13 +71,17 @@ pub trait Task: Sync {
     ///
     /// # Errors
     /// [`TrainError`] if a sample cannot be read.
-    fn validate(&self, networks: &Networks) -> Result<Option<Validation>, TrainError>;
+    fn validate(&self, _networks: &Networks) -> Result<Option<Validation>, TrainError> {
+        Ok(None)
+    }
 
     /// A picture of the predictions for a few samples. `networks` are as in [`Self::validate`].
     ///
     /// # Errors
     /// [`TrainError`] if a sample cannot be read.
-    fn preview(&self, networks: &Networks) -> Result<Option<RgbImage>, TrainError>;
+    fn preview(&self, _networks: &Networks) -> Result<Option<RgbImage>, TrainError> {
+        Ok(None)
+    }
 
     /// Frozen weights that are written beside the trained ones, in the layout of checkpoints.
     fn frozen(&self, _networks: &Networks) -> BTreeMap<String, Vec<f32>> {

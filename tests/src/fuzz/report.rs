@@ -11,10 +11,13 @@ use super::child::Ended;
 
 /// What the numbers of a report mean.
 const MEANING: &str = "\
-Each is a sound sample, changed at random, read as a user would. It must end with exit code 0 and whole output or with 2 and
-none (evaluations may end with 1 where a part cannot be read: the rest is whole), within 20 s and with at most 300 MB, and 50
-bytes for each byte that it became longer, beyond what the sound sample takes; without a panic, without control characters on
-the terminal, and with its inputs as they were.
+Each case is a sound sample with random changes, and the program reads it as it reads a user's file. These conditions must hold:
+
+* The exit code is 0 with whole output, or 2 without output. Evaluations may end with 1 if a part cannot be read; the rest is whole.
+* The case ends within 20 s.
+* It takes at most 300 MB more than the sound sample, and 50 bytes for each byte by which it is longer.
+* There is no panic, and no control character reaches the terminal.
+* The input files do not change.
 ";
 /// What the columns of its table are called.
 const HEADER: &str =

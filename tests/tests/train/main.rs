@@ -1,5 +1,5 @@
-//! `snapsnap train-stage1` and `train-stage2` as a user types them: what they leave behind, that a run which is killed,
-//! interrupted or out of disk goes on as if nothing had happened, and what is refused.
+//! `snapsnap train-stage1` and `train-stage2` as a user types them: their files, runs that are continued after a kill,
+//! an interrupt or a full disk, and refusals.
 
 mod options;
 mod refusals;
@@ -14,7 +14,7 @@ use std::sync::OnceLock;
 
 use snapsnap_tests::{TRAINING, snapsnap, succeed};
 
-/// Three people to learn from and one to validate on, made once.
+/// A data set of three training people and one held-out person, made once.
 fn people() -> &'static Path {
     static PEOPLE: OnceLock<PathBuf> = OnceLock::new();
     PEOPLE.get_or_init(|| {
@@ -30,7 +30,7 @@ fn people() -> &'static Path {
     })
 }
 
-/// A folder with the config above.
+/// A temporary folder with the config of the tests.
 fn place() -> (tempfile::TempDir, PathBuf) {
     let temporary = tempfile::tempdir().expect("temporary folder");
     let config = temporary.path().join("train.toml");
@@ -45,7 +45,7 @@ fn train(stage: u32, config: &Path, run: &Path) -> Command {
     command
 }
 
-/// The files that must not depend on how a run went.
+/// Files that must not depend on the interruptions of a run.
 fn results(run: &Path) -> Vec<Vec<u8>> {
     let names = ["last.safetensors", "best.safetensors", "state/state.safetensors"];
     names.map(|name| fs::read(run.join(name)).unwrap_or_else(|e| panic!("{name}: {e}"))).to_vec()

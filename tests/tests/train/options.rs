@@ -1,4 +1,4 @@
-//! What a run may use beside the usual: kept point maps, perceptual distance, 16 bits.
+//! Options of a run: cached point maps, perceptual distance, 16 bits.
 
 use std::collections::HashMap;
 use std::fs;
@@ -11,9 +11,9 @@ use snapsnap_tests::{refused, snapsnap, succeed};
 
 use super::{logged, people, place, results, train};
 
-/// Maps that were kept, all or some of them damaged, are what the predictor makes again.
+/// Cached maps give the same bytes as predicted ones. Damaged files are written again.
 #[test]
-fn point_maps_that_are_kept_change_nothing() {
+fn cached_point_maps_change_nothing() {
     let (temporary, config) = place();
     let (one, maps) = (temporary.path().join("one"), temporary.path().join("maps"));
     const PLAIN: [&str; 6] = [
@@ -26,7 +26,7 @@ fn point_maps_that_are_kept_change_nothing() {
     ];
     let plain = PLAIN.map(|key| format!("--set=samples.augment.{key}"));
     succeed(train(1, &config, &one).arg("--set=training.steps=12"));
-    let learn = |run: &str, kept: bool| {
+    let learn = |run: &str, is_cached: bool| {
         let run = temporary.path().join(run);
         let mut command = train(2, &config, &run);
         command
@@ -34,18 +34,18 @@ fn point_maps_that_are_kept_change_nothing() {
             .args(&plain)
             .arg("--weights")
             .arg(one.join("best.safetensors"));
-        if kept {
+        if is_cached {
             command.arg("--set").arg(format!("stage2.point_map_cache='{}'", maps.display()));
         }
         succeed(&mut command);
         results(&run)
     };
     let live = learn("live", false);
-    assert!(learn("first", true) == live, "other bytes while maps are made");
+    assert!(learn("first", true) == live, "other bytes with an empty cache");
     let folder = fs::read_dir(&maps).expect("lists").next().expect("one predictor").expect("entry").path();
     let files: Vec<PathBuf> =
         fs::read_dir(&folder).expect("lists").map(|entry| entry.expect("entry").path()).collect();
-    // Four views of three people to learn from, each of which may be the front, and one to validate on, at most.
+    // At most four fronts of each of the three training people, and those of one held-out person.
     assert!((6..=14).contains(&files.len()), "{files:?}");
     let before: Vec<Vec<u8>> = files.iter().map(|file| fs::read(file).expect("reads")).collect();
     let times = || files.iter().map(|file| fs::metadata(file).expect("there").modified().expect("a time"));
@@ -56,11 +56,11 @@ fn point_maps_that_are_kept_change_nothing() {
     fs::write(&files[3], other).expect("writes");
     fs::write(&files[2], b"{").expect("writes");
     let written: Vec<_> = times().collect();
-    assert!(learn("second", true) == live, "other bytes of maps that were kept");
+    assert!(learn("second", true) == live, "other bytes with a full cache");
     for (i, (file, before)) in files.iter().zip(&before).enumerate() {
         assert!(fs::read(file).expect("reads") == *before, "{}", file.display());
         let is_new = times().nth(i) != Some(written[i]);
-        assert_eq!(is_new, i < 4, "{}: what is sound is read, what is damaged is written", file.display());
+        assert_eq!(is_new, i < 4, "{}: only damaged files are written", file.display());
     }
 
     let refused = |arguments: &[&str]| {
@@ -107,7 +107,7 @@ fn perceptual(path: &Path) {
 }
 
 #[test]
-fn perceptual_distance_counts_towards_the_end() {
+fn perceptual_distance_is_part_of_the_last_steps() {
     let (temporary, config) = place();
     let (one, two) = (temporary.path().join("one"), temporary.path().join("two"));
     succeed(train(1, &config, &one).arg("--set=training.steps=4"));
@@ -130,9 +130,9 @@ fn perceptual_distance_counts_towards_the_end() {
     assert!(said.contains("stage2.lpips"), "{said}");
 }
 
-/// Too large a loss scale is found out within a few steps, which are skipped.
+/// The loss scale of f16 is reduced within a few steps, which are skipped.
 #[test]
-fn sixteen_bits_learn_what_thirty_two_do() {
+fn validations_of_sixteen_bits_are_close_to_thirty_two() {
     let (temporary, config) = place();
     let losses = |precision: &str| {
         let run = temporary.path().join(precision);
@@ -149,7 +149,7 @@ fn sixteen_bits_learn_what_thirty_two_do() {
     }
     let state = fs::read(temporary.path().join("f16/state/state.safetensors")).expect("a state");
     assert!(String::from_utf8_lossy(&state[..20_000]).contains("\\\"loss_scale\\\":{"));
-    // The regressor as well, on a predictor that is frozen; validations are in f32.
+    // The regressor as well, on a frozen predictor. Validations are in f32.
     let start = temporary.path().join("f32/best.safetensors");
     let scores = ["f32", "f16"].map(|precision| {
         let run = temporary.path().join(format!("two-{precision}"));

@@ -1,4 +1,4 @@
-//! What cannot be trained.
+//! Refused settings, weights and folders.
 
 use std::fs;
 
@@ -7,7 +7,7 @@ use snapsnap_tests::{refused, succeed};
 use super::{people, place, results, train};
 
 #[test]
-fn what_cannot_be_trained_is_refused_by_name() {
+fn wrong_settings_weights_and_folders_are_refused_by_name() {
     let (temporary, config) = place();
     let run = temporary.path().join("run");
     let wrong = |arguments: &[&str], expected: &[&str]| {
@@ -32,7 +32,7 @@ fn what_cannot_be_trained_is_refused_by_name() {
     let said = refused(&mut train(1, &config, &people().join("run")));
     assert!(said.contains("lies in a data set"), "{said}");
 
-    // A run is not begun twice, nor gone on with by other networks or another stage.
+    // A run is not begun twice, nor continued with other networks or another stage.
     succeed(train(1, &config, &run).args(["--set", "training.steps=2"]));
     let before = results(&run);
     let said = refused(&mut train(1, &config, &run));
@@ -42,7 +42,7 @@ fn what_cannot_be_trained_is_refused_by_name() {
     let said = refused(train(2, &config, &run).args(["--resume"]));
     assert!(said.contains("stage 1"), "{said}");
     assert!(results(&run) == before);
-    // Without its state a folder is none of a run's, but weights that a run begins with are not replaced by it.
+    // A folder without a state may be used again, but a run does not replace its own initial weights.
     fs::rename(run.join("state"), run.join("elsewhere")).expect("moves");
     let said = refused(train(2, &config, &run).arg("--weights").arg(run.join("best.safetensors")));
     assert!(said.contains("would be replaced"), "{said}");

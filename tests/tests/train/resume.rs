@@ -1,4 +1,5 @@
-//! Runs that were killed, interrupted or out of disk go on as if nothing had happened; damaged states are refused.
+//! Runs that are continued after a kill, an interrupt or a full disk end with the same bytes. Damaged states are
+//! refused.
 
 use std::fs;
 use std::path::Path;
@@ -33,10 +34,10 @@ fn start(command: &mut Command) -> Child {
 }
 
 #[test]
-fn runs_that_were_killed_end_with_the_bytes_of_an_undisturbed_one() {
+fn killed_runs_end_with_the_bytes_of_an_undisturbed_run() {
     let (temporary, config) = place();
     let undisturbed = temporary.path().join("undisturbed");
-    // Long enough to be killed often, with a checkpoint every few moments.
+    // Long enough for several kills, with frequent checkpoints.
     let long = ["--set", "training.steps=240"];
     succeed(train(1, &config, &undisturbed).args(long));
     let seed = std::env::var("SNAPSNAP_TEST_SEED").ok().and_then(|s| s.parse().ok()).unwrap_or(7);
@@ -57,7 +58,7 @@ fn runs_that_were_killed_end_with_the_bytes_of_an_undisturbed_one() {
 }
 
 #[test]
-fn time_budgets_and_interrupts_end_a_session_that_goes_on_to_the_same_bytes() {
+fn sessions_after_a_time_limit_or_an_interrupt_end_with_the_same_bytes() {
     let (temporary, config) = place();
     let weights = temporary.path().join("start.safetensors");
     let one = temporary.path().join("one");
@@ -71,7 +72,7 @@ fn time_budgets_and_interrupts_end_a_session_that_goes_on_to_the_same_bytes() {
         "--resume",
     ]));
     assert!(said.contains("interrupted") && said.contains("--resume"), "{said}");
-    // The run knows its own predictor, data and config.
+    // The run's folder contains its predictor, data paths and config.
     fs::remove_file(&weights).expect("removes");
     let own = || {
         let mut command = snapsnap();
@@ -88,13 +89,13 @@ fn time_budgets_and_interrupts_end_a_session_that_goes_on_to_the_same_bytes() {
     }
     succeed(&mut own());
     assert!(results(&whole) == results(&pieces), "other bytes");
-    // A finished run that is asked to go on changes nothing.
+    // --resume of a finished run changes nothing.
     let before = results(&whole);
     succeed(train(2, &config, &whole).arg("--resume"));
     assert!(results(&whole) == before);
 }
 
-/// A limit on the size of files stands for a full disk: the checkpoint does not fit, the log does.
+/// A limit on the size of files imitates a full disk. The log fits, the checkpoint does not.
 #[cfg(unix)]
 #[test]
 fn a_full_disk_leaves_the_last_checkpoint_and_exit_code_2() {
@@ -124,7 +125,7 @@ fn a_damaged_state_is_refused_and_changes_nothing() {
     let lengths = [0, 7, 100, header, whole.len() / 2, whole.len() - 1];
     let mut damaged: Vec<Vec<u8>> = lengths.iter().map(|length| whole[..*length].to_vec()).collect();
     for _ in 0..12 {
-        // In the header, where the bytes mean something.
+        // Only in the header: any values of the tensors are valid.
         let mut bytes = whole.clone();
         let at = random.random_range(0..header);
         bytes[at] = bytes[at].wrapping_add(random.random_range(1..255));
@@ -135,7 +136,7 @@ fn a_damaged_state_is_refused_and_changes_nothing() {
         let output = train(1, &config, &run).args(["--resume", "--set", "training.steps=2"]).output();
         let output = output.expect("runs");
         let said = String::from_utf8_lossy(&output.stderr);
-        // A changed byte of the header may still be a state, of another step, say; a truncated file is none.
+        // A changed header may be a valid state, for example of another step. A truncated file never is.
         if bytes.len() < whole.len() || output.status.code() != Some(0) {
             assert_eq!(output.status.code(), Some(2), "{said}");
             assert!(said.contains("state.safetensors") && !said.contains("panicked"), "{said}");

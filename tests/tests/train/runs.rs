@@ -1,4 +1,4 @@
-//! Runs that nothing disturbs, on one device and on two.
+//! Undisturbed runs, on one device and on two.
 
 use std::fs;
 
@@ -7,7 +7,7 @@ use snapsnap_tests::{refused, snapsnap, succeed};
 use super::{logged, people, place, train};
 
 #[test]
-fn both_stages_learn_and_leave_what_a_reconstruction_needs() {
+fn both_stages_learn_and_write_weights_for_reconstructions() {
     let (temporary, config) = place();
     let (one, two) = (temporary.path().join("one"), temporary.path().join("two"));
     let said = succeed(&mut train(1, &config, &one));
@@ -30,7 +30,7 @@ fn both_stages_learn_and_leave_what_a_reconstruction_needs() {
     assert!(said.contains("reconstruct"), "{said}");
     assert_eq!(logged(&two, "validation/psnr_masked").len(), 4);
 
-    // Both parts are in one file now, which makes a person of two photographs.
+    // The file of stage 2 contains both networks.
     let view = |view: u32| people().join(format!("val/img/0000/{view}.png"));
     let ply = temporary.path().join("human.ply");
     let mut command = snapsnap();
@@ -39,9 +39,9 @@ fn both_stages_learn_and_leave_what_a_reconstruction_needs() {
     assert!(fs::metadata(&ply).expect("a file").len() > 10_000);
 }
 
-/// Two implementations on the same processor stand for two cards.
+/// Two backends on the same processor stand for two GPUs.
 #[test]
-fn two_devices_share_batches_and_learn_what_one_does() {
+fn two_devices_share_batches_and_have_the_losses_of_one() {
     let (temporary, config) = place();
     let weights = temporary.path().join("start.safetensors");
     for stage in [1, 2] {
@@ -55,7 +55,7 @@ fn two_devices_share_batches_and_learn_what_one_does() {
                 .arg("--data")
                 .arg(people());
             command.args(["--device", devices, "--set", "training.steps=3", "--set", "training.batch=3"]);
-            // What is random within a step follows from the device's number.
+            // The random shifts of a step depend on the device's index.
             command.args(["--set", "stage2.point_noise=0", "-o"]).arg(&run);
             if stage == 2 {
                 command.arg("--weights").arg(&weights);
@@ -66,7 +66,7 @@ fn two_devices_share_batches_and_learn_what_one_does() {
         let ((one, last), (two, _)) = (losses("cpu"), losses("cpu,ndarray"));
         println!("stage {stage}: {one:?} {two:?}");
         for ((step, one), (_, two)) in one.iter().zip(&two) {
-            // Pixels of all samples are pooled on one device and averaged over two.
+            // One device averages over all pixels, two devices over the means of each.
             assert!((one - two).abs() < 0.05 * one, "stage {stage}, step {step}: {one} and {two}");
         }
         fs::copy(last, &weights).expect("copies");
@@ -80,7 +80,7 @@ fn two_devices_share_batches_and_learn_what_one_does() {
 }
 
 #[test]
-fn a_rehearsal_writes_nothing_and_says_how_long_the_run_will_take() {
+fn a_rehearsal_writes_nothing_and_prints_the_time_of_the_run() {
     let (temporary, config) = place();
     let run = temporary.path().join("run");
     let said = succeed(train(1, &config, &run).arg("--dry-run"));

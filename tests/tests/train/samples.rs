@@ -1,4 +1,4 @@
-//! Samples that cannot be read or show nobody cost steps or validations, not the run.
+//! Samples that cannot be read or do not show a person cost steps or validations, not the run.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -33,9 +33,9 @@ fn a_broken_sample_is_skipped_and_named_and_twenty_in_a_row_end_the_run() {
     assert!(said.contains("20 steps in a row") && said.contains(".png: "), "{said}");
 }
 
-/// A person who is not in their photographs cannot be trained on; the others can.
+/// Samples without a person are skipped. The others are trained on.
 #[test]
-fn samples_that_show_nobody_are_skipped_and_named() {
+fn samples_without_a_person_are_skipped_and_named() {
     let (temporary, config) = place();
     let (copy, one) = (temporary.path().join("people"), temporary.path().join("one"));
     copy_folder(people(), &copy);
@@ -61,9 +61,9 @@ fn samples_that_show_nobody_are_skipped_and_named() {
     assert_eq!(logged(&run, "loss").len(), 9 - said.matches("skipped: ").count());
 }
 
-/// A picture that cannot be read costs the validations it is in, but no step, and the last one is made up for.
+/// An unreadable picture costs validations, but no steps. The final validation is made by the next session.
 #[test]
-fn validations_that_cannot_be_made_cost_no_step() {
+fn failed_validations_cost_no_step() {
     let (temporary, config) = place();
     let (copy, run) = (temporary.path().join("people"), temporary.path().join("run"));
     copy_folder(people(), &copy);

@@ -1,4 +1,4 @@
-//! `snapsnap doctor`: what this machine and this build have, and what mends what is missing.
+//! `snapsnap doctor`: devices, features, weights and missing parts, each with its remedy.
 
 use std::path::PathBuf;
 

@@ -79,7 +79,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let since = Instant::now();
     let device = device::choose(&arguments.device)?;
     timed("finding the device", since);
-    if device::is_cpu(&device) {
+    if memory::is_cpu(&device) {
         let network = config.memory_needed(weights.parameters());
         let what = format!("a canvas of {0}×{0} pixels", config.network.resolution);
         memory::check(&what, network, "choose a smaller `network.resolution`")?;

@@ -230,7 +230,7 @@ impl Default for MetricsSection {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct BaselineSection {
-    /// The photographs as flat cut-outs: who learned nothing beats it by nothing.
+    /// The photographs as flat cut-outs, which need no training.
     pub billboard: bool,
     /// True points in the photographs' colours: the most that the regressor could begin with.
     pub true_points: bool,

@@ -86,7 +86,7 @@ pub fn cases() -> Vec<Case> {
 }
 
 /// What a trained predictor makes of a person in 16 bits beside what it makes in 32: `photographs` are on its canvas. Fails where
-/// a tenth of the points are further off than a tenth of what such networks err by (docs/training.md: 30 mm).
+/// a tenth of the points are further off than a tenth of what such networks err by (docs/notes/training.md: 30 mm).
 pub fn sixteen_bits(weights: WeightFile, photographs: [Photograph; 2]) -> Vec<Case> {
     let shared = Arc::new((weights, photographs));
     let case = |precision: Precision| {

@@ -4,7 +4,7 @@
 use std::io::{self, BufRead, BufReader, Cursor, Read};
 
 use super::header::{Element, Format, Header, MAX_HEADER, Property, parse};
-use crate::scene::{Problem, Stored};
+use crate::stored::{Problem, Stored};
 use snapsnap_base::quoted;
 
 /// Longest line of a body in text.

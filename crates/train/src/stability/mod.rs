@@ -21,32 +21,10 @@ use crate::photometric::Photometric;
 use crate::points::{Prediction, losses};
 use crate::schedule::Schedule;
 
-/// Networks of thousands of parameters on pictures of 64²: attention, all kinds of convolutions, resizing, windows and
-/// anchors are in them.
-const SMALL: &str = r#"
-[network]
-enc_dim = 16
-enc_depth = 1
-enc_heads = 2
-dec_dim = 16
-dec_depth = 2
-dec_heads = 2
-layer_dims = [4, 4, 8, 8]
-feature_dim = 8
-last_dim = 4
-hooks = [0, 1, 1, 2]
-resolution = 64
-net_resolution = 32
-conf_threshold = 0.4
-delta = 0.2
-anchor = "ray"
-window = true
-[regressor]
-start = "geometric"
-[mode]
-compat = false
-[samples]
-random_targets = 1
+/// A short training of small networks.
+const SMALL: &str = concat!(
+    include_str!("small.toml"),
+    r#"
 [training]
 steps = 24
 batch = 2
@@ -62,21 +40,18 @@ alpha_weight = 0.5
 anisotropy_weight = 0.1
 anisotropy_limit = 1.5
 points_weight = 1.0
-"#;
+"#
+);
+/// Settings that include interpolation, and sides of random weights, whose confidences are near ½.
+const SETTINGS: [&str; 2] = ["network.net_resolution=32", "network.conf_threshold=0.4"];
 
-/// All cases of losses, optimiser and training. `many_steps` is the length of the case of a million steps.
+/// All cases of losses, optimiser and training. `many_steps` is the number of steps of the longest case.
 pub fn cases(many_steps: u64) -> Vec<Case> {
     let mut cases = Vec::new();
     for (name, count) in [("empty", 0), ("of one pixel", 1)] {
-        cases.push(Case {
-            area: "Losses and optimiser",
-            input: format!("stage 1 with a mask {name}, points elsewhere NaN and 1e30"),
-            holds: "loss as in f64 and finite; no gradient outside the mask".into(),
-            value_limit: 1e-6,
-            gradient_limit: 0.0,
-            once: false,
-            run: Box::new(move |device| point_loss(count, device)),
-        });
+        let input = format!("stage 1 with a mask {name}, points elsewhere NaN and 1e30");
+        let holds = "loss as in f64 and finite; no gradient outside the mask";
+        cases.push(case(&input, holds, 1e-6, move |device| point_loss(count, device)));
     }
     for (name, a, b) in [
         ("equal", 0.3_f32, 0.3_f32),
@@ -85,59 +60,42 @@ pub fn cases(many_steps: u64) -> Vec<Case> {
         ("1 and 1", 1.0, 1.0),
         ("0.9 and 0.9", 0.9, 0.9),
     ] {
-        cases.push(Case {
-            area: "Losses and optimiser",
-            input: format!("SSIM and L1 of constant pictures, {name}"),
-            // f32 keeps 6e-8 of E[x²] − E[x]², which is 1.3e-4 of C₂ for values near 1.
-            holds: "(2ab + C₁)/(a² + b² + C₁) away from the border but for f32's rounding of variances, 1.3e-4; never above 1; \
-                    gradient finite"
-                .into(),
-            value_limit: 1.3e-4,
-            gradient_limit: 0.0,
-            once: false,
-            run: Box::new(move |device| constant_pictures(a, b, device)),
-        });
+        let input = format!("SSIM and L1 of constant pictures, {name}");
+        // f32 has an error of 6e-8 in E[x²] − E[x]², which is 1.3e-4 of C₂ for values near 1.
+        let holds = "(2ab + C₁)/(a² + b² + C₁) away from the border but for f32's rounding of variances, 1.3e-4; never above 1; \
+                     gradient finite";
+        cases.push(case(&input, holds, 1.3e-4, move |device| constant_pictures(a, b, device)));
     }
-    cases.push(Case {
-        area: "Losses and optimiser",
-        input: "PSNR and SSIM of identical pictures".into(),
-        holds: "∞, printed as inf; exactly 1".into(),
-        value_limit: 0.0,
-        gradient_limit: 0.0,
-        once: true,
-        run: Box::new(|_| identical_pictures()),
-    });
-    cases.push(Case {
-        area: "Losses and optimiser",
-        input: "zero gradients, 1000 steps of AdamW and of Muon".into(),
-        // A rounding of the product in each of the steps.
-        holds: "weights finite, changed by their decay alone, but for 1000 roundings of f32".into(),
-        value_limit: 6e-5,
-        gradient_limit: 0.0,
-        once: false,
-        run: Box::new(zero_gradients),
-    });
-    cases.push(Case {
-        area: "Losses and optimiser",
-        input: format!("{many_steps} AdamW steps with gradients of 1e-12, 1e-20, 1e-30 and 1e3"),
-        // Adding a 10⁶th of a weight to it is rounded to 24 bits each time; the steps themselves are right.
-        holds: "weights as f64's, relative, but for the rounding of a million sums in f32: 1 %".into(),
-        value_limit: 1e-2,
-        gradient_limit: 0.0,
-        once: true,
-        run: Box::new(move |_| many_adamw_steps(many_steps)),
-    });
-    cases.push(Case {
-        area: "Losses and optimiser",
-        input: "the ends of the learning rate, runs of 1 to 10⁶ steps".into(),
-        holds: "between 0 and the highest, finite, first and last as the schedule says".into(),
-        value_limit: 1e-9,
-        gradient_limit: 0.0,
-        once: true,
-        run: Box::new(|_| ends_of_the_rate()),
-    });
+    let holds = "∞, printed as inf; exactly 1";
+    let of_pictures = case("PSNR and SSIM of identical pictures", holds, 0.0, |_| identical_pictures());
+    cases.push(Case { once: true, ..of_pictures });
+    // Each step rounds a product.
+    let holds = "weights finite, changed by their decay alone, but for 1000 roundings of f32";
+    cases.push(case("zero gradients, 1000 steps of AdamW and of Muon", holds, 6e-5, zero_gradients));
+    // Each step adds a millionth of a weight to it and rounds the sum to 24 bits.
+    let input = format!("{many_steps} AdamW steps with gradients of 1e-12, 1e-20, 1e-30 and 1e3");
+    let holds = "weights as f64's, relative, but for the rounding of a million sums in f32: 1 %";
+    let of_steps = case(&input, holds, 1e-2, move |_| many_adamw_steps(many_steps));
+    cases.push(Case { once: true, ..of_steps });
+    let holds = "between 0 and the highest, finite, first and last as the schedule says";
+    let of_rates =
+        case("the ends of the learning rate, runs of 1 to 10⁶ steps", holds, 1e-9, |_| ends_of_the_rate());
+    cases.push(Case { once: true, ..of_rates });
     cases.extend(trainings::cases());
     cases
+}
+
+/// A case on every device, without an error of gradients.
+fn case(input: &str, holds: &str, value_limit: f64, run: impl Fn(&Device) -> Found + 'static) -> Case {
+    Case {
+        area: "Losses and optimiser",
+        input: input.to_owned(),
+        holds: holds.to_owned(),
+        value_limit,
+        gradient_limit: 0.0,
+        once: false,
+        run: Box::new(run),
+    }
 }
 
 fn finite(values: &[f32]) -> bool {
@@ -202,14 +160,14 @@ fn identical_pictures() -> Found {
         .must(similarity == Some(1.0), "SSIM is not 1")
 }
 
-/// Two rows of weights, one of a matrix that Muon takes.
+/// Weights of a matrix, which Muon trains, and of a bias.
 fn zero_gradients(device: &Device) -> Found {
     const STEPS: usize = 1000;
     let config = config(&[]);
     let networks = config.networks();
     let predictor = random_predictor(&networks, 1, &device.clone().autodiff());
     let mut trained = Networks { predictor: Some(predictor), regressors: Vec::new() };
-    // One hidden matrix, one bias: all parameters would say no more.
+    // One hidden matrix and one bias stand for all parameters.
     let names: Vec<String> = trained
         .rows()
         .into_keys()
@@ -242,7 +200,7 @@ fn zero_gradients(device: &Device) -> Found {
         .must(names.len() >= 2, "the parameters are not there")
 }
 
-/// The update itself, on four weights, beside f64's.
+/// Updates of four weights, compared with updates in f64.
 fn many_adamw_steps(steps: u64) -> Found {
     const GRADIENTS: [f32; 4] = [1e-12, 1e-20, 1e-30, 1e3];
     let config = OptimizerConfig { rate: 1e-5, weight_decay: 0.0, ..OptimizerConfig::default() };
@@ -293,5 +251,6 @@ fn ends_of_the_rate() -> Found {
 }
 
 fn config(overrides: &[String]) -> TrainConfig {
-    TrainConfig::from_toml(SMALL, "the small networks", overrides).expect("a config")
+    let overrides = [&SETTINGS.map(String::from)[..], overrides].concat();
+    TrainConfig::from_toml(SMALL, "the small networks", &overrides).expect("a config")
 }

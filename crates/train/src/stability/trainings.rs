@@ -1,4 +1,4 @@
-//! Cases of short trainings that are stiff or broken.
+//! Short trainings with extreme people, rates or losses.
 
 use std::path::Path;
 use std::slice::from_ref;
@@ -7,7 +7,6 @@ use std::sync::atomic::AtomicBool;
 
 use burn::tensor::Device;
 use glam::Vec3;
-use image::RgbImage;
 use snapsnap_data::dataset::{Folder, Split};
 use snapsnap_data::prepare::{DataConfig, Subject};
 use snapsnap_data::sample::{Joined, Stage1Item};
@@ -28,30 +27,21 @@ use crate::task::{Moment, Part, Task, Validation};
 
 /// Stiff trainings, and one sample whose loss is not a number (docs/method.md, "Stability cases").
 pub(super) fn cases() -> Vec<Case> {
-    let mut cases = Vec::new();
-    cases.push(Case {
-        area: "Stiff training",
-        input: "one sample whose loss is NaN".into(),
-        holds: "its step is skipped and counted, training goes on, weights finite".into(),
-        value_limit: 0.0,
-        gradient_limit: 0.0,
-        once: true,
-        run: Box::new(|_| told(poisoned())),
-    });
+    let holds = "its step is skipped and counted, training goes on, weights finite";
+    let mut cases = vec![case("one sample whose loss is NaN", holds, || told(poisoned()))];
     for (name, factor) in [("×10", 10.0), ("÷10", 0.1)] {
-        cases.push(Case {
-            area: "Stiff training",
-            input: format!(
-                "rate {name}, people nearly black, over-exposed, filling 1 % and 99 % of the frame; 24 steps of either stage"
-            ),
-            holds: "no step skipped, every logged number finite".into(),
-            value_limit: 0.0,
-            gradient_limit: 0.0,
-            once: true,
-            run: Box::new(move |_| told(stiff(factor))),
-        });
+        let input = format!(
+            "rate {name}, people nearly black, over-exposed, filling 1 % and 99 % of the frame; 24 steps of either stage"
+        );
+        let holds = "no step skipped, every logged number finite";
+        cases.push(case(&input, holds, move || told(stiff(factor))));
     }
     cases
+}
+
+/// A case that does not depend on the device.
+fn case(input: &str, holds: &str, run: impl Fn() -> Found + 'static) -> Case {
+    Case { area: "Stiff training", once: true, ..super::case(input, holds, 0.0, move |_| run()) }
 }
 
 fn told(found: Result<Found, TrainError>) -> Found {
@@ -76,7 +66,7 @@ impl Watch for Silent {
     fn note(&mut self, _: &str) {}
 }
 
-/// A short training in a folder that goes with it.
+/// A short training in a temporary folder: its outcome, and whether all logged numbers and weights are finite.
 fn trained<T: Task>(
     task: &T,
     config: &TrainConfig,
@@ -95,8 +85,7 @@ fn trained<T: Task>(
     Ok((outcome, watch.finite))
 }
 
-/// A data set of people as they should not be photographed: nearly black, over-exposed, 1 % and nearly all of the
-/// frame.
+/// A data set of extreme people: nearly black, over-exposed, in 1 % of the frame, and in nearly all of it.
 fn extreme_people(root: &Path) -> Result<Arc<Folder>, TrainError> {
     let mut data = DataConfig::default();
     (data.views.count, data.views.resolution) = (4, 64);
@@ -110,7 +99,7 @@ fn extreme_people(root: &Path) -> Result<Arc<Folder>, TrainError> {
     let middle = Vec3::new(0.0, 0.85, 0.0);
     let mut small = person.clone();
     small.positions.iter_mut().for_each(|p| *p = middle + (*p - middle) * 0.33);
-    // A ball that the cameras, two metres away, see nothing beside.
+    // A ball that fills the view of the cameras, which are two metres away.
     let mut ball = person.clone();
     ball.positions.iter_mut().for_each(|p| *p = middle + (*p - middle).normalize_or(Vec3::Y) * 1.45);
     for (name, mesh) in [("0000", lit(0.01)), ("0001", lit(40.0)), ("0002", small), ("0003", ball)] {
@@ -152,7 +141,7 @@ fn stiff(factor: f64) -> Result<Found, TrainError> {
         .must(one_finite && two_finite, "a logged number or a weight is not finite"))
 }
 
-/// Stage 1, in whose fourth step the loss is NaN.
+/// Stage 1 with a loss of NaN in its fourth step.
 struct Poisoned(PointTask);
 
 impl Task for Poisoned {
@@ -178,14 +167,6 @@ impl Task for Poisoned {
             parts.iter_mut().for_each(|part| part.value = part.value.clone() * f64::NAN);
         }
         Ok(parts)
-    }
-
-    fn validate(&self, networks: &Networks) -> Result<Option<Validation>, TrainError> {
-        self.0.validate(networks)
-    }
-
-    fn preview(&self, networks: &Networks) -> Result<Option<RgbImage>, TrainError> {
-        self.0.preview(networks)
     }
 }
 

@@ -1,4 +1,4 @@
-//! A point predictor that stays as it is.
+//! A frozen point predictor.
 
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
@@ -13,18 +13,18 @@ use crate::networks::Networks;
 use crate::points::{Prediction, predict, window};
 use crate::precision::{Precision, lower};
 
-/// A predictor that is not even differentiated.
+/// A predictor without gradients.
 pub(super) struct Frozen {
     pub networks: Networks,
-    /// The same in the precision of the training, on each device that trains.
+    /// The predictor in the training's precision, on each training device.
     lowered: Vec<PointPredictor>,
     precision: Precision,
-    /// What it made so far, if that is kept.
+    /// Cached point maps, if configured.
     maps: Option<Maps>,
 }
 
 impl Frozen {
-    /// `predictor` is not tracked and on the first of the devices.
+    /// `predictor` has no gradients and is on the first device.
     pub fn new(config: &TrainConfig, predictor: PointPredictor, devices: &[Device]) -> Self {
         let maps = config.stage2.point_map_cache.as_ref();
         let maps = maps.map(|folder| Maps::new(folder, &config.networks(), &predictor));
@@ -35,8 +35,8 @@ impl Frozen {
         Self { networks, lowered, precision, maps }
     }
 
-    /// What it makes of a sample's photographs: in a step on one of the devices, which is given by its place and as it
-    /// is without gradients, or, with no place, for a validation, in f32.
+    /// Predicts the points of a sample's photographs on `device`. `place` is the index of the training device in a
+    /// step, and `None` in a validation, which is in f32.
     pub fn predict(
         &self,
         config: &Config,
@@ -46,7 +46,7 @@ impl Frozen {
     ) -> Result<Prediction, TrainError> {
         let (predictor, precision) = match (place, &self.networks.predictor) {
             (Some(place), _) => (&self.lowered[place], self.precision),
-            (None, predictor) => (predictor.as_ref().expect("set when made"), Precision::F32),
+            (None, predictor) => (predictor.as_ref().expect("set in `new`"), Precision::F32),
         };
         let made = || of_sample(predictor, config, item, device);
         match &self.maps {
@@ -59,7 +59,7 @@ impl Frozen {
     }
 }
 
-/// What a predictor makes of a sample's photographs.
+/// A predictor's point maps of one sample.
 pub(super) fn of_sample(
     predictor: &PointPredictor,
     config: &Config,

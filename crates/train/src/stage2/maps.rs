@@ -24,16 +24,16 @@ use crate::precision::Precision;
 /// Metadata key of the checksum of a file's values.
 const CHECKSUM: &str = "snapsnap.checksum";
 
-/// Folder of one predictor's point maps, a file for each pair of photographs. Names follow from the program's version,
-/// from what the predictor is, from its weights, from the photographs, and from where and how they are computed: what
-/// is out of date is not found.
+/// Folder of one predictor's point maps, with a file for each pair of photographs. Names are hashes of the program's
+/// version, the predictor's config and weights, the photographs, the device and the precision, so that outdated files
+/// are never read.
 pub(super) struct Maps {
     folder: PathBuf,
     views: Vec<View>,
 }
 
 impl Maps {
-    /// Those of this predictor below `root`.
+    /// The folder of this predictor below `root`.
     pub fn new(root: &Path, config: &Config, predictor: &PointPredictor) -> Self {
         let mut hash = Sha256::new();
         hash.update(env!("CARGO_PKG_VERSION"));
@@ -46,11 +46,11 @@ impl Maps {
         Self { folder: root.join(name(hash)), views: predictor.views().to_vec() }
     }
 
-    /// The point maps of a sample's photographs, computed in `precision` on `device`: those that are there, or else
-    /// what `predict` makes, which is kept. A file that is damaged is made again.
+    /// The point maps of a sample's photographs in `precision` on `device`, read from their file or computed by
+    /// `predict` and written. A damaged file is written again.
     ///
     /// # Errors
-    /// [`TrainError`] if they cannot be written.
+    /// [`TrainError`] if the file cannot be written.
     pub fn of(
         &self,
         item: &Stage2Item,
@@ -71,7 +71,7 @@ impl Maps {
         let prediction = predict();
         fs::create_dir_all(&self.folder).map_err(FileError::write(&self.folder))?;
         match write(&path, &prediction) {
-            // Maps that are not finite are not kept; what becomes of them is the sample's affair.
+            // Maps that are not finite are not written. The step reports them.
             Err(WeightsError::Tensors { .. }) | Ok(()) => Ok(prediction),
             Err(e) => Err(e.into()),
         }
@@ -83,7 +83,7 @@ fn name(hash: Sha256) -> String {
 }
 
 fn update(hash: &mut Sha256, values: &[f32]) {
-    /// Values that are turned into bytes at a time.
+    /// Values per update of the hash.
     const PART: usize = 1 << 16;
     for part in values.chunks(PART) {
         let bytes: Vec<u8> = part.iter().flat_map(|v| v.to_le_bytes()).collect();
@@ -110,7 +110,7 @@ fn checksum(tensors: &[Vec<f32>]) -> String {
     name(hash)
 }
 
-/// The maps of a file, if it is whole and of these views and this window.
+/// The maps of a file, if it is intact and of these views and this window.
 fn read(path: &Path, views: &[View], window: Window, device: &Device) -> Option<Prediction> {
     let source = Source::open(path).ok()?;
     let (h, w) = (window.rows.len(), window.columns.len());

@@ -40,10 +40,10 @@ use scores::Scores;
 
 /// Samples of a preview.
 const PREVIEWS: usize = 3;
-/// Error that a preview shows white.
+/// Error that is white in previews.
 const WORST: f32 = 0.5;
 
-/// The training of the regressor on what a point predictor gives, which is frozen or trained as well.
+/// The training of the regressor on the points of a predictor, which is frozen or trained as well.
 pub struct GaussianTask {
     networks: Config,
     losses: Stage2Config,
@@ -52,21 +52,22 @@ pub struct GaussianTask {
     seed: u64,
     /// The predictor, unless it is trained as well.
     frozen: Option<Frozen>,
-    /// Perceptual distance on each device that trains, if it is asked for.
+    /// Perceptual distance on each training device, if configured.
     lpips: Vec<Lpips>,
-    /// From this step on it counts.
+    /// First step with the perceptual distance.
     lpips_from: u64,
     sets: Vec<Stage2>,
     validation: Fixed<Stage2Item>,
-    /// Found once.
+    /// Scores of the billboard, computed once.
     billboard: OnceLock<Scores>,
-    /// Those that train, with gradients.
+    /// Training devices, with gradients.
     devices: Vec<Device>,
 }
 
 impl GaussianTask {
-    /// A training on these data sets and these devices, of which there is one at least and which have gradients.
-    /// `predictor`, unless the config trains it as well, is the frozen one, not tracked and on the first of them.
+    /// A training on these data sets and devices. There must be at least one device, and devices must have gradients.
+    /// `predictor` is the frozen predictor, without gradients and on the first device, or `None` if it is trained as
+    /// well.
     ///
     /// # Errors
     /// [`TrainError`] if a data set cannot be used with this config, or weights of LPIPS cannot be read.
@@ -108,13 +109,13 @@ impl GaussianTask {
         })
     }
 
-    /// Samples of a validation.
+    /// Number of samples of a validation.
     pub fn validation_samples(&self) -> usize {
         self.validation.count
     }
 
-    /// What the point predictor, the one that is trained or the frozen one, makes of a sample's photographs: in a step
-    /// on one of the devices, by its place, or, with none, for a validation, in f32.
+    /// Predicts the points of a sample's photographs with the trained or the frozen predictor. `place` is the index of
+    /// the training device in a step, and `None` in a validation.
     fn predict(
         &self,
         networks: &Networks,
@@ -129,7 +130,7 @@ impl GaussianTask {
                 Ok(of_sample(predictor, &self.networks, item, device))
             }
             (None, frozen) => {
-                let frozen = frozen.as_ref().expect("what is not trained is frozen");
+                let frozen = frozen.as_ref().expect("a predictor that is not trained is frozen");
                 frozen.predict(&self.networks, item, place, &inner)
             }
         }
@@ -146,7 +147,7 @@ impl GaussianTask {
         Ok(gaussians(&self.networks, networks, item, prediction, &Phase::new(false, 0), None, device))
     }
 
-    /// Pictures of all views to compare `[V,3,h,w]`; the background alone where there is nobody.
+    /// Rendered pictures of all targets `[V,3,h,w]`, the background alone without Gaussians.
     fn shown(
         &self,
         item: &Stage2Item,
@@ -162,8 +163,7 @@ impl GaussianTask {
         }
     }
 
-    /// What the photographs give as flat cut-outs in the plane through the body's axis: who learned nothing beats it by
-    /// nothing.
+    /// Scores of the billboard baseline: both photographs as flat cut-outs in the plane through the body's axis.
     fn billboard(&self) -> Result<Scores, TrainError> {
         if let Some(scores) = self.billboard.get() {
             return Ok(*scores);
@@ -230,7 +230,7 @@ impl Task for GaussianTask {
         for item in &items {
             let count = item.target_cameras.len();
             let all: Vec<usize> = (0..count).collect();
-            // The sides' two views are the last ones.
+            // The sides are the last two views.
             let chosen = match (&phase.views, phase.one_view) {
                 (views, true) if views.start == 2 => vec![random.random_range(count - 2..count)],
                 (_, true) => vec![random.random_range(0..count)],
@@ -238,7 +238,7 @@ impl Task for GaussianTask {
             };
             let deviation = self.losses.point_noise as f32;
             let mut noise = || {
-                // Sum of uniform numbers: nearly normal, and bounded.
+                // A sum of uniform numbers is nearly normal, and bounded.
                 deviation * (0..3).map(|_| random.random_range(-1.0_f32..1.0)).sum::<f32>()
             };
             let noise: Option<&mut dyn FnMut() -> f32> =

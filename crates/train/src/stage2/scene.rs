@@ -1,4 +1,4 @@
-//! The Gaussians of a sample, and what they are compared with.
+//! The Gaussians of a sample, and their targets.
 
 use std::ops::Range;
 
@@ -17,19 +17,19 @@ use crate::points::Prediction;
 /// Steps at which the published curriculum changes from the sides to front and back, and from these to all views
 /// (docs/method.md, "Losses of stage 2").
 const CURRICULUM: [u64; 2] = [2000, 4000];
-/// Until here the published curriculum compares one view per step, then all.
+/// Step until which the published curriculum renders one view per step. Later it renders all.
 const ONE_VIEW: u64 = 10_000;
-/// Its weight of the mean scale while the sides are alone.
+/// Weight of the mean scale while the published curriculum trains the sides alone.
 const SCALE_PENALTY: f64 = 2.0;
 
-/// Which views' Gaussians take part, and what is compared.
+/// Gaussians and targets of a step.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Phase {
-    /// Views by their place.
+    /// Views whose Gaussians are rendered.
     pub views: Range<usize>,
     /// Weight of the mean scale.
     pub scale: f64,
-    /// Whether only one view is compared.
+    /// Whether a step has only one target.
     pub one_view: bool,
 }
 
@@ -45,8 +45,8 @@ impl Phase {
     }
 }
 
-/// Gaussians of a sample in the data set's world; `None` if no pixel is valid. With `noise`, points stray by so many
-/// metres.
+/// Gaussians of a sample in the data set's world; `None` if no pixel is valid. `noise` returns random shifts of the
+/// points in metres.
 pub(super) fn gaussians(
     config: &Config,
     networks: &Networks,
@@ -68,7 +68,7 @@ pub(super) fn gaussians(
     }
     let views = points.len() / (3 * area);
     if let Some(noise) = noise.filter(|_| networks.predictor.is_none()) {
-        // Every view's shell is shifted as a whole: that is how predictions are off.
+        // Every view's points are shifted together, like the errors of predictions.
         for view in points.chunks_exact_mut(3 * area) {
             let shift = [noise(), noise(), noise()];
             view.chunks_exact_mut(3).for_each(|p| (0..3).for_each(|c| p[c] += shift[c]));
@@ -86,10 +86,10 @@ pub(super) fn gaussians(
     let sides = if views > 2 { side_images(photos, &points, &valid) } else { Vec::new() };
     let images: Vec<&[f32]> = photos.into_iter().chain(sides.iter().map(Vec::as_slice)).collect();
     let points = if networks.predictor.is_some() {
-        // Where the predictor is trained, what looks like its error must lead back to it.
+        // Gradients of the pictures reach a predictor that is trained.
         Tensor::cat(maps, 0)
     } else {
-        // One overflow would spoil the normalisation of a whole view.
+        // An overflow would spoil the normalisation of the whole view.
         points.iter_mut().filter(|v| !v.is_finite()).for_each(|v| *v = 0.0);
         Tensor::<4>::from_data(TensorData::new(points, [views, side, side, 3]), device)
     };
@@ -113,7 +113,7 @@ pub(super) fn gaussians(
     (!gaussians.is_empty()).then(|| placed(config, gaussians.scaled(item.scale), &to_world))
 }
 
-/// Target pictures `[V,3,h,w]` and masks `[V,h,w]` of some views.
+/// Target pictures `[V,3,h,w]` and masks `[V,h,w]` of the views with these indices.
 pub(super) fn targets(item: &Stage2Item, views: &[usize], device: &Device) -> (Tensor<4>, Tensor<3>) {
     let (side, count) = (item.target_side, views.len());
     let area = side * side;
@@ -125,8 +125,8 @@ pub(super) fn targets(item: &Stage2Item, views: &[usize], device: &Device) -> (T
     (Tensor::from_data(pictures, device), Tensor::from_data(masks, device))
 }
 
-/// Mean over Gaussians with these `scales` `[N,3]` of ln(longest / shortest axis) − ln(limit), where that is positive.
-/// (A mean penalty on scales alone misses the few that are too long.)
+/// Anisotropy penalty of Gaussians with `scales` `[N,3]`: the mean of max(0, ln(longest / shortest axis) − ln(limit)).
+/// (A penalty on the mean scale has little effect on a few long Gaussians.)
 pub fn anisotropy_penalty(scales: &Tensor<2>, limit: f64) -> Tensor<1> {
     let logs = scales.clone().clamp_min(1e-12).log();
     let ratio = logs.clone().max_dim(1) - logs.min_dim(1);
@@ -138,7 +138,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_published_curriculum_goes_from_the_sides_to_everything() {
+    fn the_published_curriculum_goes_from_the_sides_to_all_views() {
         let phase = |step| Phase::new(true, step);
         assert_eq!(phase(0), Phase { views: 2..4, scale: 2.0, one_view: true });
         assert_eq!(phase(1999), phase(0));
@@ -149,7 +149,7 @@ mod tests {
     }
 
     #[test]
-    fn only_what_a_needle_has_too_much_costs() {
+    fn only_anisotropy_above_the_limit_costs() {
         let device = Device::flex();
         let scales = Tensor::<2>::from_floats([[0.01, 0.01, 0.08], [0.01, 0.1, 1.0]], &device);
         let cost = host(anisotropy_penalty(&scales, 10.0))[0];

@@ -1,4 +1,4 @@
-//! How like the truth rendered pictures are.
+//! Scores of rendered pictures.
 
 use burn::tensor::{Device, Tensor};
 use snapsnap_data::sample::Stage2Item;
@@ -11,11 +11,11 @@ use snapsnap_ops::host;
 use super::scene::targets;
 use crate::photometric::Photometric;
 
-/// How like the truth pictures are, summed or averaged over samples.
+/// Scores of pictures, as sums or means over samples.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Scores {
     samples: f64,
-    /// dB, over whole pictures, where the person is and a little around it, and there in the two sides alone.
+    /// PSNR in dB of whole pictures, of the person with a margin, and of the person in the two sides.
     pub full: f64,
     pub masked: f64,
     pub sides: f64,
@@ -26,7 +26,7 @@ impl Scores {
     pub fn add(&mut self, item: &Stage2Item, image: Tensor<4>, device: &Device) -> Result<(), EvalError> {
         let (count, side) = (item.target_cameras.len(), item.target_side);
         let (target, _) = targets(item, &(0..count).collect::<Vec<_>>(), device);
-        // Values beyond what a picture can hold are no error: files and screens cut them.
+        // Files and screens clamp values outside [0, 1].
         let shown = host(image.clone().clamp(0.0, 1.0));
         let [mut full, mut masked, mut sides] = [SquaredError::default(); 3];
         for view in 0..count {
@@ -36,10 +36,10 @@ impl Scores {
             let truth = Picture::new(of(&item.targets), size, "target")?;
             full.add(&shown, &truth, &Region::all(&truth))?;
             let mask = &item.target_masks[view * side * side..(view + 1) * side * side];
-            // A view of nobody has only a background.
+            // A view without a person.
             let Ok(person) = Region::masked(mask, size, margin(side)) else { continue };
             masked.add(&shown, &truth, &person)?;
-            // The sides' views are the last ones.
+            // The sides are the last views.
             if view >= count - 2 {
                 sides.add(&shown, &truth, &person)?;
             }

@@ -8,7 +8,7 @@ use snapsnap_data::prepare::{DataConfig, Subject, ViewsConfig};
 use super::super::Format;
 use super::{nothing, scans};
 
-/// What both have in common.
+/// Common settings.
 const CHECK: Format = Format {
     name: "",
     sample: |_| (),

@@ -7,7 +7,7 @@ use snapsnap_data::dataset::Split;
 use super::super::Format;
 use super::{datasets, nothing, put, weights};
 
-/// Every kind of key, beside those of the networks.
+/// Every kind of key except those of the networks.
 const TRAINING: &str = r#"
 [data]
 folders = ["in/set"]
@@ -59,7 +59,7 @@ anisotropy_limit = 4.0
 point_noise = 0.01
 "#;
 
-/// A rehearsal, which writes nothing. What takes long without being a mistake is held fixed.
+/// A rehearsal, which writes nothing. Settings that could make it slow are fixed.
 const REHEARSAL: Format = Format {
     name: "train-config",
     sample,

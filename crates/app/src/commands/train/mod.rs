@@ -152,7 +152,7 @@ impl<'a> Plan<'a> {
             );
             return Err(Failure::Input(message));
         }
-        if device::is_cpu(&devices[0]) {
+        if memory::is_cpu(&devices[0]) {
             memory::check("this training", least_memory(&config), "a smaller network or batch needs less")?;
         }
         let precision = config.training.precision;
