@@ -1,6 +1,6 @@
 //! Helpers of the parity and end-to-end tests: devices, fixtures, error norms.
 
-// What these measure, limit and open, they ask of Linux.
+// These modules use interfaces of Linux.
 #[cfg(target_os = "linux")]
 pub mod browser;
 #[cfg(target_os = "linux")]
@@ -45,15 +45,15 @@ point_noise = 0.01
 "#
 );
 
-/// Name of the device that tests run on: `SNAPSNAP_TEST_DEVICE` = `flex` (default), `ndarray`, `wgpu`, or, where it is
-/// compiled in, `vulkan`.
+/// Name of the device that tests run on: `SNAPSNAP_TEST_DEVICE` = `flex` (default), `ndarray`, `wgpu`, or, if compiled
+/// in, `vulkan`.
 pub fn device_name() -> String {
     std::env::var("SNAPSNAP_TEST_DEVICE").unwrap_or_else(|_| "flex".into())
 }
 
-/// The device that tests run on, or `None`, said aloud, where the machine has no adapter for it.
+/// The device that tests run on, or `None`, with a printed note, if the machine has no adapter for it.
 ///
-/// `wgpu` takes whatever adapter there is, a software one included; `cargo xtask test` runs the suite on each device.
+/// `wgpu` takes any adapter, also a software one. `cargo xtask test` runs the suite on each device.
 pub fn device() -> Option<Device> {
     match device_name().as_str() {
         "flex" => Some(Device::flex()),
@@ -69,7 +69,7 @@ pub fn device() -> Option<Device> {
     }
 }
 
-/// Whether an adapter answers; one that does not is an error where `SNAPSNAP_REQUIRE_WGPU` is set.
+/// Whether there is an adapter. A missing one is an error if `SNAPSNAP_REQUIRE_WGPU` is set.
 fn adapter(kind: DeviceType) -> bool {
     let is_wgpu = matches!(kind, DeviceType::Wgpu);
     let found = std::panic::catch_unwind(|| {
@@ -88,17 +88,17 @@ fn adapter(kind: DeviceType) -> bool {
     found
 }
 
-/// Whether a device is a GPU made of software, on which kernels take their time.
+/// Whether a device is a software GPU, on which kernels are slow.
 pub fn is_software(device: &Device) -> bool {
     device.identity().is_some_and(|identity| identity.physical.is_none())
 }
 
-#[allow(deprecated, reason = "still the second CPU implementation that results are checked on")]
+#[allow(deprecated, reason = "the second CPU implementation")]
 fn ndarray() -> Device {
     Device::ndarray()
 }
 
-/// The program as a user starts it, built if it is not; `SNAPSNAP_PROGRAM` names one that is there.
+/// The program as a user starts it. It is built first, unless `SNAPSNAP_PROGRAM` is the path of a program.
 pub fn snapsnap() -> Command {
     static PROGRAM: OnceLock<PathBuf> = OnceLock::new();
     let program = PROGRAM.get_or_init(|| {
@@ -128,7 +128,7 @@ pub fn snapsnap() -> Command {
     command
 }
 
-/// Runs a command that must succeed; returns what it printed.
+/// Runs a command that must succeed. Returns its output.
 pub fn succeed(command: &mut Command) -> String {
     let output = command.output().expect("the program starts");
     let (out, err) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
@@ -136,7 +136,7 @@ pub fn succeed(command: &mut Command) -> String {
     out.into_owned()
 }
 
-/// Runs a command that must refuse its input with exit code 2; returns its message.
+/// Runs a command that must refuse its input with exit code 2. Returns its message.
 pub fn refused(command: &mut Command) -> String {
     let output = command.output().expect("the program starts");
     let err = String::from_utf8_lossy(&output.stderr).into_owned();
@@ -145,7 +145,7 @@ pub fn refused(command: &mut Command) -> String {
     err
 }
 
-/// The repository, or the folder with its `configs` and `tests/data` that `SNAPSNAP_ROOT` names.
+/// The repository, or the folder `SNAPSNAP_ROOT` with its `configs` and `tests/data`.
 pub fn root() -> PathBuf {
     let built = || Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("the workspace root").to_owned();
     std::env::var_os("SNAPSNAP_ROOT").map_or_else(built, PathBuf::from)
@@ -210,7 +210,7 @@ pub fn shared(name: &str) -> PathBuf {
     root().join("../shared").join(name)
 }
 
-/// A `.safetensors` file read whole.
+/// A `.safetensors` file in memory.
 pub struct Numbers(Vec<u8>);
 
 impl Numbers {
@@ -242,7 +242,7 @@ impl Numbers {
         (view.shape().to_vec(), view.data().chunks_exact(8).map(value).collect())
     }
 
-    /// The string that the file's metadata has under `key`.
+    /// The value of `key` in the file's metadata.
     pub fn metadata(&self, key: &str) -> String {
         let (_, metadata) = SafeTensors::read_metadata(&self.0).expect("a safetensors file");
         metadata.metadata().as_ref().and_then(|m| m.get(key).cloned()).unwrap_or_else(|| panic!("no {key}"))
@@ -281,7 +281,7 @@ pub fn values<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
     tensor.into_data().try_into_vec().expect("an f32 tensor")
 }
 
-/// Asserts a relative L2 error and prints it, so that a log shows what was reached.
+/// Asserts a relative L2 error, and prints it for the log.
 pub fn assert_close<const D: usize>(
     what: &str,
     got: Tensor<D>,

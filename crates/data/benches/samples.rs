@@ -36,8 +36,8 @@ fn measure<I: Send + Sync + 'static>(name: &str, loader: &Loader<I>, count: usiz
     let before = ALLOCATOR.current_usage_as_mb();
     let start = Instant::now();
     let mut loaded = 0;
-    'all: loop {
-        for batch in loader.batches(0) {
+    'all: for pass in 0.. {
+        for batch in loader.batches(pass, 0) {
             batch.expect("loads");
             loaded += 1;
             if [100, 1000, 10_000].contains(&loaded) || loaded == count {

@@ -161,7 +161,7 @@ impl<'a> Cutout<'a> {
 
 fn nobody(mask_path: &Path, placement: Placement) -> FileError {
     let least =
-        if matches!(placement, Placement::Demo { .. }) { "255, as `mode.compat` asks" } else { "128" };
+        if matches!(placement, Placement::Demo { .. }) { "255, which `mode.compat` needs" } else { "128" };
     let message = format!("the mask is empty: no pixel of the person reaches {least}");
     FileError::Unsuitable { path: mask_path.to_owned(), message }
 }

@@ -224,7 +224,7 @@ impl<'a> Machine<'a> {
             Some(Value::List(items) | Value::Dict(items)) => items.borrow_mut().extend(values),
             // State of a foreign object.
             Some(Value::Object(_)) => {}
-            _ => return Err("it adds to what is no container".into()),
+            _ => return Err("it adds to a value that is no container".into()),
         }
         Ok(())
     }
@@ -323,7 +323,7 @@ impl<'a> Machine<'a> {
                 let state = self.pop()?;
                 match self.stack.last() {
                     Some(Value::Object(parts)) => parts.borrow_mut().push(state),
-                    _ => return Err("it sets the state of what is no object".into()),
+                    _ => return Err("it sets the state of a value that is no object".into()),
                 }
                 return Ok(());
             }
@@ -334,7 +334,7 @@ impl<'a> Machine<'a> {
             0x94 => return self.remember(self.memo.len()),
             b'h' | b'j' => {
                 let at = self.whole(if operation == b'h' { 1 } else { 4 })?;
-                self.memo.get(at).cloned().ok_or("it recalls what was never stored")?
+                self.memo.get(at).cloned().ok_or("it recalls a value that was never stored")?
             }
             other => return Err(format!("step {other:#04x} is not understood")),
         };

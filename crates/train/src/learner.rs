@@ -252,7 +252,7 @@ impl<'a, T: Task> Samples<'a, T> {
             let samples = self.task.samples(pass);
             let loader = Loader::new(samples, t.batch, t.workers, t.prefetch);
             let loader = if t.shuffle { loader.shuffled(t.seed) } else { loader };
-            (loader.from_pass(pass).batches(place as usize), number)
+            (loader.batches(pass, place as usize), number)
         });
         *next += 1;
         let made = batches.next();

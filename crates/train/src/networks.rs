@@ -19,6 +19,16 @@ pub struct Networks {
     pub regressors: Vec<Regressor>,
 }
 
+/// A parameter.
+struct Parameter {
+    /// The checkpoint's name.
+    name: String,
+    shape: Vec<usize>,
+    /// Whether the checkpoint contains the transpose of this matrix.
+    is_transposed: bool,
+    values: Tensor<1>,
+}
+
 /// One row of values per parameter, by the checkpoint's names.
 pub type Rows = BTreeMap<String, Tensor<1>>;
 
@@ -59,17 +69,44 @@ impl Networks {
         }
     }
 
-    /// All values, without gradients.
-    pub fn rows(&self) -> Rows {
-        struct Collect(Rows);
+    /// All parameters with their values, without gradients.
+    fn parameters(&self) -> Vec<Parameter> {
+        struct Collect(Vec<Parameter>);
         impl NamedVisitor for Collect {
-            fn visit<const D: usize>(&mut self, name: &str, _: bool, parameter: &Param<Tensor<D>>) {
-                self.0.insert(name.to_owned(), parameter.val().without_autodiff().reshape([-1]));
+            fn visit<const D: usize>(
+                &mut self,
+                name: &str,
+                is_transposed: bool,
+                parameter: &Param<Tensor<D>>,
+            ) {
+                let values = parameter.val().without_autodiff();
+                let shape = values.dims().to_vec();
+                let values = values.reshape([-1]);
+                self.0.push(Parameter { name: name.to_owned(), shape, is_transposed, values });
             }
         }
-        let mut collect = Collect(Rows::new());
+        let mut collect = Collect(Vec::new());
         self.visit(&mut collect);
         collect.0
+    }
+
+    /// All values, without gradients.
+    pub fn rows(&self) -> Rows {
+        self.parameters().into_iter().map(|parameter| (parameter.name, parameter.values)).collect()
+    }
+
+    /// Shapes of all parameters.
+    pub fn shapes(&self) -> BTreeMap<String, Vec<usize>> {
+        self.parameters().into_iter().map(|parameter| (parameter.name, parameter.shape)).collect()
+    }
+
+    /// All values in the layout of checkpoints.
+    pub fn checkpoint(&self) -> BTreeMap<String, Vec<f32>> {
+        let stored = |Parameter { name, shape, is_transposed, values }: Parameter| match shape[..] {
+            [rows, columns] if is_transposed => (name, host(values.reshape([rows, columns]).transpose())),
+            _ => (name, host(values)),
+        };
+        self.parameters().into_iter().map(stored).collect()
     }
 
     /// The same networks with the values in `rows`. Other parameters keep their values.
@@ -84,39 +121,6 @@ impl Networks {
             }
         }
         self.map(&mut Replace(rows))
-    }
-
-    /// Shapes of all parameters.
-    pub fn shapes(&self) -> BTreeMap<String, Vec<usize>> {
-        struct Collect(BTreeMap<String, Vec<usize>>);
-        impl NamedVisitor for Collect {
-            fn visit<const D: usize>(&mut self, name: &str, _: bool, parameter: &Param<Tensor<D>>) {
-                self.0.insert(name.to_owned(), parameter.dims().to_vec());
-            }
-        }
-        let mut collect = Collect(BTreeMap::new());
-        self.visit(&mut collect);
-        collect.0
-    }
-
-    /// All values in the layout of checkpoints.
-    pub fn checkpoint(&self) -> BTreeMap<String, Vec<f32>> {
-        struct Collect(BTreeMap<String, Vec<f32>>);
-        impl NamedVisitor for Collect {
-            fn visit<const D: usize>(
-                &mut self,
-                name: &str,
-                is_transposed: bool,
-                parameter: &Param<Tensor<D>>,
-            ) {
-                let tensor = parameter.val().without_autodiff();
-                let tensor = if is_transposed { tensor.swap_dims(0, 1) } else { tensor };
-                self.0.insert(name.to_owned(), host(tensor));
-            }
-        }
-        let mut collect = Collect(BTreeMap::new());
-        self.visit(&mut collect);
-        collect.0
     }
 }
 

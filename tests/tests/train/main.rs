@@ -39,9 +39,14 @@ fn place() -> (tempfile::TempDir, PathBuf) {
 }
 
 fn train(stage: u32, config: &Path, run: &Path) -> Command {
+    train_on(people(), stage, config, run)
+}
+
+/// A training on a data set.
+fn train_on(data: &Path, stage: u32, config: &Path, run: &Path) -> Command {
     let mut command = snapsnap();
     command.arg(format!("train-stage{stage}")).arg("--config").arg(config);
-    command.args(["--device", "cpu", "--data"]).arg(people()).arg("-o").arg(run);
+    command.args(["--device", "cpu", "--data"]).arg(data).arg("-o").arg(run);
     command
 }
 

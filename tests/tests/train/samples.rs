@@ -3,9 +3,9 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use snapsnap_tests::{refused, snapsnap, succeed};
+use snapsnap_tests::{refused, succeed};
 
-use super::{logged, people, place, results, train};
+use super::{logged, people, place, results, train, train_on};
 
 #[test]
 fn a_broken_sample_is_skipped_and_named_and_twenty_in_a_row_end_the_run() {
@@ -15,19 +15,14 @@ fn a_broken_sample_is_skipped_and_named_and_twenty_in_a_row_end_the_run() {
     let broken = copy.join("train/img/0001/2.png");
     fs::write(&broken, b"not a picture").expect("writes");
     let one = ["--set", "training.batch=1", "--set", "training.validation_samples=0"];
-    let train = |run: &str| {
-        let mut command = snapsnap();
-        command.args(["train-stage1", "--device", "cpu", "--config"]).arg(&config).args(one);
-        command.arg("--data").arg(&copy).arg("-o").arg(temporary.path().join(run));
-        command
-    };
-    let output = train("some").output().expect("runs");
+    let train = |run: &str| train_on(&copy, 1, &config, &temporary.path().join(run)).args(one).output();
+    let output = train("some").expect("runs");
     let said = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success() && said.contains("skipped") && said.contains("img/0001/2.png"), "{said}");
     for (subject, view) in (0..3).flat_map(|subject| (0..4).map(move |view| (subject, view))) {
         fs::write(copy.join(format!("train/img/000{subject}/{view}.png")), b"").expect("writes");
     }
-    let output = train("none").output().expect("runs");
+    let output = train("none").expect("runs");
     let said = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(1), "{said}");
     assert!(said.contains("20 steps in a row") && said.contains(".png: "), "{said}");
@@ -46,15 +41,8 @@ fn samples_without_a_person_are_skipped_and_named() {
     let set = ["--set=training.steps=9", "--set=training.batch=1", "--set=network.conf_threshold=0.999"];
     succeed(train(1, &config, &one).args(set));
     let run = temporary.path().join("run");
-    let mut command = snapsnap();
-    command
-        .args(["train-stage2", "--device", "cpu", "--config"])
-        .arg(&config)
-        .args(set)
-        .arg("--data")
-        .arg(&copy);
-    command.arg("--weights").arg(one.join("best.safetensors")).arg("-o").arg(&run);
-    let output = command.output().expect("runs");
+    let mut command = train_on(&copy, 2, &config, &run);
+    let output = command.args(set).arg("--weights").arg(one.join("best.safetensors")).output().expect("runs");
     let said = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success() && said.contains("skipped: no pixel is part of a person"), "{said}");
     assert!(said.contains("0001, view ") && !said.contains("0000, view "), "{said}");
@@ -68,9 +56,8 @@ fn failed_validations_cost_no_step() {
     let (copy, run) = (temporary.path().join("people"), temporary.path().join("run"));
     copy_folder(people(), &copy);
     let train = || {
-        let mut command = snapsnap();
-        command.args(["train-stage1", "--device", "cpu", "--resume", "--config"]).arg(&config);
-        command.arg("--data").arg(&copy).arg("-o").arg(&run);
+        let mut command = train_on(&copy, 1, &config, &run);
+        command.arg("--resume");
         command
     };
     let pictures: Vec<PathBuf> = (0..4).map(|view| copy.join(format!("val/img/0000/{view}.png"))).collect();

@@ -59,7 +59,7 @@ pub fn check(root: &Path, mut progress: impl FnMut(usize, usize)) -> Result<Chec
             .map(|view| faults(&folder, *split, subject, view))
             .collect();
         let (problems, seen): (Vec<_>, Vec<_>) = found.into_iter().unzip();
-        // What is wrong with a file of all views shows with each of them.
+        // A fault in a file of all views is reported once.
         let mut said = HashSet::new();
         checked.problems.extend(problems.into_iter().flatten().filter(|p| said.insert(p.clone())));
         let at = folder.path(*split, "img", subject);

@@ -3,7 +3,6 @@
 
 use std::collections::BTreeMap;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::{Builder, JoinHandle};
@@ -21,7 +20,6 @@ pub struct Loader<I> {
     prefetch: usize,
     /// Seed of the order, if it is random. Every pass has its own order.
     shuffle: Option<u64>,
-    passes: AtomicU64,
 }
 
 impl<I: 'static> Loader<I> {
@@ -32,25 +30,12 @@ impl<I: 'static> Loader<I> {
     /// If `batch` or `workers` is 0.
     pub fn new(dataset: impl Dataset<I> + 'static, batch: usize, workers: usize, prefetch: usize) -> Self {
         assert!(batch > 0 && workers > 0, "{batch} items by {workers} workers");
-        Self {
-            dataset: Arc::new(dataset),
-            batch,
-            workers,
-            prefetch,
-            shuffle: None,
-            passes: AtomicU64::new(0),
-        }
+        Self { dataset: Arc::new(dataset), batch, workers, prefetch, shuffle: None }
     }
 
     /// The loader with a random order, a new one in every pass.
     pub fn shuffled(mut self, seed: u64) -> Self {
         self.shuffle = Some(seed);
-        self
-    }
-
-    /// The loader with this pass as its next one.
-    pub fn from_pass(self, pass: u64) -> Self {
-        self.passes.store(pass, Ordering::Relaxed);
         self
     }
 }
@@ -105,11 +90,10 @@ pub struct Batches<I> {
 }
 
 impl<I: Send + Sync + 'static> Loader<I> {
-    /// The next pass without its first `skipped` batches.
-    pub fn batches(&self, skipped: usize) -> Batches<I> {
+    /// A pass without its first `skipped` batches.
+    pub fn batches(&self, pass: u64, skipped: usize) -> Batches<I> {
         let mut order: Vec<usize> = (0..self.dataset.len()).collect();
         if let Some(seed) = self.shuffle {
-            let pass = self.passes.fetch_add(1, Ordering::Relaxed);
             order.shuffle(&mut stream(&format!("order/{seed}/{pass}")));
         }
         order.drain(..(skipped * self.batch).min(order.len()));
@@ -184,7 +168,7 @@ impl<I> Drop for Batches<I> {
 
 #[cfg(test)]
 mod tests {
-    use std::sync::atomic::AtomicUsize;
+    use std::sync::atomic::{AtomicUsize, Ordering};
     use std::time::Duration;
 
     use super::*;
@@ -237,19 +221,16 @@ mod tests {
     fn the_order_of_batches_does_not_depend_on_the_workers() {
         for workers in [1, 2, 5] {
             let (loader, _) = loader(103, workers, None);
-            assert_eq!(order(loader.batches(0)), (0..103).collect::<Vec<_>>());
+            assert_eq!(order(loader.batches(0, 0)), (0..103).collect::<Vec<_>>());
         }
         let shuffled = |workers: usize| {
             let loader = loader(50, workers, None).0.shuffled(7);
-            [order(loader.batches(0)), order(loader.batches(0))]
+            [0, 1].map(|pass| order(loader.batches(pass, 0)))
         };
         let [first, second] = shuffled(1);
-        let later = loader(50, 2, None).0.shuffled(7).from_pass(1);
-        assert_eq!(order(later.batches(0)), second);
-        // In the middle of a pass, too.
-        let rest = loader(50, 3, None).0.shuffled(7).from_pass(1).batches(5);
+        let rest = loader(50, 3, None).0.shuffled(7).batches(1, 5);
         assert_eq!(order(rest), second[20..]);
-        assert_eq!(loader(50, 2, None).0.batches(13).count(), 0);
+        assert_eq!(loader(50, 2, None).0.batches(0, 13).count(), 0);
         assert_eq!([first.clone(), second.clone()], shuffled(3));
         assert_ne!(first, second);
         let mut sorted = first;
@@ -260,7 +241,7 @@ mod tests {
     #[test]
     fn the_number_of_loaded_items_is_bounded() {
         let (loader, most) = loader(400, 3, None);
-        for batch in loader.batches(0) {
+        for batch in loader.batches(0, 0) {
             std::thread::sleep(Duration::from_millis(1));
             drop(batch);
         }
@@ -272,14 +253,14 @@ mod tests {
     #[test]
     fn errors_and_panics_reach_the_consumer_and_the_rest_goes_on() {
         let (loader, _) = loader(40, 2, Some(9));
-        let results: Vec<_> = loader.batches(0).collect();
+        let results: Vec<_> = loader.batches(0, 0).collect();
         assert_eq!(results.len(), 10);
         assert_eq!(results[2].as_ref().expect_err("broken").to_string(), "item 9 is broken");
         assert_eq!(results.iter().filter(|r| r.is_err()).count(), 1);
         let (loader, _) = self::loader(40, 2, Some(1009));
-        let results: Vec<_> = loader.batches(0).collect();
+        let results: Vec<_> = loader.batches(0, 0).collect();
         assert!(results[2].as_ref().expect_err("panicked").to_string().contains("panicked"));
         // Workers of a dropped iterator end as well.
-        drop(loader.batches(0).next());
+        drop(loader.batches(0, 0).next());
     }
 }

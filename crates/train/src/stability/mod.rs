@@ -102,8 +102,8 @@ fn finite(values: &[f32]) -> bool {
     values.iter().all(|v| v.is_finite())
 }
 
-/// A front view of 4 × 4 pixels, `count` of which have a true point; predictions and truth elsewhere are what networks
-/// and files can at worst hold.
+/// A front view of 4 × 4 pixels, `count` of which have a true point. Predictions and ground truth of the others have
+/// the worst possible values.
 fn point_loss(count: usize, device: &Device) -> Found {
     const SIDE: usize = 4;
     const AREA: usize = SIDE * SIDE;

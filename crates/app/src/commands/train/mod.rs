@@ -200,7 +200,7 @@ impl<'a> Plan<'a> {
                 Ok(())
             });
         }
-        let path = self.arguments.output.as_deref().expect("clap asks for it");
+        let path = self.arguments.output.as_deref().expect("required by clap");
         let folder = RunFolder::open(path, self.arguments, &self.config, &self.folders)?;
         let limit = self.arguments.minutes.map(|minutes| Duration::from_secs_f64(60.0 * minutes));
         let stop = interrupt::patiently();

@@ -374,7 +374,8 @@ fn stage_one_is_loaded_in_batches() {
     let config = SampleConfig { repeat: 3, ..SampleConfig::default() };
     let stage = Stage1::new(folder, TRAIN, config).expect("makes samples");
     let loader = Loader::new(stage, 4, 2, 1).shuffled(1);
-    let batches = loader.batches(0).map(|items| Stage1Batcher.batch(items.expect("loads"), &Device::flex()));
+    let batches =
+        loader.batches(0, 0).map(|items| Stage1Batcher.batch(items.expect("loads"), &Device::flex()));
     let shapes: Vec<[usize; 5]> = batches.map(|batch| batch.points.dims()).collect();
     assert_eq!(shapes, [[4, 4, 64, 64, 3], [2, 4, 64, 64, 3]]);
 }
