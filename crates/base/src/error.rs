@@ -16,10 +16,10 @@ pub fn is_guarded() -> bool {
 /// Reads a file with libraries that may panic on damaged ones, and turns a panic into an error.
 ///
 /// # Errors
-/// What `read` returns, or [`FileError::Unsuitable`] with the panic's message.
+/// The error of `read`, or [`FileError::Unsuitable`] with the panic's message.
 pub fn guarded<T>(path: &Path, read: impl FnOnce() -> Result<T, FileError>) -> Result<T, FileError> {
     let outer = GUARDED.replace(true);
-    // What `read` may have left half-changed is dropped with it.
+    // Half-changed state of `read` is dropped with it.
     let result = catch_unwind(AssertUnwindSafe(read));
     GUARDED.set(outer);
     result.unwrap_or_else(|panic| {

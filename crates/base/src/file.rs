@@ -10,7 +10,7 @@ use std::time::Duration;
 
 /// How the names of temporary files begin.
 const PREFIX: &str = ".snapsnap-";
-/// Temporary files that nobody has written into for so long are of runs that were killed.
+/// Age of temporary files after which they count as left by a killed run.
 const LEFT: Duration = Duration::from_secs(600);
 /// How often the removal of a folder is tried.
 const FOLDER_TRIES: usize = 100;
@@ -35,7 +35,7 @@ pub fn remove_unfinished() {
     let mut unfinished = unfinished();
     unfinished.ending = true;
     for path in unfinished.paths.drain(..) {
-        // Whoever renamed or removed it first has done the work. Others may still be writing into a folder.
+        // It may be renamed or removed already. Other threads may still be writing into a folder.
         for _ in 0..FOLDER_TRIES {
             let removed = if path.is_dir() { fs::remove_dir_all(&path) } else { fs::remove_file(&path) };
             if removed.is_ok() || !path.is_dir() {
@@ -125,7 +125,7 @@ fn tidy(folder: &Path) {
             continue;
         }
         let name = entry.file_name().to_string_lossy().into_owned();
-        // Behind the prefix come six characters.
+        // Six characters follow the prefix.
         let is_ours = name.strip_prefix(PREFIX).is_some_and(|rest| rest.len() == 6);
         let is_old = |file: &File| {
             let age = file.metadata().and_then(|metadata| metadata.modified()).map(|time| time.elapsed());
@@ -146,7 +146,7 @@ fn tidy(folder: &Path) {
 /// regular file (a pipe, a device) is written in place: renaming would replace the device itself.
 ///
 /// # Errors
-/// What `fill` returns, or the operating system's refusal to create, write or rename the file.
+/// The error of `fill`, or the operating system's refusal to create, write or rename the file.
 pub fn write_whole<E: From<io::Error>>(
     path: &Path,
     fill: impl FnOnce(&mut BufWriter<&mut File>) -> Result<(), E>,

@@ -34,7 +34,7 @@ pub struct Config {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct NetworkConfig {
-    /// What lies between photographs and raw points. A `convolution` takes of the sizes below those of the encoder, whose
+    /// Network between photographs and raw points. A `convolution` takes of the sizes below those of the encoder, whose
     /// tokens lie where it is coarsest, of the decoder, which are the sides', `mlp_ratio`, `patch` (8 or 16), `rope_base`,
     /// `layer_dims`, the channels at 1, 2, 4 and 8 times the finest pixel, and `last_dim`.
     pub body: Body,
@@ -85,7 +85,7 @@ pub struct NetworkConfig {
     pub upsample: Option<Upsample>,
     /// Initial value of δ, the learned global scale of the points (metres per network unit).
     pub delta: f64,
-    /// What the predicted points are measured from.
+    /// Origin of the predicted points.
     pub anchor: Anchor,
     /// Whether the predictor's input is only the window of the canvas that holds the person
     /// (docs/method.md, "Window").
@@ -174,7 +174,7 @@ pub struct RegressorConfig {
     pub channels: usize,
     /// Groups of every group normalisation.
     pub groups: usize,
-    /// What the network's output is measured from; unset: as published.
+    /// Start of the network's output; unset: as published.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub start: Option<RegressorStart>,
     /// Where a Gaussian's colour comes from; unset: the pixel's with a geometric start, else the network's own.
@@ -194,7 +194,7 @@ impl RegressorConfig {
         self.margin.unwrap_or(RECEPTIVE_RADIUS)
     }
 
-    /// What the network's output is measured from.
+    /// Start of the network's output.
     pub fn start(&self) -> RegressorStart {
         self.start.unwrap_or(RegressorStart::Published)
     }

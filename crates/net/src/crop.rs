@@ -40,7 +40,7 @@ impl Window {
         found
     }
 
-    /// What the point predictor looks at on the canvas of `config`: everything, or the window of the persons in the masks.
+    /// Part of the canvas that the point predictor receives: the whole canvas, or the window of the persons in the masks.
     pub fn of_predictor<'a>(config: &Config, masks: impl Iterator<Item = &'a [bool]>) -> Self {
         let side = config.network.resolution;
         let person = if config.network.window { Self::around(masks, side) } else { None };

@@ -23,7 +23,7 @@ pub struct Seen<'a> {
     pub valid: &'a [bool],
 }
 
-/// What one view's N valid pixels give.
+/// Features of one view's N valid pixels.
 pub struct Part {
     features: Tensor<2>,
     points: Tensor<2>,
@@ -300,7 +300,7 @@ mod tests {
             assert_eq!(plane[..2], rgb[5 * c..5 * c + 2]);
             assert!(plane[2..].iter().all(|value| (value - own[c]).abs() < 1e-6), "{plane:?}");
         }
-        // What a lossy mask makes of a white pixel stays a colour.
+        // A white pixel under a lossy mask stays a colour.
         let config = RegressorConfig { straight_color: true, ..RegressorConfig::default() };
         assert_eq!(*photograph_colors(&config, &[0.9, -0.9, 0.9], &[0.6]), [1.0, -1.0, 1.0]);
     }

@@ -1,4 +1,4 @@
-//! What the photographs' masks say of the unseen sides: whoever is outside of a silhouette is not there.
+//! The visual hull of the two photographs: points outside of a silhouette are not on the person.
 
 use glam::DVec3;
 use snapsnap_splat::{Camera, RigidTransform};
@@ -105,7 +105,7 @@ mod tests {
         let point = |x: f32, z: f32| [x, 0.0, z];
         let front_only = Hull::new([&left_half, &all], side, 0);
         assert!(front_only.contains(point(-0.1, 2.0)) && !front_only.contains(point(0.1, 2.0)));
-        // What the front has on the left the back has on the right.
+        // The front's left is the back's right.
         let back_only = Hull::new([&all, &left_half], side, 0);
         assert!(!back_only.contains(point(-0.1, 2.0)) && back_only.contains(point(0.1, 2.0)));
         let both = Hull::new([&left_half, &left_half], side, 0);

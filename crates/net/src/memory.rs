@@ -8,7 +8,7 @@ const F32: u64 = 4;
 /// photographs, point maps on the device and on the host, side images, the regressor's planes of 16 channels and the
 /// Gaussians; measured (docs/inference.md). Twice as much is needed where every pixel of every view becomes a Gaussian.
 const PER_PIXEL: u64 = 500;
-/// What neither size nor weights decide: code, buffers of the threads.
+/// Memory that depends neither on size nor on weights: code, buffers of the threads.
 const BASE: u64 = 200 << 20;
 
 impl Config {

@@ -57,7 +57,7 @@ impl<'a> Path<'a> {
     }
 }
 
-/// What visits the parameters of a module by name.
+/// A visitor of a module's parameters, by name.
 pub trait NamedVisitor {
     /// One parameter. `is_transposed`: the checkpoint has the transpose of this matrix.
     fn visit<const D: usize>(&mut self, name: &str, is_transposed: bool, parameter: &Param<Tensor<D>>);
@@ -85,7 +85,7 @@ pub fn visit_named<M: Module>(module: &M, prefix: &str, visitor: &mut impl Named
     module.visit(&mut Adapter { path: Path::new(prefix), visitor });
 }
 
-/// What changes the parameters of a module by name.
+/// A mapper of a module's parameters, by name.
 pub trait NamedMapper {
     /// One parameter's values; neither tracked nor on a device with gradients.
     fn map<const D: usize>(&mut self, name: &str, values: Tensor<D>) -> Tensor<D>;

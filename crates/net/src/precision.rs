@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use crate::names::Path;
 use crate::network::PointPredictor;
 
-/// What the point predictor computes in.
+/// Float type of the point predictor's layers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Precision {

@@ -40,7 +40,7 @@ pub struct Reconstruction {
     pub gaussians: Gaussians,
     /// Pixels and Gaussians that were left out because they were not finite.
     pub lost: usize,
-    /// What ran, what was left out and why.
+    /// Steps that ran, and steps that were left out, with reasons.
     pub plan: Vec<String>,
     /// Time per module, the device synchronised before and after each.
     pub times: Vec<(&'static str, Duration)>,
@@ -253,7 +253,7 @@ impl Run<'_> {
         })
     }
 
-    /// What the point predictor looks at.
+    /// The window that the point predictor receives.
     fn predictor_window(&self, photos: [&Photograph; 2]) -> Window {
         let config = &self.model.config;
         let masks = photos.map(|photo| photo.mask.iter().map(|m| *m > 0.0).collect::<Vec<_>>());

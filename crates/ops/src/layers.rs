@@ -95,7 +95,7 @@ pub fn patches(layer: &Conv2d, x: Tensor<4>) -> Tensor<3> {
 
 /// A function of an input, a weight and perhaps a bias, with its gradients.
 trait Layer: std::fmt::Debug + Send + Sync + 'static {
-    /// What the backward pass needs beside the input and the weight.
+    /// Values that the backward pass needs beside the input and the weight.
     type Kept: Send + 'static;
 
     fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>) -> (Vec<f32>, Self::Kept);

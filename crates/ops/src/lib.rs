@@ -46,12 +46,12 @@ pub fn is_trained_fast<const D: usize>(x: &Tensor<D>) -> bool {
     x.dtype() == DType::F32 && device.is_autodiff() && device.inner() == Device::flex()
 }
 
-/// `x` in what a layer's weight is in.
+/// `x` in the float type of a layer's weight.
 pub fn as_weight<const D: usize, const W: usize>(x: Tensor<D>, weight: &Param<Tensor<W>>) -> Tensor<D> {
     x.cast(weight.val().dtype())
 }
 
-/// What is computed in f32 for 16 bits: norms, rotations.
+/// Runs `compute` in f32 for tensors of 16 bits: norms, rotations.
 pub fn in_f32<const D: usize>(x: Tensor<D>, compute: impl FnOnce(Tensor<D>) -> Tensor<D>) -> Tensor<D> {
     let dtype = x.dtype();
     let is_half = matches!(dtype, DType::F16 | DType::BF16);

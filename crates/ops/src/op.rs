@@ -1,5 +1,5 @@
-//! Operators of our own with gradients of their own, as one Burn backend extension. Everything that knows Burn's backend
-//! interfaces is in this file; those interfaces change with every minor version of Burn.
+//! Operators of our own with gradients of their own, as one Burn backend extension. All code for Burn's backend
+//! interfaces is in this file, since they change with every minor version of Burn.
 
 use std::any::Any;
 use std::fmt::Debug;
@@ -35,7 +35,7 @@ pub trait Kernel: Debug + Send + Sync + 'static {
     ) -> [Option<Vec<f32>>; 3];
 }
 
-/// What an operator keeps for its backward pass, which takes it.
+/// Values that an operator keeps for its backward pass.
 pub type Kept = Option<Box<dyn Any + Send>>;
 
 /// The tensors of a call.
@@ -59,7 +59,7 @@ pub trait KernelBackend: Backend {
     fn run(#[extension_type] inputs: Inputs<Self>, kernel: Arc<dyn Kernel>) -> Output<Self>;
 }
 
-/// What a backend without autodiff brings along.
+/// Operations of a backend without autodiff.
 pub trait Untracked: Backend {
     /// As [`Kernel::forward`].
     fn forward(inputs: &Inputs<Self>, kernel: &dyn Kernel, keep: bool) -> (FloatTensor<Self>, Kept);

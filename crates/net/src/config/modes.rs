@@ -20,7 +20,7 @@ names! {
     }
 }
 names! {
-    /// What lies between photographs and raw points.
+    /// Network between photographs and raw points.
     Body {
         /// DUSt3R: encoder, two decoders, a head per view (docs/method.md, "Point predictor").
         Transformer = "transformer",

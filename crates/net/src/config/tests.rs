@@ -1,4 +1,4 @@
-//! What is accepted, what is refused, and in which words.
+//! Accepted configs, refused configs, and the messages of refusals.
 
 use super::*;
 

@@ -21,7 +21,7 @@ fn stride(patch: usize) -> usize {
     patch >> (LEVELS - 1)
 }
 
-/// Tokens of the coarsest image and blocks that let them look at each other.
+/// Tokens of the coarsest image, and blocks of attention between them.
 #[derive(Module, Debug)]
 struct Attention {
     embed: Linear,
@@ -94,7 +94,7 @@ impl Decoder {
     }
 }
 
-/// What both decoders begin with.
+/// Input of both decoders.
 #[derive(Debug, Clone)]
 pub struct Levels {
     /// An image of each size `[B, layer_dims, ..]`.

@@ -8,7 +8,7 @@ use crate::config::Config;
 use crate::crop::Window;
 use crate::resample::shrink;
 
-/// What the point predictor sees of B pairs of photographs.
+/// Input of the point predictor: B pairs of photographs.
 #[derive(Debug, Clone)]
 pub struct Input {
     /// `[2·B, C, h, w]`, all fronts, then all backs: colours in [−1, 1] times the mask, then what else the config adds. With

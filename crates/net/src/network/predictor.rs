@@ -104,7 +104,7 @@ fn means(maps: &[(View, PointMap)]) -> Vec<(View, PointMap)> {
     maps.iter().map(mean).collect()
 }
 
-/// What the encoder of a predictor gives.
+/// Output of the encoder.
 #[derive(Debug, Clone)]
 pub enum Encoded {
     /// Tokens `[2·B, N, enc_dim]` of all fronts, then all backs.
@@ -113,7 +113,7 @@ pub enum Encoded {
     Levels(Levels),
 }
 
-/// What the heads of a predictor begin with.
+/// Input of the heads.
 #[derive(Debug, Clone)]
 #[allow(clippy::large_enum_variant, reason = "there is one at a time")]
 pub enum Decoded {
@@ -261,7 +261,7 @@ impl PointPredictor {
         self.anchored(view, self.to_canvas(map, factor, method, weights), window)
     }
 
-    /// What each photograph shows.
+    /// Features of each photograph.
     pub fn encode(&self, Input { images, grid }: Input) -> Encoded {
         match &self.body {
             Body::Transformer(net) => Encoded::Tokens(net.encode(images, &grid), grid),
@@ -273,7 +273,7 @@ impl PointPredictor {
         }
     }
 
-    /// What they show together.
+    /// Features of both photographs together.
     pub fn decode(&self, encoded: Encoded) -> Decoded {
         match encoded {
             Encoded::Tokens(tokens, grid) => {
@@ -298,7 +298,7 @@ impl PointPredictor {
             _ => panic!("decoded by another network"),
         };
         let map = |(&view, raw): (&View, Tensor<4>)| {
-            // What was seen in a mirror lies in a mirror.
+            // A mirrored photograph gives a mirrored map.
             let raw = if self.config.mirror && view == View::Back { raw.flip([3]) } else { raw };
             (view, activate(raw, &self.config))
         };

@@ -22,7 +22,7 @@ pub struct Attributes {
     pub offset: Tensor<2>,
 }
 
-/// What N Gaussians are before the network corrects them.
+/// Attributes of N Gaussians before the corrections of the network.
 #[derive(Debug, Clone)]
 pub struct Geometry {
     /// Distance of neighbouring points `[N, 1]`, metres.

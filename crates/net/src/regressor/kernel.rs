@@ -25,7 +25,7 @@ struct Pass {
     /// B, H, W.
     size: [usize; 3],
     frozen: Option<Vec<Layer>>,
-    /// What the forward pass measured.
+    /// Statistics that the forward pass measured.
     measured: Arc<Mutex<Vec<Layer>>>,
 }
 

@@ -14,7 +14,7 @@ use super::schema::{self, Part, TensorSpec};
 use super::source::{CONFIG_KEY, Entry, Float, Source, is_readable};
 use crate::config::{Config, Schema};
 
-/// Hears how many bytes of how many have been written.
+/// Called with the number of bytes written and their total.
 pub type Progress<'a> = &'a dyn Fn(u64, u64);
 
 /// Values per task: a second-level cache holds them.
@@ -92,7 +92,7 @@ fn write_floats(
         let mut written = 0;
         let mut problems = Vec::new();
         for (i, name) in names.iter().enumerate() {
-            // What is beyond the range of 16 bits becomes infinite.
+            // Values beyond the range of 16 bits become infinite.
             let values = float.rounded(values(i).map_err(Failure::Weights)?);
             problems.extend(not_finite(name, &values));
             let bytes = float.bytes(&values);

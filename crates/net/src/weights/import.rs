@@ -17,7 +17,7 @@ pub struct ImportOptions {
     pub side_heads: SideHeads,
     /// Seed of what is drawn.
     pub seed: u64,
-    /// What the file is written in.
+    /// Float type of the written file.
     pub float: Float,
 }
 
@@ -30,7 +30,7 @@ pub fn stored_config(path: &Path) -> Result<Option<Config>, WeightsError> {
     source.metadata.contains_key(CONFIG_KEY).then(|| source.config()).transpose()
 }
 
-/// What an import did.
+/// Report of an import.
 #[derive(Debug, Default)]
 pub struct ImportReport {
     /// Tensors written.

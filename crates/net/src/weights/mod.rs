@@ -22,7 +22,7 @@ pub use init::{SideHeads, init};
 pub use load::{random_predictor, random_regressors};
 pub use source::{CONFIG_KEY, Entry, Float, Source};
 
-/// What can be wrong with weights.
+/// Errors of weight files.
 #[derive(Debug, thiserror::Error)]
 pub enum WeightsError {
     /// The file could not be read or written, or is not what it should be.

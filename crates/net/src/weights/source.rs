@@ -27,7 +27,7 @@ pub struct Source {
     pub metadata: BTreeMap<String, String>,
 }
 
-/// What the file says about one tensor.
+/// Description of one tensor in the file.
 #[derive(Debug, Clone)]
 pub struct Entry {
     /// Element type, PyTorch's name in lower case (`f32`, `bf16`, `i64` …).
@@ -218,7 +218,7 @@ impl Float {
         }
     }
 
-    /// What a safetensors file calls it.
+    /// Name in a safetensors file.
     pub(super) fn dtype(self) -> Dtype {
         match self {
             Self::F32 => Dtype::F32,

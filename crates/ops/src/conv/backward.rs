@@ -41,7 +41,7 @@ pub struct Backward<'a> {
     pub stride: usize,
     /// Whether the input was doubled first.
     pub enlarge: bool,
-    /// What is computed; the rest stays empty.
+    /// Gradients to compute; the others stay empty.
     pub wanted: Wanted,
 }
 
@@ -63,7 +63,7 @@ impl Sums {
     }
 }
 
-/// What [`Backward::run`] gives.
+/// Result of [`Backward::run`].
 #[derive(Debug, Clone, Default)]
 pub struct Gradients {
     /// Per source `[height, width, 16]`: of the plane, or, if it is activated, of scale·x + shift.

@@ -11,7 +11,7 @@ use crate::math::silu;
 /// Output rows per task.
 const BAND: usize = 16;
 
-/// What the result is added to before it is scaled.
+/// Second summand of the result, before scaling.
 pub enum Shortcut<'a> {
     /// Nothing.
     None,

@@ -1,4 +1,4 @@
-//! What the passes do with rows of pixels, in vectors of whatever width the processor has.
+//! Inner loops of both passes over rows of pixels, in vectors of the processor's own width.
 
 use pulp::{Simd, WithSimd};
 

@@ -22,7 +22,7 @@ pub struct GroupNorm<'a> {
     pub beta: &'a [f32],
 }
 
-/// What a normalisation's backward pass gives.
+/// Result of a normalisation's backward pass.
 #[derive(Debug, Clone)]
 pub struct NormGradients {
     /// Of the factors.

@@ -1,4 +1,4 @@
-//! What the backward pass does with a row of pixels before and after the products.
+//! Steps of the backward pass on a row of pixels, before and after the products.
 
 use pulp::{Simd, WithSimd};
 

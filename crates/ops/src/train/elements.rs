@@ -1,4 +1,4 @@
-//! What is done element by element, as loops of vector instructions. (Plain loops compile to branches here, which random
+//! Element-wise operations, as loops of vector instructions. (Plain loops compile to branches here, which random
 //! signs make ten times as slow.)
 
 use pulp::Arch;

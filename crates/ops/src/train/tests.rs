@@ -313,7 +313,7 @@ fn resizing_back_equals_plain_loops() {
     }
 }
 
-/// What all operators compute, forward and backward, at sizes of several tasks.
+/// Results and gradients of all operators, at sizes of several tasks.
 fn everything() -> Vec<Vec<f32>> {
     let (buffers, mut all) = (Buffers::default(), Vec::new());
     let keep = |all: &mut Vec<_>, g: Gradients| all.extend([g.input, g.weight, g.bias].into_iter().flatten());

@@ -11,7 +11,7 @@ use crate::conv::{
     Wanted, add, arrange, rearrange, transpose,
 };
 
-/// What [`Network::backward`] gives; empty where nothing was asked for.
+/// Result of [`Network::backward`]; unwanted gradients are empty.
 #[derive(Debug, Default)]
 pub struct Gradients {
     /// `[B, H, W, 6]`.

@@ -1,4 +1,4 @@
-//! Input → features, and what the way back needs.
+//! Input → features, and the tape for the backward pass.
 
 use rayon::prelude::*;
 
@@ -10,7 +10,7 @@ use crate::conv::{Affine, CHANNELS, Conv, Layer, Moments, Plane, Shortcut, Sourc
 /// Pixels that are copied at once.
 const TASK: usize = 4096;
 
-/// What [`Network::forward`] gives.
+/// Result of [`Network::forward`].
 #[derive(Debug)]
 pub struct Forward {
     /// `[B, H, W, 14]`, before activation.

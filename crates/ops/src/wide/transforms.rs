@@ -136,7 +136,7 @@ impl WithSimd for Filters<'_> {
     }
 }
 
-/// What tiles are read from.
+/// Source of tiles.
 pub trait Lines: Sync {
     /// Groups of channels.
     fn groups(&self) -> usize;
