@@ -36,8 +36,8 @@ pub fn choose(name: &str) -> Result<Device, Failure> {
     }
 }
 
-/// Every device there is: both CPU backends, and of every kind that is compiled in the first card, or the software adapter where
-/// that bears it.
+/// Every device there is: both CPU backends, and of every compiled kind the first card, or the software adapter if it can run
+/// kernels.
 pub fn all() -> Vec<Device> {
     let gpus = gpus().into_iter().filter_map(|(name, _)| choose(name).ok());
     [Device::flex(), ndarray()].into_iter().chain(gpus).collect()
@@ -49,7 +49,7 @@ pub struct Found {
     pub name: String,
     /// As it calls itself.
     pub adapter: String,
-    /// What computes on it.
+    /// Backend.
     pub backend: &'static str,
     /// Whether it is a GPU made of software.
     pub software: bool,

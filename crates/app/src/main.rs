@@ -32,7 +32,7 @@ use clap::{CommandFactory, Parser, Subcommand};
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
-/// What a newcomer needs.
+/// First steps for new users.
 const FIRST_STEPS: &str = "First steps:
   snapsnap demo                                            the sample pair: Gaussians, turntable, report
   snapsnap reconstruct front.png back.png -o human.ply     your own photographs

@@ -51,7 +51,7 @@ impl Arguments {
     }
 }
 
-/// What LPIPS is computed with, or why there is none, for reports.
+/// The weights of LPIPS, or the reason for its absence, for reports.
 pub fn describe(lpips: &Result<Lpips, String>) -> String {
     match lpips {
         Ok(network) if network.is_published() => "published weights".into(),
@@ -60,7 +60,7 @@ pub fn describe(lpips: &Result<Lpips, String>) -> String {
     }
 }
 
-/// What is said behind a distance with other weights.
+/// Remark behind a distance with other weights.
 pub fn mark(lpips: &Result<Lpips, String>) -> &'static str {
     match lpips {
         Ok(network) if !network.is_published() => " (not with the published weights)",

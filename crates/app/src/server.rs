@@ -19,7 +19,7 @@ const PATIENCE: Duration = Duration::from_secs(10);
 /// A client that takes nothing for so long is gone.
 const STALLED: Duration = Duration::from_secs(20);
 
-/// What is asked for.
+/// A request.
 pub struct Request {
     /// The path, without what follows `?` or `#`.
     pub path: String,
@@ -29,7 +29,7 @@ pub struct Request {
     pub method: String,
 }
 
-/// What is answered.
+/// An answer.
 pub struct Answer {
     pub status: u16,
     pub headers: Vec<(&'static str, String)>,
@@ -79,7 +79,7 @@ fn converse(mut stream: TcpStream, answer: &dyn Fn(&Request) -> Answer) -> io::R
         stream.write_all(&content)?;
     }
     drop(content);
-    // What else a client sends is taken for a moment: closed at once, it might lose the answer.
+    // The rest of the request is read for a moment: after an immediate close, the client might lose the answer.
     stream.shutdown(Shutdown::Write)?;
     stream.set_read_timeout(Some(Duration::from_millis(500)))?;
     let end = Instant::now() + Duration::from_secs(2);

@@ -11,9 +11,9 @@ use crate::failure::Failure;
 
 /// File name of the weights in a folder.
 const IN_FOLDER: &str = "weights.safetensors";
-/// What is used where no weights are given: trained on made people (docs/weights.md).
+/// The default weights, trained on synthetic people (docs/weights.md).
 const DEFAULT: &[u8] = include_bytes!("../../../assets/weights/default.safetensors");
-/// What stands for their path.
+/// Their name in place of a path.
 pub const DEFAULT_NAME: &str = "the default weights";
 
 /// Opens a weight file, or `weights.safetensors` in a folder, or, without a path, the default weights; --config and --set win

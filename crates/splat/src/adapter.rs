@@ -1,4 +1,4 @@
-//! What the graphics layer computes through.
+//! The adapter behind the graphics layer.
 
 use cubecl_wgpu::wgpu::Backend;
 use cubecl_wgpu::{AutoGraphicsApi, GraphicsApi};

@@ -237,7 +237,7 @@ mod tests {
         assert!((level.centre() - rolled.centre()).length() < 1e-12);
         let point = DVec3::new(0.1, 1.4, 0.2);
         let [a, b] = [level, rolled].map(|c| c.project(point).expect("in front").0 - c.principal_point);
-        // What was below is now on the left's side of the image's own axes: (x, y) → (y, −x).
+        // The roll turns the image's axes: (x, y) → (y, −x).
         assert!((b - DVec2::new(a.y, -a.x)).length() < 1e-9, "{a} {b}");
     }
 

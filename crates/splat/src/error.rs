@@ -1,4 +1,4 @@
-//! What can go wrong on this floor.
+//! Errors of this crate.
 
 use snapsnap_base::FileError;
 

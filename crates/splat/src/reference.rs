@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use crate::options::{MIN_ALPHA, MIN_TRANSMITTANCE};
 use crate::{Camera, RenderOptions};
 
-/// What the oracle computes with: f64, f64 with derivatives, or f32 for comparison.
+/// Number type of the oracle: f64, f64 with derivatives, or f32 for comparison.
 pub trait Number:
     Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> + Div<Output = Self> + Neg<Output = Self>
 {

@@ -8,7 +8,7 @@ use burn::tensor::{DType, Tensor};
 use crate::op::{Counts, Job, SplatBackend, SplatInputs};
 use crate::{Camera, Gaussians, RenderOptions, SplatError};
 
-/// What [`render`] returns.
+/// Result of [`render`].
 #[derive(Debug, Clone)]
 pub struct Rendered {
     /// `[V,H,W,3]`: Σ c·α·T + T_final·background.
@@ -17,7 +17,7 @@ pub struct Rendered {
     pub alpha: Tensor<3>,
     /// `[V,H,W]`, metres: Σ t_z·α·T, not divided by alpha. Only if asked for.
     pub depth: Option<Tensor<3>>,
-    /// What was seen and what was left out.
+    /// Counts of visible Gaussians and of those left out.
     pub counts: Counts,
 }
 

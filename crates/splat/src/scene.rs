@@ -30,7 +30,7 @@ impl Kind {
         }
     }
 
-    /// What `path` is to be by its extension: SPZ for `.spz`, else PLY.
+    /// The kind of `path` by its extension: SPZ for `.spz`, else PLY.
     pub fn of(path: &Path) -> Self {
         Self::named(path).unwrap_or(Self::Ply)
     }
@@ -82,7 +82,7 @@ impl Stored {
         Ok(bytes)
     }
 
-    /// What a file of this kind would hold less well than its steps let expect: a sentence each.
+    /// Losses beyond the usual steps of this kind of file, a sentence each.
     pub fn losses(&self, kind: Kind) -> Vec<String> {
         match kind {
             Kind::Ply => Vec::new(),

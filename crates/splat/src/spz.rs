@@ -113,7 +113,7 @@ pub(crate) fn read(input: impl Read) -> Result<Stored, Problem> {
     Ok(Stored { coefficients, columns })
 }
 
-/// What an SPZ cannot hold.
+/// Refuses values that an SPZ cannot hold.
 pub(crate) fn check(stored: &Stored) -> Result<(), String> {
     let n = stored.len();
     if n > MAX_POINTS {
@@ -125,7 +125,7 @@ pub(crate) fn check(stored: &Stored) -> Result<(), String> {
     Ok(())
 }
 
-/// What an SPZ holds less well than its usual steps: a sentence each. Scales below e⁻¹⁰ m (45 µm) become that, which nobody sees.
+/// Losses beyond the usual steps of an SPZ, a sentence each. Scales below e⁻¹⁰ m (45 µm) become that, which is invisible.
 pub(crate) fn losses(stored: &Stored) -> Vec<String> {
     let mut losses = Vec::new();
     let bits = fractional_bits(stored);

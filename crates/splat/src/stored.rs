@@ -52,7 +52,7 @@ pub struct Stored {
 }
 
 impl Stored {
-    /// What is always there: centres in metres, quaternions (w, x, y, z), logarithms of standard deviations in metres, logits
+    /// Columns that every file has: centres in metres, quaternions (w, x, y, z), logarithms of standard deviations in metres, logits
     /// of opacities, and the coefficients of SH degree 0.
     pub const COLUMNS: [&str; 14] = [
         "x", "y", "z", "rot_0", "rot_1", "rot_2", "rot_3", "scale_0", "scale_1", "scale_2", "opacity",
@@ -139,7 +139,7 @@ impl Stored {
     }
 }
 
-/// What keeps a file from being read.
+/// Reason why a file cannot be read.
 pub(crate) enum Problem {
     Io(io::Error),
     Content(String),

@@ -101,7 +101,7 @@ pub struct View {
     pub y_max: f32,
 }
 
-/// What the forward and the backward pass both need of a projected Gaussian.
+/// Values of a projected Gaussian that both passes need.
 #[derive(CubeType, Clone, Copy, Debug)]
 pub struct Projection {
     /// Mean in the camera's frame.

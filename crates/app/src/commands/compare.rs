@@ -54,7 +54,7 @@ enum Window {
     Mask,
 }
 
-/// What two pictures give.
+/// Figures of two pictures.
 struct Compared {
     name: String,
     score: Score,

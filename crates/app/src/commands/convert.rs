@@ -14,7 +14,7 @@ use crate::say;
 pub struct Arguments {
     /// File of Gaussians, PLY or SPZ.
     input: PathBuf,
-    /// What to write: .ply or .spz.
+    /// Output file: .ply or .spz.
     output: PathBuf,
 }
 
@@ -27,7 +27,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     if quiet {
         return Ok(());
     }
-    // What goes into a pipe stays what it is.
+    // Messages must not enter a pipe of data.
     let say = if file::is_special(output) { say::err } else { say::out };
     if dropped > 0 {
         say(&format!(

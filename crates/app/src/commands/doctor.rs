@@ -27,7 +27,7 @@ const COMFORTABLE: u64 = 1_000_000_000;
 /// Weights that were looked for.
 struct Weights {
     name: String,
-    /// What they are, or what is wrong with them.
+    /// Their description, or their fault.
     state: Result<String, String>,
     /// How sound ones are got.
     mend: &'static str,
@@ -105,7 +105,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
 /// Weights that were asked for and are not sound are a failure; what merely could be better is none.
 fn broken(weights: &[Weights]) -> Result<(), Failure> {
     match weights.iter().find_map(|w| w.state.as_ref().err().map(|state| (&w.name, state))) {
-        // What is said of a file begins with its name.
+        // A message about a file begins with its name.
         Some((name, state)) if state.starts_with(name) => Err(Failure::Input(state.clone())),
         Some((name, state)) => Err(Failure::Input(format!("{name}: {state}"))),
         None => Ok(()),

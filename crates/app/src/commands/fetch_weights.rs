@@ -28,7 +28,7 @@ const CHUNK: usize = 1 << 16;
 
 #[derive(Args)]
 pub struct Arguments {
-    /// What to fetch [default: all of it].
+    /// Names to fetch [default: all].
     #[arg(value_enum)]
     what: Vec<Name>,
     /// A folder with the files, or a mirror's address below which they lie, instead of where they were published.
@@ -165,7 +165,7 @@ fn fetch(item: &Item, origin: &Origin, folder: &Path, quiet: bool) -> Result<(),
         Origin::Address(address) => address,
     };
     let part = folder.join(format!("{}.part", item.file));
-    // What else has that name is not ours to fill.
+    // A file of another kind with that name is left alone.
     if part.symlink_metadata().is_ok_and(|there| !there.is_file() || is_shared(&there)) {
         let message = "is no unfinished download: a link, or no regular file; move it away";
         return Err(Failure::Input(format!("{}: {message}", part.display())));
@@ -197,7 +197,7 @@ fn copy(item: &Item, from: &Path, path: &Path, quiet: bool) -> Result<(), Failur
     let mut source =
         file::open(from).map_err(|e| Failure::Input(format!("{}: cannot read: {e}", from.display())))?;
     let progress = Progress::bytes(quiet);
-    // What is written is what was summed, though the source change meanwhile.
+    // The checksum is that of the written bytes, even if the source changes meanwhile.
     let written = file::write_whole(path, |out| {
         let mut out = Summed { out, hasher: Sha256::new() };
         let length = take(&mut source, &mut out, 0, item, &progress)?;

@@ -71,7 +71,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     Ok(())
 }
 
-/// What was asked for, else what a file of ours says of itself, else the published size: the only published weights of it were
+/// The config that was asked for, else the one stored in a file of ours, else the published size: the only published weights of it were
 /// trained with every quirk of the published code.
 fn config(arguments: &Arguments) -> Result<Config, Failure> {
     if arguments.config.config.is_none() {

@@ -17,7 +17,7 @@ use crate::{device, memory, say};
 pub struct Arguments {
     /// File of Gaussians, PLY or SPZ.
     input: PathBuf,
-    /// What to write: .glb, .obj or .ply.
+    /// Output file: .glb, .obj or .ply.
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
     #[command(flatten)]
@@ -30,7 +30,7 @@ pub struct Arguments {
     verbose: bool,
 }
 
-/// What a surface is to be like.
+/// Options of a surface.
 #[derive(Args)]
 pub struct SurfaceArguments {
     /// Triangles of the mesh, about; 0 keeps all [default: 100000].

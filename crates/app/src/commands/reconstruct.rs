@@ -146,7 +146,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
         plan.push(told(&mesh.write(&world.clone().into(), &arguments.output, quiet)?));
         times.push(("mesh", since.elapsed()));
     }
-    // What goes into a pipe must stay a PLY.
+    // Messages must not enter a pipe of data.
     let say = if file::is_special(&arguments.output) { say::err } else { say::out };
     if arguments.verbose {
         report(say, &plan, &times, start.elapsed());

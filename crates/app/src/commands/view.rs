@@ -48,7 +48,7 @@ const PAGE: [PageFile; 4] = [
 
 pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let input = arguments.input.as_path();
-    // What cannot be shown is refused here and not in the browser.
+    // Unsuitable files are refused here and not in the browser.
     finite(input)?;
     let wanted = arguments.port.unwrap_or(0);
     let cannot = |e: io::Error| Failure::Input(format!("--port {wanted}: cannot listen on 127.0.0.1: {e}"));
@@ -56,7 +56,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let port = listener.local_addr().map_err(cannot)?.port();
     let url = format!("http://127.0.0.1:{port}/");
     interrupt::end_well();
-    // Whoever asked for silence still has to know where it is.
+    // The address is printed with --quiet as well.
     say::out(&url);
     if !quiet {
         say::err(&format!("shows {}; Ctrl-C ends it", input.display()));

@@ -1,4 +1,4 @@
-//! What one call of the operation is to do, and what it counted: plain host data.
+//! Input of one call of the operation, and its counts: plain host data.
 
 use crate::options::{MIN_TRANSMITTANCE, RenderOptions, TILE};
 use crate::vjp::{Mat3, Vec3, View};

@@ -87,9 +87,9 @@ pub trait SplatBackend: Backend {
 /// Image, state if kept, counts.
 pub type Forward<B> = Result<(FloatTensor<B>, Option<<B as SplatKernels>::State>, Counts), SplatError>;
 
-/// What a backend without autodiff brings along.
+/// Operations of a backend without autodiff.
 pub trait SplatKernels: Backend {
-    /// What the backward pass needs beside the inputs.
+    /// Values that the backward pass needs beside the inputs.
     type State: Clone + Send + Debug + 'static;
 
     /// Image, and the state where `keep`.
@@ -130,7 +130,7 @@ fn failed<B: Backend>(anything: FloatTensor<B>, error: SplatError) -> SplatOutpu
     SplatOutput { color, alpha, depth, counts: Err(error) }
 }
 
-/// What arrives at the outputs, until the backward pass fetches it.
+/// Gradients of the outputs, until the backward pass reads them.
 type Arrived<B> = Arc<Mutex<[Option<FloatTensor<B>>; 3]>>;
 
 #[derive(Debug)]

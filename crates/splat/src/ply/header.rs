@@ -107,11 +107,11 @@ pub struct Element {
     pub name: String,
     /// Rows that the header promises.
     pub count: usize,
-    /// What each row holds, in order.
+    /// Properties of each row, in order.
     pub properties: Vec<Property>,
 }
 
-/// What stands before the body.
+/// The header.
 #[derive(Clone, Debug)]
 pub struct Header {
     /// How the body is written.
@@ -127,7 +127,7 @@ pub struct Header {
 /// Reads the header at the start of `bytes`.
 ///
 /// # Errors
-/// What is wrong with it, without the file's name.
+/// A fault of the header, without the file's name.
 pub fn parse(bytes: &[u8]) -> Result<Header, String> {
     let mut rest = &bytes[..bytes.len().min(MAX_HEADER)];
     let mut number = 0;

@@ -5,7 +5,7 @@
 //! ([`blend`]). Empty tiles have empty lists and cost nothing but the writing of their pixels. The backward pass walks
 //! the same lists from the back ([`mod@backward`]).
 //!
-//! Whatever is shared out among threads is joined again in a fixed order, so results do not depend on their number.
+//! Results of threads are joined in a fixed order, so that they do not depend on the number of threads.
 
 #![allow(
     clippy::needless_range_loop,
@@ -44,7 +44,7 @@ impl Scene<'_> {
     }
 }
 
-/// What the backward pass needs of each view.
+/// Values of each view that the backward pass needs.
 #[derive(Debug, Default)]
 pub struct State {
     views: Vec<ViewState>,
@@ -162,7 +162,7 @@ mod tests {
         }
     }
 
-    /// What is not wanted takes no room, and what is wanted is the same by itself.
+    /// Unwanted gradients take no memory, and wanted ones do not depend on the others.
     #[test]
     fn only_what_is_wanted_is_made() {
         let full = pass(EVERYTHING).1;

@@ -103,7 +103,7 @@ pub fn pixels(
     let start = starts[CUBE_POS] as usize;
     let end = ends[CUBE_POS] as usize;
 
-    // What lies behind them has no gradient.
+    // Splats behind them have no gradient.
     let mut unseen = start + visited + unit;
     while unseen < end {
         for i in 0..len {

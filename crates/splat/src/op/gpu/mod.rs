@@ -47,7 +47,7 @@ fn channels(depth: bool) -> usize {
     if depth { 5 } else { 4 }
 }
 
-/// What the backward pass needs.
+/// Values that the backward pass needs.
 #[derive(Debug, Clone)]
 pub struct State {
     views: CubeTensor,
