@@ -336,7 +336,7 @@ fn what_cannot_be_evaluated_is_refused_by_name() {
     fs::create_dir(&training).expect("a folder");
     fs::write(training.join("config.toml"), "[training]").expect("writes");
     let said = refused(&mut evaluate(people(), &training, &[]));
-    assert!(said.contains("config.toml") && said.contains("not a report's"), "{said}");
+    assert!(said.contains("config.toml") && said.contains("belongs to no report"), "{said}");
     assert_eq!(fs::read_dir(&training).expect("there").count(), 1);
     // A report does not replace what it is made of.
     fs::create_dir(&report).expect("a folder");
