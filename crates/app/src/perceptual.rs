@@ -1,4 +1,4 @@
-//! Finding the weights of LPIPS.
+//! The weights of LPIPS.
 
 use std::path::{Path, PathBuf};
 
@@ -8,32 +8,33 @@ use snapsnap_eval::lpips::Lpips;
 use crate::device;
 use crate::failure::Failure;
 
-/// Where `cargo xtask fetch-weights` puts them.
+/// Default folder of the weights.
 pub const FOLDER: &str = "weights";
 
 #[derive(Args)]
 pub struct Arguments {
-    /// Folder with the published weights of AlexNet and LPIPS, as `cargo xtask fetch-weights` makes it, or weight files of
-    /// your own [default: weights].
+    /// Folder with the published weights of AlexNet and LPIPS, as `cargo xtask fetch-weights` makes it, or weight files
+    /// of your own [default: weights].
     #[arg(long, value_name = "DIR|FILE", num_args = 1..)]
     lpips: Vec<PathBuf>,
 }
 
 impl Arguments {
-    /// Files that are given.
+    /// Files of the command line.
     pub fn files(&self) -> &[PathBuf] {
         &self.lpips
     }
 
-    /// The network on the device of this name, which is not looked for in vain; or why there is none.
+    /// The network on the device of this name, or the reason for its absence. The device is chosen only if there are
+    /// weights.
     ///
     /// # Errors
-    /// If weights that were asked for are not there, or those that are there are damaged.
+    /// If weights of the command line are missing, or weights are damaged.
     pub fn load(&self, device: &str) -> Result<Result<Lpips, String>, Failure> {
         self.load_or(Path::new(FOLDER), device)
     }
 
-    /// The same with another folder to look in where none is given.
+    /// The same with another default folder.
     ///
     /// # Errors
     /// As [`Self::load`].
@@ -51,7 +52,7 @@ impl Arguments {
     }
 }
 
-/// The weights of LPIPS, or the reason for its absence, for reports.
+/// The weights of LPIPS, or the reason for their absence, for reports.
 pub fn describe(lpips: &Result<Lpips, String>) -> String {
     match lpips {
         Ok(network) if network.is_published() => "published weights".into(),

@@ -1,4 +1,4 @@
-//! The folder that a report is written into, and what stands on top of it.
+//! Folders of reports, their headers, and the errors of incomplete ones.
 
 use std::cell::RefCell;
 use std::fs;
@@ -8,14 +8,15 @@ use std::path::{Path, PathBuf};
 use image::RgbImage;
 use serde_json::Value;
 use snapsnap_base::file;
+use snapsnap_eval::evaluate::LeftOut;
 use snapsnap_eval::report::{Header, today};
 
 use crate::commands::check_outputs;
 use crate::failure::Failure;
-use crate::output;
 use crate::pictures::{make_folder, write_png};
+use crate::{output, say};
 
-/// Files that reports on figures have, of whatever command.
+/// Files of the reports of all commands but those that pass their own.
 const FILES: &[&str] = &[
     "report.md",
     "config.toml",
@@ -29,28 +30,28 @@ const FILES: &[&str] = &[
     "training_pictures.svg",
     REPORT,
 ];
-/// By which a report is known; written last.
+/// The file that marks a folder as a report. It is written last.
 pub const REPORT: &str = "report.json";
-/// Longest one that is looked into.
+/// Largest size of such a file in bytes.
 const MOST: u64 = 256 << 20;
 
 /// Files of one report.
 pub struct ReportFolder {
     path: PathBuf,
-    /// All that there can be.
+    /// All possible files.
     files: &'static [&'static str],
     is_new: bool,
     written: RefCell<Vec<String>>,
 }
 
 impl ReportFolder {
-    /// Makes the folder. Refuses one where a report's files cannot be written, or would replace one of the `inputs` or anything
-    /// but an older report's.
+    /// Makes the folder. Refuses one in which a report's files cannot be written, or would replace one of the `inputs`
+    /// or files that belong to no older report.
     pub fn new(path: &Path, inputs: &[&Path]) -> Result<Self, Failure> {
         Self::of(path, FILES, inputs)
     }
 
-    /// The same for a report with files of its own; the last is [`REPORT`].
+    /// The same for a report with other files, the last of which is [`REPORT`].
     pub fn of(path: &Path, files: &'static [&'static str], inputs: &[&Path]) -> Result<Self, Failure> {
         if path.exists() && !path.is_dir() {
             return Err(Failure::Input(format!("{}: exists and is no folder", path.display())));
@@ -69,12 +70,12 @@ impl ReportFolder {
         Ok(folder)
     }
 
-    /// Where it is.
+    /// The folder.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Writes text, if there is any.
+    /// Writes a text unless it is empty.
     pub fn text(&self, name: &str, text: &str) -> Result<(), Failure> {
         if text.is_empty() {
             return Ok(());
@@ -87,12 +88,12 @@ impl ReportFolder {
         picture.map_or(Ok(()), |picture| write_png(&self.file(name), picture))
     }
 
-    /// Writes the report's JSON, and removes what an older report had and this one has not.
+    /// Writes the report's JSON, and removes files of an older report that this one does not have.
     pub fn finish(&self, value: &Value) -> Result<(), Failure> {
         let text = serde_json::to_string_pretty(value).expect("a value") + "\n";
         self.text(REPORT, &text)?;
         let written = self.written.borrow();
-        for name in self.files.iter().filter(|name| !written.iter().any(|there| there == *name)) {
+        for name in self.files.iter().filter(|name| !written.iter().any(|file| file == *name)) {
             let path = self.path.join(name);
             match fs::remove_file(&path) {
                 Err(e) if e.kind() != io::ErrorKind::NotFound => {
@@ -104,7 +105,7 @@ impl ReportFolder {
         Ok(())
     }
 
-    /// A file that the caller writes.
+    /// Path of a file that the caller writes.
     pub fn file(&self, name: &str) -> PathBuf {
         assert!(self.files.contains(&name), "{name}");
         self.written.borrow_mut().push(name.to_owned());
@@ -113,7 +114,7 @@ impl ReportFolder {
 }
 
 impl Drop for ReportFolder {
-    /// An empty folder is nothing to leave behind.
+    /// Removes a new folder that is still empty.
     fn drop(&mut self) {
         if self.is_new {
             let _ = fs::remove_dir(&self.path);
@@ -121,7 +122,7 @@ impl Drop for ReportFolder {
     }
 }
 
-/// Whether a folder holds a report of ours.
+/// Whether a folder contains a report of this program.
 fn is_report(folder: &Path) -> bool {
     let text = file::read_text(&folder.join(REPORT), MOST).unwrap_or_default();
     let report: Value = serde_json::from_str(&text).unwrap_or_default();
@@ -129,7 +130,22 @@ fn is_report(folder: &Path) -> bool {
         && !report["commit"].is_null()
 }
 
-/// The command line as it was typed, program and all.
+/// The error of a command with failed parts, which are printed. `rest` describes the other parts.
+pub fn complete(left_out: &[LeftOut], rest: &str) -> Result<(), Failure> {
+    if left_out.is_empty() {
+        return Ok(());
+    }
+    left_out.iter().for_each(|l| say::err(&format!("left out: {}: {}", l.name, l.why)));
+    Err(Failure::Internal(format!("{} left out, {rest}", left_out.len())))
+}
+
+/// The error of a command without any successful part.
+pub fn nothing_left(message: &str, left_out: &[LeftOut]) -> Failure {
+    let whys: Vec<String> = left_out.iter().map(|l| format!("{}: {}", l.name, l.why)).collect();
+    Failure::Input(format!("{message}: {}", whys.join("; ")))
+}
+
+/// The header of a report, with the command line of this process.
 pub fn header(device: &str) -> Header {
     let words = std::env::args_os().skip(1).map(|word| {
         let word = word.to_string_lossy().into_owned();

@@ -1,6 +1,6 @@
 //! Baselines of an evaluation (docs/method.md, "Evaluation").
 
-use std::path::Path;
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use burn::tensor::{Device, Tensor, TensorData};
@@ -14,14 +14,14 @@ use snapsnap_splat::{Camera, Gaussians};
 
 use crate::EvalError;
 use crate::evaluate::model::joined;
-use crate::evaluate::person::{part_of, smaller, test_of};
+use crate::evaluate::person::{People, part_of, planes, smaller, test_of};
 use crate::pictures::Picture;
 
-/// Largest side at which mean pictures are kept: they are smooth.
+/// Largest side of mean pictures, which are smooth.
 const MEAN_SIDE: usize = 256;
 
-/// Photographs `[N,3,S,S]` in [−1, 1] as flat cut-outs, each in the upright plane through the body's axis that faces its
-/// camera; world frame. `valid` `[N,S,S]` says which pixels are the person's. `None` if none is.
+/// Photographs `[N,3,S,S]` in [−1, 1] as flat cut-outs, each in the upright plane through the body's axis that faces
+/// its camera; world frame. `valid` `[N,S,S]` is the person's mask. `None` if it is empty.
 pub fn billboard(
     images: &[f32],
     valid: &[bool],
@@ -41,8 +41,8 @@ pub fn billboard(
     some(joined(cameras.iter().enumerate().map(part).collect()))
 }
 
-/// Where the rays of a camera's pixels meet the upright plane through the world's y axis that faces it: `[S,S,3]` metres in the
-/// camera's frame.
+/// Intersections of the rays of a camera's pixels with the upright plane through the world's y axis that faces it:
+/// `[S,S,3]` metres in the camera's frame.
 fn upright(camera: &Camera, side: usize) -> Vec<f32> {
     let camera = camera.resized(side as u32, side as u32);
     let centre = camera.centre();
@@ -56,9 +56,9 @@ fn upright(camera: &Camera, side: usize) -> Vec<f32> {
     (0..side * side).flat_map(point).collect()
 }
 
-/// True points `[V,S,S,3]` (metres, first camera's frame) where `valid` `[V,S,S]`, in the colours of the first `photographs`
-/// views' own photographs `[N,3,S,S]` in [−1, 1]; further views are sides, which get the nearest points' colours. World frame.
-/// `None` if nothing is valid.
+/// Gaussians (world frame) at ground-truth points `[V,S,S,3]` (metres, first camera's frame) with the mask `valid`
+/// `[V,S,S]`. The first `photographs` views have the colours of their photographs `[N,3,S,S]` in [−1, 1]. Further views
+/// are sides with the colours of the nearest points. `None` if the mask is empty.
 pub fn true_points(
     images: &[f32],
     photographs: usize,
@@ -95,46 +95,49 @@ fn some(gaussians: Gaussians) -> Option<Gaussians> {
     (!gaussians.is_empty()).then_some(gaussians)
 }
 
-/// The mean picture, view by view, of people to train on.
+/// The mean picture of training people for each view.
 pub struct MeanPictures {
     side: usize,
     /// `[3,S,S]` of each view.
     views: Vec<Vec<f32>>,
-    /// How many people.
-    pub people: usize,
 }
 
 impl MeanPictures {
-    /// Of the training people of data sets that have `views` views each.
+    /// Mean pictures of the training people in data sets with the views of the people to evaluate.
     ///
     /// # Errors
-    /// [`EvalError`] for a set with other views or sizes, or a picture that cannot be read.
-    pub fn new(folders: &[impl AsRef<Path>], views: usize) -> Result<Self, EvalError> {
+    /// [`EvalError`] for sets with different views or sizes, or a picture that cannot be read.
+    pub fn new(folders: &[PathBuf], evaluated: &[People]) -> Result<Self, EvalError> {
+        let views = evaluated.first().map_or(0, People::views);
+        if let Some(set) = evaluated.iter().find(|set| set.views() != views) {
+            let (root, found) = (set.folder().root().display(), set.views());
+            let message = format!(
+                "{root} has {found} views, the data set before it {views}: mean pictures need equal views"
+            );
+            return Err(EvalError::Empty(message));
+        }
         let mut sums: Vec<Vec<f64>> = Vec::new();
         let (mut side, mut people) = (0, 0);
         for path in folders {
-            let path = path.as_ref();
             let folder = Arc::new(Folder::open(path)?);
             let found = folder.description().views;
-            let wrong = |message: String| EvalError::Empty(format!("{}: {message}", path.display()));
+            let wrong = |message: &str| EvalError::Empty(format!("{}: {message}", path.display()));
             if found != views {
-                return Err(wrong(format!("has {found} views, the people to evaluate {views}")));
+                return Err(wrong(&format!("has {found} views, the people to evaluate {views}")));
             }
             if folder.description().arrangement != Arrangement::Ring {
-                return Err(wrong(
-                    "is arranged in groups: its views are not those of the people to evaluate".into(),
-                ));
+                return Err(wrong("is arranged in groups: mean pictures need a ring of views"));
             }
             let stored = folder.description().resolution as usize;
             let kept = part_of(stored, MEAN_SIDE);
             if side != 0 && kept != side {
-                return Err(wrong(format!("has pictures of {kept}², the sets before it of {side}²")));
+                return Err(wrong(&format!("has pictures of {kept}², the sets before it of {side}²")));
             }
             side = kept;
-            // Filled by the first picture: memory follows pictures, and not what a data set says of itself.
+            // Sums get their size from the first picture, not from the description of the data set.
             sums.resize(views, Vec::new());
             let test = test_of(&folder, Some(Split::Train))?;
-            // Every view sums its people in their order, so that the number of threads changes nothing.
+            // Each view sums its people in their order, so that the result does not depend on the number of threads.
             sums.par_iter_mut().enumerate().try_for_each(|(view, sum)| -> Result<(), EvalError> {
                 for row in 0..test.len() {
                     let (values, _) = test.target(row, view, [0.0; 3])?;
@@ -147,7 +150,7 @@ impl MeanPictures {
             people += test.len();
         }
         let mean = |sum: Vec<f64>| sum.into_iter().map(|v| (v / people as f64) as f32).collect();
-        Ok(Self { side, views: sums.into_iter().map(mean).collect(), people })
+        Ok(Self { side, views: sums.into_iter().map(mean).collect() })
     }
 
     /// The mean picture of a view at a size.
@@ -155,8 +158,7 @@ impl MeanPictures {
     /// # Errors
     /// Never; a picture's values are checked.
     pub fn picture(&self, view: usize, side: usize) -> Result<Picture, EvalError> {
-        let planes = TensorData::new(self.views[view].clone(), [1, 3, self.side, self.side]);
-        let planes = Tensor::<4>::from_data(planes, &Device::flex());
+        let planes = planes(self.views[view].clone(), 3, self.side);
         let planes = if side == self.side { planes } else { bilinear(planes, [side, side], false) };
         Picture::new(host(planes.clamp(0.0, 1.0)), [side, side], "mean picture")
     }
@@ -167,9 +169,9 @@ mod tests {
     use super::*;
     use snapsnap_splat::Orbit;
 
-    /// Points of a cut-out lie in a plane through the body's axis, and their camera sees them where their pixels are.
+    /// Points of a cut-out lie in a plane through the body's axis and project to the centres of their pixels.
     #[test]
-    fn a_cut_out_stands_upright_before_any_camera() {
+    fn a_cut_out_is_upright_for_any_camera() {
         let orbit =
             Orbit { radius: 2.7, yaw_degrees: 70.0, pitch_degrees: -4.0, focal: 0.9, ..Orbit::default() };
         let camera = orbit.camera(64);

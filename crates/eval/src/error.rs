@@ -1,4 +1,4 @@
-//! What can be wrong with what is compared.
+//! Errors of comparisons.
 
 use snapsnap_base::FileError;
 use snapsnap_base::config::ConfigError;
@@ -8,18 +8,18 @@ use snapsnap_splat::SplatError;
 /// A comparison that cannot be made.
 #[derive(Debug, thiserror::Error)]
 pub enum EvalError {
-    /// Pictures of different sizes.
+    /// Different sizes.
     #[error("the sizes differ: {} and {}", size(found), size(expected))]
     Sizes {
-        /// `[B, C, H, W]`, or what there is of it.
+        /// Extents, the last two of which are height and width.
         found: Vec<usize>,
-        /// What it is compared with.
+        /// Those of the other picture.
         expected: Vec<usize>,
     },
-    /// A value that no picture has: not finite, or outside [0, 1], as of values up to 255 that were not divided.
+    /// A value of a picture that is not finite or outside [0, 1], such as one of 0 to 255.
     #[error("value {value} at channel {channel}, row {row}, column {column} of the {what}: must be 0 to 1")]
     Value {
-        /// Which of the two.
+        /// The picture.
         what: &'static str,
         /// The value.
         value: f32,
@@ -47,7 +47,7 @@ pub enum EvalError {
     Splat(#[from] SplatError),
 }
 
-/// The last two extents as people say them.
+/// Width and height for messages.
 fn size(extents: &[usize]) -> String {
     match extents {
         [.., height, width] => format!("{width}×{height}"),

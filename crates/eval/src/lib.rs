@@ -1,5 +1,5 @@
-//! How like the truth pictures and surfaces are, and what that costs: metrics, the evaluation of a model on a data set, error
-//! against run time, numerical stability.
+//! Metrics of pictures and surfaces, the evaluation of a model on a data set, error against run time, numerical
+//! stability.
 
 pub mod baselines;
 pub mod bench;
@@ -16,5 +16,6 @@ pub mod score;
 pub mod similarity;
 pub mod stability;
 pub mod statistics;
+pub mod variant;
 
 pub use error::EvalError;

@@ -9,15 +9,15 @@ use burn::tensor::ops::{ConvOptions, MaxPoolOptions};
 use burn::tensor::{Device, Tensor, TensorData};
 use snapsnap_net::weights::{Source, WeightsError, not_finite};
 
-/// Least side of a picture: below it nothing is left for the third layer.
+/// Least side of a picture. Smaller ones leave no pixel for the third layer.
 pub const MIN_SIDE: usize = 31;
 
-/// Names under which `cargo xtask fetch-weights` keeps the published files: torchvision's AlexNet and the authors' learned layers.
+/// File names of the published weights: torchvision's AlexNet and the authors' learned layers.
 pub const PUBLISHED: [&str; 2] = ["alexnet-owt-7be5be79.pth", "lpips-alex-v0.1.pth"];
-/// What the authors' package says with these of the two pictures of [`Lpips::check`] (docs/lpips_reference.py).
+/// Distance of the two pictures of [`Lpips::check`] with the authors' package (docs/lpips_reference.py).
 const KNOWN: f64 = 0.093_218_468;
 
-/// What is subtracted from red, green and blue in [−1, 1], and what they are divided by.
+/// Shift and divisor of red, green and blue in [−1, 1].
 const SHIFT: [f32; 3] = [-0.030, -0.088, -0.188];
 const SCALE: [f32; 3] = [0.458, 0.448, 0.450];
 /// Added to the length of a pixel's features.
@@ -25,13 +25,13 @@ const EPSILON: f64 = 1e-10;
 
 /// A convolution of torchvision's AlexNet.
 struct Layer {
-    /// Its place in `features`.
+    /// Its index in `features`.
     place: usize,
     /// Outputs, inputs, side of the kernel.
     size: [usize; 3],
     stride: usize,
     padding: usize,
-    /// Whether the largest of 3×3 pixels, of every second, is what it sees.
+    /// Whether a max pooling of 3×3 pixels with stride 2 precedes it.
     pooled: bool,
 }
 
@@ -60,11 +60,12 @@ struct Parameters {
 }
 
 impl Lpips {
-    /// Reads AlexNet (`features.*`; its classifier is not needed) and the learned layers (`lin0.model.1.weight` to `lin4…`),
-    /// as torchvision and the authors publish them, in one file or several.
+    /// Reads AlexNet (`features.*` without the classifier) and the learned layers (`lin0.model.1.weight` to `lin4…`)
+    /// from one or several files with the names of torchvision and the authors.
     ///
     /// # Errors
-    /// [`WeightsError`] for files that cannot be read and for tensors that are missing, unknown, given twice or mis-shaped.
+    /// [`WeightsError`] for files that cannot be read and for tensors that are missing, unknown, given twice or
+    /// mis-shaped.
     pub fn load(files: &[PathBuf], device: &Device) -> Result<Self, WeightsError> {
         let sources = files.iter().map(|path| Source::open(path)).collect::<Result<Vec<_>, _>>()?;
         let mut problems = Vec::new();
@@ -122,12 +123,12 @@ impl Lpips {
         Ok(Self { layers: layers.into() })
     }
 
-    /// Which of the published files are not in a folder.
+    /// Published files that are not in a folder.
     pub fn missing(folder: &Path) -> Vec<PathBuf> {
         PUBLISHED.map(|name| folder.join(name)).into_iter().filter(|file| !file.exists()).collect()
     }
 
-    /// The published weights in a folder, their known value checked.
+    /// The published weights in a folder, checked with a known distance.
     ///
     /// # Errors
     /// [`WeightsError`] for files that cannot be read, or that are not the published ones.
@@ -136,20 +137,21 @@ impl Lpips {
         let network = Self::load(&files, device)?;
         if !network.is_published() {
             let found = network.check();
-            let problem =
-                format!("on the check pictures they give {found:.6}, the published ones {KNOWN:.6}");
+            let problem = format!(
+                "the distance of the check pictures is {found:.6}, with published weights {KNOWN:.6}"
+            );
             return Err(WeightsError::Tensors { origin: origin(&files), problems: vec![problem] });
         }
         Ok(network)
     }
 
-    /// Whether it gives the published weights' distance of the check pictures. Devices differ in rounding, by far less than
-    /// weights do.
+    /// Whether the distance of the check pictures is that of the published weights. Differences between devices are far
+    /// smaller than those between weights.
     pub fn is_published(&self) -> bool {
         (self.check() - KNOWN).abs() <= 1e-4 * KNOWN
     }
 
-    /// Distance of two pictures of 64 × 64 pixels that follow from a formula: noise, and half that noise and half another.
+    /// Distance of two pictures of 64 × 64 pixels: noise from a formula, and its mean with other noise.
     pub fn check(&self) -> f64 {
         const SIDE: usize = 64;
         let device = self.device();
@@ -162,7 +164,7 @@ impl Lpips {
         f64::from(self.distance(a, half).into_scalar::<f32>())
     }
 
-    /// Where its weights are.
+    /// Device of its weights.
     pub fn device(&self) -> Device {
         self.layers[0].weight.device()
     }
@@ -177,8 +179,8 @@ impl Lpips {
         Self { layers: self.layers.iter().map(moved).collect() }
     }
 
-    /// Distance of each picture from its truth, `[B]`: pictures `[B, 3, H, W]` with values in [0, 1], sides of
-    /// [`MIN_SIDE`] at least, on the device of the network.
+    /// Distance of each picture from its target, `[B]`. Pictures `[B, 3, H, W]` have values in [0, 1], sides of at
+    /// least [`MIN_SIDE`], and the device of the network.
     ///
     /// # Panics
     /// If a picture is smaller, or has another number of channels.
@@ -209,7 +211,7 @@ impl Parameters {
     }
 }
 
-/// Values in [0, 1] as the network was trained to see them.
+/// Values in [0, 1] with the network's normalisation.
 fn normalised(x: Tensor<4>) -> Tensor<4> {
     let of_channel = |values: [f32; 3]| {
         Tensor::<1>::from_floats(values, &x.device()).reshape([1, 3, 1, 1]).cast(x.dtype())
@@ -219,13 +221,13 @@ fn normalised(x: Tensor<4>) -> Tensor<4> {
 
 /// Features of length 1 per pixel.
 fn unit(x: Tensor<4>) -> Tensor<4> {
-    /// The square root has no gradient at 0, which is where a pixel has no features at all.
+    /// Least square, since the square root has no gradient at 0.
     const MIN_SQUARE: f64 = 1e-30;
     let length = x.clone().square().sum_dim(1).clamp_min(MIN_SQUARE).sqrt();
     x / (length + EPSILON)
 }
 
-/// Numbers in [0, 1) that any language makes alike.
+/// Numbers in [0, 1), equal in every language.
 fn number(stream: u32, place: usize) -> f64 {
     let mixed = (place as u32).wrapping_mul(2_654_435_761).wrapping_add(stream.wrapping_mul(40_503_121));
     let mixed = (mixed ^ (mixed >> 15)).wrapping_mul(2_246_822_519);
@@ -278,7 +280,7 @@ mod tests {
         Tensor::from_data(TensorData::new(values(stream, 3 * h * w, |u| u), [1, 3, h, w]), device)
     }
 
-    /// What the authors' package gives (docs/lpips_reference.py): distance, and norm and sum of its gradient.
+    /// Distance, and norm and sum of its gradient, of the authors' package (docs/lpips_reference.py).
     #[test]
     fn distances_and_gradients_are_the_authors() {
         const EXPECTED: [([usize; 2], [f64; 3]); 3] = [

@@ -1,5 +1,5 @@
-//! Pictures as they are compared: red, green and blue in [0, 1], one plane after the other. There is one way in for every
-//! kind of source, so that neither the range nor the order of colours can be got wrong without a word.
+//! Pictures for comparisons: red, green and blue planes in [0, 1]. Each kind of source has one checked constructor, so
+//! that wrong ranges and orders of colours are errors.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use image::{DynamicImage, Rgb32FImage, RgbImage};
@@ -36,8 +36,7 @@ impl Picture {
         Ok(Self { width, height, values })
     }
 
-    /// What a renderer gives, `[H, W, 3]`, shrunk to means of `times`² pixels: values beyond what a file or a screen can show
-    /// are cut first.
+    /// A render `[H, W, 3]`, clamped to [0, 1] and shrunk to means of `times`² pixels.
     ///
     /// # Errors
     /// [`EvalError::Value`] for a value that is not finite.
@@ -64,7 +63,7 @@ impl Picture {
                         sums.iter_mut().zip(pixel).for_each(|(sum, v)| *sum += cut(*v));
                     }
                 }
-                // Rounding of the mean of ones must not leave [0, 1].
+                // Rounding can move the mean of ones beyond 1.
                 let mean =
                     |sum: f32| if sum.is_nan() { sum } else { (sum / (times * times) as f32).min(1.0) };
                 (red[column], green[column], blue[column]) = (mean(sums[0]), mean(sums[1]), mean(sums[2]));
@@ -73,18 +72,17 @@ impl Picture {
         Self::new(planes, size, "render")
     }
 
-    /// 8 bits per channel.
+    /// A picture with 8 bits per channel.
     pub fn from_rgb8(picture: &RgbImage) -> Self {
         let plane = |c: usize| picture.pixels().map(move |p| f32::from(p.0[c]) / 255.0);
         let (width, height) = (picture.width() as usize, picture.height() as usize);
         Self { width, height, values: (0..3).flat_map(plane).collect() }
     }
 
-    /// Any file's picture. Grey is red, green and blue alike; where there is alpha, the picture is laid over black, which is
-    /// what the protocols have behind people.
+    /// A picture of any file. Pictures with alpha are laid over black, the background of the protocols.
     ///
     /// # Errors
-    /// [`EvalError::Value`]: a file of floating-point numbers may hold anything.
+    /// [`EvalError::Value`] for files of floating-point numbers with other values.
     pub fn from_file(picture: DynamicImage, what: &'static str) -> Result<Self, EvalError> {
         let (width, height) = (picture.width() as usize, picture.height() as usize);
         let planes = |values: &Rgb32FImage, share: &dyn Fn(usize) -> f32| -> Vec<f32> {
@@ -128,10 +126,10 @@ impl Picture {
         &self.values[channel * self.height * self.width..][..self.height * self.width]
     }
 
-    /// The part of it in `[x, y, width, height]`.
+    /// The part `[x, y, width, height]`.
     ///
     /// # Panics
-    /// If that is not inside.
+    /// If it is not inside the picture.
     pub fn cropped(&self, [x, y, width, height]: [usize; 4]) -> Self {
         assert!(x + width <= self.width && y + height <= self.height, "{width}×{height} at {x}, {y}");
         let line = |c: usize, row: usize| &self.plane(c)[row * self.width + x..][..width];
@@ -139,7 +137,7 @@ impl Picture {
         Self { width, height, values: lines.flat_map(|(c, row)| line(c, row)).copied().collect() }
     }
 
-    /// The same with black wherever `inside` `[H, W]` is not set.
+    /// The picture with black pixels outside of the mask `inside` `[H, W]`.
     pub fn only(mut self, inside: &[bool]) -> Self {
         for plane in self.values.chunks_exact_mut(inside.len().max(1)) {
             plane.iter_mut().zip(inside).filter(|(_, set)| !**set).for_each(|(v, _)| *v = 0.0);
@@ -147,7 +145,7 @@ impl Picture {
         self
     }
 
-    /// In 8 bits.
+    /// The picture with 8 bits per channel.
     pub fn to_rgb8(&self) -> RgbImage {
         RgbImage::from_fn(self.width as u32, self.height as u32, |x, y| {
             let at = y as usize * self.width + x as usize;
@@ -188,13 +186,13 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_in_0_to_1_is_refused_with_its_place() {
+    fn values_outside_of_0_to_1_are_refused_with_their_place() {
         let values = |bad: f32| (0..18).map(|i| if i == 16 { bad } else { 0.5 }).collect::<Vec<f32>>();
         for bad in [255.0, -1e-6, 1.000_001, f32::NAN, f32::INFINITY] {
             let said = Picture::new(values(bad), [2, 3], "picture").expect_err("refused").to_string();
             assert!(said.contains("channel 2, row 1, column 1 of the picture"), "{said}");
         }
-        // Renders are cut, but a NaN is no colour.
+        // Renders are clamped, but a NaN is an error.
         assert_eq!(Picture::rendered(&values(7.0), [2, 3], 1).expect("cut").plane(1)[5], 1.0);
         assert!(Picture::rendered(&values(f32::NAN), [2, 3], 1).is_err());
     }
@@ -213,7 +211,7 @@ mod tests {
         let picture = Picture::new(values, [4, 4], "picture").expect("a picture");
         let crop = picture.cropped([1, 2, 2, 1]);
         assert_eq!(crop.values(), [9.0, 10.0, 25.0, 26.0, 41.0, 42.0].map(|v| v / 48.0));
-        // A render has its colours side by side; red and blue are 0 here, what is over 1 is cut before the mean.
+        // A render has interleaved colours. Values over 1 are clamped before the mean.
         let render: Vec<f32> = (0..16).flat_map(|i| [0.0, if i == 6 { 9.0 } else { 0.5 }, 0.0]).collect();
         let half = Picture::rendered(&render, [4, 4], 2).expect("a picture");
         assert_eq!(

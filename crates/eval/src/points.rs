@@ -1,38 +1,38 @@
-//! How far predicted points lie from the true ones, view by view.
+//! Distances of predicted points from the ground truth for each view.
 
 /// Names of the views in reports, in their order.
 pub const VIEWS: [&str; 4] = ["front", "back", "right", "left"];
 
-/// A view's predicted and true points.
+/// A view's predicted and ground-truth points.
 #[derive(Debug, Clone, Copy)]
 pub struct Pair<'a> {
-    /// Its place among [`VIEWS`].
+    /// Its index in [`VIEWS`].
     pub view: usize,
     /// `[H,W,3]` metres.
     pub points: &'a [f32],
     /// `[H,W,3]` metres, same frame.
     pub truth: &'a [f32],
-    /// `[H,W]` above ½ where there is a true point.
+    /// `[H,W]`, above ½ at pixels with ground truth.
     pub valid: &'a [f32],
 }
 
 /// Mean distances of one person's points in a view, metres.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PointError {
-    /// Its place among [`VIEWS`].
+    /// Its index in [`VIEWS`].
     pub view: usize,
-    /// As they are.
+    /// Mean distance.
     pub mean: f64,
-    /// After the mean shift of the person's photographed views together is removed.
+    /// The same after the common mean shift of the photographed views is removed.
     pub centred: f64,
-    /// Share of the true points at whose pixels nothing was predicted, which are in neither: outside of the predictor's window,
-    /// or not finite.
+    /// Share of the ground-truth points without a finite prediction inside of the predictor's window. The means do not
+    /// include them.
     pub missed: f64,
 }
 
-/// Errors of one person in every view that has a true point and predicts some.
+/// Errors of one person in every view with ground truth and predictions.
 pub fn point_errors(pairs: &[Pair]) -> Vec<PointError> {
-    // No point lies in the first camera itself: that is what pixels outside of the predictor's window hold.
+    // Pixels outside of the predictor's window have the point 0, the position of the first camera.
     let is_predicted = |p: &[f32]| p.iter().all(|v| v.is_finite()) && p.iter().any(|v| *v != 0.0);
     let there = |pair: &Pair| -> Vec<usize> {
         let is_there = |i: &usize| pair.valid[*i] > 0.5 && is_predicted(&pair.points[3 * i..3 * i + 3]);
@@ -72,22 +72,22 @@ mod tests {
     fn errors_are_mean_distances_with_and_without_the_common_shift() {
         let truth = [1.0; 9];
         let pair = |view, points| Pair { view, points, truth: &truth, valid: &[1.0, 0.0, 1.0] };
-        // Two points 5 and 1 off; what is not valid does not count.
+        // Two points with errors of 5 and 1, and an invalid one.
         let front = [4.0, 5.0, 1.0, 100.0, 0.0, 0.0, 2.0, 1.0, 1.0];
         let [error] = point_errors(&[pair(0, &front)])[..] else { panic!("one view") };
         let half = (1.0_f64 + 4.0).sqrt();
         assert!((error.mean - 3.0).abs() < 1e-12 && (error.centred - half).abs() < 1e-12, "{error:?}");
-        // Shells that lie apart stay apart, and sides have no say in the shift.
+        // The shift is common to front and back, and independent of the sides.
         let (near, far) = ([1.0; 9], [1.0, 1.0, 3.0, 1.0, 1.0, 1.0, 1.0, 1.0, 3.0]);
         let errors = point_errors(&[pair(0, &near), pair(1, &far), pair(2, &far)]);
         let found: Vec<_> = errors.iter().map(|e| (e.view, e.mean, e.centred)).collect();
         assert_eq!(found, [(0, 0.0, 1.0), (1, 2.0, 1.0), (2, 2.0, 1.0)]);
-        let nobody = Pair { valid: &[0.0; 3], ..pair(2, &near) };
-        assert_eq!(point_errors(&[nobody]), []);
+        let empty = Pair { valid: &[0.0; 3], ..pair(2, &near) };
+        assert_eq!(point_errors(&[empty]), []);
     }
 
     #[test]
-    fn what_is_not_predicted_is_missed_and_no_error() {
+    fn points_without_a_prediction_are_missed_and_have_no_error() {
         let truth = [1.0; 12];
         let points = [1.0, 1.0, 2.0, 0.0, 0.0, 0.0, f32::NAN, 1.0, 1.0, 5.0, 5.0, 5.0];
         let pair = Pair { view: 1, points: &points, truth: &truth, valid: &[1.0, 1.0, 1.0, 0.0] };

@@ -1,11 +1,10 @@
-//! Sheets of pictures for people to look at.
+//! Sheets of pictures.
 
 use std::io::{Cursor, Write};
 use std::path::Path;
 
 use image::{ImageFormat, Rgb, RgbImage, imageops};
-use snapsnap_base::FileError;
-use snapsnap_base::file;
+use snapsnap_base::{FileError, file};
 
 /// Largest side of one picture of a grid in pixels.
 const MOST: u32 = 256;
@@ -31,12 +30,12 @@ pub fn picture(side: usize, color: impl Fn(usize) -> [f32; 3]) -> RgbImage {
     RgbImage::from_fn(side as u32, side as u32, |x, y| self::color(color(y as usize * side + x as usize)))
 }
 
-/// A colour in 8 bits; what is outside [0, 1] is cut.
+/// A colour in 8 bits, clamped to [0, 1].
 pub fn color(color: [f32; 3]) -> Rgb<u8> {
     Rgb(color.map(|c| (c.clamp(0.0, 1.0) * 255.0).round() as u8))
 }
 
-/// An error from 0 to `most`, from black over red and yellow to white.
+/// The colour of an error from 0 to `most`: from black over red and yellow to white.
 pub fn heat(error: f32, most: f32) -> [f32; 3] {
     let at = 3.0 * error / most;
     [at, at - 1.0, at - 2.0]

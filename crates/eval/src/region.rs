@@ -8,9 +8,9 @@ use crate::pictures::Picture;
 
 /// The paper's window, height and width at 1024 pixels.
 const PAPER: [usize; 2] = [1000, 500];
-/// How far around the person's mask the protocol `masked` looks, at 1024 pixels.
+/// Margin of the protocol `masked` around the person's mask, at 1024 pixels.
 const MARGIN: usize = 8;
-/// The height that both are said for.
+/// The picture height of both.
 const AT: usize = 1024;
 
 /// Pixels of a picture.
@@ -18,7 +18,7 @@ const AT: usize = 1024;
 pub struct Region {
     /// Left, top, width, height.
     pub window: [usize; 4],
-    /// `[height, width]` of the window: which of its pixels count; `None`: all.
+    /// Mask `[height, width]` of the pixels of the window that count; `None`: all.
     pub inside: Option<Vec<bool>>,
 }
 
@@ -28,11 +28,11 @@ impl Region {
         Self { window: [0, 0, picture.width, picture.height], inside: None }
     }
 
-    /// The paper's: 1000 × 500 of 1024 pixels, scaled to the picture's height, around the middle of the box of all pixels of
-    /// the true picture that are not exactly black, pushed inside. A person who is wider is cut.
+    /// The paper's window of 1000 × 500 of 1024 pixels, scaled to the picture's height. Its centre is that of the box
+    /// of all pixels of the ground truth that are not black; it is moved into the picture. Wider people are cut off.
     ///
     /// # Errors
-    /// [`EvalError::Empty`] for a true picture that is black throughout.
+    /// [`EvalError::Empty`] for a black picture.
     pub fn paper(target: &Picture) -> Result<Self, EvalError> {
         let Picture { width, height, .. } = *target;
         let seen = |i: usize| (0..3).any(|c| target.plane(c)[i] != 0.0);
@@ -48,7 +48,7 @@ impl Region {
         Ok(Self { window, inside: None })
     }
 
-    /// The person's mask `[H, W]` (any value above 0), with [`margin`] pixels around it.
+    /// The person's mask `[H, W]` (any value above 0) with `margin` pixels around it.
     ///
     /// # Errors
     /// [`EvalError::Empty`] for a mask without a person.
@@ -77,12 +77,12 @@ impl Region {
     }
 }
 
-/// How far around masks the protocol `masked` looks in pictures of this height: 8 pixels of 1024.
+/// Margin of the protocol `masked` in pictures of this height: 8 pixels of 1024.
 pub fn margin(height: usize) -> usize {
     (MARGIN * height).div_ceil(AT)
 }
 
-/// First and last column and row of the pixels that `is_set`: left, top, right, bottom.
+/// Left, top, right and bottom of the pixels that are set.
 fn bounds(width: usize, height: usize, is_set: impl Fn(usize) -> bool) -> Option<[usize; 4]> {
     let mut found: Option<[usize; 4]> = None;
     for i in (0..width * height).filter(|i| is_set(*i)) {

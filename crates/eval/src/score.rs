@@ -1,4 +1,4 @@
-//! All metrics of a picture and the true one.
+//! All metrics of a picture and its ground truth.
 
 use burn::tensor::Device;
 use burn::tensor::ops::PadMode;
@@ -11,23 +11,23 @@ use crate::region::Region;
 use crate::similarity::{psnr, ssim};
 use crate::statistics::number;
 
-/// What is reported of a view, or means of it.
+/// Metrics of a view, or their means.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Score {
     /// dB; ∞ for equal pictures.
     #[serde(with = "number")]
     pub psnr: f64,
-    /// Absent where the region holds no whole window.
+    /// Absent if the region contains no whole window.
     #[serde(with = "number::optional")]
     pub ssim: Option<f64>,
-    /// Absent without weights, and where a window is too small for the network.
+    /// Absent without weights, and for windows that are too small for the network.
     #[serde(with = "number::optional")]
     pub lpips: Option<f64>,
 }
 
 impl Score {
-    /// Compares an image with the true one where `region` says. LPIPS sees the region's box, black where the region's mask is
-    /// not set, in both, and on to the network's least size.
+    /// Compares an image with the ground truth in a region. LPIPS gets the region's box, with black pixels outside of a
+    /// mask. Boxes of masks are enlarged with black to the network's least size.
     ///
     /// # Errors
     /// [`EvalError::Sizes`].
@@ -38,7 +38,7 @@ impl Score {
         lpips: Option<&Lpips>,
     ) -> Result<Self, EvalError> {
         let (psnr, ssim) = (psnr(image, target, region)?, ssim(image, target, region)?);
-        let seen = |picture: &Picture| {
+        let visible = |picture: &Picture| {
             let part = picture.cropped(region.window);
             match &region.inside {
                 Some(inside) => part.only(inside),
@@ -46,12 +46,11 @@ impl Score {
             }
         };
         let [.., width, height] = region.window;
-        // Black around a mask may as well go on to the network's least size.
         let short = [width, height].map(|side| MIN_SIDE.saturating_sub(side));
         let lpips = lpips.filter(|_| short == [0, 0] || region.inside.is_some()).map(|network| {
             let device: &Device = &network.device();
             let tensor = |picture| {
-                seen(picture).tensor(device).pad((0, short[0], 0, short[1]), PadMode::Constant(0.0))
+                visible(picture).tensor(device).pad((0, short[0], 0, short[1]), PadMode::Constant(0.0))
             };
             let distance = network.distance(tensor(image), tensor(target));
             f64::from(snapsnap_ops::host(distance)[0])
@@ -59,7 +58,7 @@ impl Score {
         Ok(Self { psnr, ssim, lpips })
     }
 
-    /// Means, of the figures that all have; `None` without any.
+    /// Means of the figures that all scores have; `None` without scores.
     pub fn mean(scores: &[Self]) -> Option<Self> {
         let n = scores.len() as f64;
         let all =

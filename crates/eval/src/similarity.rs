@@ -10,7 +10,7 @@ use crate::pictures::Picture;
 use crate::region::Region;
 
 /// Side of the protocol's uniform window: scikit-image's default.
-pub const UNIFORM: usize = 7;
+const UNIFORM: usize = 7;
 /// Side of the loss's Gaussian window.
 const GAUSSIAN: usize = 11;
 /// Its standard deviation in pixels.
@@ -27,7 +27,7 @@ pub struct SquaredError {
 }
 
 impl SquaredError {
-    /// Adds those of two pictures in a region.
+    /// Adds the differences of two pictures in a region.
     ///
     /// # Errors
     /// [`EvalError::Sizes`].
@@ -53,7 +53,8 @@ impl SquaredError {
     }
 }
 
-/// Peak signal-to-noise ratio in dB over the pixels of a region and the three channels, for a peak of 1; ∞ for equal pictures.
+/// Peak signal-to-noise ratio in dB over the pixels of a region and the three channels, for a peak of 1; ∞ for equal
+/// pictures.
 ///
 /// # Errors
 /// [`EvalError::Sizes`].
@@ -63,7 +64,7 @@ pub fn psnr(image: &Picture, target: &Picture, region: &Region) -> Result<f64, E
     Ok(error.psnr())
 }
 
-/// Pictures that are compared must be of one size.
+/// Checks that two pictures have one size.
 ///
 /// # Errors
 /// [`EvalError::Sizes`].
@@ -75,10 +76,10 @@ pub fn check_sizes(image: &Picture, target: &Picture) -> Result<(), EvalError> {
     Err(EvalError::Sizes { found: size(image), expected: size(target) })
 }
 
-/// Structural similarity as scikit-image's `structural_similarity` computes it by default for values in [0, 1]: uniform window
-/// of 7 × 7 pixels, sample covariances (N − 1), mean over pixels and channels. A region without a mask is a picture of its own:
-/// pixels whose window leaves it are left out, as the protocol does with its crops. Where a region has a mask, the pixels that
-/// count are compared with all that is around them. `None` if no pixel is left.
+/// Structural similarity as scikit-image's `structural_similarity` computes it by default for values in [0, 1]: uniform
+/// window of 7 × 7 pixels, sample covariances (N − 1), mean over pixels and channels. Without a mask, the region is
+/// cropped first, and pixels whose window leaves it are left out. With a mask, windows of its pixels may leave it.
+/// `None` if no pixel is left.
 ///
 /// # Errors
 /// [`EvalError::Sizes`].
@@ -97,7 +98,7 @@ pub fn ssim(image: &Picture, target: &Picture, region: &Region) -> Result<Option
     let window = Window::uniform();
     let rows: Vec<(usize, usize)> = (0..3).flat_map(|c| (half..height - half).map(move |y| (c, y))).collect();
     let line = |(c, row): (usize, usize)| -> [f64; 2] {
-        // Places in the crop as places in the region's window.
+        // From columns of the crop to pixels of the region's window.
         let inside = |column: usize| {
             let (row, column) = ((top + row).checked_sub(y), (left + column).checked_sub(x));
             let place = row.zip(column).filter(|(row, column)| *row < h && *column < w);
@@ -107,19 +108,19 @@ pub fn ssim(image: &Picture, target: &Picture, region: &Region) -> Result<Option
         let counted = similarities.into_iter().enumerate().filter(|(column, _)| inside(column + half));
         counted.fold([0.0; 2], |[sum, count], (_, s)| [sum + s, count + 1.0])
     };
-    // Summed in the order of the rows, so that the number of threads changes nothing.
+    // Sums in the order of the rows do not depend on the number of threads.
     let sums: Vec<[f64; 2]> = rows.into_par_iter().map(line).collect();
     let [sum, count] = sums.iter().fold([0.0; 2], |[a, b], [c, d]| [a + c, b + d]);
     Ok((count > 0.0).then(|| sum / count))
 }
 
-/// What a pixel's surroundings count.
+/// A window around a pixel.
 struct Window {
     /// Along rows and along columns; their sum is 1.
     weights: Vec<f64>,
-    /// What variances are multiplied with.
+    /// Factor of variances.
     correction: f64,
-    /// Whether there are zeros beyond the border; else pixels whose window reaches it are left out.
+    /// Whether the picture is padded with zeros. Otherwise pixels whose window leaves it are left out.
     padded: bool,
 }
 
@@ -163,7 +164,7 @@ fn line_of(a: &[f32], b: &[f32], [height, width]: [usize; 2], y: usize, window: 
         let vab = correction * (mab - ma * mb).clamp(-most, most);
         let similarity =
             ((2.0 * ma * mb + C1) * (2.0 * vab + C2)) / ((ma * ma + mb * mb + C1) * (va + vb + C2));
-        // Nothing is more alike than equal; rounding must not say so.
+        // Rounding can exceed the similarity of equal pictures.
         similarity.min(1.0)
     };
     columns.windows(weights.len()).map(similarity).collect()
@@ -187,13 +188,13 @@ pub fn ssim_of_loss(image: &Picture, target: &Picture, region: &Region) -> Resul
     Ok(sums.iter().sum::<f64>() / (3 * region.pixels()) as f64)
 }
 
-/// Structural similarity of every pixel and channel of pictures `[B,C,H,W]` with values in [0, 1], `[B,C,H,W]`, as stage 2's
-/// loss takes it: an 11×11 Gaussian window of σ = 1.5, beyond the border zeros, population variances. Differentiable.
+/// Structural similarity `[B,C,H,W]` of every pixel and channel of pictures `[B,C,H,W]` with values in [0, 1], for the
+/// loss of stage 2: an 11×11 Gaussian window of σ = 1.5, zero padding, population variances. Differentiable.
 pub fn ssim_gaussian(x: Tensor<4>, y: Tensor<4>) -> Tensor<4> {
     let mean = |t: Tensor<4>| blur(t);
     let (mx, my) = (mean(x.clone()), mean(y.clone()));
     let (mxx, myy, mxy) = (mx.clone().square(), my.clone().square(), mx * my);
-    // E[x²] − E[x]² is negative by rounding where a picture is flat, and would carry the similarity above 1.
+    // E[x²] − E[x]² is negative by rounding where a picture is flat. The similarity would exceed 1.
     let variance = |t: Tensor<4>, m: &Tensor<4>| (mean(t.square()) - m.clone()).clamp_min(0.0);
     let (vx, vy) = (variance(x.clone(), &mxx), variance(y.clone(), &myy));
     let covariance = mean(x * y) - mxy.clone();

@@ -1,18 +1,19 @@
-//! Means over people, and how far they can be trusted; run times.
+//! Means over people with confidence intervals; quantiles.
 
-use rand::Rng;
-use rand::SeedableRng;
+use std::time::Duration;
+
+use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
 
 /// Resamples of a bootstrap.
 const RESAMPLES: usize = 2000;
-/// Their seed: equal data give equal intervals.
+/// Seed of a bootstrap: equal data have equal intervals.
 const SEED: u64 = 1;
-/// What lies between the bounds.
+/// Share of the resampled means between the bounds.
 const CONFIDENCE: f64 = 0.95;
 
-/// A mean and the bounds between which it lies with 95 % confidence.
+/// A mean and its bounds with 95 % confidence.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Interval {
     /// Mean over people.
@@ -26,8 +27,8 @@ pub struct Interval {
     pub high: f64,
 }
 
-/// Mean of one figure per person, with the percentile bootstrap over people; `None` without people. Of paired differences it is
-/// the paired interval. An infinite figure (the PSNR of equal pictures) makes the mean infinite.
+/// Mean of one figure per person, with the percentile bootstrap over people; `None` without people. For paired
+/// differences it is the paired interval. An infinite figure (the PSNR of equal pictures) makes the mean infinite.
 pub fn interval(figures: &[f64]) -> Option<Interval> {
     let n = figures.len();
     if n == 0 {
@@ -42,7 +43,7 @@ pub fn interval(figures: &[f64]) -> Option<Interval> {
     Some(Interval { mean, low: quantile(&means, tail), high: quantile(&means, 1.0 - tail) })
 }
 
-/// By how much a figure is larger than another: nothing where they are equal, even if both are infinite.
+/// Difference of two figures: 0 for equal ones, even if both are infinite.
 pub fn difference(a: f64, b: f64) -> f64 {
     if a == b { 0.0 } else { a - b }
 }
@@ -57,23 +58,33 @@ pub fn quantile(sorted: &[f64], share: f64) -> f64 {
     if below == above { below } else { below + (above - below) * at.fract() }
 }
 
-/// Numbers in JSON, which has no infinities: those are written as `"inf"`.
+/// A quantile of times in seconds, linear between them.
+///
+/// # Panics
+/// Without times.
+pub fn quantile_of_times(times: &[Duration], share: f64) -> f64 {
+    let mut seconds: Vec<f64> = times.iter().map(Duration::as_secs_f64).collect();
+    seconds.sort_by(f64::total_cmp);
+    quantile(&seconds, share)
+}
+
+/// Numbers in JSON. JSON has no infinities: they are written as `"inf"`.
 pub mod number {
     use serde::de::Error;
     use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-    /// As text where it is not finite.
+    /// Writes a number, or text if it is not finite.
     ///
     /// # Errors
-    /// Of the serializer.
+    /// Those of the serializer.
     pub fn serialize<S: Serializer>(value: &f64, serializer: S) -> Result<S::Ok, S::Error> {
         if value.is_finite() { value.serialize(serializer) } else { value.to_string().serialize(serializer) }
     }
 
-    /// Either.
+    /// Reads a number or its text.
     ///
     /// # Errors
-    /// Of the deserializer, and for text that is no number.
+    /// Those of the deserializer, and for text that is no number.
     pub fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
         #[derive(Deserialize)]
         #[serde(untagged)]
@@ -87,14 +98,14 @@ pub mod number {
         }
     }
 
-    /// The same for figures that may be absent.
+    /// The same for optional figures.
     pub mod optional {
         use serde::Serializer;
 
-        /// `null` where there is none.
+        /// Writes `null` for `None`.
         ///
         /// # Errors
-        /// Of the serializer.
+        /// Those of the serializer.
         pub fn serialize<S: Serializer>(value: &Option<f64>, serializer: S) -> Result<S::Ok, S::Error> {
             match value {
                 Some(value) => super::serialize(value, serializer),
@@ -114,9 +125,9 @@ mod tests {
         assert_eq!([0.0, 0.5, 1.0, 1.0 / 6.0].map(|share| quantile(&values, share)), [1.0, 3.0, 8.0, 1.5]);
     }
 
-    /// Of many normal figures the bounds lie 1.96 standard errors from the mean.
+    /// The bounds of many normal figures are 1.96 standard errors from the mean.
     #[test]
-    fn the_interval_is_that_of_the_normal_approximation_where_that_holds() {
+    fn intervals_of_normal_figures_are_those_of_the_normal_approximation() {
         let mut random = ChaCha8Rng::seed_from_u64(7);
         let normal = |random: &mut ChaCha8Rng| (0..12).map(|_| random.random::<f64>()).sum::<f64>() - 6.0;
         let figures: Vec<f64> = (0..400).map(|_| 20.0 + 2.0 * normal(&mut random)).collect();
@@ -130,7 +141,7 @@ mod tests {
     }
 
     #[test]
-    fn one_person_has_no_spread_and_equal_pictures_are_infinitely_alike() {
+    fn one_person_has_no_spread_and_infinite_figures_are_written_as_text() {
         assert_eq!(interval(&[3.0]), Some(Interval { mean: 3.0, low: 3.0, high: 3.0 }));
         assert_eq!(interval(&[]), None);
         let endless = interval(&[f64::INFINITY, f64::INFINITY]).expect("people");

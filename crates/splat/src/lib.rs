@@ -20,5 +20,5 @@ pub use camera::{Camera, Orbit, RigidTransform};
 pub use error::SplatError;
 pub use gaussians::Gaussians;
 pub use op::{Counts, MAX_SIDE};
-pub use options::{MIN_ALPHA, MIN_TRANSMITTANCE, RenderOptions, TILE};
+pub use options::{MIN_ALPHA, MIN_TRANSMITTANCE, Preset, RenderOptions, TILE};
 pub use render::{Rendered, render};

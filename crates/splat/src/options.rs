@@ -1,6 +1,7 @@
-//! What a render does besides placing Gaussians: constants of the rasteriser, background, optional outputs.
+//! Options of a render: constants of the rasteriser, background, optional outputs.
 
 use burn::tensor::Tensor;
+use serde::{Deserialize, Serialize};
 
 /// Side of the square image tiles that share one list of splats, in pixels.
 pub const TILE: usize = 16;
@@ -9,7 +10,7 @@ pub const MIN_ALPHA: f32 = 1.0 / 255.0;
 /// A pixel takes no further splat once that would bring its transmittance below this.
 pub const MIN_TRANSMITTANCE: f32 = 1e-4;
 
-/// Constants and wishes of a render. Start from a preset and change fields.
+/// Options of a render. Start from a preset and change fields.
 #[derive(Debug, Clone)]
 pub struct RenderOptions {
     /// Largest α of a single splat, in (0, 1). Bounds 1/(1 − α) in the gradient.
@@ -43,5 +44,26 @@ impl Default for RenderOptions {
     /// [`RenderOptions::inria`].
     fn default() -> Self {
         Self::inria()
+    }
+}
+
+/// Presets of [`RenderOptions`], as configs and command lines name them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Preset {
+    /// [`RenderOptions::inria`].
+    #[default]
+    Inria,
+    /// [`RenderOptions::gsplat_1_5`].
+    Gsplat,
+}
+
+impl Preset {
+    /// The options of this preset.
+    pub fn options(self) -> RenderOptions {
+        match self {
+            Self::Inria => RenderOptions::inria(),
+            Self::Gsplat => RenderOptions::gsplat_1_5(),
+        }
     }
 }

@@ -20,7 +20,7 @@ fn json(command: &mut Command) -> Value {
     serde_json::from_str(&succeed(command.arg("--json"))).expect("JSON")
 }
 
-/// The pair of the reference that is cut out of the sheet of people.
+/// The pair of pictures of the reference that is cut out of the sheet of people.
 #[test]
 fn figures_are_those_of_scikit_image_in_every_window() {
     let temporary = tempfile::tempdir().expect("a folder");
@@ -53,7 +53,7 @@ fn figures_are_those_of_scikit_image_in_every_window() {
             assert_eq!(found["window"], serde_json::json!([17, 2, 125, 250]));
         }
     }
-    // No margin: the mask as it is.
+    // The mask without a margin.
     let found = json(compare(&a, &b).args(["--window", "mask", "--margin", "0", "--mask"]).arg(&mask));
     let inside = (0..256).flat_map(|y| (0..160).map(move |x| (x, y))).filter(|(x, y)| disc(*x, *y)).count();
     assert_eq!(found["pixels"].as_u64(), Some(inside as u64));
@@ -71,7 +71,7 @@ fn a_picture_is_infinitely_like_itself_and_that_is_printed() {
     );
 }
 
-/// Red and blue exchanged, 16 bits instead of 8, a grey picture.
+/// Exchanged channels, and 16 bits instead of 8.
 #[test]
 fn neither_range_nor_order_of_colours_is_lost() {
     let temporary = tempfile::tempdir().expect("a folder");
@@ -111,7 +111,7 @@ fn folders_are_compared_by_name_and_what_is_left_out_is_named() {
     );
     let expected = -20.0 * (10.0_f64 / 255.0).log10();
     assert!((found["mean"]["psnr"].as_f64().expect("a number") - expected).abs() < 1e-5, "{found}");
-    // Missing, of another size, cut short.
+    // A missing picture, one of another size, a truncated one.
     flat(16, 1).save(b.join("3.png")).expect("writes");
     flat(16, 1).save(a.join("4.png")).expect("writes");
     flat(17, 1).save(b.join("4.png")).expect("writes");

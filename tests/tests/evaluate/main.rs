@@ -1,5 +1,4 @@
-//! `snapsnap evaluate`, `bench` and `compare` as a user types them: what they report, that reports follow from their inputs, and
-//! what happens where something is missing or damaged.
+//! `snapsnap evaluate`, `bench`, `compare` and `stability`: reports, and missing or damaged inputs.
 
 mod bench;
 mod compare;
@@ -15,7 +14,7 @@ use std::sync::OnceLock;
 use serde_json::Value;
 use snapsnap_tests::{TRAINING, snapsnap, succeed};
 
-/// Two people to test on, eight views of 64², and two to learn from; made once.
+/// A data set of two test people and two training people, with eight views of 64². It is made once.
 fn people() -> &'static Path {
     static PEOPLE: OnceLock<PathBuf> = OnceLock::new();
     PEOPLE.get_or_init(|| {
@@ -41,7 +40,7 @@ fn people() -> &'static Path {
     })
 }
 
-/// A copy to be damaged.
+/// A copy of the data set in a folder.
 fn copied(to: &Path) -> PathBuf {
     let folder = to.join("people");
     let status = Command::new("cp").arg("-r").arg(people()).arg(&folder).status().expect("cp");
@@ -85,7 +84,7 @@ fn json(report: &Path) -> Value {
     serde_json::from_str(&text).expect("JSON")
 }
 
-/// Exit code, and what was said on stderr.
+/// Exit code and stderr of a command.
 fn ended(command: &mut Command) -> (Option<i32>, String) {
     let Output { status, stderr, .. } = command.output().expect("the program starts");
     let said = String::from_utf8_lossy(&stderr).into_owned();

@@ -54,7 +54,7 @@ fn scans_are_the_truth_where_they_are_given() {
     let temporary = tempfile::tempdir().expect("a folder");
     let (meshes, report) = (temporary.path().join("meshes"), temporary.path().join("report"));
     fs::create_dir(&meshes).expect("a folder");
-    // As scanned, in a folder for each; the meshes that are judged stand in the world of the views.
+    // Scans are in a folder each and as scanned. The evaluated meshes are in the world of the views.
     let raw = people().join("scans/test");
     for name in ["0000", "0001"] {
         let mut mesh = import::read(&raw.join(name).join(format!("{name}.obj"))).expect("the saved scan");
@@ -71,12 +71,12 @@ fn scans_are_the_truth_where_they_are_given() {
     for key in ["truth_to_surface", "surface_to_scan"] {
         assert!(figure(key) < 1e-4, "{key}: {found}");
     }
-    // Points of both are drawn apart: 50,000 on some three square metres.
+    // Both have 50,000 different points on some three square metres.
     assert!((0.3..0.5).contains(&figure("chamfer")), "{found}");
 }
 
-/// What `snapsnap mesh` would make of a reconstruction lies about as near to the truth as its Gaussians: what is closed below, as
-/// a skirt is, lies farther.
+/// The mesh of a reconstruction is about as near to the ground truth as its Gaussians, except for closed parts such as
+/// the bottom of a skirt.
 #[test]
 fn the_mesh_of_the_gaussians_is_measured_beside_them() {
     let temporary = tempfile::tempdir().expect("a folder");
@@ -93,7 +93,7 @@ fn the_mesh_of_the_gaussians_is_measured_beside_them() {
     let figure = |of: &str, key: &str| found[of][key]["mean"].as_f64().expect("a number");
     let [centres, mesh] = ["geometry_cm", "mesh_cm"].map(|of| figure(of, "chamfer"));
     assert!(mesh > 0.3 && mesh < 1.5 * centres && mesh < 3.0, "{mesh} and {centres} cm");
-    // A surface has smoother normals than depths of Gaussians have.
+    // A surface has smoother normals than depth maps of Gaussians.
     let [centres, mesh] = ["geometry_cm", "mesh_cm"].map(|of| figure(of, "normal_consistency"));
     assert!(mesh > centres && mesh > 0.8, "{mesh} and {centres}");
     let text = fs::read_to_string(report.join("report.md")).expect("a report");

@@ -82,21 +82,21 @@ fn a_report_has_its_keys_and_follows_from_its_tables() {
         let subject = &of["subjects"][1];
         assert_eq!((group["people"].as_u64(), &group["psnr"]["mean"]), (Some(1), &subject["psnr"]));
     }
-    // True points in the photographs' colours are nearer the truth than what random weights make of it.
+    // Ground-truth points in the photographs' colours are better than cut-outs.
     let psnr = |value: &Value| value["masked"]["psnr"]["mean"].as_f64().expect("a number");
     assert!(psnr(&found["baselines"]["true_points"]) > psnr(&found["baselines"]["billboard"]) + 2.0);
     assert!(found["points_mm"]["front"]["mean"].as_f64().is_some_and(|mm| mm > 0.0));
     for name in ["report.md", "people.png", "by_view.svg", "subjects.csv", "config.toml"] {
         assert!(fs::metadata(report.join(name)).is_ok_and(|file| file.len() > 100), "{name}");
     }
-    // Again, into the same folder: the same figures.
+    // A second run into the same folder has the same figures.
     succeed(evaluate(people(), &report, &arguments).args(["--set", ablation]));
     assert_eq!(fs::read_to_string(report.join("views.csv")).expect("a table"), table);
 }
 
-/// Where no camera stood at right angles, what it would have seen is put together from what its neighbours saw.
+/// Without a camera at a right angle, the ground truth of a side consists of the points of neighbouring views.
 #[test]
-fn true_points_of_a_side_do_not_depend_on_where_the_cameras_stood() {
+fn true_points_of_a_side_do_not_depend_on_the_angles_of_the_cameras() {
     let temporary = tempfile::tempdir().expect("a folder");
     let points = |views: usize| {
         let data = temporary.path().join(format!("{views} views"));
@@ -109,7 +109,7 @@ fn true_points_of_a_side_do_not_depend_on_where_the_cameras_stood() {
         succeed(&mut evaluate(&data, &report, &["--set", "metrics.geometry=false"]));
         json(&report)["points_mm"].clone()
     };
-    // Every 30°, of which one is the side's own, and every 36°: 72° and 108° are its neighbours.
+    // Views every 30° include the side itself. Of views every 36°, 72° and 108° are its neighbours.
     let (exact, neighbours) = (points(12), points(10));
     println!("{exact}\n{neighbours}");
     for view in ["front", "back", "right", "left"] {
@@ -119,7 +119,7 @@ fn true_points_of_a_side_do_not_depend_on_where_the_cameras_stood() {
     }
 }
 
-/// Pairs of photographs of known cameras: no unseen side, five shells.
+/// Five pairs of photographs with known cameras have no unseen sides.
 #[test]
 fn five_photographs_have_no_unseen_sides() {
     let temporary = tempfile::tempdir().expect("a folder");
@@ -132,10 +132,9 @@ fn five_photographs_have_no_unseen_sides() {
     assert!(text.contains("| model | 2 | 6 |"), "{text}");
 }
 
-/// Photographs that are changed are what the ablation saw: figures of its own for every view, and none of the points where the
-/// pixels are others.
+/// Changed photographs change the figures of their ablation. Placed ones have no errors of points.
 #[test]
-fn photographs_are_changed_as_asked_for() {
+fn photographs_are_changed_by_ablations() {
     let temporary = tempfile::tempdir().expect("a folder");
     let report = temporary.path().join("report");
     let changes = [
@@ -156,14 +155,14 @@ fn photographs_are_changed_as_asked_for() {
     for name in ["brighter", "cut", "narrow", "placed"] {
         assert!((psnr(other(name)) - model).abs() > 0.05, "{name}: {} and {model} dB", psnr(other(name)));
     }
-    // A stop too bright in front, a stop too dark behind.
+    // One stop too bright in front and one too dark behind.
     assert!(psnr(other("brighter")) < model - 1.0, "{} and {model} dB", psnr(other("brighter")));
     assert!(other("cut")["points_mm"]["front"]["mean"].is_number(), "{}", other("cut")["points_mm"]);
     assert!(other("placed")["points_mm"]["front"].is_null(), "{}", other("placed")["points_mm"]);
 }
 
 #[test]
-fn what_is_missing_or_damaged_is_named_and_the_rest_evaluated() {
+fn missing_and_damaged_parts_are_named_and_the_rest_evaluated() {
     let temporary = tempfile::tempdir().expect("a folder");
     let report = temporary.path().join("report");
     let left_out = |found: &Value| -> Vec<String> {
@@ -172,7 +171,7 @@ fn what_is_missing_or_damaged_is_named_and_the_rest_evaluated() {
             .map(|e| format!("{}: {}", e["name"].as_str().unwrap_or(""), e["why"].as_str().unwrap_or("")))
             .collect()
     };
-    // A person who is not there, weights that are not there.
+    // A missing person and missing weights.
     let (code, said) = ended(&mut evaluate(
         people(),
         &report,
@@ -186,14 +185,14 @@ fn what_is_missing_or_damaged_is_named_and_the_rest_evaluated() {
     assert!(all[0].starts_with("against: nowhere.safetensors") && all[1].starts_with("0815: "), "{all:?}");
     assert!(said.contains("0815") && said.contains("nowhere.safetensors"), "{said}");
 
-    // A list that names nobody, and views that are none.
+    // A group without people, and no compared view.
     let (code, said) =
         ended(&mut evaluate(people(), &report, &["--set", "groups.loose.subjects=[\"0815\"]"]));
     assert!(code == Some(1) && said.contains("groups.loose"), "{said}");
     let (code, said) = ended(&mut evaluate(people(), &report, &["--set", "views.compared=[0, 4]"]));
     assert!(code == Some(1) && said.contains("no view is left"), "{said}");
 
-    // A picture cut short, a view without its camera, a picture of another size.
+    // A truncated picture, a view without its camera, a picture of another size.
     let data = copied(temporary.path());
     let png = data.join("test/img/0000/3.png");
     let bytes = fs::read(&png).expect("a picture");
@@ -222,7 +221,7 @@ fn what_is_missing_or_damaged_is_named_and_the_rest_evaluated() {
         assert!(parts.iter().all(|part| entry.contains(part)), "{entry}");
     }
 
-    // A camera that mirrors, and a view without depth: its pictures count.
+    // A camera that mirrors, and a view without depth, whose pictures are compared.
     let data = temporary.path().join("mirrored");
     fs::create_dir(&data).expect("a folder");
     let data = copied(&data);
@@ -241,7 +240,7 @@ fn what_is_missing_or_damaged_is_named_and_the_rest_evaluated() {
     assert_eq!(found["protocols"]["masked"]["views"].as_u64(), Some(6), "{said}");
     assert!(left_out(&found).iter().any(|entry| entry.starts_with("0000, model, points: ")), "{said}");
 
-    // No weights at all: the baselines are still worth something.
+    // Baselines are evaluated without weights.
     let (code, said) = ended(&mut evaluate(people(), &report, &["--weights", "nowhere.safetensors"]));
     assert!(code == Some(1) && said.contains("nowhere.safetensors"), "{said}");
     let found = json(&report);
@@ -250,12 +249,12 @@ fn what_is_missing_or_damaged_is_named_and_the_rest_evaluated() {
     assert!(!report.join("people.png").exists(), "pictures of an older report are gone");
 }
 
-/// Points that are not finite give no Gaussians: that is counted, and what is left is judged.
+/// Points that are not finite are counted, and the others are evaluated.
 #[test]
 fn a_prediction_that_is_not_finite_is_counted() {
     let temporary = tempfile::tempdir().expect("a folder");
     let report = temporary.path().join("report");
-    // δ is the first tensor of the file that is written: metres per unit, here more than f32 holds once multiplied.
+    // With this δ, in metres per unit, products overflow f32.
     let huge = ["--set", "network.anchor=none", "--set", "network.conf_threshold=0.0"];
     let config = temporary.path().join("networks.toml");
     let networks = snapsnap_tests::TRAINING
@@ -282,7 +281,7 @@ fn a_prediction_that_is_not_finite_is_counted() {
 }
 
 #[test]
-fn what_cannot_be_evaluated_is_refused_by_name() {
+fn wrong_evaluations_are_refused_with_the_reason() {
     let temporary = tempfile::tempdir().expect("a folder");
     let report = temporary.path().join("report");
     let wrong = |arguments: &[&str], expected: &[&str]| {
@@ -295,7 +294,9 @@ fn what_cannot_be_evaluated_is_refused_by_name() {
     wrong(&["--set", "views.inputs=[0, 99]"], &["no view 99, of 8"]);
     wrong(&["--set", "views.inputs=[1, 1]"], &["twice"]);
     wrong(&["--set", "views.resolution=48"], &["64", "48"]);
-    wrong(&["--set", "ablations.model.sides=false"], &["`model`", "something else"]);
+    wrong(&["--set", "ablations.model.sides=false"], &["`model`", "another meaning"]);
+    wrong(&["--set", "ablations.a.tune=\"all\""], &["ablations.a.tune", "only settings of"]);
+    wrong(&["--set", "ablations.a.stride=0"], &["ablations.a.stride", "1 to 64"]);
     wrong(&["--set", "model.devices=[\"cpu\", \"cpu\"]"], &["on cpu", "twice"]);
     wrong(&["--set", "report.people=9"], &["report.people"]);
     wrong(&["--set", "views.supersampling=3"], &["views.supersampling"]);
@@ -328,17 +329,17 @@ fn what_cannot_be_evaluated_is_refused_by_name() {
         .args(["--set", &again, "-o"]);
     let said = refused(command.arg(&report));
     assert!(said.contains("data.folders") && said.contains("twice"), "{said}");
-    // `..` behind what is not there yet.
+    // `..` after a folder that does not exist.
     let said = refused(&mut evaluate(people(), &people().join("no/../report"), &[]));
     assert!(said.contains("lies in a data set") && !people().join("no").exists(), "{said}");
-    // Nor does it go where something else is.
+    // A folder with other files is refused.
     let training = temporary.path().join("training");
     fs::create_dir(&training).expect("a folder");
     fs::write(training.join("config.toml"), "[training]").expect("writes");
     let said = refused(&mut evaluate(people(), &training, &[]));
     assert!(said.contains("config.toml") && said.contains("belongs to no report"), "{said}");
     assert_eq!(fs::read_dir(&training).expect("there").count(), 1);
-    // A report does not replace what it is made of.
+    // A report does not replace its inputs.
     fs::create_dir(&report).expect("a folder");
     fs::write(report.join("report.json"), "{\"command\": \"snapsnap evaluate\", \"commit\": \"0\"}")
         .expect("writes");

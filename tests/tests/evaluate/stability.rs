@@ -6,7 +6,7 @@ use snapsnap_tests::{refused, snapsnap, succeed};
 
 use super::{json, weights};
 
-/// What the command tells on the processor; cargo xtask stability looks at every device.
+/// The cases on the CPU. `cargo xtask stability` runs them on every device.
 #[test]
 fn every_case_holds_on_the_processor() {
     let temporary = tempfile::tempdir().expect("a folder");
@@ -24,7 +24,7 @@ fn every_case_holds_on_the_processor() {
             && of("Losses and optimiser") >= 9
             && of("Stiff training") == 3
     );
-    // What is compared with f64 has figures, and they are no excuse of a limit.
+    // Cases against f64 have errors below the limit.
     for case in cases.iter().filter(|case| case["area"] == "Splats" && !case["gradient_error"].is_null()) {
         assert!(case["value_error"].as_f64().is_some_and(|e| e < 2e-6), "{case}");
     }

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
 use serde_json::{Value, json};
+use snapsnap_eval::evaluate::LeftOut;
 use snapsnap_eval::lpips::Lpips;
 use snapsnap_eval::pictures::Picture;
 use snapsnap_eval::region::{Region, margin};
@@ -16,22 +17,22 @@ use snapsnap_mesh::picture::{self, MAX_BYTES, decode};
 use crate::failure::Failure;
 use crate::{memory, perceptual, say};
 
-/// Bytes per pixel of two pictures that are compared: as they are decoded, as planes, and the parts that are looked at.
+/// Bytes per pixel of two pictures: decoded, as planes, and the compared parts.
 const BYTES: u64 = 160;
-/// Endings of pictures that are looked for in folders.
+/// File extensions of pictures in folders.
 const ENDINGS: [&str; 7] = ["png", "jpg", "jpeg", "webp", "bmp", "tif", "tiff"];
 
 #[derive(Args)]
 pub struct Arguments {
-    /// Picture, or folder of pictures, to judge.
+    /// Picture, or folder of pictures.
     a: PathBuf,
-    /// The true one; of a folder, pictures of the same name.
+    /// Ground-truth picture, or folder of pictures with the same names.
     b: PathBuf,
-    /// Where the person is (any value above 0), or a folder of such pictures.
+    /// Mask of the person (any value above 0), or a folder of such pictures.
     #[arg(long, value_name = "MASK")]
     mask: Option<PathBuf>,
-    /// Where to compare: everywhere; in the paper's window of 1000 × 500 of 1024 pixels around what is not black in B; or in
-    /// the mask and 8 of 1024 pixels around it. Default: the mask where one is given, else everywhere.
+    /// Compared pixels: all; those of the paper's window of 1000 × 500 of 1024 pixels around the pixels of B that are
+    /// not black; or the mask and 8 of 1024 pixels around it. Default: the mask if one is given, else all.
     #[arg(long, value_enum)]
     window: Option<Window>,
     /// Pixels around the mask instead of 8 of 1024.
@@ -39,7 +40,7 @@ pub struct Arguments {
     margin: Option<usize>,
     #[command(flatten)]
     lpips: perceptual::Arguments,
-    /// auto, cpu, ndarray, wgpu, vulkan, cuda or metal: what computes LPIPS.
+    /// Device for LPIPS: auto, cpu, ndarray, wgpu, vulkan, cuda or metal.
     #[arg(long, default_value = "auto")]
     device: String,
     /// Print JSON.
@@ -95,18 +96,18 @@ fn folders(arguments: &Arguments, lpips: &Result<Lpips, String>) -> Result<(), F
         }
     }
     let (ours, truths) = (pictures_in(a)?, pictures_in(b)?);
-    let mut left_out: Vec<(String, String)> = Vec::new();
-    for (name, folder) in
-        ours.difference(&truths).map(|n| (n, b)).chain(truths.difference(&ours).map(|n| (n, a)))
-    {
-        left_out.push((name.clone(), format!("is not in {}", folder.display())));
-    }
+    let missing = |folder: &Path| {
+        let why = format!("is not in {}", folder.display());
+        move |name: &String| LeftOut::new(name, &why)
+    };
+    let mut left_out: Vec<LeftOut> = ours.difference(&truths).map(missing(b)).collect();
+    left_out.extend(truths.difference(&ours).map(missing(a)));
     let mut compared = Vec::new();
     for name in ours.intersection(&truths) {
         let mask = mask.as_ref().map(|folder| folder.join(name));
         match compare(arguments, &a.join(name), &b.join(name), mask.as_deref(), lpips) {
             Ok(found) => compared.push(found),
-            Err(failure) => left_out.push((name.clone(), failure.to_string())),
+            Err(failure) => left_out.push(LeftOut::new(name, failure)),
         }
     }
     let scores: Vec<Score> = compared.iter().map(|c| c.score).collect();
@@ -118,8 +119,6 @@ fn folders(arguments: &Arguments, lpips: &Result<Lpips, String>) -> Result<(), F
             value
         };
         let pictures: Vec<Value> = compared.iter().map(named).collect();
-        let left_out: Vec<Value> =
-            left_out.iter().map(|(name, why)| json!({ "name": name, "why": why })).collect();
         let found = json!({
             "pictures": pictures, "mean": mean, "left_out": left_out, "lpips_weights": perceptual::describe(lpips),
         });
@@ -130,10 +129,10 @@ fn folders(arguments: &Arguments, lpips: &Result<Lpips, String>) -> Result<(), F
         lines.extend(mean.map(|mean| line(&format!("mean of {}", compared.len()), &mean)));
         lines.push(format!("LPIPS: {}", perceptual::describe(lpips)));
         say::lines(&lines.join("\n"))?;
-        left_out.iter().for_each(|(name, why)| say::err(&format!("left out: {name}: {why}")));
+        left_out.iter().for_each(|l| say::err(&format!("left out: {}: {}", l.name, l.why)));
     }
     match (compared.len(), left_out.len()) {
-        (0, 0) => Err(Failure::Input(format!("{} and {}: hold no picture", a.display(), b.display()))),
+        (0, 0) => Err(Failure::Input(format!("{} and {}: contain no picture", a.display(), b.display()))),
         (_, 0) => Ok(()),
         (n, lost) => Err(Failure::Internal(format!("{n} pictures compared, {lost} left out"))),
     }

@@ -6,26 +6,27 @@ use std::time::Instant;
 
 use burn::tensor::Device;
 use clap::{Args, ValueEnum};
+use snapsnap_base::config::Schema;
 use snapsnap_eval::baselines::MeanPictures;
-use snapsnap_eval::evaluate::config::{Ablation, EvalConfig};
+use snapsnap_eval::evaluate::config::EvalConfig;
 use snapsnap_eval::evaluate::meshes::{Align, evaluate_meshes};
-use snapsnap_eval::evaluate::model::{Leave, Model};
+use snapsnap_eval::evaluate::model::Model;
 use snapsnap_eval::evaluate::person::People;
-use snapsnap_eval::evaluate::{Contestant, LeftOut, Outcome, evaluate, sheet};
+use snapsnap_eval::evaluate::{Contestant, Kind, LeftOut, evaluate, sheet};
 use snapsnap_eval::report;
 use snapsnap_eval::report::evaluation::{Cost, Evaluation};
-
-use snapsnap_base::config::Schema;
+use snapsnap_eval::variant::Variant;
+use snapsnap_net::weights::WeightFile;
 
 use super::{ConfigArguments, outside_data};
 use crate::failure::Failure;
 use crate::progress::Progress;
-use crate::report::{ReportFolder, header};
+use crate::report::{ReportFolder, complete, header, nothing_left};
 use crate::{device, memory, perceptual, say, weights};
 
 #[derive(Args)]
 pub struct Arguments {
-    /// What to compare, how and with what, as in configs/eval.toml.
+    /// Config of the evaluation, as in configs/eval.toml.
     #[arg(long, value_name = "TOML")]
     config: PathBuf,
     /// Override one config key; may be repeated.
@@ -34,16 +35,16 @@ pub struct Arguments {
     /// Data sets [default: data.folders of the config].
     #[arg(long, value_name = "DATASET", num_args = 1..)]
     data: Vec<PathBuf>,
-    /// Weights to judge [default: model.weights of the config, else those that come with the program].
+    /// Weights of the model [default: model.weights of the config, else those that come with the program].
     #[arg(long, value_name = "FILE|DIR")]
     weights: Option<PathBuf>,
-    /// Other weights, which are compared with these person by person.
+    /// Other weights, which are compared with the model person by person.
     #[arg(long, value_name = "FILE|DIR")]
     against: Option<PathBuf>,
-    /// Judge the meshes NAME.obj, .ply or .glb in this folder instead of weights.
+    /// Evaluate the meshes NAME.obj, .ply or .glb in this folder instead of weights.
     #[arg(long, value_name = "DIR", conflicts_with_all = ["weights", "against"])]
     mesh_dir: Option<PathBuf>,
-    /// Move meshes onto the truth first: turned and moved (rigid), or scaled as well (similarity).
+    /// Align meshes with the ground truth first: turned and moved (rigid), or scaled as well (similarity).
     #[arg(long, value_enum, value_name = "HOW", num_args = 0..=1, default_missing_value = "rigid")]
     icp: Option<Icp>,
     #[command(flatten)]
@@ -62,34 +63,15 @@ enum Icp {
     Similarity,
 }
 
+/// The end of the message about failed parts.
+const REST: &str = "the rest, if there is any, was evaluated";
+
 pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     if arguments.icp.is_some() && arguments.mesh_dir.is_none() {
         return Err(Failure::Input("--icp needs --mesh-dir: only meshes are moved".into()));
     }
     let config = config_of(arguments)?;
-    if config.data.folders.is_empty() {
-        let message =
-            "no data: give --data DATASET, made with `snapsnap prepare`, or data.folders in the config";
-        return Err(Failure::Input(message.into()));
-    }
-    let folders = &config.data.folders;
-    let mut known = HashSet::new();
-    if let Some(again) = folders.iter().find(|f| !known.insert(f.canonicalize().unwrap_or((*f).clone()))) {
-        return Err(Failure::Input(format!("data.folders: {} is there twice", again.display())));
-    }
-    let (mut sets, mut missing, mut first) = (Vec::new(), Vec::new(), None);
-    for path in folders {
-        match People::open(path, &config.data, &config.views) {
-            Ok(set) => sets.push(set),
-            Err(e) => {
-                missing.push(LeftOut { name: path.display().to_string(), why: e.to_string() });
-                first.get_or_insert(e);
-            }
-        }
-    }
-    if let (true, Some(e)) = (sets.is_empty(), first) {
-        return Err(e.into());
-    }
+    let (sets, mut missing) = data_sets(&config)?;
     let roots = sets.iter().map(|set| set.folder().root());
     outside_data(&arguments.output, roots.chain(config.baselines.mean.iter().map(PathBuf::as_path)))?;
     if let Some(meshes) = &arguments.mesh_dir {
@@ -101,18 +83,16 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
         (None, names) => names.to_vec(),
     };
     let devices = names.iter().map(|name| device::choose(name)).collect::<Result<Vec<_>, _>>()?;
-    let others = config.ablations.values().filter_map(|ablation| ablation.weights.as_ref());
+    let variants = config.variants(&names);
     let inputs: Vec<&Path> = std::iter::once(&arguments.config)
-        .chain(&config.model.weights)
-        .chain(others)
+        .chain(variants.iter().filter_map(|(_, variant)| variant.weights.as_ref()))
         .chain(arguments.lpips.files())
         .map(PathBuf::as_path)
         .collect();
     let lpips = arguments.lpips.load_or(&config.metrics.lpips, &names[0])?;
-    let contestants = contestants(&config, &sets, (&names, &devices), &mut missing)?;
+    let contestants = contestants(&config, &sets, &variants, &devices[0], &mut missing);
     if contestants.is_empty() {
-        let whys: Vec<String> = missing.iter().map(|m| format!("{}: {}", m.name, m.why)).collect();
-        return Err(Failure::Input(format!("nothing is left to evaluate: {}", whys.join("; "))));
+        return Err(nothing_left("nothing is left to evaluate", &missing));
     }
     let folder = ReportFolder::new(&arguments.output, &inputs)?;
 
@@ -124,17 +104,16 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let cost = Cost { seconds: start.elapsed().as_secs_f64(), memory: memory::most_used() };
     drop(progress);
     outcome.left_out.splice(0..0, missing);
-    let described = perceptual::describe(&lpips);
-    let named = device::describe(&devices[0]);
-    let shown = contestants.iter().find(|contestant| contestant.networks().is_some());
-    let ranked = report_of(&named, &config, &outcome, &described, cost).ranked(config.report.people);
+    let (header, lpips) = (header(&device::describe(&devices[0])), perceptual::describe(&lpips));
+    let mut report = Evaluation { header, config: &config, outcome, lpips, cost };
+    let ranked = report.ranked(config.report.people);
     let mut people = None;
-    if let Some(contestant) = shown.filter(|_| !ranked.is_empty()) {
-        let (picture, mut left_out) = sheet(&config, &sets, contestant, &ranked);
+    // The first contestant is the model, without which the ranking is empty.
+    if !ranked.is_empty() {
+        let (picture, left_out) = sheet(&config, &sets, &contestants[0], &ranked);
         people = picture;
-        outcome.left_out.append(&mut left_out);
+        report.outcome.left_out.extend(left_out);
     }
-    let report = report_of(&named, &config, &outcome, &described, cost);
     let by_view = report.by_view();
     let pictures: Vec<&str> = [(people.is_some(), "people.png"), (!by_view.is_empty(), "by_view.svg")]
         .into_iter()
@@ -152,26 +131,37 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
         say::out(&summary(&json));
         say::out(&format!("{}: report.md, report.json, pictures and tables", folder.path().display()));
     }
-    complete(&outcome.left_out)
+    complete(&report.outcome.left_out, REST)
 }
 
-fn report_of<'a>(
-    device: &str,
-    config: &'a EvalConfig,
-    outcome: &'a Outcome,
-    lpips: &str,
-    cost: Cost,
-) -> Evaluation<'a> {
-    Evaluation { header: header(device), config, outcome, lpips: lpips.into(), cost }
+/// Refuses a config without data sets.
+pub(super) fn check_data(folders: &[PathBuf]) -> Result<(), Failure> {
+    let message = "no data: give --data DATASET, made with `snapsnap prepare`, or data.folders in the config";
+    if folders.is_empty() { Err(Failure::Input(message.into())) } else { Ok(()) }
 }
 
-/// What is left out is told, and is a failure.
-fn complete(left_out: &[LeftOut]) -> Result<(), Failure> {
-    if left_out.is_empty() {
-        return Ok(());
+/// The data sets that can be opened, at least one, and failures of the others.
+fn data_sets(config: &EvalConfig) -> Result<(Vec<People>, Vec<LeftOut>), Failure> {
+    let folders = &config.data.folders;
+    check_data(folders)?;
+    let mut known = HashSet::new();
+    if let Some(again) = folders.iter().find(|f| !known.insert(f.canonicalize().unwrap_or((*f).clone()))) {
+        return Err(Failure::Input(format!("data.folders: {} is there twice", again.display())));
     }
-    left_out.iter().for_each(|l| say::err(&format!("left out: {}: {}", l.name, l.why)));
-    Err(Failure::Internal(format!("{} left out, the rest, if there is any, was evaluated", left_out.len())))
+    let (mut sets, mut missing, mut first) = (Vec::new(), Vec::new(), None);
+    for path in folders {
+        match People::open(path, &config.data, &config.views) {
+            Ok(set) => sets.push(set),
+            Err(e) => {
+                missing.push(LeftOut::new(path.display().to_string(), &e));
+                first.get_or_insert(e);
+            }
+        }
+    }
+    match first {
+        Some(e) if sets.is_empty() => Err(e.into()),
+        _ => Ok((sets, missing)),
+    }
 }
 
 fn judge_meshes(
@@ -186,7 +176,7 @@ fn judge_meshes(
         return Err(Failure::Input(format!("--mesh-dir {}: is no folder", meshes.display())));
     }
     let folder = ReportFolder::new(&arguments.output, &[&arguments.config])?;
-    let (align, said) = match arguments.icp {
+    let (align, alignment) = match arguments.icp {
         None => (Align::No, "none: as the meshes are"),
         Some(Icp::Rigid) => (Align::Rigidly, "rigid, by iterated closest points"),
         Some(Icp::Similarity) => (Align::Similarly, "rigid and scale, by iterated closest points"),
@@ -199,7 +189,7 @@ fn judge_meshes(
     left_out.splice(0..0, missing);
     let header = header("cpu");
     folder.text("config.toml", &config.to_toml())?;
-    folder.text("report.md", &report::meshes::markdown(&header, &figures, &left_out, said))?;
+    folder.text("report.md", &report::meshes::markdown(&header, &figures, &left_out, alignment))?;
     let json = report::meshes::json(&header, &figures, &left_out);
     folder.finish(&json)?;
     if !quiet {
@@ -211,7 +201,7 @@ fn judge_meshes(
             ));
         }
     }
-    complete(&left_out)
+    complete(&left_out, REST)
 }
 
 fn config_of(arguments: &Arguments) -> Result<EvalConfig, Failure> {
@@ -223,77 +213,52 @@ fn config_of(arguments: &Arguments) -> Result<EvalConfig, Failure> {
         config.model.weights.clone_from(&arguments.weights);
     }
     if let Some(against) = &arguments.against {
-        let other = Ablation { weights: Some(against.clone()), ..Ablation::default() };
+        let other = Variant { weights: Some(against.clone()), ..Variant::default() };
         config.ablations.insert("against".into(), other);
     }
     Ok(config)
 }
 
-/// The model, what it is compared with, and the baselines; what cannot be loaded goes to `missing`.
+/// The weights and the device of a variant.
+pub(super) fn opened(variant: &Variant) -> Result<(WeightFile, Device), Failure> {
+    let device = device::choose(variant.device.as_deref().unwrap_or("auto"))?;
+    let arguments = ConfigArguments { config: None, set: variant.set.clone() };
+    let weights = weights::open(variant.weights.as_deref(), &arguments)?;
+    memory::check_networks(&weights, &device)?;
+    Ok((weights, device))
+}
+
+/// The model, its variants and the baselines. Those that cannot be loaded are added to `missing`.
 fn contestants(
     config: &EvalConfig,
     sets: &[People],
-    (names, devices): (&[String], &[Device]),
+    variants: &[(String, Variant)],
+    device: &Device,
     missing: &mut Vec<LeftOut>,
-) -> Result<Vec<Contestant>, Failure> {
+) -> Vec<Contestant> {
     let mut contestants = Vec::new();
-    let mut left_out = |name: &str, why: String| missing.push(LeftOut { name: name.into(), why });
-    let whole = Ablation::default();
-    let model = |ablation: &Ablation, device: &Device| -> Result<Model, Failure> {
-        let path = ablation.weights.as_deref().or(config.model.weights.as_deref());
-        let set = [config.model.set.clone(), ablation.set.clone()].concat();
-        let weights = weights::open(path, &ConfigArguments { config: None, set })?;
-        memory::check_networks(&weights, device)?;
-        let sides = ablation.sides && !has_known_sides(config);
-        let leave = Leave { sides, side_colors: ablation.side_colors, ..Leave::default() };
-        let photographs = ablation.photographs.unwrap_or(config.photographs);
-        let mut model = Model::load(&weights, device, leave)?;
-        model.photographs = photographs;
-        Ok(model)
-    };
-    match model(&whole, &devices[0]) {
-        Ok(model) => contestants.push(Contestant::model("model", model)),
-        Err(e) => left_out("model", e.to_string()),
-    }
-    for (name, device) in names.iter().zip(devices).skip(1) {
-        match model(&whole, device) {
-            Ok(model) => contestants.push(Contestant::other(&format!("on {name}"), model)),
-            Err(e) => left_out(name, e.to_string()),
-        }
-    }
-    for (name, ablation) in &config.ablations {
-        match model(ablation, &devices[0]) {
-            Ok(model) => contestants.push(Contestant::other(name, model)),
-            Err(e) => left_out(name, e.to_string()),
+    for (i, (name, variant)) in variants.iter().enumerate() {
+        let kind = if i == 0 { Kind::Model } else { Kind::Other };
+        let model =
+            opened(variant).and_then(|(weights, device)| Ok(Model::load(&weights, &device, variant)?));
+        match model {
+            Ok(model) => contestants.push(Contestant::model(name, kind, model)),
+            Err(e) => missing.push(LeftOut::new(name, e)),
         }
     }
     if config.baselines.billboard {
-        contestants.push(Contestant::billboard(&devices[0]));
+        contestants.push(Contestant::billboard(device));
     }
     if config.baselines.true_points {
-        contestants.push(Contestant::true_points(&devices[0]));
+        contestants.push(Contestant::true_points(device));
     }
     if !config.baselines.mean.is_empty() {
-        let views = sets[0].views();
-        let mean = match sets.iter().find(|set| set.views() != views) {
-            Some(set) => Err(snapsnap_eval::EvalError::Empty(format!(
-                "{} has {} views, the data set before it {views}: no one picture is the mean of a view",
-                set.folder().root().display(),
-                set.views()
-            ))),
-            None => MeanPictures::new(&config.baselines.mean, views),
-        };
-        match mean {
+        match MeanPictures::new(&config.baselines.mean, sets) {
             Ok(pictures) => contestants.push(Contestant::mean(pictures)),
-            Err(e) => left_out("mean_picture", e.to_string()),
+            Err(e) => missing.push(LeftOut::new("mean_picture", e)),
         }
     }
-    Ok(contestants)
-}
-
-/// Scenes of more than two photographs have no unseen sides.
-fn has_known_sides(config: &EvalConfig) -> bool {
-    config.views.inputs.len() > 2
+    contestants
 }
 
 /// The most important lines.

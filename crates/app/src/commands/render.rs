@@ -6,10 +6,11 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use burn::tensor::{Device, Tensor};
-use clap::{Args, ValueEnum};
+use clap::Args;
+use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use snapsnap_base::file;
 use snapsnap_splat::scene::{self, Loaded};
-use snapsnap_splat::{Camera, Counts, MAX_SIDE, RenderOptions, Rendered, cameras, render};
+use snapsnap_splat::{Camera, Counts, MAX_SIDE, Preset, RenderOptions, Rendered, cameras, render};
 
 use super::check_outputs;
 use crate::failure::Failure;
@@ -24,14 +25,6 @@ const DEFAULT_SIDE: u32 = 1024;
 const MAX_PIXELS: u64 = 1 << 26;
 /// Where pictures go if no output is named.
 const DEFAULT_FOLDER: &str = "renders";
-
-#[derive(Clone, Copy, ValueEnum)]
-enum Preset {
-    /// The original rasteriser: largest α 0.99, near plane 0.2 m.
-    Inria,
-    /// gsplat 1.5: largest α 0.999, near plane 0.01 m.
-    Gsplat,
-}
 
 #[derive(Args)]
 #[command(group = clap::ArgGroup::new("views").required(true).args(["cameras", "orbit"]))]
@@ -57,7 +50,7 @@ pub struct Arguments {
     #[arg(long, value_name = "FILE.safetensors")]
     raw: Option<PathBuf>,
     /// Constants of the rasteriser.
-    #[arg(long, value_enum, default_value = "inria")]
+    #[arg(long, value_parser = preset(), default_value = "inria")]
     preset: Preset,
     /// Keep the weight of splats smaller than a pixel.
     #[arg(long)]
@@ -86,10 +79,6 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let start = Instant::now();
     let loaded = scene::read(&arguments.ply, &device)?;
     let reading = start.elapsed();
-    let preset = match arguments.preset {
-        Preset::Inria => RenderOptions::inria(),
-        Preset::Gsplat => RenderOptions::gsplat_1_5(),
-    };
     // Black costs nothing, and depth is computed for --raw only.
     let background =
         (arguments.background != [0.0; 3]).then(|| Tensor::<1>::from_floats(arguments.background, &device));
@@ -97,7 +86,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
         antialiased: arguments.antialiased,
         background,
         depth: arguments.raw.is_some(),
-        ..preset
+        ..arguments.preset.options()
     };
 
     if let Some(folder) = &folder {
@@ -305,6 +294,17 @@ fn report(say: fn(&str), n: usize, counts: &[Counts], device: &Device) {
 
 fn ms(time: std::time::Duration) -> f64 {
     time.as_secs_f64() * 1e3
+}
+
+fn preset() -> impl TypedValueParser<Value = Preset> {
+    let values = [
+        PossibleValue::new("inria").help("The original rasteriser: largest α 0.99, near plane 0.2 m"),
+        PossibleValue::new("gsplat").help("gsplat 1.5: largest α 0.999, near plane 0.01 m"),
+    ];
+    PossibleValuesParser::new(values).map(|name| match name.as_str() {
+        "gsplat" => Preset::Gsplat,
+        _ => Preset::Inria,
+    })
 }
 
 fn size(text: &str) -> Result<[u32; 2], String> {

@@ -23,16 +23,16 @@ const FEW: u64 = 10_000;
 
 #[derive(Args)]
 pub struct Arguments {
-    /// Devices to try [default: every one there is].
+    /// Devices [default: all].
     #[arg(long, value_name = "DEVICE", num_args = 1..)]
     device: Vec<String>,
-    /// Also compare what these weights give in 16 bits with what they give in 32.
+    /// Also compare the results of these weights in 16 and in 32 bits.
     #[arg(long, value_name = "FILE|DIR")]
     weights: Option<PathBuf>,
-    /// Only cases with this in their area or input.
+    /// Only cases whose area or input contains this text.
     #[arg(long, value_name = "TEXT")]
     only: Option<String>,
-    /// Fewer steps where a case makes a million.
+    /// Fewer steps instead of a million.
     #[arg(long)]
     quick: bool,
     /// Folder of the report.
@@ -40,13 +40,13 @@ pub struct Arguments {
     output: PathBuf,
 }
 
-/// A made person from the front and the back, on a canvas of so many pixels.
+/// A synthetic person from the front and the back, on a canvas of `side`² pixels.
 fn photographs(side: usize) -> [Photograph; 2] {
     let mesh = synth::person("stability");
-    let renderer = Renderer::new(&mesh).expect("a made person can be drawn");
+    let renderer = Renderer::new(&mesh).expect("a synthetic person can be drawn");
     [0.0, 180.0].map(|yaw| {
         let view = renderer.draw(&Camera::orbit_at_yaw_degrees(yaw, side as u32), &ViewOptions::default());
-        // Colours come multiplied by coverage; networks see [−1, 1] times the mask.
+        // Colours are multiplied by coverage. The input of networks is [−1, 1] times the mask.
         let rgb = (0..3)
             .flat_map(|c| {
                 view.color.iter().zip(&view.alpha).map(move |(color, alpha)| 2.0 * color[c] - alpha)
@@ -87,7 +87,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
         })
         .collect();
     let progress = Progress::steps(quiet, rounds.len(), "cases");
-    // A case that panics is a row of the table, not lines on the terminal.
+    // Panics are rows of the table and print nothing.
     let hook = std::panic::take_hook();
     std::panic::set_hook(Box::new(|_| {}));
     let mut rows: Vec<Row> = Vec::new();
@@ -110,6 +110,8 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     if failed.is_empty() {
         return Ok(());
     }
-    failed.iter().for_each(|row| say::err(&format!("fails: {}, on {}: {}", row.input, row.device, row.note)));
+    failed
+        .iter()
+        .for_each(|row| say::err(&format!("fails: {}, on {}: {}", row.case.input, row.device, row.note)));
     Err(Failure::Internal(format!("{} of {} cases fail", failed.len(), rows.len())))
 }

@@ -1,11 +1,10 @@
-//! Error against run time: the same people, reconstructed in different settings.
+//! Error against run time: the evaluation of several variants of a model, with time and memory.
 
 pub mod config;
 mod oracle;
 pub mod report;
 mod tune;
 
-use snapsnap_data::sample::Handling;
 use std::time::{Duration, Instant};
 
 use burn::tensor::Device;
@@ -16,72 +15,75 @@ use snapsnap_net::weights::WeightFile;
 use snapsnap_splat::{Camera, Gaussians, scene};
 
 use crate::EvalError;
-use crate::evaluate::config::{DataSection, EvalConfig, Protocol};
-use crate::evaluate::model::{Leave, Model};
+use crate::evaluate::model::Model;
 use crate::evaluate::person::{People, photograph};
-use crate::evaluate::{Contestant, evaluate, rendered};
+use crate::evaluate::{Contestant, Kind, by_person, evaluate, rendered};
 use crate::lpips::Lpips;
 use crate::score::Score;
-use crate::statistics::{Interval, difference, interval, quantile};
+use crate::statistics::{Interval, difference, interval, quantile_of_times};
+use crate::variant::Variant;
 
-use config::{BenchConfig, Setting};
+use config::BenchConfig;
 
-/// What a setting costs and how far off its result is.
+/// Most readings and renders that are timed.
+const FEW: usize = 5;
+
+/// Costs and errors of a variant.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Measured {
-    /// Of the setting.
+    /// Its name.
     pub name: String,
-    /// What it turns.
+    /// The varied property.
     pub knob: Option<String>,
-    /// The scene that it belongs to, if it is about one.
+    /// Its scene, if it belongs to one.
     pub scene: Option<String>,
-    /// What is left out.
+    /// The omitted work.
     pub omits: Option<String>,
-    /// What ran, what was left out and why, in its own words.
+    /// The steps that ran, and the omitted ones with reasons.
     pub plan: Vec<String>,
-    /// Seconds of a step of fitting the Gaussians to the photographs, p50.
+    /// Seconds of a step that fits the Gaussians to the photographs, p50.
     pub tuning: Option<f64>,
-    /// In words.
+    /// Name of the device.
     pub device: String,
-    /// Reconstructions that were timed.
+    /// Number of timed reconstructions.
     pub runs: usize,
-    /// Seconds from the photographs on their canvas to the Gaussians.
+    /// Seconds from the photographs on their canvas to the Gaussians, p50.
     pub p50: f64,
-    /// The same.
+    /// The same, p95.
     pub p95: f64,
-    /// Seconds of each module, p50; those outside a reconstruction as well.
+    /// Seconds of each module, p50, and of the work before and after a reconstruction.
     pub modules: Vec<(String, f64)>,
-    /// Bytes of memory of a process that does nothing else, at most, without comparing pictures; `None` where the system does
-    /// not tell. A card's memory is not in it.
+    /// Largest memory, in bytes, of a process that does nothing else, before pictures are compared. The memory of a GPU
+    /// is not included. `None` if the system does not report it.
     pub memory: Option<u64>,
     /// Seconds to render a view, p50.
     pub render: f64,
-    /// Gaussians of the first person.
+    /// Number of Gaussians of the first person.
     pub gaussians: usize,
     /// dB, protocol `masked`, mean over people and views.
     #[serde(with = "crate::statistics::number")]
     pub psnr: f64,
-    /// The same of each person.
+    /// The same for each person.
     pub people: Vec<PersonScore>,
-    /// The same.
+    /// Mean over people and views.
     pub ssim: Option<f64>,
-    /// The same.
+    /// Mean over people and views.
     pub lpips: Option<f64>,
-    /// What it was computed with, or why there is none.
+    /// The weights of LPIPS, or the reason for their absence.
     pub lpips_weights: String,
-    /// Mean distance of the predicted points from the true ones, mm: front and back.
+    /// Mean distance of the predicted points of front and back from the ground truth, mm.
     pub points_mm: Option<f64>,
-    /// The same of the sides.
+    /// The same for the unseen sides.
     pub sides_mm: Option<f64>,
     /// Largest difference of a colour from the f64 oracle with the same cut-offs.
     pub splat_error: f64,
-    /// Largest difference that the cut-offs make, between oracles with and without.
+    /// Largest difference of a colour between oracles with and without cut-offs.
     pub cutoff_error: f64,
-    /// What could not be compared.
+    /// Failed parts with reasons.
     pub left_out: Vec<String>,
 }
 
-/// What one person's pictures gave.
+/// Score of one person's pictures.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct PersonScore {
     /// The person.
@@ -96,135 +98,94 @@ impl Measured {
     pub fn time(&self) -> f64 {
         self.p50 + self.render
     }
+
+    /// Whether it belongs to no scene and its Gaussians are not fitted.
+    fn is_plain(&self) -> bool {
+        self.scene.is_none() && self.tuning.is_none()
+    }
 }
 
-/// Measures one setting in this process; `most_used` tells how much memory it took so far.
+/// Measures one variant in this process. `most_used` returns the largest memory of the process so far, in bytes.
 ///
 /// # Errors
 /// [`EvalError`] for data and weights that cannot be used.
 pub fn measure(
     config: &BenchConfig,
-    name: &str,
-    setting: &Setting,
+    (name, variant): (&str, &Variant),
     weights: &WeightFile,
     (device, device_name): (&Device, &str),
     (lpips, lpips_weights): (Option<&Lpips>, &str),
     most_used: &dyn Fn() -> Option<u64>,
 ) -> Result<Measured, EvalError> {
-    let mut data = DataSection { subjects: config.bench.people, ..config.data.clone() };
-    if let Some(only) = &setting.only {
-        data.only.clone_from(only);
-    }
-    // What is fitted is the first person's.
-    if setting.tune.is_some() {
-        data.subjects = 1;
-    }
-    let folder = setting.data.as_ref().or(config.data.folders.first());
+    let runs = config.bench.runs;
+    let mut eval = config.evaluation(variant);
+    let folder = variant.data.as_ref().or(config.data.folders.first());
     let folder = folder.ok_or_else(|| EvalError::Empty("there is no data set".into()))?;
-    let mut eval = EvalConfig { data, ..EvalConfig::default() };
-    eval.views.inputs = setting.inputs.clone().unwrap_or_default();
-    eval.views.resolution = config.bench.resolution;
-    eval.views.supersampling = setting.supersampling.unwrap_or(2);
-    eval.views.preset = setting.preset.unwrap_or_default();
-    eval.views.antialiased = setting.antialiased.unwrap_or(false);
-    eval.metrics.protocols = vec![Protocol::Masked];
-    eval.metrics.geometry = false;
     let people = People::open(folder, &eval.data, &eval.views)?;
-    let count = people.views();
-    eval.views.compared = (0..config.bench.views.min(count))
-        .map(|i| (2 * i + 1) * count / (2 * config.bench.views.min(count)))
-        .collect();
-
-    let mut modules: Vec<(String, f64)> = Vec::new();
-    let start = Instant::now();
-    let leave = Leave {
-        // Scenes of more than two photographs have no unseen sides.
-        sides: setting.sides.unwrap_or(eval.views.inputs.len() <= 2),
-        side_colors: setting.side_colors.unwrap_or(true),
-        stride: setting.stride.unwrap_or(1),
-        min_opacity: setting.min_opacity.unwrap_or(0.0),
-        precision: setting.precision.unwrap_or_default(),
-    };
-    let model = Model::load(weights, device, leave)?;
-    device.sync().expect("the device finishes its work");
-    modules.push(("loading weights".into(), start.elapsed().as_secs_f64()));
-
+    let (all, compared) = (people.views(), config.bench.views.min(people.views()));
+    eval.views.compared = (0..compared).map(|i| (2 * i + 1) * all / (2 * compared)).collect();
     let nobody = || match eval.data.only.as_slice() {
-        [] => EvalError::Empty(format!("{}: there is nobody", folder.display())),
-        only => EvalError::Empty(format!("{}: has nobody called {}", folder.display(), only.join(", "))),
+        [] => EvalError::Empty(format!("{}: has no people", folder.display())),
+        only => EvalError::Empty(format!("{}: has no person named {}", folder.display(), only.join(", "))),
     };
     let first = people.chosen().first().copied().ok_or_else(nobody)?;
-    let inputs = people.inputs(&eval.views, 0);
-    let mut readings = Vec::new();
-    let mut item = people.item(first, &inputs, &Handling::default())?;
-    for _ in 0..config.bench.runs.min(5) {
-        let start = Instant::now();
-        item = people.item(first, &inputs, &Handling::default())?;
-        let canvases: Vec<_> =
-            (0..inputs.len()).map(|place| photograph(&item, place, model.side())).collect();
-        readings.push(start.elapsed());
-        drop(canvases);
-    }
-    modules.push(("reading photographs".into(), p(&readings, 0.5)));
 
+    let (model, loading) = timed(1, || {
+        let model = Model::load(weights, device, variant)?;
+        device.sync().expect("the device finishes its work");
+        Ok(model)
+    })?;
+    let inputs = people.inputs(&eval.views, 0);
+    let read = || people.item(first, &inputs, &model.photographs);
+    read()?;
+    let (item, reading) = timed(runs.min(FEW), || {
+        let item = read()?;
+        (0..inputs.len()).for_each(|place| drop(photograph(&item, place, model.side())));
+        Ok(item)
+    })?;
     for _ in 0..config.bench.warm_up {
-        drop(model.reconstruct(&item, &inputs));
+        model.reconstruct(&item, &inputs)?;
     }
-    let (mut times, mut parts) = (Vec::new(), Vec::<(&'static str, Vec<Duration>)>::new());
-    let mut made = None;
-    for _ in 0..config.bench.runs {
-        let run = model.reconstruct(&item, &inputs);
-        times.push(run.time);
-        // Several pairs of photographs go through each module one after another.
-        let mut seen: Vec<&str> = Vec::new();
-        for (name, time) in &run.modules {
-            let again = seen.contains(name);
-            seen.push(name);
-            match parts.iter_mut().find(|(there, _)| there == name) {
-                Some((_, times)) if again => *times.last_mut().expect("of this run") += *time,
-                Some((_, times)) => times.push(*time),
-                None => parts.push((name, vec![*time])),
-            }
-        }
-        made = Some(run);
-    }
-    let mut made = made.expect("at least one run");
-    modules.extend(parts.iter().map(|(name, times)| ((*name).to_owned(), p(times, 0.5))));
-    if made.gaussians.is_empty() {
-        return Err(EvalError::Empty("no Gaussian came out".into()));
+    let mut reconstructions = Vec::new();
+    let (mut made, _) = timed(runs, || {
+        let mut made = model.reconstruct(&item, &inputs)?;
+        reconstructions.push((made.time, std::mem::take(&mut made.modules)));
+        Ok(made)
+    })?;
+    let times: Vec<Duration> = reconstructions.iter().map(|(time, _)| *time).collect();
+    let mut modules =
+        vec![("loading weights".to_owned(), loading), ("reading photographs".to_owned(), reading)];
+    for (module, _) in &reconstructions[0].1 {
+        let of_all = reconstructions.iter().flat_map(|(_, modules)| modules);
+        let times: Vec<Duration> = of_all.filter(|(name, _)| name == module).map(|(_, time)| *time).collect();
+        modules.push(((*module).to_owned(), quantile_of_times(&times, 0.5)));
     }
     let mut tuning = None;
-    if let Some(what) = setting.tune {
-        let steps = tune::STEPS.min(20 * config.bench.runs);
-        let (tuned, times) = tune::fit(&made.gaussians, &people, (first, &inputs, &item), what, steps)?;
-        made.gaussians = tuned;
-        tuning = Some(p(&times, 0.5));
+    if let Some(tuned) = variant.tune {
+        let steps = tune::STEPS.min(20 * runs);
+        let (gaussians, times) = tune::fit(&made.gaussians, &people, (first, &inputs, &item), tuned, steps)?;
+        made.gaussians = gaussians;
+        tuning = Some(quantile_of_times(&times, 0.5));
     }
     let memory = most_used();
+
     let temporary = tempfile::tempdir().map_err(FileError::write(&std::env::temp_dir()))?;
-    let start = Instant::now();
-    scene::write(&made.gaussians, &temporary.path().join("human.ply"))?;
-    modules.push(("writing the PLY".into(), start.elapsed().as_secs_f64()));
+    let ply = temporary.path().join("human.ply");
+    let ((), writing) = timed(1, || Ok(scene::write(&made.gaussians, &ply)?))?;
+    modules.push(("writing the PLY".into(), writing));
     let side = people.side(&eval.views);
     let camera = item.cameras[eval.views.compared[0]];
-    let mut renders = Vec::new();
-    for _ in 0..config.bench.runs.min(5) {
-        let start = Instant::now();
-        drop(rendered(&made.gaussians, &camera, side, &eval.views)?);
-        renders.push(start.elapsed());
-    }
-    let render = p(&renders, 0.5);
+    let (_, render) = timed(runs.min(FEW), || rendered(&made.gaussians, &camera, side, &eval.views))?;
     modules.push((format!("rendering a view of {side}²"), render));
-
-    let options = eval.views.render_options();
     let patch = patch(&made.gaussians, &camera.resized(side as u32, side as u32), config.bench.oracle);
-    let (splat_error, cutoff_error) = oracle::errors(&made.gaussians, &patch, &options)?;
+    let (splat_error, cutoff_error) = oracle::errors(&made.gaussians, &patch, &eval.views.render_options())?;
+
     let (gaussians, plan) = (made.gaussians.len(), made.plan);
-    let contestants = match setting.tune {
-        Some(_) => [Contestant::fixed(name, made.gaussians)],
-        None => [Contestant::model(name, model)],
+    let contestant = match variant.tune {
+        Some(_) => Contestant::fixed(name, made.gaussians),
+        None => Contestant::model(name, Kind::Model, model),
     };
-    let outcome = evaluate(&eval, std::slice::from_ref(&people), &contestants, lpips, &|_, _| ());
+    let outcome = evaluate(&eval, std::slice::from_ref(&people), &[contestant], lpips, &|_, _| ());
     let judged = &outcome.judged[0];
     let scores: Vec<Score> = judged.rows.iter().map(|row| row.scores[0]).collect();
     let Score { psnr, ssim, lpips } =
@@ -235,29 +196,25 @@ pub fn measure(
             errors.filter(|error| (error.view > 1) == sides).map(|error| 1e3 * error.mean).collect();
         (!errors.is_empty()).then(|| errors.iter().sum::<f64>() / errors.len() as f64)
     };
-    let of_person = |(row, name): (usize, &String)| {
-        let rows = judged.rows.iter().filter(|r| r.person == row);
-        let scores: Vec<Score> = rows.map(|r| r.scores[0]).collect();
-        Some(PersonScore { name: name.clone(), psnr: Score::mean(&scores)?.psnr })
-    };
-    let left_out = outcome.left_out.iter().map(|l| format!("{}: {}", l.name, l.why)).collect();
+    let of_person =
+        |(row, score): (usize, Score)| PersonScore { name: outcome.people[row].clone(), psnr: score.psnr };
     Ok(Measured {
         name: name.into(),
-        knob: setting.knob.clone(),
-        scene: setting.scene.clone(),
-        omits: setting.omits.clone(),
+        knob: variant.knob.clone(),
+        scene: variant.scene.clone(),
+        omits: variant.omits.clone(),
         plan,
         tuning,
         device: device_name.into(),
-        runs: config.bench.runs,
-        p50: p(&times, 0.5),
-        p95: p(&times, 0.95),
+        runs,
+        p50: quantile_of_times(&times, 0.5),
+        p95: quantile_of_times(&times, 0.95),
         modules,
         memory,
         render,
         gaussians,
         psnr,
-        people: outcome.people.iter().enumerate().filter_map(of_person).collect(),
+        people: by_person(&judged.rows, 0).into_iter().map(of_person).collect(),
         ssim,
         lpips,
         lpips_weights: lpips_weights.into(),
@@ -265,18 +222,22 @@ pub fn measure(
         sides_mm: points(true),
         splat_error,
         cutoff_error,
-        left_out,
+        left_out: outcome.left_out.iter().map(|l| format!("{}: {}", l.name, l.why)).collect(),
     })
 }
 
-/// A quantile of times, seconds.
-fn p(times: &[Duration], share: f64) -> f64 {
-    let mut seconds: Vec<f64> = times.iter().map(Duration::as_secs_f64).collect();
-    seconds.sort_by(f64::total_cmp);
-    quantile(&seconds, share)
+/// The result of the last of `count` calls, and the median of their seconds.
+fn timed<T>(count: usize, mut call: impl FnMut() -> Result<T, EvalError>) -> Result<(T, f64), EvalError> {
+    let (mut times, mut last) = (Vec::new(), None);
+    for _ in 0..count {
+        let start = Instant::now();
+        last = Some(call()?);
+        times.push(start.elapsed());
+    }
+    Ok((last.expect("at least one call"), quantile_of_times(&times, 0.5)))
 }
 
-/// The part of a picture around the middle of what it shows, as a camera of its own.
+/// A camera for the patch of a picture around the middle of the Gaussians.
 fn patch(shown: &Gaussians, camera: &Camera, side: u32) -> Camera {
     let side = side.min(camera.width).min(camera.height);
     let mean = snapsnap_ops::host(shown.means.clone().mean_dim(0));
@@ -287,17 +248,15 @@ fn patch(shown: &Gaussians, camera: &Camera, side: u32) -> Camera {
     Camera { width: side, height: side, principal_point: camera.principal_point - corner, ..*camera }
 }
 
-/// Share of time below which a difference is noise.
+/// Share of the time. Smaller differences are noise.
 const FASTER: f64 = 0.03;
 
-/// Which settings others beat: clearly better pictures (the paired interval over people is above 0) in no more time, or as good
-/// ones in clearly less time. Time is that of a reconstruction and a view. By place, the place of the best of those that beat
-/// it. Scenes, tuned Gaussians and other people are not compared.
+/// For each variant, the index of the best variant that dominates it: with clearly better pictures (the paired interval
+/// over people is above 0) in no more time, or with equally good ones in clearly less time. Time is that of a
+/// reconstruction and a view. Scenes, tuned Gaussians and different people are not compared.
 pub fn dominated(measured: &[Measured]) -> Vec<Option<usize>> {
     let names = |m: &Measured| m.people.iter().map(|person| person.name.clone()).collect::<Vec<_>>();
-    let is_alike = |a: &Measured, b: &Measured| {
-        [a, b].iter().all(|m| m.scene.is_none() && m.tuning.is_none()) && names(a) == names(b)
-    };
+    let is_alike = |a: &Measured, b: &Measured| a.is_plain() && b.is_plain() && names(a) == names(b);
     let beats = |a: &Measured, b: &Measured| {
         let pairs = a.people.iter().zip(&b.people);
         let differences: Vec<f64> = pairs.map(|(a, b)| difference(a.psnr, b.psnr)).collect();
@@ -316,7 +275,8 @@ pub fn dominated(measured: &[Measured]) -> Vec<Option<usize>> {
 mod tests {
     use super::*;
 
-    /// Reconstructs in that time and renders in a second; a person's PSNR and that of another, who is 2 dB better.
+    /// A variant that reconstructs in `p50` seconds and renders in one, with the PSNR of two people that differ by 2
+    /// dB.
     fn measured(p50: f64, psnr: f64) -> Measured {
         let person = |name: &str, psnr| PersonScore { name: name.into(), psnr };
         Measured {
@@ -348,20 +308,20 @@ mod tests {
     }
 
     #[test]
-    fn what_is_slower_and_no_better_is_dominated_by_the_best_of_its_betters() {
+    fn slower_and_no_better_variants_are_dominated_by_the_best_better_one() {
         let all = [(10.0, 20.0), (20.0, 19.0), (5.0, 19.5), (30.0, 21.0), (10.2, 20.0)];
         let mut all = all.map(|(p50, psnr)| measured(p50, psnr));
-        // The last one is slower by less than noise.
+        // The difference to the time of the last one is noise.
         assert_eq!(dominated(&all), [None, Some(4), None, None, None]);
-        // Better of one person, worse of the other: not clearly better, though in the mean.
+        // Better for one person and worse for the other: better in the mean, but not clearly.
         all[4].people[0].psnr -= 1.0;
         all[4].people[1].psnr += 1.5;
         assert_eq!(dominated(&all), [None, Some(4), None, None, None]);
-        // What renders slowly is slow.
+        // Time to render counts.
         all[4].render = 20.0;
         assert_eq!(dominated(&all), [None, Some(0), None, None, None]);
         all[4].render = 1.0;
-        // Scenes, fitted Gaussians and other people are not compared.
+        // Scenes, fitted Gaussians and different people are not compared.
         let others: [fn(&mut Measured); 3] =
             [|m| m.scene = Some("another".into()), |m| m.tuning = Some(1.0), |m| m.people[1].name.push('c')];
         for other in others {

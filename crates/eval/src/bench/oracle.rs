@@ -1,4 +1,4 @@
-//! How far the renderer is from the plain formulas in f64.
+//! Differences of the renderer from the f64 oracle.
 
 use snapsnap_ops::host;
 use snapsnap_splat::reference::{self, Cutoff, Scene};
@@ -6,11 +6,11 @@ use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
 
 use crate::EvalError;
 
-/// Largest α of a splat where nothing is cut off.
+/// Largest α of a splat without cut-offs.
 const WHOLE: f32 = 0.999_99;
 
-/// Largest differences of a colour in a view: of the renderer from the oracle with the same cut-offs, and of that from one
-/// whose pixels never close, whose splats fade smoothly and may be opaque.
+/// Largest differences of a colour in a view: of the renderer from the oracle with the same cut-offs, and of that
+/// oracle from one without cut-offs, whose pixels never close, and whose splats fade smoothly and may be opaque.
 pub(super) fn errors(
     gaussians: &Gaussians,
     camera: &Camera,
@@ -31,8 +31,8 @@ pub(super) fn errors(
     Ok((rounding, cutoffs))
 }
 
-/// Gaussians before black, as the oracle takes them.
-pub(crate) fn scene(gaussians: &Gaussians) -> Scene<f64> {
+/// The oracle's form of Gaussians, over black.
+fn scene(gaussians: &Gaussians) -> Scene<f64> {
     let double = |values: Vec<f32>| values.into_iter().map(f64::from).collect::<Vec<_>>();
     let means = double(host(gaussians.means.clone()));
     let rotations = double(host(gaussians.rotations.clone()));

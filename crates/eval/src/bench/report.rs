@@ -5,30 +5,28 @@ use std::path::Path;
 
 use serde_json::{Value, json};
 use snapsnap_base::file;
+use snapsnap_base::plot::{Axes, Series, svg};
 
 use super::{Measured, dominated};
 use crate::evaluate::LeftOut;
-use crate::report::{Header, escaped, table};
-use snapsnap_base::plot::{Axes, Series, svg};
+use crate::report::{Header, escaped, left_out_markdown, number, table, table_markdown};
 
-/// Longest log of a training that is read.
+/// Largest size of a training's log in bytes.
 const MOST: u64 = 256 << 20;
 
-/// What validations of the two stages tell.
+/// Figures of the validations of stage 1 and stage 2.
 const POINTS: &str = "point error, mm";
 const PICTURES: &str = "masked PSNR, dB";
 
-/// What a report is made of.
+/// The content of a report.
 pub struct Bench<'a> {
     /// Command, commit, device, date.
     pub header: Header,
-    /// Settings, the model as it is first.
+    /// Variants, the model under test first.
     pub measured: &'a [Measured],
-    /// Settings that could not be measured.
+    /// Variants that could not be measured, and trainings that could not be read.
     pub left_out: &'a [LeftOut],
-    /// What LPIPS was computed with, or why there is none.
-    pub lpips: String,
-    /// Trainings: name, and seconds and masked PSNR or point error of their validations.
+    /// Trainings with validations.
     pub training: &'a [Training],
 }
 
@@ -36,9 +34,9 @@ pub struct Bench<'a> {
 pub struct Training {
     /// Its folder's name.
     pub name: String,
-    /// What is validated.
+    /// The validated figure.
     pub what: &'static str,
-    /// Seconds, value.
+    /// Seconds and values.
     pub points: Vec<(f64, f64)>,
 }
 
@@ -46,7 +44,7 @@ impl Training {
     /// Reads the log of a run.
     ///
     /// # Errors
-    /// Why it cannot be read, or that it has no validation.
+    /// A message, if it cannot be read or has no validation.
     pub fn read(run: &Path) -> Result<Self, String> {
         let path = run.join("log.jsonl");
         let wrong = |message: String| format!("{}: {message}", path.display());
@@ -64,6 +62,9 @@ impl Training {
     }
 }
 
+/// Title and cells of a column.
+type Column = (&'static str, fn(&Measured) -> String);
+
 impl Bench<'_> {
     /// `report.json`.
     pub fn json(&self) -> Value {
@@ -78,9 +79,21 @@ impl Bench<'_> {
         report["settings"] = self.measured.iter().zip(&by).map(setting).collect();
         let curve = |t: &Training| json!({ "run": t.name, "what": t.what, "points": t.points });
         report["training"] = self.training.iter().map(curve).collect();
-        report["lpips"] = json!(self.lpips);
+        report["lpips"] = json!(self.lpips());
         report["left_out"] = json!(self.left_out);
         report
+    }
+
+    /// The weights of LPIPS, or the reason for their absence.
+    fn lpips(&self) -> &str {
+        self.measured.first().map_or("n/a", |m| &m.lpips_weights)
+    }
+
+    /// All failures, those of the measured variants last.
+    pub fn failures(&self) -> Vec<LeftOut> {
+        let partly =
+            self.measured.iter().flat_map(|m| m.left_out.iter().map(|why| LeftOut::new(&m.name, why)));
+        self.left_out.iter().cloned().chain(partly).collect()
     }
 
     /// `report.md`.
@@ -89,108 +102,88 @@ impl Bench<'_> {
         let runs = self.measured.first().map_or(0, |m| m.runs);
         let _ = writeln!(
             text,
-            "* {runs} reconstructions each after warm-up, device synchronised, each setting in a process of its own, whose largest memory \
-             is told (without comparing pictures)\n\
+            "* {runs} reconstructions each after warm-up, device synchronised. Each setting runs in its own process, whose largest memory \
+             is reported (before pictures are compared)\n\
              * Errors: protocol `masked`; LPIPS: {}\n\
-             * Splat error: largest difference of a colour from the f64 oracle, not supersampled (where rounding takes a splat over a \
-             cut-off, up to 1/255 and what it hides); by cut-offs: what skipping α < 1/255, closing pixels and \
-             the largest α change of it\n\
-             * Dominated: another has clearly better pictures (95 % interval of the differences person by person above 0) in no more time, or \
-             no worse ones in less time by more than 3 %; time: reconstruction and one view\n",
-            self.lpips
+             * Splat error: largest difference of a colour from the f64 oracle, not supersampled (up to 1/255 and the colours behind, where \
+             rounding moves a splat over a cut-off); by cut-offs: the change by skipping α < 1/255, closing pixels and \
+             the largest α\n\
+             * Dominated: another setting has clearly better pictures (95 % interval of the differences person by person above 0) in no more \
+             time, or no worse ones in less time by more than 3 %; time: reconstruction and one view\n",
+            self.lpips()
         );
-        let _ = writeln!(
-            text,
-            "| knob | setting | PSNR, dB | SSIM ×100 | LPIPS ×100 | front, back, mm | sides, mm | reconstruction p50, ms | p95, ms | a view, ms | memory, MB | Gaussians | splat error | by cut-offs | dominated by |\n\
-             |---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|"
-        );
-        let by = dominated(self.measured);
-        let optional =
-            |value: Option<f64>, times: f64| value.map_or("n/a".into(), |v| format!("{:.2}", v * times));
-        for (m, by) in self.measured.iter().zip(&by) {
-            let _ = writeln!(
-                text,
-                "| {} | {} | {:.2} | {} | {} | {} | {} | {:.1} | {:.1} | {:.1} | {} | {} | {:.1e} | {:.1e} | {} |",
-                escaped(m.knob.as_deref().unwrap_or_default()),
-                escaped(&m.name),
-                m.psnr,
-                optional(m.ssim, 100.0),
-                optional(m.lpips, 100.0),
-                optional(m.points_mm, 1.0),
-                optional(m.sides_mm, 1.0),
-                1e3 * m.p50,
-                1e3 * m.p95,
-                1e3 * m.render,
-                m.memory.map_or("n/a".into(), |bytes| (bytes / 1_000_000).to_string()),
-                m.gaussians,
-                m.splat_error,
-                m.cutoff_error,
-                by.map_or(String::new(), |place| escaped(&self.measured[place].name)),
-            );
-        }
+        const COLUMNS: &[Column] = &[
+            ("knob", |m| m.knob.clone().unwrap_or_default()),
+            ("setting", |m| m.name.clone()),
+            ("PSNR, dB", |m| format!("{:.2}", m.psnr)),
+            ("SSIM ×100", |m| scaled(m.ssim, 100.0)),
+            ("LPIPS ×100", |m| scaled(m.lpips, 100.0)),
+            ("front, back, mm", |m| scaled(m.points_mm, 1.0)),
+            ("sides, mm", |m| scaled(m.sides_mm, 1.0)),
+            ("reconstruction p50, ms", |m| format!("{:.1}", 1e3 * m.p50)),
+            ("p95, ms", |m| format!("{:.1}", 1e3 * m.p95)),
+            ("a view, ms", |m| format!("{:.1}", 1e3 * m.render)),
+            ("memory, MB", |m| m.memory.map_or("n/a".into(), |bytes| (bytes / 1_000_000).to_string())),
+            ("Gaussians", |m| m.gaussians.to_string()),
+            ("splat error", |m| format!("{:.1e}", m.splat_error)),
+            ("by cut-offs", |m| format!("{:.1e}", m.cutoff_error)),
+        ];
+        let (header, rows) = self.table(COLUMNS, "dominated by");
+        text += &table_markdown(&header, rows.into_iter());
         self.scenes(&mut text);
         self.modules(&mut text);
         for picture in pictures {
             let _ = writeln!(text, "\n![{picture}]({picture})");
         }
-        let partly = self.measured.iter().flat_map(|m| m.left_out.iter().map(move |why| (&m.name, why)));
-        let whole = self.left_out.iter().map(|l| (&l.name, &l.why));
-        let all: Vec<_> = whole.chain(partly).collect();
-        if !all.is_empty() {
-            let _ = writeln!(text, "\n## Left out: {}\n", all.len());
-            for (name, why) in all {
-                let _ = writeln!(text, "* {}: {}", escaped(name), escaped(why));
-            }
-        }
-        text
+        text + &left_out_markdown(&self.failures())
     }
 
-    /// What each omission saves and costs, beside the setting of its scene that leaves nothing out.
+    /// Savings and costs of each omission, relative to the setting of its scene that omits nothing.
     fn scenes(&self, text: &mut String) {
         let mut scenes: Vec<&String> = self.measured.iter().filter_map(|m| m.scene.as_ref()).collect();
         scenes.dedup();
         for scene in scenes {
             let of_scene = || self.measured.iter().filter(|m| m.scene.as_ref() == Some(scene));
             let Some(whole) = of_scene().find(|m| m.omits.is_none()) else { continue };
-            let _ = writeln!(
-                text,
-                "\n## Scene: {}\n\n| left out | {}, ms | saved | memory, MB | saved | PSNR, dB | lost | front, back, mm | more | Gaussians |\n\
-                 |---|---|---|---|---|---|---|---|---|---|",
-                escaped(scene),
-                if whole.tuning.is_some() { "a step of fitting" } else { "time" }
-            );
-            // Where something is fitted, a step of that is what takes time.
+            // The time of a fit is that of a step.
             let time = |m: &Measured| 1e3 * m.tuning.unwrap_or(m.p50);
             let share = |now: f64, before: f64| format!("{:.0} %", 100.0 * (1.0 - now / before));
             let megabytes = |m: &Measured| m.memory.map(|bytes| bytes as f64 / 1e6);
-            for m in of_scene() {
-                let is_whole = m.omits.is_none();
-                let or_nothing = |text: String| if is_whole { String::new() } else { text };
+            let row = |m: &Measured| {
+                let or_nothing = |text: String| if m.omits.is_none() { String::new() } else { text };
                 let memory = megabytes(m).zip(megabytes(whole));
                 let points = m.points_mm.zip(whole.points_mm);
-                let _ = writeln!(
-                    text,
-                    "| {} | {:.1} | {} | {} | {} | {:.2} | {} | {} | {} | {} |",
-                    escaped(m.omits.as_deref().unwrap_or("nothing")),
-                    time(m),
+                vec![
+                    m.omits.clone().unwrap_or("nothing".into()),
+                    format!("{:.1}", time(m)),
                     or_nothing(share(time(m), time(whole))),
                     memory.map_or("n/a".into(), |(now, _)| format!("{now:.0}")),
                     or_nothing(memory.map_or("n/a".into(), |(now, before)| share(now, before))),
-                    m.psnr,
+                    format!("{:.2}", m.psnr),
                     or_nothing(format!("{:.2}", whole.psnr - m.psnr)),
                     points.map_or("n/a".into(), |(now, _)| format!("{now:.1}")),
                     or_nothing(points.map_or("n/a".into(), |(now, before)| format!("{:.1}", now - before))),
-                    m.gaussians
-                );
-            }
+                    m.gaussians.to_string(),
+                ]
+            };
+            let milliseconds = if whole.tuning.is_some() { "a step of fitting, ms" } else { "time, ms" };
+            let header = [
+                "left out",
+                milliseconds,
+                "saved",
+                "memory, MB",
+                "saved",
+                "PSNR, dB",
+                "lost",
+                "front, back, mm",
+                "more",
+                "Gaussians",
+            ];
+            let table = table_markdown(&header, of_scene().map(row));
+            let _ = write!(text, "\n## Scene: {}\n\n{table}", escaped(scene));
             for m in of_scene() {
-                let omits = m.omits.as_deref().unwrap_or("nothing");
-                let _ = writeln!(
-                    text,
-                    "\nWhat ran with {} left out: {}.",
-                    escaped(omits),
-                    escaped(&m.plan.join("; "))
-                );
+                let (omits, plan) = (m.omits.as_deref().unwrap_or("nothing"), m.plan.join("; "));
+                let _ = writeln!(text, "\nSteps, {} left out: {}.", escaped(omits), escaped(&plan));
             }
         }
     }
@@ -202,79 +195,61 @@ impl Bench<'_> {
                 names.push(name);
             }
         }
-        let _ = writeln!(text, "\n## By module\n\nMilliseconds, p50.\n");
-        let heads: Vec<String> = names.iter().map(|name| escaped(name)).collect();
-        let _ = writeln!(text, "| setting | {} |\n|---|{}", heads.join(" | "), "---|".repeat(names.len()));
-        for m in self.measured {
+        let row = |m: &Measured| -> Vec<String> {
             let time = |name: &&String| {
-                let found = m.modules.iter().find(|(there, _)| there == *name);
+                let found = m.modules.iter().find(|(module, _)| module == *name);
                 found.map_or(String::new(), |(_, seconds)| format!("{:.1}", 1e3 * seconds))
             };
-            let times: Vec<String> = names.iter().map(time).collect();
-            let _ = writeln!(text, "| {} | {} |", escaped(&m.name), times.join(" | "));
-        }
+            [m.name.clone()].into_iter().chain(names.iter().map(time)).collect()
+        };
+        let header: Vec<&str> =
+            ["setting"].into_iter().chain(names.iter().map(|name| name.as_str())).collect();
+        let table = table_markdown(&header, self.measured.iter().map(row));
+        let _ = write!(text, "\n## By module\n\nMilliseconds, p50.\n\n{table}");
     }
 
     /// `settings.csv`.
     pub fn csv(&self) -> String {
-        let header = [
-            "setting",
-            "knob",
-            "scene",
-            "omits",
-            "people",
-            "device",
-            "psnr",
-            "ssim",
-            "lpips",
-            "points_mm",
-            "sides_mm",
-            "p50_s",
-            "p95_s",
-            "render_s",
-            "tuning_step_s",
-            "memory_bytes",
-            "gaussians",
-            "splat_error",
-            "cutoff_error",
-            "dominated_by",
+        const COLUMNS: &[Column] = &[
+            ("setting", |m| m.name.clone()),
+            ("knob", |m| m.knob.clone().unwrap_or_default()),
+            ("scene", |m| m.scene.clone().unwrap_or_default()),
+            ("omits", |m| m.omits.clone().unwrap_or_default()),
+            ("people", |m| m.people.iter().map(|p| p.name.as_str()).collect::<Vec<_>>().join(" ")),
+            ("device", |m| m.device.clone()),
+            ("psnr", |m| m.psnr.to_string()),
+            ("ssim", |m| number(m.ssim)),
+            ("lpips", |m| number(m.lpips)),
+            ("points_mm", |m| number(m.points_mm)),
+            ("sides_mm", |m| number(m.sides_mm)),
+            ("p50_s", |m| m.p50.to_string()),
+            ("p95_s", |m| m.p95.to_string()),
+            ("render_s", |m| m.render.to_string()),
+            ("tuning_step_s", |m| number(m.tuning)),
+            ("memory_bytes", |m| m.memory.map_or(String::new(), |bytes| bytes.to_string())),
+            ("gaussians", |m| m.gaussians.to_string()),
+            ("splat_error", |m| m.splat_error.to_string()),
+            ("cutoff_error", |m| m.cutoff_error.to_string()),
         ];
-        let number = |value: Option<f64>| value.map_or(String::new(), |v| v.to_string());
-        let row = |(m, by): (&Measured, Option<usize>)| {
-            vec![
-                m.name.clone(),
-                m.knob.clone().unwrap_or_default(),
-                m.scene.clone().unwrap_or_default(),
-                m.omits.clone().unwrap_or_default(),
-                m.people.iter().map(|person| person.name.as_str()).collect::<Vec<_>>().join(" "),
-                m.device.clone(),
-                m.psnr.to_string(),
-                number(m.ssim),
-                number(m.lpips),
-                number(m.points_mm),
-                number(m.sides_mm),
-                m.p50.to_string(),
-                m.p95.to_string(),
-                m.render.to_string(),
-                number(m.tuning),
-                m.memory.map_or(String::new(), |bytes| bytes.to_string()),
-                m.gaussians.to_string(),
-                m.splat_error.to_string(),
-                m.cutoff_error.to_string(),
-                by.map_or(String::new(), |place| self.measured[place].name.clone()),
-            ]
-        };
-        table(&header, self.measured.iter().zip(dominated(self.measured)).map(row))
+        let (header, rows) = self.table(COLUMNS, "dominated_by");
+        table(&header, rows.into_iter())
     }
 
-    /// PSNR over run time, the front joined; empty where there is nothing to choose from.
+    /// Header and rows of a table of all variants, whose last column is the dominating variant.
+    fn table(&self, columns: &[Column], last: &'static str) -> (Vec<&'static str>, Vec<Vec<String>>) {
+        let row = |(m, by): (&Measured, Option<usize>)| -> Vec<String> {
+            let by = by.map_or(String::new(), |index| self.measured[index].name.clone());
+            columns.iter().map(|(_, cell)| cell(m)).chain([by]).collect()
+        };
+        let header = columns.iter().map(|(title, _)| *title).chain([last]).collect();
+        (header, self.measured.iter().zip(dominated(self.measured)).map(row).collect())
+    }
+
+    /// PSNR over run time with the Pareto front as a line; empty for less than two settings.
     fn pareto(&self) -> String {
         let at = |m: &Measured| (1e3 * m.time(), m.psnr);
         let by = dominated(self.measured);
-        let plain = || {
-            let alike = |m: &Measured| m.scene.is_none() && m.tuning.is_none();
-            self.measured.iter().zip(&by).filter(move |(m, _)| alike(m))
-        };
+        let plain = || self.measured.iter().zip(&by).filter(|(m, _)| m.is_plain());
         if plain().count() < 2 {
             return String::new();
         }
@@ -309,7 +284,7 @@ impl Bench<'_> {
         svg(&[(axes, series)])
     }
 
-    /// The plots by their names, empty where there is nothing to draw.
+    /// File names and texts of the plots. A plot without points is empty.
     pub fn plots(&self) -> [(&'static str, String); 3] {
         [
             ("pareto.svg", self.pareto()),
@@ -317,4 +292,9 @@ impl Bench<'_> {
             ("training_pictures.svg", self.curves(PICTURES)),
         ]
     }
+}
+
+/// A figure in a table of Markdown, multiplied by `times`.
+fn scaled(figure: Option<f64>, times: f64) -> String {
+    figure.map_or("n/a".into(), |v| format!("{:.2}", v * times))
 }

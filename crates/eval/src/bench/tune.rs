@@ -1,5 +1,4 @@
-//! Fitting a person's Gaussians to the photographs that they were made of: what that costs with everything tracked, and with colours
-//! alone.
+//! Fit of a person's Gaussians to the photographs: the cost of gradients of all parameters, and of colours alone.
 
 use std::time::{Duration, Instant};
 
@@ -7,28 +6,28 @@ use burn::tensor::Tensor;
 use snapsnap_data::sample::TestItem;
 use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
 
-use super::config::Tune;
 use crate::EvalError;
 use crate::evaluate::person::People;
+use crate::variant::Tune;
 
-/// Steps of a fit.
+/// Number of steps of a fit.
 pub(super) const STEPS: usize = 40;
-/// Step sizes of Adam: means in metres, rotations, scales and opacities as shares of themselves, colours.
+/// Step sizes of Adam: means in metres, rotations, scales relative to their size, opacities, colours.
 const RATES: [f64; 5] = [1e-4, 1e-3, 5e-3, 5e-3, 1e-2];
 
-/// Adam's memory of a parameter.
-struct Moments<const D: usize> {
-    mean: Tensor<D>,
-    squares: Tensor<D>,
+/// Adam's moments of a parameter.
+struct Moments {
+    mean: Tensor<2>,
+    squares: Tensor<2>,
 }
 
-impl<const D: usize> Moments<D> {
-    fn new(like: &Tensor<D>) -> Self {
+impl Moments {
+    fn new(like: &Tensor<2>) -> Self {
         Self { mean: like.zeros_like(), squares: like.zeros_like() }
     }
 
-    /// The step against a gradient, of about 1.
-    fn direction(&mut self, gradient: Tensor<D>, step: usize) -> Tensor<D> {
+    /// The direction of a step, of size 1 or so.
+    fn direction(&mut self, gradient: Tensor<2>, step: usize) -> Tensor<2> {
         const BETAS: [f64; 2] = [0.9, 0.99];
         self.mean = self.mean.clone() * BETAS[0] + gradient.clone() * (1.0 - BETAS[0]);
         self.squares = self.squares.clone() * BETAS[1] + gradient.square() * (1.0 - BETAS[1]);
@@ -37,8 +36,8 @@ impl<const D: usize> Moments<D> {
     }
 }
 
-/// Fits Gaussians (world frame) to a person's photographs with an L1 loss; also the time of each step. What is not fitted is not
-/// tracked, and costs neither gradients nor moments.
+/// Fits Gaussians (world frame) to a person's stored photographs with an L1 loss. Also returns the time of each step.
+/// Parameters that are not fitted are not tracked and need neither gradients nor moments.
 pub(super) fn fit(
     gaussians: &Gaussians,
     people: &People,
@@ -53,48 +52,42 @@ pub(super) fn fit(
         Ok(people.target(row, *view, side)?.0.tensor(&device).permute([0, 2, 3, 1]))
     };
     let targets = Tensor::cat(inputs.iter().map(target).collect::<Result<Vec<_>, _>>()?, 0);
-    let inner = |x: &Tensor<2>| Tensor::from_data(x.to_data(), &device);
-    let mut rows = [&gaussians.means, &gaussians.rotations, &gaussians.scales, &gaussians.colors].map(inner);
-    let mut opacities: Tensor<1> = Tensor::from_data(gaussians.opacities.to_data(), &device);
-    let all = what == Tune::All;
-    let mut moments: Vec<Option<Moments<2>>> = rows
+    let Gaussians { means, rotations, scales, opacities, colors } = gaussians.clone();
+    let mut rows = [means, rotations, scales, opacities.unsqueeze_dim(1), colors]
+        .map(|x: Tensor<2>| Tensor::<2>::from_data(x.to_data(), &device));
+    let is_fitted = |parameter: usize| what == Tune::All || parameter == 4;
+    let mut moments: Vec<Option<Moments>> = rows
         .iter()
         .enumerate()
-        .map(|(i, x)| (all || i == 3).then(|| Moments::new(&x.clone().inner())))
+        .map(|(i, x)| is_fitted(i).then(|| Moments::new(&x.clone().inner())))
         .collect();
-    let mut of_opacities = all.then(|| Moments::new(&opacities.clone().inner()));
+    let assembled = |[means, rotations, scales, opacities, colors]: [Tensor<2>; 5]| {
+        Gaussians::new(means, rotations, scales, opacities.squeeze_dim(1), colors)
+    };
     let mut times = Vec::new();
     for step in 0..steps {
         let start = Instant::now();
-        let tracked = |x: &Tensor<2>, is: bool| if is { x.clone().require_grad() } else { x.clone() };
-        let leaves: Vec<Tensor<2>> =
-            rows.iter().zip(&moments).map(|(x, moments)| tracked(x, moments.is_some())).collect();
-        let open = if all { opacities.clone().require_grad() } else { opacities.clone() };
-        let [means, rotations, scales, colors] = [0, 1, 2, 3].map(|i| leaves[i].clone());
-        let set = Gaussians::new(means, rotations, scales, open.clone(), colors)?;
-        let rendered = render(&set, &cameras, &RenderOptions::inria())?;
+        let tracked = [0, 1, 2, 3, 4].map(|i| match is_fitted(i) {
+            true => rows[i].clone().require_grad(),
+            false => rows[i].clone(),
+        });
+        let rendered = render(&assembled(tracked.clone())?, &cameras, &RenderOptions::inria())?;
         let gradients = (rendered.color - targets.clone()).abs().mean().backward();
         for (i, moments) in moments.iter_mut().enumerate() {
             let Some(moments) = moments else { continue };
-            let Some(gradient) = leaves[i].grad(&gradients) else { continue };
+            let Some(gradient) = tracked[i].grad(&gradients) else { continue };
             let direction = moments.direction(gradient, step);
             let value = rows[i].clone().inner();
-            // Colours are bound to what a picture can hold, scales grow and shrink by shares.
+            // Steps of scales are relative to them. Opacities and colours stay in [0, 1].
             let moved = match i {
-                2 => value.clone() - value * direction * RATES[2],
-                3 => (value - direction * RATES[4]).clamp(0.0, 1.0),
+                2 => value.clone() - value * direction * RATES[i],
+                3 | 4 => (value - direction * RATES[i]).clamp(0.0, 1.0),
                 _ => value - direction * RATES[i],
             };
             rows[i] = Tensor::from_inner(moved);
         }
-        if let Some((moments, gradient)) = of_opacities.as_mut().zip(open.grad(&gradients)) {
-            let value = opacities.clone().inner();
-            let direction = moments.direction(gradient, step);
-            opacities = Tensor::from_inner((value - direction * RATES[3]).clamp(0.0, 1.0));
-        }
         device.sync().expect("the device finishes its work");
         times.push(start.elapsed());
     }
-    let [means, rotations, scales, colors] = rows.map(Tensor::inner);
-    Ok((Gaussians::new(means, rotations, scales, opacities.inner(), colors)?, times))
+    Ok((assembled(rows.map(Tensor::inner))?, times))
 }

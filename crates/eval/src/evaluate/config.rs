@@ -1,35 +1,37 @@
 //! The TOML schema of an evaluation.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 use snapsnap_base::config::Schema;
 use snapsnap_data::dataset::Split;
 use snapsnap_data::sample::Handling;
-use snapsnap_splat::RenderOptions;
+use snapsnap_splat::{Preset, RenderOptions};
 
-/// Everything that decides what an evaluation computes.
+use crate::variant::{Variant, names_twice, views_problem};
+
+/// The config of an evaluation.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct EvalConfig {
-    /// Who is looked at.
+    /// The people.
     pub data: DataSection,
-    /// Which views go in and which are compared.
+    /// Input views and compared views.
     pub views: ViewsSection,
-    /// What is done to the photographs that models see; baselines have them as they are.
+    /// Changes to the photographs for models. Baselines get unchanged photographs.
     pub photographs: Handling,
-    /// What is judged.
+    /// The model under test.
     pub model: ModelSection,
-    /// How pictures are compared.
+    /// Metrics.
     pub metrics: MetricsSection,
-    /// What it is compared with.
+    /// Baselines.
     pub baselines: BaselineSection,
-    /// The same model otherwise, or another one, by name; each is compared with the model, person by person.
-    pub ablations: BTreeMap<String, Ablation>,
-    /// Lists of subjects that get figures of their own, such as those in loose clothes.
+    /// Variants of the model by name. Each is compared with the model, person by person.
+    pub ablations: BTreeMap<String, Variant>,
+    /// Groups of subjects with figures of their own, such as those in loose clothes.
     pub groups: BTreeMap<String, Group>,
-    /// What is written.
+    /// Pictures of the report.
     pub report: ReportSection,
 }
 
@@ -37,16 +39,16 @@ pub struct EvalConfig {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DataSection {
-    /// The data sets; `--data` replaces them.
+    /// The data sets. `--data` replaces them.
     pub folders: Vec<PathBuf>,
-    /// Which people of them; unset: those that lie in the folder itself, as in the authors' test sets.
+    /// Split of the people. Unset: they are in the folder itself, as in the authors' test sets.
     #[serde(with = "split")]
     pub split: Option<Split>,
-    /// Only so many of each, the first ones; 0: all.
+    /// Number of people of each data set, the first ones; 0: all.
     pub subjects: usize,
-    /// Only these; empty: all.
+    /// Names of the people; empty: all.
     pub only: Vec<String>,
-    /// Folder of true meshes, NAME.obj, .ply or .glb, for point-to-surface distances.
+    /// Folder of ground-truth meshes, NAME.obj, .ply or .glb, for point-to-surface distances.
     pub scans: Option<PathBuf>,
 }
 
@@ -82,16 +84,16 @@ impl Default for DataSection {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ViewsSection {
-    /// Views that go in; empty: the first and the opposite one. Of more than two, each and the next make a pair of
-    /// photographs of known cameras, around the circle, without unseen sides; what the pairs give is put together.
+    /// Input views; empty: the first and the opposite one. With more than two, each and the next around the circle are
+    /// a pair of photographs with known cameras and without unseen sides. The Gaussians of all pairs are joined.
     pub inputs: Vec<usize>,
-    /// The same people again with all inputs so many views further: other angles than the person's own front.
+    /// Offsets that are added to the input views, for other angles than the person's own front.
     pub turns: Vec<usize>,
-    /// Side of the pictures that are compared, in pixels; 0: the data set's, else a whole part of it.
+    /// Side of the compared pictures in pixels; 0: that of the data set, of which it is a whole part.
     pub resolution: usize,
-    /// Renders are so many times as large on each side, 1 or 2, and shrunk.
+    /// Pictures are rendered this many times as large on each side, 1 or 2, and shrunk.
     pub supersampling: usize,
-    /// Views that are compared, of those that do not go in; empty: all.
+    /// Compared views. Input views are left out. Empty: all.
     pub compared: Vec<usize>,
     /// Constants of the rasteriser.
     pub preset: Preset,
@@ -114,60 +116,23 @@ impl Default for ViewsSection {
 }
 
 impl ViewsSection {
-    /// How pictures are rendered, before black.
+    /// Options of a render over black.
     pub fn render_options(&self) -> RenderOptions {
-        let options = match self.preset {
-            Preset::Inria => RenderOptions::inria(),
-            Preset::Gsplat => RenderOptions::gsplat_1_5(),
-        };
-        RenderOptions { antialiased: self.antialiased, ..options }
+        RenderOptions { antialiased: self.antialiased, ..self.preset.options() }
     }
-}
-
-/// Constants of a rasteriser.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Preset {
-    /// The original one; what the published weights were trained with.
-    #[default]
-    Inria,
-    /// gsplat 1.5.
-    Gsplat,
 }
 
 /// The section `[model]`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ModelSection {
-    /// Weight file; `--weights` replaces it.
+    /// Weight file. `--weights` replaces it.
     pub weights: Option<PathBuf>,
     /// Overrides of the config that is stored with the weights, `section.key=value`.
     pub set: Vec<String>,
-    /// Devices, as `--device` names them; empty: the best there is. The first one makes the figures, each further one is
-    /// compared with it like an ablation.
+    /// Devices, as in `--device`; empty: the best one. The model runs on the first. Each further one is compared with
+    /// it like an ablation.
     pub devices: Vec<String>,
-}
-
-/// A section `[ablations.NAME]`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Ablation {
-    /// Other weights; unset: the model's.
-    pub weights: Option<PathBuf>,
-    /// Further overrides of the stored config.
-    pub set: Vec<String>,
-    /// Whether the unseen sides are predicted.
-    pub sides: bool,
-    /// Whether their pixels get the colours of the nearest photographed points.
-    pub side_colors: bool,
-    /// What is done to the photographs instead of what is done to the model's.
-    pub photographs: Option<Handling>,
-}
-
-impl Default for Ablation {
-    fn default() -> Self {
-        Self { weights: None, set: Vec::new(), sides: true, side_colors: true, photographs: None }
-    }
 }
 
 /// A section `[groups.NAME]`.
@@ -178,18 +143,18 @@ pub struct Group {
     pub subjects: Vec<String>,
 }
 
-/// Where pictures are compared.
+/// Region in which pictures are compared.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Protocol {
-    /// In the window of 1000 × 500 of 1024 pixels around the person.
+    /// The window of 1000 × 500 of 1024 pixels around the person.
     Paper,
-    /// On the person and 8 of 1024 pixels around.
+    /// The person and a margin of 8 of 1024 pixels.
     Masked,
 }
 
 impl Protocol {
-    /// As in configs and reports.
+    /// Its name in configs and reports.
     pub fn name(self) -> &'static str {
         match self {
             Self::Paper => "paper",
@@ -202,15 +167,15 @@ impl Protocol {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct MetricsSection {
-    /// Where pictures are compared.
+    /// Regions in which pictures are compared.
     pub protocols: Vec<Protocol>,
-    /// Folder with the published weights of LPIPS; `--lpips` replaces it.
+    /// Folder with the published weights of LPIPS. `--lpips` replaces it.
     pub lpips: PathBuf,
-    /// Chamfer distance of the Gaussians' centres and agreement of normals.
+    /// Whether the Chamfer distance of the Gaussians' centres and the cosine of normals are measured.
     pub geometry: bool,
-    /// Gaussians at least so opaque are surface.
+    /// Least opacity of Gaussians that belong to the surface.
     pub opaque: f32,
-    /// The same of the mesh that `snapsnap mesh` makes of the Gaussians: seconds per person.
+    /// Whether the mesh of `snapsnap mesh` is measured too, which takes seconds per person.
     pub mesh: bool,
 }
 
@@ -232,10 +197,10 @@ impl Default for MetricsSection {
 pub struct BaselineSection {
     /// The photographs as flat cut-outs, which need no training.
     pub billboard: bool,
-    /// True points in the photographs' colours: the most that the regressor could begin with.
+    /// Ground-truth points in the photographs' colours: the best input of a regressor.
     pub true_points: bool,
-    /// Data sets of people to train on with the same views, of any size: their mean picture per view knows nobody, but no
-    /// wrong colours either. Empty: left out.
+    /// Data sets of people to train on with the same views, of any size. The baseline is their mean picture of each
+    /// view. Empty: left out.
     pub mean: Vec<PathBuf>,
 }
 
@@ -249,9 +214,9 @@ impl Default for BaselineSection {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ReportSection {
-    /// How many people of each kind are shown: the best, those in the middle, the worst.
+    /// Number of people in the picture of each kind: best, middle and worst.
     pub people: usize,
-    /// Views of each that are shown, degrees from the input view.
+    /// Views of each in degrees from the first input view.
     pub degrees: Vec<f64>,
 }
 
@@ -261,31 +226,53 @@ impl Default for ReportSection {
     }
 }
 
-/// What is wrong with a list of views that go in.
-pub(crate) fn views_problem(inputs: &[usize]) -> Option<String> {
-    if inputs.len() == 1 || inputs.len() > 64 {
-        return Some("must be empty, or 2 to 64 views".into());
+impl EvalConfig {
+    /// The model under test, and its variants on the further `devices` and in `[ablations]`, with their names in
+    /// reports.
+    pub fn variants(&self, devices: &[String]) -> Vec<(String, Variant)> {
+        let model = Variant {
+            weights: self.model.weights.clone(),
+            set: self.model.set.clone(),
+            device: devices.first().cloned(),
+            inputs: Some(self.views.inputs.clone()),
+            photographs: Some(self.photographs),
+            ..Variant::default()
+        };
+        let on = |name: &String| Variant { device: Some(name.clone()), ..Variant::default() };
+        let others = devices.iter().skip(1).map(|name| (on_device(name), on(name)));
+        let others = others.chain(self.ablations.clone()).map(|(name, other)| (name, other.over(&model)));
+        [("model".to_owned(), model.clone())].into_iter().chain(others).collect()
     }
-    let is_twice = inputs.iter().collect::<BTreeSet<_>>().len() < inputs.len();
-    is_twice.then(|| "names a view twice".into())
+}
+
+/// Name of the model on another device in reports.
+fn on_device(name: &str) -> String {
+    format!("on {name}")
 }
 
 impl Schema for EvalConfig {
     fn refusal(&self) -> Option<(String, String)> {
-        self.problem().map(|(key, message)| (key.to_owned(), message))
+        if let Some((key, message)) = self.problem() {
+            return Some((key.to_owned(), message));
+        }
+        self.ablations.iter().find_map(|(name, ablation)| {
+            let of_benchmarks = |key| (key, "only settings of `snapsnap bench` have this key".to_owned());
+            let problem = ablation.refusal().or_else(|| ablation.key_of_benchmarks().map(of_benchmarks));
+            problem.map(|(key, message)| (format!("ablations.{name}.{key}"), message))
+        })
     }
 }
 
 impl EvalConfig {
     fn problem(&self) -> Option<(&'static str, String)> {
-        /// Names that reports have for others.
+        /// Other names in reports.
         const TAKEN: [&str; 5] = ["model", "against", "billboard", "true_points", "mean_picture"];
         let Self { views, metrics, report, ablations, model, .. } = self;
-        let devices = model.devices.iter().map(|name| format!("on {name}"));
+        let devices = model.devices.iter().map(|name| on_device(name));
         let mut names: Vec<String> = ablations.keys().cloned().chain(devices).collect();
         names.sort_unstable();
         if let Some(name) = names.iter().find(|name| TAKEN.contains(&name.as_str())) {
-            return Some(("ablations", format!("`{name}` is the name of something else in reports")));
+            return Some(("ablations", format!("`{name}` has another meaning in reports")));
         }
         if let Some(pair) = names.windows(2).find(|pair| pair[0] == pair[1]) {
             return Some(("ablations", format!("`{}` is there twice, as an ablation or a device", pair[0])));
@@ -293,40 +280,38 @@ impl EvalConfig {
         if names.iter().chain(self.groups.keys()).any(|name| name.contains(char::is_control)) {
             return Some(("ablations", "the name of one, or of a group, has control characters".into()));
         }
-        let handlings = ablations.values().filter_map(|ablation| ablation.photographs.as_ref());
-        if let Some((key, message)) = handlings.chain([&self.photographs]).find_map(Handling::problem) {
+        if let Some((key, message)) = self.photographs.problem() {
             return Some(("photographs", format!("`{key}` {message}")));
         }
         if let Some(problem) = views_problem(&views.inputs) {
             return Some(("views.inputs", problem));
         }
-        let lists = [("views.turns", &views.turns), ("views.compared", &views.compared)];
-        for (key, list) in lists {
-            if list.iter().collect::<BTreeSet<_>>().len() < list.len() {
+        for (key, list) in [("views.turns", &views.turns), ("views.compared", &views.compared)] {
+            if names_twice(list) {
                 return Some((key, "names a view twice".into()));
             }
         }
-        if views.turns.is_empty() || views.turns.len() > 64 {
-            return Some(("views.turns", "must have 1 to 64 entries".into()));
-        }
-        if ![1, 2].contains(&views.supersampling) {
-            return Some(("views.supersampling", format!("is {}, must be 1 or 2", views.supersampling)));
-        }
-        if metrics.protocols.is_empty() {
-            return Some(("metrics.protocols", "is empty, must name `paper`, `masked` or both".into()));
-        }
-        if metrics.protocols.len() > 2 || metrics.protocols.get(1) == metrics.protocols.first() {
-            return Some(("metrics.protocols", "names a protocol twice".into()));
-        }
-        if !(0.0..=1.0).contains(&metrics.opaque) {
-            return Some(("metrics.opaque", format!("is {}, must be 0 to 1", metrics.opaque)));
-        }
-        if report.people > 5 || report.degrees.len() > 12 {
-            return Some(("report.people", "at most 5 people of each kind and 12 views of each".into()));
-        }
-        if report.degrees.iter().any(|degrees| !degrees.is_finite()) {
-            return Some(("report.degrees", "must be numbers".into()));
-        }
-        None
+        let problems = [
+            ("views.turns", !(1..=64).contains(&views.turns.len()), "must have 1 to 64 entries"),
+            ("views.supersampling", ![1, 2].contains(&views.supersampling), "must be 1 or 2"),
+            (
+                "metrics.protocols",
+                metrics.protocols.is_empty(),
+                "is empty, must name `paper`, `masked` or both",
+            ),
+            (
+                "metrics.protocols",
+                metrics.protocols.len() > 2 || metrics.protocols.get(1) == metrics.protocols.first(),
+                "names a protocol twice",
+            ),
+            ("metrics.opaque", !(0.0..=1.0).contains(&metrics.opaque), "must be 0 to 1"),
+            (
+                "report.people",
+                report.people > 5 || report.degrees.len() > 12,
+                "at most 5 people of each kind and 12 views of each",
+            ),
+            ("report.degrees", report.degrees.iter().any(|d| !d.is_finite()), "must be numbers"),
+        ];
+        problems.into_iter().find_map(|(key, is_wrong, message)| is_wrong.then(|| (key, message.into())))
     }
 }

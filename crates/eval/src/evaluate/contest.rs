@@ -1,4 +1,4 @@
-//! Who is compared: the model, what it is without something, others, and the baselines.
+//! Contestants of an evaluation: the model, its variants and the baselines.
 
 use std::time::Duration;
 
@@ -7,7 +7,7 @@ use snapsnap_data::sample::{Handling, TestItem};
 use snapsnap_net::Photograph;
 use snapsnap_splat::Gaussians;
 
-use super::model::Model;
+use super::model::{Model, no_gaussian};
 use super::person::{People, Points, nearest_view, photograph, points};
 use super::sides::side_points;
 use crate::EvalError;
@@ -18,21 +18,21 @@ use crate::points::{Pair, PointError, point_errors};
 /// Azimuths of the right and the left side, degrees from the first photograph.
 const SIDES: [f64; 2] = [90.0, 270.0];
 
-/// What a contestant is to a report.
+/// The role of a contestant in a report.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Kind {
-    /// What the report is about.
+    /// The model under test.
     #[default]
     Model,
-    /// What it is compared with, person by person.
+    /// A variant, which is compared with the model person by person.
     Other,
-    /// What anybody can do.
+    /// A method without networks.
     Baseline,
 }
 
-/// Somebody who is compared.
+/// A model or a baseline.
 pub struct Contestant {
-    /// In reports.
+    /// Its name in reports.
     pub name: String,
     means: Means,
 }
@@ -45,37 +45,32 @@ enum Means {
     Fixed(Box<Gaussians>),
 }
 
-/// What a contestant has to show of a person.
+/// A contestant's result for a person.
 #[derive(Default)]
 pub struct Shown {
-    /// World frame; none where there are only pictures.
+    /// World frame; `None` for pictures alone.
     pub gaussians: Option<Gaussians>,
     /// Errors of the predicted points.
     pub points: Vec<PointError>,
-    /// Why there are none, where there could be.
+    /// Why the errors of the points could not be measured.
     pub no_points: Option<String>,
-    /// Pixels and Gaussians that were not finite.
+    /// Number of pixels and Gaussians that were not finite.
     pub lost: usize,
-    /// What it took.
+    /// Time of the reconstruction.
     pub time: Option<Duration>,
 }
 
 impl Shown {
-    /// Whether it is rendered by the processor.
+    /// Whether it is rendered on the CPU.
     pub fn is_on_cpu(&self) -> bool {
         self.gaussians.as_ref().is_none_or(|gaussians| gaussians.device().identity().is_none())
     }
 }
 
 impl Contestant {
-    /// What the report is about.
-    pub fn model(name: &str, model: Model) -> Self {
-        Self { name: name.into(), means: Means::Model(Kind::Model, Box::new(model)) }
-    }
-
-    /// What it is compared with.
-    pub fn other(name: &str, model: Model) -> Self {
-        Self { name: name.into(), means: Means::Model(Kind::Other, Box::new(model)) }
+    /// The model under test or a variant of it.
+    pub fn model(name: &str, kind: Kind, model: Model) -> Self {
+        Self { name: name.into(), means: Means::Model(kind, Box::new(model)) }
     }
 
     /// The photographs as cut-outs.
@@ -83,7 +78,7 @@ impl Contestant {
         Self { name: "billboard".into(), means: Means::Billboard(device.clone()) }
     }
 
-    /// True points in the photographs' colours.
+    /// Ground-truth points in the photographs' colours.
     pub fn true_points(device: &Device) -> Self {
         Self { name: "true_points".into(), means: Means::TruePoints(device.clone()) }
     }
@@ -93,12 +88,12 @@ impl Contestant {
         Self { name: "mean_picture".into(), means: Means::Mean(pictures) }
     }
 
-    /// Gaussians of one person (world frame), whoever is looked at.
+    /// The same Gaussians (world frame) for every person.
     pub fn fixed(name: &str, gaussians: Gaussians) -> Self {
         Self { name: name.into(), means: Means::Fixed(Box::new(gaussians)) }
     }
 
-    /// What it is to the report.
+    /// Its role in the report.
     pub fn kind(&self) -> Kind {
         match &self.means {
             Means::Model(kind, _) => *kind,
@@ -106,15 +101,10 @@ impl Contestant {
         }
     }
 
-    /// The networks, where it has some.
-    pub fn networks(&self) -> Option<&Model> {
-        if let Means::Model(_, model) = &self.means { Some(model) } else { None }
-    }
-
-    /// What it makes of a person's photographs; baselines have a canvas of so many pixels on each side.
+    /// Its result for a person's photographs. `canvas` is the side of the baselines' canvas in pixels.
     ///
     /// # Errors
-    /// [`EvalError`] if files cannot be read, or nothing came out.
+    /// [`EvalError`] if files cannot be read, or no Gaussian came out.
     pub(super) fn prepare(
         &self,
         people: &People,
@@ -123,18 +113,14 @@ impl Contestant {
         inputs: &[usize],
         canvas: usize,
     ) -> Result<Shown, EvalError> {
-        let nothing = || EvalError::Empty("no Gaussian came out".into());
         let plain = |gaussians| Shown { gaussians: Some(gaussians), ..Shown::default() };
         match &self.means {
             Means::Model(_, model) => {
                 let is_changed = model.photographs != Handling::default();
                 let own = is_changed.then(|| people.item(row, inputs, &model.photographs)).transpose()?;
                 let item = own.as_ref().unwrap_or(item);
-                let made = model.reconstruct(item, inputs);
-                if made.gaussians.is_empty() {
-                    return Err(nothing());
-                }
-                // Pictures can be compared without them.
+                let made = model.reconstruct(item, inputs)?;
+                // Pictures can be compared without errors of points.
                 let (points, no_points) = match errors(people, row, item, inputs, &made.maps, model.side()) {
                     Ok(points) => (points, None),
                     Err(e) => (Vec::new(), Some(e.to_string())),
@@ -145,7 +131,8 @@ impl Contestant {
             Means::Billboard(device) => {
                 let (images, valid) = on_canvas(item, inputs.len(), canvas);
                 let cameras: Vec<_> = inputs.iter().map(|view| item.cameras[*view]).collect();
-                billboard(&images, &valid.concat(), canvas, &cameras, device).map(plain).ok_or_else(nothing)
+                let made = billboard(&images, &valid.concat(), canvas, &cameras, device);
+                made.map(plain).ok_or_else(no_gaussian)
             }
             Means::TruePoints(device) => {
                 let mut views = inputs.to_vec();
@@ -163,14 +150,14 @@ impl Contestant {
                 }
                 let front = &item.cameras[inputs[0]];
                 let made = true_points(&images, inputs.len(), &points, &valid, canvas, front, device);
-                made.map(plain).ok_or_else(nothing)
+                made.map(plain).ok_or_else(no_gaussian)
             }
             Means::Fixed(gaussians) => Ok(plain(gaussians.as_ref().clone())),
             Means::Mean(_) => Ok(Shown::default()),
         }
     }
 
-    /// A view of what only has pictures.
+    /// A view of a contestant without Gaussians.
     pub(super) fn picture(&self, view: usize, side: usize) -> Result<Picture, EvalError> {
         match &self.means {
             Means::Mean(pictures) => pictures.picture(view, side),
@@ -179,9 +166,10 @@ impl Contestant {
     }
 }
 
-/// The photographs `[N,3,S,S]` on a canvas, and which pixels are at least half the person's: those have the person's own colour.
+/// The photographs `[N,3,S,S]` on a canvas, and the pixels that are at least half the person's. Those have the person's
+/// own colour.
 fn on_canvas(item: &TestItem, count: usize, side: usize) -> (Vec<f32>, Vec<Vec<bool>>) {
-    // Networks see colours times the mask, and may have learned to undo that; baselines have not.
+    // Stored colours are multiplied with the mask. Networks may have learned to undo that, baselines cannot.
     let own = |photo: Photograph| {
         let Photograph { mut rgb, mask, valid } = photo;
         for plane in rgb.chunks_exact_mut(mask.len()) {
@@ -194,7 +182,7 @@ fn on_canvas(item: &TestItem, count: usize, side: usize) -> (Vec<f32>, Vec<Vec<b
     (images.concat(), valid)
 }
 
-/// Errors of predicted maps, by their places among [`crate::points::VIEWS`], at the pixels that have a true point.
+/// Errors of predicted maps, by their indices in [`crate::points::VIEWS`], at the pixels with ground truth.
 fn errors(
     people: &People,
     row: usize,
@@ -203,7 +191,7 @@ fn errors(
     maps: &[(usize, Vec<f32>)],
     side: usize,
 ) -> Result<Vec<PointError>, EvalError> {
-    // More than two photographs are pairs, which have no one frame.
+    // Pairs of more than two photographs have no common frame.
     if maps.is_empty() {
         return Ok(Vec::new());
     }

@@ -1,4 +1,4 @@
-//! Meshes, of any method, against the true surfaces of a test set.
+//! Meshes of any method, compared with the ground truth of a test set.
 
 use std::path::{Path, PathBuf};
 
@@ -12,50 +12,51 @@ use snapsnap_mesh::import::{self, EXTENSIONS};
 use super::config::EvalConfig;
 use super::person::People;
 use super::surface::{thinned, truth as truth_of};
-use super::{LeftOut, name_of, nobody};
+use super::{LeftOut, missing, name_of};
 use crate::EvalError;
 use crate::geometry::{Alignment, chamfer, icp, point_to_surface, sampled};
 
 /// Points drawn from each surface.
 const POINTS: usize = 50_000;
-/// Of them, those that an alignment looks at.
+/// Points drawn for an alignment.
 const ALIGNED: usize = 5_000;
-/// Decides which points are drawn, of a mesh and of the true one: equal draws would make equal meshes equal point by point.
+/// Seeds of the points of a mesh and of the scan. With one seed, equal meshes would get equal points.
 const SEEDS: [u64; 2] = [1, 2];
 
-/// What a person's mesh gave, centimetres.
+/// Figures of a person's mesh, centimetres.
 #[derive(Debug, Clone, Serialize)]
 pub struct MeshFigures {
     /// The person.
     pub name: String,
-    /// From the mesh to the nearest true point.
+    /// From points of the mesh to the nearest ground-truth point.
     pub to_truth: f64,
-    /// From the true points to the nearest point of the mesh.
+    /// From ground-truth points to the nearest point of the mesh.
     pub from_truth: f64,
     /// Mean of both.
     pub chamfer: f64,
-    /// From the true points to the mesh's triangles.
+    /// From ground-truth points to the mesh's triangles.
     pub truth_to_surface: f64,
-    /// From the mesh's points to the true scan's triangles, where there is a scan.
+    /// From points of the mesh to the scan's triangles, if there is a scan.
     pub surface_to_scan: Option<f64>,
-    /// Mean cosine of normals, from the views nearest to 0, 90, 180 and 270°, where both are seen.
+    /// Mean cosine of normals from the views nearest to 0, 90, 180 and 270°, at pixels with both normals.
     pub normal_consistency: Option<f64>,
-    /// Degrees, centimetres (of its middle) and factor by which it was moved, if that was asked for.
+    /// Degrees, centimetres (of its middle) and factor of the alignment, if there was one.
     pub aligned: Option<[f64; 3]>,
 }
 
-/// Whether meshes are moved onto the truth before they are measured.
+/// Alignment of meshes with the ground truth before they are measured.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Align {
-    /// As they are.
+    /// None.
     No,
-    /// Turned and moved.
+    /// Rotation and translation.
     Rigidly,
-    /// Scaled as well.
+    /// Rotation, translation and scale.
     Similarly,
 }
 
-/// Compares the meshes NAME.obj, .ply or .glb in a folder; `progress` hears how many are done.
+/// Compares the meshes NAME.obj, .ply or .glb in a folder with the ground truth. `progress` is called with the number
+/// of finished people and their total.
 pub fn evaluate_meshes(
     config: &EvalConfig,
     sets: &[People],
@@ -70,11 +71,11 @@ pub fn evaluate_meshes(
         let name = name_of(sets, people, row);
         match one(config, people, row, &name, folder, align) {
             Ok(found) => figures.push(found),
-            Err(e) => left_out.push(LeftOut { name, why: e.to_string() }),
+            Err(e) => left_out.push(LeftOut::new(name, e)),
         }
         progress(done + 1, total);
     }
-    left_out.extend(nobody(config, sets));
+    left_out.extend(missing(config, sets));
     (figures, left_out)
 }
 
@@ -93,14 +94,14 @@ fn one(
         Some(scans) => {
             let path = find(scans, subject)?;
             let mut scan = import::read(&path)?;
-            // As `prepare` stood it up; people to test on are not moved from the middle. What stands so already stays.
+            // The scan gets the pose that `prepare` gave it. Test people are not moved sideways.
             normalise(&mut scan, Collection::Other, None::<&mut ChaCha8Rng>)
                 .map_err(|e| FileError::unsuitable(&path, e.to_string()))?;
             Some(scan)
         }
         None => None,
     };
-    // A scan knows what no view sees.
+    // A scan is complete; the points of the views are not.
     let truth = match &scan {
         Some(scan) => sampled(scan, POINTS, SEEDS[1])?,
         None => seen.points.clone(),
@@ -112,7 +113,7 @@ fn one(
         mesh.positions.iter_mut().for_each(|p| *p = Vec3::from_array(motion.apply(p.to_array())));
         let Alignment { scale, rotation, .. } = motion;
         let angle = 2.0 * rotation.w.abs().min(1.0).acos();
-        // Of its middle: where the world's origin goes says nothing.
+        // The motion of the world's origin has no meaning, that of the middle has.
         let middle = |points: &mut dyn Iterator<Item = [f32; 3]>| {
             points.map(|p| Vec3::from_array(p).as_dvec3()).sum::<DVec3>() / ALIGNED as f64
         };
@@ -136,7 +137,7 @@ fn one(
 }
 
 fn find(folder: &Path, name: &str) -> Result<PathBuf, EvalError> {
-    // Collections of scans have a folder for each.
+    // Collections of scans have a folder for each scan.
     let folders = [folder.to_owned(), folder.join(name)];
     let files =
         folders.iter().flat_map(|folder| EXTENSIONS.map(|ending| folder.join(format!("{name}.{ending}"))));

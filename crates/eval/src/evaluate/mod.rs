@@ -8,6 +8,7 @@ pub mod person;
 mod sides;
 mod surface;
 
+use std::collections::BTreeMap;
 use std::time::Duration;
 
 use image::RgbImage;
@@ -28,12 +29,12 @@ pub use contest::{Contestant, Kind};
 use person::People;
 pub use surface::{Surface, Truth, truth};
 
-/// What a view of a person gave.
+/// Scores of one view of a person.
 #[derive(Debug, Clone)]
 pub struct Row {
     /// Row of [`Outcome::people`].
     pub person: usize,
-    /// How many views further the photographs were taken.
+    /// Offset that was added to the input views.
     pub turn: usize,
     /// The view.
     pub view: usize,
@@ -43,12 +44,12 @@ pub struct Row {
     pub scores: Vec<Score>,
 }
 
-/// Everything a contestant gave.
+/// All measurements of a contestant.
 #[derive(Debug, Clone, Default)]
 pub struct Judged {
     /// Its name.
     pub name: String,
-    /// What it is.
+    /// Its role.
     pub kind: Kind,
     /// Views.
     pub rows: Vec<Row>,
@@ -64,7 +65,19 @@ pub struct Judged {
     pub gaussians: Vec<usize>,
 }
 
-/// Something that could not be evaluated.
+/// Means of each person's views, by row of [`Outcome::people`].
+pub(crate) fn by_person<'a>(
+    rows: impl IntoIterator<Item = &'a Row>,
+    protocol: usize,
+) -> BTreeMap<usize, Score> {
+    let mut scores: BTreeMap<usize, Vec<Score>> = BTreeMap::new();
+    for row in rows {
+        scores.entry(row.person).or_default().push(row.scores[protocol]);
+    }
+    scores.into_iter().filter_map(|(person, scores)| Some((person, Score::mean(&scores)?))).collect()
+}
+
+/// A part of an evaluation that failed.
 #[derive(Debug, Clone, serde::Serialize)]
 pub struct LeftOut {
     /// Person, or person and view, or model.
@@ -73,20 +86,27 @@ pub struct LeftOut {
     pub why: String,
 }
 
-/// What an evaluation found.
+impl LeftOut {
+    /// A failed part and the reason.
+    pub fn new(name: impl Into<String>, why: impl ToString) -> Self {
+        Self { name: name.into(), why: why.to_string() }
+    }
+}
+
+/// The result of an evaluation.
 pub struct Outcome {
     /// Names of the people.
     pub people: Vec<String>,
     /// The model first, if it could be loaded.
     pub judged: Vec<Judged>,
-    /// What is missing.
+    /// Failed parts.
     pub left_out: Vec<LeftOut>,
-    /// Size of what is compared, and how it is rendered, in words.
+    /// Size of the compared pictures and of their renders, for the report.
     pub pictures: String,
 }
 
-/// Evaluates contestants on all people; `progress` hears how many are done. What is wrong with single people, views or
-/// contestants is told in the outcome, and the rest is evaluated.
+/// Evaluates contestants on all people. `progress` is called with the number of finished people and their total.
+/// Failures of single people, views or contestants are part of the outcome, and the rest is evaluated.
 pub fn evaluate(
     config: &EvalConfig,
     sets: &[People],
@@ -110,11 +130,11 @@ pub fn evaluate(
         for &row in people.chosen() {
             let person = outcome.people.len();
             outcome.people.push(name_of(sets, people, row));
-            let wanted = config.metrics.geometry || config.metrics.mesh;
-            let truth = wanted.then(|| truth(people, row)).transpose();
+            let is_measured = config.metrics.geometry || config.metrics.mesh;
+            let truth = is_measured.then(|| truth(people, row)).transpose();
             let truth = truth.unwrap_or_else(|e| {
                 let name = format!("{}, geometry", outcome.people[person]);
-                outcome.left_out.push(LeftOut { name, why: e.to_string() });
+                outcome.left_out.push(LeftOut::new(name, e));
                 None
             });
             for &turn in &config.views.turns {
@@ -124,34 +144,32 @@ pub fn evaluate(
             progress(person + 1, total);
         }
     }
-    for (group, subjects) in &config.groups {
-        let is_there = |name: &&String| outcome.people.iter().any(|person| is_named(person, name));
-        let missing: Vec<&String> = subjects.subjects.iter().filter(|name| !is_there(name)).collect();
-        for name in missing {
-            let why = format!("groups.{group} names it, it is not among the people");
-            outcome.left_out.push(LeftOut { name: name.clone(), why });
+    for (key, group) in &config.groups {
+        for name in &group.subjects {
+            if !outcome.people.iter().any(|person| is_named(person, name)) {
+                outcome.left_out.push(LeftOut::new(name, format!("groups.{key}: no person has this name")));
+            }
         }
     }
-    outcome.left_out.extend(nobody(config, sets));
+    outcome.left_out.extend(missing(config, sets));
     outcome
 }
 
-/// Who is asked for and not there.
-pub(crate) fn nobody(config: &EvalConfig, sets: &[People]) -> Vec<LeftOut> {
+/// People of the config who are missing.
+pub(crate) fn missing(config: &EvalConfig, sets: &[People]) -> Vec<LeftOut> {
     let is_missing = |name: &&String| {
         !sets.iter().any(|set| set.chosen().iter().any(|row| set.test().name(*row) == name.as_str()))
     };
     let missing = config.data.only.iter().filter(is_missing);
-    let why = "data.only names it, no data set has it, or not among its first ones".to_owned();
-    let mut left_out: Vec<LeftOut> =
-        missing.map(|name| LeftOut { name: name.clone(), why: why.clone() }).collect();
+    let why = "data.only: no data set has this person, or not among its first ones";
+    let mut left_out: Vec<LeftOut> = missing.map(|name| LeftOut::new(name, why)).collect();
     if left_out.is_empty() && sets.iter().all(|set| set.chosen().is_empty()) {
-        left_out.push(LeftOut { name: "everything".into(), why: "there is nobody".into() });
+        left_out.push(LeftOut::new("everything", "the data sets have no people"));
     }
     left_out
 }
 
-/// Whether a person is called so, with the data set's name before it or without.
+/// Whether a person has this name, with or without the data set's name before it.
 pub(crate) fn is_named(person: &str, name: &str) -> bool {
     person == name || person.rsplit('/').next() == Some(name)
 }
@@ -174,7 +192,7 @@ fn name_of(sets: &[People], people: &People, row: usize) -> String {
     }
 }
 
-/// A person seen from a side.
+/// A person with the input views of one turn.
 struct Place<'a> {
     people: &'a People,
     row: usize,
@@ -184,9 +202,10 @@ struct Place<'a> {
 }
 
 impl Place<'_> {
-    fn left_out(&self, outcome: &mut Outcome, what: &str, why: &dyn ToString) {
+    /// Records a failure; `what` follows the person's name.
+    fn left_out(&self, outcome: &mut Outcome, what: &str, why: impl ToString) {
         let name = format!("{}{what}", outcome.people[self.person]);
-        outcome.left_out.push(LeftOut { name, why: why.to_string() });
+        outcome.left_out.push(LeftOut::new(name, why));
     }
 }
 
@@ -202,7 +221,7 @@ fn one(
     let inputs = people.inputs(&config.views, turn);
     let item = match people.item(row, &inputs, &Handling::default()) {
         Ok(item) => item,
-        Err(e) => return at.left_out(outcome, "", &e),
+        Err(e) => return at.left_out(outcome, "", e),
     };
     let mut shown: Vec<Option<contest::Shown>> = Vec::new();
     for (i, contestant) in contestants.iter().enumerate() {
@@ -210,7 +229,7 @@ fn one(
         let made = match made {
             Ok(made) => made,
             Err(e) => {
-                at.left_out(outcome, &format!(", {}", contestant.name), &e);
+                at.left_out(outcome, &format!(", {}", contestant.name), e);
                 shown.push(None);
                 continue;
             }
@@ -220,7 +239,7 @@ fn one(
         }
         if made.lost > 0 {
             let why = format!("{} pixels or Gaussians left out: they are not finite", made.lost);
-            at.left_out(outcome, &format!(", {}", contestant.name), &why);
+            at.left_out(outcome, &format!(", {}", contestant.name), why);
         }
         let judged = &mut outcome.judged[i];
         if !made.points.is_empty() {
@@ -232,30 +251,26 @@ fn one(
             if config.metrics.geometry {
                 match Surface::of_gaussians(gaussians, truth, config.metrics.opaque) {
                     Ok(surface) => judged.surface.push((person, surface)),
-                    Err(e) => at.left_out(outcome, &format!(", {}, geometry", contestant.name), &e),
+                    Err(e) => at.left_out(outcome, &format!(", {}, geometry", contestant.name), e),
                 }
             }
             if config.metrics.mesh && outcome.judged[i].kind != Kind::Baseline {
                 match Surface::of_mesh(gaussians, truth) {
                     Ok(surface) => outcome.judged[i].mesh.push((person, surface)),
-                    Err(e) => at.left_out(outcome, &format!(", {}, mesh", contestant.name), &e),
+                    Err(e) => at.left_out(outcome, &format!(", {}, mesh", contestant.name), e),
                 }
             }
         }
         shown.push(Some(made));
     }
-    let wanted = |view: &usize| config.views.compared.is_empty() || config.views.compared.contains(view);
+    let is_compared = |view: &usize| config.views.compared.is_empty() || config.views.compared.contains(view);
     let compared: Vec<usize> =
-        (0..people.views()).filter(|view| wanted(view) && !inputs.contains(view)).collect();
+        (0..people.views()).filter(|view| is_compared(view) && !inputs.contains(view)).collect();
     if compared.is_empty() {
-        at.left_out(
-            outcome,
-            "",
-            &"no view is left to compare: every one, or every one of views.compared, goes in",
-        );
+        at.left_out(outcome, "", "no view is left to compare: every one of views.compared is an input");
     }
     let compare = |view: &usize| compare(config, at, &item, *view, (contestants, &shown), lpips);
-    // A device of its own does one thing at a time.
+    // A GPU runs one task at a time.
     let is_on_cpu = shown.iter().flatten().all(contest::Shown::is_on_cpu);
     let most = if is_on_cpu { at_once(people.side(&config.views) * config.views.supersampling) } else { 1 };
     let found = compared.chunks(most).flat_map(|views| match views {
@@ -267,7 +282,7 @@ fn one(
         let scored = match found {
             Ok(scored) => scored,
             Err(e) => {
-                at.left_out(outcome, &format!(", view {view}"), &e);
+                at.left_out(outcome, &format!(", view {view}"), e);
                 continue;
             }
         };
@@ -275,19 +290,19 @@ fn one(
         for (i, scores) in scored {
             match scores {
                 Ok(scores) => outcome.judged[i].rows.push(Row { person, turn, view, degrees, scores }),
-                Err(e) => at.left_out(outcome, &format!(", {}, view {view}", contestants[i].name), &e),
+                Err(e) => at.left_out(outcome, &format!(", {}, view {view}", contestants[i].name), e),
             }
         }
     }
 }
 
-/// How many pictures of this side are worked on at once, so that memory stays flat: 64 million pixels, some 3 GB.
+/// Number of pictures of this side that are processed at once. It bounds memory: 64 million pixels need some 3 GB.
 pub(crate) fn at_once(side: usize) -> usize {
     const PIXELS: usize = 1 << 26;
     (PIXELS / (side * side).max(1)).clamp(1, rayon::current_num_threads())
 }
 
-/// A contestant's place, and its scores by protocol.
+/// A contestant's index, and its scores by protocol.
 type Scored = (usize, Result<Vec<Score>, EvalError>);
 
 fn compare(
@@ -316,7 +331,7 @@ fn compare(
     Ok(contestants.iter().enumerate().filter_map(scores).collect())
 }
 
-/// What a contestant shows in a view.
+/// A contestant's picture of a view.
 fn picture(
     config: &EvalConfig,
     contestant: &Contestant,
@@ -331,10 +346,10 @@ fn picture(
     }
 }
 
-/// Gaussians (world frame) as a camera sees them, before black, `side`² pixels, rendered as the config says.
+/// A render of Gaussians (world frame) over black, `side`² pixels, with the config's options.
 ///
 /// # Errors
-/// [`EvalError`] for what cannot be rendered.
+/// [`EvalError`] for Gaussians that cannot be rendered.
 pub fn rendered(
     gaussians: &Gaussians,
     camera: &Camera,
@@ -347,8 +362,8 @@ pub fn rendered(
     Picture::rendered(&snapsnap_ops::host(color), [large, large], views.supersampling)
 }
 
-/// What some people (rows of the outcome's) look like: photographs and, for each view asked for, the model's picture, the true one
-/// and the error; and who cannot be shown.
+/// A sheet of some people (rows of the outcome's): both photographs and, for each view of the config, the model's
+/// picture, the ground truth and the error. Also the people whose pictures failed.
 pub fn sheet(
     config: &EvalConfig,
     sets: &[People],
@@ -361,10 +376,7 @@ pub fn sheet(
     for (people, row) in persons.iter().map(|person| places[*person]) {
         match pictures(config, people, row, contestant) {
             Ok(pictures) => rows.push(pictures),
-            Err(e) => {
-                let name = format!("{}, pictures", name_of(sets, people, row));
-                left_out.push(LeftOut { name, why: e.to_string() });
-            }
+            Err(e) => left_out.push(LeftOut::new(format!("{}, pictures", name_of(sets, people, row)), e)),
         }
     }
     (grid(&rows), left_out)
@@ -377,7 +389,7 @@ fn pictures(
     row: usize,
     contestant: &Contestant,
 ) -> Result<Vec<RgbImage>, EvalError> {
-    /// Mean absolute difference of channels that is shown white.
+    /// Mean absolute difference of channels that is white in the sheet.
     const WORST: f32 = 0.5;
     let inputs = people.inputs(&config.views, config.views.turns[0]);
     let item = people.item(row, &inputs, &Handling::default())?;

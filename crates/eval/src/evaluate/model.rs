@@ -1,4 +1,4 @@
-//! A model as it is judged: photographs of a person → Gaussians in the data set's world.
+//! A variant of the model: photographs of a person → Gaussians in the data set's world.
 
 use std::time::{Duration, Instant};
 
@@ -7,75 +7,61 @@ use snapsnap_data::photo::Mapping;
 use snapsnap_data::sample::{Handling, TestItem};
 use snapsnap_net::config::Config;
 use snapsnap_net::gaussians::placed;
-use snapsnap_net::precision::Precision;
 use snapsnap_net::weights::{WeightFile, WeightsError};
 use snapsnap_net::{Reconstruction, Reconstructor};
 use snapsnap_ops::host;
 use snapsnap_splat::Gaussians;
 
 use super::person::photograph;
+use crate::EvalError;
+use crate::variant::Variant;
 
-/// Networks on a device, and what is left out of what they do.
+/// The networks of a variant on a device.
 pub struct Model {
     reconstructor: Reconstructor,
-    leave: Leave,
-    /// What is done to its photographs.
+    stride: usize,
+    min_opacity: f32,
+    /// Changes to its photographs.
     pub photographs: Handling,
 }
 
-/// What a model does without.
-#[derive(Debug, Clone, Copy)]
-pub struct Leave {
-    /// Whether the unseen sides are predicted.
-    pub sides: bool,
-    /// Whether their pixels get the colours of the nearest photographed points.
-    pub side_colors: bool,
-    /// Only every so many-th row and column of pixels becomes a Gaussian, so many times as large.
-    pub stride: usize,
-    /// Gaussians less opaque are dropped.
-    pub min_opacity: f32,
-    /// What the point predictor computes in.
-    pub precision: Precision,
-}
-
-impl Default for Leave {
-    /// Nothing.
-    fn default() -> Self {
-        Self { sides: true, side_colors: true, stride: 1, min_opacity: 0.0, precision: Precision::F32 }
-    }
-}
-
-/// What it made of a person.
+/// The reconstruction of a person.
 pub struct Made {
     /// In the data set's world.
     pub gaussians: Gaussians,
-    /// Point maps `[S,S,3]` of the views in the first photograph's frame, by their places among
-    /// [`crate::points::VIEWS`]; none where there are more than two photographs.
+    /// Point maps `[S,S,3]` in the first photograph's frame, by the indices of their views in [`crate::points::VIEWS`].
+    /// Empty for more than two photographs, and for placed ones.
     pub maps: Vec<(usize, Vec<f32>)>,
-    /// Pixels and Gaussians left out because they were not finite.
+    /// Number of pixels and Gaussians that were not finite and are left out.
     pub lost: usize,
     /// From the photographs on their canvas to the Gaussians.
     pub time: Duration,
-    /// Of each module.
+    /// Times of the modules, over all pairs of photographs.
     pub modules: Vec<(&'static str, Duration)>,
-    /// What ran, what was left out and why.
+    /// The steps that ran, and the omitted ones with reasons.
     pub plan: Vec<String>,
 }
 
 impl Model {
-    /// Loads both networks.
+    /// Loads both networks of a variant, whose config is that of `weights`.
     ///
     /// # Errors
     /// [`WeightsError`] if a part is absent or a value is not finite.
-    pub fn load(weights: &WeightFile, device: &Device, leave: Leave) -> Result<Self, WeightsError> {
-        let mut reconstructor = Reconstructor::load(weights, device)?.in_precision(leave.precision);
-        if !leave.sides {
+    pub fn load(weights: &WeightFile, device: &Device, variant: &Variant) -> Result<Self, WeightsError> {
+        let mut reconstructor =
+            Reconstructor::load(weights, device)?.in_precision(variant.precision.unwrap_or_default());
+        if !variant.has_sides() {
             reconstructor = reconstructor.without_sides();
         }
-        if !leave.side_colors {
+        if variant.side_colors == Some(false) {
             reconstructor = reconstructor.without_side_colors();
         }
-        Ok(Self { reconstructor, leave, photographs: Handling::default() })
+        Ok(Self {
+            reconstructor,
+            stride: variant.stride.unwrap_or(1),
+            min_opacity: variant.min_opacity.unwrap_or(0.0),
+            photographs: variant.photographs.unwrap_or_default(),
+        })
     }
 
     /// The config in force.
@@ -90,13 +76,16 @@ impl Model {
 
     /// Gaussians of a person seen from the views `inputs`. With more than two photographs, each and the next around the
     /// circle form a pair, in the frame of the known camera of its first one.
-    pub fn reconstruct(&self, item: &TestItem, inputs: &[usize]) -> Made {
+    ///
+    /// # Errors
+    /// [`EvalError::Empty`] if no Gaussian came out.
+    pub fn reconstruct(&self, item: &TestItem, inputs: &[usize]) -> Result<Made, EvalError> {
         let side = self.side();
         let photographs: Vec<_> = (0..inputs.len()).map(|place| photograph(item, place, side)).collect();
         let start = Instant::now();
         let count = if inputs.len() == 2 { 1 } else { inputs.len() };
         let (mut parts, mut maps, mut lost) = (Vec::new(), Vec::new(), 0);
-        let (mut modules, mut plan) = (Vec::new(), Vec::new());
+        let (mut modules, mut plan) = (Vec::<(&'static str, Duration)>::new(), Vec::new());
         for first in 0..count {
             let pair = [&photographs[first], &photographs[(first + 1) % inputs.len()]];
             let made = self.reconstructor.reconstruct(pair[0], pair[1], &|_| ());
@@ -112,12 +101,17 @@ impl Model {
             }
             parts.push(placed(self.config(), gaussians, &to_world));
             lost += made.lost;
-            modules.extend(made.times.iter().copied());
-            // All pairs are treated alike.
+            for (name, time) in &made.times {
+                match modules.iter_mut().find(|(module, _)| module == name) {
+                    Some((_, sum)) => *sum += *time,
+                    None => modules.push((*name, *time)),
+                }
+            }
+            // All pairs have one plan.
             if first == 0 {
                 plan.clone_from(&made.plan);
             }
-            // The pixels of what was placed are not those that have true points.
+            // Pixels of placed photographs have no ground truth.
             if count == 1 && !is_placed {
                 maps = maps_of(&made, side);
             }
@@ -127,21 +121,23 @@ impl Model {
         }
         let gaussians = joined(parts);
         gaussians.device().sync().expect("the device finishes its work");
-        Made { gaussians, maps, lost, time: start.elapsed(), modules, plan }
+        let time = start.elapsed();
+        if gaussians.is_empty() {
+            return Err(no_gaussian());
+        }
+        Ok(Made { gaussians, maps, lost, time, modules, plan })
     }
-}
 
-impl Model {
-    /// What stride and opacity leave of the Gaussians.
+    /// The Gaussians after the variant's stride and least opacity.
     fn thinned(&self, made: &Reconstruction, side: usize) -> Gaussians {
-        let Leave { stride, min_opacity, .. } = self.leave;
+        let Self { stride, min_opacity, .. } = *self;
         let gaussians = made.gaussians.clone();
         if stride == 1 && min_opacity <= 0.0 {
             return gaussians;
         }
         let pixels: Vec<usize> =
             made.valid.iter().flat_map(|valid| (0..valid.len()).filter(|i| valid[*i])).collect();
-        // Where Gaussians were lost, what is left has no known pixels: every so many-th goes on.
+        // If Gaussians were lost, the pixels of the others are unknown.
         let on_grid = |row: usize| match pixels.len() == gaussians.len() {
             true => [pixels[row] / side, pixels[row] % side].iter().all(|at| at.is_multiple_of(stride)),
             false => row.is_multiple_of(stride * stride),
@@ -159,8 +155,12 @@ impl Model {
             gaussians.opacities.select(0, keep.clone()),
             rows(gaussians.colors),
         )
-        .expect("rows of what fits")
+        .expect("rows of one set")
     }
+}
+
+pub(super) fn no_gaussian() -> EvalError {
+    EvalError::Empty("no Gaussian came out".into())
 }
 
 fn maps_of(made: &Reconstruction, side: usize) -> Vec<(usize, Vec<f32>)> {

@@ -1,4 +1,4 @@
-//! One person of a test set, and what a canvas of another size shows of the photographs.
+//! People of a test set: their photographs, ground-truth pictures and points on canvases of any size.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -29,35 +29,30 @@ impl People {
     /// Opens a data set.
     ///
     /// # Errors
-    /// [`EvalError`] if it is none, or its views are not what the config asks for.
+    /// [`EvalError`] if it is none, or does not have the views of the config.
     pub fn open(path: &Path, data: &DataSection, views: &ViewsSection) -> Result<Self, EvalError> {
         let folder = Arc::new(Folder::open(path)?);
         let test = test_of(&folder, data.split)?;
         let description = folder.description();
-        let wrong = |message: String| EvalError::File(FileError::unsuitable(path, message));
+        let wrong = |message: &str| EvalError::File(FileError::unsuitable(path, message));
         let count = description.views;
         if description.arrangement != Arrangement::Ring {
-            return Err(wrong(
-                "is arranged in groups, to train on: people to test are seen from all around".into(),
-            ));
+            return Err(wrong("is arranged in groups, for training: test people need a ring of views"));
         }
         if views.inputs.is_empty() && !count.is_multiple_of(2) {
-            let message = format!("has {count} views, none opposite the first: say `views.inputs`");
-            return Err(wrong(message));
+            return Err(wrong(&format!("has {count} views, none opposite the first: set `views.inputs`")));
         }
         let lists = [("inputs", &views.inputs), ("turns", &views.turns), ("compared", &views.compared)];
         for (key, list) in lists {
             if let Some(view) = list.iter().find(|view| **view >= count) {
-                return Err(wrong(format!("has no view {view}, of {count}, which `views.{key}` asks for")));
+                return Err(wrong(&format!("has no view {view}, of {count}, which `views.{key}` names")));
             }
         }
         let side = description.resolution as usize;
         if views.resolution > 0 && !side.is_multiple_of(views.resolution) {
-            let message = format!(
-                "has views of {side}², of which `views.resolution` = {} is no whole part",
-                views.resolution
-            );
-            return Err(wrong(message));
+            let message =
+                format!("has views of {side}², no multiple of `views.resolution` = {}", views.resolution);
+            return Err(wrong(&message));
         }
         let is_chosen =
             |i: &usize| data.only.is_empty() || data.only.iter().any(|name| name == test.name(*i));
@@ -76,7 +71,7 @@ impl People {
         &self.test
     }
 
-    /// Rows of those to be looked at.
+    /// Rows of the people that are evaluated.
     pub fn chosen(&self) -> &[usize] {
         &self.chosen
     }
@@ -86,22 +81,22 @@ impl People {
         self.folder.description().views
     }
 
-    /// The views that go in, `turn` views further round.
+    /// The input views plus `turn`.
     pub fn inputs(&self, views: &ViewsSection, turn: usize) -> Vec<usize> {
         let count = self.views();
         let first = if views.inputs.is_empty() { vec![0, count / 2] } else { views.inputs.clone() };
         first.into_iter().map(|view| (view + turn) % count).collect()
     }
 
-    /// Side of the pictures that are compared.
+    /// Side of the compared pictures.
     pub fn side(&self, views: &ViewsSection) -> usize {
         if views.resolution > 0 { views.resolution } else { self.folder.description().resolution as usize }
     }
 
-    /// A person's photographs, changed as `handling` says, masks and cameras.
+    /// A person's photographs, with the changes of `handling`, masks and cameras.
     ///
     /// # Errors
-    /// [`EvalError::File`]; also for a camera that mirrors, whose world has no Gaussians: no quaternion turns them so.
+    /// [`EvalError::File`], also for a camera that mirrors: no quaternion can express the mirrored Gaussians.
     pub fn item(&self, row: usize, inputs: &[usize], handling: &Handling) -> Result<TestItem, EvalError> {
         let item = self.test.sample(row, inputs, handling)?;
         let mirrors = |camera: &Camera| camera.world_to_camera.rotation.determinant() < 0.0;
@@ -115,7 +110,7 @@ impl People {
         }
     }
 
-    /// What a view shows, over black, and the person's share of each pixel `[S, S]`.
+    /// The ground-truth picture of a view over black, and the person's share of each pixel `[S, S]`.
     ///
     /// # Errors
     /// [`EvalError::File`].
@@ -128,16 +123,16 @@ impl People {
     }
 }
 
-/// A split of a data set as it is, nothing changed.
+/// A split of a data set without any change.
 pub fn test_of(folder: &Arc<Folder>, split: Option<Split>) -> Result<Test, EvalError> {
     if let Some(split) = split.filter(|split| !folder.root().join(split.name()).is_dir()) {
-        let message = format!("has no split `{split}`: see data.split");
+        let message = format!("has no split `{split}`: change `data.split`");
         return Err(EvalError::File(FileError::unsuitable(folder.root(), message)));
     }
     Ok(Test::new(folder.clone(), split, SampleConfig::default())?)
 }
 
-/// The largest whole part of a side that is no longer than `most`.
+/// The largest whole part of a side up to `most`.
 pub fn part_of(side: usize, most: usize) -> usize {
     (1..=side).find(|f| side.is_multiple_of(*f) && side / f <= most).map_or(side, |factor| side / factor)
 }
@@ -147,22 +142,24 @@ pub fn smaller(values: Vec<f32>, channels: usize, from: usize, to: usize) -> Vec
     if from == to {
         return values;
     }
-    let planes = TensorData::new(values, [1, channels, from, from]);
-    let planes = Tensor::<4>::from_data(planes, &Device::flex());
-    // Means of values in [0, 1] may leave it by rounding.
-    host(shrink(planes, from / to, Downsample::Area).clamp(0.0, 1.0))
+    // Rounding can move means of values in [0, 1] beyond it.
+    host(shrink(planes(values, channels, from), from / to, Downsample::Area).clamp(0.0, 1.0))
 }
 
-/// One of the photographs that go in, on a canvas of `side` pixels: area means where that is a whole part of its own side,
-/// else interpolated.
+/// Planes `[1, C, S, S]` on the CPU.
+pub fn planes(values: Vec<f32>, channels: usize, side: usize) -> Tensor<4> {
+    Tensor::from_data(TensorData::new(values, [1, channels, side, side]), &Device::flex())
+}
+
+/// One of the input photographs on a canvas of `side` pixels: area means if that is a whole part of its own side, else
+/// interpolated.
 pub fn photograph(item: &TestItem, place: usize, side: usize) -> Photograph {
     let from = item.side;
     let area = from * from;
     let rgb = item.images[3 * place * area..3 * (place + 1) * area].to_vec();
     let mask = item.masks[place * area..(place + 1) * area].to_vec();
     let sized = |values: Vec<f32>, channels: usize| {
-        let planes = TensorData::new(values, [1, channels, from, from]);
-        let planes = Tensor::<4>::from_data(planes, &Device::flex());
+        let planes = planes(values, channels, from);
         host(match from.is_multiple_of(side) {
             true => shrink(planes, from / side, Downsample::Area),
             false => bilinear(planes, [side, side], false),
@@ -173,12 +170,12 @@ pub fn photograph(item: &TestItem, place: usize, side: usize) -> Photograph {
     Photograph { rgb, mask, valid }
 }
 
-/// Points `[V,S,S,3]` and where there are any `[V,S,S]`.
+/// Points `[V,S,S,3]`, and their mask `[V,S,S]`.
 pub type Points = (Vec<f32>, Vec<f32>);
 
-/// Points that some views see, on a canvas of `side` pixels where that is a whole part of the stored side (`None` where it
-/// is not): `[V,S,S,3]` metres in the first view's frame, and where there are any `[V,S,S]`. A pixel of the canvas holds the
-/// mean of the points in it, if there are any in half of it or more.
+/// Ground-truth points of some views on a canvas of `side` pixels: `[V,S,S,3]` metres in the first view's frame, and
+/// their mask `[V,S,S]`. A pixel of the canvas has the mean of its points, if at least half of it has points. `None` if
+/// `side` is no whole part of the stored side.
 pub fn points(
     test: &Test,
     row: usize,
@@ -199,8 +196,7 @@ pub fn points(
     Ok(Some((points.concat(), valid.concat())))
 }
 
-/// One view's points, on `side`² pixels instead of `stored`², of which that is a whole part: means where there are points in half
-/// of a pixel or more.
+/// One view's points on `side`² pixels instead of `stored`²: the means of pixels of which at least half has points.
 pub(super) fn means(points: &[f32], valid: &[f32], stored: usize, side: usize) -> Points {
     let factor = stored / side;
     let mut means = vec![0.0; 3 * side * side];
@@ -223,13 +219,13 @@ pub(super) fn means(points: &[f32], valid: &[f32], stored: usize, side: usize) -
     (means, shares)
 }
 
-/// The view whose camera is nearest to so many degrees around the person from the view `first`.
+/// The view whose camera is nearest to `wanted` degrees around the person from the view `first`.
 pub fn nearest_view(cameras: &[Camera], first: usize, wanted: f64) -> usize {
     let off = |view: &usize| off(&cameras[*view], &cameras[first], wanted);
     (0..cameras.len()).min_by(|a, b| off(a).total_cmp(&off(b))).expect("there are views")
 }
 
-/// How far a camera is from `wanted` degrees around the person from `front`, 0° to 180°.
+/// Angle between a camera and the direction `wanted` degrees around the person from `front`, 0° to 180°.
 pub fn off(camera: &Camera, front: &Camera, wanted: f64) -> f64 {
     let apart = (degrees(camera, front) - wanted).rem_euclid(360.0);
     apart.min(360.0 - apart)

@@ -1,4 +1,4 @@
-//! True points of the two sides that nobody photographed.
+//! Ground-truth points of the two unseen sides.
 
 use glam::{DVec2, DVec3};
 use snapsnap_data::sample::{Test, TestItem};
@@ -7,20 +7,20 @@ use snapsnap_splat::Camera;
 use super::person::{Points, off};
 use crate::EvalError;
 
-/// A side is put together from so many views,
+/// Number of views whose points are joined to a side.
 const SOURCES: usize = 4;
-/// none farther from it than so many degrees: what they see of it grows less, and what they see beyond it more.
+/// Largest angle between a side and such a view in degrees. Views farther away see less of the side.
 const FARTHEST: f64 = 30.0;
-/// A view so near, degrees, is that side.
+/// Largest angle, in degrees, of a view that is the side itself.
 const SAME: f64 = 0.1;
-/// Points of a pixel that lie so far behind its nearest one, metres, are of another surface.
+/// Points farther than this behind the nearest one of their pixel, metres, belong to another surface.
 const LAYER: f64 = 0.02;
-/// A point farther from its pixel's centre, pixels, says nothing of it.
+/// Largest distance of a point from its pixel's centre in pixels.
 const REACH: f64 = 0.5;
 
-/// What a camera `azimuth` degrees around the world's y axis from that of view `first` sees, on a canvas of `side` pixels:
-/// points `[S,S,3]` (metres, the frame of view `first`) and where there are any `[S,S]`. Put together from the points of the
-/// views nearest to it (of that view alone, if there is one); none where no view is near.
+/// Points seen by a camera `azimuth` degrees around the world's y axis from that of view `first`, on a canvas of `side`
+/// pixels: points `[S,S,3]` (metres, the frame of view `first`) and their mask `[S,S]`. They are the points of the view
+/// at that angle, or else of the nearest views. The mask is empty if no view is near.
 ///
 /// # Errors
 /// [`EvalError::File`].
@@ -52,9 +52,10 @@ pub fn side_points(
     Ok((nearest.into_iter().flat_map(|point| point.map_or([0.0; 3], in_front)).collect(), valid))
 }
 
-/// Of each pixel `[H,W]` the point (world frame) that is nearest to its centre, of those on the surface in front.
+/// Index of the point (world frame) nearest to each pixel's centre `[H,W]`, among those on the front surface.
 fn visible(points: &[DVec3], camera: &Camera) -> Vec<Option<usize>> {
     let (width, height) = (f64::from(camera.width), f64::from(camera.height));
+    // Pixel, depth, and distance from the pixel's centre.
     let place = |point: &DVec3| -> Option<(usize, f64, f64)> {
         let (at, depth) = camera.project(*point)?;
         let is_inside = at.x >= 0.0 && at.y >= 0.0 && at.x < width && at.y < height;
@@ -81,12 +82,12 @@ fn visible(points: &[DVec3], camera: &Camera) -> Vec<Option<usize>> {
 mod tests {
     use super::*;
 
-    /// A ball of 30 cm and a small one before it, as cameras 12° to either side of a side's own see them.
+    /// A ball of 30 cm with a small one in front, seen by cameras 12° to either side of the side's own.
     #[test]
-    fn what_neighbours_see_of_a_side_is_what_the_side_sees() {
+    fn points_of_neighbouring_views_are_those_of_the_side() {
         const BALLS: [(DVec3, f64); 2] =
             [(DVec3::new(0.0, 0.85, 0.0), 0.3), (DVec3::new(0.5, 0.9, 0.05), 0.08)];
-        // Where the ray through a pixel's centre meets the nearer ball.
+        // Point at which the ray through a pixel's centre meets the nearer ball.
         let cast = |camera: &Camera, cell: u32| -> Option<DVec3> {
             let pixel = DVec2::new((cell % camera.width).into(), (cell / camera.width).into()) + 0.5;
             let along = ((pixel - camera.principal_point) / camera.focal).extend(1.0);
@@ -111,7 +112,8 @@ mod tests {
         let found = visible(&seen, &canvas);
         let pairs = || found.iter().zip(&exact).map(|(i, exact)| (i.map(|i| seen[i]), *exact));
         let off: Vec<f64> = pairs().filter_map(|(i, exact)| Some((i? - exact?).length())).collect();
-        // Pixels are 2 cm wide at that distance, and hold eight points or so. Few are seen by the side and by no neighbour, or the other way round.
+        // Pixels are 2 cm wide at that distance, and have about eight points. Few are seen only by the side or only by
+        // its neighbours.
         let mean = off.iter().sum::<f64>() / off.len() as f64;
         assert!(mean < 0.4 * 0.02, "{mean} m");
         let only_one = pairs().filter(|(i, exact)| i.is_some() != exact.is_some()).count();

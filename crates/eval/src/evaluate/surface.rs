@@ -1,4 +1,4 @@
-//! Geometry of a person: true points of all views, and how far what was made lies from them.
+//! Geometry of a person: ground-truth points of all views, and distances of reconstructions from them.
 
 use glam::DVec3;
 use rayon::prelude::*;
@@ -13,38 +13,38 @@ use super::person::{People, means, nearest_view, part_of};
 use crate::EvalError;
 use crate::geometry::{Chamfer, chamfer, consistency, normals, points, sampled};
 
-/// True points kept per view, at most.
+/// Largest number of ground-truth points per view.
 const PER_VIEW: usize = 4000;
-/// Gaussians compared, at most: more say nothing new.
+/// Largest number of compared Gaussians.
 const MOST: usize = 60_000;
-/// Normals are compared in maps of this side at most, where a pixel is about a centimetre wide: finer, they tell of roughness.
+/// Largest side of maps of normals, at which a pixel is about a centimetre wide. Finer maps would measure roughness.
 const NORMALS: usize = 256;
-/// Decides which points are drawn of a mesh.
+/// Seed of the points drawn from a mesh.
 const SEED: u64 = 1;
 /// Directions from which normals are compared, degrees from the first view.
 const DIRECTIONS: [f64; 4] = [0.0, 90.0, 180.0, 270.0];
 
-/// Distances of a surface from the true one.
+/// Distances of a surface from the ground truth.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Surface {
     /// Metres.
     pub chamfer: Chamfer,
-    /// Mean cosine of normals, from four sides, where both are seen.
+    /// Mean cosine of normals from four sides, at pixels with both normals.
     pub normals: Option<f64>,
 }
 
-/// What is true of a person.
+/// Ground truth of a person.
 pub struct Truth {
     /// World frame, metres.
     pub points: Vec<[f32; 3]>,
-    /// Views nearest to the four directions, in pictures of 256² pixels at most, and the normals that they see.
+    /// Cameras of the views nearest to the four directions, with at most 256² pixels, and their normals.
     pub views: Vec<(Camera, Vec<Option<DVec3>>)>,
 }
 
-/// What is true of a person, from the depth maps.
+/// Ground truth of a person from the depth maps.
 ///
 /// # Errors
-/// [`EvalError`] for files that cannot be read, or without any point.
+/// [`EvalError`] for files that cannot be read, or that have no point.
 pub fn truth(people: &People, row: usize) -> Result<Truth, EvalError> {
     let cameras = people.test().sample(row, &[], &Handling::default())?.cameras;
     let directions = DIRECTIONS.map(|wanted| nearest_view(&cameras, 0, wanted));
@@ -79,13 +79,13 @@ pub fn truth(people: &People, row: usize) -> Result<Truth, EvalError> {
         views.extend(normals);
     }
     if all.is_empty() {
-        return Err(EvalError::Empty("no view has a depth: there is no true surface".into()));
+        return Err(EvalError::Empty("no view has a depth: there is no ground truth".into()));
     }
     Ok(Truth { points: all, views })
 }
 
 impl Truth {
-    /// Mean cosine between the true normals and those of the depths that `depth` gives of a camera, where both are seen.
+    /// Mean cosine between the normals of the ground truth and those of the depth maps that `depth` returns.
     ///
     /// # Errors
     /// Those of `depth`.
@@ -103,7 +103,7 @@ impl Truth {
         Ok((count > 0).then(|| sum / count as f64))
     }
 
-    /// The same of a mesh (world frame, metres).
+    /// The same for a mesh (world frame, metres).
     ///
     /// # Errors
     /// [`EvalError::Empty`] for a mesh that cannot be drawn.
@@ -114,17 +114,18 @@ impl Truth {
     }
 }
 
-/// So many of a list at most, evenly.
+/// At most `most` entries of a list, at equal distances.
 pub(super) fn thinned<T: Copy>(all: &[T], most: usize) -> Vec<T> {
     let kept = all.len().min(most);
     (0..kept).map(|i| all[i * all.len() / kept]).collect()
 }
 
 impl Surface {
-    /// Of Gaussians (world frame): the centres of those that are at least so opaque, and their rendered depths.
+    /// Distances of Gaussians (world frame): of the centres of those with an opacity of at least `opaque`, and of their
+    /// rendered depths.
     ///
     /// # Errors
-    /// [`EvalError`] if none is.
+    /// [`EvalError`] if no Gaussian is so opaque.
     pub fn of_gaussians(gaussians: &Gaussians, truth: &Truth, opaque: f32) -> Result<Self, EvalError> {
         let opacities = snapsnap_ops::host(gaussians.opacities.clone());
         let centres = points(&gaussians.means)?;
@@ -134,15 +135,15 @@ impl Surface {
         let depth = |camera: &Camera| {
             let options = RenderOptions { depth: true, ..RenderOptions::inria() };
             let rendered = render(gaussians, std::slice::from_ref(camera), &options)?;
-            let depth = snapsnap_ops::host(rendered.depth.expect("asked for"));
+            let depth = snapsnap_ops::host(rendered.depth.expect("an option"));
             let alpha = snapsnap_ops::host(rendered.alpha);
-            // Depths are weighted by coverage; half of it is a surface.
+            // Depths are weighted by coverage. A surface has at least half.
             Ok(depth.iter().zip(alpha).map(|(z, a)| if a > 0.5 { z / a } else { 0.0 }).collect())
         };
         Ok(Self { chamfer: chamfer(&there, &truth.points)?, normals: truth.agreement(depth)? })
     }
 
-    /// Of the mesh that is made of Gaussians (world frame): points drawn from it, and the depths of its triangles.
+    /// Distances of the mesh of Gaussians (world frame): of points drawn from it, and of the depths of its triangles.
     ///
     /// # Errors
     /// [`EvalError`] if no mesh can be made of them.

@@ -5,36 +5,36 @@ use glam::{DMat3, DQuat, DVec3};
 use super::{check_points, nearest};
 use crate::EvalError;
 
-/// Steps after which it ends in any case.
+/// Largest number of steps.
 const MOST: usize = 100;
-/// It ends when the mean squared distance falls by less than this share.
+/// Least relative decrease of the mean squared distance in a step.
 const ENOUGH: f64 = 1e-6;
 
 /// x ↦ scale · rotation · x + translation.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Alignment {
-    /// 1 unless it was asked for.
+    /// 1 for rigid motions.
     pub scale: f64,
     /// A proper rotation.
     pub rotation: DQuat,
     /// In the points' unit.
     pub translation: DVec3,
-    /// Mean squared distance to the nearest neighbour after it.
+    /// Mean squared distance to the nearest neighbour after the motion.
     pub cost: f64,
-    /// Steps.
+    /// Number of steps.
     pub steps: usize,
 }
 
 impl Alignment {
-    /// Where a point goes.
+    /// The moved point.
     pub fn apply(&self, point: [f32; 3]) -> [f32; 3] {
         (self.scale * (self.rotation * double(point)) + self.translation).as_vec3().to_array()
     }
 }
 
-/// Moves points onto others: each step pairs every point with its nearest neighbour and applies the best rigid motion of those
-/// pairs (with `scale`: the best similarity). It finds the nearest minimum, so the points must lie roughly right: within some
-/// 30° and a quarter of the size.
+/// Motion of points onto others. Each step pairs every point with its nearest neighbour and finds the best rigid motion
+/// of those pairs (with `scale`: the best similarity). The result is the nearest minimum, so the initial error must be
+/// below some 30° and a quarter of the size.
 ///
 /// # Errors
 /// [`EvalError::Empty`] for a set without points or with one that is not finite.
@@ -67,8 +67,8 @@ pub fn icp(points: &[[f32; 3]], onto: &[[f32; 3]], scale: bool) -> Result<Alignm
     Ok(best)
 }
 
-/// The motion that brings points nearest to their partners in the least squares' sense (Horn 1987): the rotation is the
-/// eigenvector, of the largest eigenvalue, of a symmetric matrix made of their covariances.
+/// The motion with the least squared distances of points from their partners (Horn 1987). Its rotation is the
+/// eigenvector of the largest eigenvalue of a symmetric matrix of their covariances.
 fn procrustes(points: &[[f32; 3]], targets: &[[f32; 3]], scale: bool) -> Alignment {
     let n = points.len() as f64;
     let centre = |of: &[[f32; 3]]| of.iter().map(|p| double(*p)).sum::<DVec3>() / n;
@@ -94,13 +94,13 @@ fn procrustes(points: &[[f32; 3]], targets: &[[f32; 3]], scale: bool) -> Alignme
     for (p, t) in points.iter().zip(targets) {
         rotated += (rotation * (double(*p) - from)).dot(double(*t) - to);
     }
-    // Points that all lie in one place have no size to change.
+    // Equal points have no scale.
     let scale = if scale && spread > 0.0 && rotated > 0.0 { rotated / spread } else { 1.0 };
     let translation = to - scale * (rotation * from);
     Alignment { scale, rotation, translation, cost: 0.0, steps: 0 }
 }
 
-/// By Jacobi rotations.
+/// The eigenvector of the largest eigenvalue of a symmetric matrix, by Jacobi rotations.
 fn largest_eigenvector(mut a: [[f64; 4]; 4]) -> [f64; 4] {
     const SWEEPS: usize = 30;
     let mut vectors = [[0.0; 4]; 4];

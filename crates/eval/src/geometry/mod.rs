@@ -1,5 +1,5 @@
-//! How far surfaces lie apart. Nothing is aligned unless [`icp`] is called. Lengths are in the unit of the points, metres
-//! throughout this project; reports print centimetres.
+//! Distances between surfaces, without alignment unless [`icp`] is called. Lengths have the unit of the points, metres
+//! in this project. Reports print centimetres.
 
 mod align;
 mod normals;
@@ -18,15 +18,15 @@ use crate::EvalError;
 pub use align::{Alignment, icp};
 pub use normals::{consistency, normals};
 
-/// Points farther away than this, metres, are refused: f32 has no squares of their distances.
+/// Largest coordinate of a point in metres. The squares of larger ones overflow f32.
 const FARTHEST: f32 = 1e15;
 
 /// Mean distances between two sets of points.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Chamfer {
-    /// From each point of the first to the nearest of the second: how far off what was made is.
+    /// From each point of the first to the nearest of the second.
     pub forward: f64,
-    /// From each point of the second to the nearest of the first: how much of it was missed.
+    /// From each point of the second to the nearest of the first.
     pub backward: f64,
 }
 
@@ -76,7 +76,7 @@ pub fn chamfer(a: &[[f32; 3]], b: &[[f32; 3]]) -> Result<Chamfer, EvalError> {
     Ok(Chamfer { forward: one_way(a, b), backward: one_way(b, a) })
 }
 
-/// For each of the first points the row of the nearest of the second, and how far it is.
+/// For each of the first points, the row of the nearest of the second and its distance.
 fn nearest(from: &[[f32; 3]], to: &[[f32; 3]]) -> Vec<(usize, f64)> {
     let rows = Neighbours::new(to).expect("points were checked").nearest(from);
     let apart = |(p, row): (&[f32; 3], u32)| (row as usize, distance(*p, to[row as usize]));
@@ -88,7 +88,7 @@ fn distance(a: [f32; 3], b: [f32; 3]) -> f64 {
     squares.iter().sum::<f64>().sqrt()
 }
 
-/// Mean Euclidean distance from points to the nearest place on the triangles of a mesh, one way.
+/// Mean Euclidean distance from points to the triangles of a mesh.
 ///
 /// # Errors
 /// [`EvalError::Empty`] without points or with one that is not finite, or for a mesh that has no area.
@@ -97,7 +97,7 @@ pub fn point_to_surface(points: &[[f32; 3]], mesh: &Mesh) -> Result<f64, EvalErr
     check_points(&mesh.positions.iter().map(|p| p.to_array()).collect::<Vec<_>>())?;
     let vertices = mesh.positions.iter().map(|p| Vector::new(p.x, p.y, p.z)).collect();
     let mut faces: Vec<[u32; 3]> = mesh.faces.iter().map(|face| face.positions).collect();
-    // Every copy of a nearest face would be looked at: a damaged file may have thousands.
+    // Queries visit every copy of a nearest face. A damaged file may have thousands.
     faces.iter_mut().for_each(|corners| corners.sort_unstable());
     faces.sort_unstable();
     faces.dedup();
@@ -111,7 +111,7 @@ pub fn point_to_surface(points: &[[f32; 3]], mesh: &Mesh) -> Result<f64, EvalErr
     Ok(distances.iter().sum::<f64>() / points.len() as f64)
 }
 
-/// Points drawn evenly from the surface of a mesh; the same seed draws the same.
+/// Points drawn uniformly from the surface of a mesh. One seed always draws the same points.
 ///
 /// # Errors
 /// [`EvalError::Empty`] for a mesh without area.

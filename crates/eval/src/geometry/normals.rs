@@ -1,15 +1,15 @@
-//! Normals of depth maps, and how far two agree.
+//! Normals of depth maps, and the cosine between those of two maps.
 
 use glam::DVec3;
 use snapsnap_splat::Camera;
 
-/// Neighbouring depths further apart than this share of the depth belong to two surfaces: a slope of 84° at the published cameras'
-/// 2 m and 1024 pixels.
+/// Largest difference of neighbouring depths on one surface, relative to the depth: a slope of 84° at the 2 m and 1024
+/// pixels of the published cameras.
 const JUMP: f32 = 0.01;
 
-/// Unit normals `[H, W]`, camera's axes, towards the camera, of a depth map `[H, W]` (metres along the optical axis, 0 where
-/// there is none): of the points right of and below each pixel against those left of and above it. `None` at the rims of
-/// surfaces and of the picture.
+/// Unit normals `[H, W]` towards the camera, in the camera's axes, of a depth map `[H, W]` (metres along the optical
+/// axis, 0 for no depth). They are central differences of the points. `None` at the rims of surfaces and of the
+/// picture.
 pub fn normals(depth: &[f32], camera: &Camera) -> Vec<Option<DVec3>> {
     let (width, height) = (camera.width as usize, camera.height as usize);
     let point = |x: usize, y: usize| {
@@ -37,8 +37,8 @@ pub fn normals(depth: &[f32], camera: &Camera) -> Vec<Option<DVec3>> {
     (0..width * height).map(|i| normal(i % width, i / width)).collect()
 }
 
-/// Mean cosine between the normals of two maps where both have one, and how many pixels those are; `None` where they never
-/// meet. 1 where surfaces face alike.
+/// Mean cosine between the normals of two maps at pixels with both, and the number of those pixels; `None` without such
+/// pixels.
 pub fn consistency(a: &[Option<DVec3>], b: &[Option<DVec3>]) -> Option<(f64, usize)> {
     let (mut sum, mut count) = (0.0, 0_usize);
     for (a, b) in a.iter().zip(b).filter_map(|(a, b)| a.zip(*b)) {

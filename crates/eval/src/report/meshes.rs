@@ -4,7 +4,7 @@ use std::fmt::Write;
 
 use serde_json::{Value, json};
 
-use super::{Header, cell, escaped};
+use super::{Header, cell, left_out_markdown, table_markdown};
 use crate::evaluate::LeftOut;
 use crate::evaluate::meshes::MeshFigures;
 use crate::statistics::{Interval, interval};
@@ -19,7 +19,7 @@ const FIGURES: [Figure; 6] = [
     ("normal_consistency", "normals, mean cosine", |f| f.normal_consistency),
 ];
 
-/// Over the people who have it.
+/// A figure over the people who have it.
 fn overall(figures: &[MeshFigures], of: fn(&MeshFigures) -> Option<f64>) -> Option<Interval> {
     interval(&figures.iter().filter_map(of).collect::<Vec<f64>>())
 }
@@ -39,20 +39,14 @@ pub fn json(header: &Header, figures: &[MeshFigures], left_out: &[LeftOut]) -> V
 pub fn markdown(header: &Header, figures: &[MeshFigures], left_out: &[LeftOut], alignment: &str) -> String {
     let mut text = header.markdown("Meshes");
     let people = figures.len();
+    let row = |(key, title, of): Figure| {
+        let digits = if key == "normal_consistency" { 4 } else { 3 };
+        vec![title.to_owned(), cell(overall(figures, of), 1.0, digits)]
+    };
     let _ = writeln!(
         text,
-        "* {people} people; intervals: 95 %, bootstrap over people\n* Alignment: {alignment}\n"
+        "* {people} people; intervals: 95 %, bootstrap over people\n* Alignment: {alignment}\n\n{}",
+        table_markdown(&["", ""], FIGURES.into_iter().map(row))
     );
-    let _ = writeln!(text, "| | |\n|---|---|");
-    for (key, title, of) in FIGURES {
-        let digits = if key == "normal_consistency" { 4 } else { 3 };
-        let _ = writeln!(text, "| {title} | {} |", cell(overall(figures, of), 1.0, digits));
-    }
-    if !left_out.is_empty() {
-        let _ = writeln!(text, "\n## Left out: {}\n", left_out.len());
-        for LeftOut { name, why } in left_out {
-            let _ = writeln!(text, "* {}: {}", escaped(name), escaped(why));
-        }
-    }
-    text
+    text.trim_end().to_owned() + "\n" + &left_out_markdown(left_out)
 }

@@ -7,23 +7,24 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use serde_json::{Value, json};
 
+use crate::evaluate::LeftOut;
 use crate::statistics::Interval;
 
-/// What every report begins with.
+/// The first lines of every report.
 #[derive(Debug, Clone)]
 pub struct Header {
     /// The command line.
     pub command: String,
-    /// Of the program.
+    /// Commit of the program.
     pub commit: String,
-    /// In words.
+    /// Name of the device.
     pub device: String,
     /// UTC, `YYYY-MM-DD`.
     pub date: String,
 }
 
 impl Header {
-    /// The four keys, to which a report adds its own.
+    /// The first four keys of a report.
     pub fn json(&self) -> Value {
         json!({ "command": self.command, "commit": self.commit, "device": self.device, "date": self.date })
     }
@@ -44,7 +45,7 @@ pub fn today() -> String {
     format!("{year:04}-{month:02}-{day:02}")
 }
 
-/// The date of a day since 1970-01-01: years are counted from March, so that leap days come last.
+/// The date of a day since 1970-01-01. Years start in March, so that leap days come last.
 fn civil(days: u64) -> (u64, u64, u64) {
     let days = days + 719_468;
     let (era, day) = (days / 146_097, days % 146_097);
@@ -56,7 +57,7 @@ fn civil(days: u64) -> (u64, u64, u64) {
     (era * 400 + year + late, month, day)
 }
 
-/// A figure with its interval, in a table; `times` scales it.
+/// A figure with its interval in a table of Markdown, multiplied by `times`.
 pub fn cell(interval: Option<Interval>, times: f64, digits: usize) -> String {
     match interval {
         None => "n/a".into(),
@@ -81,6 +82,31 @@ pub fn table(header: &[&str], rows: impl Iterator<Item = Vec<String>>) -> String
     rows.for_each(|row| table.write_record(row).expect("as long as the header"));
     let bytes = table.into_inner().expect("memory can be written");
     String::from_utf8(bytes).expect("made of text")
+}
+
+/// A figure in a table of CSV; an absent one is empty.
+pub fn number(figure: Option<f64>) -> String {
+    figure.map_or(String::new(), |v| v.to_string())
+}
+
+/// The section of failures, if there are any.
+pub fn left_out_markdown(left_out: &[LeftOut]) -> String {
+    if left_out.is_empty() {
+        return String::new();
+    }
+    let line = |LeftOut { name, why }: &LeftOut| format!("* {}: {}\n", escaped(name), escaped(why));
+    let lines: String = left_out.iter().map(line).collect();
+    format!("\n## Left out: {}\n\n{lines}", left_out.len())
+}
+
+/// A Markdown table.
+pub fn table_markdown(header: &[&str], rows: impl Iterator<Item = Vec<String>>) -> String {
+    let line = |row: Vec<String>| {
+        let cells: Vec<String> = row.iter().map(|cell| escaped(cell)).collect();
+        format!("| {} |\n", cells.join(" | "))
+    };
+    let (titles, rule) = (header.join(" | "), "---|".repeat(header.len()));
+    format!("| {titles} |\n|{rule}\n{}", rows.map(line).collect::<String>())
 }
 
 /// Text within a Markdown table.

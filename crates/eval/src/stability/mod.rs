@@ -10,42 +10,71 @@ use std::time::Instant;
 use burn::tensor::Device;
 use serde::Serialize;
 
-/// An input, and what must hold of it.
+/// An input and its required result.
+#[derive(Serialize)]
 pub struct Case {
     /// Splats, networks, losses, training.
     pub area: &'static str,
-    /// What goes in.
+    /// The input.
     pub input: String,
-    /// What must hold, for people.
+    /// The requirement.
     pub holds: String,
-    /// Largest error of values that is allowed.
+    /// Largest allowed error of values.
     pub value_limit: f64,
-    /// Largest error of gradients that is allowed.
+    /// Largest allowed error of gradients.
     pub gradient_limit: f64,
-    /// Whether it runs on the first device alone: what is computed on the host, or says nothing about a device.
+    /// Whether it runs on the first device alone, since its result does not depend on the device.
+    #[serde(skip)]
     pub once: bool,
-    /// Does it.
-    #[allow(clippy::type_complexity, reason = "a function")]
-    pub run: Box<dyn Fn(&Device) -> Found>,
+    /// The test.
+    #[serde(skip)]
+    pub run: Run,
 }
 
-/// What a case found.
+/// The test of a case on a device.
+pub type Run = Box<dyn Fn(&Device) -> Found>;
+
+impl Case {
+    /// A case that runs on every device, with the limits of values and gradients.
+    pub fn new(
+        area: &'static str,
+        input: impl Into<String>,
+        holds: &str,
+        [value_limit, gradient_limit]: [f64; 2],
+        run: impl Fn(&Device) -> Found + 'static,
+    ) -> Self {
+        let (input, holds, run) = (input.into(), holds.into(), Box::new(run));
+        Self { area, input, holds, value_limit, gradient_limit, once: false, run }
+    }
+}
+
+/// The result of a case.
 #[derive(Debug, Clone, Default)]
 pub struct Found {
-    /// Of values against f64, as the case says; not finite where they are not.
+    /// Error of values against f64, as defined by the case; not finite for values that are not.
     pub value: Option<f64>,
-    /// Of gradients against f64, relative.
+    /// Relative error of gradients against f64.
     pub gradient: Option<f64>,
-    /// What else was seen.
+    /// Further observations.
     pub note: String,
-    /// Something that must hold and does not.
+    /// The first failed requirement.
     pub broken: Option<String>,
-    /// Why it could not be run here, which is no failure.
+    /// Why the case does not run here. That is no failure.
     pub skipped: Option<String>,
 }
 
 impl Found {
-    /// Whether something that must hold does; told what if not.
+    /// The result of a case that cannot run on this device.
+    pub fn skipped(why: String) -> Self {
+        Self { skipped: Some(why), ..Self::default() }
+    }
+
+    /// A failed result.
+    pub fn broken(what: impl ToString) -> Self {
+        Self { broken: Some(what.to_string()), ..Self::default() }
+    }
+
+    /// Records the failure `what` unless the requirement holds.
     pub fn must(mut self, holds: bool, what: &str) -> Self {
         if !holds && self.broken.is_none() {
             self.broken = Some(what.to_owned());
@@ -54,45 +83,38 @@ impl Found {
     }
 }
 
-/// An error, ∞ for NaN: a largest of several would not see it.
+/// An error, ∞ for NaN, which `max` would ignore.
 fn nan_is_worst(v: f64) -> f64 {
     if v.is_nan() { f64::INFINITY } else { v }
 }
 
 /// A row of the table.
-#[derive(Debug, Clone, Serialize)]
-pub struct Row {
-    /// As in [`Case`].
-    pub area: String,
-    /// As in [`Case`].
-    pub input: String,
-    /// In words.
+#[derive(Serialize)]
+pub struct Row<'a> {
+    /// The case.
+    #[serde(flatten)]
+    pub case: &'a Case,
+    /// Name of the device.
     pub device: String,
-    /// As in [`Case`].
-    pub holds: String,
-    /// `null` where there is none or it is not finite.
+    /// `None` if it is absent or not finite.
     pub value_error: Option<f64>,
-    /// As in [`Case`].
-    pub value_limit: f64,
-    /// `null` where there is none or it is not finite.
+    /// `None` if it is absent or not finite.
     pub gradient_error: Option<f64>,
-    /// As in [`Case`].
-    pub gradient_limit: f64,
-    /// What it took.
+    /// Run time.
     pub seconds: f64,
     /// `holds`, `fails` or `skipped`.
-    pub verdict: String,
-    /// What else was seen, what broke, or why it was skipped.
+    pub verdict: &'static str,
+    /// Observations, the failed requirement, or why it was skipped.
     pub note: String,
 }
 
-/// Runs a case; what panics fails.
-pub fn run(case: &Case, device: &Device, device_name: &str) -> Row {
+/// Runs a case. A panic is a failure.
+pub fn run<'a>(case: &'a Case, device: &Device, device_name: &str) -> Row<'a> {
     let start = Instant::now();
     let found = catch_unwind(AssertUnwindSafe(|| (case.run)(device))).unwrap_or_else(|panic| {
         let said = panic.downcast_ref::<String>().cloned();
         let said = said.or_else(|| panic.downcast_ref::<&str>().map(|s| (*s).to_owned()));
-        Found { broken: Some(format!("panicked: {}", said.unwrap_or_default())), ..Found::default() }
+        Found::broken(format!("panicked: {}", said.unwrap_or_default()))
     });
     let over = |error: Option<f64>, limit: f64| error.is_some_and(|e| e.is_nan() || e > limit);
     let (verdict, note) = match (&found.skipped, &found.broken) {
@@ -105,16 +127,12 @@ pub fn run(case: &Case, device: &Device, device_name: &str) -> Row {
         _ => ("holds", found.note.clone()),
     };
     Row {
-        area: case.area.into(),
-        input: case.input.clone(),
+        case,
         device: device_name.into(),
-        holds: case.holds.clone(),
         value_error: found.value.filter(|v| v.is_finite()),
-        value_limit: case.value_limit,
         gradient_error: found.gradient.filter(|v| v.is_finite()),
-        gradient_limit: case.gradient_limit,
         seconds: start.elapsed().as_secs_f64(),
-        verdict: verdict.into(),
+        verdict,
         note,
     }
 }

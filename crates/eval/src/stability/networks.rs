@@ -1,4 +1,4 @@
-//! Networks at the ends of what numbers hold.
+//! Networks at the limits of number formats.
 
 use std::sync::Arc;
 
@@ -15,92 +15,56 @@ use snapsnap_ops::{Rope, host, rotary_attention};
 
 use super::{Case, Found, nan_is_worst};
 
+const AREA: &str = "Networks";
+
 /// All cases of networks but those in 16 bits, which need trained weights.
 pub fn cases() -> Vec<Case> {
     let mut cases = Vec::new();
     for norm in [0.0_f32, 1e-12, 0.29, 0.31, 20.0, 88.0, 1e4] {
-        cases.push(Case {
-            area: "Networks",
-            input: format!("exponential depth at raw norm {norm:?}"),
-            holds: "p = r/‖r‖·(e^‖r‖ − 1) relative to f64 as far as f32 reaches (e^88), finite beyond; gradient finite".into(),
-            // Seen: 2.0e-6 (lavapipe, at 88) and 7e-7.
-            value_limit: 5e-6,
-            gradient_limit: 5e-6,
-            once: false,
-            run: Box::new(move |device| exponential_depth(norm, device)),
-        });
+        let input = format!("exponential depth at raw norm {norm:?}");
+        let holds = "p = r/‖r‖·(e^‖r‖ − 1) relative to f64 as far as f32 reaches (e^88), finite beyond; gradient finite";
+        // Measured: 2.0e-6 (lavapipe, at 88) and 7e-7.
+        cases.push(Case::new(AREA, input, holds, [5e-6; 2], move |device| exponential_depth(norm, device)));
     }
     for (mode, name) in [(ConfMode::Sigmoid, "sigmoid"), (ConfMode::Exp, "exp")] {
-        cases.push(Case {
-            area: "Networks",
-            input: format!("confidences ({name}) at ±1e4 and ±88"),
-            holds: "as f64 (relative above 1), in range; finite beyond f32's reach, gradient finite".into(),
-            value_limit: 5e-6,
-            gradient_limit: 0.0,
-            once: false,
-            run: Box::new(move |device| confidences(mode, device)),
-        });
+        let input = format!("confidences ({name}) at ±1e4 and ±88");
+        let holds = "as f64 (relative above 1), in range; finite beyond f32's reach, gradient finite";
+        cases.push(Case::new(AREA, input, holds, [5e-6, 0.0], move |device| confidences(mode, device)));
     }
-    cases.push(Case {
-        area: "Networks",
-        input: "the regressor's 14 channels at ±1e4".into(),
-        holds: "attributes finite and in range, gradient finite".into(),
-        value_limit: 0.0,
-        gradient_limit: 0.0,
-        once: false,
-        run: Box::new(attributes),
-    });
+    let input = "the regressor's 14 channels at ±1e4";
+    cases.push(Case::new(
+        AREA,
+        input,
+        "attributes finite and in range, gradient finite",
+        [0.0; 2],
+        attributes,
+    ));
     for (size, name) in
         [(1.0_f32, "identical tokens"), (1e4, "identical tokens of 1e4"), (1e18, "tokens of 1e18")]
     {
-        cases.push(Case {
-            area: "Networks",
-            input: format!("attention with {name}"),
-            holds: "the mean of equal values, relative; finite, gradient finite".into(),
-            value_limit: 1e-5,
-            gradient_limit: 0.0,
-            once: false,
-            run: Box::new(move |device| attention(size, device)),
-        });
+        let input = format!("attention with {name}");
+        let holds = "the mean of equal values, relative; finite, gradient finite";
+        cases.push(Case::new(AREA, input, holds, [1e-5, 0.0], move |device| attention(size, device)));
     }
-    cases.push(Case {
-        area: "Networks",
-        input: "attention with different tokens of 1e4".into(),
-        holds: "each token sees itself alone, relative; finite, gradient finite".into(),
-        value_limit: 1e-5,
-        gradient_limit: 0.0,
-        once: false,
-        run: Box::new(attention_to_oneself),
-    });
-    cases.push(Case {
-        area: "Networks",
-        input: "the regressor on constant channels (no variance to divide by)".into(),
-        holds: "features finite and equal wherever padding does not reach, gradient finite".into(),
-        // Of the largest feature; seen: 8.1e-7.
-        value_limit: 1e-5,
-        gradient_limit: 0.0,
-        once: false,
-        run: Box::new(constant_channels),
-    });
+    let input = "attention with different tokens of 1e4";
+    let holds = "each token attends to itself alone, relative; finite, gradient finite";
+    cases.push(Case::new(AREA, input, holds, [1e-5, 0.0], attention_to_oneself));
+    let input = "the regressor on constant channels (no variance to divide by)";
+    let holds = "features finite and equal wherever padding does not reach, gradient finite";
+    // Relative to the largest feature; measured: 8.1e-7.
+    cases.push(Case::new(AREA, input, holds, [1e-5, 0.0], constant_channels));
     cases
 }
 
-/// What a trained predictor makes of a person in 16 bits beside what it makes in 32: `photographs` are on its canvas. Fails where
-/// a tenth of the points are further off than a tenth of what such networks err by (docs/notes/training.md: 30 mm).
+/// Points of a trained predictor in 16 bits against those in 32, with `photographs` on its canvas. The limit of nine
+/// tenths of the points is a tenth of the error of such networks (docs/notes/training.md: 30 mm).
 pub fn sixteen_bits(weights: WeightFile, photographs: [Photograph; 2]) -> Vec<Case> {
     let shared = Arc::new((weights, photographs));
     let case = |precision: Precision| {
         let shared = shared.clone();
-        Case {
-            area: "Networks",
-            input: format!("the given weights in {} beside f32", precision.name()),
-            holds: "nine tenths of the front's and the back's points within 3 mm (values: metres); finite"
-                .into(),
-            value_limit: 3e-3,
-            gradient_limit: 0.0,
-            once: false,
-            run: Box::new(move |device| in_precision(&shared, precision, device)),
-        }
+        let input = format!("the given weights in {} beside f32", precision.name());
+        let holds = "nine tenths of the front's and the back's points within 3 mm (values: metres); finite";
+        Case::new(AREA, input, holds, [3e-3, 0.0], move |device| in_precision(&shared, precision, device))
     };
     [Precision::F16, Precision::Bf16].map(case).into()
 }
@@ -111,12 +75,10 @@ fn in_precision(
     device: &Device,
 ) -> Found {
     if !device.supports_dtype(precision.dtype()) {
-        let skipped = Some(format!("the device does not compute in {}", precision.name()));
-        return Found { skipped, ..Found::default() };
+        return Found::skipped(format!("the device does not compute in {}", precision.name()));
     }
     let maps = |precision: Precision| -> Result<(Vec<f32>, Vec<Vec<bool>>), Found> {
-        let model = Reconstructor::load(weights, device)
-            .map_err(|e| Found { broken: Some(e.to_string()), ..Found::default() })?;
+        let model = Reconstructor::load(weights, device).map_err(Found::broken)?;
         let made = model.in_precision(precision).reconstruct(front, back, &|_| ());
         Ok((host(made.maps.points), made.valid))
     };
@@ -137,8 +99,8 @@ fn in_precision(
         })
         .collect();
     apart.sort_by(f64::total_cmp);
-    let (Some(last), false) = (apart.last().copied(), apart.is_empty()) else {
-        return Found { broken: Some("no pixel is valid".into()), ..Found::default() };
+    let Some(last) = apart.last().copied() else {
+        return Found::broken("no pixel is valid");
     };
     let median = crate::statistics::quantile(&apart, 0.5);
     let note = format!("median {:.2} mm, at most {:.2} mm", 1e3 * median, 1e3 * last);
@@ -154,7 +116,7 @@ fn all_finite(values: &[f32]) -> bool {
     values.iter().all(|v| v.is_finite())
 }
 
-/// Raw points of one norm in several directions; f64's values and derivatives beside them.
+/// Raw points of one norm in several directions, against values and derivatives in f64.
 fn exponential_depth(norm: f32, device: &Device) -> Found {
     let directions: [[f64; 3]; 3] = [[1.0, 0.0, 0.0], [0.6, 0.0, -0.8], [-0.48, 0.6, 0.64]];
     let raw: Vec<f32> = (0..4)
@@ -166,7 +128,7 @@ fn exponential_depth(norm: f32, device: &Device) -> Found {
     let gradients = points.clone().sum().backward();
     let gradient = host(x.grad(&gradients).expect("tracked"));
     let got = host(points);
-    // Nothing can be compared where f32 has no such number.
+    // Numbers beyond f32 are not compared.
     let (mut value, mut slope) = (None, None);
     let worst = |most: &mut Option<f64>, off: f64| *most = Some(nan_is_worst(off).max(most.unwrap_or(0.0)));
     for i in 0..3 {
@@ -250,14 +212,14 @@ fn attributes(device: &Device) -> Found {
         .must(all_finite(&gradient), "a gradient is not finite")
 }
 
-/// Twelve tokens, all alike: whatever the weights are, the answer is the value itself.
+/// Twelve equal tokens. The output is their value for any weights.
 fn attention(size: f32, device: &Device) -> Found {
     let row: Vec<f32> = (0..CHANNELS).map(|c| size * (0.2 + 0.03 * c as f32)).collect();
     let all: Vec<f32> = (0..TOKENS).flat_map(|_| row.clone()).collect();
     attended(&all, &all, device)
 }
 
-/// Twelve tokens of one length in directions of their own: no product is as large as that of a token with itself.
+/// Twelve tokens of one length in different directions. The product of a token with itself is the largest.
 fn attention_to_oneself(device: &Device) -> Found {
     let mut random = ChaCha8Rng::seed_from_u64(11);
     let mut tokens: Vec<f32> = (0..TOKENS * CHANNELS).map(|_| random.random_range(-1.0_f32..1.0)).collect();
@@ -273,7 +235,7 @@ const TOKENS: usize = 12;
 const CHANNELS: usize = 32;
 const HEADS: usize = 2;
 
-/// Attention of tokens with themselves, whose answer must be the values.
+/// Attention of tokens with themselves, whose output must be the values.
 fn attended(tokens: &[f32], values: &[f32], device: &Device) -> Found {
     let shape = [1, TOKENS, CHANNELS];
     let [q, k, v] = [tokens, tokens, values].map(|rows| tensor(rows.to_vec(), shape, device));
@@ -305,7 +267,7 @@ fn constant_channels(device: &Device) -> Found {
     let got = host(features.cast(DType::F32));
     let width = got.len() / (side * side);
     let at = |row: usize, column: usize| &got[(row * side + column) * width..][..width];
-    // The two pixels in the middle see the same but for the padding, which the normalisation hides.
+    // Both pixels in the middle have equal surroundings except for the padding, which the normalisation hides.
     let (a, b) = (at(side / 2, side / 2), at(side / 2 + 4, side / 2 + 4));
     let most = got.iter().fold(0.0_f32, |most, v| most.max(v.abs()));
     let apart = a.iter().zip(b).map(|(a, b)| f64::from((a - b).abs() / most.max(1e-20))).fold(0.0, f64::max);

@@ -5,7 +5,7 @@ use std::fmt::Write;
 use serde_json::{Value, json};
 
 use super::Row;
-use crate::report::{Header, escaped};
+use crate::report::{Header, table_markdown};
 
 /// `report.json`.
 pub fn json(header: &Header, rows: &[Row]) -> Value {
@@ -24,38 +24,33 @@ pub fn markdown(header: &Header, rows: &[Row]) -> String {
     let count = |verdict: &str| rows.iter().filter(|row| row.verdict == verdict).count();
     let _ = writeln!(
         text,
-        "* {} hold, {} fail, {} were skipped\n\nErrors against f64: of values as the case says, of gradients relative; in brackets what is \
-         allowed.\n",
+        "* {} hold, {} fail, {} were skipped\n\nErrors against f64: of values as defined by the case, of gradients relative; limits in \
+         brackets.\n",
         count("holds"),
         count("fails"),
         count("skipped")
     );
-    let mut area = "";
-    for row in rows {
-        if row.area != area {
-            area = &row.area;
-            let _ = writeln!(
-                text,
-                "\n## {area}\n\n| input | device | what must hold | values | gradients | ms | verdict | |\n|---|---|---|---|---|---|---|---|"
-            );
-        }
-        let error = |error: Option<f64>, limit: f64| match error {
-            Some(0.0) => format!("0 ({limit:.1e})"),
-            Some(error) => format!("{error:.1e} ({limit:.1e})"),
-            None => String::new(),
-        };
-        let _ = writeln!(
-            text,
-            "| {} | {} | {} | {} | {} | {:.0} | {} | {} |",
-            escaped(&row.input),
-            escaped(&row.device),
-            escaped(&row.holds),
-            error(row.value_error, row.value_limit),
-            error(row.gradient_error, row.gradient_limit),
-            1e3 * row.seconds,
-            row.verdict,
-            escaped(&row.note)
-        );
+    let error = |error: Option<f64>, limit: f64| match error {
+        Some(0.0) => format!("0 ({limit:.1e})"),
+        Some(error) => format!("{error:.1e} ({limit:.1e})"),
+        None => String::new(),
+    };
+    let cells = |row: &Row| {
+        vec![
+            row.case.input.clone(),
+            row.device.clone(),
+            row.case.holds.clone(),
+            error(row.value_error, row.case.value_limit),
+            error(row.gradient_error, row.case.gradient_limit),
+            format!("{:.0}", 1e3 * row.seconds),
+            row.verdict.to_owned(),
+            row.note.clone(),
+        ]
+    };
+    let header = ["input", "device", "requirement", "values", "gradients", "ms", "verdict", ""];
+    for rows in rows.chunk_by(|a, b| a.case.area == b.case.area) {
+        let table = table_markdown(&header, rows.iter().map(cells));
+        let _ = write!(text, "\n## {}\n\n{table}", rows[0].case.area);
     }
     text
 }

@@ -12,46 +12,40 @@ use snapsnap_splat::{Camera, Gaussians, MAX_SIDE, RenderOptions, RigidTransform,
 
 use super::{Case, Found, nan_is_worst};
 
+const AREA: &str = "Splats";
+
 /// Mean, rotation (w first), scales, opacity, colour.
 type Row = [f32; 14];
 
-/// What is allowed: f32's rounding, blended. Seen on flex, ndarray and lavapipe: at most 7.9e-7 and 4.2e-6.
+/// Limits for blended rounding of f32. Largest errors on flex, ndarray and lavapipe: 7.9e-7 and 4.2e-6.
 const VALUES: f64 = 2e-6;
 const GRADIENTS: f64 = 1e-5;
-/// Gradients smaller are as good as none.
+/// Smaller gradients count as 0.
 const SMALLEST: f64 = 1e-30;
 
-/// Norms of quaternions that name a rotation.
+/// Norms of quaternions that are rotations.
 const QUATERNIONS: RangeInclusive<f32> = 1e-6..=1e18;
 
 /// All cases of the rasteriser (docs/method.md, "Stability cases").
 pub fn cases() -> Vec<Case> {
     let mut cases = Vec::new();
     let camera = camera(32, 24, 30.0);
-    let mut add = |input: String, holds: &str, rows: Vec<Row>, camera: Camera, limits: [f64; 2]| {
-        cases.push(Case {
-            area: "Splats",
-            input,
-            holds: holds.into(),
-            value_limit: limits[0],
-            gradient_limit: limits[1],
-            once: false,
-            run: Box::new(move |device| against_oracle(&rows, &camera, device)),
-        });
+    let mut add = |input: String, holds: &str, rows: Vec<Row>, camera: Camera| {
+        let run = move |device: &Device| against_oracle(&rows, &camera, device);
+        cases.push(Case::new(AREA, input, holds, [VALUES, GRADIENTS], run));
     };
-    let usual = [VALUES, GRADIENTS];
     let equal = "as the oracle, forward and backward";
     for ratio in [1e2_f32, 1e3, 1e5, 1e7] {
         let shape = |long: [bool; 3]| long.map(|long| if long { 0.3 } else { 0.3 / ratio });
-        add(format!("needles 1:{ratio:.0e}"), equal, shaped(shape([true, false, false])), camera, usual);
-        add(format!("discs 1:{ratio:.0e}"), equal, shaped(shape([true, true, false])), camera, usual);
+        add(format!("needles 1:{ratio:.0e}"), equal, shaped(shape([true, false, false])), camera);
+        add(format!("discs 1:{ratio:.0e}"), equal, shaped(shape([true, true, false])), camera);
     }
     for scale in [1e-8_f32, 1e-4, 1.0, 1e2, 1e4] {
-        add(format!("all scales {scale:.0e} m"), equal, shaped([scale; 3]), camera, usual);
+        add(format!("all scales {scale:.0e} m"), equal, shaped([scale; 3]), camera);
     }
     for opacity in [0.0_f32, 1e-7, 1.0 - 1e-7, 1.0] {
         let rows = changed(|row| row[10] = opacity);
-        add(format!("opacity {opacity:?}"), equal, rows, camera, usual);
+        add(format!("opacity {opacity:?}"), equal, rows, camera);
     }
     for (name, norm) in [
         ("0", 0.0_f32),
@@ -70,7 +64,7 @@ pub fn cases() -> Vec<Case> {
         } else {
             "left out (below 1e-6 it is no rotation, beyond 1e18 no number), gradient 0; the others as the oracle without it"
         };
-        add(format!("quaternion of norm {name}"), holds, rows, camera, usual);
+        add(format!("quaternion of norm {name}"), holds, rows, camera);
     }
     for (name, z) in [
         ("at", 0.2_f32),
@@ -80,29 +74,36 @@ pub fn cases() -> Vec<Case> {
     ] {
         let rows = changed(|row| row[2] = z);
         let name = if z < 0.0 { name.to_owned() } else { format!("{name} the near plane") };
-        add(name, "left out where the oracle leaves it out", rows, camera, usual);
+        add(name, "left out where the oracle leaves it out", rows, camera);
     }
     for distance in [1e-3_f32, 1.0, 1e3, 1e6] {
-        // As large in the picture, wherever it is.
+        // Its size in the picture does not depend on the distance.
         let far = |row: &mut Row| {
             row[2] = distance;
             row[7..10].iter_mut().for_each(|s| *s *= distance / 2.0);
         };
-        add(format!("{distance:.0e} m away"), equal, changed(far), camera, usual);
+        add(format!("{distance:.0e} m away"), equal, changed(far), camera);
     }
     for focal in [1.0, 30.0, 1e4, 1e6] {
         let holds = "as the oracle: the picture's size on the sensor does not matter";
-        // Seen under the same angle from further away, so that the picture stays full.
+        // The distance grows with the focal length, so that the picture stays full.
         let rows = changed_all(|row| {
             let factor = (focal / 30.0) as f32;
             row[2] *= factor.max(0.2);
         });
-        add(format!("focal length {focal:.0e} px"), holds, rows, self::camera(32, 24, focal), usual);
+        add(format!("focal length {focal:.0e} px"), holds, rows, self::camera(32, 24, focal));
     }
-    add("image of 1×1".into(), equal, people(), self::camera(1, 1, 1.0), usual);
-    cases.push(far_from_the_origin());
-    cases.push(many_on_one_pixel());
-    cases.push(largest_image());
+    add("image of 1×1".into(), equal, six(), self::camera(1, 1, 1.0));
+    let holds = "as the oracle: positions are what f32 holds there (8 mm apart), nothing is lost beyond that";
+    let input = "scene and camera 1e5 m from the origin";
+    cases.push(Case::new(AREA, input, holds, [VALUES, GRADIENTS], far_from_the_origin));
+    let holds = "as the oracle; gradients finite, and zero behind the closed pixel";
+    let input = "10,000 opaque Gaussians on one pixel";
+    cases.push(Case::new(AREA, input, holds, [VALUES, 0.0], many_on_one_pixel));
+    let holds =
+        "as the oracle in a patch, or refused for want of memory; more than the largest side is refused";
+    let input = "image of 8192×8192, and beyond the largest side";
+    cases.push(Case::new(AREA, input, holds, [VALUES, 0.0], largest_image));
     cases
 }
 
@@ -117,7 +118,7 @@ fn camera(width: u32, height: u32, focal: f64) -> Camera {
 }
 
 /// Six Gaussians two metres before the camera.
-fn people() -> Vec<Row> {
+fn six() -> Vec<Row> {
     let mut random = ChaCha8Rng::seed_from_u64(11);
     let mut one = || {
         let mut between = |low: f32, high: f32| random.random_range(low..high);
@@ -132,22 +133,22 @@ fn people() -> Vec<Row> {
     (0..6).map(|_| one()).collect()
 }
 
-/// Those, one of which is changed.
+/// The six Gaussians with a change of one.
 fn changed(change: impl Fn(&mut Row)) -> Vec<Row> {
-    let mut rows = people();
+    let mut rows = six();
     change(&mut rows[2]);
     rows
 }
 
 fn changed_all(change: impl Fn(&mut Row)) -> Vec<Row> {
-    let mut rows = people();
+    let mut rows = six();
     rows.iter_mut().for_each(change);
     rows
 }
 
-/// Two of them are of this shape.
+/// The six Gaussians, two of which have these scales.
 fn shaped(scales: [f32; 3]) -> Vec<Row> {
-    let mut rows = people();
+    let mut rows = six();
     for row in &mut rows[1..3] {
         row[7..10].copy_from_slice(&scales);
     }
@@ -185,8 +186,8 @@ fn double(rows: &[Row]) -> Scene<f64> {
     Scene { gaussians: rows.iter().map(|row| row.map(f64::from)).collect(), background: [0.0; 3] }
 }
 
-/// Renders and differentiates a scene and compares both with the oracle. A Gaussian that has no direction is left out of the
-/// oracle too, for which it would be 0/0.
+/// Compares a render and its gradients with the oracle. Gaussians without a direction, which would be 0/0, are left out
+/// of the oracle too.
 fn against_oracle(rows: &[Row], camera: &Camera, device: &Device) -> Found {
     let options = RenderOptions { depth: true, ..RenderOptions::inria() };
     let norm = |row: &Row| row[3..7].iter().map(|q| f64::from(*q).powi(2)).sum::<f64>().sqrt() as f32;
@@ -198,22 +199,22 @@ fn against_oracle(rows: &[Row], camera: &Camera, device: &Device) -> Found {
     let mut upstream: Vec<[f64; 5]> = (0..expected.len())
         .map(|_| [(); 5].map(|()| f64::from(random.random_range(-1.0_f32..1.0))))
         .collect();
-    // Where f32 may decide a cut-off otherwise, nothing is compared.
+    // Pixels at which rounding may change a cut-off are not compared.
     upstream.iter_mut().zip(&banded).filter(|(_, banded)| **banded).for_each(|(u, _)| *u = [0.0; 5]);
 
     let tracked = Tracked::new(rows, device);
     let rendered = match render(&tracked.gaussians(), std::slice::from_ref(camera), &options) {
         Ok(rendered) => rendered,
-        Err(e) => return Found { broken: Some(format!("refused: {e}")), ..Found::default() },
+        Err(e) => return Found::broken(format!("refused: {e}")),
     };
-    let depth = rendered.depth.clone().expect("asked for");
+    let depth = rendered.depth.clone().expect("an option");
     let parts = [rendered.color.clone(), rendered.alpha.clone().unsqueeze_dim(3), depth.unsqueeze_dim(3)];
     let image = Tensor::cat(parts.to_vec(), 3);
     let weights: Vec<f32> = upstream.iter().flatten().map(|u| *u as f32).collect();
     let weights = Tensor::<4>::from_data(TensorData::new(weights, image.dims()), &image.device());
     let gradients = (image.clone() * weights).sum().backward();
     let got = host(image);
-    // Depths are as large as the scene is far.
+    // Errors of depths are relative to the distance of the scene.
     let reach = scene.gaussians.iter().map(|g| g[2].abs()).fold(1.0, f64::max);
     let mut worst = 0.0_f64;
     for (pixel, (found, expected)) in got.chunks_exact(5).zip(&expected).enumerate() {
@@ -225,8 +226,8 @@ fn against_oracle(rows: &[Row], camera: &Camera, device: &Device) -> Found {
         }
     }
     let of_oracle = reference::gradient(&scene, camera, &options, Cutoff::Hard, &upstream).gaussians;
-    // Each Gaussian by itself, whose gradients may be far smaller than those of the others, and all of its parameters in their
-    // own sizes: where terms cancel (a ball's rotation), what is left of them is rounding.
+    // Errors are relative for each Gaussian, since gradients of others may be far larger, and for all its parameters in
+    // their own units, since terms may cancel to rounding errors (the rotation of a ball).
     let (mut off, mut size) = (vec![0.0_f64; rows.len()], vec![0.0_f64; rows.len()]);
     let ranges = [0..3, 3..7, 7..10, 11..14, 10..11];
     for (part, range) in ranges.into_iter().enumerate() {
@@ -235,13 +236,13 @@ fn against_oracle(rows: &[Row], camera: &Camera, device: &Device) -> Found {
             _ => tracked.parts[part].grad(&gradients).map(host),
         };
         let Some(found) = found else {
-            return Found { broken: Some("no gradient".into()), ..Found::default() };
+            return Found::broken("no gradient");
         };
         for (row, values) in found.chunks_exact(range.len()).enumerate() {
             let place = kept.iter().position(|k| *k == row);
             for (value, i) in values.iter().zip(range.clone()) {
                 let expected = place.map_or(0.0, |place| of_oracle[place][i]);
-                // What is left out has no gradient at all, whatever its size.
+                // Omitted Gaussians have no gradient in any unit.
                 let unit = place.map_or(1.0, |_| unit(&rows[row], i, camera));
                 off[row] = off[row].max(nan_is_worst((f64::from(*value) - expected).abs() * unit));
                 size[row] = size[row].max(expected.abs() * unit);
@@ -259,7 +260,7 @@ fn against_oracle(rows: &[Row], camera: &Camera, device: &Device) -> Found {
         .must(share < banded.len(), "nothing could be compared")
 }
 
-/// A parameter's own size: a footprint, half a pixel at least, for the mean; its length for the rotation.
+/// A parameter's unit: a footprint of at least half a pixel for the mean, its length for the rotation.
 fn unit(row: &Row, parameter: usize, camera: &Camera) -> f64 {
     let largest = |values: &[f32]| values.iter().fold(0.0_f64, |most, v| most.max(f64::from(v.abs())));
     match parameter {
@@ -277,119 +278,85 @@ fn mean(row: &Row) -> DVec3 {
 }
 
 /// The same scene and camera 10⁵ m from the origin, where f32 has steps of 8 mm.
-fn far_from_the_origin() -> Case {
+fn far_from_the_origin(device: &Device) -> Found {
     const FAR: f32 = 1e5;
-    Case {
-        area: "Splats",
-        input: "scene and camera 1e5 m from the origin".into(),
-        holds: "as the oracle: positions are what f32 holds there (8 mm apart), nothing is lost beyond that"
-            .into(),
-        value_limit: VALUES,
-        gradient_limit: GRADIENTS,
-        once: false,
-        run: Box::new(|device| {
-            let mut camera = camera(32, 24, 30.0);
-            camera.world_to_camera.translation = DVec3::new(-f64::from(FAR), 0.0, 0.0);
-            against_oracle(&changed_all(|row| row[0] += FAR), &camera, device)
-        }),
-    }
+    let mut camera = camera(32, 24, 30.0);
+    camera.world_to_camera.translation = DVec3::new(-f64::from(FAR), 0.0, 0.0);
+    against_oracle(&changed_all(|row| row[0] += FAR), &camera, device)
 }
 
 /// Ten thousand nearly opaque Gaussians, one behind the other.
-fn many_on_one_pixel() -> Case {
-    Case {
-        area: "Splats",
-        input: "10,000 opaque Gaussians on one pixel".into(),
-        holds: "as the oracle; gradients finite, and zero behind the closed pixel".into(),
-        value_limit: VALUES,
-        gradient_limit: 0.0,
-        once: false,
-        run: Box::new(|device| {
-            let mut random = ChaCha8Rng::seed_from_u64(5);
-            let rows: Vec<Row> = (0..10_000)
-                .map(|i| {
-                    let mut row = [0.0; 14];
-                    row[2] = 1.0 + i as f32 * 1e-3;
-                    (row[3], row[10]) = (1.0, 1.0);
-                    row[7..10].fill(0.05);
-                    row[11..].copy_from_slice(&[(); 3].map(|()| random.random::<f32>()));
-                    row
-                })
-                .collect();
-            let camera = camera(9, 9, 10.0);
-            let options = RenderOptions::inria();
-            let tracked = Tracked::new(&rows, device);
-            let rendered = match render(&tracked.gaussians(), std::slice::from_ref(&camera), &options) {
-                Ok(rendered) => rendered,
-                Err(e) => return Found { broken: Some(format!("refused: {e}")), ..Found::default() },
-            };
-            let gradients = rendered.color.clone().sum().backward();
-            let got = host(rendered.color);
-            let scene = double(&rows);
-            let expected = reference::render(&scene, &camera, &options, Cutoff::Hard);
-            let banded = reference::banded(&scene, &camera, &options);
-            let apart = |(pixel, e): (usize, &reference::Pixel<f64>)| -> f64 {
-                (0..3).map(|c| (f64::from(got[3 * pixel + c]) - e.color[c]).abs()).fold(0.0, f64::max)
-            };
-            let open = expected.iter().enumerate().filter(|(pixel, _)| !banded[*pixel]);
-            let worst = open.map(apart).map(nan_is_worst).fold(0.0, f64::max);
-            let opacities = tracked.opacities.grad(&gradients).expect("tracked");
-            let found: Vec<Vec<f32>> = (tracked.parts.iter())
-                .map(|part| host(part.grad(&gradients).expect("tracked")))
-                .chain([host(opacities)])
-                .collect();
-            // Those in the middle of a pixel close it at once, those at its rim after hundreds.
-            let behind = found.iter().flat_map(|part| &part[part.len() / 10 * 9..]);
-            let most = behind.map(|v| nan_is_worst(f64::from(v.abs()))).fold(0.0, f64::max);
-            Found { value: Some(worst), gradient: Some(most), ..Found::default() }
-                .must(found.iter().flatten().all(|v| v.is_finite()), "a gradient is not finite")
-        }),
-    }
+fn many_on_one_pixel(device: &Device) -> Found {
+    let mut random = ChaCha8Rng::seed_from_u64(5);
+    let rows: Vec<Row> = (0..10_000)
+        .map(|i| {
+            let mut row = [0.0; 14];
+            row[2] = 1.0 + i as f32 * 1e-3;
+            (row[3], row[10]) = (1.0, 1.0);
+            row[7..10].fill(0.05);
+            row[11..].copy_from_slice(&[(); 3].map(|()| random.random::<f32>()));
+            row
+        })
+        .collect();
+    let camera = camera(9, 9, 10.0);
+    let options = RenderOptions::inria();
+    let tracked = Tracked::new(&rows, device);
+    let rendered = match render(&tracked.gaussians(), std::slice::from_ref(&camera), &options) {
+        Ok(rendered) => rendered,
+        Err(e) => return Found::broken(format!("refused: {e}")),
+    };
+    let gradients = rendered.color.clone().sum().backward();
+    let got = host(rendered.color);
+    let scene = double(&rows);
+    let expected = reference::render(&scene, &camera, &options, Cutoff::Hard);
+    let banded = reference::banded(&scene, &camera, &options);
+    let apart = |(pixel, e): (usize, &reference::Pixel<f64>)| -> f64 {
+        (0..3).map(|c| (f64::from(got[3 * pixel + c]) - e.color[c]).abs()).fold(0.0, f64::max)
+    };
+    let open = expected.iter().enumerate().filter(|(pixel, _)| !banded[*pixel]);
+    let worst = open.map(apart).map(nan_is_worst).fold(0.0, f64::max);
+    let opacities = tracked.opacities.grad(&gradients).expect("tracked");
+    let found: Vec<Vec<f32>> = (tracked.parts.iter())
+        .map(|part| host(part.grad(&gradients).expect("tracked")))
+        .chain([host(opacities)])
+        .collect();
+    // Gaussians in the middle of a pixel close it at once, those at its rim after hundreds.
+    let behind = found.iter().flat_map(|part| &part[part.len() / 10 * 9..]);
+    let most = behind.map(|v| nan_is_worst(f64::from(v.abs()))).fold(0.0, f64::max);
+    Found { value: Some(worst), gradient: Some(most), ..Found::default() }
+        .must(found.iter().flatten().all(|v| v.is_finite()), "a gradient is not finite")
 }
 
-/// The largest image that is accepted, compared in a patch; one pixel more is refused.
-fn largest_image() -> Case {
-    Case {
-        area: "Splats",
-        input: "image of 8192×8192, and beyond the largest side".into(),
-        holds:
-            "as the oracle in a patch, or refused for want of memory; more than the largest side is refused"
-                .into(),
-        value_limit: VALUES,
-        gradient_limit: 0.0,
-        once: false,
-        run: Box::new(|device| {
-            let options = RenderOptions::inria();
-            let rows = people();
-            let tracked = Tracked::new(&rows, device);
-            let plain = |t: &Tensor<2>| t.clone().detach().inner();
-            let [means, rotations, scales, colors] = tracked.parts.each_ref().map(plain);
-            let opacities = tracked.opacities.clone().detach().inner();
-            let gaussians = Gaussians::new(means, rotations, scales, opacities, colors).expect("fits");
-            let beyond = camera(MAX_SIDE + 1, 8, 30.0);
-            let refused = render(&gaussians, &[beyond], &options).is_err();
-            let large = camera(8192, 8192, 8000.0);
-            let (x, y) = (4300_u32, 4000_u32);
-            let color = match render(&gaussians, &[large], &options) {
-                Ok(rendered) => rendered.color,
-                Err(e @ (SplatError::Memory { .. } | SplatError::TooManyIntersections { .. })) => {
-                    return Found { skipped: Some(format!("refused: {e}")), ..Found::default() };
-                }
-                Err(e) => return Found { broken: Some(format!("refused: {e}")), ..Found::default() },
-            };
-            const SIDE: u32 = 12;
-            let part = color.narrow(1, y as usize, SIDE as usize).narrow(2, x as usize, SIDE as usize);
-            let got = host(part);
-            let which = (y..y + SIDE).flat_map(|row| (x..x + SIDE).map(move |column| row * 8192 + column));
-            let expected = reference::pixels(&double(&rows), &large, &options, Cutoff::Hard, which);
-            let mut worst = 0.0_f64;
-            for (pixel, e) in expected.iter().enumerate() {
-                for c in 0..3 {
-                    worst = worst.max(nan_is_worst((f64::from(got[3 * pixel + c]) - e.color[c]).abs()));
-                }
-            }
-            Found { value: Some(worst), ..Found::default() }
-                .must(refused, "a side beyond the largest was accepted")
-        }),
+/// The largest accepted image, compared in a patch. One pixel more is refused.
+fn largest_image(device: &Device) -> Found {
+    let options = RenderOptions::inria();
+    let rows = six();
+    let tracked = Tracked::new(&rows, device);
+    let plain = |t: &Tensor<2>| t.clone().detach().inner();
+    let [means, rotations, scales, colors] = tracked.parts.each_ref().map(plain);
+    let opacities = tracked.opacities.clone().detach().inner();
+    let gaussians = Gaussians::new(means, rotations, scales, opacities, colors).expect("fits");
+    let beyond = camera(MAX_SIDE + 1, 8, 30.0);
+    let refused = render(&gaussians, &[beyond], &options).is_err();
+    let large = camera(8192, 8192, 8000.0);
+    let (x, y) = (4300_u32, 4000_u32);
+    let color = match render(&gaussians, &[large], &options) {
+        Ok(rendered) => rendered.color,
+        Err(e @ (SplatError::Memory { .. } | SplatError::TooManyIntersections { .. })) => {
+            return Found::skipped(format!("refused: {e}"));
+        }
+        Err(e) => return Found::broken(format!("refused: {e}")),
+    };
+    const SIDE: u32 = 12;
+    let part = color.narrow(1, y as usize, SIDE as usize).narrow(2, x as usize, SIDE as usize);
+    let got = host(part);
+    let which = (y..y + SIDE).flat_map(|row| (x..x + SIDE).map(move |column| row * 8192 + column));
+    let expected = reference::pixels(&double(&rows), &large, &options, Cutoff::Hard, which);
+    let mut worst = 0.0_f64;
+    for (pixel, e) in expected.iter().enumerate() {
+        for c in 0..3 {
+            worst = worst.max(nan_is_worst((f64::from(got[3 * pixel + c]) - e.color[c]).abs()));
+        }
     }
+    Found { value: Some(worst), ..Found::default() }.must(refused, "a side beyond the largest was accepted")
 }

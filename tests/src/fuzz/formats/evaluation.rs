@@ -1,4 +1,4 @@
-//! Configs of evaluations and benchmarks, and what both read: test sets, meshes, pictures, LPIPS's layers.
+//! Configs of evaluations and benchmarks, and their inputs: test sets, meshes, pictures.
 
 use std::fs;
 use std::path::Path;
@@ -9,7 +9,7 @@ use snapsnap_data::dataset::Split;
 use super::super::Format;
 use super::{datasets, nothing, pictures, put, scans, weights};
 
-/// Every kind of key of an evaluation, but ablations that would each take as long as the model.
+/// Every kind of key of an evaluation, with one ablation to save time.
 const EVALUATION: &str = r#"
 [data]
 folders = ["in/set"]
@@ -87,7 +87,7 @@ precision = "f32"
 supersampling = 1
 "#;
 
-/// What all have in common.
+/// Common fields of all formats.
 const REPORT: Format = Format {
     name: "",
     sample: |_| (),
@@ -111,7 +111,7 @@ pub const FORMATS: &[Format] = &[
     Format {
         name: "evaluation-set",
         sample,
-        // Pictures are all that is read of those to learn from.
+        // Of training people, only pictures are read.
         changed: &[
             "dataset.toml",
             "0000/1.png",
@@ -148,7 +148,7 @@ pub const FORMATS: &[Format] = &[
     },
 ];
 
-/// A person to test on with a scan and one to learn from, four views of each; weights, and both configs.
+/// A test person with a scan and a training person, with four views each; weights, and both configs.
 fn sample(folder: &Path) {
     datasets::four_views(&folder.join("set"), &[Split::Test, Split::Train]);
     weights::write(folder);
@@ -169,7 +169,7 @@ fn compared(folder: &Path) {
     put(folder, "m.png", pictures::encoded(&DynamicImage::from(mask), ImageFormat::Png));
 }
 
-/// Whether there is a report with such a key.
+/// Whether there is a report with this key.
 fn report(work: &Path, key: &str) -> Result<(), String> {
     let text = fs::read_to_string(work.join("out/report.json")).map_err(|e| format!("report.json: {e}"))?;
     let report: serde_json::Value = serde_json::from_str(&text).map_err(|e| format!("report.json: {e}"))?;

@@ -6,66 +6,59 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde::Serialize;
 use serde_json::{Map, Value, json};
-
-use super::{Header, table};
-use crate::evaluate::config::{EvalConfig, Protocol};
-use crate::evaluate::{Judged, Kind, Outcome, Row, Surface, is_named};
-use crate::points::VIEWS;
-use crate::score::Score;
-use crate::statistics::{Interval, difference, interval, quantile};
 use snapsnap_base::plot::{Axes, Series, svg};
 
-/// The figures of a score: name, what it is, factor and digits in tables.
+use super::{Header, number, table};
+use crate::evaluate::config::{EvalConfig, Protocol};
+use crate::evaluate::{Judged, Kind, Outcome, Row, Surface, by_person, is_named};
+use crate::points::{PointError, VIEWS};
+use crate::score::Score;
+use crate::statistics::{Interval, difference, interval, quantile_of_times};
+
+/// A figure of a score: name, value, factor and digits in tables.
 type Figure = (&'static str, fn(&Score) -> Option<f64>, f64, usize);
 const FIGURES: [Figure; 3] =
     [("psnr", |s| Some(s.psnr), 1.0, 2), ("ssim", |s| s.ssim, 100.0, 2), ("lpips", |s| s.lpips, 100.0, 2)];
 
-/// What a report is made of.
+/// The content of a report.
 pub struct Evaluation<'a> {
     /// Command, commit, device, date.
     pub header: Header,
-    /// In force.
+    /// The config in force.
     pub config: &'a EvalConfig,
-    /// What was found.
-    pub outcome: &'a Outcome,
-    /// What LPIPS was computed with, or why there is none.
+    /// The result.
+    pub outcome: Outcome,
+    /// The weights of LPIPS, or the reason for their absence.
     pub lpips: String,
-    /// What all of it took.
+    /// Time and memory.
     pub cost: Cost,
 }
 
-/// What an evaluation takes.
+/// Time and memory of an evaluation.
 #[derive(Debug, Clone, Copy, Serialize)]
 pub struct Cost {
     /// From the first photograph to the last figure.
     pub seconds: f64,
-    /// Bytes of memory of the process at most; `None` where the system does not tell.
+    /// Largest memory of the process in bytes; `None` if the system does not report it.
     pub memory: Option<u64>,
 }
 
-/// Means of each person's views, by person.
-type People = BTreeMap<usize, Score>;
-
 impl Evaluation<'_> {
-    fn people(&self, judged: &Judged, protocol: usize) -> People {
-        means(judged.rows.iter(), protocol)
-    }
-
     /// Intervals over people, by figure.
-    fn overall(people: &People) -> [Option<Interval>; 3] {
+    fn overall(people: &BTreeMap<usize, Score>) -> [Option<Interval>; 3] {
         FIGURES.map(|(_, of, ..)| {
             let values: Option<Vec<f64>> = people.values().map(of).collect();
             interval(&values?)
         })
     }
 
-    /// Of the views that both have, the one's figures minus the other's, person by person.
+    /// Figures of `one` minus those of `other`, person by person, over the views that both have.
     fn difference(one: &Judged, other: &Judged, protocol: usize) -> [Option<Interval>; 3] {
         let place = |row: &Row| (row.person, row.turn, row.view);
         let both: BTreeSet<_> = one.rows.iter().map(place).collect();
         let both: BTreeSet<_> = other.rows.iter().map(place).filter(|row| both.contains(row)).collect();
         let [one, other] = [one, other]
-            .map(|judged| means(judged.rows.iter().filter(|row| both.contains(&place(row))), protocol));
+            .map(|judged| by_person(judged.rows.iter().filter(|row| both.contains(&place(row))), protocol));
         FIGURES.map(|(_, of, ..)| {
             let pairs = one.values().zip(other.values());
             let values: Option<Vec<f64>> = pairs.map(|(a, b)| Some(difference(of(a)?, of(b)?))).collect();
@@ -97,7 +90,7 @@ impl Evaluation<'_> {
             None => json!({}),
         };
         let plain = |judged: &Judged| {
-            self.by_protocol(|protocol| figures(&Self::overall(&self.people(judged, protocol))))
+            self.by_protocol(|protocol| figures(&Self::overall(&by_person(&judged.rows, protocol))))
         };
         let named = |kind: Kind, value: &dyn Fn(&Judged) -> Value| -> Value {
             Value::Object(self.of_kind(kind).map(|judged| (judged.name.clone(), value(judged))).collect())
@@ -131,7 +124,7 @@ impl Evaluation<'_> {
     }
 
     fn protocol_json(&self, model: &Judged, protocol: usize) -> Value {
-        let people = self.people(model, protocol);
+        let people = by_person(&model.rows, protocol);
         let subject = |(person, score): (&usize, &Score)| {
             let mut value = json!(score);
             value["name"] = json!(self.outcome.people[*person]);
@@ -145,7 +138,7 @@ impl Evaluation<'_> {
         })
     }
 
-    /// Figures of the people of each list, by contestant and protocol.
+    /// Figures of each group, by contestant and protocol.
     fn groups(&self) -> impl Iterator<Item = (String, Vec<Grouped>)> {
         self.config.groups.iter().map(|(name, group)| {
             let inside = |person: &usize| {
@@ -154,7 +147,7 @@ impl Evaluation<'_> {
             let mut rows = Vec::new();
             for judged in &self.outcome.judged {
                 for (i, protocol) in self.protocols() {
-                    let mut people = self.people(judged, i);
+                    let mut people = by_person(&judged.rows, i);
                     people.retain(|person, _| inside(person));
                     rows.push(Grouped {
                         contestant: judged.name.clone(),
@@ -168,7 +161,7 @@ impl Evaluation<'_> {
         })
     }
 
-    /// `views.csv`: a line per contestant, person, view and protocol.
+    /// `views.csv`: a row per contestant, person, view and protocol.
     pub fn views_csv(&self) -> String {
         const HEADER: [&str; 9] =
             ["contestant", "protocol", "subject", "turn", "view", "degrees", "psnr", "ssim", "lpips"];
@@ -185,13 +178,13 @@ impl Evaluation<'_> {
         table(&HEADER, rows.into_iter())
     }
 
-    /// `subjects.csv`: a line per contestant, person and protocol.
+    /// `subjects.csv`: a row per contestant, person and protocol.
     pub fn subjects_csv(&self) -> String {
         const HEADER: [&str; 6] = ["contestant", "protocol", "subject", "psnr", "ssim", "lpips"];
         let mut rows = Vec::new();
         for judged in &self.outcome.judged {
             for (i, protocol) in self.protocols() {
-                for (person, score) in self.people(judged, i) {
+                for (person, score) in by_person(&judged.rows, i) {
                     let person = self.outcome.people[person].clone();
                     let mut cells = vec![judged.name.clone(), protocol.name().into(), person];
                     cells.extend(numbers(&score));
@@ -221,14 +214,16 @@ impl Evaluation<'_> {
         svg(&[(axes, self.outcome.judged.iter().map(series).collect())])
     }
 
-    /// The people whom the model shows best, those in the middle, and the worst, `count` of each and nobody twice: rows of
-    /// the outcome's people, by the last protocol's PSNR.
+    /// The best, middle and worst people by PSNR of the last protocol, `count` of each without repetition: rows of the
+    /// outcome's people.
     pub fn ranked(&self, count: usize) -> Vec<usize> {
         let Some((model, (protocol, _))) = self.model().zip(self.protocols().last()) else {
             return Vec::new();
         };
-        let mut people: Vec<(usize, f64)> =
-            self.people(model, protocol).into_iter().map(|(person, score)| (person, score.psnr)).collect();
+        let mut people: Vec<(usize, f64)> = by_person(&model.rows, protocol)
+            .into_iter()
+            .map(|(person, score)| (person, score.psnr))
+            .collect();
         people.sort_by(|a, b| b.1.total_cmp(&a.1));
         let n = people.len();
         let starts = [0, (n / 2).saturating_sub(count / 2), n.saturating_sub(count)];
@@ -238,16 +233,7 @@ impl Evaluation<'_> {
     }
 }
 
-/// Means of each person's views.
-fn means<'a>(rows: impl Iterator<Item = &'a Row>, protocol: usize) -> People {
-    let mut scores: BTreeMap<usize, Vec<Score>> = BTreeMap::new();
-    for row in rows {
-        scores.entry(row.person).or_default().push(row.scores[protocol]);
-    }
-    scores.into_iter().filter_map(|(person, scores)| Some((person, Score::mean(&scores)?))).collect()
-}
-
-/// A line of a group's table.
+/// A row of a group's table.
 struct Grouped {
     contestant: String,
     protocol: Protocol,
@@ -271,13 +257,12 @@ fn figures(intervals: &[Option<Interval>; 3]) -> Value {
     Value::Object(entries.collect::<Map<_, _>>())
 }
 
-/// Millimetres, as they are and centred, and the share missed: means over people and turns.
+/// Means over people and turns: distance in mm, distance after centring in mm, share of missed points.
 fn point_means(judged: &Judged, view: usize) -> Option<[f64; 3]> {
     let errors = judged.points.iter().flat_map(|(_, errors)| errors).filter(|error| error.view == view);
     let errors: Vec<_> = errors.collect();
-    let mean = |of: fn(&crate::points::PointError) -> f64| {
-        errors.iter().map(|error| of(error)).sum::<f64>() / errors.len() as f64
-    };
+    let mean =
+        |of: fn(&PointError) -> f64| errors.iter().map(|error| of(error)).sum::<f64>() / errors.len() as f64;
     (!errors.is_empty()).then(|| [mean(|e| 1e3 * e.mean), mean(|e| 1e3 * e.centred), mean(|e| e.missed)])
 }
 
@@ -290,7 +275,7 @@ fn points_json(judged: &Judged) -> Value {
     Value::Object(VIEWS.iter().enumerate().map(view).collect())
 }
 
-/// Centimetres to the truth, from it and both, and cosines, over people.
+/// Means over people: centimetres to the truth, from the truth and both, and cosines.
 fn surface_intervals(surfaces: &[(usize, Surface)]) -> [Option<Interval>; 4] {
     type Of = fn(&Surface) -> Option<f64>;
     let over = |of: Of| {
@@ -318,18 +303,17 @@ fn geometry_json(surfaces: &[(usize, Surface)]) -> Value {
     json!({ "to_truth": forward, "from_truth": backward, "chamfer": mean, "normal_consistency": normals })
 }
 
-/// p50 and p95.
+/// Seconds, p50 and p95.
 fn seconds(judged: &Judged) -> Option<[f64; 2]> {
-    let mut times: Vec<f64> = judged.times.iter().map(std::time::Duration::as_secs_f64).collect();
-    times.sort_by(f64::total_cmp);
-    (!times.is_empty()).then(|| [quantile(&times, 0.5), quantile(&times, 0.95)])
+    let times = &judged.times;
+    (!times.is_empty()).then(|| [0.5, 0.95].map(|share| quantile_of_times(times, share)))
 }
 
 fn seconds_json(judged: &Judged) -> Value {
     json!(seconds(judged).map(|[p50, p95]| json!({ "p50": p50, "p95": p95 })))
 }
 
-/// The figures of a score in a table; empty where there is none.
+/// The figures of a score in a table; absent ones are empty.
 fn numbers(score: &Score) -> [String; 3] {
-    FIGURES.map(|(_, of, ..)| of(score).map_or(String::new(), |v| v.to_string()))
+    FIGURES.map(|(_, of, ..)| number(of(score)))
 }

@@ -1,0 +1,142 @@
+//! Variants of the model under test: the model with one thing changed. Ablations of an evaluation and settings of a
+//! benchmark are variants.
+
+use std::collections::BTreeSet;
+use std::path::PathBuf;
+
+use serde::{Deserialize, Serialize};
+use snapsnap_data::sample::Handling;
+use snapsnap_net::precision::Precision;
+use snapsnap_splat::Preset;
+
+/// A section `[ablations.NAME]` of an evaluation, and `[model]` or `[settings.NAME]` of a benchmark. Unset keys are
+/// those of the model under test.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Variant {
+    /// Weight file.
+    pub weights: Option<PathBuf>,
+    /// Overrides of the config that is stored with the weights, `section.key=value`.
+    pub set: Vec<String>,
+    /// Device, as in `--device`.
+    pub device: Option<String>,
+    /// Precision of the point predictor.
+    pub precision: Option<Precision>,
+    /// Whether the unseen sides are predicted. Unset: only with two photographs.
+    pub sides: Option<bool>,
+    /// Whether pixels of the unseen sides get the colours of the nearest photographed points.
+    pub side_colors: Option<bool>,
+    /// Only each `stride`-th row and column of pixels becomes Gaussians, which are `stride` times as large.
+    pub stride: Option<usize>,
+    /// Least opacity of the Gaussians that are kept.
+    pub min_opacity: Option<f32>,
+    /// Benchmarks: the property that is varied. Settings with the same knob belong together.
+    pub knob: Option<String>,
+    /// Benchmarks: pictures are rendered this many times as large on each side, 1 or 2, and shrunk.
+    pub supersampling: Option<usize>,
+    /// Benchmarks: constants of the rasteriser.
+    pub preset: Option<Preset>,
+    /// Benchmarks: whether splats smaller than a pixel keep their weight.
+    pub antialiased: Option<bool>,
+    /// Benchmarks: the scene. Settings of a scene are compared with its one setting that omits nothing.
+    pub scene: Option<String>,
+    /// Benchmarks: the omitted work, for the report. Unset: none.
+    pub omits: Option<String>,
+    /// Benchmarks: another data set.
+    pub data: Option<PathBuf>,
+    /// Benchmarks: names of the people. Unset: the first ones.
+    pub only: Option<Vec<String>>,
+    /// Benchmarks: input views, as in `views.inputs` of an evaluation.
+    pub inputs: Option<Vec<usize>>,
+    /// Benchmarks: the parameters of the Gaussians that are fitted to the photographs afterwards.
+    pub tune: Option<Tune>,
+    /// Changes to the photographs.
+    pub photographs: Option<Handling>,
+}
+
+/// Parameters that are fitted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Tune {
+    /// Every parameter.
+    All,
+    /// Colours alone.
+    Colors,
+}
+
+impl Variant {
+    /// This variant with the unset keys of `base`. Overrides of the config follow those of `base`.
+    pub fn over(self, base: &Self) -> Self {
+        let base = base.clone();
+        Self {
+            weights: self.weights.or(base.weights),
+            set: [base.set, self.set].concat(),
+            device: self.device.or(base.device),
+            precision: self.precision.or(base.precision),
+            sides: self.sides.or(base.sides),
+            side_colors: self.side_colors.or(base.side_colors),
+            stride: self.stride.or(base.stride),
+            min_opacity: self.min_opacity.or(base.min_opacity),
+            knob: self.knob.or(base.knob),
+            supersampling: self.supersampling.or(base.supersampling),
+            preset: self.preset.or(base.preset),
+            antialiased: self.antialiased.or(base.antialiased),
+            scene: self.scene.or(base.scene),
+            omits: self.omits.or(base.omits),
+            data: self.data.or(base.data),
+            only: self.only.or(base.only),
+            inputs: self.inputs.or(base.inputs),
+            tune: self.tune.or(base.tune),
+            photographs: self.photographs.or(base.photographs),
+        }
+    }
+
+    /// Whether the unseen sides are predicted: scenes of more than two photographs have none.
+    pub(crate) fn has_sides(&self) -> bool {
+        self.sides.unwrap_or(self.inputs.as_ref().is_none_or(|inputs| inputs.len() <= 2))
+    }
+
+    /// The first key whose value makes no sense, and why.
+    pub(crate) fn refusal(&self) -> Option<(&'static str, String)> {
+        let photographs = self.photographs.as_ref().and_then(Handling::problem);
+        let must = |is_wrong: bool, range: &str| is_wrong.then(|| format!("must be {range}"));
+        let problems = [
+            ("photographs", photographs.map(|(key, message)| format!("`{key}` {message}"))),
+            ("inputs", self.inputs.as_deref().and_then(views_problem)),
+            ("stride", must(self.stride.is_some_and(|n| !(1..=64).contains(&n)), "1 to 64")),
+            ("supersampling", must(self.supersampling.is_some_and(|n| ![1, 2].contains(&n)), "1 or 2")),
+            ("min_opacity", must(self.min_opacity.is_some_and(|o| !(0.0..=1.0).contains(&o)), "0 to 1")),
+        ];
+        problems.into_iter().find_map(|(key, problem)| Some((key, problem?)))
+    }
+
+    /// The first key that is set and that only benchmarks have.
+    pub(crate) fn key_of_benchmarks(&self) -> Option<&'static str> {
+        let keys = [
+            ("knob", self.knob.is_some()),
+            ("supersampling", self.supersampling.is_some()),
+            ("preset", self.preset.is_some()),
+            ("antialiased", self.antialiased.is_some()),
+            ("scene", self.scene.is_some()),
+            ("omits", self.omits.is_some()),
+            ("data", self.data.is_some()),
+            ("only", self.only.is_some()),
+            ("inputs", self.inputs.is_some()),
+            ("tune", self.tune.is_some()),
+        ];
+        keys.into_iter().find_map(|(key, is_set)| is_set.then_some(key))
+    }
+}
+
+/// Why a list of input views makes no sense.
+pub(crate) fn views_problem(inputs: &[usize]) -> Option<String> {
+    if inputs.len() == 1 || inputs.len() > 64 {
+        return Some("must be empty, or 2 to 64 views".into());
+    }
+    names_twice(inputs).then(|| "names a view twice".into())
+}
+
+/// Whether a list contains an entry twice.
+pub(crate) fn names_twice(views: &[usize]) -> bool {
+    views.iter().collect::<BTreeSet<_>>().len() < views.len()
+}
