@@ -37,10 +37,13 @@
 //! ∂L/∂α_i = T_i·e_i − (Σ_{j>i} α_j T_j e_j + T_final·background·v_colour)/(1 − α_i).
 //! Splats are visited back to front, so the bracket is a running sum and T_i = T_{i+1}/(1 − α_i).
 
+use bytemuck::NoUninit;
+use cubecl::CubeTypeMut;
 use cubecl::prelude::*;
 
 /// Three numbers.
-#[derive(CubeType, Clone, Copy, Debug)]
+#[derive(CubeType, CubeTypeMut, Clone, Copy, Debug, NoUninit)]
+#[repr(C)]
 pub struct Vec3 {
     /// First.
     pub x: f32,
@@ -64,7 +67,8 @@ pub struct Quat {
 }
 
 /// Three rows of three.
-#[derive(CubeType, Clone, Copy, Debug)]
+#[derive(CubeType, Clone, Copy, Debug, NoUninit)]
+#[repr(C)]
 pub struct Mat3 {
     /// First row.
     pub r0: Vec3,
@@ -75,7 +79,8 @@ pub struct Mat3 {
 }
 
 /// A camera as the rasteriser uses it.
-#[derive(CubeType, Clone, Copy, Debug)]
+#[derive(CubeType, Clone, Copy, Debug, NoUninit)]
+#[repr(C)]
 pub struct View {
     /// World → camera rotation.
     pub rotation: Mat3,

@@ -1,5 +1,6 @@
 //! Input of one call of the operation, and its counts: plain host data.
 
+use super::splat::{FATES, Uniforms};
 use crate::options::{MIN_TRANSMITTANCE, RenderOptions, TILE};
 use crate::vjp::{Mat3, Vec3, View};
 use crate::{Camera, SplatError};
@@ -31,6 +32,14 @@ pub struct Counts {
     pub invalid: u64,
     /// Pairs of a splat and a 16×16 tile that it reaches: what the run time follows.
     pub intersections: u64,
+}
+
+impl Counts {
+    /// The number of Gaussians of each fate, as [`super::splat`] numbers them, and of intersections.
+    pub(super) fn new(fates: [u64; FATES], intersections: u64) -> Self {
+        let [visible, near, outside, transparent, degenerate, invalid] = fates;
+        Self { visible, near, outside, transparent, degenerate, invalid, intersections }
+    }
 }
 
 /// One call: cameras and constants in the form that the kernels use.
@@ -85,6 +94,21 @@ impl Job {
         if self.depth { 5 } else { 4 }
     }
 
+    /// Sizes and constants of a call with `n` Gaussians.
+    pub(super) fn uniforms(&self, n: usize) -> Uniforms {
+        Uniforms {
+            n,
+            views: self.views.len(),
+            width: self.width as u32,
+            height: self.height as u32,
+            tiles_x: self.tiles_x() as u32,
+            tiles: (self.tiles_x() * self.tiles_y()) as u32,
+            near: self.near,
+            blur: self.blur,
+            max_alpha: self.max_alpha,
+        }
+    }
+
     pub(super) fn tiles_x(&self) -> usize {
         self.width.div_ceil(TILE)
     }
@@ -109,42 +133,6 @@ impl Wanted {
     /// Whether any of those is wanted that the shape of a splat depends on: they share their sums over pixels.
     pub fn geometry(self) -> bool {
         self.means || self.rotations || self.scales
-    }
-}
-
-/// Which sums over pixels the backward pass keeps of one intersection, in this order: colour (3), opacity (1),
-/// geometry (5), depth (1); what is not wanted has no place.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub(super) struct Record {
-    pub colors: bool,
-    pub opacities: bool,
-    pub geometry: bool,
-    pub depth: bool,
-}
-
-impl Record {
-    pub fn new(wanted: Wanted, job: &Job) -> Self {
-        let (colors, geometry) = (wanted.colors, wanted.geometry());
-        // The compensation of antialiasing carries the opacity's gradient on to the geometry.
-        let opacities = wanted.opacities || (geometry && job.antialiased);
-        Self { colors, opacities, geometry, depth: geometry && job.depth }
-    }
-
-    /// f32 per intersection.
-    pub fn len(self) -> usize {
-        self.depth_at() + usize::from(self.depth)
-    }
-
-    pub fn opacity_at(self) -> usize {
-        3 * usize::from(self.colors)
-    }
-
-    pub fn geometry_at(self) -> usize {
-        self.opacity_at() + usize::from(self.opacities)
-    }
-
-    pub fn depth_at(self) -> usize {
-        self.geometry_at() + 5 * usize::from(self.geometry)
     }
 }
 

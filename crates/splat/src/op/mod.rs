@@ -6,7 +6,10 @@
 mod cpu;
 mod flex_ndarray;
 mod gpu;
+mod gradient;
 mod job;
+mod splat;
+mod twofold;
 
 use std::fmt::Debug;
 use std::ops::Range;

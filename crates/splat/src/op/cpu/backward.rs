@@ -4,12 +4,13 @@ use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
 
 use super::super::Upstream;
-use super::super::job::{Job, Record, Wanted};
+use super::super::gradient::{Record, SplatGradient};
+use super::super::job::{Job, Wanted};
 use super::lanes::{BATCH, Lanes, fetch, row, rows};
-use super::splats::{Splat, parameters, projection};
+use super::splats::{Visible, projection};
 use super::{Scene, State, ViewState};
 use crate::options::{MIN_ALPHA, TILE};
-use crate::vjp::{FootprintGradient, project_vjp};
+use crate::vjp::{Vec3, project_vjp};
 
 /// Gaussians per task.
 const CHUNK: usize = 2048;
@@ -163,7 +164,7 @@ impl Band<'_> {
         let first =
             (self.view.lists.starts[tile] - self.view.lists.starts[self.y * self.job.tiles_x()]) as usize;
         let (left, top) = ((x * TILE) as f32, self.y * TILE);
-        let mut batch = [Splat::default(); BATCH];
+        let mut batch = [Visible::default(); BATCH];
         for (begin, entries) in (0..visited).step_by(BATCH).zip(list[..visited].chunks(BATCH)).rev() {
             fetch(&self.view.splats, entries, &mut batch);
             for (n, splat) in (begin..begin + entries.len()).zip(&batch).rev() {
@@ -235,14 +236,14 @@ impl Band<'_> {
 fn take_off<const SHAPE: bool, const DEPTH: bool>(
     p: &mut Pixels,
     sums: &mut Sums,
-    splat: &Splat,
+    visible: &Visible,
     n: u32,
     left: f32,
     top: usize,
     y: usize,
     max_alpha: f32,
 ) {
-    let row = row(splat, left, (top + y) as f32 + 0.5);
+    let row = row(&visible.splat, left, (top + y) as f32 + 0.5);
     let (transmittance, behind, last) = (&mut p.transmittance[y], &mut p.behind[y], &p.last[y]);
     let [red, green, blue, opaque, deep] = &p.upstream;
     let [red, green, blue, opaque, deep] = [&red[y], &green[y], &blue[y], &opaque[y], &deep[y]];
@@ -258,17 +259,19 @@ fn take_off<const SHAPE: bool, const DEPTH: bool>(
         sums.color[1][i] += weight * green[i];
         sums.color[2][i] += weight * blue[i];
         if SHAPE {
-            let mut e =
-                splat.color[0] * red[i] + splat.color[1] * green[i] + splat.color[2] * blue[i] + opaque[i];
+            let mut e = visible.color[0] * red[i]
+                + visible.color[1] * green[i]
+                + visible.color[2] * blue[i]
+                + opaque[i];
             if DEPTH {
-                e += splat.depth * deep[i];
+                e += visible.splat.depth * deep[i];
                 sums.depth[i] += weight * deep[i];
             }
             let v_alpha = t * e - behind[i] * inverse;
             behind[i] += weight * e;
             // Where α is clamped it does not depend on the splat.
             let g = if row.alpha[i] < max_alpha { v_alpha * alpha } else { 0.0 };
-            let (w_0, w_1) = (splat.l0 * row.dx[i], splat.l1 * row.sheared[i]);
+            let (w_0, w_1) = (row.w[0][i], row.w[1][i]);
             let (g_0, g_1) = (g * w_0, g * w_1);
             sums.alpha[i] += g;
             sums.first[0][i] += g_0;
@@ -281,8 +284,11 @@ fn take_off<const SHAPE: bool, const DEPTH: bool>(
 }
 
 #[inline(always)]
-fn write(sums: &Sums, splat: &Splat, record: Record, out: &mut [f32]) {
-    let sum = |lanes: &Lanes| {
+fn write(sums: &Sums, visible: &Visible, record: Record, out: &mut [f32]) {
+    let sum = |is_kept: bool, lanes: &Lanes| {
+        if !is_kept {
+            return 0.0;
+        }
         // Halves upon halves: a fixed order that the compiler can turn into SIMD.
         let mut lanes = *lanes;
         let mut width = TILE / 2;
@@ -294,25 +300,20 @@ fn write(sums: &Sums, splat: &Splat, record: Record, out: &mut [f32]) {
         }
         lanes[0]
     };
-    if record.colors {
-        out[..3].copy_from_slice(&[sum(&sums.color[0]), sum(&sums.color[1]), sum(&sums.color[2])]);
-    }
-    if record.opacities {
-        out[record.opacity_at()] = sum(&sums.alpha) / splat.opacity;
-    }
-    if record.geometry {
-        let [a, b, c] = &sums.second;
-        out[record.geometry_at()..record.geometry_at() + 5].copy_from_slice(&[
-            sum(&sums.first[0]),
-            sum(&sums.first[1]),
-            sum(a),
-            sum(b),
-            sum(c),
-        ]);
-    }
-    if record.depth {
-        out[record.depth_at()] = sum(&sums.depth);
-    }
+    let [red, green, blue] = sums.color.each_ref().map(|lanes| sum(record.colors, lanes));
+    let [r0, r1] = sums.first.each_ref().map(|lanes| sum(record.geometry, lanes));
+    let [s00, s01, s11] = sums.second.each_ref().map(|lanes| sum(record.geometry, lanes));
+    let gradient = SplatGradient {
+        color: Vec3 { x: red, y: green, z: blue },
+        opacity: sum(record.opacities, &sums.alpha) / visible.splat.opacity,
+        r0,
+        r1,
+        s00,
+        s01,
+        s11,
+        depth: sum(record.depth, &sums.depth),
+    };
+    gradient.store(out, 0, 1, record);
 }
 
 /// Adds up the records of each Gaussian and takes them through its projection.
@@ -354,32 +355,21 @@ fn gather(
             let splat = &view.splats[at as usize];
             let places = view.lists.first_place[at as usize] as usize
                 ..view.lists.first_place[at as usize + 1] as usize;
-            let mut sum = [0.0_f32; 10];
+            let mut sums = SplatGradient::zero();
             for &place in &view.lists.places[places] {
-                let at = place as usize * record.len();
-                sum.iter_mut().zip(&records[at..at + record.len()]).for_each(|(s, r)| *s += r);
+                sums.add(records, place as usize * record.len(), record);
             }
             if record.colors {
-                add(colors, 3 * i, &sum[..3]);
+                add(colors, 3 * i, &[sums.color.x, sums.color.y, sums.color.z]);
             }
-            let v_opacity = if record.opacities { sum[record.opacity_at()] } else { 0.0 };
             if !opacities.is_empty() {
-                opacities[i] += v_opacity * splat.compensation;
+                opacities[i] += sums.opacity * splat.compensation;
             }
             if record.geometry {
-                let g = splat.gaussian as usize;
-                let at = record.geometry_at();
-                let gradient = FootprintGradient {
-                    r0: sum[at],
-                    r1: sum[at + 1],
-                    s00: sum[at + 2],
-                    s01: sum[at + 3],
-                    s11: sum[at + 4],
-                    depth: if record.depth { sum[record.depth_at()] } else { 0.0 },
-                    compensation: if job.antialiased { v_opacity * scene.opacities[g] } else { 0.0 },
-                };
-                let p = projection(&scene, g, camera, job);
-                let v = project_vjp(camera, &p, &parameters(&scene, g).2, &gradient);
+                let gaussian = scene.gaussian(splat.gaussian as usize);
+                let v_compensation = if job.antialiased { sums.opacity * gaussian.opacity } else { 0.0 };
+                let p = projection(&gaussian, camera, job);
+                let v = project_vjp(camera, &p, &gaussian.scale, &sums.footprint(v_compensation));
                 if !means.is_empty() {
                     add(means, 3 * i, &[v.mean.x, v.mean.y, v.mean.z]);
                 }

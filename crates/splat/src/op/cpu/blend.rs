@@ -5,7 +5,7 @@ use rayon::prelude::*;
 
 use super::super::job::Job;
 use super::lanes::{BATCH, Lanes, fetch, row, rows};
-use super::{ViewState, splats::Splat, tiles::Lists};
+use super::{ViewState, splats::Visible, tiles::Lists};
 use crate::options::{MIN_ALPHA, MIN_TRANSMITTANCE, TILE};
 
 /// Composites `view` over `background` into `image` `[H,W,C]` and, where `view` has room for them, notes each pixel's
@@ -34,7 +34,7 @@ pub fn blend(view: &mut ViewState, background: [f32; 3], job: &Job, image: &mut 
 
 /// One row of tiles.
 struct Band<'a> {
-    splats: &'a [Splat],
+    splats: &'a [Visible],
     lists: &'a Lists,
     job: &'a Job,
     background: [f32; 3],
@@ -121,7 +121,7 @@ impl Band<'_> {
         }
         let mut rows_alive = height;
         let (left, top) = ((x * TILE) as f32, self.y * TILE);
-        let mut batch = [Splat::default(); BATCH];
+        let mut batch = [Visible::default(); BATCH];
         for (first, entries) in (0..).step_by(BATCH).zip(list.chunks(BATCH)) {
             fetch(self.splats, entries, &mut batch);
             for (n, splat) in (first + 1..).zip(&batch[..entries.len()]) {
@@ -167,14 +167,14 @@ impl Band<'_> {
 #[inline(always)]
 fn add<const DEPTH: bool>(
     p: &mut Pixels,
-    splat: &Splat,
+    visible: &Visible,
     n: u32,
     left: f32,
     top: usize,
     y: usize,
     max_alpha: f32,
 ) -> bool {
-    let row = row(splat, left, (top + y) as f32 + 0.5);
+    let row = row(&visible.splat, left, (top + y) as f32 + 0.5);
     let open = &mut p.open[y];
     let (transmittance, last) = (&mut p.transmittance[y], &mut p.last[y]);
     let mut weight = [0.0; TILE];
@@ -195,13 +195,13 @@ fn add<const DEPTH: bool>(
     for c in 0..3 {
         let sum = &mut p.sums[c][y];
         for i in 0..TILE {
-            sum[i] += weight[i] * splat.color[c];
+            sum[i] += weight[i] * visible.color[c];
         }
     }
     if DEPTH {
         let sum = &mut p.sums[3][y];
         for i in 0..TILE {
-            sum[i] += weight[i] * splat.depth;
+            sum[i] += weight[i] * visible.splat.depth;
         }
     }
     closed != 0

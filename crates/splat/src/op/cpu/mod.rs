@@ -19,6 +19,7 @@ mod splats;
 mod tiles;
 
 use super::job::{Counts, Job};
+use super::splat::{FATES, Gaussian, gaussian};
 use crate::SplatError;
 
 pub(super) use backward::{Gradients, backward};
@@ -39,6 +40,10 @@ impl Scene<'_> {
         self.opacities.len()
     }
 
+    fn gaussian(&self, g: usize) -> Gaussian {
+        gaussian(self.means, self.rotations, self.scales, self.opacities, g)
+    }
+
     fn background(&self) -> [f32; 3] {
         self.background.try_into().expect("`render` checks its shape")
     }
@@ -53,7 +58,7 @@ pub struct State {
 #[derive(Debug)]
 struct ViewState {
     /// Visible splats, front to back.
-    splats: Vec<splats::Splat>,
+    splats: Vec<splats::Visible>,
     lists: tiles::Lists,
     /// `[H,W]` transmittance behind the last splat.
     transmittance: Vec<f32>,
@@ -67,14 +72,14 @@ pub fn forward(scene: Scene, job: &Job, keep: bool) -> Result<(Vec<f32>, State, 
     let channels = job.channels();
     let mut image = Vec::new();
     let mut state = State::default();
-    let mut counts = Counts::default();
+    let (mut fates, mut intersections) = ([0; FATES], 0);
     for (index, view) in job.views.iter().enumerate() {
-        let splats = splats::visible(scene, view, job, &mut counts);
+        let splats = splats::visible(scene, view, job, &mut fates);
         let lists = tiles::lists(&splats, job, keep)?;
         if image.is_empty() {
             image = zeros("the image", job.views.len() * pixels * channels)?;
         }
-        counts.intersections += lists.len() as u64;
+        intersections += lists.len() as u64;
         let kept = if keep { pixels } else { 0 };
         let transmittance = zeros("the state of all pixels", kept)?;
         let mut view = ViewState { splats, lists, transmittance, last: vec![0; kept] };
@@ -84,7 +89,7 @@ pub fn forward(scene: Scene, job: &Job, keep: bool) -> Result<(Vec<f32>, State, 
             state.views.push(view);
         }
     }
-    Ok((image, state, counts))
+    Ok((image, state, Counts::new(fates, intersections)))
 }
 
 /// So many zeros, or an error where the system refuses the memory.

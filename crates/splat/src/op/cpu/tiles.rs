@@ -3,7 +3,8 @@
 use rayon::prelude::*;
 
 use super::super::job::Job;
-use super::splats::Splat;
+use super::super::splat::{tiles_in_row, tiles_of};
+use super::splats::Visible;
 use crate::SplatError;
 
 /// Splats per task.
@@ -43,21 +44,23 @@ impl Lists {
 ///
 /// # Errors
 /// [`SplatError::TooManyIntersections`] beyond [`MAX_ENTRIES`] or [`MAX_KEPT`].
-pub fn lists(splats: &[Splat], job: &Job, keep_places: bool) -> Result<Lists, SplatError> {
+pub fn lists(splats: &[Visible], job: &Job, keep_places: bool) -> Result<Lists, SplatError> {
     let limit = if keep_places { MAX_KEPT } else { MAX_ENTRIES };
     let found = splats.iter().map(|splat| u64::from(splat.tiles)).sum();
     if found > limit {
         return Err(SplatError::TooManyIntersections { found, limit });
     }
+    let uniforms = job.uniforms(splats.len());
     // Per task: the tiles of its splats in order.
     let chunks: Vec<Vec<u32>> = splats
         .par_chunks(CHUNK)
         .map(|splats| {
             let mut tiles = Vec::with_capacity(splats.iter().map(|splat| splat.tiles as usize).sum());
             for splat in splats {
-                for y in splat.tile_rows() {
-                    let row = (y * job.tiles_x()) as u32;
-                    tiles.extend(splat.tiles_in_row(y, job).into_iter().flatten().map(|x| row + x as u32));
+                let rows = tiles_of(&splat.rows);
+                for y in rows.first..rows.end {
+                    let row = tiles_in_row(&splat.splat, y, &uniforms);
+                    tiles.extend((row.first..row.end).map(|x| y * uniforms.tiles_x + x));
                 }
             }
             tiles

@@ -3,11 +3,51 @@
 use cubecl::prelude::*;
 
 use super::channels;
-use super::project::SPLAT;
+use crate::op::splat::{SPLAT, Splat, Uniforms, load3, offset, store3, weight};
 use crate::options::{MIN_ALPHA, MIN_TRANSMITTANCE, TILE};
+use crate::vjp::Vec3;
 
 /// Units of a cube: the pixels of a tile.
 pub const UNITS: usize = TILE * TILE;
+
+/// One list of splats per tile and view, front to back, in one buffer.
+#[derive(CubeType, CubeLaunch)]
+pub struct TileLists {
+    /// Splat of each entry.
+    pub entries: Box<[u32]>,
+    /// First entry of each tile.
+    pub starts: Box<[u32]>,
+    /// The entry after the last of each tile.
+    pub ends: Box<[u32]>,
+}
+
+/// The pixel of a unit.
+#[derive(CubeType, Clone, Copy)]
+pub struct Pixel {
+    /// Centre, pixels.
+    pub x: f32,
+    /// Centre, pixels.
+    pub y: f32,
+    /// Whether it lies in the image.
+    pub inside: bool,
+    /// Number among the pixels of all views.
+    pub index: usize,
+}
+
+/// The pixel of unit `unit` in the tile of this cube.
+#[cube]
+pub fn pixel_of_unit(unit: u32, uniforms: &Uniforms) -> Pixel {
+    let tile = CUBE_POS as u32 % uniforms.tiles;
+    let x = tile % uniforms.tiles_x * comptime!(TILE as u32) + unit % comptime!(TILE as u32);
+    let y = tile / uniforms.tiles_x * comptime!(TILE as u32) + unit / comptime!(TILE as u32);
+    let row = CUBE_POS as u32 / uniforms.tiles * uniforms.height + y;
+    Pixel {
+        x: f32::cast_from(x) + 0.5,
+        y: f32::cast_from(y) + 0.5,
+        inside: x < uniforms.width && y < uniforms.height,
+        index: row as usize * uniforms.width as usize + x as usize,
+    }
+}
 
 /// Image `[V,H,W,C]` and, where `keep`, each pixel's final transmittance and one more than the index of the last splat
 /// that it took in its tile's list (0 for none).
@@ -17,47 +57,31 @@ pub fn blend(
     splats: &[f32],
     colors: &[f32],
     background: &[f32],
-    entries: &[u32],
-    starts: &[u32],
-    ends: &[u32],
+    lists: &TileLists,
     image: &mut [f32],
     transmittance: &mut [f32],
     last: &mut [u32],
-    n: usize,
-    tiles_x: usize,
-    tiles: usize,
-    all_tiles: usize,
-    width: usize,
-    height: usize,
-    max_alpha: f32,
+    uniforms: &Uniforms,
     #[comptime] depth: bool,
     #[comptime] keep: bool,
 ) {
-    if CUBE_POS >= all_tiles {
+    if CUBE_POS >= uniforms.tiles as usize * uniforms.views {
         terminate!();
     }
     let unit = UNIT_POS as usize;
-    let tile = CUBE_POS % tiles;
-    let x = tile % tiles_x * comptime!(TILE) + unit % comptime!(TILE);
-    let y = tile / tiles_x * comptime!(TILE) + unit / comptime!(TILE);
-    let px = f32::cast_from(x as u32) + 0.5;
-    let py = f32::cast_from(y as u32) + 0.5;
-    let inside = x < width && y < height;
-
-    let mut shapes = Shared::<[f32]>::new_slice(comptime!(UNITS * SPLAT));
-    let mut tints = Shared::<[f32]>::new_slice(comptime!(UNITS * 3));
+    let pixel = pixel_of_unit(UNIT_POS, uniforms);
+    let mut batch_splats = Shared::<[f32]>::new_slice(comptime!(UNITS * SPLAT));
+    let mut batch_colors = Shared::<[f32]>::new_slice(comptime!(UNITS * 3));
     let open_pixels = Shared::<[Atomic<u32>]>::new_slice(1usize);
 
-    let mut open = inside;
+    let mut open = pixel.inside;
     let mut t = 1.0f32;
-    let mut red = 0.0f32;
-    let mut green = 0.0f32;
-    let mut blue = 0.0f32;
+    let mut color = Vec3 { x: 0.0f32, y: 0.0f32, z: 0.0f32 };
     let mut deep = 0.0f32;
     let mut taken = 0u32;
 
-    let start = starts[CUBE_POS] as usize;
-    let end = ends[CUBE_POS] as usize;
+    let start = lists.starts[CUBE_POS] as usize;
+    let end = lists.ends[CUBE_POS] as usize;
     let mut batch = start;
     let mut any_open = 1u32;
     while batch < end && any_open > 0u32 {
@@ -69,35 +93,29 @@ pub fn blend(
             open_pixels[0].store(1u32);
         }
         if batch + unit < end {
-            let splat = entries[batch + unit] as usize;
-            for i in 0..comptime!(SPLAT) {
-                shapes[unit * comptime!(SPLAT) + i] = splats[splat * comptime!(SPLAT) + i];
-            }
-            for i in 0..3usize {
-                tints[unit * 3 + i] = colors[splat % n * 3 + i];
-            }
+            let entry = lists.entries[batch + unit] as usize;
+            Splat::load(splats, entry).store(&mut batch_splats, unit);
+            store3(&mut batch_colors, 3 * unit, &load3(colors, entry % uniforms.n * 3));
         }
         any_open = workgroup_uniform_load_atomic::<u32>(&open_pixels[0]);
         let count = (end - batch).min(comptime!(UNITS));
         let mut i = 0usize;
         while i < count && open {
-            let at = i * comptime!(SPLAT);
-            let dx = px - shapes[at];
-            let dy = py - shapes[at + 1];
-            let p = shapes[at + 2] * dx;
-            let q = shapes[at + 4] * (dy + shapes[at + 3] * dx);
-            let alpha = (shapes[at + 5] * ((p * p + q * q) * -0.5f32).exp()).min(max_alpha);
+            let splat = Splat::load(&batch_splats, i);
+            let w = offset(&splat, pixel.x, pixel.y);
+            let alpha = weight(&splat, &w).min(uniforms.max_alpha);
             if alpha >= comptime!(MIN_ALPHA) {
                 let next = t * (1.0 - alpha);
                 if next < comptime!(MIN_TRANSMITTANCE) {
                     open = false;
                 } else {
-                    let weight = alpha * t;
-                    red += weight * tints[i * 3];
-                    green += weight * tints[i * 3 + 1];
-                    blue += weight * tints[i * 3 + 2];
+                    let share = alpha * t;
+                    let splat_color = load3(&batch_colors, 3 * i);
+                    color.x += share * splat_color.x;
+                    color.y += share * splat_color.y;
+                    color.z += share * splat_color.z;
                     if comptime!(depth) {
-                        deep += weight * shapes[at + 6];
+                        deep += share * splat.depth;
                     }
                     t = next;
                     taken = (batch - start + i) as u32 + 1u32;
@@ -109,19 +127,18 @@ pub fn blend(
         batch += comptime!(UNITS);
     }
 
-    if inside {
-        let pixel = (CUBE_POS / tiles * height + y) * width + x;
-        let channels = comptime!(channels(depth));
-        image[pixel * channels] = red + t * background[0];
-        image[pixel * channels + 1] = green + t * background[1];
-        image[pixel * channels + 2] = blue + t * background[2];
-        image[pixel * channels + 3] = 1.0 - t;
+    if pixel.inside {
+        let at = pixel.index * comptime!(channels(depth));
+        image[at] = color.x + t * background[0];
+        image[at + 1] = color.y + t * background[1];
+        image[at + 2] = color.z + t * background[2];
+        image[at + 3] = 1.0 - t;
         if comptime!(depth) {
-            image[pixel * channels + 4] = deep;
+            image[at + 4] = deep;
         }
         if comptime!(keep) {
-            transmittance[pixel] = t;
-            last[pixel] = taken;
+            transmittance[pixel.index] = t;
+            last[pixel.index] = taken;
         }
     }
 }

@@ -29,13 +29,16 @@ use burn_cubecl::ops::into_data_sync;
 use burn_cubecl::tensor::CubeTensor;
 use cubecl::prelude::*;
 
-use super::job::{Counts, Job, Record, Wanted};
+use super::gradient::Record;
+use super::job::{Counts, Job, Wanted};
+use super::splat::{FATES, SPLAT, UniformsLaunch};
 use super::{
     CHANNELS, Forward, SplatBackend, SplatInputs, SplatKernels, SplatOutput, Upstream, splat_untracked,
 };
 use crate::SplatError;
+use blend::TileListsLaunch;
 use buffers::Buffers;
-use project::{REACH, SPLAT, STATISTICS};
+use project::{ParametersLaunch, REACH, STATISTICS};
 
 /// Units of a cube where each unit has work of its own.
 const UNITS: u32 = 256;
@@ -70,6 +73,13 @@ struct Lists {
     len: usize,
 }
 
+impl Lists {
+    fn launch(&self) -> TileListsLaunch {
+        let buffer = |tensor: &CubeTensor| tensor.clone().into_buffer_arg();
+        TileListsLaunch::new(buffer(&self.entries), buffer(&self.starts), buffer(&self.ends))
+    }
+}
+
 impl SplatBackend for CubeBackend {
     fn splat(inputs: SplatInputs<Self>, job: Arc<Job>) -> SplatOutput<Self> {
         splat_untracked(inputs, &job)
@@ -82,8 +92,7 @@ impl SplatKernels for CubeBackend {
     fn forward(inputs: &SplatInputs<Self>, job: &Job, keep: bool) -> Forward<Self> {
         let inputs = contiguous(inputs);
         let buffers = Buffers::of(&inputs.means);
-        let numbers: Vec<f32> = job.views.iter().flat_map(project::view_numbers).collect();
-        let views = buffers.upload(&numbers);
+        let views = buffers.upload(bytemuck::cast_slice(&job.views));
         let (splats, reach, lists, counts) = lists(&buffers, &inputs, &views, job, keep)?;
 
         let shape = [job.views.len(), job.height, job.width, job.channels()];
@@ -97,21 +106,13 @@ impl SplatKernels for CubeBackend {
             buffers.cubes(all_tiles),
             CubeDim::new_1d(blend::UNITS as u32),
             splats.clone().into_buffer_arg(),
-            inputs.colors.into_buffer_arg(),
-            inputs.background.into_buffer_arg(),
-            lists.entries.clone().into_buffer_arg(),
-            lists.starts.clone().into_buffer_arg(),
-            lists.ends.clone().into_buffer_arg(),
+            inputs.colors.clone().into_buffer_arg(),
+            inputs.background.clone().into_buffer_arg(),
+            lists.launch(),
             image.clone().into_buffer_arg(),
             transmittance.clone().into_buffer_arg(),
             last.clone().into_buffer_arg(),
-            inputs.len.max(1),
-            job.tiles_x(),
-            job.tiles_x() * job.tiles_y(),
-            all_tiles,
-            job.width,
-            job.height,
-            job.max_alpha,
+            inputs.uniforms(job),
             job.depth,
             keep,
         );
@@ -136,7 +137,7 @@ impl SplatKernels for CubeBackend {
         let scales = room([n, 3], wanted.scales);
         let colors = room([n, 3], wanted.colors);
         let opacities = wanted.opacities.then(|| gradient(&buffers, [n]));
-        let background = wanted.background.then(|| background(&buffers, job, state, &upstream));
+        let background = wanted.background.then(|| background(&buffers, &inputs, job, state, &upstream));
         let record = Record::new(wanted, job);
         if record.len() > 0 && n > 0 {
             let records = records(&buffers, &inputs, job, state, upstream, record);
@@ -147,10 +148,7 @@ impl SplatKernels for CubeBackend {
                 &buffers.client,
                 buffers.cubes(n.div_ceil(UNITS as usize)),
                 CubeDim::new_1d(UNITS),
-                inputs.means.into_buffer_arg(),
-                inputs.rotations.into_buffer_arg(),
-                inputs.scales.into_buffer_arg(),
-                inputs.opacities.into_buffer_arg(),
+                inputs.parameters(),
                 state.views.clone().into_buffer_arg(),
                 state.reach.clone().into_buffer_arg(),
                 records.into_buffer_arg(),
@@ -159,9 +157,7 @@ impl SplatKernels for CubeBackend {
                 unused(&scales),
                 unused(&opacities),
                 unused(&colors),
-                n,
-                job.views.len(),
-                job.blur,
+                inputs.uniforms(job),
                 job.antialiased,
                 record,
                 wanted,
@@ -203,6 +199,20 @@ struct Inputs {
     len: usize,
 }
 
+impl Inputs {
+    fn parameters(&self) -> ParametersLaunch {
+        let buffer = |tensor: &CubeTensor| tensor.clone().into_buffer_arg();
+        let Self { means, rotations, scales, opacities, .. } = self;
+        ParametersLaunch::new(buffer(means), buffer(rotations), buffer(scales), buffer(opacities))
+    }
+
+    fn uniforms(&self, job: &Job) -> UniformsLaunch {
+        // Kernels divide by the number of Gaussians.
+        let u = job.uniforms(self.len.max(1));
+        UniformsLaunch::new(u.n, u.views, u.width, u.height, u.tiles_x, u.tiles, u.near, u.blur, u.max_alpha)
+    }
+}
+
 fn contiguous(inputs: &SplatInputs<CubeBackend>) -> Inputs {
     let len = inputs.opacities.meta.num_elements();
     let buffers = Buffers::of(&inputs.means);
@@ -231,7 +241,6 @@ fn lists(
     let (n, tiles) = (inputs.len, job.tiles_x() * job.tiles_y());
     let total = n * job.views.len();
     let all_tiles = tiles * job.views.len();
-    let (width, height) = (job.width as u32, job.height as u32);
     let dim = CubeDim::new_1d(UNITS);
     let one_each = |n: usize| buffers.cubes(n.div_ceil(UNITS as usize));
     // The largest array per intersection: its record of the backward pass, or a number.
@@ -254,22 +263,14 @@ fn lists(
         &buffers.client,
         one_each(total),
         dim,
-        inputs.means.clone().into_buffer_arg(),
-        inputs.rotations.clone().into_buffer_arg(),
-        inputs.scales.clone().into_buffer_arg(),
-        inputs.opacities.clone().into_buffer_arg(),
+        inputs.parameters(),
         inputs.colors.clone().into_buffer_arg(),
         views.clone().into_buffer_arg(),
         splats.clone().into_buffer_arg(),
         reach.clone().into_buffer_arg(),
         keys.clone().into_buffer_arg(),
         statistics.clone().into_buffer_arg(),
-        n,
-        total,
-        width,
-        height,
-        job.near,
-        job.blur,
+        inputs.uniforms(job),
         job.antialiased,
     );
     let (_, order) = sort::sort_pairs(buffers, keys, None, total, u32::BITS);
@@ -285,13 +286,12 @@ fn lists(
     );
     let offsets = scan::exclusive_sum(buffers, &sorted, total);
     let s: Vec<u32> = into_data_sync(statistics).try_into_vec().expect("u32 as allocated");
-    let found = u64::from(s[6]) + (u64::from(s[7]) << 10) + (u64::from(s[8]) << 20);
+    let [low, middle, high] = [0, 1, 2].map(|limb| u64::from(s[FATES + limb]));
+    let found = low + (middle << 10) + (high << 20);
     if found > limit {
         return Err(SplatError::TooManyIntersections { found, limit });
     }
-    let [visible, near, outside, transparent, degenerate, invalid] =
-        [0, 1, 2, 3, 4, 5].map(|i| u64::from(s[i]));
-    let counts = Counts { visible, near, outside, transparent, degenerate, invalid, intersections: found };
+    let counts = Counts::new(std::array::from_fn(|fate| u64::from(s[fate])), found);
 
     let len = found as usize;
     let (tile_of, splat_of) = (buffers.u32(len), buffers.u32(len));
@@ -310,13 +310,7 @@ fn lists(
         reach.clone().into_buffer_arg(),
         tile_of.clone().into_buffer_arg(),
         splat_of.clone().into_buffer_arg(),
-        n,
-        total,
-        width,
-        height,
-        job.tiles_x() as u32,
-        tiles as u32,
-        all_tiles as u32,
+        inputs.uniforms(job),
     );
     let bits = usize::BITS - all_tiles.leading_zeros();
     let (sorted_tiles, slots) = sort::sort_pairs(buffers, tile_of, None, len, bits);
@@ -345,8 +339,7 @@ fn records(
     record: Record,
 ) -> CubeTensor {
     let records = buffers.f32(state.lists.len * record.len());
-    let tiles = job.tiles_x() * job.tiles_y();
-    let all_tiles = tiles * job.views.len();
+    let all_tiles = job.tiles_x() * job.tiles_y() * job.views.len();
     backward::pixels::launch(
         &buffers.client,
         buffers.cubes(all_tiles),
@@ -354,28 +347,26 @@ fn records(
         state.splats.clone().into_buffer_arg(),
         inputs.colors.clone().into_buffer_arg(),
         inputs.background.clone().into_buffer_arg(),
-        state.lists.entries.clone().into_buffer_arg(),
+        state.lists.launch(),
         state.lists.slots.clone().into_buffer_arg(),
-        state.lists.starts.clone().into_buffer_arg(),
-        state.lists.ends.clone().into_buffer_arg(),
         state.transmittance.clone().into_buffer_arg(),
         state.last.clone().into_buffer_arg(),
         upstream.into_buffer_arg(),
         records.clone().into_buffer_arg(),
-        inputs.len,
-        job.tiles_x(),
-        tiles,
-        all_tiles,
-        job.width,
-        job.height,
-        job.max_alpha,
+        inputs.uniforms(job),
         job.depth,
         record,
     );
     records
 }
 
-fn background(buffers: &Buffers, job: &Job, state: &State, upstream: &CubeTensor) -> CubeTensor {
+fn background(
+    buffers: &Buffers,
+    inputs: &Inputs,
+    job: &Job,
+    state: &State,
+    upstream: &CubeTensor,
+) -> CubeTensor {
     let count = job.views.len() * job.height;
     let (rows, out) = (buffers.f32(3 * count), buffers.f32(3));
     backward::background_rows::launch(
@@ -385,9 +376,8 @@ fn background(buffers: &Buffers, job: &Job, state: &State, upstream: &CubeTensor
         state.transmittance.clone().into_buffer_arg(),
         upstream.clone().into_buffer_arg(),
         rows.clone().into_buffer_arg(),
-        count,
-        job.width,
-        job.channels(),
+        inputs.uniforms(job),
+        job.depth,
     );
     backward::background_sum::launch(
         &buffers.client,

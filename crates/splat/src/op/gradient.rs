@@ -1,0 +1,152 @@
+//! Sums over the pixels of a splat, and which of them the backward pass keeps.
+
+use cubecl::prelude::*;
+
+use super::job::{Job, Wanted};
+use super::splat::Offset;
+use crate::vjp::{FootprintGradient, Vec3};
+
+/// Which sums over pixels the backward pass keeps of one intersection, in this order: colour (3), opacity (1),
+/// geometry (5), depth (1); what is not wanted has no place.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub(super) struct Record {
+    pub colors: bool,
+    pub opacities: bool,
+    pub geometry: bool,
+    pub depth: bool,
+}
+
+impl Record {
+    pub fn new(wanted: Wanted, job: &Job) -> Self {
+        let (colors, geometry) = (wanted.colors, wanted.geometry());
+        // The compensation of antialiasing carries the opacity's gradient on to the geometry.
+        let opacities = wanted.opacities || (geometry && job.antialiased);
+        Self { colors, opacities, geometry, depth: geometry && job.depth }
+    }
+
+    /// f32 per intersection.
+    pub fn len(self) -> usize {
+        self.depth_at() + usize::from(self.depth)
+    }
+
+    pub fn opacity_at(self) -> usize {
+        3 * usize::from(self.colors)
+    }
+
+    pub fn geometry_at(self) -> usize {
+        self.opacity_at() + usize::from(self.opacities)
+    }
+
+    pub fn depth_at(self) -> usize {
+        self.geometry_at() + 5 * usize::from(self.geometry)
+    }
+}
+
+/// Sums over the pixels of one splat. The backward pass keeps them for each intersection, as a [`Record`].
+#[derive(CubeType, Clone, Copy, Debug)]
+pub struct SplatGradient {
+    /// ∂L/∂colour.
+    pub color: Vec3,
+    /// ∂L/∂opacity after antialiasing.
+    pub opacity: f32,
+    /// Σ g·w₀ (see [`crate::vjp`]).
+    pub r0: f32,
+    /// Σ g·w₁.
+    pub r1: f32,
+    /// Σ g·w₀².
+    pub s00: f32,
+    /// Σ g·w₀·w₁.
+    pub s01: f32,
+    /// Σ g·w₁².
+    pub s11: f32,
+    /// ∂L/∂depth.
+    pub depth: f32,
+}
+
+#[cube]
+impl SplatGradient {
+    /// No gradient.
+    pub fn zero() -> SplatGradient {
+        SplatGradient {
+            color: Vec3 { x: 0.0f32, y: 0.0f32, z: 0.0f32 },
+            opacity: 0.0f32,
+            r0: 0.0f32,
+            r1: 0.0f32,
+            s00: 0.0f32,
+            s01: 0.0f32,
+            s11: 0.0f32,
+            depth: 0.0f32,
+        }
+    }
+
+    /// Adds the part of a pixel at `w` with g = `g`.
+    #[inline(always)]
+    pub fn add_shape(&mut self, g: f32, w: &Offset) {
+        let g_0 = g * w.w0;
+        let g_1 = g * w.w1;
+        self.r0 += g_0;
+        self.r1 += g_1;
+        self.s00 += g_0 * w.w0;
+        self.s01 += g_0 * w.w1;
+        self.s11 += g_1 * w.w1;
+    }
+
+    /// The sums that the projection's gradient follows from.
+    pub fn footprint(&self, compensation: f32) -> FootprintGradient {
+        FootprintGradient {
+            r0: self.r0,
+            r1: self.r1,
+            s00: self.s00,
+            s01: self.s01,
+            s11: self.s11,
+            depth: self.depth,
+            compensation,
+        }
+    }
+
+    /// Adds the record that starts at `at`.
+    pub fn add(&mut self, records: &[f32], at: usize, #[comptime] record: Record) {
+        if comptime!(record.colors) {
+            self.color.x += records[at];
+            self.color.y += records[at + 1];
+            self.color.z += records[at + 2];
+        }
+        if comptime!(record.opacities) {
+            self.opacity += records[at + comptime!(record.opacity_at())];
+        }
+        if comptime!(record.geometry) {
+            let at = at + comptime!(record.geometry_at());
+            self.r0 += records[at];
+            self.r1 += records[at + 1];
+            self.s00 += records[at + 2];
+            self.s01 += records[at + 3];
+            self.s11 += records[at + 4];
+        }
+        if comptime!(record.depth) {
+            self.depth += records[at + comptime!(record.depth_at())];
+        }
+    }
+
+    /// Writes a record: its first number at `at`, each other one `stride` further.
+    pub fn store(&self, out: &mut [f32], at: usize, #[comptime] stride: usize, #[comptime] record: Record) {
+        if comptime!(record.colors) {
+            out[at] = self.color.x;
+            out[at + stride] = self.color.y;
+            out[at + comptime!(2 * stride)] = self.color.z;
+        }
+        if comptime!(record.opacities) {
+            out[at + comptime!(record.opacity_at() * stride)] = self.opacity;
+        }
+        if comptime!(record.geometry) {
+            let at = at + comptime!(record.geometry_at() * stride);
+            out[at] = self.r0;
+            out[at + stride] = self.r1;
+            out[at + comptime!(2 * stride)] = self.s00;
+            out[at + comptime!(3 * stride)] = self.s01;
+            out[at + comptime!(4 * stride)] = self.s11;
+        }
+        if comptime!(record.depth) {
+            out[at + comptime!(record.depth_at() * stride)] = self.depth;
+        }
+    }
+}

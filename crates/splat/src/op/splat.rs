@@ -1,0 +1,311 @@
+//! A Gaussian in one view: culling, the tiles that it reaches, its weight at a pixel.
+//!
+//! Like [`crate::vjp`], the functions are compiled twice from this one source: as plain Rust for the CPU and, through
+//! CubeCL's `#[cube]`, into the GPU kernels.
+
+use cubecl::CubeTypeMut;
+use cubecl::prelude::*;
+
+use super::job::{MAX_MAGNITUDE, MIN_QUATERNION, RADIUS_MARGIN};
+use super::twofold::{exp, to_f32, to_u32};
+use crate::options::{MIN_ALPHA, TILE};
+use crate::vjp::{Footprint, Quat, Vec3, View, footprint, project, span, to_camera};
+
+/// A visible Gaussian as the pixels of one view use it.
+#[derive(CubeType, Clone, Copy, Debug, Default)]
+pub struct Splat {
+    /// Centre, pixels.
+    pub u: f32,
+    /// Centre, pixels.
+    pub v: f32,
+    /// Factor of Σ'⁻¹ (see [`crate::vjp`]).
+    pub l0: f32,
+    /// Factor of Σ'⁻¹.
+    pub k: f32,
+    /// Factor of Σ'⁻¹.
+    pub l1: f32,
+    /// Opacity after antialiasing.
+    pub opacity: f32,
+    /// t_z, metres.
+    pub depth: f32,
+    /// Squared radius, in standard deviations, beyond which α < 1/255.
+    pub radius_squared: f32,
+}
+
+/// Sizes and constants of a call.
+#[derive(CubeType, CubeLaunch)]
+pub struct Uniforms {
+    /// Number of Gaussians.
+    pub n: usize,
+    /// Number of views.
+    pub views: usize,
+    /// Width of an image, pixels.
+    pub width: u32,
+    /// Height of an image, pixels.
+    pub height: u32,
+    /// Tiles in a row of tiles.
+    pub tiles_x: u32,
+    /// Tiles of a view.
+    pub tiles: u32,
+    /// Near plane, metres.
+    pub near: f32,
+    /// Variance that is added to every projected Gaussian, square pixels.
+    pub blur: f32,
+    /// Clamp of α.
+    pub max_alpha: f32,
+}
+
+/// Parameters of a Gaussian.
+#[derive(CubeType, Clone, Copy, Debug)]
+pub struct Gaussian {
+    pub mean: Vec3,
+    pub rotation: Quat,
+    pub scale: Vec3,
+    pub opacity: f32,
+}
+
+/// Three consecutive numbers.
+#[cube]
+pub fn load3(values: &[f32], at: usize) -> Vec3 {
+    Vec3 { x: values[at], y: values[at + 1], z: values[at + 2] }
+}
+
+/// Writes three consecutive numbers.
+#[cube]
+pub fn store3(values: &mut [f32], at: usize, v: &Vec3) {
+    values[at] = v.x;
+    values[at + 1] = v.y;
+    values[at + 2] = v.z;
+}
+
+/// Adds `v` to `sum`.
+#[cube]
+pub fn add3(sum: &mut Vec3, v: &Vec3) {
+    sum.x += v.x;
+    sum.y += v.y;
+    sum.z += v.z;
+}
+
+/// Gaussian number `g` of arrays `[N,3]`, `[N,4]`, `[N,3]`, `[N]`.
+#[cube]
+pub fn gaussian(means: &[f32], rotations: &[f32], scales: &[f32], opacities: &[f32], g: usize) -> Gaussian {
+    let at = 4 * g;
+    Gaussian {
+        mean: load3(means, 3 * g),
+        rotation: Quat { w: rotations[at], x: rotations[at + 1], y: rotations[at + 2], z: rotations[at + 3] },
+        scale: load3(scales, 3 * g),
+        opacity: opacities[g],
+    }
+}
+
+/// Numbers from `first` up to, but without, `end`.
+#[derive(CubeType, CubeTypeMut, Clone, Copy, Debug, Default)]
+pub struct Extent {
+    pub first: u32,
+    pub end: u32,
+}
+
+/// A splat and its tiles, or the reason why the Gaussian is culled.
+#[derive(CubeType, Clone, Copy, Debug)]
+pub struct Projected {
+    /// Meaningless if the Gaussian is culled.
+    pub splat: Splat,
+    /// √(det Σ'_raw / det Σ') with antialiasing, else 1.
+    pub compensation: f32,
+    /// Rows of pixels within reach.
+    pub rows: Extent,
+    /// Number of tiles within reach; 0 if the Gaussian is culled.
+    pub tiles: u32,
+    /// [`VISIBLE`], or the reason of the culling.
+    pub fate: u32,
+}
+
+/// Reaches a pixel.
+pub const VISIBLE: u32 = 0;
+/// At or before the near plane.
+pub const NEAR: u32 = 1;
+/// No pixel within reach.
+pub const OUTSIDE: u32 = 2;
+/// Opacity below 1/255.
+pub const TRANSPARENT: u32 = 3;
+/// No rotation, or a projection beyond f32.
+pub const DEGENERATE: u32 = 4;
+/// A parameter that is not finite, or beyond ±[`MAX_MAGNITUDE`].
+pub const INVALID: u32 = 5;
+/// Number of fates.
+pub const FATES: usize = 6;
+
+/// Whether a number is finite and not huge. The test is on bits, since shader compilers may assume that there is no NaN.
+#[cube]
+fn in_range(value: f32) -> bool {
+    value.to_bits() & 0x7FFF_FFFFu32 <= comptime!(MAX_MAGNITUDE.to_bits())
+}
+
+#[cube]
+fn in_range3(values: &Vec3) -> bool {
+    in_range(values.x) && in_range(values.y) && in_range(values.z)
+}
+
+#[cube]
+fn is_valid(gaussian: &Gaussian, color: &Vec3) -> bool {
+    let q = &gaussian.rotation;
+    in_range3(&gaussian.mean)
+        && in_range(q.w)
+        && in_range(q.x)
+        && in_range(q.y)
+        && in_range(q.z)
+        && in_range3(&gaussian.scale)
+        && in_range(gaussian.opacity)
+        && in_range3(color)
+}
+
+#[cube]
+fn has_rotation(q: &Quat) -> bool {
+    q.w * q.w + q.x * q.x + q.y * q.y + q.z * q.z >= comptime!(MIN_QUATERNION)
+}
+
+#[cube]
+fn is_sound(f: &Footprint) -> bool {
+    f.determinant > 0.0
+        && f.l0 > 0.0
+        && f.l1 > 0.0
+        && in_range(f.determinant)
+        && in_range(f.u)
+        && in_range(f.v)
+        && in_range(f.k)
+        && in_range(f.sigma_x)
+        && in_range(f.sigma_y)
+        && in_range(1.0 / f.l1)
+}
+
+/// Projects a Gaussian into a view, or culls it.
+#[cube]
+pub fn splat(
+    view: &View,
+    gaussian: &Gaussian,
+    color: &Vec3,
+    uniforms: &Uniforms,
+    #[comptime] antialiased: bool,
+) -> Projected {
+    let t = to_camera(view, &gaussian.mean);
+    let p = project(view, &t, &gaussian.rotation, &gaussian.scale, uniforms.blur);
+    let f = footprint(view, &p);
+    let mut compensation = 1.0f32;
+    if comptime!(antialiased) {
+        compensation = f.compensation;
+    }
+    let opacity = gaussian.opacity * compensation;
+    let radius_squared = 2.0 * (opacity / comptime!(MIN_ALPHA)).ln() + comptime!(RADIUS_MARGIN);
+    let splat = Splat { u: f.u, v: f.v, l0: f.l0, k: f.k, l1: f.l1, opacity, depth: t.z, radius_squared };
+
+    let mut fate = comptime!(VISIBLE).runtime();
+    if !is_valid(gaussian, color) {
+        fate = comptime!(INVALID).runtime();
+    } else if !in_range3(&t) {
+        fate = comptime!(DEGENERATE).runtime();
+    } else if t.z <= uniforms.near {
+        fate = comptime!(NEAR).runtime();
+    } else if !has_rotation(&gaussian.rotation) || !is_sound(&f) {
+        fate = comptime!(DEGENERATE).runtime();
+    } else if opacity < comptime!(MIN_ALPHA) {
+        fate = comptime!(TRANSPARENT).runtime();
+    }
+    let mut rows = Extent { first: 0u32, end: 0u32 };
+    let mut tiles = 0u32;
+    if fate == comptime!(VISIBLE) {
+        let extent = radius_squared.sqrt() * f.sigma_y;
+        rows = pixels_between(f.v - extent, f.v + extent, uniforms.height);
+        let tile_rows = tiles_of(&rows);
+        for y in tile_rows.first..tile_rows.end {
+            let row = tiles_in_row(&splat, y, uniforms);
+            tiles += row.end - row.first;
+        }
+        if tiles == 0u32 {
+            fate = comptime!(OUTSIDE).runtime();
+        }
+    }
+    Projected { splat, compensation, rows, tiles, fate }
+}
+
+/// The pixels of an axis of `side` pixels whose centres are between `low` and `high`.
+#[cube]
+fn pixels_between(low: f32, high: f32, side: u32) -> Extent {
+    let first = (low - 0.5).max(0.0).ceil();
+    let last = (high - 0.5).min(to_f32(side) - 1.0).floor();
+    let any = first <= last;
+    Extent { first: select(any, to_u32(first), 0u32), end: select(any, to_u32(last) + 1u32, 0u32) }
+}
+
+/// The tiles of these pixels.
+#[cube]
+pub fn tiles_of(pixels: &Extent) -> Extent {
+    let tile = comptime!(TILE as u32);
+    Extent { first: pixels.first / tile, end: (pixels.end + tile - 1u32) / tile }
+}
+
+/// The tiles within reach in the row `y` of tiles: those of the pixels that the splat's ellipse covers within the row.
+#[cube]
+pub fn tiles_in_row(splat: &Splat, y: u32, uniforms: &Uniforms) -> Extent {
+    let tile = comptime!(TILE as u32);
+    let top = to_f32(y * tile) + 0.5 - splat.v;
+    let bottom = to_f32((y * tile + tile - 1u32).min(uniforms.height - 1u32)) + 0.5 - splat.v;
+    let reached = span(splat.l0, splat.k, splat.l1, splat.radius_squared, top, bottom);
+    tiles_of(&pixels_between(splat.u + reached.left, splat.u + reached.right, uniforms.width))
+}
+
+/// Offset of a pixel from a splat's centre in standard deviations, w = F·d (see [`crate::vjp`]).
+#[derive(CubeType, Clone, Copy, Debug)]
+pub struct Offset {
+    pub w0: f32,
+    pub w1: f32,
+}
+
+/// Offset of the point (`x`, `y`) of the image.
+#[cube]
+#[inline(always)]
+pub fn offset(splat: &Splat, x: f32, y: f32) -> Offset {
+    let dx = x - splat.u;
+    let dy = y - splat.v;
+    Offset { w0: splat.l0 * dx, w1: splat.l1 * (dy + splat.k * dx) }
+}
+
+/// o·exp(−½|w|²): the splat's α before the clamp at α_max.
+#[cube]
+#[inline(always)]
+pub fn weight(splat: &Splat, w: &Offset) -> f32 {
+    splat.opacity * exp((w.w0 * w.w0 + w.w1 * w.w1) * -0.5f32)
+}
+
+/// f32 of a splat in a buffer.
+pub const SPLAT: usize = 8;
+
+#[cube]
+impl Splat {
+    /// Number `index` of a buffer of splats.
+    pub fn load(splats: &[f32], index: usize) -> Splat {
+        let at = index * comptime!(SPLAT);
+        Splat {
+            u: splats[at],
+            v: splats[at + 1],
+            l0: splats[at + 2],
+            k: splats[at + 3],
+            l1: splats[at + 4],
+            opacity: splats[at + 5],
+            depth: splats[at + 6],
+            radius_squared: splats[at + 7],
+        }
+    }
+
+    /// Writes number `index` of a buffer of splats.
+    pub fn store(&self, splats: &mut [f32], index: usize) {
+        let at = index * comptime!(SPLAT);
+        splats[at] = self.u;
+        splats[at + 1] = self.v;
+        splats[at + 2] = self.l0;
+        splats[at + 3] = self.k;
+        splats[at + 4] = self.l1;
+        splats[at + 5] = self.opacity;
+        splats[at + 6] = self.depth;
+        splats[at + 7] = self.radius_squared;
+    }
+}

@@ -1,0 +1,80 @@
+//! Functions that Rust and CubeCL spell differently: `f` runs on CPUs, and CubeCL calls `f::expand` where a `#[cube]`
+//! function that calls `f` is compiled for a GPU.
+
+/// exp(x) for x ≤ 0, within 2 units in the last place; below −87 it stays at exp(−87). GPUs use their own.
+///
+/// x = n·ln 2 + r with |r| ≤ ½ ln 2; exp(r) by its Taylor polynomial, whose remainder r⁸/8! is below 6e-9; 2ⁿ by the
+/// exponent bits. Unlike the standard library's, a loop over it compiles to SIMD.
+#[inline(always)]
+pub fn exp(x: f32) -> f32 {
+    /// Adding it to a small float rounds that to an integer, which the low bits then hold.
+    const ROUND: f32 = 12_582_912.0;
+    /// ln 2 in two parts: the first has few enough bits that n times it is exact.
+    const LN_2_HIGH: f32 = 0.693_359_4;
+    const LN_2_LOW: f32 = -2.121_944_4e-4;
+    let x = x.max(-87.0);
+    let shifted = x * std::f32::consts::LOG2_E + ROUND;
+    let n = shifted - ROUND;
+    let r = (x - n * LN_2_HIGH) - n * LN_2_LOW;
+    let mut p = 1.0 / 5040.0;
+    p = p * r + 1.0 / 720.0;
+    p = p * r + 1.0 / 120.0;
+    p = p * r + 1.0 / 24.0;
+    p = p * r + 1.0 / 6.0;
+    p = p * r + 0.5;
+    p = p * r + 1.0;
+    p = p * r + 1.0;
+    let exponent = shifted.to_bits().wrapping_sub(ROUND.to_bits()).wrapping_add(127) << 23;
+    p * f32::from_bits(exponent)
+}
+
+/// The integer part of a number that is not negative.
+#[inline(always)]
+pub fn to_u32(x: f32) -> u32 {
+    x as u32
+}
+
+/// A small integer as a float.
+#[inline(always)]
+pub fn to_f32(n: u32) -> f32 {
+    n as f32
+}
+
+pub mod exp {
+    use cubecl::prelude::*;
+
+    pub fn expand(scope: &Scope, x: NativeExpand<f32>) -> NativeExpand<f32> {
+        x.__expand_exp_method(scope)
+    }
+}
+
+pub mod to_u32 {
+    use cubecl::prelude::*;
+
+    pub fn expand(scope: &Scope, x: NativeExpand<f32>) -> NativeExpand<u32> {
+        u32::__expand_cast_from::<f32>(scope, x)
+    }
+}
+
+pub mod to_f32 {
+    use cubecl::prelude::*;
+
+    pub fn expand(scope: &Scope, n: NativeExpand<u32>) -> NativeExpand<f32> {
+        f32::__expand_cast_from::<u32>(scope, n)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #[test]
+    fn exp_is_within_two_units_in_the_last_place() {
+        for i in 0..870_000 {
+            let x = -(i as f32) * 1e-4;
+            let exact = f64::from(x).exp();
+            let error = (f64::from(super::exp(x)) - exact).abs() / exact;
+            assert!(error < 2.0 * f64::from(f32::EPSILON), "exp({x}): relative error {error}");
+        }
+        assert_eq!(super::exp(0.0), 1.0);
+        assert_eq!(super::exp(-1e30), super::exp(-87.0));
+    }
+}
