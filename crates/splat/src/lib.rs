@@ -5,6 +5,7 @@ mod camera;
 pub mod cameras;
 mod error;
 mod gaussians;
+mod linear;
 mod op;
 mod options;
 pub mod ply;

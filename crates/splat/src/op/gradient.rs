@@ -4,7 +4,8 @@ use cubecl::prelude::*;
 
 use super::job::{Job, Wanted};
 use super::splat::Offset;
-use crate::vjp::{FootprintGradient, Vec3};
+use crate::linear::Vec3;
+use crate::vjp::FootprintGradient;
 
 /// Which sums over pixels the backward pass keeps of one intersection, in this order: colour (3), opacity (1),
 /// geometry (5), depth (1); what is not wanted has no place.

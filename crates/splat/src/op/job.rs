@@ -1,8 +1,9 @@
 //! Input of one call of the operation, and its counts: plain host data.
 
 use super::splat::{FATES, Uniforms};
+use crate::linear::{Mat3, Vec3};
 use crate::options::{MIN_TRANSMITTANCE, RenderOptions, TILE};
-use crate::vjp::{Mat3, Vec3, View};
+use crate::vjp::View;
 use crate::{Camera, SplatError};
 
 /// Values beyond this are treated like infinities: their products leave the range of f32.

@@ -8,8 +8,9 @@ use cubecl::prelude::*;
 
 use super::job::{MAX_MAGNITUDE, MIN_QUATERNION, RADIUS_MARGIN};
 use super::twofold::{exp, to_f32, to_u32};
+use crate::linear::{Quat, Vec3, load3};
 use crate::options::{MIN_ALPHA, TILE};
-use crate::vjp::{Footprint, Quat, Vec3, View, footprint, project, span, to_camera};
+use crate::vjp::{Footprint, View, footprint, project, span, to_camera};
 
 /// A visible Gaussian as the pixels of one view use it.
 #[derive(CubeType, Clone, Copy, Debug, Default)]
@@ -62,28 +63,6 @@ pub struct Gaussian {
     pub rotation: Quat,
     pub scale: Vec3,
     pub opacity: f32,
-}
-
-/// Three consecutive numbers.
-#[cube]
-pub fn load3(values: &[f32], at: usize) -> Vec3 {
-    Vec3 { x: values[at], y: values[at + 1], z: values[at + 2] }
-}
-
-/// Writes three consecutive numbers.
-#[cube]
-pub fn store3(values: &mut [f32], at: usize, v: &Vec3) {
-    values[at] = v.x;
-    values[at + 1] = v.y;
-    values[at + 2] = v.z;
-}
-
-/// Adds `v` to `sum`.
-#[cube]
-pub fn add3(sum: &mut Vec3, v: &Vec3) {
-    sum.x += v.x;
-    sum.y += v.y;
-    sum.z += v.z;
 }
 
 /// Gaussian number `g` of arrays `[N,3]`, `[N,4]`, `[N,3]`, `[N]`.

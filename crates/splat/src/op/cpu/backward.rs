@@ -9,8 +9,9 @@ use super::super::job::{Job, Wanted};
 use super::lanes::{BATCH, Lanes, fetch, row, rows};
 use super::splats::{Visible, projection};
 use super::{Scene, State, ViewState};
+use crate::linear::Vec3;
 use crate::options::{MIN_ALPHA, TILE};
-use crate::vjp::{Vec3, project_vjp};
+use crate::vjp::project_vjp;
 
 /// Gaussians per task.
 const CHUNK: usize = 2048;

@@ -3,8 +3,9 @@
 use rayon::prelude::*;
 
 use super::super::job::Job;
-use super::super::splat::{Extent, FATES, Gaussian, Projected, Splat, VISIBLE, load3, splat};
+use super::super::splat::{Extent, FATES, Gaussian, Projected, Splat, VISIBLE, splat};
 use super::Scene;
+use crate::linear::load3;
 use crate::vjp::{Projection, View, project, to_camera};
 
 /// Gaussians per task.

@@ -8,11 +8,12 @@ use cubecl::prelude::*;
 use super::blend::{Pixel, TileLists, UNITS, pixel_of_unit};
 use super::channels;
 use super::project::{Parameters, Reach, load_view};
+use crate::linear::{Quat, Vec3, add3, dot, load3, store3};
 use crate::op::gradient::{Record, SplatGradient};
 use crate::op::job::Wanted;
-use crate::op::splat::{Offset, Splat, Uniforms, add3, load3, offset, store3, weight};
+use crate::op::splat::{Offset, Splat, Uniforms, offset, weight};
 use crate::options::MIN_ALPHA;
-use crate::vjp::{GaussianGradient, Quat, Vec3, dot, footprint, project, project_vjp, to_camera};
+use crate::vjp::{GaussianGradient, footprint, project, project_vjp, to_camera};
 
 /// Splats that a cube visits between two barriers.
 const ROUND: usize = 8;

@@ -3,9 +3,9 @@
 use cubecl::prelude::*;
 
 use super::channels;
-use crate::op::splat::{SPLAT, Splat, Uniforms, load3, offset, store3, weight};
+use crate::linear::{Vec3, load3, store3};
+use crate::op::splat::{SPLAT, Splat, Uniforms, offset, weight};
 use crate::options::{MIN_ALPHA, MIN_TRANSMITTANCE, TILE};
-use crate::vjp::Vec3;
 
 /// Units of a cube: the pixels of a tile.
 pub const UNITS: usize = TILE * TILE;

@@ -2,10 +2,11 @@
 
 use cubecl::prelude::*;
 
+use crate::linear::{Mat3, load3};
 use crate::op::splat::{
-    Extent, FATES, Gaussian, Splat, Uniforms, VISIBLE, gaussian, load3, splat, tiles_in_row, tiles_of,
+    Extent, FATES, Gaussian, Splat, Uniforms, VISIBLE, gaussian, splat, tiles_in_row, tiles_of,
 };
-use crate::vjp::{Mat3, View};
+use crate::vjp::View;
 
 /// f32 of a camera in a buffer.
 const VIEW: usize = size_of::<View>() / 4;
