@@ -1,6 +1,6 @@
-//! Time per person that is made: `cargo bench --workspace --bench people -- [MAKEHUMAN_DATA]`.
+//! Time per synthetic person: `cargo bench --workspace --bench people -- [MAKEHUMAN_DATA]`.
 //!
-//! A person is morphed or built, posed, dressed, meshed and painted; drawing is measured by the bench `view`.
+//! The time includes building or morphing, posing, dressing, meshing and painting. The bench `view` measures drawing.
 
 use std::path::Path;
 use std::time::Instant;
@@ -13,7 +13,7 @@ use snapsnap_people::synth;
 const COUNT: usize = 20;
 
 fn measure(kind: &str, make: impl Fn(&str) -> Mesh) {
-    // What is read once is not counted.
+    // Excludes files that are read only once.
     make("warm");
     let start = Instant::now();
     let triangles: usize = (0..COUNT).map(|index| make(&format!("train/1/{index}")).faces.len()).sum();
@@ -24,7 +24,7 @@ fn measure(kind: &str, make: impl Fn(&str) -> Mesh) {
 fn main() {
     println!("| people | each | per minute | triangles |\n|---|---:|---:|---:|");
     measure("synthetic", synth::person);
-    // Cargo adds flags of its own.
+    // Cargo adds flags.
     match std::env::args().skip(1).find(|argument| !argument.starts_with('-')) {
         Some(folder) => {
             let library = Library::open(Path::new(&folder)).expect("MakeHuman's data");

@@ -1,4 +1,4 @@
-//! Makes people to train on: of simple shapes ([`synth`]), and of MakeHuman's data ([`makehuman`]).
+//! Synthetic people for training, built of simple shapes ([`synth`]) or from MakeHuman's data ([`makehuman`]).
 
 pub mod makehuman;
 mod math;

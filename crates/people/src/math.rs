@@ -1,5 +1,4 @@
-//! Functions whose results are the same on every machine: the standard library's sine differs between systems in its last
-//! digits.
+//! Functions with the same results on every machine. The standard library's sine differs between systems in its last digits.
 
 use std::f32::consts::PI;
 
@@ -31,7 +30,7 @@ pub fn smoothstep(from: f32, to: f32, x: f32) -> f32 {
     t * t * (3.0 - 2.0 * t)
 }
 
-/// The smaller of two distances, rounded where they are within `radius` of each other.
+/// The smaller of two distances, with a smooth transition where they differ by less than `radius`.
 pub fn smooth_min(a: f32, b: f32, radius: f32) -> f32 {
     let overlap = (radius - (a - b).abs()).max(0.0) / radius;
     a.min(b) - overlap * overlap * radius / 4.0
@@ -70,6 +69,11 @@ pub fn noise(p: Vec3, seed: u32) -> f32 {
 /// Smooth noise on a plane.
 pub fn noise2(p: Vec2, seed: u32) -> f32 {
     noise(p.extend(0.5), seed)
+}
+
+/// Smallest and largest coordinates; infinite without points.
+pub fn bounds(points: impl Iterator<Item = Vec3>) -> (Vec3, Vec3) {
+    points.fold((Vec3::INFINITY, Vec3::NEG_INFINITY), |(low, high), p| (low.min(p), high.max(p)))
 }
 
 #[cfg(test)]

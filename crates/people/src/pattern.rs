@@ -1,11 +1,11 @@
-//! Cloth: patterns with detail that no network can guess, so that it has to look.
+//! Patterns of cloth, with detail that a network cannot guess.
 
 use glam::{Vec2, Vec3};
 use rand::Rng;
 
 use crate::math::{hash, noise2, sin_cos, smoothstep};
 
-/// Kinds of weave and print, in metres of cloth.
+/// Kinds of weave and print.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Kind {
     Plain,
@@ -36,7 +36,7 @@ const KINDS: [Kind; 12] = [
     Kind::Denim,
     Kind::Knit,
 ];
-/// What most trousers and shoes are made of.
+/// Kinds of most trousers and shoes.
 const QUIET: [Kind; 6] = [Kind::Plain, Kind::Denim, Kind::Plain, Kind::Knit, Kind::Checks, Kind::Stripes];
 
 /// A cloth.
@@ -65,52 +65,42 @@ impl Pattern {
         Self::of(KINDS[random.random_range(0..KINDS.len())], random, 1.0)
     }
 
-    /// A cloth as trousers and shoes are made of.
+    /// A cloth for trousers and shoes.
     pub fn draw_quiet(random: &mut impl Rng) -> Self {
         Self::of(QUIET[random.random_range(0..QUIET.len())], random, 0.6)
     }
 
-    fn of(kind: Kind, random: &mut impl Rng, gaudy: f32) -> Self {
+    /// `strength`: factor of strong saturations.
+    fn of(kind: Kind, random: &mut impl Rng, strength: f32) -> Self {
         let base: f32 = random.random_range(0.0..1.0);
         // Much cloth is black, white or grey.
-        let saturation =
-            if random.random_range(0.0..1.0) < 0.3 { 0.06 } else { random.random_range(0.25..0.85) * gaudy };
-        let value: f32 = random.random_range(0.15..0.95);
+        let is_grey = random.random_range(0.0..1.0_f64) < 0.3;
+        let mut between = |low: f32, high: f32| random.random_range(low..high);
+        let saturation = if is_grey { 0.06 } else { between(0.25, 0.85) * strength };
+        let value = between(0.15, 0.95);
         let contrast = if value > 0.5 { -0.45 } else { 0.45 };
-        let second = hue(
-            base + random.random_range(-0.15..0.5),
-            saturation * 0.9,
-            (value + contrast).clamp(0.05, 1.0),
-        );
-        let third = hue(
-            base + random.random_range(0.2..0.8),
-            (saturation + 0.2).min(0.9),
-            random.random_range(0.3..0.95),
-        );
+        let second = hue(base + between(-0.15, 0.5), saturation * 0.9, (value + contrast).clamp(0.05, 1.0));
+        let third = hue(base + between(0.2, 0.8), (saturation + 0.2).min(0.9), between(0.3, 0.95));
         let first = if kind == Kind::Denim {
-            hue(
-                random.random_range(0.57..0.63),
-                random.random_range(0.35..0.6),
-                random.random_range(0.2..0.6),
-            )
+            hue(between(0.57, 0.63), between(0.35, 0.6), between(0.2, 0.6))
         } else {
             hue(base, saturation, value)
         };
-        let scale = random.random_range(0.02..0.08);
+        let scale = between(0.02, 0.08);
         Self { kind, colors: [first, second, third], scale, seed: random.random() }
     }
 
-    /// The colour that most of it has.
+    /// The main colour.
     pub fn main(&self) -> Vec3 {
         self.colors[0]
     }
 
-    /// Colour at `at`, metres of cloth: to the right, and up.
+    /// Colour at `at`, metres of cloth to the right and up.
     pub fn color(&self, at: Vec2) -> Vec3 {
         let [a, b, c] = self.colors;
         let p = at / self.scale;
         let f = p - p.floor();
-        // Edges as sharp as a printer's, soft over a millimetre.
+        // Half the width of an edge, 0.8 mm of cloth.
         let soft = 0.0008 / self.scale;
         let band = |x: f32, from: f32, to: f32| {
             smoothstep(from - soft, from + soft, x) * (1.0 - smoothstep(to - soft, to + soft, x))
@@ -172,7 +162,7 @@ impl Pattern {
                 a * (0.8 + 0.25 * rib + 0.25 * row)
             }
         };
-        // Threads, and the light and dark of cloth that was worn.
+        // Threads, and light and dark patches of worn cloth.
         let thread = noise2(at * 900.0, self.seed ^ 77) - 0.5;
         let patch = noise2(at * 14.0, self.seed ^ 99) - 0.5;
         (color * (1.0 + 0.10 * thread + 0.12 * patch)).clamp(Vec3::ZERO, Vec3::ONE)
@@ -184,7 +174,7 @@ impl Pattern {
 pub struct Print {
     /// Colours of the picture.
     colors: [Vec3; 2],
-    /// Which picture: a number of two digits, or a sign.
+    /// Number of two digits; without one, the picture is a sign.
     number: Option<u32>,
     sign: u32,
     /// Height in metres.
@@ -206,7 +196,7 @@ const DIGITS: [[u8; 5]; 10] = [
 ];
 
 impl Print {
-    /// A picture that stands out from cloth of the colour `on`.
+    /// A picture in contrast to cloth of the colour `on`.
     pub fn draw(random: &mut impl Rng, on: Vec3) -> Self {
         let bright = on.element_sum() > 1.4;
         let value = if bright { random.random_range(0.05..0.4) } else { random.random_range(0.75..1.0) };
@@ -216,7 +206,7 @@ impl Print {
         Self { colors, number, sign: random.random_range(0..4), size: random.random_range(0.1..0.22) }
     }
 
-    /// Lays the picture, centred on 0, over `color` at `at` (metres: to the right as seen by a viewer, and up).
+    /// The picture, centred at 0, over `color` at `at` (metres to the viewer's right and up).
     pub fn over(&self, color: Vec3, at: Vec2) -> Vec3 {
         let p = at / self.size;
         if p.abs().max_element() > 0.75 {
@@ -225,7 +215,7 @@ impl Print {
         let [first, second] = self.colors;
         match self.number {
             Some(number) => {
-                // Two digits of 3 × 5 dots with one between them.
+                // Two digits of 3 × 5 dots with one empty column between them.
                 let (column, row) = ((p.x / 0.15 + 3.5).floor(), ((0.5 - p.y) * 5.0).floor());
                 if !(0.0..7.0).contains(&column) || !(0.0..5.0).contains(&row) || column == 3.0 {
                     return color;

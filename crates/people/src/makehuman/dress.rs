@@ -6,33 +6,30 @@ use glam::{Vec2, Vec3};
 use kiddo::SquaredEuclidean;
 
 use super::net::{Net, PARTS, Vertex, coordinates, tree};
-use super::{ORDER, Person, Piece};
+use super::{HEAD, ORDER, Person, Piece, Place};
 use crate::math::{noise, smoothstep};
 use crate::synth::body::Body;
 use crate::synth::outfit::Lower;
-use crate::synth::part::{Kind, neckline};
+use crate::synth::part::Kind;
 use crate::synth::surface::{self, Surface};
 
 /// Metres that skin stays below cloth.
 const GAP: f32 = 0.004;
-/// Beyond this, how far inside a garment a place is does not matter.
+/// Largest depth inside a garment, metres; deeper places count as this deep.
 const FAR: f32 = 0.08;
 /// Side of the cells that hair is meshed with, metres.
 const HAIR_CELL: f32 = 0.006;
-/// Cloth within so many metres of a place in the resting pose is what lies over it.
+/// Largest distance in the resting pose between a place and the cloth over it, metres.
 const OVER: f32 = 0.02;
-/// Vertices of cloth around a place among which one of those is looked for.
+/// Number of nearest vertices among which the cloth over a place is searched.
 const AROUND: NonZeroUsize = NonZeroUsize::new(16).expect("not zero");
 
 impl Person<'_> {
-    /// The mean over the parts that a vertex belongs to of what `depth` says of its place on each chart, by kind, angle,
-    /// metres along, and the chart's length: so that edges run smoothly from part to part.
-    fn blend(&self, vertex: &Vertex, depth: impl Fn(Kind, f32, f32, f32) -> f32) -> f32 {
+    /// The mean of `depth` over a vertex's places on the charts of its parts, so that edges run smoothly from part to part.
+    fn blend(&self, vertex: &Vertex, depth: impl Fn(Place) -> f32) -> f32 {
         let (mut sum, mut shares) = (0.0, 0.0);
         for (part, share) in vertex.parts.iter().enumerate().filter(|(_, share)| **share > 0.0) {
-            let chart = &self.body.parts[self.rows[part]];
-            let (angle, along) = chart.chart(vertex.rest);
-            sum += share * depth(ORDER[part].0, angle, along, chart.length).clamp(-FAR, FAR);
+            sum += share * depth(self.place_on(part, vertex)).clamp(-FAR, FAR);
             shares += share;
         }
         if shares > 0.0 { sum / shares } else { -FAR }
@@ -40,51 +37,41 @@ impl Person<'_> {
 
     /// Metres inside the top's edges; negative outside.
     pub fn in_top(&self, vertex: &Vertex) -> f32 {
-        self.blend(vertex, |kind, angle, along, length| match kind {
-            Kind::Trunk => {
-                let collar = self.marks.collar - neckline(self.marks.neckline, angle);
-                (along - self.marks.hem).min(collar - along)
-            }
-            Kind::Arm => self.outfit.sleeve * length - along,
+        self.blend(vertex, |at| match at.kind {
+            Kind::Trunk => (at.along - self.marks.hem).min(self.marks.collar(at.angle) - at.along),
+            Kind::Arm => self.outfit.sleeve * at.length - at.along,
             _ => -FAR,
         })
     }
 
     /// Metres inside the edges of trousers, or of a skirt's lining on the trunk.
     pub fn in_bottom(&self, vertex: &Vertex) -> f32 {
-        // Under a top only as far as it may ride up.
+        // At most 6 cm above the hem of the top.
         let band = self.marks.waistband.min(self.marks.hem + 0.06);
-        self.blend(vertex, |kind, _, along, length| match (kind, self.outfit.lower) {
-            (Kind::Trunk, _) => band - along,
-            (Kind::Leg, Lower::Trousers { length: share, .. }) => share * length - along,
+        self.blend(vertex, |at| match (at.kind, self.outfit.lower) {
+            (Kind::Trunk, _) => band - at.along,
+            (Kind::Leg, Lower::Trousers { length, .. }) => length * at.length - at.along,
             // Shorts under a skirt.
-            (Kind::Leg, Lower::Skirt { .. }) => 0.05 - along,
+            (Kind::Leg, Lower::Skirt { .. }) => 0.05 - at.along,
             _ => -FAR,
         })
     }
 
     pub fn in_shoes(&self, vertex: &Vertex) -> f32 {
-        self.blend(vertex, |kind, _, along, length| {
-            let shaft = (self.outfit.boots * length).max(0.025);
-            match kind {
-                Kind::Foot => FAR,
-                Kind::Leg => along - (length - shaft),
-                _ => -FAR,
-            }
+        self.blend(vertex, |at| match at.kind {
+            Kind::Foot => FAR,
+            Kind::Leg => at.along - (at.length - (self.outfit.boots * at.length).max(0.025)),
+            _ => -FAR,
         })
     }
 
-    /// A piece of the base mesh, whose vertices lie on their own parts.
-    fn own(&self, net: Net) -> Piece {
+    pub fn skin(&self) -> Piece {
+        let net = self.group("body").subdivide();
         let parts = net.vertices.iter().map(|vertex| self.rows[vertex.part()] as u8).collect();
         Piece { net, parts }
     }
 
-    pub fn skin(&self) -> Piece {
-        self.own(self.group("body").subdivide())
-    }
-
-    /// Skin as cloth leaves it: what is under a garment lies on its inner side.
+    /// Skin that is pressed in to the inner side of the garments over it.
     pub fn pressed_skin(&self, mut skin: Piece, garments: &[Piece]) -> Piece {
         let depth =
             |vertex: &Vertex| self.in_top(vertex).max(self.in_bottom(vertex)).max(self.in_shoes(vertex));
@@ -95,8 +82,8 @@ impl Person<'_> {
         skin
     }
 
-    /// A layer of cloth over the body: the part of the tights that is `inside`, `thick` metres off. Its cloth lies on the
-    /// charts of `kinds`, also where it reaches a little beyond them.
+    /// A layer of cloth over the body: the part of the tights where `inside` is positive, moved outwards by `thick` metres.
+    /// Its colours come from the charts of `kinds`, also where it extends a little beyond them.
     fn layer(
         &self,
         kinds: &[Kind],
@@ -122,10 +109,10 @@ impl Person<'_> {
 
     /// Metres that trousers stand off the body.
     fn off_bottom(&self, vertex: &Vertex) -> f32 {
-        let (kind, _, along, length) = self.place(vertex);
-        let flare = match (kind, self.outfit.lower) {
+        let at = self.place(vertex);
+        let flare = match (at.kind, self.outfit.lower) {
             (Kind::Leg, Lower::Trousers { flare, .. }) => {
-                let down = (along / length).clamp(0.0, 1.0);
+                let down = (at.along / at.length).clamp(0.0, 1.0);
                 flare * down * down
             }
             _ => 0.0,
@@ -138,19 +125,19 @@ impl Person<'_> {
             &[Kind::Trunk, Kind::Arm],
             |vertex| self.in_top(vertex),
             |vertex| {
-                let (kind, angle, along, length) = self.place(vertex);
-                let share = (along / (self.outfit.sleeve * length).max(0.05)).clamp(0.0, 1.0);
-                let flare = if kind == Kind::Arm { self.outfit.sleeve_flare * share * share } else { 0.0 };
+                let at = self.place(vertex);
+                let share = (at.along / (self.outfit.sleeve * at.length).max(0.05)).clamp(0.0, 1.0);
+                let flare = if at.kind == Kind::Arm { self.outfit.sleeve_flare * share * share } else { 0.0 };
                 // Collars lie close to the neck.
-                let loose = if kind == Kind::Trunk {
-                    let collar = self.marks.collar - neckline(self.marks.neckline, angle);
-                    1.0 - smoothstep(collar - 0.09, collar - 0.02, along)
+                let loose = if at.kind == Kind::Trunk {
+                    let collar = self.marks.collar(at.angle);
+                    1.0 - smoothstep(collar - 0.09, collar - 0.02, at.along)
                 } else {
                     1.0
                 };
                 let off =
                     0.006 + loose * (0.8 * self.outfit.top_thickness + flare + 1.5 * self.folds(vertex));
-                // It hangs over the trousers.
+                // The top hangs over the trousers.
                 let over = smoothstep(-0.03, 0.0, self.in_bottom(vertex));
                 off.max(over * (self.off_bottom(vertex) + GAP))
             },
@@ -170,19 +157,19 @@ impl Person<'_> {
             &[Kind::Leg, Kind::Foot],
             |vertex| self.in_shoes(vertex),
             |vertex| {
-                let (kind, angle, ..) = self.place(vertex);
-                // Soles are thicker.
-                let sole = if kind == Kind::Foot && angle.abs() > 2.2 { 0.008 } else { 0.0 };
+                let at = self.place(vertex);
+                let sole = if at.kind == Kind::Foot && at.angle.abs() > 2.2 { 0.008 } else { 0.0 };
                 0.004 + 0.6 * self.outfit.shoe_thickness + sole
             },
         )
     }
 
-    /// Skirts and the tails of coats: row of the part.
+    /// Rows of the skirts and the tails of coats.
     pub fn drapes(&self) -> impl Iterator<Item = usize> {
         (0..self.body.parts.len()).filter(|row| self.body.parts[*row].kind == Kind::Skirt)
     }
 
+    /// Metres inside the edges of a skirt or a coat's tail.
     fn in_drape(&self, row: usize, vertex: &Vertex) -> f32 {
         let part = &self.body.parts[row];
         let along = part.chart(vertex.rest).1;
@@ -190,12 +177,12 @@ impl Person<'_> {
         (part.length - along).min(along - band).clamp(-FAR, FAR)
     }
 
-    /// `under`: what it hangs over, from the inside out.
+    /// A skirt or the tail of a coat. `under`: the pieces below it, from the inside out.
     pub fn skirt(&self, row: usize, under: &[&Piece]) -> Piece {
         let is_coat = self.body.parts[row].side == 1;
         let mut net = self.group("helper-skirt").subdivide().subdivide();
         let off = if is_coat { 0.012 } else { 0.004 } + self.outfit.lower_thickness;
-        // Close at the waist, where it is sewn on.
+        // Close to the body at the waist.
         let loose = |vertex: &Vertex| smoothstep(0.0, 0.08, self.body.parts[row].chart(vertex.rest).1);
         let folds = |vertex: &Vertex| {
             let p = vertex.rest - self.figure.pelvis.start;
@@ -212,7 +199,7 @@ impl Person<'_> {
         Piece { net, parts }
     }
 
-    /// Hair, meshed around the resting head and carried along by it.
+    /// Hair, meshed around the resting head and moved with it.
     pub fn hair(&self, skin: &Piece) -> Option<Piece> {
         let row = self.body.parts.iter().position(|part| part.kind == Kind::Hair)?;
         let hair = Body { parts: vec![self.body.parts[row].clone()] };
@@ -223,13 +210,11 @@ impl Person<'_> {
         let mut net = Net { vertices, faces: faces.into_iter().map(|f| f.to_vec()).collect() };
         push_out(&mut net, &skin.net, false, |_| 0.006);
         // The face stays free: an ellipse around the mouth, up to above the brows.
-        let face = self.landmarks();
-        let head = &self.body.parts[self.rows[1]];
-        let height = (self.figure.head.end - self.figure.head.start).length();
+        let face = &self.face;
         let net = net.cut(|vertex| {
-            let (angle, along) = head.chart(vertex.rest);
-            let up = (along / height - face.mouth) / (face.brow + 0.07 - face.mouth);
-            Vec2::new(angle / 1.05, up).length() - 1.0
+            let at = self.place_on(HEAD, vertex);
+            let up = (at.along / at.length - face.mouth) / (face.brow + 0.07 - face.mouth);
+            Vec2::new(at.angle / 1.05, up).length() - 1.0
         });
         let parts = vec![row as u8; net.vertices.len()];
         Some(Piece { net, parts })
@@ -237,7 +222,7 @@ impl Person<'_> {
 }
 
 /// Moves vertices that lie inside `solid`, or nearer to it than `gap` metres, out to that distance. With `spans` they move
-/// along their own normals: where what lies below has a fold, cloth goes over it.
+/// along their own normals, so that cloth spans folds of the piece below it.
 fn push_out(net: &mut Net, solid: &Net, spans: bool, gap: impl Fn(&Vertex) -> f32) {
     let normals = solid.normals();
     if solid.vertices.is_empty() {
@@ -246,7 +231,7 @@ fn push_out(net: &mut Net, solid: &Net, spans: bool, gap: impl Fn(&Vertex) -> f3
     let places = coordinates(net.vertices.iter().map(|vertex| vertex.posed));
     let tree = tree(solid.vertices.iter().map(|vertex| vertex.posed));
     let found = tree.query_batch(&places).nearest_one::<SquaredEuclidean<f32>>().execute();
-    // Further inside than this the nearest skin is that of the other side.
+    // Deeper inside, the nearest skin would be that of the other side.
     let deepest = 0.05;
     let own = net.normals();
     for ((vertex, found), own) in net.vertices.iter_mut().zip(&found).zip(own) {
@@ -261,8 +246,8 @@ fn push_out(net: &mut Net, solid: &Net, spans: bool, gap: impl Fn(&Vertex) -> f3
     }
 }
 
-/// Moves skin in until it lies `gap` metres below the cloth over it: in the pose cloth of another limb may be nearer, in
-/// the resting pose limbs are apart. `depths`: how deep inside a garment each vertex is.
+/// Moves skin in until it lies `gap` metres below the cloth over it. The resting pose decides which cloth that is, since in
+/// the pose cloth of another limb may be nearer. `depths`: depth of each vertex inside the garments.
 fn press_in(skin: &mut Net, depths: &[f32], cloth: &Net, gap: f32) {
     let normals = cloth.normals();
     if cloth.vertices.is_empty() {
@@ -270,19 +255,19 @@ fn press_in(skin: &mut Net, depths: &[f32], cloth: &Net, gap: f32) {
     }
     let press = |vertex: &mut Vertex, depth: f32, cloth_row: usize| {
         let out = (vertex.posed - cloth.vertices[cloth_row].posed).dot(normals[cloth_row]);
-        // At hems skin goes over into what is bare.
+        // Covered skin meets bare skin at hems.
         let gap = gap * smoothstep(0.0, 0.015, depth);
         vertex.posed -= normals[cloth_row] * (out + gap).clamp(0.0, 0.05);
     };
     let covered: Vec<usize> = (0..depths.len()).filter(|row| depths[*row] > 0.0).collect();
-    // First what lies over it in the resting pose, however far away it is now …
+    // First the cloth that is nearest in the resting pose, at any distance in the pose.
     let places = coordinates(covered.iter().map(|row| skin.vertices[*row].rest));
     let rest = tree(cloth.vertices.iter().map(|vertex| vertex.rest));
     let found = rest.query_batch(&places).nearest_one::<SquaredEuclidean<f32>>().execute();
     for (row, found) in covered.iter().zip(&found).filter(|(_, found)| found.distance < OVER * OVER) {
         press(&mut skin.vertices[*row], depths[*row], found.item as usize);
     }
-    // … then what of that is nearest now.
+    // Then the nearest cloth in the pose, of the cloth that is near in the resting pose.
     let posed = tree(cloth.vertices.iter().map(|vertex| vertex.posed));
     for _ in 0..2 {
         let places = coordinates(covered.iter().map(|row| skin.vertices[*row].posed));

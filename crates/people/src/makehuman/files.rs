@@ -1,33 +1,35 @@
-//! MakeHuman's own files: base mesh, morph targets, rig and skin weights.
+//! MakeHuman's files: base mesh, morph targets, rig and skin weights.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use glam::Vec3;
 use serde::Deserialize;
-use snapsnap_base::{file, quoted};
+use serde::de::DeserializeOwned;
+use snapsnap_base::{FileError, file, quoted};
 
-use snapsnap_base::FileError;
-
-/// MakeHuman counts in decimetres.
+/// Metres per unit of MakeHuman's files, a decimetre.
 const METRES: f32 = 0.1;
-/// Largest file that is read; the largest that MakeHuman has takes a few megabytes.
+/// Size limit of a file. The largest of MakeHuman's files has a few megabytes.
 const MAX_BYTES: u64 = 256 << 20;
 
-/// Largest coordinate, decimetres; a NaN is refused as well.
+/// Largest coordinate, decimetres.
 const LARGEST: f32 = 1000.0;
-/// What of the base mesh and the rig is used.
+/// Required groups of the base mesh and bones of the rig.
 const GROUPS: [&str; 5] = ["body", "helper-tights", "helper-skirt", "helper-l-eye", "helper-r-eye"];
 const BONES: [&str; 5] = ["spine03", "neck01", "head", "jaw", "oris01"];
 const SIDED_BONES: [&str; 9] =
     ["eye", "upperarm01", "lowerarm01", "wrist", "finger3-3", "upperleg01", "lowerleg01", "foot", "clavicle"];
 
-/// Moves of vertices: row and metres.
+/// Row and displacement in metres of each vertex that moves.
 pub type Target = Arc<Vec<(u32, Vec3)>>;
 
-/// A bone: its name, its parent's row, and the vertices whose mean is its head and its tail.
+/// Faces of each group of the base mesh. Triangles repeat their last corner.
+type Groups = HashMap<String, Vec<[u32; 4]>>;
+
+/// A bone: its name, its parent's row, and the vertices whose means are its head and its tail.
 #[derive(Debug, Clone)]
 pub struct RigBone {
     pub name: String,
@@ -39,10 +41,10 @@ pub struct RigBone {
 /// The data of a MakeHuman installation.
 pub struct Library {
     root: PathBuf,
-    /// Metres.
+    /// Vertices of the base mesh, metres.
     pub positions: Vec<Vec3>,
-    /// Faces of each group; triangles repeat their last corner.
-    pub groups: HashMap<String, Vec<[u32; 4]>>,
+    /// Contains all of `GROUPS`.
+    pub groups: Groups,
     /// Parents before children.
     pub bones: Vec<RigBone>,
     /// Bones that move each vertex, with shares that add up to 1.
@@ -56,7 +58,7 @@ impl Library {
         &self.root
     }
 
-    /// Opens `folder`: MakeHuman's `data`, or a checkout that has it.
+    /// Opens `folder`: MakeHuman's `data`, or a checkout that contains it.
     ///
     /// # Errors
     /// [`FileError`] naming the file that is missing or damaged.
@@ -68,23 +70,20 @@ impl Library {
             FileError::unsuitable(folder, message)
         })?;
         let (positions, groups) = read_base(&root.join(base))?;
-        let missing = GROUPS.iter().find(|group| !groups.contains_key(**group));
-        if let Some(group) = missing {
+        if let Some(group) = GROUPS.iter().find(|group| !groups.contains_key(**group)) {
             return Err(FileError::unsuitable(&root.join(base), format!("has no group `{group}`")));
         }
         let (bones, weights) = read_rig(&root.join("rigs"), positions.len())?;
         let sided = SIDED_BONES.iter().flat_map(|name| ["L", "R"].map(|side| format!("{name}.{side}")));
         let mut needed = BONES.iter().map(|name| (*name).to_owned()).chain(sided);
         if let Some(bone) = needed.find(|needed| !bones.iter().any(|bone| bone.name == *needed)) {
-            return Err(FileError::unsuitable(
-                &root.join("rigs/default.mhskel"),
-                format!("has no bone `{bone}`"),
-            ));
+            let path = root.join("rigs/default.mhskel");
+            return Err(FileError::unsuitable(&path, format!("has no bone `{bone}`")));
         }
         Ok(Self { root, positions, groups, bones, weights, targets: Mutex::default() })
     }
 
-    /// The morph target at this path below `targets`, without its ending. Read once.
+    /// The morph target at the path `name` below `targets`, without its ending. Each file is read once.
     ///
     /// # Errors
     /// [`FileError`] if it is missing or damaged.
@@ -119,23 +118,26 @@ fn read_text(path: &Path) -> Result<String, FileError> {
     file::read_text(path, MAX_BYTES).map_err(FileError::read(path))
 }
 
+fn read_json<T: DeserializeOwned>(path: &Path) -> Result<T, FileError> {
+    serde_json::from_str(&read_text(path)?).map_err(|e| FileError::unsuitable(path, e))
+}
+
 fn wrong(path: &Path, line: usize, text: &str) -> FileError {
     FileError::unsuitable(path, format!("line {}, `{}`: not understood", line + 1, quoted(text)))
 }
 
-/// Three finite numbers.
+/// Three numbers within ±`LARGEST`, converted to metres.
 fn vector<'a>(mut words: impl Iterator<Item = &'a str>) -> Option<Vec3> {
     let mut next = || words.next()?.parse().ok().filter(|v: &f32| v.abs() < LARGEST);
     Some(METRES * Vec3::new(next()?, next()?, next()?))
 }
 
-type Base = (Vec<Vec3>, HashMap<String, Vec<[u32; 4]>>);
-
-/// The general importer does not keep the rows of vertices, which targets and weights refer to.
-fn read_base(path: &Path) -> Result<Base, FileError> {
+/// Reads positions and groups. The importer of `snapsnap_mesh` changes the rows of vertices, which targets and weights
+/// refer to.
+fn read_base(path: &Path) -> Result<(Vec<Vec3>, Groups), FileError> {
     let text = read_text(path)?;
     let mut positions = Vec::new();
-    let mut groups: HashMap<String, Vec<[u32; 4]>> = HashMap::new();
+    let mut groups = Groups::new();
     let mut group = String::new();
     for (number, line) in text.lines().enumerate() {
         let mut words = line.split_ascii_whitespace();
@@ -175,7 +177,7 @@ fn read_target(path: &Path, vertices: usize) -> Result<Vec<(u32, Vec3)>, FileErr
 
 #[derive(Deserialize)]
 struct RigFile {
-    bones: HashMap<String, BoneFile>,
+    bones: BTreeMap<String, BoneFile>,
     joints: HashMap<String, Vec<u32>>,
 }
 
@@ -188,24 +190,20 @@ struct BoneFile {
 
 #[derive(Deserialize)]
 struct WeightsFile {
-    weights: HashMap<String, Vec<(u32, f32)>>,
+    weights: BTreeMap<String, Vec<(u32, f32)>>,
 }
 
 type Rig = (Vec<RigBone>, Vec<Vec<(u32, f32)>>);
 
 fn read_rig(folder: &Path, vertices: usize) -> Result<Rig, FileError> {
     let path = folder.join("default.mhskel");
-    let file: RigFile =
-        serde_json::from_str(&read_text(&path)?).map_err(|e| FileError::unsuitable(&path, e))?;
-    let mut names: Vec<&String> = file.bones.keys().collect();
-    names.sort_unstable();
+    let file: RigFile = read_json(&path)?;
     let mut bones: Vec<RigBone> = Vec::new();
     let mut rows: HashMap<&str, usize> = HashMap::new();
-    // Parents first: each round takes those whose parent was taken.
-    while bones.len() < names.len() {
+    // Parents first: each round adds the bones whose parent is there.
+    while bones.len() < file.bones.len() {
         let before = bones.len();
-        for name in &names {
-            let bone = &file.bones[*name];
+        for (name, bone) in &file.bones {
             let parent = bone.parent.as_deref().map(|parent| rows.get(parent).copied());
             if rows.contains_key(name.as_str()) || parent == Some(None) {
                 continue;
@@ -218,7 +216,7 @@ fn read_rig(folder: &Path, vertices: usize) -> Result<Rig, FileError> {
             };
             rows.insert(name, bones.len());
             let (head, tail) = (joint(&bone.head)?, joint(&bone.tail)?);
-            bones.push(RigBone { name: (*name).clone(), parent: parent.flatten(), head, tail });
+            bones.push(RigBone { name: name.clone(), parent: parent.flatten(), head, tail });
         }
         if bones.len() == before {
             return Err(FileError::unsuitable(&path, "a bone's parent is missing, or bones form a loop"));
@@ -226,15 +224,12 @@ fn read_rig(folder: &Path, vertices: usize) -> Result<Rig, FileError> {
     }
 
     let path = folder.join("default_weights.mhw");
-    let file: WeightsFile =
-        serde_json::from_str(&read_text(&path)?).map_err(|e| FileError::unsuitable(&path, e))?;
+    let file: WeightsFile = read_json(&path)?;
     let mut weights: Vec<Vec<(u32, f32)>> = vec![Vec::new(); vertices];
-    let mut names: Vec<&String> = file.weights.keys().collect();
-    names.sort_unstable();
-    for name in names {
+    for (name, list) in &file.weights {
         let unknown = || FileError::unsuitable(&path, format!("bone `{}` is not in the rig", quoted(name)));
         let bone = *rows.get(name.as_str()).ok_or_else(unknown)? as u32;
-        for (row, weight) in &file.weights[name] {
+        for (row, weight) in list {
             let vertex = weights.get_mut(*row as usize).filter(|_| *weight >= 0.0 && weight.is_finite());
             let message = || format!("bone `{}` has a wrong weight for vertex {row}", quoted(name));
             vertex.ok_or_else(|| FileError::unsuitable(&path, message()))?.push((bone, *weight));

@@ -1,12 +1,11 @@
-//! MakeHuman people: bodies mixed from morph targets, posed by skinning, dressed in layers cut from the base mesh's own
-//! helper surfaces, in the clothes and colours of the synthetic people.
+//! People of MakeHuman's data: bodies mixed from morph targets, posed by skinning, and dressed in layers. The layers are cut
+//! from the helper surfaces of the base mesh; clothes and colours are those of [`synth`](crate::synth).
 //!
-//! Colour follows from the place on the resting body alone, so that whatever layer is seen somewhere has the right one;
-//! skin under cloth is pressed in, so that it cannot come through.
+//! The place on the resting body alone determines a colour, so that all layers at a place have the same one. Skin under
+//! cloth is pressed in, so that it does not come through.
 
 mod dress;
 mod files;
-mod hands;
 mod net;
 mod rig;
 mod shape;
@@ -15,17 +14,18 @@ mod tests;
 
 use glam::{Mat3, Vec3};
 
-use crate::synth::MOVES;
+use crate::math::bounds;
 use crate::synth::atlas;
 use crate::synth::body::Body;
 use crate::synth::figure::{Build, Figure, Pose};
 use crate::synth::outfit::{Lower, Outfit};
 use crate::synth::paint::{Face as Landmarks, Painter};
-use crate::synth::part::{Kind, Marks};
+use crate::synth::part::{Kind, Marks, Part};
+use crate::synth::stand;
 use crate::synth::surface::Surface;
 pub use files::Library;
 use net::{Net, PARTS, Vertex};
-use rig::{Joints, Posed};
+use rig::Joints;
 use shape::{Mix, morph};
 use snapsnap_base::FileError;
 use snapsnap_base::random::stream;
@@ -45,132 +45,129 @@ const ORDER: [(Kind, usize); PARTS] = [
     (Kind::Foot, 1),
 ];
 
-/// Longest side of the box around a person and all that may be worn, metres: what is larger no memory could mesh.
+/// Row of the head in [`ORDER`].
+const HEAD: usize = 1;
+
+/// Longest side of the box around a person, metres. A larger one would not fit in memory as a mesh.
 const LARGEST: f32 = 5.0;
 
-/// The person of this name: life-size in metres, standing on y = 0 and
-/// facing +z.
+/// The person of this name: life-size in metres, standing on y = 0 and facing +z.
 ///
 /// # Errors
 /// [`FileError`] naming a file that is missing or damaged.
 pub fn person(library: &Library, name: &str) -> Result<Mesh, FileError> {
-    with_person(library, name, |person| person.mesh())
+    Ok(Person::of(library, name)?.mesh())
 }
 
-fn with_person<T>(library: &Library, name: &str, then: impl FnOnce(&Person) -> T) -> Result<T, FileError> {
-    let mut random = stream(&format!("makehuman/{name}"));
-    let mix = Mix::draw(&mut random);
-    let mut build = Build::draw(&mut random);
-    let mut pose = Pose::draw(&mut random);
-    let rest = morph(library, &mix, &mut random)?;
-    let (low, high) = bounds(rest.iter().copied());
-    let reach = (high - low).max_element();
-    if reach > LARGEST || !rest.iter().all(|p| p.is_finite()) {
-        let message = format!("a person of {reach} m comes out: one of its targets is damaged");
-        return Err(FileError::unsuitable(library.root(), message));
-    }
-    let body = || library.groups.get("body").into_iter().flatten().flatten().map(|row| rest[*row as usize]);
-    let (low, high) = bounds(body());
-    (build.sex, build.stature) = (mix.sex, (high.y - low.y).max(0.5));
-    build.girth = 0.8 + 0.4 * mix.weight;
-    let mut outfit = Outfit::draw(&mut random, &build);
-    outfit.glasses = false;
-    if matches!(outfit.lower, Lower::Skirt { .. }) {
-        // The base mesh's skirt begins below the waist.
-        outfit.top_length = outfit.top_length.max(0.5);
-    }
-    pose.spread_arms(0.5 * outfit.breadth());
-    let joints = Joints::of(library, &rest);
-    let middle = |height: f32| {
-        let (low, high) = bounds(body().filter(|p| p.x.abs() < 0.1 && (p.y - height).abs() < 0.03));
-        if low.is_finite() { (low.z + high.z) / 2.0 } else { 0.0 }
-    };
-    let figure = joints.figure(build, high.y, middle);
-    let cloth = 0.01 + outfit.top_thickness + if outfit.breadth() > 0.0 { 0.03 } else { 0.0 };
-    let shares = shares(library);
-    let vertices = |posed: &Posed| -> Vec<Vertex> {
-        let places = rest.iter().zip(&posed.positions).zip(&shares);
-        places.map(|((rest, posed), parts)| Vertex { rest: *rest, posed: *posed, parts: *parts }).collect()
-    };
-    let mut posed = joints.pose(&rest, &figure, &pose);
-    for _ in 0..MOVES {
-        let vertices = vertices(&posed);
-        let sunk = hands::sunk(&group(library, &vertices, "body"), cloth);
-        if sunk == [false; 2] {
-            break;
-        }
-        (0..2).filter(|side| sunk[*side]).for_each(|side| pose.ease_arm(side));
-        posed = joints.pose(&rest, &figure, &pose);
-    }
-    Ok(then(&Person::new(library, vertices(&posed), posed.head, &figure, &outfit, &joints)))
-}
-
-fn bounds(points: impl Iterator<Item = Vec3>) -> (Vec3, Vec3) {
-    points.fold((Vec3::INFINITY, Vec3::NEG_INFINITY), |(low, high), p| (low.min(p), high.max(p)))
-}
-
+/// A person in a pose, before it becomes a mesh.
 struct Person<'a> {
     library: &'a Library,
-    figure: &'a Figure,
-    outfit: &'a Outfit,
+    figure: Figure,
+    outfit: Outfit,
     marks: Marks,
     body: Body,
-    /// Rows of `body` of the parts of [`ORDER`].
+    /// Rows of `body.parts` in the order of [`ORDER`].
     rows: [usize; PARTS],
     vertices: Vec<Vertex>,
     /// The surface that clothes are cut from.
     tights: Net,
-    /// How the head moved: turn, then shift.
+    /// Rotation and translation from the resting head to the posed one.
     head: (Mat3, Vec3),
-    eyes: [Vec3; 2],
-    mouth: (Vec3, Vec3),
+    face: Landmarks,
 }
 
-/// A piece with the row of the body's part that each vertex lies on.
+/// A piece of the surface.
 struct Piece {
     net: Net,
+    /// Row in `body.parts` of the part that each vertex lies on.
     parts: Vec<u8>,
 }
 
+/// Place of a vertex on the chart of a part.
+struct Place {
+    kind: Kind,
+    angle: f32,
+    along: f32,
+    /// Length of the chart.
+    length: f32,
+}
+
 impl<'a> Person<'a> {
-    fn new(
-        library: &'a Library,
-        vertices: Vec<Vertex>,
-        head: (Mat3, Vec3),
-        figure: &'a Figure,
-        outfit: &'a Outfit,
-        joints: &Joints,
-    ) -> Self {
-        let body = Body::new(figure, outfit);
+    fn of(library: &'a Library, name: &str) -> Result<Self, FileError> {
+        let mut random = stream(&format!("makehuman/{name}"));
+        let mix = Mix::draw(&mut random);
+        let mut build = Build::draw(&mut random);
+        let mut pose = Pose::draw(&mut random);
+        let rest = morph(library, &mix, &mut random)?;
+        let (low, high) = bounds(rest.iter().copied());
+        let reach = (high - low).max_element();
+        if reach > LARGEST || !rest.iter().all(|p| p.is_finite()) {
+            let message = format!("a person of {reach} m comes out: one of its targets is damaged");
+            return Err(FileError::unsuitable(library.root(), message));
+        }
+        let skin = || library.groups["body"].iter().flatten().map(|row| rest[*row as usize]);
+        let (low, high) = bounds(skin());
+        (build.sex, build.stature) = (mix.sex, (high.y - low.y).max(0.5));
+        build.girth = 0.8 + 0.4 * mix.weight;
+        let mut outfit = Outfit::draw(&mut random, &build);
+        outfit.glasses = false;
+        if matches!(outfit.lower, Lower::Skirt { .. }) {
+            // The base mesh's skirt begins below the waist.
+            outfit.top_length = outfit.top_length.max(0.5);
+        }
+        pose.spread_arms(0.5 * outfit.breadth());
+
+        let joints = Joints::of(library, &rest);
+        let middle = |height: f32| {
+            let (low, high) = bounds(skin().filter(|p| p.x.abs() < 0.1 && (p.y - height).abs() < 0.03));
+            if low.is_finite() { (low.z + high.z) / 2.0 } else { 0.0 }
+        };
+        let figure = joints.figure(build, high.y, middle);
+        let shares = shares(library);
+        let posed = |pose: &Pose| {
+            let (positions, head) = joints.pose(&rest, &figure, pose);
+            let places = rest.iter().zip(positions).zip(&shares);
+            let vertices = places.map(|((rest, posed), parts)| Vertex { rest: *rest, posed, parts: *parts });
+            (vertices.collect::<Vec<_>>(), head)
+        };
+        let cloth = 0.01 + outfit.top_thickness + if outfit.breadth() > 0.0 { 0.03 } else { 0.0 };
+        let sunk =
+            |(vertices, _): &(Vec<Vertex>, _)| rig::sunk_hands(&group(library, vertices, "body"), cloth);
+        let (vertices, head) = pose.free_hands(posed, sunk);
+
+        let body = Body::new(&figure, &outfit);
         let row = |kind: Kind, side: usize| {
             body.parts.iter().position(|part| part.kind == kind && part.side == side).unwrap_or(0)
         };
-        let tights = group(library, &vertices, "helper-tights").subdivide().subdivide();
-        Self {
+        let rows = ORDER.map(|(kind, side)| row(kind, side));
+        Ok(Self {
             library,
+            marks: Marks::of(&figure, &outfit),
+            rows,
+            tights: group(library, &vertices, "helper-tights").subdivide().subdivide(),
+            head,
+            face: landmarks(&body.parts[rows[HEAD]], &joints),
             figure,
             outfit,
-            marks: Marks::of(figure, outfit),
-            rows: ORDER.map(|(kind, side)| row(kind, side)),
             body,
             vertices,
-            tights,
-            head,
-            eyes: [joints.eye(0), joints.eye(1)],
-            mouth: joints.mouth(),
-        }
+        })
     }
 
     fn group(&self, name: &str) -> Net {
         group(self.library, &self.vertices, name)
     }
 
-    /// Kind of part, and place on its chart.
-    fn place(&self, vertex: &Vertex) -> (Kind, f32, f32, f32) {
-        let part = vertex.part();
+    /// Place of a vertex on the chart of a part, which is a row of [`ORDER`].
+    fn place_on(&self, part: usize, vertex: &Vertex) -> Place {
         let chart = &self.body.parts[self.rows[part]];
         let (angle, along) = chart.chart(vertex.rest);
-        (ORDER[part].0, angle, along, chart.length)
+        Place { kind: ORDER[part].0, angle, along, length: chart.length }
+    }
+
+    /// Place of a vertex on the chart of its own part.
+    fn place(&self, vertex: &Vertex) -> Place {
+        self.place_on(vertex.part(), vertex)
     }
 
     fn mesh(&self) -> Mesh {
@@ -180,7 +177,7 @@ impl<'a> Person<'a> {
         let skirts: Vec<Piece> = self
             .drapes()
             .map(|row| {
-                // Tails belong to the top; skirts begin under it.
+                // The tail of a coat hangs over the top, a skirt under it.
                 let is_tail = self.body.parts[row].side == 1;
                 self.skirt(row, &[&skin, &garments[0], &garments[1]][..if is_tail { 3 } else { 2 }])
             })
@@ -197,42 +194,14 @@ impl<'a> Person<'a> {
             positions.extend(net.vertices.iter().map(|vertex| vertex.posed));
             surface.positions.extend(net.vertices.iter().map(|vertex| vertex.rest));
             surface.parts.extend(parts);
-            for face in &net.faces {
-                surface
-                    .faces
-                    .extend((1..face.len() - 1).map(|i| [face[0], face[i], face[i + 1]].map(|r| r + first)));
-            }
+            surface.faces.extend(net.triangles().map(|face| face.map(|row| row + first)));
         }
-        let mut painter = Painter::new(self.figure, self.outfit);
-        painter.face = self.landmarks();
+        let painter = Painter::new(&self.figure, &self.outfit, &self.face);
         let mut mesh = atlas::paint(&self.body, &surface, &painter);
         mesh.positions = positions;
         self.add_eyes(&mut mesh);
-        let floor = mesh.positions.iter().map(|p| p.y).fold(f32::INFINITY, f32::min);
-        mesh.positions.iter_mut().for_each(|p| p.y -= floor);
+        stand(&mut mesh);
         mesh
-    }
-
-    /// Where the features of the face are, on the chart of the head.
-    fn landmarks(&self) -> Landmarks {
-        let head = &self.body.parts[self.rows[1]];
-        let size = (self.figure.head.end - self.figure.head.start).length();
-        let at = |p: Vec3| {
-            let (angle, along) = head.chart(p);
-            (angle.abs(), along / size)
-        };
-        let eye = at(self.eyes[0] + 0.016 * Vec3::Z);
-        let (low, high) = self.mouth;
-        let mouth = at((low + high) / 2.0);
-        let corner = at(Vec3::new(high.x, (low.y + high.y) / 2.0, low.z));
-        Landmarks {
-            eye,
-            brow: eye.1 + 0.075,
-            mouth: mouth.1,
-            lips: [corner.0 * 1.15, (high.y - low.y) / size * 0.3],
-            nose: None,
-            painted_eyes: false,
-        }
     }
 
     fn add_eyes(&self, mesh: &mut Mesh) {
@@ -253,23 +222,38 @@ impl<'a> Person<'a> {
                     _ => Vec3::splat(0.88),
                 });
             }
-            for face in &net.faces {
-                for i in 1..face.len() - 1 {
-                    let positions = [face[0], face[i], face[i + 1]].map(|row| row + first);
-                    mesh.faces.push(Face { positions, texcoords: None, material });
-                }
+            for face in net.triangles() {
+                let positions = face.map(|row| row + first);
+                mesh.faces.push(Face { positions, texcoords: None, material });
             }
         }
     }
 }
 
-/// A group of the base mesh.
-fn group(library: &Library, vertices: &[Vertex], name: &str) -> Net {
-    let faces = library.groups.get(name).map_or(&[][..], Vec::as_slice);
-    Net::of(|row| vertices[row as usize], faces)
+/// Places of the features of the face on the chart of the head.
+fn landmarks(head: &Part, joints: &Joints) -> Landmarks {
+    let at = |p: Vec3| {
+        let (angle, along) = head.chart(p);
+        (angle.abs(), along / head.length)
+    };
+    let eye = at(joints.head("eye.L") + 0.016 * Vec3::Z);
+    let (low, high) = joints.mouth();
+    let corner = at(Vec3::new(high.x, (low.y + high.y) / 2.0, low.z));
+    Landmarks {
+        eye,
+        brow: eye.1 + 0.075,
+        mouth: at((low + high) / 2.0).1,
+        lips: [corner.0 * 1.15, (high.y - low.y) / head.length * 0.3],
+        painted: false,
+    }
 }
 
-/// How much each vertex belongs to each part of the body.
+/// A group of the base mesh.
+fn group(library: &Library, vertices: &[Vertex], name: &str) -> Net {
+    Net::of(vertices, &library.groups[name])
+}
+
+/// Share of each part of the body in each vertex.
 fn shares(library: &Library) -> Vec<[f32; PARTS]> {
     let kinds: Vec<usize> = library.bones.iter().map(|bone| part_of(&bone.name)).collect();
     let shares = library.weights.iter().map(|weights| {
@@ -290,7 +274,7 @@ fn part_of(bone: &str) -> usize {
         _ if starts(&["upperleg", "lowerleg"]) => 6 + side,
         _ if starts(&["foot", "toe"]) => 8 + side,
         _ if starts(&["root", "spine", "pelvis", "neck", "clavicle", "shoulder", "breast"]) => 0,
-        // The head and everything in the face.
+        // The head and the face.
         _ => 1,
     }
 }

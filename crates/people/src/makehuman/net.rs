@@ -1,4 +1,4 @@
-//! Pieces of a body's surface: smoothed by subdivision, cut along seams.
+//! Pieces of a body's surface, which can be subdivided and cut.
 
 use std::collections::HashMap;
 
@@ -13,7 +13,7 @@ pub const PARTS: usize = 10;
 pub struct Vertex {
     pub rest: Vec3,
     pub posed: Vec3,
-    /// How much it belongs to each part.
+    /// Share of each part.
     pub parts: [f32; PARTS],
 }
 
@@ -28,18 +28,18 @@ impl Vertex {
         })
     }
 
-    /// The part that it belongs to most.
+    /// The part with the largest share.
     pub fn part(&self) -> usize {
         (1..PARTS).fold(0, |best, part| if self.parts[part] > self.parts[best] { part } else { best })
     }
 }
 
-/// Points as the tree wants them.
+/// Points in the form that [`tree`] is searched with.
 pub fn coordinates(points: impl IntoIterator<Item = Vec3>) -> Vec<[f32; 3]> {
     points.into_iter().map(|p| p.to_array()).collect()
 }
 
-/// Finds the nearest of many points.
+/// A tree for searches of the nearest of many points.
 pub fn tree(points: impl IntoIterator<Item = Vec3>) -> ImmutableKdTree<f32, 3> {
     ImmutableKdTree::new_from_slice(&coordinates(points)).expect("fewer points than u32 can number")
 }
@@ -53,27 +53,32 @@ pub struct Net {
 
 impl Net {
     /// The faces of a group, with only the vertices that they use.
-    pub fn of(vertices: impl Fn(u32) -> Vertex, faces: &[[u32; 4]]) -> Self {
+    pub fn of(vertices: &[Vertex], faces: &[[u32; 4]]) -> Self {
         let mut rows = HashMap::new();
         let mut net = Self::default();
         for face in faces {
             let corners = if face[3] == face[2] { &face[..3] } else { &face[..] };
-            let corners = corners.iter().map(|row| {
-                *rows.entry(*row).or_insert_with(|| {
-                    net.vertices.push(vertices(*row));
-                    net.vertices.len() as u32 - 1
-                })
-            });
-            net.faces.push(corners.collect());
+            let row = |row: &u32| *rows.entry(*row).or_insert_with(|| net.add(vertices[*row as usize]));
+            let face = corners.iter().map(row).collect();
+            net.faces.push(face);
         }
         net
     }
 
-    /// One step of Catmull and Clark's subdivision; borders stay smooth curves.
+    /// Adds a vertex and returns its row.
+    fn add(&mut self, vertex: Vertex) -> u32 {
+        self.vertices.push(vertex);
+        self.vertices.len() as u32 - 1
+    }
+
+    /// The faces, split into triangles.
+    pub fn triangles(&self) -> impl Iterator<Item = [u32; 3]> {
+        self.faces.iter().flat_map(|face| (1..face.len() - 1).map(move |i| [face[0], face[i], face[i + 1]]))
+    }
+
+    /// One step of Catmull and Clark's subdivision; borders become smooth curves.
     pub fn subdivide(&self) -> Self {
         let count = self.vertices.len();
-        let mut vertices = Vec::with_capacity(4 * count);
-        // Old vertices, then the faces' middles, then the edges'.
         let middles: Vec<Vertex> = self
             .faces
             .iter()
@@ -82,35 +87,33 @@ impl Net {
                 Vertex::mean(face.iter().map(|row| (share, self.vertices[*row as usize])))
             })
             .collect();
+        // Rows of the edges by their ends; ends and faces of each edge; edges and faces of each vertex.
         let mut rows: HashMap<(u32, u32), usize> = HashMap::new();
         let mut edges: Vec<((u32, u32), Vec<usize>)> = Vec::new();
+        let mut around: Vec<Vec<usize>> = vec![Vec::new(); count];
+        let mut touching: Vec<Vec<usize>> = vec![Vec::new(); count];
         for (index, face) in self.faces.iter().enumerate() {
             for (corner, a) in face.iter().enumerate() {
                 let b = face[(corner + 1) % face.len()];
                 let key = (*a.min(&b), *a.max(&b));
                 let row = *rows.entry(key).or_insert_with(|| {
+                    around[*a as usize].push(edges.len());
+                    around[b as usize].push(edges.len());
                     edges.push((key, Vec::new()));
                     edges.len() - 1
                 });
                 edges[row].1.push(index);
+                touching[*a as usize].push(index);
             }
-        }
-        let mut around: Vec<Vec<usize>> = vec![Vec::new(); count];
-        for (row, ((a, b), _)) in edges.iter().enumerate() {
-            around[*a as usize].push(row);
-            around[*b as usize].push(row);
-        }
-        let mut touching: Vec<Vec<usize>> = vec![Vec::new(); count];
-        for (index, face) in self.faces.iter().enumerate() {
-            face.iter().for_each(|row| touching[*row as usize].push(index));
         }
         let vertex = |row: u32| self.vertices[row as usize];
         let middle = |edge: usize| {
             let (a, b) = edges[edge].0;
             Vertex::mean([(0.5, vertex(a)), (0.5, vertex(b))])
         };
-        for row in 0..count {
-            let old = self.vertices[row];
+        // Old vertices, then the middles of the faces, then those of the edges.
+        let mut vertices = Vec::with_capacity(4 * count);
+        for (row, old) in self.vertices.iter().copied().enumerate() {
             let border: Vec<usize> =
                 around[row].iter().copied().filter(|edge| edges[*edge].1.len() != 2).collect();
             let n = touching[row].len() as f32;
@@ -121,7 +124,7 @@ impl Net {
                     Vertex::mean(faces.chain(edges).chain([((n - 3.0) / n, old)]))
                 }
                 2 => Vertex::mean([(0.5, old), (0.25, middle(border[0])), (0.25, middle(border[1]))]),
-                // Where pieces only touch.
+                // Pieces touch in a single vertex.
                 _ => old,
             });
         }
@@ -156,39 +159,30 @@ impl Net {
         normals.into_iter().map(Vec3::normalize_or_zero).collect()
     }
 
-    /// Triangles, and of those only what lies where `inside` is above 0: those across it are cut.
+    /// The region where `inside` is positive, as triangles; triangles across its border are cut.
     pub fn cut(&self, inside: impl Fn(&Vertex) -> f32) -> Self {
         let values: Vec<f32> = self.vertices.iter().map(inside).collect();
         let mut net = Self::default();
         let mut kept: HashMap<u32, u32> = HashMap::new();
         let mut cuts: HashMap<(u32, u32), u32> = HashMap::new();
-        for face in &self.faces {
-            for i in 1..face.len() - 1 {
-                let corners = [face[0], face[i], face[i + 1]];
-                let mut polygon: Vec<u32> = Vec::with_capacity(4);
-                for k in 0..3 {
-                    let (a, b) = (corners[k], corners[(k + 1) % 3]);
-                    let (fa, fb) = (values[a as usize], values[b as usize]);
-                    if fa > 0.0 {
-                        polygon.push(*kept.entry(a).or_insert_with(|| {
-                            net.vertices.push(self.vertices[a as usize]);
-                            net.vertices.len() as u32 - 1
-                        }));
-                    }
-                    if (fa > 0.0) != (fb > 0.0) {
-                        // Always from the smaller row, so that neighbours agree.
-                        polygon.push(*cuts.entry((a.min(b), a.max(b))).or_insert_with(|| {
-                            let (low, high) = (a.min(b) as usize, a.max(b) as usize);
-                            let t = values[low] / (values[low] - values[high]);
-                            let ends = [(1.0 - t, self.vertices[low]), (t, self.vertices[high])];
-                            net.vertices.push(Vertex::mean(ends));
-                            net.vertices.len() as u32 - 1
-                        }));
-                    }
+        for [a, b, c] in self.triangles() {
+            let mut polygon: Vec<u32> = Vec::with_capacity(4);
+            for (a, b) in [(a, b), (b, c), (c, a)] {
+                let (fa, fb) = (values[a as usize], values[b as usize]);
+                if fa > 0.0 {
+                    polygon.push(*kept.entry(a).or_insert_with(|| net.add(self.vertices[a as usize])));
                 }
-                for i in 1..polygon.len().saturating_sub(1) {
-                    net.faces.push(vec![polygon[0], polygon[i], polygon[i + 1]]);
+                if (fa > 0.0) != (fb > 0.0) {
+                    // From the smaller row to the larger, so that both triangles of an edge have the same cut.
+                    polygon.push(*cuts.entry((a.min(b), a.max(b))).or_insert_with(|| {
+                        let (low, high) = (a.min(b) as usize, a.max(b) as usize);
+                        let t = values[low] / (values[low] - values[high]);
+                        net.add(Vertex::mean([(1.0 - t, self.vertices[low]), (t, self.vertices[high])]))
+                    }));
                 }
+            }
+            for i in 1..polygon.len().saturating_sub(1) {
+                net.faces.push(vec![polygon[0], polygon[i], polygon[i + 1]]);
             }
         }
         net

@@ -1,10 +1,14 @@
-//! Bones of a morphed body, and the body in another pose (linear blend skinning).
+//! Bones of a morphed body, the body in another pose (linear blend skinning), and hands that sink into it.
 
 use glam::{Mat3, Vec3};
+use kiddo::SquaredEuclidean;
 
+use super::ORDER;
 use super::files::Library;
-use crate::math::{rotate_x, rotate_y, rotate_z};
+use super::net::{Net, coordinates, tree};
+use crate::math::{bounds, rotate_x, rotate_y, rotate_z};
 use crate::synth::figure::{Bone, Build, Figure, Pose, sign};
+use crate::synth::part::Kind;
 
 /// Joints of a morphed body in the pose of the base mesh.
 pub struct Joints<'a> {
@@ -27,8 +31,8 @@ impl<'a> Joints<'a> {
         self.library.bones.iter().position(|bone| bone.name == name)
     }
 
-    /// Where a bone begins; the middle of the body if the rig has no such bone.
-    fn head(&self, name: &str) -> Vec3 {
+    /// Start of a bone; the origin if the rig has no such bone.
+    pub fn head(&self, name: &str) -> Vec3 {
         self.row(name).map_or(Vec3::ZERO, |row| self.heads[row])
     }
 
@@ -36,23 +40,16 @@ impl<'a> Joints<'a> {
         self.row(name).map_or(Vec3::ZERO, |row| self.tails[row])
     }
 
-    pub fn eye(&self, side: usize) -> Vec3 {
-        self.head(&sided("eye", side))
-    }
-
     /// The box around the joints of the lips.
     pub fn mouth(&self) -> (Vec3, Vec3) {
         let lips =
             self.library.bones.iter().zip(&self.heads).filter(|(bone, _)| bone.name.starts_with("oris"));
-        let start = (Vec3::INFINITY, Vec3::NEG_INFINITY);
-        let (low, high) = lips.fold(start, |(low, high), (_, p)| (low.min(*p), high.max(*p)));
-        if low.is_finite() { (low, high) } else { (Vec3::ZERO, Vec3::ZERO) }
+        bounds(lips.map(|(_, head)| *head))
     }
 
-    /// The body as the synthetic people's figures are described. `crown` is the height of the top of the head; `middle`
-    /// says halfway between belly and back at a height, for the spine lies close under the back.
+    /// The figure of the body. `crown` is the height of the top of the head. `middle` returns z halfway between belly and
+    /// back at a height, since the spine lies close to the back.
     pub fn figure(&self, build: Build, crown: f32, middle: impl Fn(f32) -> f32) -> Figure {
-        let straight = |start: Vec3, end: Vec3| Bone { start, end, frame: Mat3::IDENTITY };
         let sides = [0, 1];
         let hips = sides.map(|side| self.head(&sided("upperleg01", side)));
         let inside = |joint: Vec3, share: f32| {
@@ -63,7 +60,6 @@ impl<'a> Joints<'a> {
         let base = inside(self.head("neck01"), 0.5);
         let skull = self.head("head");
         let chin = Vec3::new(skull.x, self.tail("jaw").y, skull.z);
-        let pelvis = straight(crotch, waist);
         let limb = |first: &str, last: &str, side: usize, hinge: Vec3| {
             let (start, end) = (self.head(&sided(first, side)), self.head(&sided(last, side)));
             Bone { start, end, frame: hanging(end - start, hinge) }
@@ -75,10 +71,10 @@ impl<'a> Joints<'a> {
         });
         Figure {
             fingers: 0.0,
-            pelvis,
-            chest: straight(waist, base),
-            neck: straight(base, chin),
-            head: straight(chin, Vec3::new(chin.x, crown, chin.z)),
+            pelvis: Bone::straight(crotch, waist),
+            chest: Bone::straight(waist, base),
+            neck: Bone::straight(base, chin),
+            head: Bone::straight(chin, Vec3::new(chin.x, crown, chin.z)),
             upper_arms: sides.map(|side| limb("upperarm01", "lowerarm01", side, hinges[side])),
             forearms: sides.map(|side| limb("lowerarm01", "wrist", side, hinges[side])),
             hands: sides.map(|side| {
@@ -89,14 +85,14 @@ impl<'a> Joints<'a> {
             calves: sides.map(|side| limb("lowerleg01", "foot", side, Vec3::X)),
             feet: sides.map(|side| {
                 let start = self.head(&sided("foot", side));
-                straight(start, start - 0.039 * build.stature * Vec3::Y)
+                Bone::straight(start, start - 0.039 * build.stature * Vec3::Y)
             }),
             build,
         }
     }
 
-    /// `positions` in `pose`; `rest` is the figure of the body as it stands.
-    pub fn pose(&self, positions: &[Vec3], rest: &Figure, pose: &Pose) -> Posed {
+    /// `positions` in `pose`, and the rotation and translation of the head. `rest` is the figure of the resting body.
+    pub fn pose(&self, positions: &[Vec3], rest: &Figure, pose: &Pose) -> (Vec<Vec3>, (Mat3, Vec3)) {
         let bones = &self.library.bones;
         let goal = Figure::new(rest.build.clone(), pose);
         let turned = |goal: &Bone, rest: &Bone| goal.frame * rest.frame.transpose();
@@ -124,7 +120,7 @@ impl<'a> Joints<'a> {
                 "neck02" => pose.head_frame(0.5),
                 "neck03" => pose.head_frame(0.75),
                 "head" => pose.head_frame(1.0),
-                // Shoulders rise with arms that are lifted.
+                // Shoulders rise with raised arms.
                 "clavicle" => parent_turn * rotate_z(sign(side) * pose.lift(side) * 0.35),
                 "shoulder01" => half(half(turned(&goal.upper_arms[side], &rest.upper_arms[side]))),
                 "upperarm01" => half(turned(&goal.upper_arms[side], &rest.upper_arms[side])),
@@ -133,7 +129,7 @@ impl<'a> Joints<'a> {
                 "upperleg01" => half(turned(&goal.thighs[side], &rest.thighs[side])),
                 "upperleg02" => turned(&goal.thighs[side], &rest.thighs[side]),
                 "lowerleg01" | "lowerleg02" => turned(&goal.calves[side], &rest.calves[side]),
-                // Toes already point a little outwards.
+                // The toes of the base mesh point a little outwards.
                 "foot" => goal.feet[side].frame * rotate_y(-sign(side) * 9.0),
                 _ if name.starts_with("finger") && !name.starts_with("finger1") => {
                     parent_turn * self.curl(name, side, pose.fingers)
@@ -149,26 +145,17 @@ impl<'a> Joints<'a> {
             self.library.weights[row].iter().map(|(bone, share)| *share * at(*bone as usize)).sum()
         };
         let head = self.row("head").unwrap_or(0);
-        Posed {
-            positions: (0..positions.len()).map(moved).collect(),
-            head: (turns[head], heads[head] - turns[head] * self.heads[head]),
-        }
+        let shift = heads[head] - turns[head] * self.heads[head];
+        ((0..positions.len()).map(moved).collect(), (turns[head], shift))
     }
 
-    /// A finger's joint bent towards the palm, around the axis of its bend in the base mesh.
+    /// Rotation of a finger's joint towards the palm, around the axis of its bend in the base mesh.
     fn curl(&self, name: &str, side: usize, degrees: f32) -> Mat3 {
         let finger = name.split('-').next().unwrap_or(name);
         let [a, b, c] = ["1", "2", "3"].map(|joint| self.head(&sided(&format!("{finger}-{joint}"), side)));
         let axis = (b - a).cross(c - b).normalize_or_zero();
         around(axis, 0.6 * degrees)
     }
-}
-
-/// A body in its pose.
-pub struct Posed {
-    pub positions: Vec<Vec3>,
-    /// How the head moved: turn, then shift.
-    pub head: (Mat3, Vec3),
 }
 
 /// A bone's name on one side.
@@ -183,7 +170,7 @@ fn hanging(down: Vec3, hinge: Vec3) -> Mat3 {
     Mat3::from_cols(right, up, right.cross(up))
 }
 
-/// A turn around an axis of length 1, or none around 0.
+/// A rotation around an axis of length 1; the identity for axis 0.
 fn around(axis: Vec3, degrees: f32) -> Mat3 {
     if axis == Vec3::ZERO {
         return Mat3::IDENTITY;
@@ -193,10 +180,37 @@ fn around(axis: Vec3, degrees: f32) -> Mat3 {
     frame * rotate_x(degrees) * frame.transpose()
 }
 
-/// The turn between two turns: their mean, made orthonormal.
+/// The rotation between two rotations: their mean, made orthonormal.
 fn halfway(a: Mat3, b: Mat3) -> Mat3 {
     let mean = (a + b) * 0.5;
     let x = mean.x_axis.normalize_or(a.x_axis);
     let y = (mean.y_axis - mean.y_axis.dot(x) * x).normalize_or(a.y_axis);
     Mat3::from_cols(x, y, x.cross(y))
+}
+
+/// Whether the left and the right hand of `body` lie in trunk or legs, or nearer to them than `gap` metres.
+pub fn sunk_hands(body: &Net, gap: f32) -> [bool; 2] {
+    /// One in so many vertices of a hand is checked.
+    const STEP: usize = 4;
+    /// Largest distance of a place inside the body from the nearest skin, metres.
+    const REACH: f32 = 0.07;
+    let normals = body.normals();
+    let owner = |row: &usize| ORDER[body.vertices[*row].part()];
+    let rows = 0..body.vertices.len();
+    let solid: Vec<usize> =
+        rows.clone().filter(|row| matches!(owner(row).0, Kind::Trunk | Kind::Leg)).collect();
+    if solid.is_empty() {
+        return [false; 2];
+    }
+    let tree = tree(solid.iter().map(|row| body.vertices[*row].posed));
+    [0, 1].map(|side| {
+        let hand = rows.clone().filter(|row| owner(row) == (Kind::Hand, side)).step_by(STEP);
+        let places = coordinates(hand.map(|row| body.vertices[row].posed));
+        let found = tree.query_batch(&places).nearest_one::<SquaredEuclidean<f32>>().execute();
+        places.iter().zip(&found).any(|(place, found)| {
+            let nearest = solid[found.item as usize];
+            let out = (Vec3::from(*place) - body.vertices[nearest].posed).dot(normals[nearest]);
+            found.distance < REACH * REACH && out < gap
+        })
+    })
 }

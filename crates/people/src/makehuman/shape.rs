@@ -1,12 +1,13 @@
-//! Bodies of all kinds: MakeHuman's macro mix of sex, age, descent, muscle, weight, height and proportions, and details.
+//! Shapes of bodies: MakeHuman's mix of sex, age, descent, muscle, weight, height and proportions, and details.
 
 use glam::Vec3;
 use rand::Rng;
 
-use super::files::Library;
 use snapsnap_base::FileError;
 
-/// Folders of details and how many of each a person gets at most.
+use super::files::Library;
+
+/// Folders of details, and the largest number of each per person.
 const DETAILS: [(&str, usize); 8] = [
     ("nose", 3),
     ("mouth", 3),
@@ -19,10 +20,10 @@ const DETAILS: [(&str, usize); 8] = [
 ];
 /// Strongest detail; 1 is the artist's extreme.
 const STRONGEST: f32 = 0.55;
-/// Details that make fairy-tale creatures, or move parts of the body off one another.
+/// Words in the names of details that are not used: unnatural shapes, and some that separate parts of the body.
 const UNUSUAL: [&str; 6] = ["pointed", "triangle", "pregnant", "trans", "angle-in", "age"];
 
-/// What the macro targets are mixed by.
+/// Shares of the macro targets.
 #[derive(Debug, Clone)]
 pub struct Mix {
     /// 0: female, 1: male.
@@ -50,7 +51,7 @@ impl Mix {
             let old = (age - 0.45).max(0.0) * between(0.4, 1.6);
             [0.0, 1.0 - old.min(1.0), old.min(1.0)]
         };
-        // Mostly of one descent.
+        // Mostly one descent.
         let shares = [(); 3].map(|()| between(0.0, 1.0)).map(|share| share * share * share + 1e-3);
         let sum: f32 = shares.iter().sum();
         Self {
@@ -121,7 +122,7 @@ fn details(library: &Library, random: &mut impl Rng) -> Result<Vec<(String, f32)
             }
             let name = &names[random.random_range(0..names.len())];
             found.push((format!("{folder}/{name}"), strength));
-            // Both sides alike.
+            // The same on the right side.
             if let Some(rest) = name.strip_prefix("l-") {
                 found.push((format!("{folder}/r-{rest}"), strength));
             }

@@ -1,13 +1,13 @@
-//! What a person is built of: trunk, head, hair, limbs, and cloth that hangs. Sizes are shares of the stature.
+//! The parts of a synthetic person: trunk, head, hair, limbs, and hanging cloth. Sizes are shares of the stature.
 
 use std::f32::consts::PI;
 
-use glam::{Mat3, Vec2, Vec3};
+use glam::{Mat3, Vec2, Vec3, Vec3Swizzles};
 
 use super::figure::{Bone, Figure, sign};
 use super::outfit::{Cut, Lower, Outfit};
 use super::part::{Drape, Kind, Layer, Marks, Part, Shape};
-use crate::math::sin_cos;
+use crate::math::{bounds, sin_cos};
 
 pub fn trunk(figure: &Figure, outfit: &Outfit) -> Part {
     let Figure { build, pelvis, chest, neck, .. } = figure;
@@ -17,40 +17,17 @@ pub fn trunk(figure: &Figure, outfit: &Outfit) -> Part {
     let waist = h * girth * (0.068 + 0.012 * sex + 0.012 * build.belly);
     let ribs = h * girth * (0.082 + 0.009 * sex) * build.shoulders;
     let mut shapes = vec![
-        Shape::capsule(pelvis.at(0.05, Vec3::ZERO), pelvis.end, [hips, waist], pelvis.frame, flat),
-        Shape::capsule(pelvis.end, chest.at(0.62, Vec3::ZERO), [waist, ribs], chest.frame, flat),
-        Shape::capsule(
-            chest.at(0.62, Vec3::ZERO),
-            chest.at(0.9, Vec3::ZERO),
-            [ribs, 0.058 * h],
-            chest.frame,
-            flat,
-        ),
-        Shape::capsule(
-            chest.at(0.86, Vec3::ZERO),
-            neck.at(0.3, Vec3::ZERO),
-            [0.05 * h, 0.034 * h],
-            chest.frame,
-            flat,
-        ),
-        Shape::capsule(
-            neck.start,
-            neck.end,
-            [0.033 * h * (0.9 + 0.15 * sex), 0.031 * h],
-            neck.frame,
-            Vec3::ONE,
-        ),
+        Shape::capsule(pelvis.point(0.05), pelvis.end, [hips, waist], pelvis.frame, flat),
+        Shape::capsule(pelvis.end, chest.point(0.62), [waist, ribs], chest.frame, flat),
+        Shape::capsule(chest.point(0.62), chest.point(0.9), [ribs, 0.058 * h], chest.frame, flat),
+        Shape::capsule(chest.point(0.86), neck.point(0.3), [0.05 * h, 0.034 * h], chest.frame, flat),
+        neck.capsule(neck.start, neck.end, [0.033 * h * (0.9 + 0.15 * sex), 0.031 * h]),
     ];
     for side in 0..2 {
         let shoulder = figure.upper_arms[side].start;
         let joint = chest.at(0.78, Vec3::new(sign(side) * 0.03 * h, 0.0, 0.0));
-        shapes.push(Shape::capsule(
-            joint,
-            shoulder,
-            [0.045 * h, 0.034 * h * girth],
-            chest.frame,
-            Vec3::new(1.0, 1.0, 0.9),
-        ));
+        let flat = Vec3::new(1.0, 1.0, 0.9);
+        shapes.push(Shape::capsule(joint, shoulder, [0.045 * h, 0.034 * h * girth], chest.frame, flat));
         let seat = pelvis.at(0.05, Vec3::new(sign(side) * 0.045 * h, -0.01 * h, -0.035 * h));
         shapes.push(Shape::ellipsoid(seat, Vec3::splat(0.055 * h * girth), pelvis.frame));
         if sex < 0.6 {
@@ -64,10 +41,9 @@ pub fn trunk(figure: &Figure, outfit: &Outfit) -> Part {
         let size = h * girth * (0.05 + 0.028 * build.belly);
         shapes.push(Shape::ellipsoid(belly, Vec3::new(1.15, 1.1, 0.9) * size, chest.frame));
     }
-    // The chart begins below the crotch, so that everything has a place on it.
-    let below = Bone { start: pelvis.at(-0.7, Vec3::ZERO), end: pelvis.end, frame: pelvis.frame };
-    let axis = vec![below, *chest, *neck];
-    let mut part = Part::new(Kind::Trunk, 0, shapes, 0.06, axis, 0.085 * h * girth);
+    // The chart begins below the crotch, so that it covers the whole trunk.
+    let axis = vec![Bone { start: pelvis.point(-0.7), ..*pelvis }, *chest, *neck];
+    let mut part = Part::new(Kind::Trunk, shapes, 0.06, axis, 0.085 * h * girth);
     let marks = Marks::of(figure, outfit);
     let mut top = Layer::new(marks.hem..marks.collar, outfit.top_thickness, 0.0, outfit.folds);
     top.drop = marks.neckline;
@@ -78,30 +54,19 @@ pub fn trunk(figure: &Figure, outfit: &Outfit) -> Part {
 
 pub fn head(figure: &Figure, outfit: &Outfit) -> Part {
     let Figure { head, neck, build, .. } = figure;
-    let size = (head.end - head.start).length();
+    let size = head.length();
     let f = head.frame;
     let at = |x: f32, y: f32, z: f32| head.at(0.0, size * Vec3::new(x, y, z));
     let ball = |x: f32, y: f32, z: f32, r: [f32; 3]| Shape::ellipsoid(at(x, y, z), size * Vec3::from(r), f);
-    let jaw = 0.2 + 0.03 * build.sex;
+    let face = [0.29 * size, (0.2 + 0.03 * build.sex) * size * 0.75];
+    let nose = [0.03 * size, 0.055 * size];
     let mut shapes = vec![
         ball(0.0, 0.62, -0.03, [0.345, 0.38, 0.42]),
-        Shape::capsule(
-            at(0.0, 0.5, 0.12),
-            at(0.0, 0.06, 0.27),
-            [0.29 * size, jaw * size * 0.75],
-            f,
-            Vec3::new(1.0, 1.0, 0.85),
-        ),
-        Shape::capsule(at(0.0, 0.3, 0.0), neck.at(0.4, Vec3::ZERO), [0.24 * size, 0.21 * size], f, Vec3::ONE),
+        Shape::capsule(at(0.0, 0.5, 0.12), at(0.0, 0.06, 0.27), face, f, Vec3::new(1.0, 1.0, 0.85)),
+        head.capsule(at(0.0, 0.3, 0.0), neck.point(0.4), [0.24 * size, 0.21 * size]),
         // Nose, brow, lips.
-        Shape::capsule(
-            at(0.0, 0.5, 0.37),
-            at(0.0, 0.31, 0.475),
-            [0.03 * size, 0.055 * size],
-            f,
-            Vec3::new(0.9, 1.0, 1.0),
-        ),
-        Shape::capsule(at(-0.16, 0.545, 0.33), at(0.16, 0.545, 0.33), [0.04 * size; 2], f, Vec3::ONE),
+        Shape::capsule(at(0.0, 0.5, 0.37), at(0.0, 0.31, 0.475), nose, f, Vec3::new(0.9, 1.0, 1.0)),
+        head.capsule(at(-0.16, 0.545, 0.33), at(0.16, 0.545, 0.33), [0.04 * size; 2]),
         ball(0.0, 0.185, 0.385, [0.1, 0.035, 0.05]),
     ];
     for side in [-1.0, 1.0] {
@@ -109,30 +74,28 @@ pub fn head(figure: &Figure, outfit: &Outfit) -> Part {
         shapes.push(ball(side * 0.165, 0.35, 0.24, [0.1, 0.1, 0.11]));
     }
     if outfit.glasses {
-        for side in [-1.0, 1.0] {
-            shapes.push(ball(side * 0.16, 0.45, 0.41, [0.12, 0.1, 0.035]));
-        }
+        shapes.extend([-1.0, 1.0].map(|side| ball(side * 0.16, 0.45, 0.41, [0.12, 0.1, 0.035])));
     }
-    let mut part = Part::new(Kind::Head, 0, shapes, 0.014, vec![*head], 0.36 * size);
+    let mut part = Part::new(Kind::Head, shapes, 0.014, vec![*head], 0.36 * size);
     part.joint = 0.02;
     part
 }
 
-pub fn hair(figure: &Figure, outfit: &Outfit) -> Vec<Part> {
-    let head = &figure.head;
-    let size = (head.end - head.start).length();
+/// Returns `None` for a bald head.
+pub fn hair(figure: &Figure, outfit: &Outfit) -> Option<Part> {
+    let Figure { head, chest, build, .. } = figure;
+    let size = head.length();
     let f = head.frame;
     let at = |x: f32, y: f32, z: f32| head.at(0.0, size * Vec3::new(x, y, z));
     let ball = |x: f32, y: f32, z: f32, r: [f32; 3]| Shape::ellipsoid(at(x, y, z), size * Vec3::from(r), f);
     let lock = |a: Vec3, b: Vec3, r: [f32; 2], flat: [f32; 3]| {
         Shape::capsule(a, b, r.map(|r| r * size), f, Vec3::from(flat))
     };
-    // Higher at the forehead, lower at the back, ears free.
+    // High at the forehead, low at the back, ears free.
     let crown = |thick: f32| ball(0.0, 0.68, -0.075, [0.345 + thick, 0.355 + thick, 0.4 + thick]);
     let nape = |thick: f32| ball(0.0, 0.46, -0.2, [0.29 + thick, 0.3 + thick, 0.25 + thick]);
-    let chest = &figure.chest;
     let shapes = match outfit.cut {
-        Cut::Bald => return Vec::new(),
+        Cut::Bald => return None,
         Cut::Short => vec![crown(0.03), nape(0.02)],
         Cut::Curls => vec![crown(0.12), nape(0.07)],
         Cut::Cap => vec![
@@ -154,7 +117,7 @@ pub fn hair(figure: &Figure, outfit: &Outfit) -> Vec<Part> {
             lock(at(-0.32, 0.55, -0.12), at(-0.3, 0.05, -0.12), [0.14, 0.12], [0.7, 1.0, 1.3]),
             lock(
                 at(0.0, 0.4, -0.3),
-                chest.at(0.72, Vec3::new(0.0, 0.0, -0.1 * figure.build.stature * figure.build.girth * 0.68)),
+                chest.at(0.72, Vec3::new(0.0, 0.0, -0.1 * build.stature * build.girth * 0.68)),
                 [0.33, 0.3],
                 [1.0, 1.0, 0.4],
             ),
@@ -167,99 +130,65 @@ pub fn hair(figure: &Figure, outfit: &Outfit) -> Vec<Part> {
             lock(at(0.0, 0.55, -0.62), at(0.0, -0.1, -0.55), [0.12, 0.05], [1.0; 3]),
         ],
     };
-    let mut part = Part::new(Kind::Hair, 0, shapes, 0.03, vec![*head], 0.42 * size);
+    let mut part = Part::new(Kind::Hair, shapes, 0.03, vec![*head], 0.42 * size);
     if outfit.cut != Cut::Cap {
         // Strands and curls.
         let folds = if outfit.cut == Cut::Curls { 0.011 } else { 0.0035 };
         part.layers.push(Layer::new(-9.0..9.0, 0.0, 0.0, folds));
     }
-    vec![part]
+    Some(part)
 }
 
 pub fn arm(figure: &Figure, outfit: &Outfit, side: usize) -> Part {
-    let (upper, fore) = (&figure.upper_arms[side], &figure.forearms[side]);
-    let Figure { build, .. } = figure;
+    let (build, upper, fore) = (&figure.build, &figure.upper_arms[side], &figure.forearms[side]);
     let r = build.stature * build.girth * (0.9 + 0.15 * build.sex);
     let shapes = vec![
-        Shape::capsule(upper.start, upper.end, [0.032 * r, 0.0245 * r], upper.frame, Vec3::ONE),
-        Shape::capsule(
-            upper.at(0.25, Vec3::ZERO),
-            upper.at(0.65, 0.005 * r * Vec3::Z),
-            [0.028 * r, 0.027 * r],
-            upper.frame,
-            Vec3::ONE,
-        ),
-        Shape::capsule(fore.start, fore.at(0.4, Vec3::ZERO), [0.0245 * r, 0.0255 * r], fore.frame, Vec3::ONE),
-        Shape::capsule(fore.at(0.4, Vec3::ZERO), fore.end, [0.0255 * r, 0.0165 * r], fore.frame, Vec3::ONE),
+        upper.capsule(upper.start, upper.end, [0.032 * r, 0.0245 * r]),
+        upper.capsule(upper.point(0.25), upper.at(0.65, 0.005 * r * Vec3::Z), [0.028 * r, 0.027 * r]),
+        fore.capsule(fore.start, fore.point(0.4), [0.0245 * r, 0.0255 * r]),
+        fore.capsule(fore.point(0.4), fore.end, [0.0255 * r, 0.0165 * r]),
     ];
-    let mut part = Part::new(Kind::Arm, side, shapes, 0.01, vec![*upper, *fore], 0.03 * r);
+    let mut part = Part::new(Kind::Arm, shapes, 0.01, vec![*upper, *fore], 0.03 * r);
     part.joint = 0.07;
-    part.layers.push(Layer::new(
-        -1.0..outfit.sleeve * part.length,
-        outfit.top_thickness,
-        outfit.sleeve_flare,
-        outfit.folds,
-    ));
+    let sleeve = -1.0..outfit.sleeve * part.length;
+    part.layers.push(Layer::new(sleeve, outfit.top_thickness, outfit.sleeve_flare, outfit.folds));
     part
 }
 
 pub fn hand(figure: &Figure, side: usize) -> Part {
     let hand = &figure.hands[side];
-    let length = (hand.end - hand.start).length();
+    let length = hand.length();
     let inwards = -sign(side);
     let at = |x: f32, y: f32, z: f32| hand.at(0.0, length * Vec3::new(x, y, z));
-    let mut shapes = vec![Shape::capsule(
-        at(0.0, 0.08, 0.0),
-        at(0.0, -0.36, 0.0),
-        [0.19 * length, 0.235 * length],
-        hand.frame,
-        Vec3::new(1.0, 1.0, 0.55),
-    )];
+    let (palm, flat) = ([0.19 * length, 0.235 * length], Vec3::new(1.0, 1.0, 0.55));
+    let mut shapes = vec![Shape::capsule(at(0.0, 0.08, 0.0), at(0.0, -0.36, 0.0), palm, hand.frame, flat)];
     // Palms face backwards in the hand's frame; fingers curl towards the palm.
     let (curl_sin, curl_cos) = sin_cos(figure.fingers * PI / 180.0);
     for (i, reach) in [0.43, 0.5, 0.47, 0.37].into_iter().enumerate() {
         let x = inwards * (0.165 - 0.11 * i as f32);
         let knuckle = at(x, -0.46, 0.0);
         let tip = knuckle + hand.frame * Vec3::new(x * 0.25, -curl_cos * reach, -curl_sin * reach) * length;
-        shapes.push(Shape::capsule(knuckle, tip, [0.075 * length, 0.055 * length], hand.frame, Vec3::ONE));
+        shapes.push(hand.capsule(knuckle, tip, [0.075 * length, 0.055 * length]));
     }
-    let thumb = at(inwards * 0.3, -0.42, -0.1);
-    shapes.push(Shape::capsule(
-        at(inwards * 0.13, -0.1, -0.02),
-        thumb,
-        [0.09 * length, 0.06 * length],
-        hand.frame,
-        Vec3::ONE,
-    ));
-    let mut part = Part::new(Kind::Hand, side, shapes, 0.008, vec![*hand], 0.2 * length);
+    let (root, tip) = (at(inwards * 0.13, -0.1, -0.02), at(inwards * 0.3, -0.42, -0.1));
+    shapes.push(hand.capsule(root, tip, [0.09 * length, 0.06 * length]));
+    let mut part = Part::new(Kind::Hand, shapes, 0.008, vec![*hand], 0.2 * length);
     part.joint = 0.02;
     part
 }
 
 pub fn leg(figure: &Figure, outfit: &Outfit, side: usize) -> Part {
-    let (thigh, calf) = (&figure.thighs[side], &figure.calves[side]);
-    let Figure { build, .. } = figure;
+    let (build, thigh, calf) = (&figure.build, &figure.thighs[side], &figure.calves[side]);
     let r = build.stature * build.girth;
     let hip = 0.058 - 0.004 * build.sex;
+    let back = |along: f32, offset: f32| calf.at(along, -offset * r * Vec3::Z);
     let shapes = vec![
-        Shape::capsule(thigh.start, thigh.end, [hip * r, 0.034 * r], thigh.frame, Vec3::ONE),
-        Shape::capsule(
-            thigh.at(0.1, Vec3::ZERO),
-            thigh.at(0.6, 0.006 * r * Vec3::Z),
-            [0.053 * r, 0.043 * r],
-            thigh.frame,
-            Vec3::ONE,
-        ),
-        Shape::capsule(calf.start, calf.end, [0.034 * r, 0.0225 * r], calf.frame, Vec3::ONE),
-        Shape::capsule(
-            calf.at(0.15, -0.01 * r * Vec3::Z),
-            calf.at(0.45, -0.012 * r * Vec3::Z),
-            [0.03 * r, 0.029 * r],
-            calf.frame,
-            Vec3::ONE,
-        ),
+        thigh.capsule(thigh.start, thigh.end, [hip * r, 0.034 * r]),
+        thigh.capsule(thigh.point(0.1), thigh.at(0.6, 0.006 * r * Vec3::Z), [0.053 * r, 0.043 * r]),
+        calf.capsule(calf.start, calf.end, [0.034 * r, 0.0225 * r]),
+        calf.capsule(back(0.15, 0.01), back(0.45, 0.012), [0.03 * r, 0.029 * r]),
     ];
-    let mut part = Part::new(Kind::Leg, side, shapes, 0.012, vec![*thigh, *calf], 0.042 * r);
+    let mut part = Part::new(Kind::Leg, shapes, 0.012, vec![*thigh, *calf], 0.042 * r);
     part.joint = 0.045;
     if let Lower::Trousers { length, flare } = outfit.lower {
         part.layers.push(Layer::new(-1.0..length * part.length, outfit.lower_thickness, flare, outfit.folds));
@@ -282,24 +211,24 @@ pub fn foot(figure: &Figure, outfit: &Outfit, side: usize) -> Part {
         Shape::capsule(at(0.0, 0.01, -0.008), heel, [0.023 * h, 0.025 * h], f, Vec3::new(0.9, 1.0, 1.0)),
         Shape::capsule(heel, ball, [0.0235 * h, 0.0255 * h], f, flat),
         Shape::capsule(ball, toes, [0.0265 * h, 0.019 * h], f, flat),
-        Shape::capsule(at(0.0, 0.0, 0.0), at(0.0, -0.02, 0.06), [0.024 * h, 0.018 * h], f, Vec3::ONE),
+        foot.capsule(at(0.0, 0.0, 0.0), at(0.0, -0.02, 0.06), [0.024 * h, 0.018 * h]),
     ];
     // Along the sole: right, towards the toes, up.
     let along = Mat3::from_cols(-f.x_axis, f.z_axis, f.y_axis);
     let axis = Bone { start: heel, end: toes, frame: along };
-    let mut part = Part::new(Kind::Foot, side, shapes, 0.025, vec![axis], 0.028 * h);
+    let mut part = Part::new(Kind::Foot, shapes, 0.025, vec![axis], 0.028 * h);
     part.layers.push(Layer::new(-9.0..9.0, outfit.shoe_thickness, 0.0, 0.0));
     part
 }
 
-/// Skirts, and the tails of coats.
+/// Skirts and the tails of coats.
 pub fn drapes(figure: &Figure, outfit: &Outfit) -> Vec<Part> {
     let mut wanted = Vec::new();
     if let Lower::Skirt { length, flare, folds } = outfit.lower {
         wanted.push((length, flare, folds as f32, outfit.lower_thickness));
     }
     if outfit.top_length > 1.0 {
-        // Beyond the crotch, in shares of the leg.
+        // Length beyond the crotch, as a share of the leg.
         let length = 0.1 + 0.16 * (outfit.top_length - 1.0);
         wanted.push((length, 0.12, 7.0, outfit.lower_thickness + outfit.top_thickness));
     }
@@ -311,21 +240,13 @@ pub fn drapes(figure: &Figure, outfit: &Outfit) -> Vec<Part> {
         let bottom = pelvis.start.y - length * leg;
         let top = waist.y + 0.01;
         // Wide enough for the legs at every height down to the hem.
-        let mut centre = Vec2::ZERO;
-        let mut reach = Vec2::splat(0.0);
-        let points: Vec<Vec3> = (0..2)
-            .flat_map(|side| {
-                [&thighs[side], &calves[side]]
-                    .into_iter()
-                    .flat_map(|bone| (0..=10).map(|i| bone.at(i as f32 / 10.0, Vec3::ZERO)))
-            })
-            .filter(|p| p.y > bottom - 0.02)
-            .collect();
-        if let Some(first) = points.first() {
-            let (low, high) = points.iter().fold((*first, *first), |(l, h), p| (l.min(*p), h.max(*p)));
-            let middle = (low + high) / 2.0;
-            centre = Vec2::new(middle.x, middle.z);
-            reach = Vec2::new(high.x - low.x, high.z - low.z) / 2.0;
+        let bones = thighs.iter().chain(calves);
+        let points = bones.flat_map(|bone| (0..=10).map(|i| bone.point(i as f32 / 10.0)));
+        let (low, high) = bounds(points.filter(|p| p.y > bottom - 0.02));
+        let (mut centre, mut reach) = (Vec2::ZERO, Vec2::ZERO);
+        if low.is_finite() {
+            centre = (low + high).xz() / 2.0;
+            reach = (high - low).xz() / 2.0;
         }
         let hips = h * girth * (0.098 - 0.008 * build.sex);
         let limb = 0.058 * h * girth + 0.012 + thickness;
@@ -333,22 +254,22 @@ pub fn drapes(figure: &Figure, outfit: &Outfit) -> Vec<Part> {
         let hem = (1.15 * reach + Vec2::splat(limb)).max(Vec2::new(1.0 + flare, 0.8 + flare) * hips);
         let top_radii = Vec2::new(1.0, 0.8) * h * girth * (0.072 + 0.012 * build.sex + 0.012 * build.belly)
             + Vec2::splat(thickness + 0.004);
-        // The hips must fit as well, though the cone is straight from waist to hem.
+        // Wide enough for the hips: the cone is straight from waist to hem.
         let down = (waist.y - pelvis.start.y) / (waist.y - bottom);
         let needed =
             (Vec2::new(0.12, 0.116) * h * girth + Vec2::splat(thickness) - (1.0 - down) * top_radii) / down;
         let drape = Drape {
             top,
             bottom,
-            ends: [(Vec2::new(waist.x, waist.z), top_radii), (centre, hem.max(needed.min(hem * 1.6)))],
+            ends: [(waist.xz(), top_radii), (centre, hem.max(needed.min(hem * 1.6)))],
             folds,
             depth: 0.03 + 0.05 * flare.min(0.6),
             seed: outfit.seed ^ 0x5eed,
         };
         let middle = Vec3::new(waist.x, top, waist.z);
-        let axis = Bone { start: middle, end: middle - Vec3::Y * (top - bottom), frame: Mat3::IDENTITY };
+        let axis = Bone::straight(middle, middle - Vec3::Y * (top - bottom));
         let radius = hem.element_sum() / 2.0;
-        let mut part = Part::new(Kind::Skirt, 0, Vec::new(), 0.02, vec![axis], radius);
+        let mut part = Part::new(Kind::Skirt, Vec::new(), 0.02, vec![axis], radius);
         part.drape = Some(drape);
         part.side = usize::from(outfit.top_length > 1.0);
         part

@@ -1,4 +1,4 @@
-//! The texture of a body: the charts of its parts side by side in one picture.
+//! The texture of a body: one picture with the charts of its parts side by side.
 
 use std::collections::HashMap;
 use std::f32::consts::PI;
@@ -13,16 +13,16 @@ use super::paint::Painter;
 use super::surface::Surface;
 use snapsnap_mesh::mesh::{Face, Material, Mesh};
 
-/// Metres per texel: finer than a pixel of the sharpest views.
+/// Metres per texel, finer than a pixel of the sharpest views.
 const TEXEL: f32 = 0.0016;
-/// Charts go round a little further than once, so that no triangle is cut at their ends.
+/// Radians by which charts extend beyond a full turn at each end, so that no triangle is cut.
 const OVERLAP: f32 = 0.5;
 /// Texels between charts.
 const GAP: usize = 4;
 /// Smallest width of the picture.
 const WIDTH: usize = 1024;
 
-/// Where a part's chart lies in the picture.
+/// Place of a part's chart in the picture.
 #[derive(Clone, Copy, Default)]
 struct Chart {
     /// Left and top texel.
@@ -34,48 +34,31 @@ struct Chart {
     step: [f32; 2],
 }
 
-impl Chart {
-    /// Texel coordinates of a place on the part.
-    fn texel(&self, angle: f32, along: f32) -> Vec2 {
-        let x = (angle + PI + OVERLAP) / self.step[0];
-        let y = (along - self.first) / self.step[1];
-        Vec2::new(self.origin[0] as f32 + x, self.origin[1] as f32 + y)
-    }
-}
-
-/// The mesh of `surface` with its texture.
+/// The faces of `surface` as a mesh with a texture; the caller adds the positions.
 pub fn paint(body: &Body, surface: &Surface, painter: &Painter) -> Mesh {
-    let parts = body.parts.len();
-    // The part that most corners of a face lie on.
-    let owners: Vec<u8> = surface
+    // Of each face: the part of most corners, and the places of the corners on its chart.
+    let charted: Vec<(usize, [(f32, f32); 3])> = surface
         .faces
         .par_iter()
         .map(|face| {
             let [a, b, c] = face.map(|row| surface.parts[row as usize]);
-            if b == c { b } else { a }
-        })
-        .collect();
-    // Where each corner lies on the chart of its face's part.
-    let places: Vec<[(f32, f32); 3]> = surface
-        .faces
-        .par_iter()
-        .zip(&owners)
-        .map(|(face, owner)| {
-            let part = &body.parts[*owner as usize];
-            let mut places = face.map(|row| part.chart(surface.positions[row as usize]));
+            let owner = usize::from(if b == c { b } else { a });
+            let mut places = face.map(|row| body.parts[owner].chart(surface.positions[row as usize]));
             let first = places[0].0;
             for place in &mut places[1..] {
                 // The short way round.
                 place.0 -= 2.0 * PI * ((place.0 - first) / (2.0 * PI)).round();
             }
-            places
+            (owner, places)
         })
         .collect();
 
-    let mut spans = vec![(f32::INFINITY, f32::NEG_INFINITY); parts];
-    for (place, owner) in places.iter().flatten().zip(owners.iter().flat_map(|o| [o; 3])) {
-        let span = &mut spans[*owner as usize];
-        *span = (span.0.min(place.1), span.1.max(place.1));
+    let mut spans = vec![(f32::INFINITY, f32::NEG_INFINITY); body.parts.len()];
+    for (owner, places) in &charted {
+        for (_, along) in places {
+            let (low, high) = &mut spans[*owner];
+            (*low, *high) = (low.min(*along), high.max(*along));
+        }
     }
     let (charts, size) = pack(body, &spans);
 
@@ -104,14 +87,16 @@ pub fn paint(body: &Body, surface: &Surface, painter: &Painter) -> Mesh {
     };
     let mut rows = HashMap::new();
     let scale = Vec2::new(size[0] as f32, size[1] as f32);
-    for ((face, owner), places) in surface.faces.iter().zip(&owners).zip(&places) {
-        let chart = &charts[*owner as usize];
+    for (face, (owner, places)) in surface.faces.iter().zip(&charted) {
+        let chart = &charts[*owner];
         let texcoords = [0, 1, 2].map(|corner| {
             let (angle, along) = places[corner];
             let turns = (angle / (2.0 * PI)).round() as i32;
             *rows.entry((face[corner], *owner, turns)).or_insert_with(|| {
-                let texel = chart.texel(angle.clamp(-PI - OVERLAP, PI + OVERLAP), along) / scale;
-                mesh.texcoords.push(Vec2::new(texel.x, 1.0 - texel.y));
+                let x = (angle.clamp(-PI - OVERLAP, PI + OVERLAP) + PI + OVERLAP) / chart.step[0];
+                let y = (along - chart.first) / chart.step[1];
+                let [left, top] = chart.origin.map(|texel| texel as f32);
+                mesh.texcoords.push(Vec2::new((left + x) / scale.x, 1.0 - (top + y) / scale.y));
                 mesh.texcoords.len() as u32 - 1
             })
         });
@@ -120,7 +105,7 @@ pub fn paint(body: &Body, surface: &Surface, painter: &Painter) -> Mesh {
     mesh
 }
 
-/// Charts in shelves, the highest first.
+/// Arranges charts in shelves, the highest first. Also returns width and height of the picture.
 fn pack(body: &Body, spans: &[(f32, f32)]) -> (Vec<Chart>, [usize; 2]) {
     let mut charts: Vec<Chart> = body
         .parts

@@ -1,12 +1,12 @@
-//! The body and its clothes as signed distances: the union of its parts.
+//! Signed distances of a body with its clothes, the union of its parts.
 
-use glam::{Vec2, Vec3};
+use glam::Vec3;
 
 use super::anatomy;
 use super::figure::Figure;
 use super::outfit::Outfit;
 use super::part::{Kind, Layer, Part};
-use crate::math::{smooth_min, smoothstep};
+use crate::math::{bounds, smooth_min, smoothstep};
 
 /// A dressed person.
 #[derive(Debug, Clone)]
@@ -15,18 +15,18 @@ pub struct Body {
     pub parts: Vec<Part>,
 }
 
-/// Below the top's hem the trunk's chart goes on for so many metres, lest the hem be cut off by the legs' charts.
+/// Metres by which the trunk's chart continues below the top's hem, so that the legs' charts do not cut off the hem.
 const HEM_REACH: f32 = 0.04;
-/// Cloth is at most this thick, with everything that folds and flares add.
+/// Largest thickness of cloth, metres, with folds and flares.
 const THICKEST: f32 = 0.08;
 
 impl Body {
-    /// Signed distance and the part that is nearest. Where all of the body is further than `enough`, any number between
-    /// `enough` and the distance.
+    /// Signed distance, and the row of the nearest part. If the distance exceeds `enough`, a number between the two may
+    /// take its place.
     pub fn distance(&self, p: Vec3, enough: f32) -> (f32, usize) {
         let mut union = f32::INFINITY;
         let mut nearest = (f32::INFINITY, 0);
-        // What skirts hang over.
+        // Distance to trunk and legs, which skirts hang over.
         let mut hips = f32::INFINITY;
         for (index, part) in self.parts.iter().enumerate() {
             let outside = (p - part.bound.0).length() - part.bound.1 - THICKEST;
@@ -40,12 +40,12 @@ impl Body {
             }
             match part.kind {
                 Kind::Trunk | Kind::Leg => hips = hips.min(d),
-                // Cloth does not show every edge of what fills it.
+                // A skirt smooths the edges of the body below it.
                 Kind::Skirt if hips.is_finite() => d = smooth_min(d, hips, 0.05),
                 _ => {}
             }
             let joint = if part.joint > 0.0 {
-                // Limbs flow into the trunk where they begin and pass it freely further on.
+                // Limbs are joined smoothly to the trunk at their start only.
                 let along = part.chart(p).1;
                 part.joint * (1.0 - smoothstep(0.0, 0.5 * part.length, along)) + 0.004
             } else {
@@ -56,15 +56,15 @@ impl Body {
         (union, nearest.1)
     }
 
-    /// The part whose chart is laid over a place on the surface: mostly the nearest, but hips that fill a skirt show the
-    /// skirt's cloth, and thighs that lie higher than the top's hem show the trunk's.
+    /// Row of the part whose chart colours a place on the surface. It is the nearest part with two exceptions: hips that
+    /// fill a skirt have the skirt's cloth, and thighs above the top's hem have the trunk's.
     pub fn owner(&self, p: Vec3, cell: f32) -> usize {
         let nearest = self.distance(p, 4.0 * cell).1;
         let kind = self.parts[nearest].kind;
         if !matches!(kind, Kind::Trunk | Kind::Leg) {
             return nearest;
         }
-        // The outer one is the last.
+        // The outermost skirt is the last.
         let hangs = |part: &Part| part.drape.is_some_and(|drape| p.y > drape.bottom && p.y < drape.top);
         if let Some(row) = self.parts.iter().rposition(hangs) {
             return row;
@@ -74,7 +74,7 @@ impl Body {
         if kind == Kind::Leg && trunk.layers.first().is_some_and(is_high) { 0 } else { nearest }
     }
 
-    /// Distance to what hands must not sink into: trunk, legs and what hangs over them.
+    /// Distance to trunk, legs and skirts, which hands must not sink into.
     pub fn trunk_distance(&self, p: Vec3) -> f32 {
         let solid =
             self.parts.iter().filter(|part| matches!(part.kind, Kind::Trunk | Kind::Leg | Kind::Skirt));
@@ -83,31 +83,30 @@ impl Body {
 
     /// A box around everything.
     pub fn bounds(&self) -> (Vec3, Vec3) {
-        let start = (Vec3::INFINITY, Vec3::NEG_INFINITY);
-        self.parts.iter().fold(start, |(low, high), part| {
-            if let Some(drape) = &part.drape {
-                let reach = |(c, r): (Vec2, Vec2)| (c - r * 1.3, c + r * 1.3);
-                let [(a, b), (c, d)] = drape.ends.map(reach);
-                let (from, to) = (a.min(c), b.max(d));
-                let low = low.min(Vec3::new(from.x, drape.bottom, from.y));
-                return (low, high.max(Vec3::new(to.x, drape.top, to.y)));
-            }
-            part.shapes.iter().fold((low, high), |(low, high), shape| {
-                let reach = Vec3::splat(shape.bound.1 + THICKEST);
-                (low.min(shape.bound.0 - reach), high.max(shape.bound.0 + reach))
+        let drapes = self.parts.iter().filter_map(|part| part.drape).flat_map(|drape| {
+            let [top, bottom] = drape.ends;
+            [(top, drape.top), (bottom, drape.bottom)].into_iter().flat_map(|((centre, radii), y)| {
+                [centre - radii * 1.3, centre + radii * 1.3].map(|p| Vec3::new(p.x, y, p.y))
             })
-        })
+        });
+        let shapes = self.parts.iter().flat_map(|part| &part.shapes).flat_map(|shape| {
+            let (centre, reach) = (shape.bound.0, Vec3::splat(shape.bound.1 + THICKEST));
+            [centre - reach, centre + reach]
+        });
+        bounds(drapes.chain(shapes))
     }
 
-    /// The person in the clothes.
+    /// The body of `figure` in the clothes of `outfit`.
     pub fn new(figure: &Figure, outfit: &Outfit) -> Self {
         let mut parts = vec![anatomy::trunk(figure, outfit), anatomy::head(figure, outfit)];
         parts.extend(anatomy::hair(figure, outfit));
         for side in 0..2 {
-            parts.push(anatomy::arm(figure, outfit, side));
-            parts.push(anatomy::hand(figure, side));
-            parts.push(anatomy::leg(figure, outfit, side));
-            parts.push(anatomy::foot(figure, outfit, side));
+            let (arm, leg) = (anatomy::arm(figure, outfit, side), anatomy::leg(figure, outfit, side));
+            let (hand, foot) = (anatomy::hand(figure, side), anatomy::foot(figure, outfit, side));
+            for mut limb in [arm, hand, leg, foot] {
+                limb.side = side;
+                parts.push(limb);
+            }
         }
         parts.extend(anatomy::drapes(figure, outfit));
         for (index, part) in parts.iter_mut().enumerate() {

@@ -1,4 +1,4 @@
-//! Proportions and pose: where the joints of a person are.
+//! Proportions and pose, and the bones that follow from them.
 
 use glam::{Mat3, Vec3};
 use rand::Rng;
@@ -10,11 +10,11 @@ use crate::math::{rotate_x, rotate_y, rotate_z};
 pub struct Build {
     /// Stature in metres.
     pub stature: f32,
-    /// 0: as most women, 1: as most men.
+    /// 0: proportions of most women, 1: of most men.
     pub sex: f32,
     /// Girth of limbs and trunk, 1 on average.
     pub girth: f32,
-    /// How far the belly stands out, 0 to 1.
+    /// Size of the belly, 0 to 1.
     pub belly: f32,
     /// Lengths of legs and arms and breadth of the shoulders, 1 on average.
     pub legs: f32,
@@ -45,13 +45,13 @@ impl Build {
 /// Angles in degrees. Arrays hold the left side (towards +x) and the right.
 #[derive(Debug, Clone, Default)]
 pub struct Pose {
-    /// Lean forward, turn and lean aside of the trunk.
+    /// Trunk: lean forwards, turn, lean aside.
     trunk: [f32; 3],
-    /// Nod, turn and tilt of the head.
+    /// Head: nod, turn, tilt.
     head: [f32; 3],
-    /// Raised aside, raised forward, turned inwards; bend of the elbow.
+    /// Arms: raised aside, raised forwards, turned inwards; bend of the elbow.
     arms: [[f32; 4]; 2],
-    /// Forward and aside; bend of the knee.
+    /// Legs: raised forwards, raised aside; bend of the knee.
     legs: [[f32; 3]; 2],
     /// Curl of the fingers.
     pub fingers: f32,
@@ -71,7 +71,7 @@ impl Pose {
             *leg = [between(-3.0, 6.0), stance + between(-1.0, 1.0), between(0.0, 8.0)];
         }
         let kind = between(0.0, 1.0);
-        // Arms down, a little away, up to horizontal; walking; hands on the hips; anything.
+        // Arms down, a little away, about horizontal; walking; hands on the hips; any other pose.
         let swing = if between(0.0, 1.0) < 0.5 { 1.0 } else { -1.0 };
         for side in 0..2 {
             let across = if side == 0 { swing } else { -swing };
@@ -110,9 +110,7 @@ impl Pose {
         }
         pose
     }
-}
 
-impl Pose {
     /// Axes of the trunk, from the pelvis (0) to the shoulders (1).
     pub fn trunk_frame(&self, share: f32) -> Mat3 {
         let [lean, turn, aside] = self.trunk;
@@ -126,26 +124,39 @@ impl Pose {
         self.trunk_frame(1.0) * rotate_y(share * look) * rotate_x(share * upright) * rotate_z(share * tilt)
     }
 
-    /// By how many degrees an arm is lifted beyond where the collarbone begins to move.
+    /// Degrees that an arm is raised aside beyond 35, where the collarbone begins to move.
     pub fn lift(&self, side: usize) -> f32 {
         (self.arms[side][0] - 35.0).max(0.0)
     }
 
-    /// Moves hanging arms out of the way of clothes that stand out around the hips by this share of them.
+    /// Moves hanging arms out of the way of clothes. `share` is the width of the clothes beyond the hips, in hip widths.
     pub fn spread_arms(&mut self, share: f32) {
         for arm in &mut self.arms {
             arm[0] = arm[0].max((10.0 + 32.0 * share).min(30.0));
         }
     }
 
-    /// Moves an arm a little away from the body: one that is bent is stretched, another one lifted.
-    pub fn ease_arm(&mut self, side: usize) {
-        let [aside, _, _, bend] = &mut self.arms[side];
-        if *bend > 45.0 { *bend -= 4.0 } else { *aside += 4.0 }
+    /// Returns `posed` of this pose, after arms were moved out of the trunk: a bent arm is stretched in small steps, a
+    /// straight one raised. `sunk` returns whether the left and the right hand lie in the trunk.
+    pub fn free_hands<T>(&mut self, posed: impl Fn(&Self) -> T, sunk: impl Fn(&T) -> [bool; 2]) -> T {
+        /// Largest number of steps.
+        const STEPS: usize = 24;
+        let mut body = posed(self);
+        for _ in 0..STEPS {
+            let sunk = sunk(&body);
+            if sunk == [false; 2] {
+                break;
+            }
+            for ([aside, _, _, bend], _) in self.arms.iter_mut().zip(sunk).filter(|(_, sunk)| *sunk) {
+                if *bend > 45.0 { *bend -= 4.0 } else { *aside += 4.0 }
+            }
+            body = posed(self);
+        }
+        body
     }
 }
 
-/// A straight piece of the body: its start, its end, and its axes (right, up, front when it hangs or stands straight).
+/// A straight piece of the body. The columns of `frame` point to the right, up and to the front in an upright pose.
 #[derive(Debug, Clone, Copy)]
 pub struct Bone {
     pub start: Vec3,
@@ -162,9 +173,23 @@ impl Bone {
         Self { start, end: start + frame.y_axis * length, frame }
     }
 
-    /// The point at `along` of the bone, moved by `offset` along its axes.
+    /// A bone with the axes of the world.
+    pub fn straight(start: Vec3, end: Vec3) -> Self {
+        Self { start, end, frame: Mat3::IDENTITY }
+    }
+
+    pub fn length(&self) -> f32 {
+        (self.end - self.start).length()
+    }
+
+    /// The point at this share of the bone's length.
+    pub fn point(&self, along: f32) -> Vec3 {
+        self.start.lerp(self.end, along)
+    }
+
+    /// [`point`](Self::point), moved by `offset` along the bone's axes.
     pub fn at(&self, along: f32, offset: Vec3) -> Vec3 {
-        self.start.lerp(self.end, along) + self.frame * offset
+        self.point(along) + self.frame * offset
     }
 }
 
@@ -173,7 +198,7 @@ impl Bone {
 pub struct Figure {
     pub build: Build,
     pub fingers: f32,
-    /// From between the hips to the waist.
+    /// From the middle of the hips to the waist.
     pub pelvis: Bone,
     /// From the waist to the base of the neck.
     pub chest: Bone,
@@ -185,7 +210,7 @@ pub struct Figure {
     pub hands: [Bone; 2],
     pub thighs: [Bone; 2],
     pub calves: [Bone; 2],
-    /// From the ankle to the ball of the foot's height above the ground, pointing down; front is where the toes are.
+    /// From the ankle down to the height of the ball; the front axis points to the toes.
     pub feet: [Bone; 2],
 }
 
@@ -195,7 +220,7 @@ pub fn sign(side: usize) -> f32 {
 }
 
 impl Figure {
-    /// Shares of the stature after Drillis and Contini (1966).
+    /// Lengths are shares of the stature after Drillis and Contini (1966).
     pub fn new(build: Build, pose: &Pose) -> Self {
         let h = build.stature;
         let turn = pose.trunk[1];
@@ -237,7 +262,7 @@ impl Figure {
             Bone::hang(thighs[side].end, frame, 0.246 * h * build.legs)
         });
         let feet = sides.map(|side| {
-            // Feet stay flat, unless the calf leans far forward: then the heel lifts.
+            // Feet stay flat. The heel lifts only if the calf leans far forwards.
             let calf = calves[side].frame;
             let lifted = (calf.y_axis.z.clamp(-1.0, 1.0) * 45.0 - 6.0).max(0.0);
             let out = sign(side) * 9.0;

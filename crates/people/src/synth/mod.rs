@@ -1,6 +1,6 @@
-//! Synthetic people: an articulated body of signed distances, posed and dressed, meshed and painted.
+//! People of simple shapes: an articulated body of signed distances, posed and dressed, meshed and painted.
 //!
-//! Everything about a person follows from a name, the same on every machine.
+//! A name determines a person completely, on every machine.
 
 mod anatomy;
 pub(crate) mod atlas;
@@ -13,35 +13,33 @@ pub(crate) mod surface;
 #[cfg(test)]
 mod tests;
 
-use glam::Vec3;
-
 use body::Body;
 use figure::{Build, Figure, Pose};
 use outfit::Outfit;
-use paint::Painter;
+use paint::{FACE, Painter};
 use snapsnap_base::random::stream;
 use snapsnap_mesh::mesh::Mesh;
 
 /// Side of the cells that bodies are meshed with, metres.
-pub const CELL: f32 = 0.005;
-
-/// Most small moves that take an arm out of the trunk.
-pub(crate) const MOVES: usize = 24;
+const CELL: f32 = 0.005;
 
 /// The person of this name: life-size in metres, standing on y = 0 and facing +z.
 pub fn person(name: &str) -> Mesh {
     let (figure, outfit, body) = dressed(name);
-    let mut surface = surface::mesh(&body, CELL);
-    let mut mesh = atlas::paint(&body, &surface, &Painter::new(&figure, &outfit));
-    let floor = surface.positions.iter().map(|p| p.y).fold(f32::INFINITY, f32::min);
-    for p in &mut surface.positions {
-        p.y -= floor;
-    }
+    let surface = surface::mesh(&body, CELL);
+    let mut mesh = atlas::paint(&body, &surface, &Painter::new(&figure, &outfit, &FACE));
     mesh.positions = surface.positions;
+    stand(&mut mesh);
     mesh
 }
 
-/// The person in a pose, its arms moved away from the trunk as far as is needed for hands to lie on it, not in it.
+/// Moves a mesh vertically so that its lowest point is at 0.
+pub(crate) fn stand(mesh: &mut Mesh) {
+    let floor = mesh.bounds().0.y;
+    mesh.positions.iter_mut().for_each(|p| p.y -= floor);
+}
+
+/// The posed and dressed person. Hands lie outside of the trunk.
 fn dressed(name: &str) -> (Figure, Outfit, Body) {
     let mut random = stream(&format!("synth/{name}"));
     let build = Build::draw(&mut random);
@@ -53,18 +51,13 @@ fn dressed(name: &str) -> (Figure, Outfit, Body) {
         let body = Body::new(&figure, &outfit);
         (figure, body)
     };
-    let (mut figure, mut body) = posed(&pose);
-    for _ in 0..MOVES {
-        let sunk = [0, 1].map(|side| {
+    let sunk = |(figure, body): &(Figure, Body)| {
+        [0, 1].map(|side| {
             let (hand, fore) = (&figure.hands[side], &figure.forearms[side]);
-            let points = [fore.at(0.75, Vec3::ZERO), hand.start, hand.at(0.5, Vec3::ZERO), hand.end];
+            let points = [fore.point(0.75), hand.start, hand.point(0.5), hand.end];
             points.iter().any(|p| body.trunk_distance(*p) < 0.014 * build.stature)
-        });
-        if sunk == [false; 2] {
-            break;
-        }
-        (0..2).filter(|side| sunk[*side]).for_each(|side| pose.ease_arm(side));
-        (figure, body) = posed(&pose);
-    }
+        })
+    };
+    let (figure, body) = pose.free_hands(posed, sunk);
     (figure, outfit, body)
 }

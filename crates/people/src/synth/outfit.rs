@@ -1,4 +1,4 @@
-//! What a person wears: cut, colours and patterns.
+//! Clothes, hair and colours of a person.
 
 use glam::Vec3;
 use rand::Rng;
@@ -6,7 +6,7 @@ use rand::Rng;
 use super::figure::Build;
 use crate::pattern::{Pattern, Print, hue};
 
-/// Hair, by how it hangs.
+/// Haircuts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Cut {
     Bald,
@@ -22,12 +22,12 @@ pub enum Cut {
     Cap,
 }
 
-/// What hangs from the waist.
+/// Trousers or a skirt.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Lower {
-    /// Share of the leg that is covered, and how much wider the hem is, metres.
+    /// `length` is a share of the leg, `flare` the additional radius at the hem in metres.
     Trousers { length: f32, flare: f32 },
-    /// Share of the leg, and how much wider the hem is, as a share of the hips.
+    /// `length` is a share of the leg, `flare` the additional radius at the hem in hip radii.
     Skirt { length: f32, flare: f32, folds: u32 },
 }
 
@@ -37,15 +37,15 @@ pub struct Outfit {
     pub sleeve: f32,
     pub top_thickness: f32,
     pub sleeve_flare: f32,
-    /// How far the top reaches below the waist, as a share of the way to the crotch; above 1 it is a coat with a tail.
+    /// Length of the top below the waist, as a share of the distance to the crotch. A coat with a tail has more than 1.
     pub top_length: f32,
-    /// Height of the collar around the neck, as a share of the neck; below 0 it is a neckline.
+    /// Height of the collar around the neck, as a share of the neck; negative for a neckline.
     pub collar: f32,
-    /// Buttons or a zip down the front.
+    /// Buttons down the front.
     pub open_front: bool,
     pub lower: Lower,
     pub lower_thickness: f32,
-    /// How much cloth is crumpled, metres.
+    /// Height of crumples, metres.
     pub folds: f32,
     /// Share of the leg that boots cover.
     pub boots: f32,
@@ -56,7 +56,7 @@ pub struct Outfit {
     pub lips: Vec3,
     pub eyes: Vec3,
     pub top: Pattern,
-    /// Second cloth of cuffs, collar and pockets.
+    /// Colour of cuffs, collar and hems.
     pub trim: Vec3,
     pub bottom: Pattern,
     pub shoes: Pattern,
@@ -68,7 +68,7 @@ pub struct Outfit {
     pub seed: u32,
 }
 
-/// Natural tones, dark to light, mixed at random.
+/// A random mixture of two neighbouring tones.
 fn tone(random: &mut impl Rng, tones: &[[u8; 3]]) -> Vec3 {
     let at: f32 = random.random_range(0.0..(tones.len() - 1) as f32);
     let color = |i: usize| Vec3::from(tones[i].map(f32::from)) / 255.0;
@@ -93,7 +93,7 @@ pub fn hair(random: &mut impl Rng) -> Vec3 {
 }
 
 impl Outfit {
-    /// How far clothes stand out around the hips, as a share of them.
+    /// Width of the clothes beyond the hips, in hip widths.
     pub fn breadth(&self) -> f32 {
         let skirt = if let Lower::Skirt { flare, .. } = self.lower { 0.15 + 0.6 * flare } else { 0.0 };
         skirt.max(if self.top_length > 1.0 { 0.22 } else { 0.0 })
@@ -116,7 +116,7 @@ impl Outfit {
         let kind = between(0.0, 1.0);
         let sleeve = match kind {
             _ if coat => between(0.9, 0.98),
-            // Not shorter: an edge through the shoulder joint would be ragged.
+            // A shorter sleeve would have a ragged edge through the shoulder joint.
             k if k < 0.12 => between(0.14, 0.2),
             k if k < 0.5 => between(0.25, 0.45),
             k if k < 0.6 => between(0.55, 0.75),
@@ -136,8 +136,8 @@ impl Outfit {
             }
         } else {
             let length = if between(0.0, 1.0) < 0.25 { between(0.3, 0.6) } else { between(0.8, 0.99) };
+            // Mostly narrow.
             let wide = between(0.0, 1.0);
-            // Seldom wide.
             Lower::Trousers { length, flare: wide * wide * wide * 0.045 }
         };
         let style = between(0.0, 1.0);
@@ -161,8 +161,7 @@ impl Outfit {
         let top = Pattern::draw(random);
         let bottom = if dress { top.clone() } else { Pattern::draw_quiet(random) };
         let trim = if trim_contrast { Pattern::draw_quiet(random).main() } else { top.main() * 0.75 };
-        let prints = printed.map(|there| there.then(|| Print::draw(random, top.main())));
-        let [front_print, back_print] = prints;
+        let [front_print, back_print] = printed.map(|there| there.then(|| Print::draw(random, top.main())));
         let skin = skin(random);
         Self {
             sleeve,

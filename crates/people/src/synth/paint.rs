@@ -1,4 +1,4 @@
-//! Skin and clothes on the charts of a body's parts.
+//! Colours of skin and clothes on the charts of a body's parts.
 
 use std::f32::consts::{FRAC_PI_2, PI};
 
@@ -6,10 +6,10 @@ use glam::{Vec2, Vec3};
 
 use super::figure::Figure;
 use super::outfit::{Cut, Lower, Outfit};
-use super::part::{Kind, Marks, Part, neckline};
+use super::part::{Kind, Marks, Part};
 use crate::math::{noise2, smoothstep};
 
-/// Where the features of a face are: angles around the head, and heights in heads above the chin.
+/// Places of the features of a face: angles around the head, and heights above the chin in heads.
 #[derive(Debug, Clone)]
 pub struct Face {
     pub eye: (f32, f32),
@@ -17,45 +17,30 @@ pub struct Face {
     pub mouth: f32,
     /// Half width and half height of the lips.
     pub lips: [f32; 2],
-    /// Height of the nostrils, where they are painted.
-    pub nose: Option<f32>,
-    pub painted_eyes: bool,
+    /// Paints eyes and nostrils, which the surface of the head does not have.
+    pub painted: bool,
 }
 
-impl Default for Face {
-    /// The face of the synthetic people.
-    fn default() -> Self {
-        Self {
-            eye: (0.41, 0.455),
-            brow: 0.545,
-            mouth: 0.19,
-            lips: [0.3, 0.034],
-            nose: Some(0.3),
-            painted_eyes: true,
-        }
-    }
-}
+/// The face of people of simple shapes.
+pub const FACE: Face =
+    Face { eye: (0.41, 0.455), brow: 0.545, mouth: 0.19, lips: [0.3, 0.034], painted: true };
 
 /// A person's colours.
 pub struct Painter<'a> {
-    pub outfit: &'a Outfit,
-    pub marks: Marks,
-    /// Height of the head in metres.
-    pub head: f32,
-    /// Where prints are centred, metres along the trunk.
-    pub chest: f32,
-    pub face: Face,
+    outfit: &'a Outfit,
+    marks: Marks,
+    /// Centre of prints, metres along the trunk.
+    chest: f32,
+    face: &'a Face,
 }
 
 impl<'a> Painter<'a> {
-    pub fn new(figure: &Figure, outfit: &'a Outfit) -> Self {
-        let marks = Marks::of(figure, outfit);
-        let length = |bone: &super::figure::Bone| (bone.end - bone.start).length();
-        let chest = 1.7 * length(&figure.pelvis) + 0.55 * length(&figure.chest);
-        Self { outfit, marks, head: length(&figure.head), chest, face: Face::default() }
+    pub fn new(figure: &Figure, outfit: &'a Outfit, face: &'a Face) -> Self {
+        let chest = 1.7 * figure.pelvis.length() + 0.55 * figure.chest.length();
+        Self { outfit, marks: Marks::of(figure, outfit), chest, face }
     }
 
-    /// Colour at a place of a part's chart: angle around (0 in front, positive towards +x) and metres along.
+    /// Colour at a place of a part's chart: angle around the axis (0 in front, positive towards +x) and metres along it.
     pub fn color(&self, part: &Part, angle: f32, along: f32) -> Vec3 {
         let cloth = Vec2::new(angle * part.radius, along);
         match part.kind {
@@ -64,7 +49,7 @@ impl<'a> Painter<'a> {
             Kind::Hand => self.skin(cloth, 3),
             Kind::Leg => self.leg(part, angle, along, cloth),
             Kind::Foot => self.foot(part, angle, along, cloth),
-            Kind::Head => self.head(angle, along / self.head, cloth),
+            Kind::Head => self.head(angle, along / part.length, cloth),
             Kind::Hair => self.hair(part, angle, along, cloth),
             Kind::Skirt => self.skirt(part, angle, along, cloth),
         }
@@ -78,8 +63,8 @@ impl<'a> Painter<'a> {
 
     fn trunk(&self, angle: f32, along: f32, cloth: Vec2) -> Vec3 {
         let Outfit { top, bottom, trim, .. } = self.outfit;
-        let Marks { hem, waistband, collar, neckline: drop } = self.marks;
-        let collar = collar - neckline(drop, angle);
+        let Marks { hem, waistband, .. } = self.marks;
+        let collar = self.marks.collar(angle);
         if along > collar {
             return self.skin(cloth, 1);
         }
@@ -120,10 +105,9 @@ impl<'a> Painter<'a> {
         if let Some(print) = &self.outfit.back_print
             && angle.abs() > FRAC_PI_2
         {
-            // Seen from behind, right is where the angle falls.
+            // From behind, the angle decreases to the right.
             let around = if angle > 0.0 { PI - angle } else { -PI - angle };
-            let at = Vec2::new(around * cloth.x / angle, along - self.chest - 0.02);
-            color = print.over(color, at);
+            color = print.over(color, Vec2::new(around * cloth.x / angle, along - self.chest - 0.02));
         }
         // Seams at the sides.
         if (angle.abs() - FRAC_PI_2).abs() * cloth.x.abs() / angle.abs().max(0.1) < 0.0015 {
@@ -141,7 +125,7 @@ impl<'a> Painter<'a> {
         if along > end - 0.022 {
             return self.outfit.trim;
         }
-        // Cloth hangs with its rows across the sleeve.
+        // The rows of the cloth run across the sleeve.
         self.outfit.top.color(Vec2::new(cloth.x, -along))
     }
 
@@ -175,23 +159,23 @@ impl<'a> Painter<'a> {
         self.outfit.shoes.color(cloth).lerp(self.outfit.shoes.main() * 0.6, toe)
     }
 
-    /// `up` in heads above the chin's base.
+    /// `up`: height above the chin in heads.
     fn head(&self, angle: f32, up: f32, cloth: Vec2) -> Vec3 {
         let Outfit { hair, lips, eyes, cut, .. } = self.outfit;
         let mut color = self.skin(cloth, 5);
         let aside = angle.abs();
-        let face = &self.face;
+        let face = self.face;
         let (eye_angle, eye_up) = face.eye;
-        // Red where blood shows.
+        // Red cheeks.
         let cheek = Vec2::new((aside - 0.75) / 0.4, (up - 0.36) / 0.12);
         let blush = (1.0 - cheek.length_squared()).max(0.0);
         color = color.lerp(Vec3::new(0.8, 0.35, 0.3) * self.outfit.skin.x.max(0.3), 0.18 * blush);
         if self.outfit.beard {
-            // Higher towards the ears, where it goes over into the hair.
+            // Higher towards the ears, up to the hair.
             let above = up - face.mouth;
             let edge = 0.08 + 0.4 * smoothstep(1.0, 1.5, aside);
             let chin = smoothstep(edge, edge - 0.06, above) * smoothstep(1.75, 1.6, aside);
-            // Over the lip, falling towards its corners.
+            // Over the lip, lower towards its corners.
             let lip = Vec2::new(aside / 0.4, (above - 0.07 + 0.2 * aside * aside) / 0.035).length();
             let lip = smoothstep(1.0, 0.7, lip);
             let strand = 0.7 + 0.4 * noise2(Vec2::new(angle * 60.0, up * 30.0), 11);
@@ -202,8 +186,8 @@ impl<'a> Painter<'a> {
             let parted = (up - face.mouth).abs() < 0.004;
             color = if parted { *lips * 0.45 } else { *lips };
         }
-        if let Some(nose) = face.nose {
-            let nostril = Vec2::new((aside - 0.075) / 0.03, (up - nose) / 0.013);
+        if face.painted {
+            let nostril = Vec2::new((aside - 0.075) / 0.03, (up - 0.3) / 0.013);
             if nostril.length() < 1.0 {
                 color *= 0.5;
             }
@@ -215,10 +199,10 @@ impl<'a> Painter<'a> {
         }
         let from_eye = Vec2::new(aside - eye_angle, up - eye_up);
         let eye = (from_eye / Vec2::new(0.135, 0.036)).length();
-        if face.painted_eyes && eye < 1.15 {
+        if face.painted && eye < 1.15 {
             color *= 0.45;
         }
-        if face.painted_eyes && eye < 1.0 {
+        if face.painted && eye < 1.0 {
             let iris = ((from_eye - Vec2::new(0.0, 0.002)) / Vec2::new(0.056, 0.034)).length();
             color = match iris {
                 r if r < 0.42 => Vec3::splat(0.03),
@@ -234,7 +218,7 @@ impl<'a> Painter<'a> {
                 color = Vec3::splat(0.06);
             }
         }
-        // Cropped hair below the hairline that the hair itself leaves free.
+        // Cropped hair below the edge of the hair's surface.
         if *cut != Cut::Bald && aside > 1.9 && up > 0.22 {
             color = color.lerp(*hair, 0.85);
         }
@@ -242,7 +226,7 @@ impl<'a> Painter<'a> {
     }
 
     fn hair(&self, part: &Part, angle: f32, along: f32, cloth: Vec2) -> Vec3 {
-        // A cap's rim; below it hair shows.
+        // The rim of a cap, with hair below it.
         let rim = 0.6 * part.length;
         if self.outfit.cut == Cut::Cap && along > rim {
             let seam = (angle * 3.0 / PI).fract().abs() < 0.02;

@@ -1,33 +1,34 @@
-//! What a body is made of: parts, each of a few tapered capsules and ellipsoids that flow into one another.
+//! Parts of a body: each is a smooth union of a few tapered capsules and ellipsoids.
 //!
-//! A part has an axis, along and around which cloth and skin are laid; a layer of cloth moves the part's surface outwards.
-//! Distances are lower bounds close to the truth (they are exact for round shapes), which is all that meshing needs.
+//! The axis of a part defines its chart, where cloth and skin are painted. A layer of cloth moves the part's surface
+//! outwards. Distances are exact for round shapes and close lower bounds otherwise, which is enough for meshing.
 
 use std::ops::Range;
 
-use glam::{Mat3, Vec2, Vec3};
+use glam::{Mat3, Vec2, Vec3, Vec3Swizzles};
 
 use super::figure::{Bone, Figure};
 use super::outfit::Outfit;
 use crate::math::{noise, sin_cos, smooth_min, smoothstep};
 
-/// A shape in a frame of its own.
+/// A tapered capsule or an ellipsoid, in a frame of its own where it is round.
 #[derive(Debug, Clone, Copy)]
 pub struct Shape {
     /// Start and end in the frame; equal for an ellipsoid.
     start: Vec3,
     axis: Vec3,
-    /// World → frame, where the shape is round.
+    /// World → frame, before the division by `squeeze`.
     turn: Mat3,
     squeeze: Vec3,
     radii: [f32; 2],
-    /// Smallest of the squeezes: distances in the frame times this are lower bounds outside.
+    /// Smallest squeeze. Outside, distances in the frame times this factor are lower bounds.
     scale: f32,
+    /// Centre and radius of a sphere around the shape.
     pub bound: (Vec3, f32),
 }
 
 impl Shape {
-    /// From `a` to `b` with radii there, flattened to `flat` (shares of the radius along right, up, front).
+    /// A capsule from `a` to `b` with a radius at each end. `flat` contains factors of the radii along right, up, front.
     pub fn capsule(a: Vec3, b: Vec3, radii: [f32; 2], frame: Mat3, flat: Vec3) -> Self {
         let turn = frame.transpose();
         let reach = (b - a).length() / 2.0 + radii[0].max(radii[1]) * flat.max_element();
@@ -56,8 +57,15 @@ impl Shape {
     }
 }
 
-/// What a part is.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+impl Bone {
+    /// A round capsule from `a` to `b` in the axes of this bone.
+    pub fn capsule(&self, a: Vec3, b: Vec3, radii: [f32; 2]) -> Shape {
+        Shape::capsule(a, b, radii, self.frame, Vec3::ONE)
+    }
+}
+
+/// Kind of a part.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
     Trunk,
     Arm,
@@ -69,7 +77,7 @@ pub enum Kind {
     Skirt,
 }
 
-/// Cloth over a part of its axis.
+/// Cloth over a range of a part's axis. Lengths are metres.
 #[derive(Debug, Clone, Copy)]
 pub struct Layer {
     pub from: f32,
@@ -78,7 +86,7 @@ pub struct Layer {
     /// More thickness towards `to`.
     flare: f32,
     folds: f32,
-    /// How much earlier it ends in front and behind.
+    /// Largest [`neckline`] by which it ends earlier, in front and behind.
     pub drop: [f32; 2],
 }
 
@@ -88,35 +96,36 @@ impl Layer {
     }
 }
 
-/// How much lower a neckline hangs at this angle, by its depth in front and behind.
+/// Depth of a neckline at this angle, from its depth in front and behind.
 pub fn neckline([front, behind]: [f32; 2], angle: f32) -> f32 {
     let cosine = sin_cos(angle).1;
     let depth = if cosine > 0.0 { front } else { behind };
     depth * cosine * cosine
 }
 
-/// A piece of the body with its clothes.
+/// A part of the body with its clothes.
 #[derive(Debug, Clone)]
 pub struct Part {
     pub kind: Kind,
-    /// 0: left, 1: right; 0 for the middle.
+    /// 0: left or middle, 1: right. Of skirts: 1 with a coat.
     pub side: usize,
     pub shapes: Vec<Shape>,
     /// Radius of the curves between the shapes.
     blend: f32,
-    /// Radius of the curve towards the trunk, at the start of the axis; it vanishes along the first bone.
+    /// Radius of the curve towards the trunk at the start of the axis. It vanishes along the first half of the axis.
     pub joint: f32,
     axis: Vec<Bone>,
-    /// Metres of cloth around it, over 2π.
+    /// Metres of cloth per radian around the axis.
     pub radius: f32,
     pub length: f32,
     pub layers: Vec<Layer>,
+    /// Centre and radius of a sphere around the shapes.
     pub bound: (Vec3, f32),
     pub seed: u32,
     pub drape: Option<Drape>,
 }
 
-/// Cloth that hangs from the waist: a cone around a vertical axis, with folds.
+/// Cloth that hangs from the waist: a cone around a vertical axis, with folds. `top` and `bottom` are heights.
 #[derive(Debug, Clone, Copy)]
 pub struct Drape {
     pub top: f32,
@@ -133,32 +142,26 @@ impl Drape {
         let t = ((self.top - p.y) / (self.top - self.bottom)).clamp(0.0, 1.0);
         let [(c0, r0), (c1, r1)] = self.ends;
         let (centre, radii) = (c0.lerp(c1, t), r0.lerp(r1, t));
-        let q = Vec2::new(p.x, p.z) - centre;
+        let q = p.xz() - centre;
         let angle = libm::atan2f(q.x, q.y);
         let sway = 1.3 * (noise(Vec3::new(3.0 * t, 0.0, 0.0), self.seed) - 0.5);
         let fold = 1.0 + self.depth * smoothstep(0.05, 1.0, t) * sin_cos(self.folds * angle + sway).0;
         let scale = radii.min_element();
-        // The surface leans, so the distance to it is shorter than the one sideways.
+        // The surface leans, so that the distance to it is shorter than the horizontal one.
         let aside = ((q / radii).length() - fold) * scale * 0.9;
         aside.max(self.bottom - p.y).max(p.y - self.top)
     }
 }
 
 impl Part {
-    pub fn new(
-        kind: Kind,
-        side: usize,
-        shapes: Vec<Shape>,
-        blend: f32,
-        axis: Vec<Bone>,
-        radius: f32,
-    ) -> Self {
-        let length = axis.iter().map(|bone| (bone.end - bone.start).length()).sum();
+    /// A part without cloth, in the middle of the body.
+    pub fn new(kind: Kind, shapes: Vec<Shape>, blend: f32, axis: Vec<Bone>, radius: f32) -> Self {
+        let length = axis.iter().map(Bone::length).sum();
         let centre = shapes.iter().map(|s| s.bound.0).sum::<Vec3>() / shapes.len().max(1) as f32;
         let reach = shapes.iter().map(|s| (s.bound.0 - centre).length() + s.bound.1).fold(0.0, f32::max);
         Self {
             kind,
-            side,
+            side: 0,
             shapes,
             blend,
             joint: 0.0,
@@ -172,7 +175,7 @@ impl Part {
         }
     }
 
-    /// Where on the part's chart a point lies: angle around the axis (0 in front, towards +x up to π) and metres along it.
+    /// Place of a point on the part's chart: angle around the axis (0 in front, towards +x up to π) and metres along it.
     pub fn chart(&self, p: Vec3) -> (f32, f32) {
         let mut best = (f32::INFINITY, 0.0, 0.0);
         let mut before = 0.0;
@@ -180,7 +183,7 @@ impl Part {
             let axis = bone.end - bone.start;
             let length = axis.length();
             let mut t = (p - bone.start).dot(axis) / (length * length);
-            // Caps continue the first and the last bone.
+            // The first and the last bone continue beyond their ends.
             if i > 0 {
                 t = t.max(0.0);
             }
@@ -197,11 +200,11 @@ impl Part {
         (best.1, best.2)
     }
 
-    /// How far cloth lies over the skin at a place of the chart.
+    /// Metres of cloth over the skin at `p` and its place on the chart.
     fn thickness(&self, p: Vec3, (angle, along): (f32, f32)) -> f32 {
         let mut thickest = 0.0_f32;
         for layer in &self.layers {
-            // A hem is as steep as cloth is thick.
+            // The cloth thins out over 8 mm at its hem.
             let to = layer.to - neckline(layer.drop, angle);
             let there = smoothstep(layer.from - 0.004, layer.from + 0.004, along)
                 * (1.0 - smoothstep(to - 0.004, to + 0.004, along));
@@ -234,26 +237,28 @@ impl Part {
 pub struct Marks {
     pub hem: f32,
     pub waistband: f32,
+    /// Upper edge of the top at the sides.
     pub collar: f32,
-    /// How much lower the neckline is in front and behind.
+    /// Depth of the neckline in front and behind.
     pub neckline: [f32; 2],
 }
 
 impl Marks {
     pub fn of(figure: &Figure, outfit: &Outfit) -> Self {
-        let length = |bone: &Bone| (bone.end - bone.start).length();
-        let crotch = 0.7 * length(&figure.pelvis);
-        let waist = crotch + length(&figure.pelvis);
-        let base = waist + length(&figure.chest);
+        let [pelvis, chest, neck] = [figure.pelvis, figure.chest, figure.neck].map(|bone| bone.length());
+        let waist = 0.7 * pelvis + pelvis;
+        let drop = (0.45 - outfit.collar).max(0.1);
         Self {
-            hem: waist - outfit.top_length.min(1.0) * length(&figure.pelvis),
-            waistband: waist - 0.06 * length(&figure.pelvis),
-            // The slope from the shoulders to the neck stays covered, however low the neckline.
-            collar: base + outfit.collar.max(0.45) * length(&figure.neck),
-            neckline: [
-                (0.45 - outfit.collar).max(0.1) * 1.3 * length(&figure.neck),
-                (0.45 - outfit.collar).max(0.1) * 0.4 * length(&figure.neck),
-            ],
+            hem: waist - outfit.top_length.min(1.0) * pelvis,
+            waistband: waist - 0.06 * pelvis,
+            // The slope from the shoulders to the neck stays covered, even with a low neckline.
+            collar: waist + chest + outfit.collar.max(0.45) * neck,
+            neckline: [drop * 1.3 * neck, drop * 0.4 * neck],
         }
+    }
+
+    /// Upper edge of the top at this angle around the neck.
+    pub fn collar(&self, angle: f32) -> f32 {
+        self.collar - neckline(self.neckline, angle)
     }
 }

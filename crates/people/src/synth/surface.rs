@@ -1,5 +1,7 @@
 //! The surface of a body as triangles.
 
+use std::cmp::Reverse;
+
 use fast_surface_nets::{SurfaceNetsBuffer, surface_nets};
 use glam::{IVec3, Vec3};
 use ndshape::RuntimeShape;
@@ -7,9 +9,9 @@ use rayon::prelude::*;
 
 use super::body::Body;
 
-/// Samples along a block's edge; blocks without surface are not sampled.
+/// Samples along the edge of a block. Blocks without surface are not sampled.
 const BLOCK: usize = 8;
-/// Distances are lower bounds; where surfaces lean or are crumpled they may be this much too large.
+/// Largest factor by which distances may be too large where surfaces lean or are crumpled.
 const SLACK: f32 = 1.4;
 
 /// A closed surface; normals point outwards.
@@ -65,7 +67,7 @@ pub fn mesh(body: &Body, cell: f32) -> Surface {
     Surface { positions, faces, parts }
 }
 
-/// Moves a point of the net onto the surface, by Newton's method, within its cell; and the part it lies on.
+/// Moves a point of the net onto the surface by Newton's method, within its cell. Also returns the row of its part.
 fn settle(body: &Body, start: Vec3, cell: f32) -> (Vec3, u8) {
     let distance = |p: Vec3| body.distance(p, 4.0 * cell).0;
     let step = 0.2 * cell;
@@ -80,7 +82,7 @@ fn settle(body: &Body, start: Vec3, cell: f32) -> (Vec3, u8) {
     (p, body.owner(p, cell) as u8)
 }
 
-/// The piece with the most triangles: crumbs of cloth are left out.
+/// The connected piece with the most triangles; the others are crumbs of cloth.
 fn largest_piece(positions: Vec<Vec3>, faces: Vec<[u32; 3]>) -> (Vec<Vec3>, Vec<[u32; 3]>) {
     let mut parent: Vec<u32> = (0..positions.len() as u32).collect();
     fn root(parent: &mut [u32], mut row: u32) -> u32 {
@@ -97,19 +99,15 @@ fn largest_piece(positions: Vec<Vec3>, faces: Vec<[u32; 3]>) -> (Vec<Vec3>, Vec<
             parent[other as usize] = first;
         }
     }
-    let mut sizes = vec![0_u32; positions.len()];
-    for face in &faces {
-        sizes[root(&mut parent, face[0]) as usize] += 1;
-    }
-    let largest =
-        (0..sizes.len()).max_by_key(|row| (sizes[*row], std::cmp::Reverse(*row))).unwrap_or(0) as u32;
-    let mut rows = vec![u32::MAX; positions.len()];
+    let roots: Vec<u32> = (0..parent.len() as u32).map(|row| root(&mut parent, row)).collect();
+    let mut sizes = vec![0_u32; roots.len()];
+    faces.iter().for_each(|face| sizes[roots[face[0] as usize] as usize] += 1);
+    let largest = (0..sizes.len()).max_by_key(|row| (sizes[*row], Reverse(*row))).unwrap_or(0) as u32;
+    let mut rows = vec![u32::MAX; roots.len()];
     let mut kept = Vec::new();
-    for row in 0..positions.len() as u32 {
-        if root(&mut parent, row) == largest {
-            rows[row as usize] = kept.len() as u32;
-            kept.push(positions[row as usize]);
-        }
+    for (row, position) in positions.into_iter().enumerate().filter(|(row, _)| roots[*row] == largest) {
+        rows[row] = kept.len() as u32;
+        kept.push(position);
     }
     let faces =
         faces.into_iter().map(|f| f.map(|row| rows[row as usize])).filter(|f| f[0] != u32::MAX).collect();

@@ -1,9 +1,12 @@
 use std::collections::{HashMap, HashSet};
 
+use glam::Vec3;
+use snapsnap_mesh::mesh::Face;
+
 use super::*;
 
-/// Every edge belongs to two triangles that run along it in opposite ways (or to two such pairs, where the surface touches
-/// itself), and all triangles hang together: no holes, no floating parts.
+/// Every edge belongs to two triangles with opposite directions (or to two such pairs, where the surface touches itself), and
+/// all triangles are connected: no holes, no floating parts.
 #[test]
 fn people_are_closed_and_of_one_piece() {
     for index in 0..6 {
@@ -26,7 +29,7 @@ fn people_are_closed_and_of_one_piece() {
             next.extend(neighbours[&row].iter().filter(|other| reached.insert(**other)));
         }
         assert_eq!(reached.len(), neighbours.len(), "person {index}");
-        // Outside is out: the volume that the triangles enclose is that of a person.
+        // Normals point outwards, and the enclosed volume is that of a person.
         let volume: f32 = mesh
             .faces
             .iter()
@@ -47,7 +50,7 @@ fn hands_and_hips_stay_where_they_belong() {
         let (figure, _, body) = dressed(&format!("test/hands/{index}"));
         for hand in &figure.hands {
             for share in [0.0, 0.5, 1.0] {
-                let depth = body.trunk_distance(hand.at(share, Vec3::ZERO));
+                let depth = body.trunk_distance(hand.point(share));
                 assert!(depth > 0.01, "person {index}: {depth} m");
             }
         }
@@ -68,15 +71,15 @@ fn hands_and_hips_stay_where_they_belong() {
     assert!(skirts > 10 && filled > 10 * skirts, "{skirts} {filled}");
 }
 
-/// Cells are at most 5 mm, and triangles about as small.
+/// Triangles are about as small as the cells, which have at most 5 mm.
 #[test]
 fn triangles_are_small_and_the_texture_covers_them() {
     let mesh = person("test/0");
-    let longest = mesh.faces.iter().map(|f| {
+    let longest = |f: &Face| {
         let [a, b, c] = f.positions.map(|row| mesh.positions[row as usize]);
         (b - a).length().max((c - b).length()).max((a - c).length())
-    });
-    let longest: Vec<f32> = longest.collect();
+    };
+    let longest: Vec<f32> = mesh.faces.iter().map(longest).collect();
     let mean = longest.iter().sum::<f32>() / longest.len() as f32;
     let worst = longest.iter().copied().fold(0.0, f32::max);
     assert!(CELL <= 0.005 && mean < 1.5 * CELL && worst < 5.0 * CELL, "{mean} m, {worst} m");
@@ -87,7 +90,7 @@ fn triangles_are_small_and_the_texture_covers_them() {
     assert!(colors.len() > 500, "{} colours", colors.len());
 }
 
-/// The same person on every machine: the numbers were written down on one and hold on all.
+/// Recorded numbers of a person, the same on every machine.
 #[test]
 fn a_name_decides_everything() {
     let mesh = person("train/1/0");
