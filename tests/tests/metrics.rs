@@ -59,6 +59,10 @@ fn pair(name: &str) -> [RgbImage; 2] {
     }
 }
 
+fn picture(image: RgbImage) -> Picture {
+    Picture::from_file(image.into(), "picture").expect("a picture")
+}
+
 fn expected() -> Value {
     let text = std::fs::read_to_string(data("metrics/expected.json")).expect("the reference");
     serde_json::from_str(&text).expect("JSON")
@@ -85,7 +89,7 @@ const EXACT: f64 = 2e-6;
 fn psnr_and_ssim_are_those_of_scikit_image_in_all_three_windows() {
     let expected = expected();
     for (name, figures) in expected["pictures"].as_object().expect("pictures") {
-        let [a, b] = pair(name).map(|picture| Picture::from_rgb8(&picture));
+        let [a, b] = pair(name).map(picture);
         let check = |window: &str, region: &Region| {
             close(
                 &format!("{name}, {window}: PSNR"),
@@ -150,7 +154,7 @@ fn random_weights(folder: &Path) -> PathBuf {
 fn lpips_is_the_packages_with_the_same_weights() {
     let (expected, network) = (expected(), random_lpips(&Device::flex()));
     for (name, figures) in expected["pictures"].as_object().expect("pictures") {
-        let [a, b] = pair(name).map(|picture| Picture::from_rgb8(&picture));
+        let [a, b] = pair(name).map(picture);
         let score = |a: &Picture, b: &Picture| {
             Score::new(a, b, &Region::all(b), Some(&network)).expect("one size").lpips.expect("weights")
         };
@@ -177,8 +181,7 @@ fn weights_that_are_not_the_published_ones_are_no_lpips() {
 #[test]
 fn a_picture_is_infinitely_like_itself_and_never_more_than_1() {
     for name in ["noise", "flat and slope", "people, shifted"] {
-        for picture in pair(name) {
-            let picture = Picture::from_rgb8(&picture);
+        for picture in pair(name).map(picture) {
             let region = Region::all(&picture);
             assert_eq!(psnr(&picture, &picture, &region).expect("one size"), f64::INFINITY, "{name}");
             assert_eq!(ssim(&picture, &picture, &region).expect("one size"), Some(1.0), "{name}");
@@ -192,7 +195,7 @@ fn a_picture_is_infinitely_like_itself_and_never_more_than_1() {
 fn the_losss_similarity_is_the_one_that_training_uses() {
     let device = Device::flex();
     for name in ["noise", "flat and slope", "other people"] {
-        let [a, b] = pair(name).map(|picture| Picture::from_rgb8(&picture));
+        let [a, b] = pair(name).map(picture);
         let got = ssim_of_loss(&a, &b, &Region::all(&b)).expect("one size");
         let map = ssim_gaussian(a.tensor(&device), b.tensor(&device));
         let expected = f64::from(map.mean().into_scalar::<f32>());
@@ -202,7 +205,7 @@ fn the_losss_similarity_is_the_one_that_training_uses() {
 
 #[test]
 fn sizes_that_differ_are_refused_by_all() {
-    let [a, b] = [noise(1, [20, 30]), noise(1, [30, 20])].map(|picture| Picture::from_rgb8(&picture));
+    let [a, b] = [noise(1, [20, 30]), noise(1, [30, 20])].map(picture);
     let region = Region::all(&b);
     for said in [
         psnr(&a, &b, &region).expect_err("PSNR").to_string(),

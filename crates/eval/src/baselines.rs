@@ -20,25 +20,20 @@ use crate::pictures::Picture;
 /// Largest side of mean pictures, which are smooth.
 const MEAN_SIDE: usize = 256;
 
-/// Photographs `[N,3,S,S]` in [−1, 1] as flat cut-outs, each in the upright plane through the body's axis that faces
-/// its camera; world frame. `valid` `[N,S,S]` is the person's mask. `None` if it is empty.
+/// Photographs `[3,S,S]` in [−1, 1] as flat cut-outs, each in the upright plane through the body's axis that faces its
+/// camera; world frame. `valid` `[S,S]` are the person's masks.
 pub fn billboard(
-    images: &[f32],
-    valid: &[bool],
+    photographs: &[Vec<f32>],
+    valid: &[Vec<bool>],
     side: usize,
     cameras: &[Camera],
     device: &Device,
-) -> Option<Gaussians> {
-    let area = side * side;
-    let part = |(place, camera): (usize, &Camera)| {
-        let seen = Seen {
-            image: &images[3 * place * area..3 * (place + 1) * area],
-            points: Tensor::from_data(TensorData::new(upright(camera, side), [1, side, side, 3]), device),
-            valid: &valid[place * area..(place + 1) * area],
-        };
-        in_world(geometric(&[seen], device), camera)
+) -> Gaussians {
+    let part = |((image, valid), camera): ((&Vec<f32>, &Vec<bool>), &Camera)| {
+        let points = Tensor::from_data(TensorData::new(upright(camera, side), [1, side, side, 3]), device);
+        in_world(geometric(&[Seen { image, points, valid }], device), camera)
     };
-    some(joined(cameras.iter().enumerate().map(part).collect()))
+    joined(photographs.iter().zip(valid).zip(cameras).map(part).collect())
 }
 
 /// Intersections of the rays of a camera's pixels with the upright plane through the world's y axis that faces it:
@@ -56,43 +51,33 @@ fn upright(camera: &Camera, side: usize) -> Vec<f32> {
     (0..side * side).flat_map(point).collect()
 }
 
-/// Gaussians (world frame) at ground-truth points `[V,S,S,3]` (metres, first camera's frame) with the mask `valid`
-/// `[V,S,S]`. The first `photographs` views have the colours of their photographs `[N,3,S,S]` in [−1, 1]. Further views
-/// are sides with the colours of the nearest points. `None` if the mask is empty.
+/// Gaussians (world frame) at ground-truth points `[V,S,S,3]` (metres, first camera's frame) with the masks `valid`
+/// `[S,S]`. The first views have the colours of their photographs `[3,S,S]` in [−1, 1]. Further views are sides with
+/// the colours of the nearest points.
 pub fn true_points(
-    images: &[f32],
-    photographs: usize,
+    photographs: &[Vec<f32>],
     points: &[f32],
     valid: &[Vec<bool>],
     side: usize,
     camera: &Camera,
     device: &Device,
-) -> Option<Gaussians> {
-    let area = side * side;
-    let photos = |view: usize| &images[3 * view * area..3 * (view + 1) * area];
+) -> Gaussians {
     let sides = match (photographs, valid.len()) {
-        (2, 4) => side_images([photos(0), photos(1)], points, valid),
+        ([front, back], 4) => side_images([front, back], points, valid),
         _ => Vec::new(),
     };
-    let seen = |view: usize| {
-        let points =
-            TensorData::new(points[3 * view * area..3 * (view + 1) * area].to_vec(), [1, side, side, 3]);
-        Seen {
-            image: if view < photographs { photos(view) } else { &sides[view - photographs] },
-            points: Tensor::from_data(points, device),
-            valid: &valid[view],
-        }
+    let seen = |((image, valid), points): ((_, _), &[f32])| {
+        let points = TensorData::new(points.to_vec(), [1, side, side, 3]);
+        Seen { image, points: Tensor::from_data(points, device), valid }
     };
-    let views: Vec<Seen> = (0..photographs + sides.len()).map(seen).collect();
-    some(in_world(geometric(&views, device), camera))
+    let images = photographs.iter().chain(&sides).map(Vec::as_slice);
+    let with_masks = images.zip(valid.iter().map(Vec::as_slice));
+    let views: Vec<Seen> = with_masks.zip(points.chunks_exact(3 * side * side)).map(seen).collect();
+    in_world(geometric(&views, device), camera)
 }
 
 fn in_world(gaussians: Gaussians, camera: &Camera) -> Gaussians {
     placed(&Config::default(), gaussians, &camera.world_to_camera.inverse())
-}
-
-fn some(gaussians: Gaussians) -> Option<Gaussians> {
-    (!gaussians.is_empty()).then_some(gaussians)
 }
 
 /// The mean picture of training people for each view.

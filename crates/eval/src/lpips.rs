@@ -43,6 +43,18 @@ const LAYERS: [Layer; 5] = [
     Layer { place: 10, size: [256, 256, 3], stride: 1, padding: 1, pooled: false },
 ];
 
+impl Layer {
+    /// Names and shapes of the layer's weight, bias and learned layer.
+    fn tensors((number, Self { place, size, .. }): (usize, &Self)) -> [(String, Vec<usize>); 3] {
+        let [outputs, inputs, side] = *size;
+        [
+            (format!("features.{place}.weight"), vec![outputs, inputs, side, side]),
+            (format!("features.{place}.bias"), vec![outputs]),
+            (format!("lin{number}.model.1.weight"), vec![1, outputs, 1, 1]),
+        ]
+    }
+}
+
 /// The network and its learned layers, not tracked.
 #[derive(Debug, Clone)]
 pub struct Lpips {
@@ -68,57 +80,44 @@ impl Lpips {
     /// mis-shaped.
     pub fn load(files: &[PathBuf], device: &Device) -> Result<Self, WeightsError> {
         let sources = files.iter().map(|path| Source::open(path)).collect::<Result<Vec<_>, _>>()?;
-        let mut problems = Vec::new();
-        let mut find = |name: String, shape: &[usize]| {
-            let mut holders = sources.iter().filter(|source| source.tensors().contains_key(&name));
-            match (holders.next(), holders.next()) {
-                (Some(source), None) if source.tensors()[&name].shape == shape => Some((source, name)),
-                (Some(source), None) => {
-                    let there = &source.tensors()[&name].shape;
-                    problems.push(format!("mis-shaped: {name} {there:?} instead of {shape:?}"));
-                    None
+        let wanted: Vec<_> = LAYERS.iter().enumerate().flat_map(Layer::tensors).collect();
+        let (mut holders, mut problems) = (Vec::new(), Vec::new());
+        for (name, shape) in &wanted {
+            let found: Vec<_> = sources.iter().filter_map(|s| Some((s, s.tensors().get(name)?))).collect();
+            match found.as_slice() {
+                [(source, entry)] if entry.shape == *shape => holders.push(*source),
+                [(_, entry)] => {
+                    problems.push(format!("mis-shaped: {name} {:?} instead of {shape:?}", entry.shape));
                 }
-                (Some(_), Some(_)) => {
-                    problems.push(format!("given twice: {name}"));
-                    None
-                }
-                _ => {
-                    problems.push(format!("missing: {name} {shape:?}"));
-                    None
-                }
+                [] => problems.push(format!("missing: {name} {shape:?}")),
+                _ => problems.push(format!("given twice: {name}")),
             }
+        }
+        if !problems.is_empty() {
+            return Err(refused(files, problems));
+        }
+        let is_unknown = |name: &&String| {
+            !name.starts_with("classifier.") && wanted.iter().all(|(known, _)| known != *name)
         };
-        let mut wanted = Vec::new();
-        for (number, Layer { place, size: [outputs, inputs, side], .. }) in LAYERS.into_iter().enumerate() {
-            let weight = find(format!("features.{place}.weight"), &[outputs, inputs, side, side]);
-            let bias = find(format!("features.{place}.bias"), &[outputs]);
-            let linear = find(format!("lin{number}.model.1.weight"), &[1, outputs, 1, 1]);
-            wanted.extend([weight, bias, linear]);
+        if let Some(name) = sources.iter().flat_map(|source| source.tensors().keys()).find(is_unknown) {
+            let problem = format!("not part of AlexNet or LPIPS: {}", name.escape_debug());
+            return Err(refused(files, vec![problem]));
         }
-        let known: Vec<&str> = wanted.iter().flatten().map(|(_, name)| name.as_str()).collect();
-        for name in sources.iter().flat_map(|source| source.tensors().keys()) {
-            if problems.is_empty() && !known.contains(&name.as_str()) && !name.starts_with("classifier.") {
-                problems.push(format!("not part of AlexNet or LPIPS: {}", name.escape_debug()));
-            }
+        let mut tensors = Vec::new();
+        for ((name, shape), source) in wanted.into_iter().zip(holders) {
+            let values = source.read_f32(&name)?;
+            problems.extend(not_finite(&name, &values));
+            tensors.push(TensorData::new(values, shape));
         }
         if !problems.is_empty() {
-            return Err(WeightsError::Tensors { origin: origin(files), problems });
+            return Err(refused(files, problems));
         }
-        let mut values = Vec::new();
-        for (source, name) in wanted.into_iter().flatten() {
-            let read = source.read_f32(&name)?;
-            problems.extend(not_finite(&name, &read));
-            values.push(read);
-        }
-        if !problems.is_empty() {
-            return Err(WeightsError::Tensors { origin: origin(files), problems });
-        }
-        let mut values = values.into_iter();
-        let mut next = || values.next().expect("three of each layer");
-        let layers = LAYERS.map(|Layer { size: [outputs, inputs, side], .. }| Parameters {
-            weight: Tensor::from_data(TensorData::new(next(), [outputs, inputs, side, side]), device),
-            bias: Tensor::from_data(TensorData::new(next(), [outputs]), device),
-            linear: Tensor::from_data(TensorData::new(next(), [1, outputs, 1, 1]), device),
+        let mut tensors = tensors.into_iter();
+        let mut next = || tensors.next().expect("three of each layer");
+        let layers = LAYERS.map(|_| Parameters {
+            weight: Tensor::from_data(next(), device),
+            bias: Tensor::from_data(next(), device),
+            linear: Tensor::from_data(next(), device),
         });
         Ok(Self { layers: layers.into() })
     }
@@ -140,7 +139,7 @@ impl Lpips {
             let problem = format!(
                 "the distance of the check pictures is {found:.6}, with published weights {KNOWN:.6}"
             );
-            return Err(WeightsError::Tensors { origin: origin(&files), problems: vec![problem] });
+            return Err(refused(&files, vec![problem]));
         }
         Ok(network)
     }
@@ -188,18 +187,14 @@ impl Lpips {
         let [_, channels, h, w] = image.dims();
         assert!(channels == 3 && h.min(w) >= MIN_SIDE, "LPIPS of {h}×{w} pixels, {channels} channels");
         let (mut x, mut y) = (normalised(image), normalised(target));
-        let mut total: Option<Tensor<1>> = None;
-        for (layer, parameters) in LAYERS.iter().zip(&self.layers) {
-            (x, y) = (parameters.run(layer, x), parameters.run(layer, y));
+        let of_layer = |(layer, parameters): (&Layer, &Parameters)| -> Tensor<1> {
+            (x, y) = (parameters.run(layer, x.clone()), parameters.run(layer, y.clone()));
             let apart = (unit(x.clone()) - unit(y.clone())).square() * parameters.linear.clone();
             let [b, c, h, w] = apart.dims();
-            let distance = apart.reshape([b, c * h * w]).sum_dim(1).squeeze_dim(1) / (h * w) as f64;
-            total = Some(match total {
-                Some(total) => total + distance,
-                None => distance,
-            });
-        }
-        total.expect("there are layers")
+            apart.reshape([b, c * h * w]).sum_dim(1).squeeze_dim(1) / (h * w) as f64
+        };
+        let distances = LAYERS.iter().zip(&self.layers).map(of_layer);
+        distances.reduce(|sum, distance| sum + distance).expect("there are layers")
     }
 }
 
@@ -234,8 +229,9 @@ fn number(stream: u32, place: usize) -> f64 {
     f64::from(mixed ^ (mixed >> 13)) / 4_294_967_296.0
 }
 
-fn origin(files: &[PathBuf]) -> String {
-    files.iter().map(|path| path.display().to_string()).collect::<Vec<_>>().join(", ")
+fn refused(files: &[PathBuf], problems: Vec<String>) -> WeightsError {
+    let names: Vec<String> = files.iter().map(|path| path.display().to_string()).collect();
+    WeightsError::Tensors { origin: names.join(", "), problems }
 }
 
 #[cfg(test)]
@@ -245,7 +241,6 @@ mod tests {
     use std::path::Path;
 
     use burn::tensor::FloatDType;
-
     use snapsnap_net::weights::write_tensors;
 
     fn values(stream: u32, count: usize, value: impl Fn(f64) -> f64) -> Vec<f32> {
@@ -254,18 +249,18 @@ mod tests {
 
     /// Random weights, named and shaped as the published ones.
     fn tensors() -> Vec<(String, Vec<usize>, Vec<f32>)> {
-        let mut tensors = Vec::new();
-        for (number, Layer { place, size: [outputs, inputs, side], .. }) in LAYERS.into_iter().enumerate() {
-            let (stream, fan_in) = (number as u32, inputs * side * side);
-            let bound = (6.0 / fan_in as f64).sqrt();
-            let weight = values(3 * stream, outputs * fan_in, |u| (2.0 * u - 1.0) * bound);
-            tensors.push((format!("features.{place}.weight"), vec![outputs, inputs, side, side], weight));
-            let bias = values(3 * stream + 1, outputs, |u| 0.1 * (u - 0.5));
-            tensors.push((format!("features.{place}.bias"), vec![outputs], bias));
-            let linear = values(3 * stream + 2, outputs, |u| u);
-            tensors.push((format!("lin{number}.model.1.weight"), vec![1, outputs, 1, 1], linear));
-        }
-        tensors
+        let all = LAYERS.iter().enumerate().flat_map(Layer::tensors).enumerate();
+        let filled = |(stream, (name, shape)): (usize, (String, Vec<usize>))| {
+            let fan_in: usize = shape[1..].iter().product();
+            let value = |u: f64| match stream % 3 {
+                0 => (2.0 * u - 1.0) * (6.0 / fan_in as f64).sqrt(),
+                1 => 0.1 * (u - 0.5),
+                _ => u,
+            };
+            let values = values(stream as u32, shape.iter().product(), value);
+            (name, shape, values)
+        };
+        all.map(filled).collect()
     }
 
     fn written(folder: &Path, tensors: &[(String, Vec<usize>, Vec<f32>)], name: &str) -> PathBuf {
@@ -338,8 +333,7 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let problems = |tensors: &[(String, Vec<usize>, Vec<f32>)], name: &str| {
             let file = written(folder.path(), tensors, name);
-            let error = Lpips::load(&[file], &Device::flex()).expect_err("no LPIPS");
-            error.to_string()
+            Lpips::load(&[file], &Device::flex()).expect_err("no LPIPS").to_string()
         };
         let whole = tensors();
         let said = problems(&whole[1..], "less");

@@ -2,7 +2,7 @@
 //! that wrong ranges and orders of colours are errors.
 
 use burn::tensor::{Device, Tensor, TensorData};
-use image::{DynamicImage, Rgb32FImage, RgbImage};
+use image::{DynamicImage, RgbImage};
 use rayon::prelude::*;
 
 use crate::EvalError;
@@ -48,35 +48,19 @@ impl Picture {
         assert!(height % times == 0 && width % times == 0, "{width}×{height} in parts of {times}");
         let cut = |v: f32| if v.is_finite() { v.clamp(0.0, 1.0) } else { v };
         let (pixels, _) = values.as_chunks::<3>();
-        let size @ [_, columns] = [height / times, width / times];
-        let mut planes = vec![0.0; 3 * size[0] * columns];
-        let (red, rest) = planes.split_at_mut(size[0] * columns);
-        let (green, blue) = rest.split_at_mut(size[0] * columns);
-        let rows =
-            red.par_chunks_mut(columns).zip(green.par_chunks_mut(columns)).zip(blue.par_chunks_mut(columns));
-        rows.enumerate().for_each(|(row, ((red, green), blue))| {
-            for column in 0..columns {
-                let mut sums = [0.0; 3];
-                for line in 0..times {
-                    let start = (row * times + line) * width + column * times;
-                    for pixel in &pixels[start..start + times] {
-                        sums.iter_mut().zip(pixel).for_each(|(sum, v)| *sum += cut(*v));
-                    }
-                }
+        let size @ [rows, columns] = [height / times, width / times];
+        let mut planes = vec![0.0; 3 * rows * columns];
+        planes.par_chunks_mut(columns).enumerate().for_each(|(line, means)| {
+            let (channel, row) = (line / rows, line % rows);
+            for (column, mean) in means.iter_mut().enumerate() {
+                let parts = (0..times).map(|part| (row * times + part) * width + column * times);
+                let pixels = parts.flat_map(|start| &pixels[start..start + times]);
+                let sum = pixels.fold(0.0, |sum, pixel| sum + cut(pixel[channel]));
                 // Rounding can move the mean of ones beyond 1.
-                let mean =
-                    |sum: f32| if sum.is_nan() { sum } else { (sum / (times * times) as f32).min(1.0) };
-                (red[column], green[column], blue[column]) = (mean(sums[0]), mean(sums[1]), mean(sums[2]));
+                *mean = if sum.is_nan() { sum } else { (sum / (times * times) as f32).min(1.0) };
             }
         });
         Self::new(planes, size, "render")
-    }
-
-    /// A picture with 8 bits per channel.
-    pub fn from_rgb8(picture: &RgbImage) -> Self {
-        let plane = |c: usize| picture.pixels().map(move |p| f32::from(p.0[c]) / 255.0);
-        let (width, height) = (picture.width() as usize, picture.height() as usize);
-        Self { width, height, values: (0..3).flat_map(plane).collect() }
     }
 
     /// A picture of any file. Pictures with alpha are laid over black, the background of the protocols.
@@ -85,30 +69,10 @@ impl Picture {
     /// [`EvalError::Value`] for files of floating-point numbers with other values.
     pub fn from_file(picture: DynamicImage, what: &'static str) -> Result<Self, EvalError> {
         let (width, height) = (picture.width() as usize, picture.height() as usize);
-        let planes = |values: &Rgb32FImage, share: &dyn Fn(usize) -> f32| -> Vec<f32> {
-            (0..3).flat_map(|c| values.pixels().enumerate().map(move |(i, p)| p.0[c] * share(i))).collect()
-        };
-        let values = if picture.color().has_alpha() {
-            let rgba = picture.into_rgba32f();
-            let alpha: Vec<f32> = rgba.pixels().map(|p| p.0[3]).collect();
-            planes(&DynamicImage::ImageRgba32F(rgba).into_rgb32f(), &|i| alpha[i])
-        } else {
-            planes(&picture.into_rgb32f(), &|_| 1.0)
-        };
-        Self::new(values, [height, width], what)
-    }
-
-    /// A tensor `[1, 3, H, W]` with values in [0, 1].
-    ///
-    /// # Errors
-    /// [`EvalError::Sizes`] for another shape, [`EvalError::Value`] for other values.
-    pub fn from_tensor(tensor: &Tensor<4>, what: &'static str) -> Result<Self, EvalError> {
-        let [b, c, height, width] = tensor.dims();
-        if [b, c] != [1, 3] {
-            let expected = vec![1, 3, height, width];
-            return Err(EvalError::Sizes { found: tensor.dims().to_vec(), expected });
-        }
-        Self::new(snapsnap_ops::host(tensor.clone()), [height, width], what)
+        // Without alpha every pixel has an alpha of 1.
+        let picture = picture.into_rgba32f();
+        let plane = |c: usize| picture.pixels().map(move |pixel| pixel.0[c] * pixel.0[3]);
+        Self::new((0..3).flat_map(plane).collect(), [height, width], what)
     }
 
     /// `[1, 3, H, W]`.
@@ -170,16 +134,14 @@ mod tests {
             ImageBuffer::from_fn(5, 4, |x, y| Rgb(eight.get_pixel(x, y).0.map(|v| u16::from(v) * 257)));
         let float =
             ImageBuffer::from_fn(5, 4, |x, y| Rgb(eight.get_pixel(x, y).0.map(|v| f32::from(v) / 255.0)));
-        let expected = Picture::from_rgb8(&eight);
-        for picture in [
-            DynamicImage::ImageRgb8(eight),
-            DynamicImage::ImageRgb16(sixteen),
+        let [expected, others @ ..] = [
             DynamicImage::ImageRgb32F(float),
-        ] {
-            assert_eq!(Picture::from_file(picture, "picture").expect("a picture"), expected);
-        }
-        let tensor = expected.tensor(&Device::flex());
-        assert_eq!(Picture::from_tensor(&tensor, "picture").expect("a picture"), expected);
+            DynamicImage::ImageRgb16(sixteen),
+            DynamicImage::ImageRgb8(eight),
+        ]
+        .map(|picture| Picture::from_file(picture, "picture").expect("a picture"));
+        assert_eq!(others, [expected.clone(), expected.clone()]);
+        assert_eq!(snapsnap_ops::host(expected.tensor(&Device::flex())), expected.values());
         assert_eq!(expected.to_rgb8(), colorful());
         // Red is the first plane.
         assert_eq!(expected.plane(0)[3], 120.0 / 255.0);

@@ -1,5 +1,9 @@
 //! Distances of predicted points from the ground truth for each view.
 
+use glam::DVec3;
+
+use crate::geometry::double;
+
 /// Names of the views in reports, in their order.
 pub const VIEWS: [&str; 4] = ["front", "back", "right", "left"];
 
@@ -33,31 +37,21 @@ pub struct PointError {
 /// Errors of one person in every view with ground truth and predictions.
 pub fn point_errors(pairs: &[Pair]) -> Vec<PointError> {
     // Pixels outside of the predictor's window have the point 0, the position of the first camera.
-    let is_predicted = |p: &[f32]| p.iter().all(|v| v.is_finite()) && p.iter().any(|v| *v != 0.0);
-    let there = |pair: &Pair| -> Vec<usize> {
-        let is_there = |i: &usize| pair.valid[*i] > 0.5 && is_predicted(&pair.points[3 * i..3 * i + 3]);
-        (0..pair.valid.len()).filter(is_there).collect()
+    let is_predicted = |p: &[f32; 3]| p.iter().all(|v| v.is_finite()) && p.iter().any(|v| *v != 0.0);
+    let differences = |pair: &Pair| -> Vec<DVec3> {
+        let points = pair.points.as_chunks().0.iter().zip(pair.truth.as_chunks().0).zip(pair.valid);
+        let there = points.filter(|((point, _), valid)| **valid > 0.5 && is_predicted(point));
+        there.map(|((point, truth), _)| double(*point) - double(*truth)).collect()
     };
-    let off = |pair: &Pair, i: usize| -> [f64; 3] {
-        [0, 1, 2].map(|c| f64::from(pair.points[3 * i + c]) - f64::from(pair.truth[3 * i + c]))
-    };
-    let (mut shift, mut count) = ([0.0; 3], 0.0);
-    for pair in pairs.iter().filter(|pair| pair.view < 2) {
-        for i in there(pair) {
-            shift.iter_mut().zip(off(pair, i)).for_each(|(sum, v)| *sum += v);
-            count += 1.0;
-        }
-    }
-    let shift = shift.map(|sum| sum / f64::max(count, 1.0));
-    let length = |v: [f64; 3]| v.iter().map(|x| x * x).sum::<f64>().sqrt();
+    let photographed: Vec<DVec3> = pairs.iter().filter(|pair| pair.view < 2).flat_map(differences).collect();
+    let shift = photographed.iter().sum::<DVec3>() / photographed.len().max(1) as f64;
     let error = |pair: &Pair| {
-        let pixels = there(pair);
-        let sum = |of: &dyn Fn([f64; 3]) -> f64| pixels.iter().map(|i| of(off(pair, *i))).sum::<f64>();
-        let n = pixels.len() as f64;
+        let differences = differences(pair);
+        let n = differences.len() as f64;
         (n > 0.0).then(|| PointError {
             view: pair.view,
-            mean: sum(&length) / n,
-            centred: sum(&|v| length([0, 1, 2].map(|c| v[c] - shift[c]))) / n,
+            mean: differences.iter().map(|d| d.length()).sum::<f64>() / n,
+            centred: differences.iter().map(|d| (d - shift).length()).sum::<f64>() / n,
             missed: 1.0 - n / pair.valid.iter().filter(|v| **v > 0.5).count() as f64,
         })
     };

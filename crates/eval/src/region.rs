@@ -63,9 +63,11 @@ impl Region {
         Ok(Self { window, inside: Some(inside) })
     }
 
-    /// Whether a pixel of the window, row by row, counts.
-    pub fn counts(&self, pixel: usize) -> bool {
-        self.inside.as_ref().is_none_or(|inside| inside[pixel])
+    /// Whether a pixel of the picture counts.
+    pub fn counts(&self, column: usize, row: usize) -> bool {
+        let [x, y, width, height] = self.window;
+        let in_window = (x..x + width).contains(&column) && (y..y + height).contains(&row);
+        in_window && self.inside.as_ref().is_none_or(|inside| inside[(row - y) * width + column - x])
     }
 
     /// Number of pixels.

@@ -9,19 +9,17 @@ use crate::lpips::{Lpips, MIN_SIDE};
 use crate::pictures::Picture;
 use crate::region::Region;
 use crate::similarity::{psnr, ssim};
-use crate::statistics::number;
+use crate::statistics::mean;
 
 /// Metrics of a view, or their means.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Score {
     /// dB; ∞ for equal pictures.
-    #[serde(with = "number")]
+    #[serde(with = "crate::statistics::number")]
     pub psnr: f64,
     /// Absent if the region contains no whole window.
-    #[serde(with = "number::optional")]
     pub ssim: Option<f64>,
     /// Absent without weights, and for windows that are too small for the network.
-    #[serde(with = "number::optional")]
     pub lpips: Option<f64>,
 }
 
@@ -60,13 +58,7 @@ impl Score {
 
     /// Means of the figures that all scores have; `None` without scores.
     pub fn mean(scores: &[Self]) -> Option<Self> {
-        let n = scores.len() as f64;
-        let all =
-            |of: fn(&Self) -> Option<f64>| scores.iter().map(of).sum::<Option<f64>>().map(|sum| sum / n);
-        (!scores.is_empty()).then(|| Self {
-            psnr: scores.iter().map(|score| score.psnr).sum::<f64>() / n,
-            ssim: all(|score| score.ssim),
-            lpips: all(|score| score.lpips),
-        })
+        let over = |of: fn(&Self) -> Option<f64>| mean(&scores.iter().map(of).collect::<Option<Vec<_>>>()?);
+        Some(Self { psnr: over(|s| Some(s.psnr))?, ssim: over(|s| s.ssim), lpips: over(|s| s.lpips) })
     }
 }

@@ -34,14 +34,10 @@ impl SquaredError {
     pub fn add(&mut self, image: &Picture, target: &Picture, region: &Region) -> Result<(), EvalError> {
         check_sizes(image, target)?;
         let [x, y, width, height] = region.window;
-        for (channel, row) in (0..3).flat_map(|channel| (0..height).map(move |row| (channel, row))) {
-            let line =
-                |picture: &Picture| (y + row) * picture.width + x..(y + row) * picture.width + x + width;
-            let (a, b) = (&image.plane(channel)[line(image)], &target.plane(channel)[line(target)]);
-            let counts = |column: usize| region.counts(row * width + column);
-            let squares =
-                (0..width).filter(|i| counts(*i)).map(|i| (f64::from(a[i]) - f64::from(b[i])).powi(2));
-            self.sum += squares.sum::<f64>();
+        for (channel, row) in (0..3).flat_map(|channel| (y..y + height).map(move |row| (channel, row))) {
+            let [a, b] = [image, target].map(|picture| &picture.plane(channel)[row * picture.width..]);
+            let counted = (x..x + width).filter(|column| region.counts(*column, row));
+            self.sum += counted.map(|i| (f64::from(a[i]) - f64::from(b[i])).powi(2)).sum::<f64>();
         }
         self.count += 3 * region.pixels();
         Ok(())
@@ -85,9 +81,8 @@ pub fn check_sizes(image: &Picture, target: &Picture) -> Result<(), EvalError> {
 /// [`EvalError::Sizes`].
 pub fn ssim(image: &Picture, target: &Picture, region: &Region) -> Result<Option<f64>, EvalError> {
     check_sizes(image, target)?;
-    let half = UNIFORM / 2;
     let [x, y, w, h] = region.window;
-    let around = if region.inside.is_some() { half } else { 0 };
+    let around = if region.inside.is_some() { UNIFORM / 2 } else { 0 };
     let [left, top] = [x.saturating_sub(around), y.saturating_sub(around)];
     let [right, bottom] = [(x + w + around).min(image.width), (y + h + around).min(image.height)];
     let (width, height) = (right - left, bottom - top);
@@ -95,23 +90,46 @@ pub fn ssim(image: &Picture, target: &Picture, region: &Region) -> Result<Option
         return Ok(None);
     }
     let [image, target] = [image, target].map(|picture| picture.cropped([left, top, width, height]));
-    let window = Window::uniform();
-    let rows: Vec<(usize, usize)> = (0..3).flat_map(|c| (half..height - half).map(move |y| (c, y))).collect();
+    let count = (UNIFORM * UNIFORM) as f64;
+    let weights = vec![1.0 / UNIFORM as f64; UNIFORM];
+    let window = Window { weights, correction: count / (count - 1.0), padded: false };
+    Ok(mean_in_region(&image, &target, [left, top], region, &window))
+}
+
+/// [`ssim_gaussian`] of two pictures, computed in f64, mean over the pixels of a region and the channels.
+///
+/// # Errors
+/// [`EvalError::Sizes`].
+pub fn ssim_of_loss(image: &Picture, target: &Picture, region: &Region) -> Result<f64, EvalError> {
+    check_sizes(image, target)?;
+    let window = Window { weights: gaussian(), correction: 1.0, padded: true };
+    Ok(mean_in_region(image, target, [0, 0], region, &window).unwrap_or(f64::NAN))
+}
+
+/// Mean similarity over the channels and over the pixels of a region, for two parts of pictures from column `left` and
+/// row `top` on. `None` if the parts have no pixel of the region.
+fn mean_in_region(
+    image: &Picture,
+    target: &Picture,
+    [left, top]: [usize; 2],
+    region: &Region,
+    window: &Window,
+) -> Option<f64> {
+    let border = if window.padded { 0 } else { window.weights.len() / 2 };
+    let size @ [height, _] = [image.height, image.width];
+    let [_, y, _, h] = region.window;
+    let rows = border.max(y - top)..(height - border).min(y + h - top);
+    let lines = (0..3).flat_map(|c| rows.clone().map(move |row| (c, row)));
     let line = |(c, row): (usize, usize)| -> [f64; 2] {
-        // From columns of the crop to pixels of the region's window.
-        let inside = |column: usize| {
-            let (row, column) = ((top + row).checked_sub(y), (left + column).checked_sub(x));
-            let place = row.zip(column).filter(|(row, column)| *row < h && *column < w);
-            place.is_some_and(|(row, column)| region.counts(row * w + column))
-        };
-        let similarities = line_of(image.plane(c), target.plane(c), [height, width], row, &window);
-        let counted = similarities.into_iter().enumerate().filter(|(column, _)| inside(column + half));
+        let similarities = line_of(image.plane(c), target.plane(c), size, row, window);
+        let counts = |column: usize| region.counts(left + border + column, top + row);
+        let counted = similarities.into_iter().enumerate().filter(|(column, _)| counts(*column));
         counted.fold([0.0; 2], |[sum, count], (_, s)| [sum + s, count + 1.0])
     };
     // Sums in the order of the rows do not depend on the number of threads.
-    let sums: Vec<[f64; 2]> = rows.into_par_iter().map(line).collect();
+    let sums: Vec<[f64; 2]> = lines.collect::<Vec<_>>().into_par_iter().map(line).collect();
     let [sum, count] = sums.iter().fold([0.0; 2], |[a, b], [c, d]| [a + c, b + d]);
-    Ok((count > 0.0).then(|| sum / count))
+    (count > 0.0).then(|| sum / count)
 }
 
 /// A window around a pixel.
@@ -122,18 +140,6 @@ struct Window {
     correction: f64,
     /// Whether the picture is padded with zeros. Otherwise pixels whose window leaves it are left out.
     padded: bool,
-}
-
-impl Window {
-    fn uniform() -> Self {
-        let count = (UNIFORM * UNIFORM) as f64;
-        let weights = vec![1.0 / UNIFORM as f64; UNIFORM];
-        Self { weights, correction: count / (count - 1.0), padded: false }
-    }
-
-    fn gaussian() -> Self {
-        Self { weights: gaussian(), correction: 1.0, padded: true }
-    }
 }
 
 /// Similarities of the pixels of row `y` of two planes `[H, W]`.
@@ -168,24 +174,6 @@ fn line_of(a: &[f32], b: &[f32], [height, width]: [usize; 2], y: usize, window: 
         similarity.min(1.0)
     };
     columns.windows(weights.len()).map(similarity).collect()
-}
-
-/// [`ssim_gaussian`] of two pictures, computed in f64, mean over the pixels of a region and the channels.
-///
-/// # Errors
-/// [`EvalError::Sizes`].
-pub fn ssim_of_loss(image: &Picture, target: &Picture, region: &Region) -> Result<f64, EvalError> {
-    check_sizes(image, target)?;
-    let [x, y, width, height] = region.window;
-    let window = Window::gaussian();
-    let rows: Vec<(usize, usize)> = (0..3).flat_map(|c| (0..height).map(move |row| (c, row))).collect();
-    let line = |(c, row): (usize, usize)| -> f64 {
-        let size = [image.height, image.width];
-        let values = line_of(image.plane(c), target.plane(c), size, y + row, &window);
-        (0..width).filter(|i| region.counts(row * width + i)).map(|i| values[x + i]).sum()
-    };
-    let sums: Vec<f64> = rows.into_par_iter().map(line).collect();
-    Ok(sums.iter().sum::<f64>() / (3 * region.pixels()) as f64)
 }
 
 /// Structural similarity `[B,C,H,W]` of every pixel and channel of pictures `[B,C,H,W]` with values in [0, 1], for the

@@ -27,14 +27,15 @@ pub struct Interval {
     pub high: f64,
 }
 
+/// The mean; `None` without figures.
+pub fn mean(figures: &[f64]) -> Option<f64> {
+    (!figures.is_empty()).then(|| figures.iter().sum::<f64>() / figures.len() as f64)
+}
+
 /// Mean of one figure per person, with the percentile bootstrap over people; `None` without people. For paired
 /// differences it is the paired interval. An infinite figure (the PSNR of equal pictures) makes the mean infinite.
 pub fn interval(figures: &[f64]) -> Option<Interval> {
-    let n = figures.len();
-    if n == 0 {
-        return None;
-    }
-    let mean = figures.iter().sum::<f64>() / n as f64;
+    let (n, mean) = (figures.len(), mean(figures)?);
     let mut random = ChaCha8Rng::seed_from_u64(SEED);
     let resampled = |_| (0..n).map(|_| figures[random.random_range(0..n)]).sum::<f64>() / n as f64;
     let mut means: Vec<f64> = (0..RESAMPLES).map(resampled).collect();
@@ -95,22 +96,6 @@ pub mod number {
         match Written::deserialize(deserializer)? {
             Written::Number(value) => Ok(value),
             Written::Text(text) => text.parse().map_err(D::Error::custom),
-        }
-    }
-
-    /// The same for optional figures.
-    pub mod optional {
-        use serde::Serializer;
-
-        /// Writes `null` for `None`.
-        ///
-        /// # Errors
-        /// Those of the serializer.
-        pub fn serialize<S: Serializer>(value: &Option<f64>, serializer: S) -> Result<S::Ok, S::Error> {
-            match value {
-                Some(value) => super::serialize(value, serializer),
-                None => serializer.serialize_none(),
-            }
         }
     }
 }

@@ -5,6 +5,7 @@ use std::collections::BTreeSet;
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value, json};
 use snapsnap_data::sample::Handling;
 use snapsnap_net::precision::Precision;
 use snapsnap_splat::Preset;
@@ -67,33 +68,22 @@ pub enum Tune {
 impl Variant {
     /// This variant with the unset keys of `base`. Overrides of the config follow those of `base`.
     pub fn over(self, base: &Self) -> Self {
-        let base = base.clone();
+        let mut keys = base.keys();
+        keys.extend(self.keys());
+        let merged = serde_json::from_value(Value::Object(keys)).expect("keys of variants");
         Self {
-            weights: self.weights.or(base.weights),
-            set: [base.set, self.set].concat(),
-            device: self.device.or(base.device),
-            precision: self.precision.or(base.precision),
-            sides: self.sides.or(base.sides),
-            side_colors: self.side_colors.or(base.side_colors),
-            stride: self.stride.or(base.stride),
-            min_opacity: self.min_opacity.or(base.min_opacity),
-            knob: self.knob.or(base.knob),
-            supersampling: self.supersampling.or(base.supersampling),
-            preset: self.preset.or(base.preset),
-            antialiased: self.antialiased.or(base.antialiased),
-            scene: self.scene.or(base.scene),
-            omits: self.omits.or(base.omits),
-            data: self.data.or(base.data),
-            only: self.only.or(base.only),
-            inputs: self.inputs.or(base.inputs),
-            tune: self.tune.or(base.tune),
-            photographs: self.photographs.or(base.photographs),
+            weights: self.weights.or(base.weights.clone()),
+            set: [base.set.clone(), self.set].concat(),
+            ..merged
         }
     }
 
-    /// Whether the unseen sides are predicted: scenes of more than two photographs have none.
-    pub(crate) fn has_sides(&self) -> bool {
-        self.sides.unwrap_or(self.inputs.as_ref().is_none_or(|inputs| inputs.len() <= 2))
+    /// The set keys with their values, without `weights`, which JSON cannot express if it is not UTF-8.
+    fn keys(&self) -> Map<String, Value> {
+        let variant = json!(Self { weights: None, ..self.clone() });
+        let Value::Object(mut keys) = variant else { unreachable!("a variant has keys") };
+        keys.retain(|_, value| !value.is_null());
+        keys
     }
 
     /// The first key whose value makes no sense, and why.
@@ -112,19 +102,20 @@ impl Variant {
 
     /// The first key that is set and that only benchmarks have.
     pub(crate) fn key_of_benchmarks(&self) -> Option<&'static str> {
-        let keys = [
-            ("knob", self.knob.is_some()),
-            ("supersampling", self.supersampling.is_some()),
-            ("preset", self.preset.is_some()),
-            ("antialiased", self.antialiased.is_some()),
-            ("scene", self.scene.is_some()),
-            ("omits", self.omits.is_some()),
-            ("data", self.data.is_some()),
-            ("only", self.only.is_some()),
-            ("inputs", self.inputs.is_some()),
-            ("tune", self.tune.is_some()),
+        const KEYS: [&str; 10] = [
+            "knob",
+            "supersampling",
+            "preset",
+            "antialiased",
+            "scene",
+            "omits",
+            "data",
+            "only",
+            "inputs",
+            "tune",
         ];
-        keys.into_iter().find_map(|(key, is_set)| is_set.then_some(key))
+        let keys = self.keys();
+        KEYS.into_iter().find(|key| keys.contains_key(*key))
     }
 }
 

@@ -20,7 +20,7 @@ use crate::evaluate::person::{People, photograph};
 use crate::evaluate::{Contestant, Kind, by_person, evaluate, rendered};
 use crate::lpips::Lpips;
 use crate::score::Score;
-use crate::statistics::{Interval, difference, interval, quantile_of_times};
+use crate::statistics::{Interval, difference, interval, mean, quantile_of_times};
 use crate::variant::Variant;
 
 use config::BenchConfig;
@@ -29,7 +29,7 @@ use config::BenchConfig;
 const FEW: usize = 5;
 
 /// Costs and errors of a variant.
-#[derive(Debug, Clone, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub struct Measured {
     /// Its name.
     pub name: String,
@@ -192,9 +192,8 @@ pub fn measure(
         Score::mean(&scores).ok_or_else(|| EvalError::Empty("no view could be compared".into()))?;
     let points = |sides: bool| {
         let errors = judged.points.iter().flat_map(|(_, errors)| errors);
-        let errors: Vec<f64> =
-            errors.filter(|error| (error.view > 1) == sides).map(|error| 1e3 * error.mean).collect();
-        (!errors.is_empty()).then(|| errors.iter().sum::<f64>() / errors.len() as f64)
+        let errors = errors.filter(|error| (error.view > 1) == sides);
+        mean(&errors.map(|error| 1e3 * error.mean).collect::<Vec<_>>())
     };
     let of_person =
         |(row, score): (usize, Score)| PersonScore { name: outcome.people[row].clone(), psnr: score.psnr };
@@ -279,32 +278,8 @@ mod tests {
     /// dB.
     fn measured(p50: f64, psnr: f64) -> Measured {
         let person = |name: &str, psnr| PersonScore { name: name.into(), psnr };
-        Measured {
-            name: String::new(),
-            knob: None,
-            scene: None,
-            omits: None,
-            plan: Vec::new(),
-            tuning: None,
-            device: String::new(),
-            runs: 1,
-            p50,
-            p95: p50,
-            modules: Vec::new(),
-            memory: None,
-            render: 1.0,
-            gaussians: 0,
-            psnr: psnr + 1.0,
-            people: vec![person("a", psnr), person("b", psnr + 2.0)],
-            ssim: None,
-            lpips: None,
-            lpips_weights: String::new(),
-            points_mm: None,
-            sides_mm: None,
-            splat_error: 0.0,
-            cutoff_error: 0.0,
-            left_out: Vec::new(),
-        }
+        let people = vec![person("a", psnr), person("b", psnr + 2.0)];
+        Measured { p50, render: 1.0, psnr: psnr + 1.0, people, ..Measured::default() }
     }
 
     #[test]

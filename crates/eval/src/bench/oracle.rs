@@ -1,5 +1,6 @@
 //! Differences of the renderer from the f64 oracle.
 
+use burn::tensor::Tensor;
 use snapsnap_ops::host;
 use snapsnap_splat::reference::{self, Cutoff, Scene};
 use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
@@ -17,7 +18,10 @@ pub(super) fn errors(
     options: &RenderOptions,
 ) -> Result<(f64, f64), EvalError> {
     let got = host(render(gaussians, std::slice::from_ref(camera), options)?.color);
-    let scene = scene(gaussians);
+    let Gaussians { means, rotations, scales, opacities, colors } = gaussians.clone();
+    let rows = host(Tensor::cat(vec![means, rotations, scales, opacities.unsqueeze_dim(1), colors], 1));
+    let rows = rows.as_chunks().0.iter().map(|row| row.map(f64::from));
+    let scene = Scene { gaussians: rows.collect(), background: [0.0; 3] };
     let hard = reference::render(&scene, camera, options, Cutoff::Hard);
     let whole = RenderOptions { max_alpha: WHOLE, ..options.clone() };
     let smooth = reference::render(&scene, camera, &whole, Cutoff::Smooth);
@@ -29,24 +33,4 @@ pub(super) fn errors(
         }
     }
     Ok((rounding, cutoffs))
-}
-
-/// The oracle's form of Gaussians, over black.
-fn scene(gaussians: &Gaussians) -> Scene<f64> {
-    let double = |values: Vec<f32>| values.into_iter().map(f64::from).collect::<Vec<_>>();
-    let means = double(host(gaussians.means.clone()));
-    let rotations = double(host(gaussians.rotations.clone()));
-    let scales = double(host(gaussians.scales.clone()));
-    let opacities = double(host(gaussians.opacities.clone()));
-    let colors = double(host(gaussians.colors.clone()));
-    let one = |i: usize| {
-        let mut numbers = [0.0; 14];
-        numbers[..3].copy_from_slice(&means[3 * i..3 * i + 3]);
-        numbers[3..7].copy_from_slice(&rotations[4 * i..4 * i + 4]);
-        numbers[7..10].copy_from_slice(&scales[3 * i..3 * i + 3]);
-        numbers[10] = opacities[i];
-        numbers[11..].copy_from_slice(&colors[3 * i..3 * i + 3]);
-        numbers
-    };
-    Scene { gaussians: (0..opacities.len()).map(one).collect(), background: [0.0; 3] }
 }

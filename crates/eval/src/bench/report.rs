@@ -189,21 +189,19 @@ impl Bench<'_> {
     }
 
     fn modules(&self, text: &mut String) {
-        let mut names: Vec<&String> = Vec::new();
+        let mut header = vec!["setting"];
         for (name, _) in self.measured.iter().flat_map(|m| &m.modules) {
-            if !names.contains(&name) {
-                names.push(name);
+            if !header.contains(&name.as_str()) {
+                header.push(name);
             }
         }
         let row = |m: &Measured| -> Vec<String> {
-            let time = |name: &&String| {
+            let time = |name: &&str| {
                 let found = m.modules.iter().find(|(module, _)| module == *name);
                 found.map_or(String::new(), |(_, seconds)| format!("{:.1}", 1e3 * seconds))
             };
-            [m.name.clone()].into_iter().chain(names.iter().map(time)).collect()
+            [m.name.clone()].into_iter().chain(header[1..].iter().map(time)).collect()
         };
-        let header: Vec<&str> =
-            ["setting"].into_iter().chain(names.iter().map(|name| name.as_str())).collect();
         let table = table_markdown(&header, self.measured.iter().map(row));
         let _ = write!(text, "\n## By module\n\nMilliseconds, p50.\n\n{table}");
     }

@@ -22,10 +22,6 @@ struct Moments {
 }
 
 impl Moments {
-    fn new(like: &Tensor<2>) -> Self {
-        Self { mean: like.zeros_like(), squares: like.zeros_like() }
-    }
-
     /// The direction of a step, of size 1 or so.
     fn direction(&mut self, gradient: Tensor<2>, step: usize) -> Tensor<2> {
         const BETAS: [f64; 2] = [0.9, 0.99];
@@ -55,26 +51,23 @@ pub(super) fn fit(
     let Gaussians { means, rotations, scales, opacities, colors } = gaussians.clone();
     let mut rows = [means, rotations, scales, opacities.unsqueeze_dim(1), colors]
         .map(|x: Tensor<2>| Tensor::<2>::from_data(x.to_data(), &device));
-    let is_fitted = |parameter: usize| what == Tune::All || parameter == 4;
-    let mut moments: Vec<Option<Moments>> = rows
-        .iter()
-        .enumerate()
-        .map(|(i, x)| is_fitted(i).then(|| Moments::new(&x.clone().inner())))
-        .collect();
+    let fitted = if what == Tune::All { 0..5 } else { 4..5 };
+    let zeros = |x: &Tensor<2>| x.clone().inner().zeros_like();
+    let initial = |x| Moments { mean: zeros(x), squares: zeros(x) };
+    let mut moments: Vec<Moments> = rows[fitted.clone()].iter().map(initial).collect();
     let assembled = |[means, rotations, scales, opacities, colors]: [Tensor<2>; 5]| {
         Gaussians::new(means, rotations, scales, opacities.squeeze_dim(1), colors)
     };
     let mut times = Vec::new();
     for step in 0..steps {
         let start = Instant::now();
-        let tracked = [0, 1, 2, 3, 4].map(|i| match is_fitted(i) {
-            true => rows[i].clone().require_grad(),
-            false => rows[i].clone(),
-        });
+        let mut tracked = rows.clone();
+        for x in &mut tracked[fitted.clone()] {
+            *x = x.clone().require_grad();
+        }
         let rendered = render(&assembled(tracked.clone())?, &cameras, &RenderOptions::inria())?;
         let gradients = (rendered.color - targets.clone()).abs().mean().backward();
-        for (i, moments) in moments.iter_mut().enumerate() {
-            let Some(moments) = moments else { continue };
+        for (i, moments) in fitted.clone().zip(&mut moments) {
             let Some(gradient) = tracked[i].grad(&gradients) else { continue };
             let direction = moments.direction(gradient, step);
             let value = rows[i].clone().inner();

@@ -286,12 +286,9 @@ impl EvalConfig {
         if let Some(problem) = views_problem(&views.inputs) {
             return Some(("views.inputs", problem));
         }
-        for (key, list) in [("views.turns", &views.turns), ("views.compared", &views.compared)] {
-            if names_twice(list) {
-                return Some((key, "names a view twice".into()));
-            }
-        }
         let problems = [
+            ("views.turns", names_twice(&views.turns), "names a view twice"),
+            ("views.compared", names_twice(&views.compared), "names a view twice"),
             ("views.turns", !(1..=64).contains(&views.turns.len()), "must have 1 to 64 entries"),
             ("views.supersampling", ![1, 2].contains(&views.supersampling), "must be 1 or 2"),
             (

@@ -5,10 +5,12 @@ use std::time::Duration;
 use burn::tensor::Device;
 use snapsnap_data::sample::{Handling, TestItem};
 use snapsnap_net::Photograph;
-use snapsnap_splat::Gaussians;
+use snapsnap_splat::{Camera, Gaussians};
 
+use super::config::ViewsSection;
 use super::model::{Model, no_gaussian};
 use super::person::{People, Points, nearest_view, photograph, points};
+use super::rendered;
 use super::sides::side_points;
 use crate::EvalError;
 use crate::baselines::{MeanPictures, billboard, true_points};
@@ -46,25 +48,15 @@ enum Means {
 }
 
 /// A contestant's result for a person.
-#[derive(Default)]
 pub struct Shown {
     /// World frame; `None` for pictures alone.
     pub gaussians: Option<Gaussians>,
-    /// Errors of the predicted points.
-    pub points: Vec<PointError>,
-    /// Why the errors of the points could not be measured.
-    pub no_points: Option<String>,
+    /// Errors of the predicted points, or why they could not be measured.
+    pub points: Result<Vec<PointError>, String>,
     /// Number of pixels and Gaussians that were not finite.
     pub lost: usize,
     /// Time of the reconstruction.
     pub time: Option<Duration>,
-}
-
-impl Shown {
-    /// Whether it is rendered on the CPU.
-    pub fn is_on_cpu(&self) -> bool {
-        self.gaussians.as_ref().is_none_or(|gaussians| gaussians.device().identity().is_none())
-    }
 }
 
 impl Contestant {
@@ -113,7 +105,10 @@ impl Contestant {
         inputs: &[usize],
         canvas: usize,
     ) -> Result<Shown, EvalError> {
-        let plain = |gaussians| Shown { gaussians: Some(gaussians), ..Shown::default() };
+        let of = |gaussians| Shown { gaussians, points: Ok(Vec::new()), lost: 0, time: None };
+        let plain = |gaussians: Gaussians| {
+            if gaussians.is_empty() { Err(no_gaussian()) } else { Ok(of(Some(gaussians))) }
+        };
         match &self.means {
             Means::Model(_, model) => {
                 let is_changed = model.photographs != Handling::default();
@@ -121,18 +116,14 @@ impl Contestant {
                 let item = own.as_ref().unwrap_or(item);
                 let made = model.reconstruct(item, inputs)?;
                 // Pictures can be compared without errors of points.
-                let (points, no_points) = match errors(people, row, item, inputs, &made.maps, model.side()) {
-                    Ok(points) => (points, None),
-                    Err(e) => (Vec::new(), Some(e.to_string())),
-                };
-                let (gaussians, lost, time) = (Some(made.gaussians), made.lost, Some(made.time));
-                Ok(Shown { gaussians, points, no_points, lost, time })
+                let points = errors(people, row, item, inputs, &made.maps, model.side());
+                let points = points.map_err(|e| e.to_string());
+                Ok(Shown { points, lost: made.lost, time: Some(made.time), ..plain(made.gaussians)? })
             }
             Means::Billboard(device) => {
-                let (images, valid) = on_canvas(item, inputs.len(), canvas);
+                let (photographs, valid) = on_canvas(item, inputs.len(), canvas);
                 let cameras: Vec<_> = inputs.iter().map(|view| item.cameras[*view]).collect();
-                let made = billboard(&images, &valid.concat(), canvas, &cameras, device);
-                made.map(plain).ok_or_else(no_gaussian)
+                plain(billboard(&photographs, &valid, canvas, &cameras, device))
             }
             Means::TruePoints(device) => {
                 let mut views = inputs.to_vec();
@@ -143,32 +134,42 @@ impl Contestant {
                     let message = format!("views of {}² give no points on a canvas of {canvas}²", item.side);
                     return Err(EvalError::Empty(message));
                 };
-                let (images, mut valid) = on_canvas(item, inputs.len(), canvas);
+                let (photographs, mut valid) = on_canvas(item, inputs.len(), canvas);
                 valid.resize(views.len(), vec![true; canvas * canvas]);
                 for (valid, there) in valid.iter_mut().flatten().zip(there) {
                     *valid &= there > 0.5;
                 }
                 let front = &item.cameras[inputs[0]];
-                let made = true_points(&images, inputs.len(), &points, &valid, canvas, front, device);
-                made.map(plain).ok_or_else(no_gaussian)
+                plain(true_points(&photographs, &points, &valid, canvas, front, device))
             }
-            Means::Fixed(gaussians) => Ok(plain(gaussians.as_ref().clone())),
-            Means::Mean(_) => Ok(Shown::default()),
+            Means::Fixed(gaussians) => plain(gaussians.as_ref().clone()),
+            Means::Mean(_) => Ok(of(None)),
         }
     }
 
-    /// A view of a contestant without Gaussians.
-    pub(super) fn picture(&self, view: usize, side: usize) -> Result<Picture, EvalError> {
-        match &self.means {
-            Means::Mean(pictures) => pictures.picture(view, side),
-            _ => Err(EvalError::Empty("there is nothing to render".into())),
+    /// Its picture of a view, `side`² pixels.
+    ///
+    /// # Errors
+    /// [`EvalError`] for Gaussians that cannot be rendered.
+    pub(super) fn picture(
+        &self,
+        shown: &Shown,
+        camera: &Camera,
+        view: usize,
+        side: usize,
+        views: &ViewsSection,
+    ) -> Result<Picture, EvalError> {
+        match (&shown.gaussians, &self.means) {
+            (Some(gaussians), _) => rendered(gaussians, camera, side, views),
+            (None, Means::Mean(pictures)) => pictures.picture(view, side),
+            (None, _) => Err(EvalError::Empty("there is nothing to render".into())),
         }
     }
 }
 
-/// The photographs `[N,3,S,S]` on a canvas, and the pixels that are at least half the person's. Those have the person's
+/// The photographs `[3,S,S]` on a canvas, and the pixels that are at least half the person's. Those have the person's
 /// own colour.
-fn on_canvas(item: &TestItem, count: usize, side: usize) -> (Vec<f32>, Vec<Vec<bool>>) {
+fn on_canvas(item: &TestItem, count: usize, side: usize) -> (Vec<Vec<f32>>, Vec<Vec<bool>>) {
     // Stored colours are multiplied with the mask. Networks may have learned to undo that, baselines cannot.
     let own = |photo: Photograph| {
         let Photograph { mut rgb, mask, valid } = photo;
@@ -177,9 +178,7 @@ fn on_canvas(item: &TestItem, count: usize, side: usize) -> (Vec<f32>, Vec<Vec<b
         }
         (rgb, valid)
     };
-    let photographs = (0..count).map(|place| photograph(item, place, side));
-    let (images, valid): (Vec<_>, Vec<_>) = photographs.map(own).unzip();
-    (images.concat(), valid)
+    (0..count).map(|place| own(photograph(item, place, side))).unzip()
 }
 
 /// Errors of predicted maps, by their indices in [`crate::points::VIEWS`], at the pixels with ground truth.

@@ -8,13 +8,14 @@ use serde::Serialize;
 use snapsnap_base::FileError;
 use snapsnap_data::scan::{Collection, normalise};
 use snapsnap_mesh::import::{self, EXTENSIONS};
+use snapsnap_mesh::mesh::Mesh;
 
 use super::config::EvalConfig;
 use super::person::People;
 use super::surface::{thinned, truth as truth_of};
 use super::{LeftOut, missing, name_of};
 use crate::EvalError;
-use crate::geometry::{Alignment, chamfer, icp, point_to_surface, sampled};
+use crate::geometry::{Alignment, chamfer, double, icp, point_to_surface, sampled};
 
 /// Points drawn from each surface.
 const POINTS: usize = 50_000;
@@ -90,17 +91,15 @@ fn one(
     let subject = people.test().name(row);
     let mut mesh = import::read(&find(folder, subject)?)?;
     let seen = truth_of(people, row)?;
-    let scan = match &config.data.scans {
-        Some(scans) => {
-            let path = find(scans, subject)?;
-            let mut scan = import::read(&path)?;
-            // The scan gets the pose that `prepare` gave it. Test people are not moved sideways.
-            normalise(&mut scan, Collection::Other, None::<&mut ChaCha8Rng>)
-                .map_err(|e| FileError::unsuitable(&path, e.to_string()))?;
-            Some(scan)
-        }
-        None => None,
+    let scan = |scans: &PathBuf| -> Result<Mesh, EvalError> {
+        let path = find(scans, subject)?;
+        let mut scan = import::read(&path)?;
+        // The scan gets the pose that `prepare` gave it. Test people are not moved sideways.
+        normalise(&mut scan, Collection::Other, None::<&mut ChaCha8Rng>)
+            .map_err(|e| FileError::unsuitable(&path, e.to_string()))?;
+        Ok(scan)
     };
+    let scan = config.data.scans.as_ref().map(scan).transpose()?;
     // A scan is complete; the points of the views are not.
     let truth = match &scan {
         Some(scan) => sampled(scan, POINTS, SEEDS[1])?,
@@ -114,11 +113,9 @@ fn one(
         let Alignment { scale, rotation, .. } = motion;
         let angle = 2.0 * rotation.w.abs().min(1.0).acos();
         // The motion of the world's origin has no meaning, that of the middle has.
-        let middle = |points: &mut dyn Iterator<Item = [f32; 3]>| {
-            points.map(|p| Vec3::from_array(p).as_dvec3()).sum::<DVec3>() / ALIGNED as f64
-        };
-        let moved =
-            middle(&mut points.iter().map(|p| motion.apply(*p))) - middle(&mut points.iter().copied());
+        let middle = |points: &[[f32; 3]]| points.iter().map(|p| double(*p)).sum::<DVec3>() / ALIGNED as f64;
+        let after: Vec<[f32; 3]> = points.iter().map(|p| motion.apply(*p)).collect();
+        let moved = middle(&after) - middle(&points);
         aligned = Some([angle.to_degrees(), 1e2 * moved.length(), scale]);
     }
     let surface = sampled(&mesh, POINTS, SEEDS[0])?;

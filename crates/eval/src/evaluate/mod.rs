@@ -25,6 +25,7 @@ use crate::region::{Region, margin};
 use crate::score::Score;
 
 use config::{EvalConfig, Protocol, ViewsSection};
+use contest::Shown;
 pub use contest::{Contestant, Kind};
 use person::People;
 pub use surface::{Surface, Truth, truth};
@@ -119,27 +120,23 @@ pub fn evaluate(
     sides.dedup();
     let pictures =
         format!("pictures of {} pixels, rendered at {}×", sides.join(" and "), config.views.supersampling);
-    let mut outcome = Outcome { people: Vec::new(), judged: Vec::new(), left_out: Vec::new(), pictures };
     let named = |contestant: &Contestant| Judged {
         name: contestant.name.clone(),
         kind: contestant.kind(),
         ..Judged::default()
     };
-    outcome.judged = contestants.iter().map(named).collect();
+    let judged = contestants.iter().map(named).collect();
+    let mut outcome = Outcome { people: Vec::new(), judged, left_out: Vec::new(), pictures };
     for people in sets {
         for &row in people.chosen() {
             let person = outcome.people.len();
             outcome.people.push(name_of(sets, people, row));
+            let at = Place { config, contestants, lpips, people, row, person };
             let is_measured = config.metrics.geometry || config.metrics.mesh;
-            let truth = is_measured.then(|| truth(people, row)).transpose();
-            let truth = truth.unwrap_or_else(|e| {
-                let name = format!("{}, geometry", outcome.people[person]);
-                outcome.left_out.push(LeftOut::new(name, e));
-                None
-            });
+            let truth = is_measured.then(|| truth(people, row));
+            let truth = truth.and_then(|truth| at.kept(&mut outcome, ", geometry", truth));
             for &turn in &config.views.turns {
-                let at = Place { people, row, turn, person };
-                one(config, &at, truth.as_ref(), contestants, lpips, &mut outcome);
+                at.evaluate(turn, truth.as_ref(), &mut outcome);
             }
             progress(person + 1, total);
         }
@@ -192,14 +189,20 @@ fn name_of(sets: &[People], people: &People, row: usize) -> String {
     }
 }
 
-/// A person with the input views of one turn.
+/// A person and the contestants.
 struct Place<'a> {
+    config: &'a EvalConfig,
+    contestants: &'a [Contestant],
+    lpips: Option<&'a Lpips>,
     people: &'a People,
+    /// Row of the data set.
     row: usize,
-    turn: usize,
     /// Row of the outcome's people.
     person: usize,
 }
+
+/// A contestant's index, and its scores by protocol.
+type Scored = (usize, Result<Vec<Score>, EvalError>);
 
 impl Place<'_> {
     /// Records a failure; `what` follows the person's name.
@@ -207,92 +210,105 @@ impl Place<'_> {
         let name = format!("{}{what}", outcome.people[self.person]);
         outcome.left_out.push(LeftOut::new(name, why));
     }
-}
 
-fn one(
-    config: &EvalConfig,
-    at: &Place,
-    truth: Option<&Truth>,
-    contestants: &[Contestant],
-    lpips: Option<&Lpips>,
-    outcome: &mut Outcome,
-) {
-    let Place { people, row, turn, person } = *at;
-    let inputs = people.inputs(&config.views, turn);
-    let item = match people.item(row, &inputs, &Handling::default()) {
-        Ok(item) => item,
-        Err(e) => return at.left_out(outcome, "", e),
-    };
-    let mut shown: Vec<Option<contest::Shown>> = Vec::new();
-    for (i, contestant) in contestants.iter().enumerate() {
-        let made = contestant.prepare(people, row, &item, &inputs, people.side(&config.views));
-        let made = match made {
-            Ok(made) => made,
-            Err(e) => {
-                at.left_out(outcome, &format!(", {}", contestant.name), e);
-                shown.push(None);
-                continue;
+    /// The result, or `None` and a record of the failure.
+    fn kept<T>(&self, outcome: &mut Outcome, what: &str, result: Result<T, impl ToString>) -> Option<T> {
+        result.map_err(|e| self.left_out(outcome, what, e)).ok()
+    }
+
+    /// Evaluates all contestants with the input views of one turn.
+    fn evaluate(&self, turn: usize, truth: Option<&Truth>, outcome: &mut Outcome) {
+        let Self { config, contestants, people, row, person, .. } = *self;
+        let (inputs, side) = (people.inputs(&config.views, turn), people.side(&config.views));
+        let item = people.item(row, &inputs, &Handling::default());
+        let Some(item) = self.kept(outcome, "", item) else { return };
+        let mut shown = Vec::new();
+        for (i, contestant) in contestants.iter().enumerate() {
+            let made = contestant.prepare(people, row, &item, &inputs, side);
+            let made = self.kept(outcome, &format!(", {}", contestant.name), made);
+            if let Some(made) = &made {
+                self.measure(i, made, truth, outcome);
             }
-        };
-        if let Some(why) = &made.no_points {
-            at.left_out(outcome, &format!(", {}, points", contestant.name), why);
+            shown.push(made);
         }
+        let is_compared =
+            |view: &usize| config.views.compared.is_empty() || config.views.compared.contains(view);
+        let compared: Vec<usize> =
+            (0..people.views()).filter(|view| is_compared(view) && !inputs.contains(view)).collect();
+        if compared.is_empty() {
+            let why = "no view is left to compare: every one of views.compared is an input";
+            self.left_out(outcome, "", why);
+        }
+        let compare = |view: &usize| self.compare(&item, *view, &shown);
+        // A GPU runs one task at a time.
+        let is_on_gpu = |gaussians: &Gaussians| gaussians.device().identity().is_some();
+        let any_on_gpu = shown.iter().flatten().filter_map(|made| made.gaussians.as_ref()).any(is_on_gpu);
+        let most = if any_on_gpu { 1 } else { at_once(side * config.views.supersampling) };
+        let found = compared.chunks(most).flat_map(|views| match views {
+            [view] => vec![compare(view)],
+            views => views.par_iter().map(compare).collect(),
+        });
+        let found: Vec<Result<Vec<Scored>, EvalError>> = found.collect();
+        for (view, found) in compared.into_iter().zip(found) {
+            let degrees = person::degrees(&item.cameras[view], &item.cameras[inputs[0]]);
+            let scored = self.kept(outcome, &format!(", view {view}"), found);
+            for (i, scores) in scored.unwrap_or_default() {
+                let what = format!(", {}, view {view}", contestants[i].name);
+                if let Some(scores) = self.kept(outcome, &what, scores) {
+                    outcome.judged[i].rows.push(Row { person, turn, view, degrees, scores });
+                }
+            }
+        }
+    }
+
+    /// Records all measurements of a contestant but those of pictures.
+    fn measure(&self, i: usize, made: &Shown, truth: Option<&Truth>, outcome: &mut Outcome) {
+        let Self { config, person, .. } = *self;
+        let name = format!(", {}", self.contestants[i].name);
+        let points = self.kept(outcome, &format!("{name}, points"), made.points.clone());
         if made.lost > 0 {
             let why = format!("{} pixels or Gaussians left out: they are not finite", made.lost);
-            at.left_out(outcome, &format!(", {}", contestant.name), why);
+            self.left_out(outcome, &name, why);
         }
         let judged = &mut outcome.judged[i];
-        if !made.points.is_empty() {
-            judged.points.push((person, made.points.clone()));
-        }
+        judged.points.extend(points.filter(|points| !points.is_empty()).map(|points| (person, points)));
         judged.times.extend(made.time);
         judged.gaussians.extend(made.gaussians.as_ref().map(Gaussians::len));
-        if let (Some(truth), Some(gaussians)) = (truth, &made.gaussians) {
-            if config.metrics.geometry {
-                match Surface::of_gaussians(gaussians, truth, config.metrics.opaque) {
-                    Ok(surface) => judged.surface.push((person, surface)),
-                    Err(e) => at.left_out(outcome, &format!(", {}, geometry", contestant.name), e),
-                }
-            }
-            if config.metrics.mesh && outcome.judged[i].kind != Kind::Baseline {
-                match Surface::of_mesh(gaussians, truth) {
-                    Ok(surface) => outcome.judged[i].mesh.push((person, surface)),
-                    Err(e) => at.left_out(outcome, &format!(", {}, mesh", contestant.name), e),
-                }
-            }
+        let is_baseline = judged.kind == Kind::Baseline;
+        let Some((truth, gaussians)) = truth.zip(made.gaussians.as_ref()) else { return };
+        if config.metrics.geometry {
+            let surface = Surface::of_gaussians(gaussians, truth, config.metrics.opaque);
+            let surface = self.kept(outcome, &format!("{name}, geometry"), surface);
+            outcome.judged[i].surface.extend(surface.map(|surface| (person, surface)));
         }
-        shown.push(Some(made));
+        if config.metrics.mesh && !is_baseline {
+            let mesh = self.kept(outcome, &format!("{name}, mesh"), Surface::of_mesh(gaussians, truth));
+            outcome.judged[i].mesh.extend(mesh.map(|mesh| (person, mesh)));
+        }
     }
-    let is_compared = |view: &usize| config.views.compared.is_empty() || config.views.compared.contains(view);
-    let compared: Vec<usize> =
-        (0..people.views()).filter(|view| is_compared(view) && !inputs.contains(view)).collect();
-    if compared.is_empty() {
-        at.left_out(outcome, "", "no view is left to compare: every one of views.compared is an input");
-    }
-    let compare = |view: &usize| compare(config, at, &item, *view, (contestants, &shown), lpips);
-    // A GPU runs one task at a time.
-    let is_on_cpu = shown.iter().flatten().all(contest::Shown::is_on_cpu);
-    let most = if is_on_cpu { at_once(people.side(&config.views) * config.views.supersampling) } else { 1 };
-    let found = compared.chunks(most).flat_map(|views| match views {
-        [view] => vec![compare(view)],
-        views => views.par_iter().map(compare).collect(),
-    });
-    let found: Vec<Result<Vec<Scored>, EvalError>> = found.collect();
-    for (view, found) in compared.into_iter().zip(found) {
-        let scored = match found {
-            Ok(scored) => scored,
-            Err(e) => {
-                at.left_out(outcome, &format!(", view {view}"), e);
-                continue;
-            }
+
+    /// Compares the pictures of a view.
+    fn compare(
+        &self,
+        item: &TestItem,
+        view: usize,
+        shown: &[Option<Shown>],
+    ) -> Result<Vec<Scored>, EvalError> {
+        let Self { config, people, .. } = *self;
+        let side = people.side(&config.views);
+        let (target, mask) = people.target(self.row, view, side)?;
+        let region = |protocol: &Protocol| match protocol {
+            Protocol::Paper => Region::paper(&target),
+            Protocol::Masked => Region::masked(&mask, [side, side], margin(side)),
         };
-        let degrees = person::degrees(&item.cameras[view], &item.cameras[inputs[0]]);
-        for (i, scores) in scored {
-            match scores {
-                Ok(scores) => outcome.judged[i].rows.push(Row { person, turn, view, degrees, scores }),
-                Err(e) => at.left_out(outcome, &format!(", {}, view {view}", contestants[i].name), e),
-            }
-        }
+        let regions = config.metrics.protocols.iter().map(region).collect::<Result<Vec<_>, _>>()?;
+        let scores = |(i, shown): (usize, &Option<Shown>)| {
+            let camera = &item.cameras[view];
+            let image = self.contestants[i].picture(shown.as_ref()?, camera, view, side, &config.views);
+            let score = |image: &Picture, region| Score::new(image, &target, region, self.lpips);
+            Some((i, image.and_then(|image| regions.iter().map(|region| score(&image, region)).collect())))
+        };
+        Ok(shown.iter().enumerate().filter_map(scores).collect())
     }
 }
 
@@ -300,50 +316,6 @@ fn one(
 pub(crate) fn at_once(side: usize) -> usize {
     const PIXELS: usize = 1 << 26;
     (PIXELS / (side * side).max(1)).clamp(1, rayon::current_num_threads())
-}
-
-/// A contestant's index, and its scores by protocol.
-type Scored = (usize, Result<Vec<Score>, EvalError>);
-
-fn compare(
-    config: &EvalConfig,
-    at: &Place,
-    item: &TestItem,
-    view: usize,
-    (contestants, shown): (&[Contestant], &[Option<contest::Shown>]),
-    lpips: Option<&Lpips>,
-) -> Result<Vec<Scored>, EvalError> {
-    let side = at.people.side(&config.views);
-    let (target, mask) = at.people.target(at.row, view, side)?;
-    let region = |protocol: &Protocol| match protocol {
-        Protocol::Paper => Region::paper(&target),
-        Protocol::Masked => Region::masked(&mask, [side, side], margin(side)),
-    };
-    let regions = config.metrics.protocols.iter().map(region).collect::<Result<Vec<_>, _>>()?;
-    let camera = item.cameras[view];
-    let scores = |(place, contestant): (usize, &Contestant)| {
-        let shown = shown[place].as_ref()?;
-        let scores = picture(config, contestant, shown, &camera, view, side).and_then(|image| {
-            regions.iter().map(|region| Score::new(&image, &target, region, lpips)).collect()
-        });
-        Some((place, scores))
-    };
-    Ok(contestants.iter().enumerate().filter_map(scores).collect())
-}
-
-/// A contestant's picture of a view.
-fn picture(
-    config: &EvalConfig,
-    contestant: &Contestant,
-    shown: &contest::Shown,
-    camera: &Camera,
-    view: usize,
-    side: usize,
-) -> Result<Picture, EvalError> {
-    match &shown.gaussians {
-        Some(gaussians) => rendered(gaussians, camera, side, &config.views),
-        None => contestant.picture(view, side),
-    }
 }
 
 /// A render of Gaussians (world frame) over black, `side`² pixels, with the config's options.
@@ -402,7 +374,7 @@ fn pictures(
     }
     for wanted in &config.report.degrees {
         let view = person::nearest_view(&item.cameras, inputs[0], *wanted);
-        let image = picture(config, contestant, &shown, &item.cameras[view], view, side)?;
+        let image = contestant.picture(&shown, &item.cameras[view], view, side, &config.views)?;
         let (target, _) = people.target(row, view, side)?;
         let window = Region::paper(&target)?.window;
         let [image, target] = [image, target].map(|picture| picture.cropped(window));

@@ -5,7 +5,6 @@ use std::time::{Duration, Instant};
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use snapsnap_data::photo::Mapping;
 use snapsnap_data::sample::{Handling, TestItem};
-use snapsnap_net::config::Config;
 use snapsnap_net::gaussians::placed;
 use snapsnap_net::weights::{WeightFile, WeightsError};
 use snapsnap_net::{Reconstruction, Reconstructor};
@@ -50,7 +49,9 @@ impl Model {
     pub fn load(weights: &WeightFile, device: &Device, variant: &Variant) -> Result<Self, WeightsError> {
         let mut reconstructor =
             Reconstructor::load(weights, device)?.in_precision(variant.precision.unwrap_or_default());
-        if !variant.has_sides() {
+        // Scenes of more than two photographs have no unseen sides.
+        let is_pair = variant.inputs.as_ref().is_none_or(|inputs| inputs.len() <= 2);
+        if !variant.sides.unwrap_or(is_pair) {
             reconstructor = reconstructor.without_sides();
         }
         if variant.side_colors == Some(false) {
@@ -64,14 +65,9 @@ impl Model {
         })
     }
 
-    /// The config in force.
-    pub fn config(&self) -> &Config {
-        self.reconstructor.config()
-    }
-
     /// Side of the canvas.
     pub fn side(&self) -> usize {
-        self.config().network.resolution
+        self.reconstructor.config().network.resolution
     }
 
     /// Gaussians of a person seen from the views `inputs`. With more than two photographs, each and the next around the
@@ -99,7 +95,7 @@ impl Model {
                 gaussians = gaussians.scaled(scale);
                 to_world = back.then(&to_world);
             }
-            parts.push(placed(self.config(), gaussians, &to_world));
+            parts.push(placed(self.reconstructor.config(), gaussians, &to_world));
             lost += made.lost;
             for (name, time) in &made.times {
                 match modules.iter_mut().find(|(module, _)| module == name) {
@@ -113,7 +109,9 @@ impl Model {
             }
             // Pixels of placed photographs have no ground truth.
             if count == 1 && !is_placed {
-                maps = maps_of(&made, side);
+                let points = host(made.maps.points.clone());
+                let of_view = points.chunks_exact(3 * side * side).map(<[f32]>::to_vec);
+                maps = made.views.iter().map(|view| *view as usize).zip(of_view).collect();
             }
         }
         if count > 1 {
@@ -148,14 +146,13 @@ impl Model {
         let n = keep.len();
         let keep = Tensor::<1, Int>::from_data(TensorData::new(keep, [n]), &gaussians.device());
         let rows = |of: Tensor<2>| of.select(0, keep.clone());
-        Gaussians::new(
-            rows(gaussians.means),
-            rows(gaussians.rotations),
-            rows(gaussians.scales) * stride as f64,
-            gaussians.opacities.select(0, keep.clone()),
-            rows(gaussians.colors),
-        )
-        .expect("rows of one set")
+        Gaussians {
+            means: rows(gaussians.means),
+            rotations: rows(gaussians.rotations),
+            scales: rows(gaussians.scales) * stride as f64,
+            opacities: gaussians.opacities.select(0, keep.clone()),
+            colors: rows(gaussians.colors),
+        }
     }
 }
 
@@ -163,24 +160,16 @@ pub(super) fn no_gaussian() -> EvalError {
     EvalError::Empty("no Gaussian came out".into())
 }
 
-fn maps_of(made: &Reconstruction, side: usize) -> Vec<(usize, Vec<f32>)> {
-    let points = host(made.maps.points.clone());
-    let of_view = points.chunks_exact(3 * side * side).map(<[f32]>::to_vec);
-    made.views.iter().map(|view| *view as usize).zip(of_view).collect()
-}
-
 /// All Gaussians of several sets.
 pub fn joined(parts: Vec<Gaussians>) -> Gaussians {
     let rows = |of: fn(&Gaussians) -> &Tensor<2>| {
         Tensor::cat(parts.iter().map(|part| of(part).clone()).collect(), 0)
     };
-    let opacities = Tensor::cat(parts.iter().map(|part| part.opacities.clone()).collect(), 0);
-    Gaussians::new(
-        rows(|part| &part.means),
-        rows(|part| &part.rotations),
-        rows(|part| &part.scales),
-        opacities,
-        rows(|part| &part.colors),
-    )
-    .expect("parts that fit")
+    Gaussians {
+        means: rows(|part| &part.means),
+        rotations: rows(|part| &part.rotations),
+        scales: rows(|part| &part.scales),
+        opacities: Tensor::cat(parts.iter().map(|part| part.opacities.clone()).collect(), 0),
+        colors: rows(|part| &part.colors),
+    }
 }

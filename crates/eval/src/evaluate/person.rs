@@ -4,6 +4,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use burn::tensor::{Device, Tensor, TensorData};
+use glam::DVec3;
 use snapsnap_base::FileError;
 use snapsnap_data::dataset::{Arrangement, Folder, Split};
 use snapsnap_data::sample::{Handling, SampleConfig, Test, TestItem};
@@ -15,6 +16,7 @@ use snapsnap_splat::Camera;
 
 use super::config::{DataSection, ViewsSection};
 use crate::EvalError;
+use crate::geometry::double;
 use crate::pictures::Picture;
 
 /// The people of one data set.
@@ -155,17 +157,19 @@ pub fn planes(values: Vec<f32>, channels: usize, side: usize) -> Tensor<4> {
 /// interpolated.
 pub fn photograph(item: &TestItem, place: usize, side: usize) -> Photograph {
     let from = item.side;
-    let area = from * from;
-    let rgb = item.images[3 * place * area..3 * (place + 1) * area].to_vec();
-    let mask = item.masks[place * area..(place + 1) * area].to_vec();
-    let sized = |values: Vec<f32>, channels: usize| {
+    let sized = |all: &[f32], channels: usize| {
+        let len = channels * from * from;
+        let values = all[place * len..(place + 1) * len].to_vec();
+        if from == side {
+            return values;
+        }
         let planes = planes(values, channels, from);
         host(match from.is_multiple_of(side) {
             true => shrink(planes, from / side, Downsample::Area),
             false => bilinear(planes, [side, side], false),
         })
     };
-    let (rgb, mask) = if from == side { (rgb, mask) } else { (sized(rgb, 3), sized(mask, 1)) };
+    let (rgb, mask) = (sized(&item.images, 3), sized(&item.masks, 1));
     let valid = mask.iter().map(|share| *share >= 0.5).collect();
     Photograph { rgb, mask, valid }
 }
@@ -199,24 +203,16 @@ pub fn points(
 /// One view's points on `side`² pixels instead of `stored`²: the means of pixels of which at least half has points.
 pub(super) fn means(points: &[f32], valid: &[f32], stored: usize, side: usize) -> Points {
     let factor = stored / side;
-    let mut means = vec![0.0; 3 * side * side];
-    let mut shares = vec![0.0; side * side];
-    for (cell, share) in shares.iter_mut().enumerate() {
+    let mean = |cell: usize| {
         let corner = cell / side * factor * stored + cell % side * factor;
-        let (mut sum, mut count) = ([0.0_f64; 3], 0_usize);
-        for (y, x) in (0..factor).flat_map(|y| (0..factor).map(move |x| (y, x))) {
-            let i = corner + y * stored + x;
-            if valid[i] > 0.5 {
-                (0..3).for_each(|c| sum[c] += f64::from(points[3 * i + c]));
-                count += 1;
-            }
-        }
-        if 2 * count >= factor * factor {
-            *share = 1.0;
-            (0..3).for_each(|c| means[3 * cell + c] = (sum[c] / count as f64) as f32);
-        }
-    }
-    (means, shares)
+        let pixels = (0..factor).flat_map(|y| (0..factor).map(move |x| corner + y * stored + x));
+        let there = pixels.filter(|i| valid[*i] > 0.5).map(|i| double(points.as_chunks().0[i]));
+        let (sum, count) = there.fold((DVec3::ZERO, 0), |(sum, count), point| (sum + point, count + 1));
+        let is_there = 2 * count >= factor * factor;
+        if is_there { ((sum / count as f64).as_vec3().to_array(), 1.0) } else { ([0.0; 3], 0.0) }
+    };
+    let (means, shares): (Vec<[f32; 3]>, Vec<f32>) = (0..side * side).map(mean).unzip();
+    (means.into_flattened(), shares)
 }
 
 /// The view whose camera is nearest to `wanted` degrees around the person from the view `first`.

@@ -6,6 +6,7 @@ use snapsnap_splat::Camera;
 
 use super::person::{Points, off};
 use crate::EvalError;
+use crate::geometry::double;
 
 /// Number of views whose points are joined to a side.
 const SOURCES: usize = 4;
@@ -42,8 +43,8 @@ pub fn side_points(
     for view in near {
         let (points, valid) = test.points(row, &[view])?;
         let to_world = item.cameras[view].world_to_camera.inverse();
-        let there = points.chunks_exact(3).zip(valid).filter(|(_, valid)| *valid > 0.5);
-        seen.extend(there.map(|(p, _)| to_world.apply(DVec3::new(p[0].into(), p[1].into(), p[2].into()))));
+        let there = points.as_chunks().0.iter().zip(valid).filter(|(_, valid)| *valid > 0.5);
+        seen.extend(there.map(|(point, _)| to_world.apply(double(*point))));
     }
     let canvas = u32::try_from(side).expect("the side of a canvas");
     let nearest = visible(&seen, &front.turned(azimuth).resized(canvas, canvas));

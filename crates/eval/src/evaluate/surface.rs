@@ -11,7 +11,7 @@ use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
 use super::at_once;
 use super::person::{People, means, nearest_view, part_of};
 use crate::EvalError;
-use crate::geometry::{Chamfer, chamfer, consistency, normals, points, sampled};
+use crate::geometry::{Chamfer, chamfer, consistency, double, normals, points, sampled};
 
 /// Largest number of ground-truth points per view.
 const PER_VIEW: usize = 4000;
@@ -52,11 +52,8 @@ pub fn truth(people: &People, row: usize) -> Result<Truth, EvalError> {
         let (points, valid) = people.test().points(row, &[view])?;
         let to_world = camera.world_to_camera.inverse();
         let there: Vec<usize> = (0..valid.len()).filter(|i| valid[*i] > 0.5).collect();
-        let point =
-            |i: usize| DVec3::new(points[3 * i].into(), points[3 * i + 1].into(), points[3 * i + 2].into());
-        let there = thinned(&there, PER_VIEW).into_iter();
-        let kept = there.map(|i| to_world.apply(point(i)).as_vec3().to_array());
-        let kept: Vec<[f32; 3]> = kept.collect();
+        let in_world = |i| to_world.apply(double(points.as_chunks().0[i])).as_vec3().to_array();
+        let kept: Vec<[f32; 3]> = thinned(&there, PER_VIEW).into_iter().map(in_world).collect();
         let normals = directions.contains(&view).then(|| {
             let stored = camera.width as usize;
             let side = part_of(stored, NORMALS);
@@ -73,15 +70,12 @@ pub fn truth(people: &People, row: usize) -> Result<Truth, EvalError> {
         let part: Result<Vec<_>, EvalError> = views.par_iter().map(|view| of_view(*view)).collect();
         found.extend(part?);
     }
-    let (mut all, mut views) = (Vec::new(), Vec::new());
-    for (kept, normals) in found {
-        all.extend(kept);
-        views.extend(normals);
-    }
-    if all.is_empty() {
+    let (points, views): (Vec<_>, Vec<_>) = found.into_iter().unzip();
+    let truth = Truth { points: points.concat(), views: views.into_iter().flatten().collect() };
+    if truth.points.is_empty() {
         return Err(EvalError::Empty("no view has a depth: there is no ground truth".into()));
     }
-    Ok(Truth { points: all, views })
+    Ok(truth)
 }
 
 impl Truth {

@@ -2,7 +2,7 @@
 
 use glam::{DMat3, DQuat, DVec3};
 
-use super::{check_points, nearest};
+use super::{check_points, double, nearest};
 use crate::EvalError;
 
 /// Largest number of steps.
@@ -21,8 +21,6 @@ pub struct Alignment {
     pub translation: DVec3,
     /// Mean squared distance to the nearest neighbour after the motion.
     pub cost: f64,
-    /// Number of steps.
-    pub steps: usize,
 }
 
 impl Alignment {
@@ -46,18 +44,17 @@ pub fn icp(points: &[[f32; 3]], onto: &[[f32; 3]], scale: bool) -> Result<Alignm
         let squares = pairs.iter().map(|(_, distance)| distance * distance).sum::<f64>();
         (pairs, squares / moved.len() as f64)
     };
-    let start =
-        Alignment { scale: 1.0, rotation: DQuat::IDENTITY, translation: DVec3::ZERO, cost: 0.0, steps: 0 };
-    let (mut pairs, first) = cost(points);
-    let mut best = Alignment { cost: first, ..start };
-    for step in 1..=MOST {
+    let (mut pairs, cost_at_rest) = cost(points);
+    let mut best =
+        Alignment { scale: 1.0, rotation: DQuat::IDENTITY, translation: DVec3::ZERO, cost: cost_at_rest };
+    for _ in 0..MOST {
         let targets: Vec<[f32; 3]> = pairs.iter().map(|(row, _)| onto[*row]).collect();
         let motion = procrustes(points, &targets, scale);
         let moved: Vec<[f32; 3]> = points.iter().map(|p| motion.apply(*p)).collect();
         let (next, after) = cost(&moved);
         let gain = best.cost - after;
         if gain > 0.0 {
-            best = Alignment { cost: after, steps: step, ..motion };
+            best = Alignment { cost: after, ..motion };
         }
         if gain <= ENOUGH * after {
             break;
@@ -97,7 +94,7 @@ fn procrustes(points: &[[f32; 3]], targets: &[[f32; 3]], scale: bool) -> Alignme
     // Equal points have no scale.
     let scale = if scale && spread > 0.0 && rotated > 0.0 { rotated / spread } else { 1.0 };
     let translation = to - scale * (rotation * from);
-    Alignment { scale, rotation, translation, cost: 0.0, steps: 0 }
+    Alignment { scale, rotation, translation, cost: 0.0 }
 }
 
 /// The eigenvector of the largest eigenvalue of a symmetric matrix, by Jacobi rotations.
@@ -114,22 +111,15 @@ fn largest_eigenvector(mut a: [[f64; 4]; 4]) -> [f64; 4] {
             let t = theta.signum() / (theta.abs() + theta.hypot(1.0));
             let c = 1.0 / t.hypot(1.0);
             let s = t * c;
-            for row in &mut a {
+            for row in a.iter_mut().chain(&mut vectors) {
                 (row[p], row[q]) = (c * row[p] - s * row[q], s * row[p] + c * row[q]);
             }
             let (rows, others) = a.split_at_mut(q);
             for (x, y) in rows[p].iter_mut().zip(&mut others[0]) {
                 (*x, *y) = (c * *x - s * *y, s * *x + c * *y);
             }
-            for row in &mut vectors {
-                (row[p], row[q]) = (c * row[p] - s * row[q], s * row[p] + c * row[q]);
-            }
         }
     }
     let largest = (0..4).max_by(|i, j| a[*i][*i].total_cmp(&a[*j][*j])).expect("four");
     vectors.map(|row| row[largest])
-}
-
-fn double(p: [f32; 3]) -> DVec3 {
-    DVec3::from_array(p.map(f64::from))
 }

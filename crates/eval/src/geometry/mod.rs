@@ -5,6 +5,7 @@ mod align;
 mod normals;
 
 use burn::tensor::Tensor;
+use glam::DVec3;
 use parry3d::math::Vector;
 use parry3d::query::PointQuery;
 use parry3d::shape::TriMesh;
@@ -83,9 +84,13 @@ fn nearest(from: &[[f32; 3]], to: &[[f32; 3]]) -> Vec<(usize, f64)> {
     from.iter().zip(rows).map(apart).collect()
 }
 
-fn distance(a: [f32; 3], b: [f32; 3]) -> f64 {
-    let squares = [0, 1, 2].map(|c| (f64::from(a[c]) - f64::from(b[c])).powi(2));
-    squares.iter().sum::<f64>().sqrt()
+/// A point in f64.
+pub(crate) fn double(point: [f32; 3]) -> DVec3 {
+    DVec3::from_array(point.map(f64::from))
+}
+
+pub(crate) fn distance(a: [f32; 3], b: [f32; 3]) -> f64 {
+    (double(a) - double(b)).length()
 }
 
 /// Mean Euclidean distance from points to the triangles of a mesh.

@@ -27,8 +27,8 @@ fn overall(figures: &[MeshFigures], of: fn(&MeshFigures) -> Option<f64>) -> Opti
 /// `report.json`.
 pub fn json(header: &Header, figures: &[MeshFigures], left_out: &[LeftOut]) -> Value {
     let mut report = header.json();
-    let entries = FIGURES.iter().map(|(key, _, of)| ((*key).to_owned(), json!(overall(figures, *of))));
-    report["geometry_cm"] = Value::Object(entries.collect());
+    let entries = FIGURES.iter().map(|(key, _, of)| (*key, json!(overall(figures, *of))));
+    report["geometry_cm"] = entries.collect();
     report["people"] = json!(figures.len());
     report["subjects"] = json!(figures);
     report["left_out"] = json!(left_out);

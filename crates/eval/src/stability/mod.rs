@@ -7,7 +7,7 @@ pub mod splats;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::time::Instant;
 
-use burn::tensor::Device;
+use burn::tensor::{Device, Tensor, TensorData};
 use serde::Serialize;
 
 /// An input and its required result.
@@ -83,9 +83,24 @@ impl Found {
     }
 }
 
-/// An error, ∞ for NaN, which `max` would ignore.
-fn nan_is_worst(v: f64) -> f64 {
-    if v.is_nan() { f64::INFINITY } else { v }
+/// The largest error, ∞ if one is NaN.
+fn worst(errors: impl IntoIterator<Item = f64>) -> f64 {
+    let number = |error: f64| if error.is_nan() { f64::INFINITY } else { error };
+    errors.into_iter().map(number).fold(0.0, f64::max)
+}
+
+/// The difference of a value from its f64 reference.
+fn apart(found: f32, expected: f64) -> f64 {
+    (f64::from(found) - expected).abs()
+}
+
+/// A tracked tensor.
+fn tracked<const D: usize>(values: Vec<f32>, shape: [usize; D], device: &Device) -> Tensor<D> {
+    Tensor::from_data(TensorData::new(values, shape), &device.clone().autodiff()).require_grad()
+}
+
+fn all_finite(values: &[f32]) -> bool {
+    values.iter().all(|v| v.is_finite())
 }
 
 /// A row of the table.
@@ -116,21 +131,21 @@ pub fn run<'a>(case: &'a Case, device: &Device, device_name: &str) -> Row<'a> {
         let said = said.or_else(|| panic.downcast_ref::<&str>().map(|s| (*s).to_owned()));
         Found::broken(format!("panicked: {}", said.unwrap_or_default()))
     });
-    let over = |error: Option<f64>, limit: f64| error.is_some_and(|e| e.is_nan() || e > limit);
-    let (verdict, note) = match (&found.skipped, &found.broken) {
-        (Some(why), _) => ("skipped", why.clone()),
+    let within = |error: Option<f64>, limit: f64| error.is_none_or(|e| e <= limit);
+    let (value, gradient) = (found.value, found.gradient);
+    let found = found
+        .must(within(value, case.value_limit), "values are off")
+        .must(within(gradient, case.gradient_limit), "gradients are off");
+    let (verdict, note) = match (found.skipped, found.broken) {
+        (Some(why), _) => ("skipped", why),
         (None, Some(what)) => ("fails", format!("{what} {}", found.note).trim_end().to_owned()),
-        _ if over(found.value, case.value_limit) => ("fails", format!("values are off {}", found.note)),
-        _ if over(found.gradient, case.gradient_limit) => {
-            ("fails", format!("gradients are off {}", found.note))
-        }
-        _ => ("holds", found.note.clone()),
+        (None, None) => ("holds", found.note),
     };
     Row {
         case,
         device: device_name.into(),
-        value_error: found.value.filter(|v| v.is_finite()),
-        gradient_error: found.gradient.filter(|v| v.is_finite()),
+        value_error: value.filter(|v| v.is_finite()),
+        gradient_error: gradient.filter(|v| v.is_finite()),
         seconds: start.elapsed().as_secs_f64(),
         verdict,
         note,

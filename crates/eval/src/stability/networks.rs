@@ -2,18 +2,20 @@
 
 use std::sync::Arc;
 
-use burn::tensor::{DType, Device, Tensor, TensorData};
+use burn::tensor::{DType, Device, Tensor};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use snapsnap_net::config::{Anchor, ConfMode, NetworkConfig, RegressorConfig};
 use snapsnap_net::network::activate;
 use snapsnap_net::precision::Precision;
 use snapsnap_net::regressor::{Attributes, Regressor, Statistics};
-use snapsnap_net::weights::WeightFile;
+use snapsnap_net::weights::{WeightFile, WeightsError};
 use snapsnap_net::{Photograph, Reconstructor};
 use snapsnap_ops::{Rope, host, rotary_attention};
 
-use super::{Case, Found, nan_is_worst};
+use super::{Case, Found, all_finite, apart, tracked, worst};
+use crate::geometry::distance;
+use crate::statistics::quantile;
 
 const AREA: &str = "Networks";
 
@@ -31,14 +33,8 @@ pub fn cases() -> Vec<Case> {
         let holds = "as f64 (relative above 1), in range; finite beyond f32's reach, gradient finite";
         cases.push(Case::new(AREA, input, holds, [5e-6, 0.0], move |device| confidences(mode, device)));
     }
-    let input = "the regressor's 14 channels at ±1e4";
-    cases.push(Case::new(
-        AREA,
-        input,
-        "attributes finite and in range, gradient finite",
-        [0.0; 2],
-        attributes,
-    ));
+    let holds = "attributes finite and in range, gradient finite";
+    cases.push(Case::new(AREA, "the regressor's 14 channels at ±1e4", holds, [0.0; 2], attributes));
     for (size, name) in
         [(1.0_f32, "identical tokens"), (1e4, "identical tokens of 1e4"), (1e18, "tokens of 1e18")]
     {
@@ -77,43 +73,31 @@ fn in_precision(
     if !device.supports_dtype(precision.dtype()) {
         return Found::skipped(format!("the device does not compute in {}", precision.name()));
     }
-    let maps = |precision: Precision| -> Result<(Vec<f32>, Vec<Vec<bool>>), Found> {
-        let model = Reconstructor::load(weights, device).map_err(Found::broken)?;
+    let maps = |precision: Precision| -> Result<_, WeightsError> {
+        let model = Reconstructor::load(weights, device)?;
         let made = model.in_precision(precision).reconstruct(front, back, &|_| ());
         Ok((host(made.maps.points), made.valid))
     };
-    let (whole, half) = match (maps(Precision::F32), maps(precision)) {
-        (Ok(whole), Ok(half)) => (whole, half.0),
-        (Err(found), _) | (_, Err(found)) => return found,
-    };
-    let (whole, valid) = whole;
-    let mut apart: Vec<f64> = (0..2)
-        .flat_map(|view| {
-            let area = valid[view].len();
-            let there = (0..area).filter(|i| valid[view][*i]).map(move |i| 3 * (view * area + i));
-            there.collect::<Vec<_>>()
-        })
-        .map(|at| {
-            let squares = (at..at + 3).map(|i| (f64::from(whole[i]) - f64::from(half[i])).powi(2));
-            squares.sum::<f64>().sqrt()
-        })
-        .collect();
+    let ((whole, valid), (half, _)) =
+        match maps(Precision::F32).and_then(|whole| Ok((whole, maps(precision)?))) {
+            Ok(both) => both,
+            Err(e) => return Found::broken(e),
+        };
+    let points = whole.as_chunks().0.iter().zip(half.as_chunks().0);
+    let valid = points.zip(valid[..2].iter().flatten()).filter(|(_, valid)| **valid);
+    let mut apart: Vec<f64> = valid.map(|((a, b), _)| distance(*a, *b)).collect();
     apart.sort_by(f64::total_cmp);
-    let Some(last) = apart.last().copied() else {
+    let Some(last) = apart.last() else {
         return Found::broken("no pixel is valid");
     };
-    let median = crate::statistics::quantile(&apart, 0.5);
-    let note = format!("median {:.2} mm, at most {:.2} mm", 1e3 * median, 1e3 * last);
-    Found { value: Some(crate::statistics::quantile(&apart, 0.9)), note, ..Found::default() }
+    let note = format!("median {:.2} mm, at most {:.2} mm", 1e3 * quantile(&apart, 0.5), 1e3 * last);
+    Found { value: Some(quantile(&apart, 0.9)), note, ..Found::default() }
         .must(apart.iter().all(|v| v.is_finite()), "a point is not finite")
 }
 
-fn tensor<const D: usize>(values: Vec<f32>, shape: [usize; D], device: &Device) -> Tensor<D> {
-    Tensor::from_data(TensorData::new(values, shape), &device.clone().autodiff()).require_grad()
-}
-
-fn all_finite(values: &[f32]) -> bool {
-    values.iter().all(|v| v.is_finite())
+/// The gradient at `x` of the sum of a tensor.
+fn gradient_of_sum<const D: usize, const E: usize>(of: &Tensor<D>, x: &Tensor<E>) -> Vec<f32> {
+    host(x.grad(&of.clone().sum().backward()).expect("tracked"))
 }
 
 /// Raw points of one norm in several directions, against values and derivatives in f64.
@@ -123,14 +107,12 @@ fn exponential_depth(norm: f32, device: &Device) -> Found {
         .flat_map(|c| directions.map(|d| if c < 3 { (d[c] * f64::from(norm)) as f32 } else { 0.0 }))
         .collect();
     let config = NetworkConfig { anchor: Anchor::None, ..NetworkConfig::default() };
-    let x = tensor(raw.clone(), [1, 4, 1, 3], device);
+    let x = tracked(raw.clone(), [1, 4, 1, 3], device);
     let points = activate(x.clone(), &config).points;
-    let gradients = points.clone().sum().backward();
-    let gradient = host(x.grad(&gradients).expect("tracked"));
+    let gradient = gradient_of_sum(&points, &x);
     let got = host(points);
     // Numbers beyond f32 are not compared.
-    let (mut value, mut slope) = (None, None);
-    let worst = |most: &mut Option<f64>, off: f64| *most = Some(nan_is_worst(off).max(most.unwrap_or(0.0)));
+    let (mut values, mut slopes) = (Vec::new(), Vec::new());
     for i in 0..3 {
         let r = [0, 1, 2].map(|c| f64::from(raw[3 * c + i]));
         let length = r.iter().map(|v| v * v).sum::<f64>().sqrt();
@@ -144,17 +126,18 @@ fn exponential_depth(norm: f32, device: &Device) -> Found {
             if size < f64::from(f32::MAX) {
                 // At norm 0 the point is 0 itself.
                 let size = if size > 0.0 { size } else { 1.0 };
-                worst(&mut value, (f64::from(got[3 * i + c]) - expected).abs() / size);
+                values.push(apart(got[3 * i + c], expected) / size);
             }
             // d(Σ p)/d r_c = f + f'·(r_c/n)·Σ r
             let expected = f + if length > 0.0 { df * r[c] / length * sum } else { 0.0 };
             let scale = f + df.abs() * length;
             if scale < f64::from(f32::MAX) {
-                worst(&mut slope, (f64::from(gradient[3 * c + i]) - expected).abs() / scale);
+                slopes.push(apart(gradient[3 * c + i], expected) / scale);
             }
         }
     }
-    Found { value, gradient: slope, ..Found::default() }
+    let most = |errors: Vec<f64>| (!errors.is_empty()).then(|| worst(errors));
+    Found { value: most(values), gradient: most(slopes), ..Found::default() }
         .must(all_finite(&got), "a point is not finite")
         .must(all_finite(&gradient), "a gradient is not finite")
 }
@@ -163,26 +146,22 @@ fn confidences(mode: ConfMode, device: &Device) -> Found {
     let logits = [-1e4_f32, -88.0, 0.0, 88.0, 1e4];
     let config = NetworkConfig { conf_mode: mode, ..NetworkConfig::default() };
     let raw: Vec<f32> = (0..4).flat_map(|c| logits.map(|v| if c == 3 { v } else { 0.1 })).collect();
-    let x = tensor(raw, [1, 4, 1, 5], device);
+    let x = tracked(raw, [1, 4, 1, 5], device);
     let conf = activate(x.clone(), &config).conf;
-    let gradient = host(x.grad(&conf.clone().sum().backward()).expect("tracked"));
+    let gradient = gradient_of_sum(&conf, &x);
     let got = host(conf);
     let expected = |x: f64| match mode {
         ConfMode::Sigmoid => 1.0 / (1.0 + (-x).exp()),
         ConfMode::Exp => 1.0 + x.exp(),
     };
-    let mut worst = 0.0_f64;
-    for (x, got) in logits.iter().zip(&got) {
-        let expected = expected(f64::from(*x));
-        if expected < f64::from(f32::MAX) {
-            worst = worst.max(nan_is_worst((f64::from(*got) - expected).abs() / expected.max(1.0)));
-        }
-    }
+    let pairs = got.iter().zip(logits.map(|x| expected(f64::from(x))));
+    let compared = pairs.filter(|(_, expected)| *expected < f64::from(f32::MAX));
+    let off = worst(compared.map(|(got, expected)| apart(*got, expected) / expected.max(1.0)));
     let inside = got.iter().all(|c| match mode {
         ConfMode::Sigmoid => (0.0..=1.0).contains(c),
         ConfMode::Exp => *c >= 1.0,
     });
-    Found { value: Some(worst), ..Found::default() }
+    Found { value: Some(off), ..Found::default() }
         .must(all_finite(&got), "a confidence is not finite")
         .must(inside, "a confidence is out of range")
         .must(all_finite(&gradient), "a gradient is not finite")
@@ -193,22 +172,19 @@ fn attributes(device: &Device) -> Found {
         .iter()
         .flat_map(|v| (0..14).map(move |i| if i % 2 == 0 { *v } else { -*v }))
         .collect();
-    let x = tensor(rows, [2, 14], device);
+    let x = tracked(rows, [2, 14], device);
     let made = Attributes::new(&RegressorConfig::default(), x.clone(), None);
-    let parts = [made.opacity, made.scale, made.rotation, made.color, made.offset];
-    let sum = parts.iter().map(|part| part.clone().sum()).reduce(|a, b| a + b).expect("five parts");
-    let gradient = host(x.grad(&sum.backward()).expect("tracked"));
-    let [opacity, scale, rotation, color, offset] = parts.map(host);
-    let unit = rotation.chunks_exact(4).all(|q| (q.iter().map(|v| v * v).sum::<f32>() - 1.0).abs() < 1e-5);
+    let made = Tensor::cat(vec![made.opacity, made.scale, made.rotation, made.color, made.offset], 1);
+    let gradient = gradient_of_sum(&made, &x);
+    let made = host(made);
+    let all = |hold: fn(&[f32; 14]) -> bool| made.as_chunks().0.iter().all(hold);
+    let unit = |row: &[f32; 14]| (row[4..8].iter().map(|v| v * v).sum::<f32>() - 1.0).abs() < 1e-5;
     Found::default()
-        .must(
-            [&opacity, &scale, &rotation, &color, &offset].into_iter().all(|v| all_finite(v)),
-            "an attribute is not finite",
-        )
-        .must(opacity.iter().all(|o| (0.0..=1.0).contains(o)), "an opacity is out of range")
-        .must(scale.iter().all(|s| *s >= 0.0), "a scale is negative")
-        .must(unit, "a quaternion is not of length 1")
-        .must(color.iter().all(|c| c.abs() <= 1.0), "a colour is out of range")
+        .must(all_finite(&made), "an attribute is not finite")
+        .must(all(|row| (0.0..=1.0).contains(&row[0])), "an opacity is out of range")
+        .must(all(|row| row[1..4].iter().all(|scale| *scale >= 0.0)), "a scale is negative")
+        .must(all(unit), "a quaternion is not of length 1")
+        .must(all(|row| row[8..11].iter().all(|color| color.abs() <= 1.0)), "a colour is out of range")
         .must(all_finite(&gradient), "a gradient is not finite")
 }
 
@@ -238,18 +214,16 @@ const HEADS: usize = 2;
 /// Attention of tokens with themselves, whose output must be the values.
 fn attended(tokens: &[f32], values: &[f32], device: &Device) -> Found {
     let shape = [1, TOKENS, CHANNELS];
-    let [q, k, v] = [tokens, tokens, values].map(|rows| tensor(rows.to_vec(), shape, device));
+    let [q, k, v] = [tokens, tokens, values].map(|rows| tracked(rows.to_vec(), shape, device));
     let rope = Rope::new(3, 4, CHANNELS / HEADS, 100.0, &device.clone().autodiff());
     let out = rotary_attention(q.clone(), k.clone(), v.clone(), &rope, HEADS);
     let gradients = out.clone().sum().backward();
     let gradient: Vec<f32> =
         [&q, &k, &v].iter().flat_map(|t| host(t.grad(&gradients).expect("tracked"))).collect();
     let got = host(out);
-    let mut worst = 0.0_f64;
-    for (got, expected) in got.iter().zip(values).map(|(g, e)| (f64::from(*g), f64::from(*e))) {
-        worst = worst.max(nan_is_worst(((got - expected) / expected).abs()));
-    }
-    Found { value: Some(worst), ..Found::default() }
+    let pairs = got.iter().zip(values);
+    let off = pairs.map(|(got, value)| apart(*got, f64::from(*value)) / f64::from(value.abs()));
+    Found { value: Some(worst(off)), ..Found::default() }
         .must(all_finite(&got), "an output is not finite")
         .must(all_finite(&gradient), "a gradient is not finite")
 }
@@ -260,18 +234,18 @@ fn constant_channels(device: &Device) -> Found {
     let network: Regressor = snapsnap_net::weights::random_regressors(&config, 1, device).remove(0);
     let values: Vec<f32> =
         (0..6).flat_map(|c| vec![[0.5, -1.0, 0.25, 0.0, 2.0, 1e3][c]; side * side]).collect();
-    let x = tensor(values, [1, 6, side, side], device);
+    let x = tracked(values, [1, 6, side, side], device);
     let network = burn::module::Module::fork(network, &device.clone().autodiff());
     let features = network.forward(x.clone(), &mut Statistics::measured());
-    let gradient = host(x.grad(&features.clone().sum().backward()).expect("tracked"));
+    let gradient = gradient_of_sum(&features, &x);
     let got = host(features.cast(DType::F32));
     let width = got.len() / (side * side);
     let at = |row: usize, column: usize| &got[(row * side + column) * width..][..width];
     // Both pixels in the middle have equal surroundings except for the padding, which the normalisation hides.
     let (a, b) = (at(side / 2, side / 2), at(side / 2 + 4, side / 2 + 4));
     let most = got.iter().fold(0.0_f32, |most, v| most.max(v.abs()));
-    let apart = a.iter().zip(b).map(|(a, b)| f64::from((a - b).abs() / most.max(1e-20))).fold(0.0, f64::max);
-    Found { value: Some(apart), note: format!("features up to {most:.1e}"), ..Found::default() }
+    let off = a.iter().zip(b).map(|(a, b)| f64::from((a - b).abs() / most.max(1e-20)));
+    Found { value: Some(worst(off)), note: format!("features up to {most:.1e}"), ..Found::default() }
         .must(all_finite(&got), "a feature is not finite")
         .must(all_finite(&gradient), "a gradient is not finite")
 }

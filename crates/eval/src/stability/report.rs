@@ -7,13 +7,16 @@ use serde_json::{Value, json};
 use super::Row;
 use crate::report::{Header, table_markdown};
 
+fn count(rows: &[Row], verdict: &str) -> usize {
+    rows.iter().filter(|row| row.verdict == verdict).count()
+}
+
 /// `report.json`.
 pub fn json(header: &Header, rows: &[Row]) -> Value {
     let mut report = header.json();
-    let count = |verdict: &str| rows.iter().filter(|row| row.verdict == verdict).count();
-    report["holds"] = json!(count("holds"));
-    report["fails"] = json!(count("fails"));
-    report["skipped"] = json!(count("skipped"));
+    for verdict in ["holds", "fails", "skipped"] {
+        report[verdict] = json!(count(rows, verdict));
+    }
     report["cases"] = json!(rows);
     report
 }
@@ -21,14 +24,13 @@ pub fn json(header: &Header, rows: &[Row]) -> Value {
 /// `report.md`.
 pub fn markdown(header: &Header, rows: &[Row]) -> String {
     let mut text = header.markdown("Stability");
-    let count = |verdict: &str| rows.iter().filter(|row| row.verdict == verdict).count();
     let _ = writeln!(
         text,
         "* {} hold, {} fail, {} were skipped\n\nErrors against f64: of values as defined by the case, of gradients relative; limits in \
          brackets.\n",
-        count("holds"),
-        count("fails"),
-        count("skipped")
+        count(rows, "holds"),
+        count(rows, "fails"),
+        count(rows, "skipped")
     );
     let error = |error: Option<f64>, limit: f64| match error {
         Some(0.0) => format!("0 ({limit:.1e})"),

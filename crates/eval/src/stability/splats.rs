@@ -1,6 +1,6 @@
 //! The rasteriser against the f64 oracle.
 
-use std::ops::RangeInclusive;
+use std::ops::{Range, RangeInclusive};
 
 use burn::tensor::{Device, Tensor, TensorData};
 use glam::{DMat3, DVec2, DVec3};
@@ -10,9 +10,8 @@ use snapsnap_ops::host;
 use snapsnap_splat::reference::{self, Cutoff, Scene};
 use snapsnap_splat::{Camera, Gaussians, MAX_SIDE, RenderOptions, RigidTransform, SplatError, render};
 
-use super::{Case, Found, nan_is_worst};
-
-const AREA: &str = "Splats";
+use super::{Case, Found, all_finite, apart, tracked, worst};
+use crate::geometry::double;
 
 /// Mean, rotation (w first), scales, opacity, colour.
 type Row = [f32; 14];
@@ -32,19 +31,20 @@ pub fn cases() -> Vec<Case> {
     let camera = camera(32, 24, 30.0);
     let mut add = |input: String, holds: &str, rows: Vec<Row>, camera: Camera| {
         let run = move |device: &Device| against_oracle(&rows, &camera, device);
-        cases.push(Case::new(AREA, input, holds, [VALUES, GRADIENTS], run));
+        cases.push(case(&input, holds, GRADIENTS, run));
     };
+    let shaped = |scales: [f32; 3]| changed(1..3, |row| row[7..10].copy_from_slice(&scales));
     let equal = "as the oracle, forward and backward";
     for ratio in [1e2_f32, 1e3, 1e5, 1e7] {
-        let shape = |long: [bool; 3]| long.map(|long| if long { 0.3 } else { 0.3 / ratio });
-        add(format!("needles 1:{ratio:.0e}"), equal, shaped(shape([true, false, false])), camera);
-        add(format!("discs 1:{ratio:.0e}"), equal, shaped(shape([true, true, false])), camera);
+        let short = 0.3 / ratio;
+        add(format!("needles 1:{ratio:.0e}"), equal, shaped([0.3, short, short]), camera);
+        add(format!("discs 1:{ratio:.0e}"), equal, shaped([0.3, 0.3, short]), camera);
     }
     for scale in [1e-8_f32, 1e-4, 1.0, 1e2, 1e4] {
         add(format!("all scales {scale:.0e} m"), equal, shaped([scale; 3]), camera);
     }
     for opacity in [0.0_f32, 1e-7, 1.0 - 1e-7, 1.0] {
-        let rows = changed(|row| row[10] = opacity);
+        let rows = changed(2..3, |row| row[10] = opacity);
         add(format!("opacity {opacity:?}"), equal, rows, camera);
     }
     for (name, norm) in [
@@ -55,7 +55,7 @@ pub fn cases() -> Vec<Case> {
         ("1e20", 1e20),
         ("−1 (signs flipped)", -1.0),
     ] {
-        let rows = changed(|row| {
+        let rows = changed(2..3, |row| {
             let before = row[3..7].iter().map(|q| q * q).sum::<f32>().sqrt();
             row[3..7].iter_mut().for_each(|q| *q *= norm / before);
         });
@@ -72,7 +72,7 @@ pub fn cases() -> Vec<Case> {
         ("just beyond", 0.2 + 1e-6),
         ("behind the camera", -1.0),
     ] {
-        let rows = changed(|row| row[2] = z);
+        let rows = changed(2..3, |row| row[2] = z);
         let name = if z < 0.0 { name.to_owned() } else { format!("{name} the near plane") };
         add(name, "left out where the oracle leaves it out", rows, camera);
     }
@@ -82,29 +82,38 @@ pub fn cases() -> Vec<Case> {
             row[2] = distance;
             row[7..10].iter_mut().for_each(|s| *s *= distance / 2.0);
         };
-        add(format!("{distance:.0e} m away"), equal, changed(far), camera);
+        add(format!("{distance:.0e} m away"), equal, changed(2..3, far), camera);
     }
     for focal in [1.0, 30.0, 1e4, 1e6] {
         let holds = "as the oracle: the picture's size on the sensor does not matter";
         // The distance grows with the focal length, so that the picture stays full.
-        let rows = changed_all(|row| {
-            let factor = (focal / 30.0) as f32;
-            row[2] *= factor.max(0.2);
-        });
+        let rows = changed(0..6, |row| row[2] *= ((focal / 30.0) as f32).max(0.2));
         add(format!("focal length {focal:.0e} px"), holds, rows, self::camera(32, 24, focal));
     }
     add("image of 1×1".into(), equal, six(), self::camera(1, 1, 1.0));
+    let far = 1e5;
+    let mut far_camera = camera;
+    far_camera.world_to_camera.translation.x = -f64::from(far);
     let holds = "as the oracle: positions are what f32 holds there (8 mm apart), nothing is lost beyond that";
-    let input = "scene and camera 1e5 m from the origin";
-    cases.push(Case::new(AREA, input, holds, [VALUES, GRADIENTS], far_from_the_origin));
+    let rows = changed(0..6, |row| row[0] += far);
+    add("scene and camera 1e5 m from the origin".into(), holds, rows, far_camera);
     let holds = "as the oracle; gradients finite, and zero behind the closed pixel";
-    let input = "10,000 opaque Gaussians on one pixel";
-    cases.push(Case::new(AREA, input, holds, [VALUES, 0.0], many_on_one_pixel));
+    cases.push(case("10,000 opaque Gaussians on one pixel", holds, 0.0, many_on_one_pixel));
     let holds =
         "as the oracle in a patch, or refused for want of memory; more than the largest side is refused";
-    let input = "image of 8192×8192, and beyond the largest side";
-    cases.push(Case::new(AREA, input, holds, [VALUES, 0.0], largest_image));
+    cases.push(case("image of 8192×8192, and beyond the largest side", holds, 0.0, largest_image));
     cases
+}
+
+/// A case of the rasteriser. A refused render is a failure.
+fn case(
+    input: &str,
+    holds: &str,
+    gradient_limit: f64,
+    run: impl Fn(&Device) -> Result<Found, SplatError> + 'static,
+) -> Case {
+    let run = move |device: &Device| run(device).unwrap_or_else(|e| Found::broken(format!("refused: {e}")));
+    Case::new("Splats", input, holds, [VALUES, gradient_limit], run)
 }
 
 fn camera(width: u32, height: u32, focal: f64) -> Camera {
@@ -133,66 +142,32 @@ fn six() -> Vec<Row> {
     (0..6).map(|_| one()).collect()
 }
 
-/// The six Gaussians with a change of one.
-fn changed(change: impl Fn(&mut Row)) -> Vec<Row> {
+/// The six Gaussians, some of which are changed.
+fn changed(which: Range<usize>, change: impl FnMut(&mut Row)) -> Vec<Row> {
     let mut rows = six();
-    change(&mut rows[2]);
+    rows[which].iter_mut().for_each(change);
     rows
 }
 
-fn changed_all(change: impl Fn(&mut Row)) -> Vec<Row> {
-    let mut rows = six();
-    rows.iter_mut().for_each(change);
-    rows
+/// Gaussians of rows `[N, 14]`.
+fn gaussians(rows: &Tensor<2>) -> Gaussians {
+    let columns = |first: usize, count: usize| rows.clone().narrow(1, first, count);
+    let opacities = columns(10, 1).squeeze_dim(1);
+    Gaussians::new(columns(0, 3), columns(3, 4), columns(7, 3), opacities, columns(11, 3))
+        .expect("14 columns")
 }
 
-/// The six Gaussians, two of which have these scales.
-fn shaped(scales: [f32; 3]) -> Vec<Row> {
-    let mut rows = six();
-    for row in &mut rows[1..3] {
-        row[7..10].copy_from_slice(&scales);
-    }
-    rows
-}
-
-/// Tracked tensors of a scene.
-struct Tracked {
-    parts: [Tensor<2>; 4],
-    opacities: Tensor<1>,
-}
-
-impl Tracked {
-    fn new(rows: &[Row], device: &Device) -> Self {
-        let device = device.clone().autodiff();
-        let part = |from: usize, width: usize| {
-            let values: Vec<f32> = rows.iter().flat_map(|row| row[from..from + width].to_vec()).collect();
-            Tensor::<2>::from_data(TensorData::new(values, [rows.len(), width]), &device).require_grad()
-        };
-        let opacities: Vec<f32> = rows.iter().map(|row| row[10]).collect();
-        let opacities = TensorData::new(opacities, [rows.len()]);
-        Self {
-            parts: [part(0, 3), part(3, 4), part(7, 3), part(11, 3)],
-            opacities: Tensor::<1>::from_data(opacities, &device).require_grad(),
-        }
-    }
-
-    fn gaussians(&self) -> Gaussians {
-        let [means, rotations, scales, colors] = self.parts.clone();
-        Gaussians::new(means, rotations, scales, self.opacities.clone(), colors).expect("rows of one number")
-    }
-}
-
-fn double(rows: &[Row]) -> Scene<f64> {
+fn scene(rows: &[Row]) -> Scene<f64> {
     Scene { gaussians: rows.iter().map(|row| row.map(f64::from)).collect(), background: [0.0; 3] }
 }
 
 /// Compares a render and its gradients with the oracle. Gaussians without a direction, which would be 0/0, are left out
 /// of the oracle too.
-fn against_oracle(rows: &[Row], camera: &Camera, device: &Device) -> Found {
+fn against_oracle(rows: &[Row], camera: &Camera, device: &Device) -> Result<Found, SplatError> {
     let options = RenderOptions { depth: true, ..RenderOptions::inria() };
     let norm = |row: &Row| row[3..7].iter().map(|q| f64::from(*q).powi(2)).sum::<f64>().sqrt() as f32;
     let kept: Vec<usize> = (0..rows.len()).filter(|i| QUATERNIONS.contains(&norm(&rows[*i]))).collect();
-    let scene = double(&kept.iter().map(|i| rows[*i]).collect::<Vec<_>>());
+    let scene = scene(&kept.iter().map(|i| rows[*i]).collect::<Vec<_>>());
     let expected = reference::render(&scene, camera, &options, Cutoff::Hard);
     let banded = reference::banded(&scene, camera, &options);
     let mut random = ChaCha8Rng::seed_from_u64(3);
@@ -202,11 +177,8 @@ fn against_oracle(rows: &[Row], camera: &Camera, device: &Device) -> Found {
     // Pixels at which rounding may change a cut-off are not compared.
     upstream.iter_mut().zip(&banded).filter(|(_, banded)| **banded).for_each(|(u, _)| *u = [0.0; 5]);
 
-    let tracked = Tracked::new(rows, device);
-    let rendered = match render(&tracked.gaussians(), std::slice::from_ref(camera), &options) {
-        Ok(rendered) => rendered,
-        Err(e) => return Found::broken(format!("refused: {e}")),
-    };
+    let tracked = tracked(rows.concat(), [rows.len(), 14], device);
+    let rendered = render(&gaussians(&tracked), std::slice::from_ref(camera), &options)?;
     let depth = rendered.depth.clone().expect("an option");
     let parts = [rendered.color.clone(), rendered.alpha.clone().unsqueeze_dim(3), depth.unsqueeze_dim(3)];
     let image = Tensor::cat(parts.to_vec(), 3);
@@ -216,48 +188,37 @@ fn against_oracle(rows: &[Row], camera: &Camera, device: &Device) -> Found {
     let got = host(image);
     // Errors of depths are relative to the distance of the scene.
     let reach = scene.gaussians.iter().map(|g| g[2].abs()).fold(1.0, f64::max);
-    let mut worst = 0.0_f64;
-    for (pixel, (found, expected)) in got.chunks_exact(5).zip(&expected).enumerate() {
-        for (c, (f, e)) in found.iter().zip(expected.channels()).enumerate() {
-            let size = if c == 4 { reach } else { 1.0 };
-            if !banded[pixel] {
-                worst = worst.max(nan_is_worst((f64::from(*f) - e).abs() / size));
-            }
-        }
-    }
+    let compared = got.chunks_exact(5).zip(&expected).zip(&banded).filter(|(_, banded)| !**banded);
+    let off = compared.flat_map(|((found, expected), _)| {
+        let errors = found.iter().zip(expected.channels()).enumerate();
+        errors.map(|(c, (f, e))| apart(*f, e) / if c == 4 { reach } else { 1.0 })
+    });
+    let value = worst(off);
     let of_oracle = reference::gradient(&scene, camera, &options, Cutoff::Hard, &upstream).gaussians;
+    let Some(found) = tracked.grad(&gradients).map(host) else {
+        return Ok(Found::broken("no gradient"));
+    };
     // Errors are relative for each Gaussian, since gradients of others may be far larger, and for all its parameters in
     // their own units, since terms may cancel to rounding errors (the rotation of a ball).
-    let (mut off, mut size) = (vec![0.0_f64; rows.len()], vec![0.0_f64; rows.len()]);
-    let ranges = [0..3, 3..7, 7..10, 11..14, 10..11];
-    for (part, range) in ranges.into_iter().enumerate() {
-        let found = match part {
-            4 => tracked.opacities.grad(&gradients).map(host),
-            _ => tracked.parts[part].grad(&gradients).map(host),
+    let of_row = |(row, found): (usize, &Row)| {
+        let (expected, units) = match kept.iter().position(|k| *k == row) {
+            Some(place) => (of_oracle[place], std::array::from_fn(|i| unit(&rows[row], i, camera))),
+            // Omitted Gaussians have no gradient in any unit.
+            None => ([0.0; 14], [1.0; 14]),
         };
-        let Some(found) = found else {
-            return Found::broken("no gradient");
-        };
-        for (row, values) in found.chunks_exact(range.len()).enumerate() {
-            let place = kept.iter().position(|k| *k == row);
-            for (value, i) in values.iter().zip(range.clone()) {
-                let expected = place.map_or(0.0, |place| of_oracle[place][i]);
-                // Omitted Gaussians have no gradient in any unit.
-                let unit = place.map_or(1.0, |_| unit(&rows[row], i, camera));
-                off[row] = off[row].max(nan_is_worst((f64::from(*value) - expected).abs() * unit));
-                size[row] = size[row].max(expected.abs() * unit);
-            }
-        }
-    }
-    let gradient = off.iter().zip(&size).map(|(off, size)| off / size.max(SMALLEST)).fold(0.0, f64::max);
+        let off = worst((0..14).map(|i| apart(found[i], expected[i]) * units[i]));
+        let size = (0..14).map(|i| expected[i].abs() * units[i]).fold(0.0, f64::max);
+        off / size.max(SMALLEST)
+    };
+    let gradient = found.as_chunks().0.iter().enumerate().map(of_row).fold(0.0, f64::max);
     let share = banded.iter().filter(|b| **b).count();
     let note = if share > 0 {
         format!("{share} of {} pixels lie at a cut-off and are not compared", banded.len())
     } else {
         String::new()
     };
-    Found { value: Some(worst), gradient: Some(gradient), note, ..Found::default() }
-        .must(share < banded.len(), "nothing could be compared")
+    Ok(Found { value: Some(value), gradient: Some(gradient), note, ..Found::default() }
+        .must(share < banded.len(), "nothing could be compared"))
 }
 
 /// A parameter's unit: a footprint of at least half a pixel for the mean, its length for the rotation.
@@ -265,7 +226,8 @@ fn unit(row: &Row, parameter: usize, camera: &Camera) -> f64 {
     let largest = |values: &[f32]| values.iter().fold(0.0_f64, |most, v| most.max(f64::from(v.abs())));
     match parameter {
         0..3 => {
-            largest(&row[7..10]).max(0.5 * camera.world_to_camera.apply(mean(row)).z.abs() / camera.focal.x)
+            let depth = camera.world_to_camera.apply(double([row[0], row[1], row[2]])).z.abs();
+            largest(&row[7..10]).max(0.5 * depth / camera.focal.x)
         }
         3..7 => largest(&row[3..7]),
         7..10 => f64::from(row[parameter]),
@@ -273,20 +235,8 @@ fn unit(row: &Row, parameter: usize, camera: &Camera) -> f64 {
     }
 }
 
-fn mean(row: &Row) -> DVec3 {
-    DVec3::new(row[0].into(), row[1].into(), row[2].into())
-}
-
-/// The same scene and camera 10⁵ m from the origin, where f32 has steps of 8 mm.
-fn far_from_the_origin(device: &Device) -> Found {
-    const FAR: f32 = 1e5;
-    let mut camera = camera(32, 24, 30.0);
-    camera.world_to_camera.translation = DVec3::new(-f64::from(FAR), 0.0, 0.0);
-    against_oracle(&changed_all(|row| row[0] += FAR), &camera, device)
-}
-
 /// Ten thousand nearly opaque Gaussians, one behind the other.
-fn many_on_one_pixel(device: &Device) -> Found {
+fn many_on_one_pixel(device: &Device) -> Result<Found, SplatError> {
     let mut random = ChaCha8Rng::seed_from_u64(5);
     let rows: Vec<Row> = (0..10_000)
         .map(|i| {
@@ -300,42 +250,30 @@ fn many_on_one_pixel(device: &Device) -> Found {
         .collect();
     let camera = camera(9, 9, 10.0);
     let options = RenderOptions::inria();
-    let tracked = Tracked::new(&rows, device);
-    let rendered = match render(&tracked.gaussians(), std::slice::from_ref(&camera), &options) {
-        Ok(rendered) => rendered,
-        Err(e) => return Found::broken(format!("refused: {e}")),
-    };
+    let tracked = tracked(rows.concat(), [rows.len(), 14], device);
+    let rendered = render(&gaussians(&tracked), std::slice::from_ref(&camera), &options)?;
     let gradients = rendered.color.clone().sum().backward();
     let got = host(rendered.color);
-    let scene = double(&rows);
+    let scene = scene(&rows);
     let expected = reference::render(&scene, &camera, &options, Cutoff::Hard);
     let banded = reference::banded(&scene, &camera, &options);
-    let apart = |(pixel, e): (usize, &reference::Pixel<f64>)| -> f64 {
-        (0..3).map(|c| (f64::from(got[3 * pixel + c]) - e.color[c]).abs()).fold(0.0, f64::max)
-    };
-    let open = expected.iter().enumerate().filter(|(pixel, _)| !banded[*pixel]);
-    let worst = open.map(apart).map(nan_is_worst).fold(0.0, f64::max);
-    let opacities = tracked.opacities.grad(&gradients).expect("tracked");
-    let found: Vec<Vec<f32>> = (tracked.parts.iter())
-        .map(|part| host(part.grad(&gradients).expect("tracked")))
-        .chain([host(opacities)])
-        .collect();
+    let compared = got.chunks_exact(3).zip(&expected).zip(&banded).filter(|(_, banded)| !**banded);
+    let off =
+        compared.flat_map(|((found, expected), _)| [0, 1, 2].map(|c| apart(found[c], expected.color[c])));
+    let value = worst(off);
+    let gradient = host(tracked.grad(&gradients).expect("tracked"));
     // Gaussians in the middle of a pixel close it at once, those at its rim after hundreds.
-    let behind = found.iter().flat_map(|part| &part[part.len() / 10 * 9..]);
-    let most = behind.map(|v| nan_is_worst(f64::from(v.abs()))).fold(0.0, f64::max);
-    Found { value: Some(worst), gradient: Some(most), ..Found::default() }
-        .must(found.iter().flatten().all(|v| v.is_finite()), "a gradient is not finite")
+    let behind = &gradient[gradient.len() / 10 * 9..];
+    let most = worst(behind.iter().map(|v| f64::from(v.abs())));
+    Ok(Found { value: Some(value), gradient: Some(most), ..Found::default() }
+        .must(all_finite(&gradient), "a gradient is not finite"))
 }
 
 /// The largest accepted image, compared in a patch. One pixel more is refused.
-fn largest_image(device: &Device) -> Found {
+fn largest_image(device: &Device) -> Result<Found, SplatError> {
     let options = RenderOptions::inria();
     let rows = six();
-    let tracked = Tracked::new(&rows, device);
-    let plain = |t: &Tensor<2>| t.clone().detach().inner();
-    let [means, rotations, scales, colors] = tracked.parts.each_ref().map(plain);
-    let opacities = tracked.opacities.clone().detach().inner();
-    let gaussians = Gaussians::new(means, rotations, scales, opacities, colors).expect("fits");
+    let gaussians = gaussians(&Tensor::from_data(TensorData::new(rows.concat(), [rows.len(), 14]), device));
     let beyond = camera(MAX_SIDE + 1, 8, 30.0);
     let refused = render(&gaussians, &[beyond], &options).is_err();
     let large = camera(8192, 8192, 8000.0);
@@ -343,20 +281,16 @@ fn largest_image(device: &Device) -> Found {
     let color = match render(&gaussians, &[large], &options) {
         Ok(rendered) => rendered.color,
         Err(e @ (SplatError::Memory { .. } | SplatError::TooManyIntersections { .. })) => {
-            return Found::skipped(format!("refused: {e}"));
+            return Ok(Found::skipped(format!("refused: {e}")));
         }
-        Err(e) => return Found::broken(format!("refused: {e}")),
+        Err(e) => return Err(e),
     };
     const SIDE: u32 = 12;
     let part = color.narrow(1, y as usize, SIDE as usize).narrow(2, x as usize, SIDE as usize);
     let got = host(part);
     let which = (y..y + SIDE).flat_map(|row| (x..x + SIDE).map(move |column| row * 8192 + column));
-    let expected = reference::pixels(&double(&rows), &large, &options, Cutoff::Hard, which);
-    let mut worst = 0.0_f64;
-    for (pixel, e) in expected.iter().enumerate() {
-        for c in 0..3 {
-            worst = worst.max(nan_is_worst((f64::from(got[3 * pixel + c]) - e.color[c]).abs()));
-        }
-    }
-    Found { value: Some(worst), ..Found::default() }.must(refused, "a side beyond the largest was accepted")
+    let expected = reference::pixels(&scene(&rows), &large, &options, Cutoff::Hard, which);
+    let off = got.iter().zip(expected.iter().flat_map(|pixel| pixel.color)).map(|(f, e)| apart(*f, e));
+    Ok(Found { value: Some(worst(off)), ..Found::default() }
+        .must(refused, "a side beyond the largest was accepted"))
 }

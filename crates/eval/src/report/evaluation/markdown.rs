@@ -2,7 +2,8 @@
 
 use std::fmt::Write;
 
-use super::{Cost, Evaluation, FIGURES, Grouped, point_means, seconds, surface_intervals};
+use super::{Cost, Evaluation, FIGURES, point_means, seconds, surface_intervals};
+use crate::evaluate::config::Protocol;
 use crate::evaluate::{Judged, Kind, Surface, by_person};
 use crate::points::VIEWS;
 use crate::report::{cell, escaped, left_out_markdown, table_markdown};
@@ -39,23 +40,24 @@ impl Evaluation<'_> {
                 let _ = writeln!(text, "Differences, person by person, from {name}:\n\n{table}");
             }
         }
-        for (name, rows) in self.groups() {
-            let row = |g: &Grouped| {
-                scores(&g.contestant, [g.protocol.name().into(), g.people.to_string()], &g.figures)
+        for (name, group) in &self.config.groups {
+            let row = |(judged, (i, protocol)): (&Judged, (usize, Protocol))| {
+                let people = self.of_group(group, judged, i);
+                let counts = [protocol.name().into(), people.len().to_string()];
+                scores(&judged.name, counts, &Self::overall(&people))
             };
+            let of_contestant = |judged| self.protocols().map(move |protocol| (judged, protocol));
+            let rows = self.outcome.judged.iter().flat_map(of_contestant);
             let header = [&["", "protocol", "people"][..], &TITLES].concat();
-            let table = table_markdown(&header, rows.iter().map(row));
-            let _ = writeln!(text, "## Group `{}`\n\n{table}", escaped(&name));
+            let table = table_markdown(&header, rows.map(row));
+            let _ = writeln!(text, "## Group `{}`\n\n{table}", escaped(name));
         }
         self.geometry_markdown(&mut text);
         for picture in pictures {
             let _ = writeln!(text, "![{picture}]({picture})\n");
         }
-        let shown: Vec<String> = self
-            .ranked(self.config.report.people)
-            .iter()
-            .map(|row| escaped(&self.outcome.people[*row]))
-            .collect();
+        let ranked = self.ranked(self.config.report.people);
+        let shown: Vec<String> = ranked.iter().map(|row| escaped(&self.outcome.people[*row])).collect();
         if !shown.is_empty() && !pictures.is_empty() {
             let degrees: Vec<String> = self.config.report.degrees.iter().map(|d| format!("{d}°")).collect();
             let _ = writeln!(

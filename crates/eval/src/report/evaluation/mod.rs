@@ -5,15 +5,15 @@ mod markdown;
 use std::collections::{BTreeMap, BTreeSet};
 
 use serde::Serialize;
-use serde_json::{Map, Value, json};
+use serde_json::{Value, json};
 use snapsnap_base::plot::{Axes, Series, svg};
 
 use super::{Header, number, table};
-use crate::evaluate::config::{EvalConfig, Protocol};
+use crate::evaluate::config::{EvalConfig, Group, Protocol};
 use crate::evaluate::{Judged, Kind, Outcome, Row, Surface, by_person, is_named};
 use crate::points::{PointError, VIEWS};
 use crate::score::Score;
-use crate::statistics::{Interval, difference, interval, quantile_of_times};
+use crate::statistics::{Interval, difference, interval, mean, quantile_of_times};
 
 /// A figure of a score: name, value, factor and digits in tables.
 type Figure = (&'static str, fn(&Score) -> Option<f64>, f64, usize);
@@ -71,7 +71,7 @@ impl Evaluation<'_> {
     }
 
     fn by_protocol(&self, value: impl Fn(usize) -> Value) -> Value {
-        Value::Object(self.protocols().map(|(i, protocol)| (protocol.name().into(), value(i))).collect())
+        self.protocols().map(|(i, protocol)| (protocol.name(), value(i))).collect()
     }
 
     fn of_kind(&self, kind: Kind) -> impl Iterator<Item = &Judged> {
@@ -93,7 +93,7 @@ impl Evaluation<'_> {
             self.by_protocol(|protocol| figures(&Self::overall(&by_person(&judged.rows, protocol))))
         };
         let named = |kind: Kind, value: &dyn Fn(&Judged) -> Value| -> Value {
-            Value::Object(self.of_kind(kind).map(|judged| (judged.name.clone(), value(judged))).collect())
+            self.of_kind(kind).map(|judged| (judged.name.clone(), value(judged))).collect()
         };
         report["baselines"] = named(Kind::Baseline, &plain);
         report["baselines_geometry_cm"] = named(Kind::Baseline, &|judged| geometry_json(&judged.surface));
@@ -115,8 +115,19 @@ impl Evaluation<'_> {
         report["geometry_cm"] = self.model().map_or(Value::Null, |model| geometry_json(&model.surface));
         report["mesh_cm"] = self.model().map_or(Value::Null, |model| geometry_json(&model.mesh));
         report["seconds"] = self.model().map_or(Value::Null, seconds_json);
-        report["groups"] =
-            Value::Object(self.groups().map(|(name, rows)| (name, group_json(&rows))).collect());
+        let group = |(name, group): (&String, &Group)| {
+            let of_contestant = |judged: &Judged| {
+                let value = self.by_protocol(|protocol| {
+                    let people = self.of_group(group, judged, protocol);
+                    let mut value = figures(&Self::overall(&people));
+                    value["people"] = json!(people.len());
+                    value
+                });
+                (judged.name.clone(), value)
+            };
+            (name.clone(), self.outcome.judged.iter().map(of_contestant).collect::<Value>())
+        };
+        report["groups"] = self.config.groups.iter().map(group).collect();
         report["lpips"] = json!(self.lpips);
         report["cost"] = json!(self.cost);
         report["left_out"] = json!(self.outcome.left_out);
@@ -138,27 +149,13 @@ impl Evaluation<'_> {
         })
     }
 
-    /// Figures of each group, by contestant and protocol.
-    fn groups(&self) -> impl Iterator<Item = (String, Vec<Grouped>)> {
-        self.config.groups.iter().map(|(name, group)| {
-            let inside = |person: &usize| {
-                group.subjects.iter().any(|subject| is_named(&self.outcome.people[*person], subject))
-            };
-            let mut rows = Vec::new();
-            for judged in &self.outcome.judged {
-                for (i, protocol) in self.protocols() {
-                    let mut people = by_person(&judged.rows, i);
-                    people.retain(|person, _| inside(person));
-                    rows.push(Grouped {
-                        contestant: judged.name.clone(),
-                        protocol,
-                        people: people.len(),
-                        figures: Self::overall(&people),
-                    });
-                }
-            }
-            (name.clone(), rows)
-        })
+    /// Means of the views of each person of a group.
+    fn of_group(&self, group: &Group, judged: &Judged, protocol: usize) -> BTreeMap<usize, Score> {
+        let mut people = by_person(&judged.rows, protocol);
+        people.retain(|person, _| {
+            group.subjects.iter().any(|subject| is_named(&self.outcome.people[*person], subject))
+        });
+        people
     }
 
     /// `views.csv`: a row per contestant, person, view and protocol.
@@ -199,14 +196,12 @@ impl Evaluation<'_> {
     pub fn by_view(&self) -> String {
         let Some((protocol, name)) = self.protocols().last() else { return String::new() };
         let series = |judged: &Judged| {
-            let mut sums: BTreeMap<i64, [f64; 2]> = BTreeMap::new();
+            let mut views: BTreeMap<i64, Vec<f64>> = BTreeMap::new();
             for row in &judged.rows {
-                let [sum, count] = sums.entry(row.degrees.round() as i64).or_default();
-                (*sum, *count) = (*sum + row.scores[protocol].psnr, *count + 1.0);
+                views.entry(row.degrees.round() as i64).or_default().push(row.scores[protocol].psnr);
             }
-            let points =
-                sums.into_iter().map(|(degrees, [sum, count])| (degrees as f64, sum / count)).collect();
-            Series { name: judged.name.clone(), points, line: true }
+            let points = views.iter().filter_map(|(degrees, psnr)| Some((*degrees as f64, mean(psnr)?)));
+            Series { name: judged.name.clone(), points: points.collect(), line: true }
         };
         let caption = format!("PSNR by view, protocol `{}`, mean over people", name.name());
         let (x, y) = ("degrees from the first photograph", "PSNR, dB");
@@ -220,11 +215,8 @@ impl Evaluation<'_> {
         let Some((model, (protocol, _))) = self.model().zip(self.protocols().last()) else {
             return Vec::new();
         };
-        let mut people: Vec<(usize, f64)> = by_person(&model.rows, protocol)
-            .into_iter()
-            .map(|(person, score)| (person, score.psnr))
-            .collect();
-        people.sort_by(|a, b| b.1.total_cmp(&a.1));
+        let mut people: Vec<(usize, Score)> = by_person(&model.rows, protocol).into_iter().collect();
+        people.sort_by(|a, b| b.1.psnr.total_cmp(&a.1.psnr));
         let n = people.len();
         let starts = [0, (n / 2).saturating_sub(count / 2), n.saturating_sub(count)];
         let places: BTreeSet<usize> =
@@ -233,62 +225,34 @@ impl Evaluation<'_> {
     }
 }
 
-/// A row of a group's table.
-struct Grouped {
-    contestant: String,
-    protocol: Protocol,
-    people: usize,
-    figures: [Option<Interval>; 3],
-}
-
-fn group_json(rows: &[Grouped]) -> Value {
-    let mut value = json!({});
-    for row in rows {
-        let mut entry = figures(&row.figures);
-        entry["people"] = json!(row.people);
-        value[&row.contestant][row.protocol.name()] = entry;
-    }
-    value
-}
-
 fn figures(intervals: &[Option<Interval>; 3]) -> Value {
-    let entries =
-        FIGURES.iter().zip(intervals).map(|((name, ..), interval)| ((*name).to_owned(), json!(interval)));
-    Value::Object(entries.collect::<Map<_, _>>())
+    FIGURES.iter().zip(intervals).map(|((name, ..), interval)| (*name, json!(interval))).collect()
 }
 
 /// Means over people and turns: distance in mm, distance after centring in mm, share of missed points.
 fn point_means(judged: &Judged, view: usize) -> Option<[f64; 3]> {
-    let errors = judged.points.iter().flat_map(|(_, errors)| errors).filter(|error| error.view == view);
-    let errors: Vec<_> = errors.collect();
-    let mean =
-        |of: fn(&PointError) -> f64| errors.iter().map(|error| of(error)).sum::<f64>() / errors.len() as f64;
-    (!errors.is_empty()).then(|| [mean(|e| 1e3 * e.mean), mean(|e| 1e3 * e.centred), mean(|e| e.missed)])
+    let errors = || judged.points.iter().flat_map(|(_, errors)| errors).filter(|error| error.view == view);
+    let over = |of: fn(&PointError) -> f64| mean(&errors().map(of).collect::<Vec<_>>());
+    Some([over(|e| 1e3 * e.mean)?, over(|e| 1e3 * e.centred)?, over(|e| e.missed)?])
 }
 
 fn points_json(judged: &Judged) -> Value {
-    let view = |(i, name): (usize, &&str)| {
+    let view = |(i, name): (usize, &&'static str)| {
         let value = point_means(judged, i)
             .map(|[mean, centred, missed]| json!({ "mean": mean, "centred": centred, "missed": missed }));
-        ((*name).to_owned(), json!(value))
+        (*name, json!(value))
     };
-    Value::Object(VIEWS.iter().enumerate().map(view).collect())
+    VIEWS.iter().enumerate().map(view).collect()
 }
 
 /// Means over people: centimetres to the truth, from the truth and both, and cosines.
 fn surface_intervals(surfaces: &[(usize, Surface)]) -> [Option<Interval>; 4] {
-    type Of = fn(&Surface) -> Option<f64>;
-    let over = |of: Of| {
-        let mut people: BTreeMap<usize, Vec<f64>> = BTreeMap::new();
-        for (person, surface) in surfaces {
-            people.entry(*person).or_default().extend(of(surface));
-        }
-        let means: Vec<f64> = people
-            .values()
-            .filter(|values| !values.is_empty())
-            .map(|values| values.iter().sum::<f64>() / values.len() as f64)
-            .collect();
-        interval(&means)
+    let over = |of: fn(&Surface) -> Option<f64>| {
+        let of_person = |turns: &[(usize, Surface)]| {
+            mean(&turns.iter().filter_map(|(_, surface)| of(surface)).collect::<Vec<_>>())
+        };
+        let people = surfaces.chunk_by(|(person, _), (next, _)| person == next);
+        interval(&people.filter_map(of_person).collect::<Vec<_>>())
     };
     [
         over(|s| Some(1e2 * s.chamfer.forward)),
