@@ -1,4 +1,4 @@
-//! Textured meshes: their files in and out, the views of them, and surfaces out of Gaussians.
+//! Textured meshes: import, export, views, and surfaces from Gaussians.
 
 pub mod export;
 pub mod fuse;

@@ -1,4 +1,4 @@
-//! Textured triangle meshes: what scans and synthetic people are made of.
+//! Textured triangle meshes, of scans and synthetic people.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -6,7 +6,7 @@ use std::sync::Arc;
 use glam::{Vec2, Vec3};
 use image::RgbImage;
 
-/// A mesh that can be drawn: indices in range, numbers finite.
+/// A triangle mesh. [`Mesh::check`] refuses indices out of range and numbers that are not finite.
 #[derive(Debug, Clone, Default)]
 pub struct Mesh {
     /// World positions, metres, y up.
@@ -17,7 +17,7 @@ pub struct Mesh {
     pub texcoords: Vec<Vec2>,
     /// Triangles, counter-clockwise as seen from outside.
     pub faces: Vec<Face>,
-    /// What faces refer to.
+    /// Materials of the faces.
     pub materials: Vec<Material>,
 }
 
@@ -32,7 +32,7 @@ pub struct Face {
     pub material: u32,
 }
 
-/// How a face reflects light: colour times texture times the positions' colours.
+/// Reflection of light: colour times texture times the positions' colours.
 #[derive(Debug, Clone)]
 pub struct Material {
     /// Diffuse colour in [0, 1].
@@ -47,86 +47,66 @@ impl Default for Material {
     }
 }
 
-/// What makes a mesh unusable.
+/// Faults of a mesh.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum MeshError {
-    /// Nothing to draw.
+    /// No faces.
     #[error("there is no triangle")]
     NoTriangle,
-    /// A NaN or an infinity.
-    #[error("{what} {index} is not finite")]
-    NotFinite {
-        /// Kind of number.
-        what: &'static str,
-        /// Its row.
-        index: usize,
-    },
-    /// A reference to nothing.
-    #[error("face {face} refers to {what} {index}, there are {count}")]
-    OutOfRange {
-        /// Row of the face.
-        face: usize,
-        /// Kind of reference.
-        what: &'static str,
-        /// Where it points.
-        index: u32,
-        /// How many there are.
-        count: usize,
-    },
-    /// All positions at one height: nothing that could be stood up.
+    /// All positions at one height: the mesh cannot be stood upright.
     #[error("the mesh has no height")]
     NoHeight,
-    /// Colours that do not belong to the positions.
-    #[error("{colors} vertex colours for {positions} positions")]
-    Colors {
-        /// Number of colours.
-        colors: usize,
-        /// Number of positions.
-        positions: usize,
-    },
+    /// A number that is not finite, a reference out of range, or colours that do not match the positions.
+    #[error("{0}")]
+    Invalid(String),
 }
 
 impl Mesh {
-    /// Triangles in the colours of their positions.
+    /// Triangles in the colours of their positions, or white ones without `colors`.
     pub fn colored(positions: Vec<Vec3>, colors: Vec<Vec3>, triangles: Vec<[u32; 3]>) -> Self {
         let face = |positions| Face { positions, texcoords: None, material: 0 };
         let faces = triangles.into_iter().map(face).collect();
         Self { positions, colors, faces, materials: vec![Material::default()], ..Self::default() }
     }
 
-    /// Whether the mesh can be drawn.
+    /// Checks that the mesh can be drawn.
     ///
     /// # Errors
-    /// [`MeshError`] for the first thing that is wrong.
+    /// [`MeshError`] for the first fault.
     pub fn check(&self) -> Result<(), MeshError> {
         if self.faces.is_empty() {
             return Err(MeshError::NoTriangle);
         }
-        let not_finite = |what, index: Option<usize>| match index {
-            Some(index) => Err(MeshError::NotFinite { what, index }),
-            None => Ok(()),
-        };
-        not_finite("position", self.positions.iter().position(|p| !p.is_finite()))?;
-        not_finite("texture coordinate", self.texcoords.iter().position(|t| !t.is_finite()))?;
-        not_finite("vertex colour", self.colors.iter().position(|c| !c.is_finite()))?;
-        if !self.colors.is_empty() && self.colors.len() != self.positions.len() {
-            return Err(MeshError::Colors { colors: self.colors.len(), positions: self.positions.len() });
+        let not_finite = [
+            ("position", self.positions.iter().position(|p| !p.is_finite())),
+            ("texture coordinate", self.texcoords.iter().position(|t| !t.is_finite())),
+            ("vertex colour", self.colors.iter().position(|c| !c.is_finite())),
+        ];
+        if let Some((what, index)) = not_finite.iter().find_map(|(what, index)| Some((what, (*index)?))) {
+            return Err(MeshError::Invalid(format!("{what} {index} is not finite")));
+        }
+        let (colors, positions) = (self.colors.len(), self.positions.len());
+        if colors > 0 && colors != positions {
+            return Err(MeshError::Invalid(format!("{colors} vertex colours for {positions} positions")));
         }
         for (face, f) in self.faces.iter().enumerate() {
-            let within =
-                |what, rows: &[u32], count: usize| match rows.iter().find(|row| **row as usize >= count) {
-                    Some(&index) => Err(MeshError::OutOfRange { face, what, index, count }),
-                    None => Ok(()),
-                };
-            within("position", &f.positions, self.positions.len())?;
-            within("texture coordinate", f.texcoords.as_ref().map_or(&[], |t| t), self.texcoords.len())?;
-            within("material", &[f.material], self.materials.len())?;
+            let references = [
+                ("position", &f.positions[..], positions),
+                ("texture coordinate", f.texcoords.as_ref().map_or(&[], |t| t), self.texcoords.len()),
+                ("material", &[f.material], self.materials.len()),
+            ];
+            for (what, rows, count) in references {
+                if let Some(row) = rows.iter().find(|row| **row as usize >= count) {
+                    let message = format!("face {face} refers to {what} {row}, there are {count}");
+                    return Err(MeshError::Invalid(message));
+                }
+            }
         }
         Ok(())
     }
 
-    /// Smooth normals: at each position the mean of its faces' normals, weighted by their area. Zero where a position has
-    /// no face.
+    /// Smooth normals: at each position the mean of its faces' normals, weighted by their area. Zero at positions without
+    /// a face.
     pub fn normals(&self) -> Vec<Vec3> {
         let mut normals = vec![Vec3::ZERO; self.positions.len()];
         for face in &self.faces {
@@ -139,7 +119,7 @@ impl Mesh {
         normals.into_iter().map(Vec3::normalize_or_zero).collect()
     }
 
-    /// Makes positions one that are equal in place and colour: files repeat them along the seams of textures, where
+    /// Merges positions that are equal in place and colour. Files repeat positions along the seams of textures, where
     /// shading would show an edge.
     pub fn weld(&mut self) {
         let bits = |v: Vec3| v.to_array().map(|x| if x == 0.0 { 0 } else { x.to_bits() });
@@ -161,7 +141,7 @@ impl Mesh {
         self.faces.iter_mut().for_each(|f| f.positions = f.positions.map(|row| places[row as usize]));
     }
 
-    /// Smallest and largest coordinates.
+    /// Smallest and largest coordinates of the positions.
     pub fn bounds(&self) -> (Vec3, Vec3) {
         let start = (Vec3::INFINITY, Vec3::NEG_INFINITY);
         self.positions.iter().fold(start, |(low, high), p| (low.min(*p), high.max(*p)))
@@ -173,12 +153,7 @@ mod tests {
     use super::*;
 
     fn triangle() -> Mesh {
-        Mesh {
-            positions: vec![Vec3::ZERO, Vec3::X, Vec3::Y],
-            faces: vec![Face { positions: [0, 1, 2], texcoords: None, material: 0 }],
-            materials: vec![Material::default()],
-            ..Mesh::default()
-        }
+        Mesh::colored(vec![Vec3::ZERO, Vec3::X, Vec3::Y], Vec::new(), vec![[0, 1, 2]])
     }
 
     #[test]

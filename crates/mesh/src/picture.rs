@@ -1,4 +1,4 @@
-//! Picture files, photographs and textures alike.
+//! Picture files: photographs, masks and textures.
 
 mod jpeg;
 #[cfg(test)]
@@ -11,23 +11,23 @@ use image::{DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader};
 
 use snapsnap_base::{FileError, file, guarded};
 
-/// Bytes that a decoded photograph, mask or view may take: 201 million pixels of red, green, blue and alpha, as many as
-/// telephones give. What comes after decoding needs about twice as much again.
+/// Bytes that a decoded photograph, mask or view may take: 201 million pixels of red, green, blue and alpha, the most that
+/// telephones take. The steps after decoding need about twice as much again.
 pub const MAX_BYTES: u64 = 768 << 20;
 /// Largest picture file that is read into memory before it is decoded.
 const MAX_FILE: u64 = 1 << 30;
 
-/// The picture in `path`, turned upright as its EXIF data say.
+/// The picture in `path`, turned upright according to its EXIF data.
 ///
 /// # Errors
 /// [`FileError`] for a file that cannot be read, is no picture, is damaged or cut short, or would take more than `most`
-/// bytes in memory; the last is known before it is decoded.
+/// bytes in memory, which is checked before the picture is decoded.
 pub fn decode(path: &Path, most: u64) -> Result<DynamicImage, FileError> {
     let file = BufReader::new(file::open(path).map_err(FileError::read(path))?);
     guarded(path, || decode_from(path, file, most))
 }
 
-/// Width and height of the picture in `path`, as stored.
+/// Width and height of the picture in `path`, without regard to its EXIF data.
 ///
 /// # Errors
 /// [`FileError`] for a file that cannot be read or is no picture.
@@ -48,14 +48,19 @@ pub fn decode_bytes(path: &Path, bytes: &[u8], most: u64) -> Result<DynamicImage
     guarded(path, || decode_from(path, Cursor::new(bytes), most))
 }
 
-/// For `map_err`: `path` is no image of a known format, or a damaged one.
+/// For `map_err`: the error of a damaged image, or one of an unknown format, in `path`.
 pub fn unreadable(path: &Path) -> impl Fn(ImageError) -> FileError {
     move |source| FileError::unsuitable(path, format!("not a readable image: {source}"))
 }
 
 fn decode_from(path: &Path, source: impl BufRead + Seek, most: u64) -> Result<DynamicImage, FileError> {
     let failed = unreadable(path);
-    let large = |[width, height]: [u32; 2], bytes: u64| {
+    let check = |[width, height]: [u32; 2], stored: u64| {
+        // Every picture becomes red, green and blue.
+        let bytes = stored.max(3 * u64::from(width) * u64::from(height));
+        if bytes <= most {
+            return Ok(());
+        }
         let (mega, most) = (bytes.div_ceil(1 << 20), most >> 20);
         let message =
             format!("is {width}×{height}, {mega} MiB in memory, more than {most}: make the picture smaller");
@@ -66,18 +71,11 @@ fn decode_from(path: &Path, source: impl BufRead + Seek, most: u64) -> Result<Dy
         let mut bytes = Vec::new();
         reader.into_inner().take(MAX_FILE).read_to_end(&mut bytes).map_err(FileError::read(path))?;
         let jpeg = jpeg::Jpeg::open(&bytes).map_err(&failed)?;
-        if jpeg.bytes_decoded() > most {
-            return large(jpeg.size, jpeg.bytes_decoded());
-        }
+        check(jpeg.size, 0)?;
         jpeg.decode().map_err(&failed)?
     } else {
         let mut decoder = reader.into_decoder().map_err(&failed)?;
-        let (width, height) = decoder.dimensions();
-        // Whatever it is stored as, red, green and blue are made of it.
-        let bytes = decoder.total_bytes().max(3 * u64::from(width) * u64::from(height));
-        if bytes > most {
-            return large([width, height], bytes);
-        }
+        check(decoder.dimensions().into(), decoder.total_bytes())?;
         let orientation = decoder.orientation().map_err(&failed)?;
         (DynamicImage::from_decoder(decoder).map_err(&failed)?, orientation)
     };

@@ -1,39 +1,43 @@
 //! Views of a mesh: colour, coverage and depth by a z-buffer rasteriser.
 //!
-//! * A pixel's coverage is the share of its samples, on a regular grid, that lie inside a triangle; triangles that share
-//!   an edge share no sample and leave none out, because edges are decided in whole numbers (1/240 pixel) by the top-left
-//!   rule.
+//! * A pixel's coverage is the share of its samples, on a regular grid, that lie inside a triangle. Triangles with a common
+//!   edge have no common sample and leave none out, because vertices are rounded to whole numbers (1/240 pixel) and edges
+//!   follow the top-left rule.
 //! * A pixel's colour is the coverage-weighted mean of its visible surfaces, over black. Each surface is shaded once per
-//!   pixel, at the middle of the samples that see it, with textures filtered to the pixel's size.
-//! * Depth is exact: where the ray through the pixel's centre (at +½) meets the plane of the nearest triangle there.
+//!   pixel, at the middle of its samples, with textures filtered to the pixel's size.
+//! * Depth is exact: the ray through the pixel's centre (at +½) meets the plane of the nearest triangle there.
 
 mod shade;
 
-use glam::{DVec2, DVec3};
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use glam::{DVec2, DVec3, Vec3};
+use image::RgbImage;
 use rayon::prelude::*;
 use snapsnap_splat::Camera;
 
 use crate::mesh::{Mesh, MeshError};
 pub use shade::Lights;
-use shade::{Shader, Surface};
+use shade::{Pyramid, Shader};
 
-/// Whole numbers per pixel that vertices are rounded to; grids of 1 to 6 samples per axis fall on them.
+/// Steps per pixel to which vertices are rounded. Samples of grids of 1 to 6 per axis lie on whole steps.
 const SUBPIXELS: i64 = 240;
-/// Side of the squares of pixels that are drawn in parallel.
-const TILE: usize = 32;
-/// Vertices nearer to the camera than this, in metres, make their triangles invisible: nothing is clipped.
+/// Rows of pixels in a band; bands are drawn in parallel.
+const BAND: usize = 8;
+/// Least depth of a vertex in metres. Triangles with a nearer one are left out, not clipped.
 const NEAR: f64 = 1e-3;
-/// Vertices further outside the image than this, in pixels, do too.
+/// Largest pixel coordinate of a vertex. Triangles with a larger one are left out.
 const FAR_OUTSIDE: f64 = 1e6;
 /// No triangle.
 const NONE: u32 = u32::MAX;
 
-/// How to draw.
+/// Options of [`Renderer::draw`].
 #[derive(Debug, Clone)]
 pub struct ViewOptions {
     /// Samples per pixel along each axis, 1 to 6.
     pub samples: usize,
-    /// Where the light comes from.
+    /// Lights of the scene.
     pub lights: Lights,
 }
 
@@ -50,28 +54,33 @@ pub struct View {
     pub width: usize,
     /// Rows.
     pub height: usize,
-    /// `[H,W]` red, green, blue in [0, 1], over black: already multiplied by `alpha`.
+    /// `[H,W]` red, green, blue in [0, 1] over black, that is multiplied by `alpha`.
     pub color: Vec<[f32; 3]>,
     /// `[H,W]` coverage in [0, 1].
     pub alpha: Vec<f32>,
-    /// `[H,W]` metres along the optical axis at the pixel's centre; 0 where the centre sees nothing.
+    /// `[H,W]` metres along the optical axis at the pixel's centre; 0 without a surface there.
     pub depth: Vec<f32>,
 }
 
 /// A triangle on the screen.
 struct Triangle {
-    /// Corners in units of 1/[`SUBPIXELS`] pixel, so ordered that the inside has positive edge functions.
+    /// Corners in units of 1/[`SUBPIXELS`] pixel, in the order in which edge functions are positive inside.
     corners: [[i64; 2]; 3],
     /// 1/z = plane · (u, v, 1) at pixel coordinates (u, v).
     plane: DVec3,
-    /// First and last pixel column and row that it may touch.
+    /// First and last pixel column and row that the triangle may touch.
     columns: [usize; 2],
     rows: [usize; 2],
     face: u32,
 }
 
-/// A mesh made ready to be drawn from many sides.
-pub struct Renderer<'a>(Surface<'a>);
+/// A mesh with the normals and textures that drawing needs, for any number of views.
+pub struct Renderer<'a> {
+    mesh: &'a Mesh,
+    normals: Vec<Vec3>,
+    /// One per material.
+    textures: Vec<Option<Arc<Pyramid>>>,
+}
 
 impl<'a> Renderer<'a> {
     /// Prepares normals and textures.
@@ -80,75 +89,68 @@ impl<'a> Renderer<'a> {
     /// [`MeshError`] if the mesh cannot be drawn.
     pub fn new(mesh: &'a Mesh) -> Result<Self, MeshError> {
         mesh.check()?;
-        Ok(Self(Surface::new(mesh)))
+        // Materials often share a texture.
+        let mut pyramids: HashMap<*const RgbImage, Arc<Pyramid>> = HashMap::new();
+        let mut pyramid = |texture: &Arc<RgbImage>| {
+            let pyramid = pyramids.entry(Arc::as_ptr(texture));
+            pyramid.or_insert_with(|| Arc::new(Pyramid::new(texture))).clone()
+        };
+        let textures = mesh.materials.iter().map(|m| m.texture.as_ref().map(&mut pyramid)).collect();
+        Ok(Self { mesh, normals: mesh.normals(), textures })
     }
 
-    /// The mesh as `camera` sees it. Surfaces are seen from both sides.
+    /// Draws the mesh from `camera`. Both sides of a surface are visible.
     ///
     /// # Panics
     /// If `options.samples` is not 1 to 6.
     pub fn draw(&self, camera: &Camera, options: &ViewOptions) -> View {
-        draw(&self.0, camera, options)
-    }
-}
+        assert!((1..=6).contains(&options.samples), "{} samples per axis", options.samples);
+        let (width, height) = (camera.width as usize, camera.height as usize);
+        let corners: Vec<DVec3> =
+            self.mesh.positions.par_iter().map(|p| camera.world_to_camera.apply(p.as_dvec3())).collect();
+        let faces = self.mesh.faces.par_iter().enumerate();
+        let triangles: Vec<Triangle> = faces
+            .filter_map(|(row, face)| triangle(face.positions.map(|row| corners[row as usize]), row, camera))
+            .collect();
+        let mut lists: Vec<Vec<u32>> = vec![Vec::new(); height.div_ceil(BAND)];
+        for (index, t) in (0..).zip(&triangles) {
+            let lists = &mut lists[t.rows[0] / BAND..=t.rows[1] / BAND];
+            lists.iter_mut().for_each(|list| list.push(index));
+        }
 
-fn draw(surface: &Surface, camera: &Camera, options: &ViewOptions) -> View {
-    assert!((1..=6).contains(&options.samples), "{} samples per axis", options.samples);
-    let (width, height) = (camera.width as usize, camera.height as usize);
-    let mesh = surface.mesh;
-    let corners: Vec<DVec3> =
-        mesh.positions.par_iter().map(|p| camera.world_to_camera.apply(p.as_dvec3())).collect();
-    let triangles: Vec<Triangle> = (0..mesh.faces.len())
-        .into_par_iter()
-        .filter_map(|face| {
-            triangle(mesh.faces[face].positions.map(|row| corners[row as usize]), face, camera)
-        })
-        .collect();
-
-    let tiles = [width.div_ceil(TILE), height.div_ceil(TILE)];
-    let mut lists: Vec<Vec<u32>> = vec![Vec::new(); tiles[0] * tiles[1]];
-    for (index, t) in (0..).zip(&triangles) {
-        for y in t.rows[0] / TILE..=t.rows[1] / TILE {
-            for x in t.columns[0] / TILE..=t.columns[1] / TILE {
-                lists[y * tiles[0] + x].push(index);
+        let places = places(options.samples);
+        let shader = Shader { renderer: self, camera, corners: &corners, lights: &options.lights };
+        let pixels = width * height;
+        let mut view = View {
+            width,
+            height,
+            color: vec![[0.0; 3]; pixels],
+            alpha: vec![0.0; pixels],
+            depth: vec![0.0; pixels],
+        };
+        let colors = view.color.par_chunks_mut(BAND * width);
+        let coverages = view.alpha.par_chunks_mut(BAND * width);
+        let depths = view.depth.par_chunks_mut(BAND * width);
+        let bands = lists.par_iter().enumerate().zip((colors, coverages, depths).into_par_iter());
+        bands.for_each(|((number, list), (color, alpha, depth))| {
+            let rows = [number * BAND, height.min((number + 1) * BAND)];
+            let Some(band) = Band::new(list, &triangles, rows, &places) else { return };
+            for (pixel, seen) in band.nearest.chunks_exact(places.len()).enumerate() {
+                let (x, y) = (band.left + pixel % band.columns, pixel / band.columns);
+                let at = y * width + x;
+                let ((inverse_depth, centre), samples) = seen.split_last().expect("the centre");
+                if *centre != NONE {
+                    depth[at] = (1.0 / inverse_depth) as f32;
+                }
+                let corner = DVec2::new(x as f64, (rows[0] + y) as f64);
+                (color[at], alpha[at]) = shade(samples, &places, corner, &triangles, &shader);
             }
-        }
+        });
+        view
     }
-
-    let shader = Shader { surface, camera, corners: &corners, lights: &options.lights };
-    let drawn: Vec<Option<View>> = lists
-        .par_iter()
-        .enumerate()
-        .map(|(tile, list)| {
-            let (left, top) = (tile % tiles[0] * TILE, tile / tiles[0] * TILE);
-            let size = [TILE.min(width - left), TILE.min(height - top)];
-            (!list.is_empty())
-                .then(|| Tile::new([left, top], size, options.samples).draw(list, &triangles, &shader))
-        })
-        .collect();
-
-    let pixels = width * height;
-    let mut view = View {
-        width,
-        height,
-        color: vec![[0.0; 3]; pixels],
-        alpha: vec![0.0; pixels],
-        depth: vec![0.0; pixels],
-    };
-    for (tile, drawn) in drawn.iter().enumerate() {
-        let Some(drawn) = drawn else { continue };
-        let (left, top) = (tile % tiles[0] * TILE, tile / tiles[0] * TILE);
-        for y in 0..drawn.height {
-            let (to, from) = ((top + y) * width + left, y * drawn.width);
-            view.color[to..to + drawn.width].copy_from_slice(&drawn.color[from..from + drawn.width]);
-            view.alpha[to..to + drawn.width].copy_from_slice(&drawn.alpha[from..from + drawn.width]);
-            view.depth[to..to + drawn.width].copy_from_slice(&drawn.depth[from..from + drawn.width]);
-        }
-    }
-    view
 }
 
-/// The triangle on the screen; `None` if it is not to be seen.
+/// The triangle on the screen; `None` for an invisible one.
 fn triangle(corners: [DVec3; 3], face: usize, camera: &Camera) -> Option<Triangle> {
     if corners.iter().any(|c| c.z < NEAR) {
         return None;
@@ -188,62 +190,36 @@ fn triangle(corners: [DVec3; 3], face: usize, camera: &Camera) -> Option<Triangl
     Some(Triangle { corners: rounded, plane, columns, rows, face: face as u32 })
 }
 
-/// Samples of a square of pixels.
-struct Tile {
-    /// First column and row.
-    origin: [usize; 2],
-    /// Columns and rows.
-    size: [usize; 2],
-    /// Places of the samples within a pixel, in 1/[`SUBPIXELS`]; the last is the centre, which counts for depth alone.
-    places: Vec<[i64; 2]>,
-    /// For each pixel and place: the nearest triangle and its 1/z.
+/// Places of the samples within a pixel, in 1/[`SUBPIXELS`]. The last is the centre, which counts only for depth.
+fn places(samples: usize) -> Vec<[i64; 2]> {
+    let place = |i: usize| (2 * i as i64 + 1) * SUBPIXELS / (2 * samples as i64);
+    let grid = (0..samples * samples).map(|i| [place(i % samples), place(i / samples)]);
+    grid.chain([[SUBPIXELS / 2; 2]]).collect()
+}
+
+/// Samples of a band's pixels between the first and the last column that triangles may touch.
+struct Band {
+    /// First column.
+    left: usize,
+    columns: usize,
+    /// For each pixel and place: 1/z of the nearest triangle, and its index.
     nearest: Vec<(f64, u32)>,
 }
 
-impl Tile {
-    fn new(origin: [usize; 2], size: [usize; 2], samples: usize) -> Self {
-        let place = |i: usize| (2 * i as i64 + 1) * SUBPIXELS / (2 * samples as i64);
-        let mut places: Vec<[i64; 2]> =
-            (0..samples * samples).map(|i| [place(i % samples), place(i / samples)]).collect();
-        places.push([SUBPIXELS / 2; 2]);
-        let nearest = vec![(0.0, NONE); size[0] * size[1] * places.len()];
-        Self { origin, size, places, nearest }
+impl Band {
+    /// Samples of the rows from `rows[0]` to before `rows[1]`; `None` where `list` has no triangle.
+    fn new(list: &[u32], triangles: &[Triangle], rows: [usize; 2], places: &[[i64; 2]]) -> Option<Self> {
+        let columns = || list.iter().map(|index| triangles[*index as usize].columns);
+        let left = columns().map(|[first, _]| first).min()?;
+        let columns = columns().map(|[_, last]| last).max()? + 1 - left;
+        let nearest = vec![(0.0, NONE); (rows[1] - rows[0]) * columns * places.len()];
+        let mut band = Self { left, columns, nearest };
+        list.iter().for_each(|index| band.add(*index, &triangles[*index as usize], rows, places));
+        Some(band)
     }
 
-    fn draw(mut self, list: &[u32], triangles: &[Triangle], shader: &Shader) -> View {
-        for &index in list {
-            self.add(index, &triangles[index as usize]);
-        }
-        let pixels = self.size[0] * self.size[1];
-        let mut view = View {
-            width: self.size[0],
-            height: self.size[1],
-            color: vec![[0.0; 3]; pixels],
-            alpha: vec![0.0; pixels],
-            depth: vec![0.0; pixels],
-        };
-        let count = self.places.len();
-        for (pixel, seen) in self.nearest.chunks_exact(count).enumerate() {
-            let (inverse_depth, centre) = seen[count - 1];
-            if centre != NONE {
-                view.depth[pixel] = (1.0 / inverse_depth) as f32;
-            }
-            let corner = DVec2::new(
-                (self.origin[0] + pixel % self.size[0]) as f64,
-                (self.origin[1] + pixel / self.size[0]) as f64,
-            );
-            self.shade(&seen[..count - 1], corner, triangles, shader, &mut view, pixel);
-        }
-        view
-    }
-
-    /// Marks the samples inside the triangle that it is nearest to.
-    fn add(&mut self, index: u32, t: &Triangle) {
-        let clip = |range: [usize; 2], axis: usize| {
-            let first = range[0].max(self.origin[axis]);
-            let last = range[1].min(self.origin[axis] + self.size[axis] - 1);
-            first..=last
-        };
+    /// Marks the samples inside the triangle to which it is the nearest so far.
+    fn add(&mut self, index: u32, t: &Triangle, rows: [usize; 2], places: &[[i64; 2]]) {
         // Edge function of edge i at (x, y), minus one where points on the edge belong to the neighbour: inside is ≥ 0.
         let edges: [[i64; 3]; 3] = std::array::from_fn(|i| {
             let (from, to) = (t.corners[i], t.corners[(i + 1) % 3]);
@@ -252,13 +228,12 @@ impl Tile {
             let owned = (dy == 0 && dx > 0) || dy < 0;
             [-dy, dx, dy * from[0] - dx * from[1] - i64::from(!owned)]
         });
-        for y in clip(t.rows, 1) {
-            for x in clip(t.columns, 0) {
-                let pixel = (y - self.origin[1]) * self.size[0] + x - self.origin[0];
+        for y in t.rows[0].max(rows[0])..=t.rows[1].min(rows[1] - 1) {
+            for x in t.columns[0]..=t.columns[1] {
+                let pixel = (y - rows[0]) * self.columns + x - self.left;
                 let (px, py) = (x as i64 * SUBPIXELS, y as i64 * SUBPIXELS);
-                let count = self.places.len();
-                let seen = &mut self.nearest[pixel * count..(pixel + 1) * count];
-                for (place, nearest) in self.places.iter().zip(seen) {
+                let seen = &mut self.nearest[pixel * places.len()..(pixel + 1) * places.len()];
+                for (place, nearest) in places.iter().zip(seen) {
                     let (sx, sy) = (px + place[0], py + place[1]);
                     if edges.iter().all(|[a, b, c]| a * sx + b * sy + c >= 0) {
                         let (u, v) = (sx as f64 / SUBPIXELS as f64, sy as f64 / SUBPIXELS as f64);
@@ -271,41 +246,39 @@ impl Tile {
             }
         }
     }
+}
 
-    /// Colour and coverage of one pixel from the samples that see something.
-    fn shade(
-        &self,
-        seen: &[(f64, u32)],
-        corner: DVec2,
-        triangles: &[Triangle],
-        shader: &Shader,
-        view: &mut View,
-        pixel: usize,
-    ) {
-        let mut color = glam::Vec3::ZERO;
-        let mut covered = 0;
-        for (i, &(_, index)) in seen.iter().enumerate() {
-            if index == NONE {
-                continue;
-            }
-            covered += 1;
-            // Each triangle at its first sample, for all of its samples.
-            if seen[..i].iter().any(|&(_, other)| other == index) {
-                continue;
-            }
-            let mut middle = DVec2::ZERO;
-            let mut weight = 0;
-            for (place, _) in self.places.iter().zip(seen).filter(|(_, s)| s.1 == index) {
-                middle += DVec2::new(place[0] as f64, place[1] as f64);
-                weight += 1;
-            }
-            let t = &triangles[index as usize];
-            let at = corner + middle / (f64::from(weight) * SUBPIXELS as f64);
-            color += weight as f32 * shader.color(t.face as usize, at, t.plane);
+/// Colour and coverage of one pixel from its samples; `corner` is the pixel's upper left corner.
+fn shade(
+    samples: &[(f64, u32)],
+    places: &[[i64; 2]],
+    corner: DVec2,
+    triangles: &[Triangle],
+    shader: &Shader,
+) -> ([f32; 3], f32) {
+    let mut color = Vec3::ZERO;
+    let mut covered = 0;
+    for (i, &(_, index)) in samples.iter().enumerate() {
+        if index == NONE {
+            continue;
         }
-        view.color[pixel] = (color / seen.len() as f32).to_array();
-        view.alpha[pixel] = covered as f32 / seen.len() as f32;
+        covered += 1;
+        // Each triangle is shaded at its first sample, for all of its samples.
+        if samples[..i].iter().any(|&(_, other)| other == index) {
+            continue;
+        }
+        let mut middle = DVec2::ZERO;
+        let mut weight = 0;
+        for (place, _) in places.iter().zip(samples).filter(|(_, sample)| sample.1 == index) {
+            middle += DVec2::new(place[0] as f64, place[1] as f64);
+            weight += 1;
+        }
+        let t = &triangles[index as usize];
+        let at = corner + middle / (f64::from(weight) * SUBPIXELS as f64);
+        color += weight as f32 * shader.color(t.face as usize, at, t.plane);
     }
+    let count = samples.len() as f32;
+    ((color / count).to_array(), covered as f32 / count)
 }
 
 #[cfg(test)]

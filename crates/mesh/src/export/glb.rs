@@ -5,51 +5,53 @@ use std::io::{self, Write};
 use std::path::Path;
 
 use glam::{Vec2, Vec3};
+use gltf::binary::{Glb, Header};
 use serde_json::{Value, json};
+use snapsnap_base::FileError;
 use snapsnap_base::file::write_whole;
 
 use super::png;
-use crate::mesh::Mesh;
-use snapsnap_base::FileError;
+use crate::mesh::{Face, Mesh};
 
-/// Kinds of numbers, in glTF's codes.
+/// glTF's codes of number types.
 const U16: u32 = 5123;
 const U32: u32 = 5125;
 const F32: u32 = 5126;
-/// What a buffer's view is for.
+/// glTF's codes for the use of a buffer view.
 const ATTRIBUTES: u32 = 34962;
 const INDICES: u32 = 34963;
 
 pub fn write(mesh: &Mesh, path: &Path) -> Result<(), FileError> {
-    let bytes = bytes(mesh).map_err(FileError::write(path))?;
+    let bytes = glb_bytes(mesh).map_err(FileError::write(path))?;
     write_whole(path, |out| out.write_all(&bytes)).map_err(FileError::write(path))
 }
 
-/// The file: one node, one primitive for each material. Colours are photographs', with their light in them: the material is
-/// unlit (KHR_materials_unlit), and rough where that is not known.
-pub fn bytes(mesh: &Mesh) -> io::Result<Vec<u8>> {
+/// The bytes of a binary glTF with one node and one primitive for each material. Colours contain the light of the photographs,
+/// so that materials are unlit (KHR_materials_unlit), and rough for viewers without that extension.
+///
+/// # Errors
+/// If a texture cannot be encoded.
+pub fn glb_bytes(mesh: &Mesh) -> io::Result<Vec<u8>> {
     let mut file = Content::default();
-    let vertices = Vertices::of(mesh);
+    let (rows, faces) = vertices(mesh);
     let normals = mesh.normals();
-    let rows = &vertices.rows;
     let positions: Vec<Vec3> = rows.iter().map(|(p, _)| mesh.positions[*p as usize]).collect();
     let (low, high) = positions
         .iter()
         .fold((Vec3::INFINITY, Vec3::NEG_INFINITY), |(low, high), p| (low.min(*p), high.max(*p)));
     let mut attributes = serde_json::Map::new();
-    let place = file.floats(positions.iter().flat_map(|p| p.to_array()));
     let bounds = json!({ "min": low.to_array(), "max": high.to_array() });
-    attributes.insert("POSITION".into(), file.accessor(place, F32, rows.len(), "VEC3", bounds));
+    let places = file.floats(rows.len(), "VEC3", positions.iter().flat_map(|p| p.to_array()), bounds);
+    attributes.insert("POSITION".into(), places);
     let normals = rows.iter().flat_map(|(p, _)| match normals[*p as usize] {
-        // A position without area has no normal, and glTF wants one of length 1.
+        // A position without area has no normal, but glTF requires one of length 1.
         Vec3::ZERO => Vec3::Y.to_array(),
         normal => normal.to_array(),
     });
-    let normals = file.floats(normals);
-    attributes.insert("NORMAL".into(), file.accessor(normals, F32, rows.len(), "VEC3", json!({})));
+    attributes.insert("NORMAL".into(), file.floats(rows.len(), "VEC3", normals, json!({})));
     if !mesh.colors.is_empty() {
-        // Linear in glTF, which takes more than 8 bits; rows are of 4 bytes or a multiple.
-        let color = |(p, _): &(u32, Option<u32>)| {
+        // Colours are linear in glTF, for which 8 bits do not suffice. Rows take a multiple of 4 bytes.
+        let color = |(p, _): &Vertex| {
             let [r, g, b] = mesh.colors[*p as usize].to_array().map(linear);
             [r, g, b, 1.0].map(|c| (c * f32::from(u16::MAX)).round() as u16)
         };
@@ -61,13 +63,12 @@ pub fn bytes(mesh: &Mesh) -> io::Result<Vec<u8>> {
         // glTF's textures begin at the top.
         let texcoord = |t: Option<u32>| t.map_or(Vec2::ZERO, |t| mesh.texcoords[t as usize]);
         let texcoords = rows.iter().map(|(_, t)| texcoord(*t)).flat_map(|t| [t.x, 1.0 - t.y]);
-        let texcoords = file.floats(texcoords);
-        attributes.insert("TEXCOORD_0".into(), file.accessor(texcoords, F32, rows.len(), "VEC2", json!({})));
+        attributes.insert("TEXCOORD_0".into(), file.floats(rows.len(), "VEC2", texcoords, json!({})));
     }
 
     let (mut primitives, mut materials, mut images) = (Vec::new(), Vec::new(), Vec::new());
     for (row, material) in mesh.materials.iter().enumerate() {
-        let faces = mesh.faces.iter().zip(&vertices.faces);
+        let faces = mesh.faces.iter().zip(&faces);
         let corners: Vec<u32> = faces
             .filter(|(face, _)| face.material as usize == row)
             .flat_map(|(_, corners)| *corners)
@@ -113,30 +114,24 @@ pub fn bytes(mesh: &Mesh) -> io::Result<Vec<u8>> {
     file.finish(&document)
 }
 
-/// glTF's vertices: a position, with the texture coordinate that a face gives it.
-struct Vertices {
-    rows: Vec<(u32, Option<u32>)>,
-    faces: Vec<[u32; 3]>,
+/// Rows of a position and of its texture coordinates, if it has some.
+type Vertex = (u32, Option<u32>);
+
+/// The distinct vertices, and the rows of each face's vertices.
+fn vertices(mesh: &Mesh) -> (Vec<Vertex>, Vec<[u32; 3]>) {
+    let (mut rows, mut known) = (Vec::new(), HashMap::new());
+    let mut row = |vertex: Vertex| {
+        *known.entry(vertex).or_insert_with(|| {
+            rows.push(vertex);
+            rows.len() as u32 - 1
+        })
+    };
+    let corner = |face: &Face, corner: usize| (face.positions[corner], face.texcoords.map(|t| t[corner]));
+    let faces = mesh.faces.iter().map(|face| [0, 1, 2].map(|i| row(corner(face, i)))).collect();
+    (rows, faces)
 }
 
-impl Vertices {
-    fn of(mesh: &Mesh) -> Self {
-        let (mut rows, mut known) = (Vec::new(), HashMap::new());
-        let mut faces = Vec::with_capacity(mesh.faces.len());
-        for face in &mesh.faces {
-            faces.push([0, 1, 2].map(|corner| {
-                let vertex = (face.positions[corner], face.texcoords.map(|t| t[corner]));
-                *known.entry(vertex).or_insert_with(|| {
-                    rows.push(vertex);
-                    rows.len() as u32 - 1
-                })
-            }));
-        }
-        Self { rows, faces }
-    }
-}
-
-/// The binary part, and what the other says of it.
+/// The binary part, and the JSON that describes it.
 #[derive(Default)]
 struct Content {
     bytes: Vec<u8>,
@@ -158,11 +153,13 @@ impl Content {
         self.views.len() - 1
     }
 
-    fn floats(&mut self, values: impl Iterator<Item = f32>) -> usize {
-        self.view(values.flat_map(f32::to_le_bytes), Some(ATTRIBUTES))
+    /// Adds vectors of numbers; returns the accessor's row.
+    fn floats(&mut self, count: usize, shape: &str, values: impl Iterator<Item = f32>, more: Value) -> Value {
+        let view = self.view(values.flat_map(f32::to_le_bytes), Some(ATTRIBUTES));
+        self.accessor(view, F32, count, shape, more)
     }
 
-    /// Says what a view holds; returns the accessor's row.
+    /// Describes the content of a view; returns the accessor's row.
     fn accessor(&mut self, view: usize, kind: u32, count: usize, shape: &str, more: Value) -> Value {
         let mut accessor =
             json!({ "bufferView": view, "componentType": kind, "count": count, "type": shape });
@@ -174,22 +171,16 @@ impl Content {
     }
 
     fn finish(self, document: &Value) -> io::Result<Vec<u8>> {
-        let mut text = serde_json::to_vec(document)?;
-        text.resize(text.len().next_multiple_of(4), b' ');
-        let chunks: [(&[u8; 4], &[u8]); 2] = [(b"JSON", &text), (b"BIN\0", &self.bytes)];
-        let length = |bytes: usize| u32::try_from(bytes).map(u32::to_le_bytes).map_err(io::Error::other);
-        let mut file = b"glTF\x02\0\0\0".to_vec();
-        file.extend(length(12 + chunks.iter().map(|(_, bytes)| 8 + bytes.len()).sum::<usize>())?);
-        for (kind, bytes) in chunks {
-            file.extend(length(bytes.len())?);
-            file.extend(kind);
-            file.extend(bytes);
-        }
-        Ok(file)
+        let json = serde_json::to_vec(document)?;
+        // Lengths in the file have 32 bits. Headers and padding take at most 32 bytes.
+        u32::try_from(json.len() + self.bytes.len() + 32).map_err(io::Error::other)?;
+        let header = Header { magic: *b"glTF", version: 2, length: 0 };
+        let file = Glb { header, json: json.into(), bin: Some(self.bytes.into()) };
+        file.to_vec().map_err(io::Error::other)
     }
 }
 
-/// Light of a colour as a screen shows it (sRGB).
+/// Linear light of an sRGB value.
 fn linear(shown: f32) -> f32 {
     let shown = shown.clamp(0.0, 1.0);
     if shown <= 0.040_45 { shown / 12.92 } else { ((shown + 0.055) / 1.055).powf(2.4) }

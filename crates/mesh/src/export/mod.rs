@@ -1,4 +1,4 @@
-//! Meshes into files: OBJ with materials and textures, binary PLY with vertex colours, binary glTF 2.0.
+//! Export of meshes: OBJ with materials and textures, binary PLY with vertex colours, binary glTF 2.0.
 
 mod glb;
 mod obj;
@@ -9,13 +9,14 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use image::{ImageFormat, RgbImage};
-
-use crate::mesh::Mesh;
 use snapsnap_base::FileError;
 
+use crate::mesh::Mesh;
+
+pub use glb::glb_bytes;
 pub use obj::write_obj;
 
-/// Kinds of files that a mesh can become.
+/// Kinds of files for a mesh.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
     /// Wavefront OBJ, its materials and textures beside it.
@@ -27,7 +28,7 @@ pub enum Kind {
 }
 
 impl Kind {
-    /// The kind that `path`'s extension names, if it is one.
+    /// The kind that the extension of `path` names, if any.
     pub fn named(path: &Path) -> Option<Self> {
         let extension = path.extension()?.to_str()?.to_ascii_lowercase();
         match extension.as_str() {
@@ -39,8 +40,8 @@ impl Kind {
     }
 }
 
-/// Writes `mesh` to `path` as the kind that its extension names (else GLB), whole or not at all
-/// (of an OBJ, its pictures and materials before it).
+/// Writes `mesh` to `path` as the kind that its extension names, or else as GLB. Each file is written as a whole or not at
+/// all. An OBJ comes after its pictures and materials.
 ///
 /// # Errors
 /// [`FileError::Write`]; [`FileError::Unsuitable`] for a texture in a PLY.
@@ -52,15 +53,7 @@ pub fn write(mesh: &Mesh, path: &Path) -> Result<(), FileError> {
     }
 }
 
-/// The bytes of a binary glTF.
-///
-/// # Errors
-/// If a texture cannot be encoded.
-pub fn glb_bytes(mesh: &Mesh) -> io::Result<Vec<u8>> {
-    glb::bytes(mesh)
-}
-
-/// What [`write()`] writes beside `path` for a mesh of one material.
+/// The files that [`write()`] writes beside `path` for a mesh of one material.
 pub fn companions(path: &Path, textured: bool) -> Vec<PathBuf> {
     if Kind::named(path) != Some(Kind::Obj) {
         return Vec::new();

@@ -1,4 +1,4 @@
-//! Meshes as scans: OBJ with materials and textures.
+//! OBJ with materials and textures.
 
 use std::collections::HashMap;
 use std::fs;
@@ -6,11 +6,11 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use snapsnap_base::FileError;
 use snapsnap_base::file::write_whole;
 
 use super::png;
 use crate::mesh::Mesh;
-use snapsnap_base::FileError;
 
 /// Writes `mesh` to `path`, with its materials and textures beside it under the same name; the OBJ is written last.
 ///
@@ -34,7 +34,7 @@ pub fn write_obj(mesh: &Mesh, path: &Path) -> Result<(), FileError> {
             write_whole(file, |out| out.write_all(&bytes)).map_err(FileError::write(file))?;
         }
     }
-    let file = folder.join(format!("{stem}.mtl"));
+    let file = path.with_extension("mtl");
     write_whole(&file, |out| out.write_all(materials.as_bytes())).map_err(FileError::write(&file))?;
     write_whole(path, |out| {
         writeln!(out, "mtllib {stem}.mtl")?;
@@ -64,7 +64,7 @@ pub fn write_obj(mesh: &Mesh, path: &Path) -> Result<(), FileError> {
     .map_err(FileError::write(path))
 }
 
-/// Where the texture of this number goes.
+/// Path of the texture of this number.
 pub fn texture_beside(path: &Path, number: usize) -> PathBuf {
     let stem = path.file_stem().unwrap_or_default().to_string_lossy();
     path.with_file_name(format!("{stem}_{number}.png"))

@@ -3,10 +3,10 @@
 use std::io::{self, Write};
 use std::path::Path;
 
+use snapsnap_base::FileError;
 use snapsnap_base::file::write_whole;
 
 use crate::mesh::Mesh;
-use snapsnap_base::FileError;
 
 pub fn write(mesh: &Mesh, path: &Path) -> Result<(), FileError> {
     if mesh.materials.iter().any(|material| material.texture.is_some()) {

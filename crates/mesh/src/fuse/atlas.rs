@@ -1,48 +1,50 @@
-//! A texture for a surface: pieces that face one way are laid flat beside one another.
+//! A texture for a surface. Charts, pieces that face one way, are laid flat beside one another.
 
-use std::collections::{HashMap, HashSet, VecDeque};
+use std::collections::{HashSet, VecDeque};
 
 use glam::{IVec2, Vec2, Vec3};
 
+use super::manifold::across;
 use crate::mesh::Mesh;
 
-/// Share of the texture that pieces fill at best.
+/// Share of the texture that charts fill in the first try.
 const FILLED: f32 = 0.75;
-/// How much coarser the texels become until all pieces find room.
+/// Factor by which texels grow from one try to the next.
 const COARSER: f32 = 1.06;
-/// Free texels around each piece, which have its colours too, so that filters do not see its neighbours.
+/// Free texels around each chart. They get its colours, so that filters do not reach its neighbours.
 const PADDING: i32 = 3;
-/// A piece grows as long as its faces are met more squarely than at this cosine.
+/// Least cosine between the normal of a chart's face and the chart's axis.
 const FLATTEST: f32 = 0.4;
-/// Tries to find room.
+/// Most tries to find room.
 const TRIES: usize = 200;
-/// Tries one after another in which there are too many pieces and they do not become fewer.
+/// Most tries in a row with too many charts and no fewer than before.
 const IN_VAIN: usize = 10;
 
 /// A texel of the surface.
 pub struct Texel {
-    /// Row of the texture, column by column in a row.
+    /// Index into the texture, row by row.
     pub at: u32,
     /// World metres.
     pub place: Vec3,
     /// Unit vector outwards.
     pub normal: Vec3,
-    /// Between those of the face's corners.
+    /// Interpolated between the face's corners.
     pub color: Vec3,
 }
 
-/// Where the faces of a mesh lie on a square texture.
+/// Places of a mesh's faces on a square texture.
 pub struct Atlas {
     /// Texture coordinates of each face's corners, (0, 0) at the lower left.
     pub texcoords: Vec<[Vec2; 3]>,
-    /// Texels that faces cover.
+    /// Texels of the faces.
     pub texels: Vec<Texel>,
 }
 
-/// Faces that are seen from along one axis and do not cover one another.
+/// Faces that do not cover one another along an axis.
 struct Chart {
+    axis: usize,
     faces: Vec<usize>,
-    /// Smallest and largest texel, before it is placed.
+    /// Smallest and largest texel before the chart is placed.
     low: IVec2,
     high: IVec2,
 }
@@ -50,11 +52,11 @@ struct Chart {
 /// Lays the faces of `mesh` on a texture of `side`² pixels.
 ///
 /// # Errors
-/// If there are too many pieces for it.
+/// If there are too many charts for it, or the surface is not closed.
 pub fn atlas(mesh: &Mesh, side: usize) -> Result<Atlas, String> {
-    let normals = mesh.normals();
-    let axes: Vec<usize> = mesh.faces.iter().map(|face| axis(corners(mesh, face.positions))).collect();
-    let neighbours = neighbours(mesh);
+    let axes: Vec<usize> = (0..mesh.faces.len()).map(|face| axis(mesh, face)).collect();
+    let triangles: Vec<[u32; 3]> = mesh.faces.iter().map(|face| face.positions).collect();
+    let across = across(&mesh.positions, &triangles).ok_or("the surface is not closed")?;
     let area: f32 = (0..axes.len())
         .map(|face| {
             let [a, b, c] = flat(mesh, face, axes[face], 1.0);
@@ -64,11 +66,11 @@ pub fn atlas(mesh: &Mesh, side: usize) -> Result<Atlas, String> {
     let mut texel = (area / (FILLED * (side * side) as f32)).sqrt();
     let (mut fewest, mut vain) = (usize::MAX, 0);
     for _ in 0..TRIES {
-        let charts = charts(mesh, &axes, &neighbours, texel);
+        let charts = charts(mesh, &axes, &across, texel);
         if let Some(places) = pack(&charts, side as i32) {
-            return Ok(lay(mesh, &normals, &axes, &charts, &places, side, texel));
+            return Ok(lay(mesh, &charts, &places, side, texel));
         }
-        // Coarser texels make pieces smaller, down to one texel and its padding, and at first fewer.
+        // Coarser texels make charts smaller, down to one texel and its padding, and at first fewer.
         let has_room = charts.len() * (1 + 2 * PADDING as usize).pow(2) <= side * side;
         vain = if has_room || charts.len() < fewest { 0 } else { vain + 1 };
         fewest = fewest.min(charts.len());
@@ -80,61 +82,53 @@ pub fn atlas(mesh: &Mesh, side: usize) -> Result<Atlas, String> {
     Err(format!("a texture of {side}² pixels has no room for the pieces of the surface"))
 }
 
-fn corners(mesh: &Mesh, rows: [u32; 3]) -> [Vec3; 3] {
-    rows.map(|row| mesh.positions[row as usize])
+fn corners(mesh: &Mesh, face: usize) -> [Vec3; 3] {
+    mesh.faces[face].positions.map(|row| mesh.positions[row as usize])
 }
 
-/// The axis along which a face is seen best: 0 to 2 are x, y and z, 3 to 5 the same from behind.
-fn axis([a, b, c]: [Vec3; 3]) -> usize {
-    let normal = (b - a).cross(c - a);
+/// Normal of a face, as long as twice its area.
+fn normal(mesh: &Mesh, face: usize) -> Vec3 {
+    let [a, b, c] = corners(mesh, face);
+    (b - a).cross(c - a)
+}
+
+/// The axis nearest to a face's normal: 0 to 2 are x, y and z, 3 to 5 their opposites.
+fn axis(mesh: &Mesh, face: usize) -> usize {
+    let normal = normal(mesh, face);
     let along = (0..3).max_by(|i, j| normal[*i].abs().total_cmp(&normal[*j].abs())).expect("three");
     if normal[along] < 0.0 { along + 3 } else { along }
 }
 
-/// How squarely a face is met along an axis.
+/// Cosine between a face's normal and an axis.
 fn cosine(mesh: &Mesh, face: usize, axis: usize) -> f32 {
-    let [a, b, c] = corners(mesh, mesh.faces[face].positions);
-    let along = (b - a).cross(c - a).normalize_or_zero()[axis % 3];
+    let along = normal(mesh, face).normalize_or_zero()[axis % 3];
     if axis < 3 { along } else { -along }
 }
 
-/// Corners of a face as seen along an axis, in texels.
+/// Corners of a face, projected along an axis, in texels.
 fn flat(mesh: &Mesh, face: usize, axis: usize, texel: f32) -> [Vec2; 3] {
     let (right, up) = [(2, 1), (0, 2), (0, 1)][axis % 3];
-    corners(mesh, mesh.faces[face].positions).map(|p| Vec2::new(p[right], p[up]) / texel)
+    corners(mesh, face).map(|p| Vec2::new(p[right], p[up]) / texel)
 }
 
-/// Faces across each face's edges.
-fn neighbours(mesh: &Mesh) -> Vec<[usize; 3]> {
-    let edges = |face: usize| {
-        let [a, b, c] = mesh.faces[face].positions;
-        [(a, b), (b, c), (c, a)]
-    };
-    let all = (0..mesh.faces.len()).flat_map(|face| edges(face).map(|edge| (edge, face)));
-    let owners: HashMap<(u32, u32), usize> = all.collect();
-    // Across the edge of a closed surface there always is a face.
-    let across = |face| edges(face).map(|(a, b)| *owners.get(&(b, a)).unwrap_or(&face));
-    (0..mesh.faces.len()).map(across).collect()
-}
-
-fn charts(mesh: &Mesh, axes: &[usize], neighbours: &[[usize; 3]], texel: f32) -> Vec<Chart> {
+fn charts(mesh: &Mesh, axes: &[usize], across: &[usize], texel: f32) -> Vec<Chart> {
     let mut taken = vec![false; axes.len()];
     let mut charts = Vec::new();
     for seed in 0..axes.len() {
         if taken[seed] {
             continue;
         }
-        let mut chart = Chart { faces: Vec::new(), low: IVec2::MAX, high: IVec2::MIN };
+        let mut chart = Chart { axis: axes[seed], faces: Vec::new(), low: IVec2::MAX, high: IVec2::MIN };
         let mut covered = HashSet::new();
         let mut waiting = VecDeque::from([seed]);
         while let Some(face) = waiting.pop_front() {
             if taken[face] {
                 continue;
             }
-            let triangle = flat(mesh, face, axes[seed], texel);
+            let triangle = flat(mesh, face, chart.axis, texel);
             let mut texels = Vec::new();
             inside(triangle, |at, _| texels.push(at));
-            // What lies before or behind a part of this piece goes into another one.
+            // Faces before or behind a part of this chart go into another one.
             if texels.iter().any(|at| covered.contains(at)) {
                 continue;
             }
@@ -145,15 +139,15 @@ fn charts(mesh: &Mesh, axes: &[usize], neighbours: &[[usize; 3]], texel: f32) ->
                 chart.low = chart.low.min(corner.floor().as_ivec2());
                 chart.high = chart.high.max(corner.floor().as_ivec2());
             }
-            let next = neighbours[face].into_iter();
-            waiting.extend(next.filter(|next| !taken[*next] && cosine(mesh, *next, axes[seed]) > FLATTEST));
+            let next = across[3 * face..3 * face + 3].iter().map(|side| side / 3);
+            waiting.extend(next.filter(|next| !taken[*next] && cosine(mesh, *next, chart.axis) > FLATTEST));
         }
         charts.push(chart);
     }
     charts
 }
 
-/// Calls `each` with the texels whose centres lie in a triangle, and with where: the weights of its corners.
+/// Calls `each` with the texels whose centres lie in a triangle and with their barycentric weights.
 fn inside(triangle: [Vec2; 3], mut each: impl FnMut(IVec2, Vec3)) {
     let [a, b, c] = triangle;
     let area = (b - a).perp_dot(c - a);
@@ -173,7 +167,7 @@ fn inside(triangle: [Vec2; 3], mut each: impl FnMut(IVec2, Vec3)) {
     }
 }
 
-/// Places of the charts' smallest texels on shelves, the highest first.
+/// Places of the charts' smallest texels. The charts stand on shelves, the highest first.
 fn pack(charts: &[Chart], side: i32) -> Option<Vec<IVec2>> {
     let size = |chart: &Chart| chart.high - chart.low + 1 + 2 * PADDING;
     let mut order: Vec<usize> = (0..charts.len()).collect();
@@ -196,21 +190,14 @@ fn pack(charts: &[Chart], side: i32) -> Option<Vec<IVec2>> {
     Some(places)
 }
 
-fn lay(
-    mesh: &Mesh,
-    normals: &[Vec3],
-    axes: &[usize],
-    charts: &[Chart],
-    places: &[IVec2],
-    side: usize,
-    texel: f32,
-) -> Atlas {
+fn lay(mesh: &Mesh, charts: &[Chart], places: &[IVec2], side: usize, texel: f32) -> Atlas {
+    let normals = mesh.normals();
     let mut texcoords = vec![[Vec2::ZERO; 3]; mesh.faces.len()];
     let mut texels = Vec::new();
     for (chart, place) in charts.iter().zip(places) {
         let moved = (*place - chart.low).as_vec2();
         for &face in &chart.faces {
-            let triangle = flat(mesh, face, axes[chart.faces[0]], texel).map(|corner| corner + moved);
+            let triangle = flat(mesh, face, chart.axis, texel).map(|corner| corner + moved);
             texcoords[face] = triangle.map(|p| Vec2::new(p.x, side as f32 - p.y) / side as f32);
             let rows = mesh.faces[face].positions;
             let of = |all: &[Vec3], w: Vec3| {
@@ -220,7 +207,7 @@ fn lay(
                 texels.push(Texel {
                     at: at.y as u32 * side as u32 + at.x as u32,
                     place: of(&mesh.positions, weights),
-                    normal: of(normals, weights).normalize_or_zero(),
+                    normal: of(&normals, weights).normalize_or_zero(),
                     color: of(&mesh.colors, weights),
                 });
             });
@@ -229,10 +216,10 @@ fn lay(
     Atlas { texcoords, texels }
 }
 
-/// Hands colours on to texels beside them that have none, as far as filters reach.
+/// Spreads colours to texels without one, as far as filters reach.
 pub fn spread(texture: &mut [Option<[u8; 3]>], side: usize) {
     for _ in 0..PADDING {
-        // Found first, so that none is handed on in the same round.
+        // Collected first, so that colours spread by one texel per round.
         let mut found = Vec::new();
         for row in (0..texture.len()).filter(|row| texture[*row].is_none()) {
             let (x, y) = (row % side, row / side);
@@ -254,24 +241,16 @@ pub fn spread(texture: &mut [Option<[u8; 3]>], side: usize) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::fuse::grid::Grid;
+    use crate::fuse::grid::tests::grid;
 
-    /// Two balls on a stick: what hides a part of itself from every side.
+    /// Two balls on a stick, a body that covers a part of itself along every axis.
     fn dumbbell() -> Mesh {
-        let n = 40;
-        let mut grid = Grid {
-            origin: Vec3::splat(-1.0),
-            cell: 2.0 / (n - 1) as f32,
-            counts: glam::USizeVec3::splat(n),
-            values: vec![0.0; n * n * n],
-        };
-        for row in 0..grid.values.len() {
-            let p = grid.place(row);
+        let (positions, faces) = grid(40, |p| {
             let ball = |x: f32| (p - Vec3::new(x, 0.0, 0.0)).length() - 0.35;
             let stick = Vec2::new(p.y, p.z).length().max(p.x.abs() - 0.5) - 0.12;
-            grid.values[row] = ball(-0.5).min(ball(0.5)).min(stick);
-        }
-        let (positions, faces) = grid.surface();
+            ball(-0.5).min(ball(0.5)).min(stick)
+        })
+        .surface();
         let colors = vec![Vec3::ONE; positions.len()];
         Mesh::colored(positions, colors, faces)
     }

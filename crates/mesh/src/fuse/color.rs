@@ -1,4 +1,4 @@
-//! Colours of a surface: what the views show that look at it most squarely.
+//! Colours of a surface, from the views that meet it most squarely.
 
 use glam::Vec3;
 use rayon::prelude::*;
@@ -6,14 +6,14 @@ use rayon::prelude::*;
 use super::views::View;
 use crate::mesh::Mesh;
 
-/// A view shows a place whose surface it sees within so many cubes of the field.
+/// Largest distance between a place and the surface that a view shows there, in cubes of the field.
 pub const REACH: f32 = 3.0;
-/// How much more a view counts that looks more squarely: its cosine to this power.
+/// The weight of a view is its cosine to this power.
 const SHARPNESS: i32 = 6;
-/// Times that colours are handed on to neighbours that no view shows.
+/// Number of times that colours spread to neighbours that no view shows.
 const ROUNDS: usize = 200;
 
-/// What views say of the colour of a place.
+/// Weighted mean of the views' colours of a place.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Mean {
     sum: Vec3,
@@ -21,8 +21,8 @@ pub struct Mean {
 }
 
 impl Mean {
-    /// Hears a view, if it shows a place that faces along `normal`.
-    pub fn hear(&mut self, view: &View, place: Vec3, normal: Vec3, reach: f32) {
+    /// Adds a view, if it shows a place that faces along `normal`.
+    pub fn add(&mut self, view: &View, place: Vec3, normal: Vec3, reach: f32) {
         let square = -view.towards(place).dot(normal);
         if square <= 0.0 {
             return;
@@ -40,13 +40,13 @@ impl Mean {
     }
 }
 
-/// Colours of all positions; those that no view shows (armpits, soles) have the mean of their neighbours'.
+/// Colours of all positions. Positions that no view shows (armpits, soles) have the mean colour of their neighbours.
 pub fn colors(mesh: &Mesh, views: &[View], cell: f32) -> Vec<Vec3> {
     let normals = mesh.normals();
     let seen = mesh.positions.par_iter().zip(&normals);
     let color = |(place, normal): (&Vec3, &Vec3)| {
         let mut mean = Mean::default();
-        views.iter().for_each(|view| mean.hear(view, *place, *normal, REACH * cell));
+        views.iter().for_each(|view| mean.add(view, *place, *normal, REACH * cell));
         mean.color()
     };
     let mut colors: Vec<Option<Vec3>> = seen.map(color).collect();
@@ -54,17 +54,17 @@ pub fn colors(mesh: &Mesh, views: &[View], cell: f32) -> Vec<Vec3> {
         if colors.iter().all(Option::is_some) {
             break;
         }
-        let mut handed = vec![(Vec3::ZERO, 0.0); colors.len()];
+        let mut around = vec![(Vec3::ZERO, 0.0); colors.len()];
         for face in &mesh.faces {
             for (to, from) in [(0, 1), (1, 2), (2, 0), (1, 0), (2, 1), (0, 2)] {
                 let [to, from] = [to, from].map(|corner: usize| face.positions[corner] as usize);
                 if let (None, Some(color)) = (colors[to], colors[from]) {
-                    handed[to].0 += color;
-                    handed[to].1 += 1.0;
+                    around[to].0 += color;
+                    around[to].1 += 1.0;
                 }
             }
         }
-        for (color, (sum, count)) in colors.iter_mut().zip(handed) {
+        for (color, (sum, count)) in colors.iter_mut().zip(around) {
             if count > 0.0 {
                 *color = Some(sum / count);
             }

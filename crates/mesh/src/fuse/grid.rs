@@ -1,4 +1,4 @@
-//! Values on a regular grid, and the closed surface where they change their sign.
+//! Values on a regular grid, and the closed surface at which their sign changes.
 
 use std::collections::HashMap;
 
@@ -18,11 +18,10 @@ pub struct Grid {
     pub values: Vec<f32>,
 }
 
-/// Steps to half of the corners that share an edge with a corner once every cube is cut into six tetrahedra around its
-/// diagonal (Kuhn's subdivision): the others are the same backwards.
+/// Steps from a corner to half of those that share an edge with it. The steps to the others have the opposite sign. Every
+/// cube consists of six tetrahedra around its diagonal (Kuhn's subdivision).
 const STEPS: [[usize; 3]; 7] = [[1, 0, 0], [0, 1, 0], [1, 1, 0], [0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 1, 1]];
-/// The tetrahedra: in which order they go along the axes from a cube's first corner to its last, and whether that order
-/// makes them left-handed.
+/// Each tetrahedron's order of axes on the way from a cube's first corner to its last, and whether it is left-handed.
 const TETRAHEDRA: [([usize; 3], bool); 6] = [
     ([0, 1, 2], false),
     ([1, 2, 0], false),
@@ -31,18 +30,45 @@ const TETRAHEDRA: [([usize; 3], bool); 6] = [
     ([2, 1, 0], true),
     ([1, 0, 2], true),
 ];
-/// Surfaces keep this share of an edge away from its ends, so that no triangle is without area.
+/// Least distance of the surface from the ends of an edge, as a share of the edge. It keeps triangles from having no area.
 const CLEARANCE: f32 = 0.05;
 
-impl Grid {
-    /// Place of a corner.
-    pub fn place(&self, row: usize) -> Vec3 {
-        let USizeVec3 { x: nx, y: ny, .. } = self.counts;
-        self.origin
-            + self.cell * Vec3::new((row % nx) as f32, (row / nx % ny) as f32, (row / (nx * ny)) as f32)
+/// Connected corners with the same sign. The edges of the tetrahedra connect them, so that the surface between two pieces
+/// is connected too.
+pub struct Pieces {
+    /// For every corner the number of its piece.
+    pub of: Vec<u32>,
+    /// For every piece the number of its corners.
+    pub sizes: Vec<usize>,
+    /// For every piece whether its corners are inside.
+    pub inside: Vec<bool>,
+}
+
+impl Pieces {
+    /// The largest piece inside, if there is one.
+    pub fn body(&self) -> Option<usize> {
+        (0..self.sizes.len()).filter(|piece| self.inside[*piece]).max_by_key(|piece| self.sizes[*piece])
     }
 
-    pub(super) fn strides(&self) -> [usize; 3] {
+    /// Number of pieces inside.
+    pub fn bodies(&self) -> usize {
+        self.inside.iter().filter(|inside| **inside).count()
+    }
+}
+
+impl Grid {
+    /// Number of a corner along each axis.
+    fn at(&self, row: usize) -> USizeVec3 {
+        let USizeVec3 { x: nx, y: ny, .. } = self.counts;
+        USizeVec3::new(row % nx, row / nx % ny, row / (nx * ny))
+    }
+
+    /// Place of a corner.
+    pub fn place(&self, row: usize) -> Vec3 {
+        self.origin + self.cell * self.at(row).as_vec3()
+    }
+
+    pub fn strides(&self) -> [usize; 3] {
         [1, self.counts.x, self.counts.x * self.counts.y]
     }
 
@@ -53,24 +79,22 @@ impl Grid {
     }
 
     /// Whether the corner lies on the border.
-    pub(super) fn on_border(&self, row: usize) -> bool {
-        let USizeVec3 { x: nx, y: ny, z: nz } = self.counts;
-        let at = [row % nx, row / nx % ny, row / (nx * ny)];
-        at.iter().zip([nx, ny, nz]).any(|(i, n)| *i == 0 || i + 1 == n)
+    pub fn on_border(&self, row: usize) -> bool {
+        let at = self.at(row);
+        at.min_element() == 0 || (at + 1).cmpeq(self.counts).any()
     }
 
-    /// For every corner which piece of connected ones with the same sign it is in, from 0, and how many corners each piece has.
-    /// Connected is what the edges of the tetrahedra connect: by them the surface between two pieces is one.
-    pub(super) fn pieces(&self) -> (Vec<u32>, Vec<usize>) {
+    /// The connected pieces of the inside and the outside.
+    pub fn pieces(&self) -> Pieces {
         let steps = self.steps();
-        let mut piece = vec![u32::MAX; self.values.len()];
-        let (mut sizes, mut waiting) = (Vec::new(), Vec::new());
+        let mut pieces = Pieces { of: vec![u32::MAX; self.values.len()], sizes: vec![], inside: vec![] };
+        let mut waiting = Vec::new();
         for first in 0..self.values.len() {
-            if piece[first] != u32::MAX {
+            if pieces.of[first] != u32::MAX {
                 continue;
             }
-            let (number, inside) = (sizes.len() as u32, self.values[first] < 0.0);
-            piece[first] = number;
+            let (number, inside) = (pieces.sizes.len() as u32, self.values[first] < 0.0);
+            pieces.of[first] = number;
             waiting.push(first);
             let mut size = 0;
             while let Some(row) = waiting.pop() {
@@ -78,65 +102,56 @@ impl Grid {
                 let border = self.on_border(row);
                 for step in steps {
                     for next in [row.checked_sub(step), row.checked_add(step)].into_iter().flatten() {
-                        // A step from the border may come out on the other side of the grid.
-                        let there = next < piece.len() && !(border && self.wraps(row, next));
-                        if there && piece[next] == u32::MAX && (self.values[next] < 0.0) == inside {
-                            piece[next] = number;
+                        // A step from the border may end at the other side of the grid.
+                        let wraps = || {
+                            let apart = self.at(row).as_i64vec3() - self.at(next).as_i64vec3();
+                            apart.abs().max_element() > 1
+                        };
+                        let there = next < self.values.len() && !(border && wraps());
+                        if there && pieces.of[next] == u32::MAX && (self.values[next] < 0.0) == inside {
+                            pieces.of[next] = number;
                             waiting.push(next);
                         }
                     }
                 }
             }
-            sizes.push(size);
+            pieces.sizes.push(size);
+            pieces.inside.push(inside);
         }
-        (piece, sizes)
+        pieces
     }
 
-    fn wraps(&self, a: usize, b: usize) -> bool {
-        let USizeVec3 { x: nx, y: ny, .. } = self.counts;
-        let apart = |a: usize, b: usize| a.abs_diff(b) > 1;
-        apart(a % nx, b % nx) || apart(a / nx % ny, b / nx % ny)
-    }
-
-    /// How many pieces inside there are.
-    pub fn bodies(&self) -> usize {
-        let (piece, sizes) = self.pieces();
-        let mut inside = vec![false; sizes.len()];
-        piece.iter().zip(&self.values).for_each(|(piece, value)| inside[*piece as usize] |= *value < 0.0);
-        inside.iter().filter(|inside| **inside).count()
-    }
-
-    /// Keeps the largest piece inside alone and fills what of the outside it encloses, so that one closed surface is left.
-    /// Returns how many pieces were dropped, and how many were filled.
+    /// Keeps only the largest piece inside and fills the outside that it encloses, which leaves one closed surface.
+    /// Returns the number of dropped and of filled pieces.
     pub fn keep_one_body(&mut self) -> (usize, usize) {
-        let border: Vec<usize> = (0..self.values.len()).filter(|row| self.on_border(*row)).collect();
-        border.iter().for_each(|row| self.values[*row] = self.values[*row].abs().max(f32::MIN_POSITIVE));
-        let (piece, sizes) = self.pieces();
-        let mut inside = vec![false; sizes.len()];
-        piece.iter().zip(&self.values).for_each(|(piece, value)| inside[*piece as usize] |= *value < 0.0);
-        let Some(body) = (0..sizes.len()).filter(|i| inside[*i]).max_by_key(|i| sizes[*i]) else {
-            return (0, 0);
-        };
-        let dropped = inside.iter().filter(|inside| **inside).count() - 1;
-        // What was dropped is outside now, and may have kept other pieces apart.
-        for (piece, value) in piece.iter().zip(&mut self.values) {
-            if *value < 0.0 && *piece as usize != body {
-                *value = -*value;
+        for row in 0..self.values.len() {
+            if self.on_border(row) {
+                self.values[row] = self.values[row].abs().max(f32::MIN_POSITIVE);
             }
         }
-        let (piece, sizes) = if dropped > 0 { self.pieces() } else { (piece, sizes) };
-        let around = piece[0];
-        let mut filled = vec![false; sizes.len()];
-        for (piece, value) in piece.iter().zip(&mut self.values) {
+        let mut pieces = self.pieces();
+        let Some(body) = pieces.body() else { return (0, 0) };
+        let dropped = pieces.bodies() - 1;
+        if dropped > 0 {
+            for (piece, value) in pieces.of.iter().zip(&mut self.values) {
+                if *value < 0.0 && *piece as usize != body {
+                    *value = -*value;
+                }
+            }
+            // Pieces of the outside may be connected now.
+            pieces = self.pieces();
+        }
+        let around = pieces.of[0];
+        for (piece, value) in pieces.of.iter().zip(&mut self.values) {
             if *value >= 0.0 && *piece != around {
-                filled[*piece as usize] = true;
                 *value = -value.max(f32::MIN_POSITIVE);
             }
         }
-        (dropped, filled.iter().filter(|filled| **filled).count())
+        // All pieces but the body and the outside around it.
+        (dropped, pieces.sizes.len() - 2)
     }
 
-    /// Puts the mean of each corner and its six neighbours in its place; those on the border stay.
+    /// Replaces each value by a weighted mean with its six neighbours. Values on the border stay.
     pub fn smooth(&mut self) {
         let strides = self.strides();
         let old = std::mem::take(&mut self.values);
@@ -152,14 +167,14 @@ impl Grid {
             .collect();
     }
 
-    /// The surface between inside and outside, from every cube's six tetrahedra: closed, each edge has two triangles, and
-    /// counter-clockwise as seen from outside.
+    /// The closed surface between inside and outside, from every cube's six tetrahedra. Each edge has two triangles, which
+    /// are counter-clockwise as seen from outside.
     pub fn surface(&self) -> (Vec<Vec3>, Vec<[u32; 3]>) {
         let strides = self.strides();
         let mut corners = HashMap::new();
         let (mut positions, mut faces) = (Vec::new(), Vec::new());
         let mut between = |a: usize, b: usize| {
-            // Both neighbours ask for the same edge, in either direction.
+            // Neighbouring tetrahedra pass the same edge in either direction.
             let key = (a.min(b), a.max(b));
             *corners.entry(key).or_insert_with(|| {
                 let [va, vb] = [key.0, key.1].map(|row| self.values[row]);
@@ -168,28 +183,18 @@ impl Grid {
                 positions.len() as u32 - 1
             })
         };
-        let USizeVec3 { x: nx, y: ny, z: nz } = self.counts;
-        for z in 0..nz.saturating_sub(1) {
-            for y in 0..ny.saturating_sub(1) {
-                for x in 0..nx.saturating_sub(1) {
-                    let first = x + nx * (y + ny * z);
-                    let inside = |row: usize| self.values[row] < 0.0;
-                    let cube = STEPS.iter().map(|s| first + s[0] + nx * (s[1] + ny * s[2]));
-                    if cube.into_iter().all(|row| inside(row) == inside(first)) {
-                        continue;
-                    }
-                    for (order, left_handed) in TETRAHEDRA {
-                        let second = first + strides[order[0]];
-                        let third = second + strides[order[1]];
-                        tetrahedron(
-                            [first, second, third, third + strides[order[2]]],
-                            left_handed,
-                            &inside,
-                            &mut between,
-                            &mut faces,
-                        );
-                    }
-                }
+        let steps = self.steps();
+        let inside = |row: usize| self.values[row] < 0.0;
+        for first in 0..self.values.len() {
+            let is_cube = (self.at(first) + 1).cmplt(self.counts).all();
+            if !is_cube || steps.iter().all(|step| inside(first + step) == inside(first)) {
+                continue;
+            }
+            for (order, left_handed) in TETRAHEDRA {
+                let second = first + strides[order[0]];
+                let third = second + strides[order[1]];
+                let corners = [first, second, third, third + strides[order[2]]];
+                tetrahedron(corners, left_handed, &inside, &mut between, &mut faces);
             }
         }
         (positions, faces)
@@ -204,7 +209,7 @@ fn tetrahedron(
     between: &mut impl FnMut(usize, usize) -> u32,
     faces: &mut Vec<[u32; 3]>,
 ) {
-    // Those inside first; every exchange of neighbours mirrors the tetrahedron.
+    // Corners inside come first. Every exchange of neighbours mirrors the tetrahedron.
     let mut sorted = corners;
     let mut mirrored = left_handed;
     for end in (1..4).rev() {
@@ -229,7 +234,7 @@ fn tetrahedron(
             face([quad[0], quad[1], quad[2]]);
             face([quad[0], quad[2], quad[3]]);
         }
-        // (d, c, b, a) is (a, b, c, d) after two exchanges, and what lies outside is d alone.
+        // (d, c, b, a) is (a, b, c, d) after two exchanges, and only d is outside.
         3 => face([between(d, a), between(d, b), between(d, c)]),
         _ => {}
     }
@@ -238,6 +243,7 @@ fn tetrahedron(
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
+    use crate::fuse::manifold::manifold;
 
     /// Every edge has two faces that run along it in opposite directions.
     pub fn is_closed(faces: &[[u32; 3]]) -> bool {
@@ -250,7 +256,7 @@ pub(super) mod tests {
         edges.iter().all(|((a, b), n)| *n == 1 && edges.get(&(*b, *a)) == Some(&1))
     }
 
-    /// Of n³ corners from (−1, −1, −1) to (1, 1, 1).
+    /// A grid of n³ corners from (−1, −1, −1) to (1, 1, 1).
     pub fn grid(n: usize, value: impl Fn(Vec3) -> f32) -> Grid {
         let cell = 2.0 / (n - 1) as f32;
         let mut grid =
@@ -280,35 +286,22 @@ pub(super) mod tests {
     #[test]
     fn noise_is_closed_and_one_piece_once_one_body_is_kept() {
         let noise = |p: Vec3| (p * 977.0).dot(Vec3::new(12.9898, 78.233, 37.719)).sin();
-        // Little inside, in crumbs; then little outside, in bubbles.
+        // Small pieces inside, then small pieces outside.
         let (dropped, _) = grid(24, |p| noise(p) + 0.95).keep_one_body();
         let mut grid = grid(24, |p| noise(p) - 0.95);
         let (_, filled) = grid.keep_one_body();
         assert!(dropped > 10 && filled > 10, "{dropped} {filled}");
         assert_eq!(grid.keep_one_body(), (0, 0));
-        let (_, sizes) = grid.pieces();
-        assert_eq!(sizes.len(), 2);
+        assert_eq!(grid.pieces().sizes.len(), 2);
         grid.values.iter_mut().for_each(|value| *value += 0.95);
         grid.keep_one_body();
         let (positions, faces) = grid.surface();
         assert!(is_closed(&faces) && volume(&positions, &faces) > 0.0);
-        let mut piece: Vec<usize> = (0..positions.len()).collect();
-        // The smallest row that a corner is connected with.
-        loop {
-            let before = piece.clone();
-            for f in &faces {
-                let least = f.iter().map(|row| piece[*row as usize]).min().expect("three");
-                f.iter().for_each(|row| piece[*row as usize] = least);
-            }
-            if piece == before {
-                break;
-            }
-        }
-        assert!(piece.iter().all(|p| *p == 0));
+        assert_eq!(manifold(&positions, faces).expect("closed").pieces().1, 1);
     }
 
     #[test]
-    fn what_a_body_encloses_is_filled_and_what_flies_beside_it_is_dropped() {
+    fn hollows_of_a_body_are_filled_and_specks_beside_it_dropped() {
         let hollow = |p: Vec3| (p.length() - 0.6).abs() - 0.15;
         let speck = |p: Vec3| (p - Vec3::splat(0.85)).length() - 0.09;
         let mut grid = grid(41, |p| hollow(p).min(speck(p)));

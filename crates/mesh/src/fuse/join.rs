@@ -1,35 +1,33 @@
-//! Parts that the Gaussians show apart from the body: a foot below a skirt, a hand beyond a cuff.
+//! Parts of a person that the Gaussians show apart from the body, as a foot below a skirt or a hand beyond a cuff.
 
 use std::collections::{HashMap, VecDeque};
 
 use super::grid::Grid;
 
-/// Pieces of at least this share of the body's corners are parts of it; smaller ones fly beside it.
+/// Least size of a part, as a share of the body's corners. Smaller pieces are dropped later.
 const PART: f64 = 0.002;
-/// Parts farther away than so many cubes are no parts.
+/// Largest distance of a part from the body, in cubes.
 const FARTHEST: usize = 32;
 /// Not reached yet.
 const NOWHERE: u32 = u32::MAX;
 
 impl Grid {
-    /// Joins parts with the body by the shortest way through the outside, three cubes thick. Returns how many.
+    /// Joins parts with the body by the shortest way through the outside, three cubes thick. Returns their number.
     pub fn join_parts(&mut self) -> usize {
-        let (piece, sizes) = self.pieces();
-        let mut inside = vec![false; sizes.len()];
-        piece.iter().zip(&self.values).for_each(|(piece, value)| inside[*piece as usize] |= *value < 0.0);
-        let Some(body) = (0..sizes.len()).filter(|i| inside[*i]).max_by_key(|i| sizes[*i]) else { return 0 };
-        let least = PART * sizes[body] as f64;
-        let is_part = |i: usize| inside[i] && i != body && sizes[i] as f64 >= least;
-        let mut waits: Vec<bool> = (0..sizes.len()).map(is_part).collect();
+        let pieces = self.pieces();
+        let Some(body) = pieces.body() else { return 0 };
+        let least = PART * pieces.sizes[body] as f64;
+        let is_part = |i: usize| pieces.inside[i] && i != body && pieces.sizes[i] as f64 >= least;
+        let mut waits: Vec<bool> = (0..pieces.sizes.len()).map(is_part).collect();
         if !waits.contains(&true) {
             return 0;
         }
         let steps = self.strides();
-        // Outwards from the body, every corner remembers whence it was reached.
-        let mut from = vec![NOWHERE; piece.len()];
+        // For every corner the one before it on the way from the body.
+        let mut from = vec![NOWHERE; pieces.of.len()];
         let mut front = VecDeque::new();
         let mut rows: HashMap<usize, Vec<usize>> = HashMap::new();
-        for (row, number) in piece.iter().map(|number| *number as usize).enumerate() {
+        for (row, number) in pieces.of.iter().map(|number| *number as usize).enumerate() {
             if waits[number] || number == body {
                 rows.entry(number).or_default().push(row);
             }
@@ -51,7 +49,7 @@ impl Grid {
                     continue;
                 }
                 from[next] = row as u32;
-                let number = piece[next] as usize;
+                let number = pieces.of[next] as usize;
                 if !waits[number] {
                     front.push_back((next, far + 1));
                     continue;
@@ -63,17 +61,15 @@ impl Grid {
                     ways.push(back);
                     back = from[back] as usize;
                 }
-                // What lies beyond the part may be joined with it.
+                // Further parts may be joined with this one.
                 begin(number, &mut from, &mut front);
             }
         }
-        for row in ways {
-            self.thicken(row);
-        }
+        ways.into_iter().for_each(|row| self.thicken(row));
         joined
     }
 
-    /// Takes a corner that is not on the border inside, and those around it.
+    /// Moves a corner that is not on the border, and the 26 around it, inside.
     fn thicken(&mut self, row: usize) {
         let [x, y, z] = self.strides();
         for plane in [row - z, row, row + z] {

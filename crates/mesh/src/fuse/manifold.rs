@@ -1,47 +1,50 @@
-//! Closed surfaces again out of triangles some of whose edges fell onto one another.
+//! Repair of closed surfaces some of whose edges fell onto one another.
 
 use std::collections::{HashMap, HashSet};
 
 use glam::Vec3;
 
-/// How far copies of a position move into their body, as a share of the mean length of edges there.
+/// Distance by which copies of a position move into their body, as a share of the mean length of edges there.
 const APART: f32 = 0.02;
 
-/// Triangles of which every edge has two and every position one fan.
+/// A surface with two triangles at every edge and one fan at every position.
 pub struct Manifold {
-    /// Rows of positions; from their number on, those of `copies`.
+    /// Rows of `places`.
     pub triangles: Vec<[u32; 3]>,
-    /// Of which position, and where it is now.
-    pub copies: Vec<(u32, Vec3)>,
-    /// For the side of triangle t that begins with corner c, as 3 t + c, the side of another along the same edge.
+    /// Places of the positions, behind which those of copies continue.
+    pub places: Vec<Vec3>,
+    /// For each place the row of its position.
+    pub sources: Vec<u32>,
+    /// For each side the other triangle's side along the same edge. Side 3 t + c of triangle t begins with its corner c.
     pub across: Vec<usize>,
 }
 
-/// Takes away triangles that lie on one another and face away from each other, and cuts surfaces apart where more than two
-/// triangles meet at an edge, or several fans at a position: bodies that touch there do not any more.
+/// Removes pairs of triangles that lie on one another and face opposite ways. Cuts the surface apart where more than two
+/// triangles meet at an edge, or several fans at a position, so that bodies that touched there do so no longer.
 ///
-/// Each edge must have as many triangles that run along it in one direction as in the other, which collapsing edges of a closed
-/// surface does not change; else there is none.
+/// Each edge must have as many triangles along it in one direction as in the other, or there is no result. Collapsing edges of
+/// a closed surface preserves this.
 pub fn manifold(positions: &[Vec3], triangles: Vec<[u32; 3]>) -> Option<Manifold> {
     let triangles = unfolded(triangles);
     let across = across(positions, &triangles)?;
-    let mut found = Manifold { triangles, copies: Vec::new(), across };
-    found.part_fans(positions);
-    found.part_edges(positions);
+    let sources = (0..positions.len() as u32).collect();
+    let mut found = Manifold { triangles, places: positions.to_vec(), sources, across };
+    found.part_fans();
+    found.part_edges();
     Some(found)
 }
 
 impl Manifold {
-    /// Every fan but a position's first gets a copy of it.
-    fn part_fans(&mut self, positions: &[Vec3]) {
-        let mut has_fan = vec![false; positions.len()];
+    /// Gives every fan but the first of a position a copy of the position.
+    fn part_fans(&mut self) {
+        let mut has_fan = vec![false; self.places.len()];
         let mut known = vec![false; self.across.len()];
         let mut fan = Vec::new();
         for first in 0..known.len() {
             if known[first] {
                 continue;
             }
-            // Around the position that the side begins with.
+            // The sides that begin with the same position as this one.
             fan.clear();
             let mut side = first;
             while !known[side] {
@@ -49,33 +52,30 @@ impl Manifold {
                 fan.push(side);
                 side = self.across[around(side, 2)];
             }
-            let row = self.triangles[first / 3][first % 3];
+            let row = self.triangles.as_flattened()[first];
             if !std::mem::replace(&mut has_fan[row as usize], true) {
                 continue;
             }
             let (mut normal, mut length) = (Vec3::ZERO, 0.0);
             for side in &fan {
-                let [here, next, last] = [0, 1, 2].map(|step| self.place(positions, around(*side, step)));
+                let [here, next, last] = self.corners(*side);
                 normal += (next - here).cross(last - here);
                 length += (next - here).length() / fan.len() as f32;
             }
-            let place = positions[row as usize] - APART * length * normal.normalize_or(Vec3::Y);
-            let copy = self.copy(positions, row, place);
-            fan.iter().for_each(|side| self.triangles[side / 3][side % 3] = copy);
+            let place = self.places[row as usize] - APART * length * normal.normalize_or(Vec3::Y);
+            let copy = self.copy(row, place);
+            fan.iter().for_each(|side| self.triangles.as_flattened_mut()[*side] = copy);
         }
     }
 
-    /// Every edge that still has more than two triangles, since the fans at both its ends pass it twice, gets positions in the middle,
-    /// each for two of them.
-    fn part_edges(&mut self, positions: &[Vec3]) {
+    /// Splits every edge that still has more than two triangles because the fans at both its ends pass it twice. Each pair of
+    /// triangles gets a position of its own in the middle.
+    fn part_edges(&mut self) {
         let mut there = HashSet::new();
-        let ends = |triangles: &[[u32; 3]], side: usize| {
-            (triangles[side / 3][side % 3], triangles[side / 3][(side + 1) % 3])
-        };
-        let sides = 0..self.across.len();
-        let mut again: Vec<usize> = sides
+        let corners = self.triangles.as_flattened();
+        let mut again: Vec<usize> = (0..corners.len())
             .filter(|side| {
-                let (from, to) = ends(&self.triangles, *side);
+                let (from, to) = (corners[*side], corners[around(*side, 1)]);
                 from < to && !there.insert((from, to))
             })
             .collect();
@@ -83,18 +83,19 @@ impl Manifold {
             let pair = [side, self.across[side]];
             let mut normal = Vec3::ZERO;
             for side in pair {
-                let [from, to, third] = [0, 1, 2].map(|step| self.place(positions, around(side, step)));
+                let [from, to, third] = self.corners(side);
                 normal += (to - from).cross(third - from);
             }
-            let [from, to] = [0, 1].map(|step| self.place(positions, around(side, step)));
+            let [from, to, _] = self.corners(side);
             let inwards = APART * (to - from).length() * normal.normalize_or(Vec3::Y);
-            let row = self.triangles[side / 3][side % 3];
-            let middle = self.copy(positions, row, 0.5 * (from + to) - inwards);
-            // Both triangles keep the half that the side begins with; new ones get the other.
+            let row = self.triangles.as_flattened()[side];
+            let middle = self.copy(row, 0.5 * (from + to) - inwards);
+            // Both triangles keep the first half of the side; new ones get the second.
             let halves = pair.map(|side| {
                 let (half, moved) = (self.across.len(), around(side, 1));
-                let [_, to, third] = [0, 1, 2].map(|step| self.triangles[side / 3][(side + step) % 3]);
-                self.triangles[side / 3][(side + 1) % 3] = middle;
+                let corners = self.triangles.as_flattened_mut();
+                let (to, third) = (corners[moved], corners[around(side, 2)]);
+                corners[moved] = middle;
                 self.triangles.push([middle, to, third]);
                 self.across.extend([usize::MAX; 3]);
                 self.pair(half + 1, self.across[moved]);
@@ -111,20 +112,20 @@ impl Manifold {
         (self.across[side], self.across[other]) = (other, side);
     }
 
-    /// Where the corner is that a side begins with.
-    fn place(&self, positions: &[Vec3], side: usize) -> Vec3 {
-        let row = self.triangles[side / 3][side % 3] as usize;
-        if row < positions.len() { positions[row] } else { self.copies[row - positions.len()].1 }
+    /// Places of the corners of the side's triangle, from the side's first corner on.
+    fn corners(&self, side: usize) -> [Vec3; 3] {
+        let rows = self.triangles.as_flattened();
+        [0, 1, 2].map(|step| self.places[rows[around(side, step)] as usize])
     }
 
-    /// A further position like that in this row, somewhere else.
-    fn copy(&mut self, positions: &[Vec3], row: u32, place: Vec3) -> u32 {
-        let source = (row as usize).checked_sub(positions.len()).map_or(row, |copy| self.copies[copy].0);
-        self.copies.push((source, place));
-        (positions.len() + self.copies.len() - 1) as u32
+    /// Row of a new copy of the position in this row.
+    fn copy(&mut self, row: u32, place: Vec3) -> u32 {
+        self.sources.push(self.sources[row as usize]);
+        self.places.push(place);
+        self.places.len() as u32 - 1
     }
 
-    /// For each triangle which piece it is in, from 0, and how many pieces there are.
+    /// For each triangle the number of its piece, and the number of pieces.
     pub fn pieces(&self) -> (Vec<usize>, usize) {
         let mut piece = vec![usize::MAX; self.triangles.len()];
         let (mut count, mut waiting) = (0, Vec::new());
@@ -148,12 +149,12 @@ impl Manifold {
     }
 }
 
-/// The side so many steps farther around the same triangle.
+/// The side `steps` farther around the same triangle.
 fn around(side: usize, steps: usize) -> usize {
     side - side % 3 + (side + steps) % 3
 }
 
-/// Without triangles that have less than three corners, and pairs of the same corners in opposite orders.
+/// Removes triangles with fewer than three corners, and pairs with the same corners in opposite orders.
 fn unfolded(mut triangles: Vec<[u32; 3]>) -> Vec<[u32; 3]> {
     let mut there: HashMap<[u32; 3], Vec<usize>> = HashMap::new();
     let mut kept = vec![true; triangles.len()];
@@ -175,9 +176,9 @@ fn unfolded(mut triangles: Vec<[u32; 3]>) -> Vec<[u32; 3]> {
     triangles
 }
 
-/// See [`Manifold::across`].
-fn across(positions: &[Vec3], triangles: &[[u32; 3]]) -> Option<Vec<usize>> {
-    // Both ends, the smaller first, then whether it runs from the larger one.
+/// [`Manifold::across`], if every side has another one.
+pub fn across(positions: &[Vec3], triangles: &[[u32; 3]]) -> Option<Vec<usize>> {
+    // Both ends, the smaller first, whether the side runs from the larger one, and the side.
     let mut sides: Vec<(u32, u32, bool, usize)> = Vec::with_capacity(3 * triangles.len());
     for (face, triangle) in triangles.iter().enumerate() {
         for at in 0..3 {
@@ -193,8 +194,8 @@ fn across(positions: &[Vec3], triangles: &[[u32; 3]]) -> Option<Vec<usize>> {
             pair(*one, *other);
             continue;
         }
-        // Around the edge, counter-clockwise as seen from its larger end: what runs from there begins a body, what runs towards
-        // it ends one.
+        // The sides in counter-clockwise order, as seen from the edge's larger end. A side from there begins a body, and a
+        // side towards it ends one.
         let [from, to] = [edge[0].0, edge[0].1].map(|row| positions[row as usize]);
         let axis = (to - from).normalize_or(Vec3::Y);
         let x = axis.any_orthonormal_vector();
@@ -206,7 +207,7 @@ fn across(positions: &[Vec3], triangles: &[[u32; 3]]) -> Option<Vec<usize>> {
         let mut around: Vec<(f32, bool, usize)> = edge.iter().map(|e| (angle(e.3), e.2, e.3)).collect();
         around.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.2.cmp(&b.2)));
         let mut open = Vec::new();
-        // A body may reach over the angle at which counting begins.
+        // A body may contain the angle at which the order begins.
         for _ in 0..2 {
             around.retain(|&(_, begins, side)| {
                 if begins {
@@ -227,32 +228,29 @@ mod tests {
     use super::*;
     use crate::fuse::grid::tests::{is_closed, volume};
 
-    /// Outwards for a right-handed (a, b, c) as seen from d.
+    /// Triangles that face outwards if (a, b, c) is counter-clockwise as seen from d.
     fn tetrahedron([a, b, c, d]: [u32; 4]) -> [[u32; 3]; 4] {
         [[a, c, b], [a, b, d], [b, c, d], [c, a, d]]
     }
 
-    /// What is left of `triangles`, so many pieces with so many copies.
+    /// Repairs `triangles` and checks the numbers of pieces and copies.
     fn check(positions: &[Vec3], triangles: &[[u32; 3]], pieces: usize, copies: usize) -> Manifold {
         let found = manifold(positions, triangles.to_vec()).expect("closed");
-        assert_eq!((found.pieces().1, found.copies.len()), (pieces, copies));
+        assert_eq!((found.pieces().1, found.places.len() - positions.len()), (pieces, copies));
         assert!(is_closed(&found.triangles));
-        let sides =
-            |side: usize| (found.triangles[side / 3][side % 3], found.triangles[side / 3][(side + 1) % 3]);
+        let corners = found.triangles.as_flattened();
         for (side, other) in found.across.iter().enumerate() {
-            let ((a, b), (c, d)) = (sides(side), sides(*other));
-            assert_eq!((a, b), (d, c));
+            let ends = (corners[side], corners[around(side, 1)]);
+            assert_eq!(ends, (corners[around(*other, 1)], corners[*other]));
         }
-        let mut all = positions.to_vec();
-        all.extend(found.copies.iter().map(|copy| copy.1));
-        let (before, after) = (volume(positions, triangles), volume(&all, &found.triangles));
+        let (before, after) = (volume(positions, triangles), volume(&found.places, &found.triangles));
         assert!(after > 0.9 * before && after <= before * 1.000_001, "{after} of {before}");
         found
     }
 
     #[test]
     fn bodies_that_touch_are_cut_apart() {
-        // An edge from 0 to 1, and one body on either side of it; from any angle.
+        // An edge from 0 to 1 with one body on either side, at several angles.
         for turn in 0..12 {
             let turned = |x: f32, y: f32| Vec3::new(x, y, 0.5).rotate_z(0.55 * turn as f32);
             let edge = [Vec3::ZERO, Vec3::Z];
@@ -260,11 +258,12 @@ mod tests {
             let positions = [&edge[..], &ends].concat();
             let (one, other) = (tetrahedron([0, 2, 3, 1]), tetrahedron([0, 4, 5, 1]));
             let found = check(&positions, &[one, other].concat(), 2, 2);
-            // Every triangle of one body has neighbours in the same.
+            // The neighbours of a triangle belong to the same body.
             assert!(found.across.iter().enumerate().all(|(side, other)| (side < 12) == (*other < 12)));
-            // The second body has the copies, which lie farther on its side.
-            assert_eq!(found.copies.iter().map(|copy| copy.0).collect::<Vec<u32>>(), [0, 1]);
-            assert!(found.copies.iter().all(|(_, place)| place.dot(turned(-1.0, 0.0).with_z(0.0)) > 0.001));
+            // The second body has the copies, which lie on its side.
+            assert_eq!(found.sources[positions.len()..], [0, 1]);
+            let copies = &found.places[positions.len()..];
+            assert!(copies.iter().all(|place| place.dot(turned(-1.0, 0.0).with_z(0.0)) > 0.001));
         }
         // At one position.
         let positions = [Vec3::ZERO, Vec3::X, Vec3::Y, Vec3::Z, -Vec3::X, -Vec3::Y, -Vec3::Z];
@@ -306,14 +305,14 @@ mod tests {
 
     #[test]
     fn an_edge_on_which_a_hole_has_closed_is_parted() {
-        // Two cubes that touch along an edge, between two full layers: around both its ends there is one fan.
+        // Two cubes touch along an edge between two full layers. Both its ends have one fan.
         let (positions, triangles) = cubes(3, |[x, y, z]| x < 2 && z < 2 && (y != 1 || x == z));
         let found = check(&positions, &triangles, 1, 1);
         assert_eq!(found.triangles.len(), triangles.len() + 2);
     }
 
     #[test]
-    fn whatever_touches_is_parted() {
+    fn random_cubes_that_touch_are_parted() {
         for seed in 0..40_u64 {
             let solid = |[x, y, z]: [usize; 3]| {
                 let mixed = (seed << 9 | (x + 6 * y + 36 * z) as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15);
@@ -321,18 +320,17 @@ mod tests {
             };
             let (positions, triangles) = cubes(6, solid);
             let found = manifold(&positions, triangles.clone()).expect("closed");
-            let found = check(&positions, &triangles, found.pieces().1, found.copies.len());
-            let mut all = positions.clone();
-            all.extend(found.copies.iter().map(|copy| copy.1));
-            let again = manifold(&all, found.triangles.clone()).expect("closed");
-            assert!(again.copies.is_empty() && again.triangles == found.triangles);
-            let places: HashSet<[u32; 3]> = all.iter().map(|p| p.to_array().map(f32::to_bits)).collect();
-            assert_eq!(places.len(), all.len());
+            let copies = found.places.len() - positions.len();
+            let found = check(&positions, &triangles, found.pieces().1, copies);
+            let again = manifold(&found.places, found.triangles.clone()).expect("closed");
+            assert!(again.places == found.places && again.triangles == found.triangles);
+            let bits = found.places.iter().map(|p| p.to_array().map(f32::to_bits));
+            assert_eq!(bits.collect::<HashSet<[u32; 3]>>().len(), found.places.len());
         }
     }
 
     #[test]
-    fn folds_are_taken_away_and_open_surfaces_refused() {
+    fn folds_are_removed_and_open_surfaces_refused() {
         let positions = [Vec3::ZERO, Vec3::X, Vec3::Y, Vec3::Z, Vec3::ONE];
         let body = tetrahedron([0, 1, 2, 3]);
         // A fin on the edge from 2 to 3, and a triangle without a third corner.

@@ -1,5 +1,6 @@
-//! One closed surface out of Gaussians: depths rendered from all around are fused into a signed distance field (Curless and
-//! Levoy, "A Volumetric Method for Building Complex Models from Range Images", 1996), of which one body is kept.
+//! One closed surface from Gaussians. Depths that are rendered from all around are fused into a signed distance field
+//! (Curless and Levoy, "A Volumetric Method for Building Complex Models from Range Images", 1996), of which one body is
+//! kept.
 
 mod atlas;
 mod color;
@@ -12,8 +13,8 @@ mod views;
 use std::collections::HashMap;
 use std::sync::Arc;
 
-use burn::tensor::{Tensor, TensorData};
-use glam::{DVec3, USizeVec3, Vec3};
+use burn::tensor::Tensor;
+use glam::{DVec3, Vec3};
 use image::RgbImage;
 use rayon::prelude::*;
 use snapsnap_splat::scene::Loaded;
@@ -22,35 +23,37 @@ use snapsnap_splat::{Gaussians, SplatError};
 use crate::mesh::Mesh;
 use color::Mean;
 use grid::Grid;
-use views::{Seen, View};
+use views::{View, host};
 
-/// Cubes along the longest side of the body's box and its margins.
+/// Cubes along the longest side of the body's box without its margins.
 const CUBES: f32 = 320.0;
-/// Side of the pictures that distances are taken from, pixels.
+/// Side in pixels of the pictures for distances.
 const SIDE: u32 = 640;
-/// Side of those that a texture is taken from: a picture at a time is kept.
+/// Side in pixels of the pictures for a texture, of which one at a time is in memory.
 const TEXTURE_SIDE: u32 = 1600;
-/// Distances are kept up to so many cubes from the surface.
+/// Largest distance from the surface that the field contains, in cubes.
 const TRUNCATION: f32 = 4.0;
-/// A place that fewer views see through counts as inside: gaps between the shells of front, back and sides are seen through from
-/// few directions, whatever lies around a body from many.
+/// Fewest views through a place that is outside. Gaps between the shells of front, back and sides are visible from few
+/// directions, the surroundings of a body from many.
 const FREE_VIEWS: u8 = 3;
-/// Gaussians less opaque than this do not say where the body is.
+/// Least opacity of the Gaussians that determine the body's box.
 const OPAQUE: f32 = 0.1;
-/// This share of the Gaussians, at either end of each axis, does not say where the body is: some may fly about.
+/// Share of the Gaussians at either end of each axis that the body's box leaves out, since some lie far from the body.
 const FLYING: f32 = 0.002;
-/// Standard deviations around a Gaussian's centre at which it is no surface any more.
+/// Extent of a Gaussian around its centre, in standard deviations.
 const SEEN: f32 = 2.0;
-/// Times that neighbouring distances are averaged: steps between views, and the grain of Gaussians.
+/// Number of times that neighbouring distances are averaged, against steps between views and the grain of Gaussians.
 const SMOOTHED: usize = 2;
+/// Fewest Gaussians of a body.
+const FEWEST: usize = 50;
 
-/// What a mesh is made of.
+/// Errors of [`fuse`].
 #[derive(Debug, thiserror::Error)]
 pub enum FuseError {
-    /// Nothing that could be seen.
+    /// Too few visible Gaussians.
     #[error("no surface: fewer than {0} Gaussians are finite and opaque")]
     Nothing(usize),
-    /// Gaussians in which no body was found.
+    /// Gaussians without a body.
     #[error("no surface: nothing that the Gaussians show is solid from any side")]
     Hollow,
     /// A texture that is too small.
@@ -59,17 +62,17 @@ pub enum FuseError {
     /// A surface that cannot be reduced.
     #[error("the surface cannot be reduced: {0}")]
     Reduce(#[from] meshoptimizer_rs::Error),
-    /// The rasteriser's refusal.
+    /// An error of the rasteriser.
     #[error(transparent)]
     Splat(#[from] SplatError),
 }
 
-/// Wishes.
+/// Options of [`fuse`].
 #[derive(Debug, Clone, Copy)]
 pub struct Options {
-    /// Triangles to reduce the surface to, about; 0 keeps all.
+    /// Approximate number of triangles of the reduced surface; 0 keeps all.
     pub faces: usize,
-    /// Side of a texture in pixels; 0: positions have colours instead.
+    /// Side of a texture in pixels; 0 for colours of positions instead.
     pub texture: usize,
 }
 
@@ -79,78 +82,58 @@ impl Default for Options {
     }
 }
 
-/// A surface and how it came about.
+/// A surface and counts of the steps that lead to it.
 #[derive(Debug, Clone)]
 pub struct Fused {
-    /// Closed, one piece, with a colour at each position; world metres, as the Gaussians were.
+    /// One closed piece, with a texture or a colour at each position; in the Gaussians' world, metres.
     pub mesh: Mesh,
-    /// Places between the shells that too few views see through, in connected pieces.
+    /// Connected gaps between the shells that were closed because too few views pass through them.
     pub closed: usize,
     /// Hollows inside that were filled.
     pub filled: usize,
-    /// Parts that lay apart from the body and were joined with it.
+    /// Parts apart from the body that were joined with it.
     pub joined: usize,
     /// Pieces beside the body that were dropped.
     pub dropped: usize,
-    /// Triangles before they were reduced.
+    /// Triangles before the reduction.
     pub faces: usize,
     /// Edge of the field's cubes, metres.
     pub cell: f32,
 }
 
-/// Fewest Gaussians that are taken for a body.
-const FEWEST: usize = 50;
-
-/// Makes a mesh of Gaussians. `stage` hears what is being done.
+/// Makes a mesh of Gaussians. `stage` receives the name of each step.
 ///
 /// # Errors
 /// [`FuseError`].
 pub fn fuse(scene: &Loaded, options: Options, stage: &dyn Fn(&str)) -> Result<Fused, FuseError> {
     let (low, high) = bounds(&scene.gaussians)?;
-    // Around the origin f32 is finest: people in the coordinates of a survey lie far from it.
+    // f32 is finest around the origin, from which people in the coordinates of a survey are far away.
     let away = (0.5 * low + 0.5 * high).round();
-    let mut fused = fuse_here(&moved(scene, -away), (low - away, high - away), options, stage)?;
-    fused.mesh.positions.iter_mut().for_each(|place| *place += away);
-    Ok(fused)
-}
+    let (low, high) = (low - away, high - away);
+    let mut scene = scene.clone();
+    let means = scene.gaussians.means;
+    let by = Tensor::<1>::from_floats((-away).to_array(), &means.device()).unsqueeze::<2>();
+    scene.gaussians.means = means + by;
 
-/// The same somewhere else.
-fn moved(scene: &Loaded, by: Vec3) -> Loaded {
-    let mut moved = scene.clone();
-    let means = &mut moved.gaussians.means;
-    let by = Tensor::<1>::from_floats(by.to_array(), &means.device()).unsqueeze::<2>();
-    *means = means.clone() + by;
-    moved
-}
-
-fn fuse_here(
-    scene: &Loaded,
-    (low, high): (Vec3, Vec3),
-    options: Options,
-    stage: &dyn Fn(&str),
-) -> Result<Fused, FuseError> {
     let size = high - low;
     let cell = size.max_element() / CUBES;
     // The border stays outside.
     let margin = cell * (TRUNCATION + 2.0);
-    let counts = ((size + 2.0 * margin) / cell).ceil();
-    let counts = USizeVec3::new(counts.x as usize + 1, counts.y as usize + 1, counts.z as usize + 1);
+    let counts = ((size + 2.0 * margin) / cell).ceil().as_usizevec3() + 1;
 
     stage("views from all around");
     let (centre, radius) = ((0.5 * (low + high)).as_dvec3(), f64::from(0.5 * size.length()));
     let cameras = views::cameras(centre, radius, SIDE).into_iter();
-    let views: Result<Vec<View>, SplatError> =
-        cameras.map(|camera| View::new(scene, camera, radius)).collect();
-    let views = views?;
+    let views: Vec<View> =
+        cameras.map(|camera| View::new(&scene, camera, radius)).collect::<Result<_, SplatError>>()?;
 
     stage("distance field");
     let mut grid = Grid { origin: low - margin, cell, counts, values: Vec::new() };
-    // Along a row, view by view: neighbours lie beside one another in a picture, and a cache, too.
     let rows = (0..counts.y * counts.z).into_par_iter();
-    let (values, closed): (Vec<f32>, Vec<bool>) =
+    let (values, gaps): (Vec<f32>, Vec<bool>) =
         rows.flat_map_iter(|row| distances(&grid, row * counts.x, &views)).unzip();
-    grid.values = closed.iter().map(|closed| if *closed { -1.0 } else { 1.0 }).collect();
-    let closed = grid.bodies();
+    grid.values = gaps.iter().map(|gap| if *gap { -1.0 } else { 1.0 }).collect();
+    let closed = grid.pieces().bodies();
     grid.values = values;
     (0..SMOOTHED).for_each(|_| grid.smooth());
     let joined = grid.join_parts();
@@ -158,7 +141,6 @@ fn fuse_here(
 
     stage("surface");
     let (positions, triangles) = grid.surface();
-    let cell = grid.cell;
     drop(grid);
     if triangles.is_empty() {
         return Err(FuseError::Hollow);
@@ -172,13 +154,14 @@ fn fuse_here(
     if options.texture > 0 {
         drop(views);
         stage("texture");
-        textured(&mut mesh, scene, (centre, radius), options.texture, cell)?;
+        textured(&mut mesh, &scene, (centre, radius), options.texture, cell)?;
     }
+    mesh.positions.iter_mut().for_each(|place| *place += away);
     Ok(Fused { mesh, closed, filled, joined, dropped, faces, cell })
 }
 
-/// Gives a mesh a texture instead of its positions' colours, which stay where no view shows a place. The ball is that of the body,
-/// its centre and radius.
+/// Replaces the colours of a mesh's positions by a texture, in which they remain at places that no view shows. The body is in
+/// the ball with this centre and radius.
 fn textured(
     mesh: &mut Mesh,
     scene: &Loaded,
@@ -190,10 +173,9 @@ fn textured(
     let mut means = vec![Mean::default(); atlas.texels.len()];
     for camera in views::cameras(centre, radius, TEXTURE_SIDE) {
         let view = View::new(scene, camera, radius)?;
-        let hear = |(mean, texel): (&mut Mean, &atlas::Texel)| {
-            mean.hear(&view, texel.place, texel.normal, color::REACH * cell);
-        };
-        means.par_iter_mut().zip(&atlas.texels).for_each(hear);
+        means.par_iter_mut().zip(&atlas.texels).for_each(|(mean, texel)| {
+            mean.add(&view, texel.place, texel.normal, color::REACH * cell);
+        });
     }
     let mut texture = vec![None; side * side];
     let bytes = |color: Vec3| color.to_array().map(|c| (255.0 * c).round() as u8);
@@ -201,13 +183,13 @@ fn textured(
         texture[texel.at as usize] = Some(bytes(mean.color().unwrap_or(texel.color)));
     }
     atlas::spread(&mut texture, side);
-    // Beyond what filters reach.
+    // Filters do not reach the other texels.
     let background = bytes(mesh.colors.iter().sum::<Vec3>() / mesh.colors.len().max(1) as f32);
     let texture = texture.into_iter().flat_map(|color| color.unwrap_or(background)).collect();
     let texture = RgbImage::from_raw(side as u32, side as u32, texture).expect("three bytes for each texel");
     mesh.colors.clear();
     mesh.materials[0].texture = Some(Arc::new(texture));
-    // Faces of one piece share their corners' coordinates.
+    // Faces of one chart share the coordinates of their corners.
     let mut rows = HashMap::new();
     for (face, texcoords) in mesh.faces.iter_mut().zip(atlas.texcoords) {
         face.texcoords = Some([0, 1, 2].map(|corner| {
@@ -221,38 +203,31 @@ fn textured(
     Ok(())
 }
 
-/// What views say of a place.
+/// Weighted mean of the distances of a place in the views.
 #[derive(Default, Clone, Copy)]
-struct Heard {
+struct Distance {
     sum: f32,
     weight: f32,
+    /// Views through the place.
     free: u8,
 }
 
-impl Heard {
-    fn hear(&mut self, seen: Seen, reach: f32) {
-        match seen {
-            Seen::Unknown => {}
-            Seen::Free => {
-                self.sum += reach;
-                self.weight += 1.0;
-                self.free = self.free.saturating_add(1);
-            }
-            // Behind the surface nothing is known.
-            Seen::Surface { distance, .. } if distance < -reach => {}
-            Seen::Surface { distance, facing } => {
-                // Along the ray to along the normal.
-                let apart = (distance * facing).min(reach);
-                self.sum += facing * apart;
-                self.weight += facing;
-                self.free = self.free.saturating_add(u8::from(apart >= reach));
-            }
+impl Distance {
+    /// Adds the distance and cosine of [`View::surface`].
+    fn add(&mut self, (distance, facing): (f32, f32), reach: f32) {
+        // The view shows nothing behind the surface.
+        if distance < -reach {
+            return;
         }
+        // From a distance along the ray to one along the normal.
+        let apart = (distance * facing).min(reach);
+        self.sum += facing * apart;
+        self.weight += facing;
+        self.free = self.free.saturating_add(u8::from(apart >= reach));
     }
 
-    /// Signed distance from the surface, truncated: the mean of what the views say that meet it squarely enough. And whether the
-    /// place counts as inside though a few views see through it.
-    fn distance(self, reach: f32) -> (f32, bool) {
+    /// Signed distance from the surface, truncated, and whether the place is a gap between the shells.
+    fn finish(self, reach: f32) -> (f32, bool) {
         let mean = if self.weight > 0.0 { self.sum / self.weight } else { -reach };
         // Within reach of a surface its own distance decides.
         let gap = mean >= 0.99 * reach && self.free < FREE_VIEWS;
@@ -264,25 +239,25 @@ impl Heard {
 fn distances(grid: &Grid, first: usize, views: &[View]) -> impl Iterator<Item = (f32, bool)> {
     let reach = TRUNCATION * grid.cell;
     let start = grid.place(first);
-    let mut heard = vec![Heard::default(); grid.counts.x];
+    let mut distances = vec![Distance::default(); grid.counts.x];
+    // View by view: neighbours on a row are neighbours in a picture and in the cache.
     for view in views {
-        for (x, heard) in heard.iter_mut().enumerate() {
+        for (x, distance) in distances.iter_mut().enumerate() {
             let place = Vec3 { x: start.x + grid.cell * x as f32, ..start };
-            heard.hear(view.see(place), reach);
+            if let Some(surface) = view.surface(place) {
+                distance.add(surface, reach);
+            }
         }
     }
-    heard.into_iter().map(move |heard| heard.distance(reach))
+    distances.into_iter().map(move |distance| distance.finish(reach))
 }
 
-/// The box of the Gaussians that make the body.
+/// The box of the body's Gaussians.
 fn bounds(gaussians: &Gaussians) -> Result<(Vec3, Vec3), FuseError> {
-    let host = |data: TensorData| -> Vec<f32> {
-        data.convert::<f32>().try_into_vec().expect("converted to f32 on this very line")
-    };
-    let opacities = host(gaussians.opacities.to_data());
-    let (means, scales) = (host(gaussians.means.to_data()), host(gaussians.scales.to_data()));
+    let opacities = host(gaussians.opacities.clone());
+    let (means, scales) = (host(gaussians.means.clone()), host(gaussians.scales.clone()));
     let rows = means.as_chunks::<3>().0.iter().zip(scales.as_chunks::<3>().0);
-    // A place, and how far around it something is seen.
+    // Centre and extent.
     let rows = rows.map(|(p, s)| (Vec3::from_array(*p), SEEN * Vec3::from_array(*s).max_element()));
     let solid = |((p, reach), opacity): &((Vec3, f32), &f32)| {
         p.is_finite() && reach.is_finite() && **opacity >= OPAQUE
@@ -300,7 +275,7 @@ fn bounds(gaussians: &Gaussians) -> Result<(Vec3, Vec3), FuseError> {
         };
         (low[axis], high[axis]) = (end(-1.0), end(1.0));
     }
-    // What was skipped at either end may be a hand.
+    // The Gaussians that were left out may be those of a hand.
     let margin = 0.06 * (high - low).max_element().max(1e-3);
     Ok((low - margin, high + margin))
 }

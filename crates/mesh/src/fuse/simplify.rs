@@ -1,4 +1,4 @@
-//! Fewer triangles for the same surface.
+//! Reduction of a surface to fewer triangles.
 
 use glam::Vec3;
 use meshoptimizer_rs::{
@@ -9,20 +9,20 @@ use meshoptimizer_rs::{
 use super::manifold::{Manifold, manifold};
 use crate::mesh::Mesh;
 
-/// Largest error that is accepted to come down to the number asked for, as a share of the surface's size.
+/// Largest accepted error, as a share of the surface's size.
 const ERROR: f32 = 0.02;
-/// What the whole range of a colour is worth, as a share of the surface's size.
+/// Error of the whole range of a colour, as a share of the surface's size.
 const COLOR: f32 = 0.02;
-/// How far around a neck everything is kept, in edges.
+/// Width in edges of the rings around a neck that are kept.
 const RINGS: usize = 2;
-/// Tries before the surface is left as it is.
+/// Most tries before the surface is returned as it is.
 const TRIES: usize = 40;
 
-/// Reduces a closed surface of one piece with colours to about `faces` triangles, which stays so: every edge has two of them.
-/// 0 keeps all.
+/// Reduces a closed surface of one piece with colours to about `faces` triangles. The result is closed and one piece, too. 0
+/// keeps all triangles.
 ///
-/// The library lets edges of thin places fall onto one another, which [`manifold`] mends. Necks that something came off at
-/// are left as they were in the next try, so that there may be some triangles more than asked for.
+/// The library lets edges of thin places fall onto one another, which [`manifold`] repairs. If pieces come off, the next try
+/// keeps the necks at which they did, so that the result may have more triangles than `faces`.
 ///
 /// # Errors
 /// The library's, for a surface beyond its limits.
@@ -30,26 +30,24 @@ pub fn simplify(mut mesh: Mesh, faces: usize) -> Result<Mesh, Error> {
     if faces == 0 || mesh.faces.len() <= faces {
         return Ok(mesh);
     }
-    // What comes off does so on the last steps: tries with what the first ones left are short.
+    // Pieces come off in the last steps. Tries on a surface that is already reduced take less time.
     if mesh.faces.len() > 10 * faces {
         mesh = simplify(mesh, 5 * faces)?;
     }
     let triangles: Vec<[u32; 3]> = mesh.faces.iter().map(|face| face.positions).collect();
     let mut kept = vec![false; mesh.positions.len()];
     for _ in 0..TRIES {
-        // What is kept, two triangles to a position, leaves at least half of them to the rest.
+        // A kept position counts as two triangles. At least half of `faces` are left to the rest.
         let wanted = faces.max(faces / 2 + 2 * kept.iter().filter(|kept| **kept).count());
         let reduced = reduce(&mesh, &triangles, &kept, wanted.min(triangles.len()))?;
         let Some(reduced) = manifold(&mesh.positions, reduced) else { break };
-        // A thin body may fall onto itself altogether.
+        // A thin body may vanish.
         if reduced.triangles.is_empty() {
             break;
         }
         let Some(necks) = necks(&triangles, mesh.positions.len(), &reduced) else {
-            for (row, place) in reduced.copies {
-                mesh.positions.push(place);
-                mesh.colors.push(mesh.colors[row as usize]);
-            }
+            mesh.colors = reduced.sources.iter().map(|row| mesh.colors[*row as usize]).collect();
+            mesh.positions = reduced.places;
             return Ok(compact(&mesh, &reduced.triangles));
         };
         kept.iter_mut().zip(necks).for_each(|(kept, neck)| *kept |= neck);
@@ -73,25 +71,24 @@ fn reduce(mesh: &Mesh, triangles: &[[u32; 3]], kept: &[bool], faces: usize) -> R
             target_error: ERROR,
             options: SimplifyOptions::REGULARIZE_LIGHT,
         },
-        // The memory of the surface is ours; the library would stop at a gigabyte.
+        // The library's own limit is a gigabyte.
         &mut Workspace::new(Limits { max_bytes: usize::MAX, max_work: u64::MAX }),
     )?;
     Ok(reduced.indices.as_chunks::<3>().0.to_vec())
 }
 
-/// Where the surface of these triangles, with so many positions, came apart when it was reduced, and some rings around; none if it
-/// is one piece.
+/// For each position whether it is at a neck or in the rings around one. Necks are places at which the surface of these
+/// triangles came apart in the reduction; `None` if the reduced one is one piece.
 fn necks(triangles: &[[u32; 3]], positions: usize, reduced: &Manifold) -> Option<Vec<bool>> {
     let (piece, count) = reduced.pieces();
     if count <= 1 {
         return None;
     }
-    // What is left belongs to its piece, what is gone to the piece of what was nearest: necks are where pieces meet.
+    // Positions that are gone belong to the piece of the nearest one that is left. Necks are the places where pieces meet.
     let mut owner = vec![usize::MAX; positions];
     let mut neck = vec![false; positions];
-    let source = |row: u32| (row as usize).checked_sub(positions).map_or(row, |copy| reduced.copies[copy].0);
     for (triangle, piece) in reduced.triangles.iter().zip(piece) {
-        for row in triangle.map(|row| source(row) as usize) {
+        for row in triangle.map(|row| reduced.sources[row as usize] as usize) {
             neck[row] |= owner[row] != usize::MAX && owner[row] != piece;
             owner[row] = piece;
         }
@@ -148,7 +145,7 @@ mod tests {
     use super::*;
     use crate::fuse::grid::tests::{grid, is_closed, volume};
 
-    /// Of n³ corners a step apart.
+    /// The surface in a grid of n³ corners with a distance of 1.
     fn surface(n: usize, value: impl Fn(Vec3) -> f32) -> Mesh {
         let steps = 0.5 * (n - 1) as f32;
         let mut grid = grid(n, |p| value((steps * (p + 1.0)).round()));
@@ -162,21 +159,29 @@ mod tests {
         mesh.faces.iter().map(|face| face.positions).collect()
     }
 
-    /// Reduces a surface and looks whether it is still one and closed, and no thinner.
-    fn check(mesh: &Mesh, faces: usize, most: usize, within: f64) {
+    /// Reduces a surface and checks that it is closed and one piece.
+    fn reduced(mesh: &Mesh, faces: usize) -> Mesh {
         let reduced = simplify(mesh.clone(), faces).expect("reduced");
+        let found = triangles(&reduced);
+        assert!(!found.is_empty() && is_closed(&found), "{faces} of {}", mesh.faces.len());
+        let again = manifold(&reduced.positions, found).expect("closed");
+        assert_eq!(again.pieces().1, 1, "{faces} of {}", mesh.faces.len());
+        reduced
+    }
+
+    /// Reduces a surface and checks that it keeps its volume, too, and has no folds.
+    fn check(mesh: &Mesh, faces: usize, most: usize, within: f64) {
+        let reduced = reduced(mesh, faces);
         reduced.check().expect("drawable");
         let found = triangles(&reduced);
-        assert!(is_closed(&found));
         assert!(found.len() <= most && found.len() > faces / 2, "{} instead of {faces}", found.len());
         let again = manifold(&reduced.positions, found.clone()).expect("closed");
-        assert!(again.copies.is_empty() && again.triangles.len() == found.len());
-        assert_eq!(again.pieces().1, 1);
+        assert!(again.places == reduced.positions && again.triangles.len() == found.len());
         let (all, found) = (volume(&mesh.positions, &triangles(mesh)), volume(&reduced.positions, &found));
         assert!((found / all - 1.0).abs() < within, "{found} instead of {all}");
     }
 
-    /// A fan of thin fins on a plate, whose sides fall onto one another.
+    /// Thin fins on a plate, the sides of which fall onto one another.
     #[test]
     fn thin_places_stay_closed() {
         let box_of = |p: Vec3, half: Vec3| ((p - 24.0).abs() - half).max_element();
@@ -190,7 +195,7 @@ mod tests {
         assert_eq!(simplify(mesh.clone(), 0).expect("the same").faces.len(), mesh.faces.len());
     }
 
-    /// Noise of every density is full of tunnels, necks and specks.
+    /// Noise of several densities has tunnels, necks and specks.
     #[test]
     fn noise_stays_one_closed_piece() {
         for seed in 0..100_usize {
@@ -201,12 +206,7 @@ mod tests {
             });
             let all = mesh.faces.len();
             for faces in [3, all / 10, all / 3] {
-                let reduced =
-                    simplify(mesh.clone(), faces).unwrap_or_else(|e| panic!("{seed}, {faces} of {all}: {e}"));
-                let found = triangles(&reduced);
-                assert!(!found.is_empty() && is_closed(&found), "{seed}, {faces} of {all}");
-                let again = manifold(&reduced.positions, found).expect("closed");
-                assert_eq!(again.pieces().1, 1, "{seed}, {faces} of {all}");
+                reduced(&mesh, faces);
             }
         }
     }
@@ -224,9 +224,9 @@ mod tests {
         }
     }
 
-    /// Beads on threads that hang from a plate, which come off.
+    /// Beads on threads at a plate; a reduction without kept necks separates them.
     #[test]
-    fn what_hangs_by_a_thread_stays_in_one_piece() {
+    fn beads_on_threads_stay_in_one_piece() {
         let mesh = surface(96, |p| {
             let (x, z) = ((p.x / 24.0).round(), (p.z / 24.0).round());
             let thick = 0.7 + 0.2 * x + 3.0 * (p.y * (0.15 + 0.06 * z)).sin().max(0.0);

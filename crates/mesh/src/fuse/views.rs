@@ -1,47 +1,37 @@
-//! What cameras all around see of Gaussians: depth, how squarely a surface is met, and colour.
+//! Views of Gaussians from all around: depth, the angle between surface and ray, and colour.
 
 use burn::tensor::Tensor;
-use glam::{DMat3, DVec2, DVec3, Mat4, Vec3};
+use glam::{DAffine3, DMat3, DMat4, DVec2, DVec3, Mat4, Vec3};
 use snapsnap_splat::scene::Loaded;
 use snapsnap_splat::{Camera, RenderOptions, RigidTransform, SplatError, render};
 
-/// Rings of cameras around the subject: how far they look down, in degrees, and how many of them there are.
+/// Rings of cameras around the subject: downward pitch in degrees, and number of cameras.
 const RINGS: [(f64, usize); 7] =
     [(-85.0, 1), (-55.0, 6), (-25.0, 10), (5.0, 16), (35.0, 10), (65.0, 6), (88.0, 1)];
-/// Radii between a ball and the cameras around it: far enough away that perspective hides little, near enough for f32's depths.
+/// Distance of the cameras from the centre of a ball, in radii: perspective hides little, and f32 suffices for depths.
 const DISTANCE: f64 = 4.0;
-/// A pixel shows a surface where Gaussians cover it so far.
+/// Least coverage of a pixel that shows a surface.
 pub const COVERED: f32 = 0.5;
-/// Surfaces that are met at a flatter angle than this cosine are not trusted: their pixels mix what lies behind one another.
+/// Least cosine between a surface's normal and the ray. The pixels of flatter surfaces mix surfaces behind one another.
 const FLATTEST: f32 = 0.15;
 
-/// What one camera sees.
+/// View of one camera.
 pub struct View {
-    /// Where it stands, world metres.
+    /// Centre of the camera, world metres.
     centre: Vec3,
-    /// Side of its picture in pixels.
+    /// Side of the picture in pixels.
     side: u32,
-    /// World to pixels times depth, and depth.
+    /// From the world to pixels times depth, and depth.
     projection: Mat4,
-    /// Metres along the optical axis; 0 where nothing is covered.
+    /// Metres along the optical axis; 0 at pixels without a surface.
     depth: Vec<f32>,
-    /// Cosine between the surface's normal and the ray; 0 where it cannot be told or is too flat.
+    /// Cosine between the surface's normal and the ray; 0 where it is unknown or the surface too flat.
     facing: Vec<f32>,
-    /// Red, green and blue in [0, 1], not darkened by what is not covered.
+    /// Red, green and blue in [0, 1], divided by the coverage.
     color: Vec<Vec3>,
 }
 
-/// What a view says of a place.
-pub enum Seen {
-    /// It lies outside of the picture, or where the picture cannot be trusted.
-    Unknown,
-    /// Nothing is there, up to infinity.
-    Free,
-    /// A surface lies so many metres behind it (below 0: before it) along the optical axis, met so squarely.
-    Surface { distance: f32, facing: f32 },
-}
-
-/// Cameras around a ball, each with the whole of it in its picture of `side`² pixels.
+/// Cameras around a ball, the whole of which is in each picture of `side`² pixels.
 pub fn cameras(centre: DVec3, radius: f64, side: u32) -> Vec<Camera> {
     let distance = DISTANCE * radius;
     let focal = (distance * distance / (radius * radius) - 1.0).sqrt() * 0.5 * 0.98;
@@ -67,18 +57,17 @@ pub fn cameras(centre: DVec3, radius: f64, side: u32) -> Vec<Camera> {
 }
 
 impl View {
-    /// Renders Gaussians as one of the [`cameras`] around a ball of this radius sees them.
+    /// Renders Gaussians from one of the [`cameras`] around a ball of this radius.
     ///
     /// # Errors
-    /// Those of [`render`].
+    /// The errors of [`render`].
     pub fn new(scene: &Loaded, camera: Camera, radius: f64) -> Result<Self, SplatError> {
-        // What flies between the camera and the ball hides nothing.
+        // Gaussians between the camera and the ball are left out.
         let near = ((DISTANCE - 1.0) * radius) as f32;
         let options = RenderOptions { depth: true, near, ..RenderOptions::inria() };
         let rendered = render(&scene.seen_by(&camera)?, std::slice::from_ref(&camera), &options)?;
-        let alpha = host(rendered.alpha);
-        let depth = host(rendered.depth.expect("asked for"));
-        let color = host(rendered.color);
+        let (alpha, color) = (host(rendered.alpha), host(rendered.color));
+        let depth = host(rendered.depth.expect("depth was requested"));
         let depth: Vec<f32> =
             depth.iter().zip(&alpha).map(|(z, a)| if *a > COVERED { z / a } else { 0.0 }).collect();
         let color = color.as_chunks::<3>().0.iter().zip(&alpha);
@@ -94,27 +83,29 @@ impl View {
         })
     }
 
-    /// The pixel of a place and its depth.
+    /// The pixel and the depth of a place.
     fn pixel(&self, place: Vec3) -> Option<(usize, f32)> {
         let p = self.projection.transform_point3(place);
         let (x, y) = (p.x / p.z, p.y / p.z);
         let side = self.side as f32;
         let within = p.z > 0.0 && x >= 0.0 && y >= 0.0 && x < side && y < side;
-        // What is not below 0 is rounded down like this.
+        // The conversion of numbers from 0 on rounds down.
         within.then(|| (y as usize * self.side as usize + x as usize, p.z))
     }
 
-    /// What is known of a place.
-    pub fn see(&self, place: Vec3) -> Seen {
-        let Some((pixel, z)) = self.pixel(place) else { return Seen::Unknown };
+    /// Distance in metres along the optical axis from a place to the surface behind it, and the cosine between the surface's
+    /// normal and the ray. The distance is negative for a surface before the place and infinite without one. `None` outside
+    /// of the picture, and where the picture cannot be trusted.
+    pub fn surface(&self, place: Vec3) -> Option<(f32, f32)> {
+        let (pixel, z) = self.pixel(place)?;
         match (self.depth[pixel], self.facing[pixel]) {
-            (0.0, _) => Seen::Free,
-            (_, 0.0) => Seen::Unknown,
-            (depth, facing) => Seen::Surface { distance: depth - z, facing },
+            (0.0, _) => Some((f32::INFINITY, 1.0)),
+            (_, 0.0) => None,
+            (depth, facing) => Some((depth - z, facing)),
         }
     }
 
-    /// The colour that is seen at a place, if a surface lies within `reach` metres of it.
+    /// Colour and cosine of the surface at a place, if one is within `reach` metres of it.
     pub fn color(&self, place: Vec3, reach: f32) -> Option<(Vec3, f32)> {
         let (pixel, z) = self.pixel(place)?;
         let (depth, facing) = (self.depth[pixel], self.facing[pixel]);
@@ -135,10 +126,8 @@ fn projection(camera: &Camera) -> Mat4 {
         DVec3::new(0.0, focal.y, 0.0),
         DVec3::new(middle.x, middle.y, 1.0),
     );
-    let (linear, offset) = (pixels * rotation, pixels * translation);
-    let column = |v: DVec3, w: f32| v.as_vec3().extend(w);
-    let [x, y, z] = [linear.x_axis, linear.y_axis, linear.z_axis].map(|v| column(v, 0.0));
-    Mat4::from_cols(x, y, z, column(offset, 1.0))
+    let projection = DAffine3::from_mat3_translation(pixels * rotation, pixels * translation);
+    DMat4::from(projection).as_mat4()
 }
 
 /// Cosines between the rays and the normals of a depth map.
@@ -146,12 +135,8 @@ fn facing(depth: &[f32], camera: &Camera) -> Vec<f32> {
     let side = camera.width as usize;
     let point = |x: usize, y: usize| {
         let z = depth[y * side + x];
-        let at = |i: usize, focal: f64, centre: f64| ((i as f64 + 0.5 - centre) / focal) as f32;
-        let (x, y) = (
-            at(x, camera.focal.x, camera.principal_point.x),
-            at(y, camera.focal.y, camera.principal_point.y),
-        );
-        (z > 0.0).then(|| z * Vec3::new(x, y, 1.0))
+        let at = (DVec2::new(x as f64 + 0.5, y as f64 + 0.5) - camera.principal_point) / camera.focal;
+        (z > 0.0).then(|| z * at.as_vec2().extend(1.0))
     };
     let mut facing = vec![0.0; depth.len()];
     for y in 1..side - 1 {
@@ -166,6 +151,7 @@ fn facing(depth: &[f32], camera: &Camera) -> Vec<f32> {
     facing
 }
 
-fn host<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
+/// The values of a tensor.
+pub fn host<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
     tensor.into_data().convert::<f32>().try_into_vec().expect("converted to f32 on this very line")
 }

@@ -1,60 +1,42 @@
 //! Binary glTF 2.0: every triangle of the default scene, in its node's place, with its base colour.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::HashSet;
 use std::fmt::Display;
 use std::path::Path;
 use std::sync::Arc;
 
 use glam::{Mat4, Vec2, Vec3};
 use gltf::accessor::{DataType, Dimensions};
+use gltf::json::Root;
 use gltf::mesh::Mode;
 use gltf::{Accessor, Document, Node, Primitive, image::Source};
 use image::RgbImage;
-use serde_json::Value;
-use snapsnap_base::file;
+use snapsnap_base::{FileError, file};
 
-use super::{MAX_BYTES, Room};
-
+use super::{MAX_BYTES, Textures, add_colors};
 use crate::mesh::{Face, Material, Mesh};
 use crate::picture::decode_bytes;
-use snapsnap_base::FileError;
 
 /// Deepest nesting of nodes.
 const MAX_DEPTH: usize = 256;
 
-/// Most positions and corners of faces that nodes may add which show a mesh once more.
+/// Most positions and corners of faces that nodes may add by a further use of a mesh.
 const MAX_ELEMENTS: usize = 10_000_000;
-
-/// What an attribute may be stored as.
-struct Kind {
-    name: &'static str,
-    types: &'static [DataType],
-    dimensions: &'static [Dimensions],
-}
-
-const SHARES: &[DataType] = &[DataType::U8, DataType::U16, DataType::F32];
-const POSITIONS: Kind = Kind { name: "positions", types: &[DataType::F32], dimensions: &[Dimensions::Vec3] };
-const TEXCOORDS: Kind = Kind { name: "texture coordinates", types: SHARES, dimensions: &[Dimensions::Vec2] };
-const COLORS: Kind =
-    Kind { name: "colours", types: SHARES, dimensions: &[Dimensions::Vec3, Dimensions::Vec4] };
-const INDICES: Kind = Kind {
-    name: "indices",
-    types: &[DataType::U8, DataType::U16, DataType::U32],
-    dimensions: &[Dimensions::Scalar],
-};
 
 pub fn read(path: &Path) -> Result<Mesh, FileError> {
     let bytes = file::read(path, MAX_BYTES).map_err(FileError::read(path))?;
     let invalid = |e: &dyn Display| FileError::unsuitable(path, format!("is no valid GLB: {e}"));
-    check_references(&bytes).map_err(|e| invalid(&e))?;
-    let gltf::Gltf { document, blob } = gltf::Gltf::from_slice(&bytes).map_err(|e| invalid(&e))?;
+    let parsed = gltf::Gltf::from_slice_without_validation(&bytes);
+    let gltf::Gltf { document, blob } = parsed.map_err(|e| invalid(&e))?;
     drop(bytes);
+    let root = document.into_json();
+    check_references(&root).map_err(|e| invalid(&e))?;
+    let document = Document::from_json(root).map_err(|e| invalid(&e))?;
     let mut file = File {
         path,
         blob: blob.unwrap_or_default(),
         mesh: Mesh::default(),
-        textures: HashMap::new(),
-        room: Room::new(),
+        textures: Textures::new(),
         nodes_left: document.nodes().len(),
         places: Vec::new(),
         shown: HashSet::new(),
@@ -64,37 +46,23 @@ pub fn read(path: &Path) -> Result<Mesh, FileError> {
     Ok(file.mesh)
 }
 
-/// Refuses references to nothing that the parser follows before it looks.
-fn check_references(bytes: &[u8]) -> Result<(), String> {
-    let glb;
-    let json = if bytes.starts_with(b"glTF") {
-        glb = gltf::Glb::from_slice(bytes).map_err(|e| e.to_string())?;
-        &glb.json[..]
-    } else {
-        bytes
-    };
-    let json: Value = serde_json::from_slice(json).map_err(|e| e.to_string())?;
-    let accessors = list(&json, "accessors").len() as u64;
-    for (mesh, value) in list(&json, "meshes").iter().enumerate() {
-        for primitive in list(value, "primitives") {
-            let attributes = primitive["attributes"].as_object().into_iter().flatten().map(|(_, row)| row);
-            let rows = attributes.chain(primitive.get("indices")).filter_map(Value::as_u64);
-            if let Some(row) = rows.into_iter().find(|row| *row >= accessors) {
+/// Refuses references that are missing or out of range, on which the validation would panic.
+fn check_references(root: &Root) -> Result<(), String> {
+    let accessors = root.accessors.len();
+    for (mesh, value) in root.meshes.iter().enumerate() {
+        for primitive in &value.primitives {
+            let mut rows = primitive.attributes.values().chain(&primitive.indices).map(|row| row.value());
+            if let Some(row) = rows.find(|row| *row >= accessors) {
                 return Err(format!("mesh {mesh} refers to accessor {row}, there are {accessors}"));
             }
         }
     }
-    for (index, image) in list(&json, "images").iter().enumerate() {
-        let is_inside = image.get("bufferView").is_some() && image.get("mimeType").is_some();
-        if image.get("uri").is_none() && !is_inside {
+    for (index, image) in root.images.iter().enumerate() {
+        if image.uri.is_none() && (image.buffer_view.is_none() || image.mime_type.is_none()) {
             return Err(format!("image {index} has neither `uri` nor `bufferView` and `mimeType`"));
         }
     }
     Ok(())
-}
-
-fn list<'a>(of: &'a Value, key: &str) -> &'a [Value] {
-    of[key].as_array().map_or(&[], Vec::as_slice)
 }
 
 struct File<'a> {
@@ -103,15 +71,14 @@ struct File<'a> {
     blob: Vec<u8>,
     mesh: Mesh,
     /// By the row of the image.
-    textures: HashMap<usize, Arc<RgbImage>>,
-    room: Room,
-    /// Nodes that may still be visited: in a tree each comes once, in a damaged file there may be loops.
+    textures: Textures<usize>,
+    /// Nodes that may still be visited: each node of a tree is visited once, but a damaged file may contain loops.
     nodes_left: usize,
-    /// Where primitives stand: mesh, primitive and the node's place.
+    /// Mesh, primitive and place in the world of every primitive that a node shows.
     places: Vec<(usize, usize, Mat4)>,
-    /// Mesh and primitive of those that stand somewhere.
+    /// Mesh and primitive of each entry of `places`.
     shown: HashSet<(usize, usize)>,
-    /// Positions and corners of those that stand in a further place.
+    /// Positions and corners of the primitives at their second and further places.
     elements: usize,
 }
 
@@ -125,16 +92,16 @@ impl File<'_> {
             let material = self.material(&material)?;
             self.mesh.materials.push(material);
         }
-        // What has no material is white.
+        // Primitives without a material are white.
         self.mesh.materials.push(Material::default());
         let scene = document.default_scene().or_else(|| document.scenes().next());
         let scene = scene.ok_or_else(|| self.wrong("it has no scene"))?;
         for node in scene.nodes() {
             self.node(&node, Mat4::IDENTITY, 0)?;
         }
-        // Only now: how much it is altogether is known.
-        let meshes: Vec<gltf::Mesh> = document.meshes().collect();
-        let primitives: Vec<Vec<Primitive>> = meshes.iter().map(|mesh| mesh.primitives().collect()).collect();
+        // The size of the whole is checked by now.
+        let meshes = document.meshes().map(|mesh| mesh.primitives().collect());
+        let primitives: Vec<Vec<Primitive>> = meshes.collect();
         for (mesh, primitive, to_world) in std::mem::take(&mut self.places) {
             self.primitive(&primitives[mesh][primitive], to_world)?;
         }
@@ -144,28 +111,20 @@ impl File<'_> {
     fn material(&mut self, material: &gltf::Material) -> Result<Material, FileError> {
         let base = material.pbr_metallic_roughness();
         let [r, g, b, _] = base.base_color_factor();
-        let texture = match base.base_color_texture() {
-            Some(texture) => Some(self.texture(&texture.texture().source())?),
-            None => None,
-        };
-        // Factors are linear, our colours are as they are shown.
+        let texture = base.base_color_texture().map(|texture| self.texture(&texture.texture().source()));
+        // Factors are linear, colours of a mesh are sRGB.
         let color = Vec3::new(r, g, b).clamp(Vec3::ZERO, Vec3::ONE).map(shown);
-        Ok(Material { color, texture })
+        Ok(Material { color, texture: texture.transpose()? })
     }
 
     fn texture(&mut self, image: &gltf::Image) -> Result<Arc<RgbImage>, FileError> {
-        if let Some(texture) = self.textures.get(&image.index()) {
-            return Ok(texture.clone());
-        }
         let Source::View { view, .. } = image.source() else {
             return Err(self.wrong(format!("texture {} is not inside the file", image.index())));
         };
         let bytes =
             view.offset().checked_add(view.length()).and_then(|end| self.blob.get(view.offset()..end));
         let bytes = bytes.ok_or_else(|| self.wrong(format!("texture {} is cut off", image.index())))?;
-        let texture = self.room.fill(|most| decode_bytes(self.path, bytes, most))?;
-        self.textures.insert(image.index(), texture.clone());
-        Ok(texture)
+        self.textures.load(image.index(), |most| decode_bytes(self.path, bytes, most))
     }
 
     fn node(&mut self, node: &Node, parent: Mat4, depth: usize) -> Result<(), FileError> {
@@ -201,8 +160,7 @@ impl File<'_> {
         }
         let set = texture_set(primitive);
         let count = primitive.get(&gltf::Semantic::Positions).as_ref().map_or(0, Accessor::count);
-        let blob = std::mem::take(&mut self.blob);
-        let reader = primitive.reader(|_| Some(&blob));
+        let reader = primitive.reader(|_| Some(&self.blob));
         let positions: Vec<Vec3> = reader
             .read_positions()
             .into_iter()
@@ -221,16 +179,11 @@ impl File<'_> {
             .flat_map(|c| c.into_rgb_f32().map(|c| Vec3::from_array(c).map(shown)))
             .collect();
         let indices: Option<Vec<u32>> = reader.read_indices().map(|indices| indices.into_u32().collect());
-        self.blob = blob;
 
-        let many = |what: &str, found: usize| {
-            self.wrong(format!("a primitive has {found} {what} for {count} positions"))
-        };
-        if !texcoords.is_empty() && texcoords.len() != count {
-            return Err(many("texture coordinates", texcoords.len()));
-        }
-        if !colors.is_empty() && colors.len() != count {
-            return Err(many("colours", colors.len()));
+        for (found, what) in [(texcoords.len(), "texture coordinates"), (colors.len(), "colours")] {
+            if found != 0 && found != count {
+                return Err(self.wrong(format!("a primitive has {found} {what} for {count} positions")));
+            }
         }
         let first = self.mesh.positions.len() as u32;
         let first_texcoord = self.mesh.texcoords.len() as u32;
@@ -261,36 +214,44 @@ impl File<'_> {
         }
         self.mesh.positions.extend(positions);
         self.mesh.texcoords.extend(texcoords);
-        if !colors.is_empty() || !self.mesh.colors.is_empty() {
-            self.mesh.colors.resize(first as usize, Vec3::ONE);
-            self.mesh.colors.extend(colors);
-            self.mesh.colors.resize(self.mesh.positions.len(), Vec3::ONE);
-        }
+        add_colors(&mut self.mesh, first as usize, colors.into_iter());
         Ok(())
     }
 
-    /// Positions and corners of a primitive, one at least, all of whose accessors lie inside the file.
+    /// Number of positions and corners of a primitive, at least 1.
+    ///
+    /// # Errors
+    /// The errors of [`File::check`] for its accessors.
     fn checked_size(&self, primitive: &Primitive) -> Result<usize, FileError> {
-        let wanted = [
-            (primitive.get(&gltf::Semantic::Positions), &POSITIONS),
-            (primitive.get(&gltf::Semantic::TexCoords(texture_set(primitive))), &TEXCOORDS),
-            (primitive.get(&gltf::Semantic::Colors(0)), &COLORS),
-            (primitive.indices(), &INDICES),
-        ];
-        for (accessor, kind) in &wanted {
-            accessor.as_ref().map_or(Ok(()), |accessor| self.check(accessor, kind))?;
-        }
-        let [positions, _, _, corners] = wanted.map(|(accessor, _)| accessor.as_ref().map(Accessor::count));
-        let positions = positions.unwrap_or(0);
-        Ok(positions.saturating_add(corners.unwrap_or(positions)).max(1))
+        let shares: &[DataType] = &[DataType::U8, DataType::U16, DataType::F32];
+        let texcoords = gltf::Semantic::TexCoords(texture_set(primitive));
+        let positions = primitive.get(&gltf::Semantic::Positions);
+        let corners = primitive.indices();
+        let size = |accessor: &Option<Accessor>| accessor.as_ref().map(Accessor::count);
+        let count = size(&positions).unwrap_or(0);
+        let count = count.saturating_add(size(&corners).unwrap_or(count)).max(1);
+        self.check("positions", positions, &[DataType::F32], &[Dimensions::Vec3])?;
+        self.check("texture coordinates", primitive.get(&texcoords), shares, &[Dimensions::Vec2])?;
+        let colors = primitive.get(&gltf::Semantic::Colors(0));
+        self.check("colours", colors, shares, &[Dimensions::Vec3, Dimensions::Vec4])?;
+        let rows = [DataType::U8, DataType::U16, DataType::U32];
+        self.check("indices", corners, &rows, &[Dimensions::Scalar])?;
+        Ok(count)
     }
 
-    /// Whether the accessor lies inside the file: the reader trusts it.
-    fn check(&self, accessor: &Accessor, kind: &Kind) -> Result<(), FileError> {
+    /// Refuses an accessor of a wrong type or outside the file: the reader does not check it.
+    fn check(
+        &self,
+        name: &str,
+        accessor: Option<Accessor>,
+        types: &[DataType],
+        dimensions: &[Dimensions],
+    ) -> Result<(), FileError> {
+        let Some(accessor) = accessor else { return Ok(()) };
         let index = accessor.index();
-        if !kind.types.contains(&accessor.data_type()) || !kind.dimensions.contains(&accessor.dimensions()) {
+        if !types.contains(&accessor.data_type()) || !dimensions.contains(&accessor.dimensions()) {
             let found = format!("{:?} of {:?}", accessor.dimensions(), accessor.data_type());
-            return Err(self.wrong(format!("accessor {index} holds {}, but as {found}", kind.name)));
+            return Err(self.wrong(format!("accessor {index} holds {name}, but as {found}")));
         }
         if accessor.sparse().is_some() {
             return Err(self.wrong(format!("accessor {index} is sparse, which scans are not")));
@@ -316,13 +277,13 @@ impl File<'_> {
     }
 }
 
-/// Which texture coordinates the primitive's texture is laid by.
+/// Number of the texture coordinates that belong to the primitive's texture.
 fn texture_set(primitive: &Primitive) -> u32 {
     let base = primitive.material().pbr_metallic_roughness();
     base.base_color_texture().map_or(0, |texture| texture.tex_coord())
 }
 
-/// Linear light as a screen shows it (sRGB).
+/// sRGB value of linear light.
 fn shown(linear: f32) -> f32 {
     if linear <= 0.003_130_8 { 12.92 * linear } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 }
 }

@@ -7,35 +7,34 @@ mod ply;
 mod tests;
 
 use std::collections::HashMap;
+use std::hash::Hash;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use glam::Vec3;
 use image::{DynamicImage, RgbImage};
-use snapsnap_base::quoted;
+use snapsnap_base::{FileError, guarded, quoted};
 
 use crate::mesh::Mesh;
 use crate::picture::decode;
-use snapsnap_base::FileError;
-use snapsnap_base::guarded;
 
-/// Endings of the files that [`read`] understands, in lower case.
+/// Endings of the files that [`read`] accepts, in lower case.
 pub const EXTENSIONS: [&str; 3] = ["obj", "ply", "glb"];
 
 /// Largest file that is read; the largest published scans take a few hundred megabytes.
 const MAX_BYTES: u64 = 4 << 30;
 
-/// Bytes that a texture may take once it is decoded: 8192×8192 pixels of red, green, blue and alpha in 16 bits each.
+/// Bytes that a decoded texture may take: 8192×8192 pixels of red, green, blue and alpha in 16 bits each.
 const MAX_TEXTURE: u64 = 512 << 20;
 /// The same for all textures of a scan, as red, green and blue.
 const MAX_TEXTURES: u64 = 1 << 30;
 
-/// Reads a scan. Positions are as in the file; positions that several vertices share are made one, so that shading is
-/// smooth across the seams of textures.
+/// Reads a scan. Positions are as in the file. Equal positions become one, so that shading is smooth across the seams of
+/// textures.
 ///
 /// # Errors
-/// [`FileError`] for a file or texture that is missing, damaged, absurdly large or in another format, and for a mesh
-/// that cannot be drawn: no triangle, NaN, faces that refer to nothing.
+/// [`FileError`] for a file or texture that is missing, damaged, too large or in another format, and for a mesh that
+/// cannot be drawn: no triangle, NaN, references out of range.
 pub fn read(path: &Path) -> Result<Mesh, FileError> {
     let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase()).unwrap_or_default();
     let reader = match extension.as_str() {
@@ -46,7 +45,7 @@ pub fn read(path: &Path) -> Result<Mesh, FileError> {
     };
     let mut mesh = guarded(path, || reader(path))?;
     mesh.check().map_err(|e| FileError::unsuitable(path, e))?;
-    // Files differ in what the brightest value of a colour is.
+    // The brightest value of a colour is 1 in some files and 255 in others.
     if mesh.colors.iter().any(|c| c.max_element() > 2.0) {
         mesh.colors.iter_mut().for_each(|c| *c /= 255.0);
     }
@@ -55,64 +54,66 @@ pub fn read(path: &Path) -> Result<Mesh, FileError> {
     Ok(mesh)
 }
 
-/// Textures of one scan, each decoded once.
-struct Textures<'a> {
-    /// The file that names them.
-    owner: &'a Path,
-    loaded: HashMap<PathBuf, Arc<RgbImage>>,
-    room: Room,
+/// Adds the colours of the positions from row `first` on. Positions without a colour become white if others have one.
+fn add_colors(mesh: &mut Mesh, first: usize, colors: impl ExactSizeIterator<Item = Vec3>) {
+    if colors.len() > 0 || !mesh.colors.is_empty() {
+        mesh.colors.resize(first, Vec3::ONE);
+        mesh.colors.extend(colors);
+        mesh.colors.resize(mesh.positions.len(), Vec3::ONE);
+    }
 }
 
-/// Bytes that are left for textures.
-struct Room(u64);
+/// Textures of one scan, each decoded once.
+struct Textures<K> {
+    loaded: HashMap<K, Arc<RgbImage>>,
+    /// Bytes that further textures may take.
+    left: u64,
+}
 
-impl Room {
+impl<K: Eq + Hash> Textures<K> {
     fn new() -> Self {
-        Self(MAX_TEXTURES)
+        Self { loaded: HashMap::new(), left: MAX_TEXTURES }
     }
 
-    /// Decodes a texture with `decode`, which is told how many bytes it may take.
-    fn fill(
+    /// The texture of this key. `decode` receives the number of bytes that the texture may take.
+    fn load(
         &mut self,
+        key: K,
         decode: impl FnOnce(u64) -> Result<DynamicImage, FileError>,
     ) -> Result<Arc<RgbImage>, FileError> {
-        let texture = match decode(MAX_TEXTURE.min(self.0)) {
-            Err(FileError::Unsuitable { path, message }) if self.0 < MAX_TEXTURE => {
+        if let Some(texture) = self.loaded.get(&key) {
+            return Ok(texture.clone());
+        }
+        let texture = match decode(MAX_TEXTURE.min(self.left)) {
+            Err(FileError::Unsuitable { path, message }) if self.left < MAX_TEXTURE => {
                 let all = MAX_TEXTURES >> 20;
                 let message = format!("{message} (all textures of a scan together may take {all} MiB)");
                 return Err(FileError::Unsuitable { path, message });
             }
-            decoded => decoded?.into_rgb8(),
+            decoded => Arc::new(decoded?.into_rgb8()),
         };
-        self.0 = self.0.saturating_sub(texture.len() as u64);
-        Ok(Arc::new(texture))
-    }
-}
-
-impl<'a> Textures<'a> {
-    fn of(owner: &'a Path) -> Self {
-        Self { owner, loaded: HashMap::new(), room: Room::new() }
-    }
-
-    /// The texture that the scan calls `name`. Scans travel: a path of another machine is looked for beside the scan.
-    fn load(&mut self, name: &str) -> Result<Arc<RgbImage>, FileError> {
-        let path = beside(self.owner, name).ok_or_else(|| {
-            let message = format!("its texture `{}` is missing", quoted(name));
-            FileError::unsuitable(self.owner, message)
-        })?;
-        if let Some(texture) = self.loaded.get(&path) {
-            return Ok(texture.clone());
-        }
-        let texture = self.room.fill(|most| decode(&path, most))?;
-        self.loaded.insert(path, texture.clone());
+        self.left = self.left.saturating_sub(texture.len() as u64);
+        self.loaded.insert(key, texture.clone());
         Ok(texture)
     }
 }
 
-/// The existing file that `owner` calls `name`: relative to its folder, or, failing that, of that name in its folder.
-fn beside(owner: &Path, name: &str) -> Option<PathBuf> {
+impl Textures<PathBuf> {
+    /// The texture to which `owner` refers as `name`.
+    fn beside(&mut self, owner: &Path, name: &str) -> Result<Arc<RgbImage>, FileError> {
+        let path = beside(owner, "texture", name)?;
+        self.load(path.clone(), |most| decode(&path, most))
+    }
+}
+
+/// The existing file to which `owner` refers as `name`: relative to the folder of `owner`, or else of that name in the
+/// folder, since scans contain paths of other machines.
+fn beside(owner: &Path, kind: &str, name: &str) -> Result<PathBuf, FileError> {
     let folder = owner.parent().unwrap_or(Path::new(""));
     let slashes = name.replace('\\', "/");
     let last = slashes.rsplit('/').next().unwrap_or_default();
-    [name, &slashes, last].iter().map(|name| folder.join(name)).find(|path| path.is_file())
+    let mut paths = [name, &slashes, last].into_iter().map(|name| folder.join(name));
+    paths
+        .find(|path| path.is_file())
+        .ok_or_else(|| FileError::unsuitable(owner, format!("its {kind} `{}` is missing", quoted(name))))
 }

@@ -5,13 +5,11 @@ use std::path::Path;
 use std::str::SplitAsciiWhitespace;
 
 use glam::{Vec2, Vec3};
-use snapsnap_base::file;
-use snapsnap_base::quoted;
+use snapsnap_base::{FileError, file, quoted};
 use snapsnap_splat::ply::header::{Element, Format, Scalar, parse};
 
 use super::{MAX_BYTES, Textures};
 use crate::mesh::{Face, Material, Mesh};
-use snapsnap_base::FileError;
 
 /// Most corners of a face; a longer list is a damaged file.
 const MAX_CORNERS: usize = 1 << 16;
@@ -34,18 +32,24 @@ pub fn read(path: &Path) -> Result<Mesh, FileError> {
         match element.name.as_str() {
             "vertex" => vertices(element, &mut body, &mut mesh),
             "face" => faces(element, &mut body, &mut mesh),
-            _ => skip(element, &mut body),
+            // Rows without properties take no room in the file.
+            _ if element.properties.is_empty() => Ok(()),
+            _ => (0..element.count).try_for_each(|row| {
+                let skip =
+                    |body: &mut Body, column: usize| body.number(element.properties[column].kind).map(drop);
+                read_row(element, row, usize::MAX, &mut body, skip)
+            }),
         }
         .map_err(wrong)?;
     }
     let named = header.comments.iter().find_map(|comment| comment.strip_prefix("TextureFile"));
     if let Some(name) = named {
-        mesh.materials[0].texture = Some(Textures::of(path).load(name.trim())?);
+        mesh.materials[0].texture = Some(Textures::new().beside(path, name.trim())?);
     }
     Ok(mesh)
 }
 
-/// What follows the header.
+/// Values behind the header.
 enum Body<'a> {
     Text(SplitAsciiWhitespace<'a>),
     Binary { bytes: &'a [u8], big: bool },
@@ -79,29 +83,36 @@ impl Body<'_> {
             Self::Binary { bytes, big } => kind.read_count(&take(bytes, kind, *big)?[..kind.size()]),
         }
     }
-
-    /// Rows that the rest can hold at most, of so many values each.
-    fn rows(&self, element: &Element) -> usize {
-        let (left, row): (usize, usize) = match self {
-            // How long the rest of the text is, is not known; vectors grow with what is there.
-            Self::Text(_) => (1 << 20, 1),
-            Self::Binary { bytes, .. } => {
-                let size = |kind: Scalar, list: Option<Scalar>| list.unwrap_or(kind).size();
-                (bytes.len(), element.properties.iter().map(|p| size(p.kind, p.list)).sum())
-            }
-        };
-        left / row.max(1)
-    }
 }
 
-/// Where an element cannot be read on.
-fn broken(element: &Element, row: usize, property: &str) -> String {
-    format!(
-        "{} {row} of {}: `{}` is missing or no number; the file may be cut off",
-        quoted(&element.name),
-        element.count,
-        quoted(property)
-    )
+/// Reads one row of an element. `value` reads the next value of the property in this column; it returns `None` for a value
+/// that is missing or no number.
+///
+/// # Errors
+/// A missing or wrong value, or a list of more than `longest` values.
+fn read_row(
+    element: &Element,
+    row: usize,
+    longest: usize,
+    body: &mut Body,
+    mut value: impl FnMut(&mut Body, usize) -> Option<()>,
+) -> Result<(), String> {
+    for (column, property) in element.properties.iter().enumerate() {
+        let broken = || {
+            let (name, count) = (quoted(&element.name), element.count);
+            let property = quoted(&property.name);
+            format!("{name} {row} of {count}: `{property}` is missing or no number; the file may be cut off")
+        };
+        let length = property.list.map_or(Some(1), |kind| body.count(kind)).ok_or_else(broken)?;
+        if length > longest {
+            let (name, property) = (quoted(&element.name), quoted(&property.name));
+            return Err(format!("{name} {row}: `{property}` has {length} entries"));
+        }
+        for _ in 0..length {
+            value(body, column).ok_or_else(broken)?;
+        }
+    }
+    Ok(())
 }
 
 /// Columns by one of the names that exporters give them.
@@ -122,24 +133,15 @@ fn vertices(element: &Element, body: &mut Body, mesh: &mut Mesh) -> Result<(), S
     };
     let s = column(element, &["s", "u", "texture_u"]);
     let texcoord = s.zip(column(element, &["t", "v", "texture_v"]));
-    let capacity = element.count.min(body.rows(element));
-    mesh.positions.reserve(capacity);
     let mut values = vec![0.0; element.properties.len()];
     for row in 0..element.count {
-        for (value, property) in values.iter_mut().zip(&element.properties) {
-            let end = || broken(element, row, &property.name);
-            match property.list {
-                None => *value = body.number(property.kind).ok_or_else(end)?,
-                Some(length) => {
-                    for _ in 0..body.count(length).ok_or_else(end)? {
-                        body.number(property.kind).ok_or_else(end)?;
-                    }
-                }
-            }
-        }
+        read_row(element, row, usize::MAX, body, |body, column| {
+            values[column] = body.number(element.properties[column].kind)?;
+            Some(())
+        })?;
         mesh.positions.push(Vec3::new(values[x], values[y], values[z]));
         if let Some(columns) = color {
-            // Whole numbers count to 255; floats are shares already.
+            // Floats are in [0, 1] already.
             let [r, g, b] = columns.map(|c| match element.properties[c].kind {
                 Scalar::F32 | Scalar::F64 => values[c],
                 Scalar::U16 => values[c] / 65_535.0,
@@ -164,26 +166,17 @@ fn faces(element: &Element, body: &mut Body, mesh: &mut Mesh) -> Result<(), Stri
     for row in 0..element.count {
         corners.clear();
         texcoords.clear();
-        for property in &element.properties {
-            let end = || broken(element, row, &property.name);
-            let length = match property.list {
-                None => 1,
-                Some(kind) => body.count(kind).ok_or_else(end)?,
-            };
-            if length > MAX_CORNERS {
-                return Err(format!("face {row}: `{}` has {length} entries", quoted(&property.name)));
-            }
-            for _ in 0..length {
-                match property.name.as_str() {
-                    "vertex_indices" | "vertex_index" => {
-                        let index = body.count(property.kind).and_then(|i| u32::try_from(i).ok());
-                        corners.push(index.ok_or_else(end)?);
-                    }
-                    "texcoord" => texcoords.push(body.number(property.kind).ok_or_else(end)?),
-                    _ => drop(body.number(property.kind).ok_or_else(end)?),
+        read_row(element, row, MAX_CORNERS, body, |body, column| {
+            let property = &element.properties[column];
+            match property.name.as_str() {
+                "vertex_indices" | "vertex_index" => {
+                    corners.push(u32::try_from(body.count(property.kind)?).ok()?);
                 }
+                "texcoord" => texcoords.push(body.number(property.kind)?),
+                _ => drop(body.number(property.kind)?),
             }
-        }
+            Some(())
+        })?;
         let first = mesh.texcoords.len() as u32;
         let per_corner = !per_vertex && !corners.is_empty() && texcoords.len() == 2 * corners.len();
         if per_corner {
@@ -198,22 +191,6 @@ fn faces(element: &Element, body: &mut Body, mesh: &mut Mesh) -> Result<(), Stri
                 per_corner.then(|| [first, first + i as u32, first + i as u32 + 1])
             };
             mesh.faces.push(Face { positions, texcoords, material: 0 });
-        }
-    }
-    Ok(())
-}
-
-fn skip(element: &Element, body: &mut Body) -> Result<(), String> {
-    if element.properties.is_empty() {
-        return Ok(());
-    }
-    for row in 0..element.count {
-        for property in &element.properties {
-            let end = || broken(element, row, &property.name);
-            let length = property.list.map_or(Some(1), |kind| body.count(kind)).ok_or_else(end)?;
-            for _ in 0..length {
-                body.number(property.kind).ok_or_else(end)?;
-            }
         }
     }
     Ok(())

@@ -1,4 +1,4 @@
-//! JPEG files, strictly: the decoder of the image crate fills with grey what a file that was cut short no longer has.
+//! Strict decoding of JPEG files. The decoder of the image crate fills the missing part of a file that was cut short with grey.
 
 use image::error::{DecodingError, ImageFormatHint};
 use image::metadata::Orientation;
@@ -8,7 +8,7 @@ use zune_jpeg::zune_core::bytestream::ZCursor;
 use zune_jpeg::zune_core::colorspace::ColorSpace;
 use zune_jpeg::zune_core::options::DecoderOptions;
 
-/// Pixels per byte that no JPEG exceeds: each block of 8×8 takes one bit at least.
+/// Most pixels per byte of a JPEG: each block of 8×8 takes one bit at least.
 const MAX_PIXELS_PER_BYTE: u64 = 512;
 
 /// A JPEG whose header has been read.
@@ -25,7 +25,7 @@ fn damaged(message: impl ToString) -> ImageError {
 }
 
 impl<'a> Jpeg<'a> {
-    /// Reads the header, and looks whether the file goes on to the end of the image.
+    /// Reads the header, and checks that the file contains the end of the image.
     pub fn open(bytes: &'a [u8]) -> Result<Self, ImageError> {
         let options = DecoderOptions::default()
             .set_strict_mode(true)
@@ -34,7 +34,7 @@ impl<'a> Jpeg<'a> {
         let mut decoder = JpegDecoder::new_with_options(ZCursor::new(bytes), options);
         decoder.decode_headers().map_err(|e| damaged(format!("{e:?}")))?;
         let (width, height) = decoder.dimensions().ok_or_else(|| damaged("its size is missing"))?;
-        // Otherwise a few bytes could ask for gigabytes.
+        // The limit keeps a few bytes from taking gigabytes.
         if (width * height) as u64 > MAX_PIXELS_PER_BYTE * bytes.len() as u64 || !is_whole(bytes) {
             return Err(damaged("the file ends before the picture does"));
         }
@@ -44,13 +44,7 @@ impl<'a> Jpeg<'a> {
         Ok(Self { decoder, size: [width as u32, height as u32], is_grey })
     }
 
-    /// Bytes of the picture as red, green and blue.
-    pub fn bytes_decoded(&self) -> u64 {
-        let [width, height] = self.size.map(u64::from);
-        3 * width * height
-    }
-
-    /// The picture as it is stored, and how it wants to be turned.
+    /// The picture as it is stored, and its orientation.
     pub fn decode(mut self) -> Result<(DynamicImage, Orientation), ImageError> {
         let pixels = self.decoder.decode().map_err(|e| damaged(format!("{e:?}")))?;
         let exif = self.decoder.exif();
@@ -61,22 +55,22 @@ impl<'a> Jpeg<'a> {
         } else {
             RgbImage::from_raw(width, height, pixels).map(DynamicImage::ImageRgb8)
         };
-        let picture = picture.ok_or_else(|| damaged("it holds fewer pixels than it promises"))?;
+        let picture = picture.ok_or_else(|| damaged("it contains fewer pixels than its header promises"))?;
         Ok((picture, orientation.unwrap_or(Orientation::NoTransforms)))
     }
 }
 
-/// Whether the segments of a JPEG lead to an end-of-image marker (ITU T.81, B.1.1). Pictures within segments, as
-/// thumbnails are, do not count.
+/// Whether the segments of a JPEG lead to an end-of-image marker (ITU T.81, B.1.1). Pictures within segments (thumbnails) do
+/// not count.
 fn is_whole(bytes: &[u8]) -> bool {
     let mut at = 0;
-    // Behind the next 0xFF come the marker, which padding may precede, and, with most markers, the segment's length.
+    // Behind 0xFF and possible padding is the marker, which is followed by the segment's length in most cases.
     while let Some(found) = bytes[at..].windows(2).position(|pair| pair[0] == 0xff && is_marker(pair[1])) {
         let marker = bytes[at + found + 1];
         at += found + 2;
         match marker {
             0xd9 => return true,
-            // Start of image, restarts and TEM stand alone.
+            // Start of image, restarts and TEM have no length.
             0xd8 | 0xd0..=0xd7 | 0x01 => {}
             _ => {
                 let Some(length) = bytes.get(at..at + 2) else { return false };
@@ -90,7 +84,7 @@ fn is_whole(bytes: &[u8]) -> bool {
     false
 }
 
-/// Not a byte of coded data, in which 0 follows every 0xFF, nor padding.
+/// Whether the byte behind 0xFF is a marker: 0 marks coded data, and 0xFF is padding.
 fn is_marker(byte: u8) -> bool {
     byte != 0 && byte != 0xff
 }

@@ -1,6 +1,5 @@
 //! Light and textures.
 
-use std::collections::HashMap;
 use std::f32::consts::TAU;
 use std::sync::Arc;
 
@@ -8,10 +7,10 @@ use glam::{DVec2, DVec3, Vec2, Vec3};
 use image::RgbImage;
 use snapsnap_splat::Camera;
 
-use crate::mesh::Mesh;
+use super::Renderer;
 
-/// Soft directional lights, so strong together that the brightest direction reflects exactly the surface's own colour:
-/// nothing is ever clipped.
+/// Soft directional lights. Together they are so strong that the brightest direction reflects exactly the surface's own
+/// colour, and none is clipped.
 #[derive(Debug, Clone)]
 pub struct Lights {
     /// Unit vectors towards the lights, world axes, and their strengths.
@@ -21,7 +20,7 @@ pub struct Lights {
 }
 
 impl Lights {
-    /// Lights from directions with strengths, and light from everywhere; scaled as a whole.
+    /// Scales these directions with strengths, and the light from everywhere, as a whole.
     pub fn new(directional: &[(Vec3, f32)], ambient: f32) -> Self {
         let directional = directional.iter().map(|(d, s)| (d.normalize_or_zero(), *s)).collect();
         let mut lights = Self { directional, ambient };
@@ -43,13 +42,13 @@ impl Lights {
 
     /// Light that a surface with this unit normal reflects, 0 to 1.
     pub fn strength(&self, normal: Vec3) -> f32 {
-        // Between the directions that were looked at a brighter one may hide, by less than a shade of 8 bits.
+        // A direction between the sampled ones may be brighter, by less than a shade of 8 bits.
         self.sum(normal).min(1.0)
     }
 
     fn sum(&self, normal: Vec3) -> f32 {
         let soft = |(direction, strength): &(Vec3, f32)| {
-            // Reaches a little beyond the terminator, as light from an area does.
+            // Light from an area reaches a little beyond the terminator.
             let cosine = (normal.dot(*direction) + 0.3) / 1.3;
             strength * cosine.max(0.0)
         };
@@ -71,18 +70,18 @@ impl Default for Lights {
     }
 }
 
-/// Pixels over which the speed of a texture is measured.
+/// Step in pixels for the derivative of texture coordinates.
 const STEP: f64 = 0.01;
 /// Most samples of a texture for one pixel.
 const MAX_TAPS: f32 = 8.0;
 
-/// A texture and its halvings.
-struct Pyramid {
+/// A texture and its reductions, each half as large as the one before.
+pub struct Pyramid {
     levels: Vec<Arc<RgbImage>>,
 }
 
 impl Pyramid {
-    fn new(texture: &Arc<RgbImage>) -> Self {
+    pub fn new(texture: &Arc<RgbImage>) -> Self {
         let mut levels = vec![texture.clone()];
         while let Some(last) = levels.last().filter(|l| l.width() > 1 || l.height() > 1) {
             let (w, h) = ((last.width() / 2).max(1), (last.height() / 2).max(1));
@@ -91,8 +90,9 @@ impl Pyramid {
         Self { levels }
     }
 
-    /// Colour at `at`, filtered over the pixel, whose columns and rows move the texture by `right` and `down`: where a
-    /// surface is seen aslant, several samples along the longer way, each no wider than the shorter one.
+    /// Colour at the texture coordinates `at`, filtered over a pixel. `right` and `down` are the changes of the coordinates
+    /// from one column and row to the next. On an oblique surface, several samples lie along the longer of them, each no
+    /// wider than the shorter one.
     fn sample(&self, at: Vec2, right: Vec2, down: Vec2) -> Vec3 {
         let size = Vec2::new(self.levels[0].width() as f32, self.levels[0].height() as f32);
         let (a, b) = ((right * size).length(), (down * size).length());
@@ -116,7 +116,7 @@ impl Pyramid {
     }
 }
 
-/// Texture coordinates have (0, 0) at the lower left; texel centres lie at +½; the texture repeats.
+/// Colour at the coordinates `at`, (0, 0) at the lower left. Texel centres are at +½; the texture repeats.
 fn bilinear(texture: &RgbImage, at: Vec2) -> Vec3 {
     let (w, h) = (i64::from(texture.width()), i64::from(texture.height()));
     let x = at.x.rem_euclid(1.0) * w as f32 - 0.5;
@@ -131,35 +131,9 @@ fn bilinear(texture: &RgbImage, at: Vec2) -> Vec3 {
     texel(0, 0).lerp(texel(1, 0), fx).lerp(texel(0, 1).lerp(texel(1, 1), fx), fy)
 }
 
-/// What drawing needs of a mesh, whatever the camera.
-pub struct Surface<'a> {
-    pub mesh: &'a Mesh,
-    normals: Vec<Vec3>,
-    /// One per material.
-    textures: Vec<Option<Arc<Pyramid>>>,
-}
-
-impl<'a> Surface<'a> {
-    pub fn new(mesh: &'a Mesh) -> Self {
-        // Materials often share a texture.
-        let mut pyramids: HashMap<*const RgbImage, Arc<Pyramid>> = HashMap::new();
-        let textures = mesh
-            .materials
-            .iter()
-            .map(|material| {
-                material.texture.as_ref().map(|texture| {
-                    let pyramid = pyramids.entry(Arc::as_ptr(texture));
-                    pyramid.or_insert_with(|| Arc::new(Pyramid::new(texture))).clone()
-                })
-            })
-            .collect();
-        Self { mesh, normals: mesh.normals(), textures }
-    }
-}
-
-/// Colours of a mesh's surfaces as one camera sees them.
+/// Colours of a mesh's surfaces in the view of one camera.
 pub struct Shader<'a> {
-    pub surface: &'a Surface<'a>,
+    pub renderer: &'a Renderer<'a>,
     pub camera: &'a Camera,
     /// Positions in the camera's frame.
     pub corners: &'a [DVec3],
@@ -169,12 +143,12 @@ pub struct Shader<'a> {
 impl Shader<'_> {
     /// Colour of `face` at pixel coordinates `at`; `plane` gives 1/z there.
     pub fn color(&self, face: usize, at: DVec2, plane: DVec3) -> Vec3 {
-        let Surface { mesh, normals, textures } = self.surface;
+        let Renderer { mesh, normals, textures } = self.renderer;
         let face = &mesh.faces[face];
         let weights = self.weights(face.positions, at, plane).as_vec3();
         let mix = |values: [Vec3; 3]| values[0] * weights.x + values[1] * weights.y + values[2] * weights.z;
         let mut normal = mix(face.positions.map(|row| normals[row as usize])).normalize_or_zero();
-        // Seen from behind, the other side of the surface is lit.
+        // The visible side of the surface is lit.
         let corners = face.positions.map(|row| self.corners[row as usize]);
         let towards = (corners[1] - corners[0]).cross(corners[2] - corners[0]).dot(corners[0]);
         if towards > 0.0 {
@@ -192,14 +166,14 @@ impl Shader<'_> {
                 coordinates[0] * w.x + coordinates[1] * w.y + coordinates[2] * w.z
             };
             let here = coordinate(at);
-            // How fast the texture moves, per pixel: over a small step, since a whole one may lead beyond the horizon.
-            let speed = |way: DVec2| ((coordinate(at + STEP * way) - here) / STEP).as_vec2();
-            color *= texture.sample(here.as_vec2(), speed(DVec2::X), speed(DVec2::Y));
+            // Change per pixel, from a small step, since a whole one may lead beyond the horizon.
+            let change = |way: DVec2| ((coordinate(at + STEP * way) - here) / STEP).as_vec2();
+            color *= texture.sample(here.as_vec2(), change(DVec2::X), change(DVec2::Y));
         }
         color
     }
 
-    /// Barycentric weights of the point of the triangle's plane that is seen at `at`.
+    /// Barycentric weights of the point of the triangle's plane at pixel coordinates `at`.
     fn weights(&self, rows: [u32; 3], at: DVec2, plane: DVec3) -> DVec3 {
         let [a, b, c] = rows.map(|row| self.corners[row as usize]);
         let inverse_depth = plane.dot(DVec3::new(at.x, at.y, 1.0));

@@ -29,9 +29,7 @@ fn flat(samples: usize) -> ViewOptions {
 }
 
 fn mesh(positions: Vec<Vec3>, faces: &[[u32; 3]]) -> Mesh {
-    let face = |positions: &[u32; 3]| Face { positions: *positions, texcoords: None, material: 0 };
-    let faces = faces.iter().map(face).collect();
-    Mesh { positions, faces, materials: vec![Material::default()], ..Mesh::default() }
+    Mesh::colored(positions, Vec::new(), faces.to_vec())
 }
 
 /// A sphere from an octahedron, every edge halved `levels` times.
@@ -69,7 +67,7 @@ fn depth_error(view: &View, camera: &Camera, exact: impl Fn(DVec3) -> Option<f64
     let mut checked = 0;
     for (pixel, depth) in view.depth.iter().enumerate() {
         if let Some(exact) = exact(ray(camera, pixel)) {
-            assert!(*depth > 0.0, "pixel {pixel} sees nothing");
+            assert!(*depth > 0.0, "pixel {pixel} shows nothing");
             worst = worst.max((f64::from(*depth) - exact).abs());
             checked += 1;
         }
@@ -119,9 +117,9 @@ fn the_depth_and_outline_of_a_sphere_are_those_of_the_formula() {
     }
 }
 
-/// A rectangle with edges at known places: coverage is the share of the pixel's samples that lie within.
+/// The coverage of a rectangle with known edges is the share of the pixel's samples that lie within.
 #[test]
-fn edges_are_where_they_should_be() {
+fn coverage_counts_the_samples_between_the_edges() {
     let camera = camera(40, 30);
     let point = |u: f64, v: f64| {
         let p = (DVec2::new(u, v) - camera.principal_point) / camera.focal * 2.0;
@@ -136,9 +134,6 @@ fn edges_are_where_they_should_be() {
             let view = draw(&mesh(corners, &[[0, 1, 2], [0, 2, 3]]), &camera, &flat(samples));
             for (pixel, alpha) in view.alpha.iter().enumerate() {
                 let (x, y) = ((pixel % 40) as f64, (pixel / 40) as f64);
-                let share = |low: f64, high: f64, at: f64| (high.min(at + 1.0) - low.max(at)).max(0.0);
-                let (across, down) = (share(left, right, x), share(top, bottom, y));
-                // As many samples of the pixel's grid as lie within.
                 let n = samples as f64;
                 let counted = |low: f64, high: f64, at: f64| {
                     (0..samples).filter(|i| (low..high).contains(&(at + (*i as f64 + 0.5) / n))).count()
@@ -147,15 +142,15 @@ fn edges_are_where_they_should_be() {
                 };
                 let expected = counted(left, right, x) * counted(top, bottom, y);
                 assert!((f64::from(*alpha) - expected).abs() < 1e-5, "{samples}: pixel {x}, {y}: {alpha}");
-                if across * down == 1.0 || across * down == 0.0 {
-                    assert_eq!(f64::from(*alpha), across * down, "{samples}: pixel {x}, {y}");
+                if expected == 1.0 || expected == 0.0 {
+                    assert_eq!(f64::from(*alpha), expected, "{samples}: pixel {x}, {y}");
                 }
             }
         }
     }
 }
 
-/// Points on a grid, shaken, and triangulated: no sample is missed, and none belongs to two triangles.
+/// Triangles between shifted points of a grid: no sample is missed, and none belongs to two triangles.
 #[test]
 fn neighbouring_triangles_share_no_sample_and_leave_none_out() {
     let camera = camera(50, 40);
@@ -201,7 +196,7 @@ fn neighbouring_triangles_share_no_sample_and_leave_none_out() {
     assert!(whole.alpha.iter().all(|alpha| *alpha == 1.0));
 }
 
-/// A cube with a picture on every side, seen from a corner: each point of the picture is where the camera projects it.
+/// A view towards a corner of a cube with a picture on every side. The camera projects each point of the picture to its place.
 #[test]
 fn a_textured_cube_shows_its_picture_undistorted() {
     let mut positions = Vec::new();
@@ -233,9 +228,8 @@ fn a_textured_cube_shows_its_picture_undistorted() {
     let eye = camera.centre();
     let mut seen = [0; 6];
     for (pixel, depth) in view.depth.iter().enumerate() {
-        let centre = DVec2::new((pixel % 120) as f64 + 0.5, (pixel / 120) as f64 + 0.5);
-        let ray = rotation.transpose() * ((centre - camera.principal_point) / camera.focal).extend(1.0);
-        // The ray lies within the cube between entering the last pair of sides and leaving the first.
+        let ray = rotation.transpose() * ray(&camera, pixel);
+        // The ray enters the cube at the last pair of sides and leaves it at the first.
         let (near, far) = ((-0.4 - eye) / ray, (0.4 - eye) / ray);
         let (enter, leave) = (near.min(far), near.max(far));
         let z = enter.max_element();
@@ -258,7 +252,7 @@ fn a_textured_cube_shows_its_picture_undistorted() {
             seen[2 * axis + usize::from(sign > 0.0)] += 1;
         }
     }
-    assert_eq!(seen.iter().filter(|count| **count > 100).count(), 3, "three sides are seen: {seen:?}");
+    assert_eq!(seen.iter().filter(|count| **count > 100).count(), 3, "three sides are visible: {seen:?}");
 }
 
 /// A fine checkerboard far away is grey, not noise.
@@ -281,7 +275,7 @@ fn distant_textures_are_averaged() {
 }
 
 #[test]
-fn light_is_never_clipped_and_the_nearer_surface_is_seen_from_both_sides() {
+fn light_is_never_clipped_and_the_nearer_surface_is_visible_from_both_sides() {
     let lights = Lights::default();
     let ball = draw(&sphere(Vec3::new(0.0, 0.0, 2.0), 0.5, 4), &camera(64, 64), &ViewOptions::default());
     let inside = || ball.color.iter().zip(&ball.alpha).filter(|(_, a)| **a == 1.0).map(|(c, _)| c[0]);
@@ -292,21 +286,19 @@ fn light_is_never_clipped_and_the_nearer_surface_is_seen_from_both_sides() {
     assert!(brightest * 100 < inside().count(), "{brightest} of {} pixels", inside().count());
     assert!(lights.strength(Vec3::new(0.4, 0.8, 0.9).normalize()) > 0.9);
 
-    let triangle = |z: f32, turned: bool| {
-        let p = vec![Vec3::new(-1.0, -1.0, z), Vec3::new(1.0, -1.0, z), Vec3::new(0.0, 1.0, z)];
-        mesh(p, &[if turned { [0, 2, 1] } else { [0, 1, 2] }])
+    let triangle = |z: f32| {
+        mesh(vec![Vec3::new(-1.0, -1.0, z), Vec3::new(1.0, -1.0, z), Vec3::new(0.0, 1.0, z)], &[[0, 1, 2]])
     };
-    let mut both = triangle(2.0, false);
-    let far = triangle(3.0, true);
-    both.positions.extend(&far.positions);
+    let mut both = triangle(2.0);
+    both.positions.extend(triangle(3.0).positions);
     both.faces.push(Face { positions: [3, 5, 4], texcoords: None, material: 1 });
     both.materials.push(Material { color: Vec3::X, texture: None });
     let view = draw(&both, &camera(32, 32), &flat(2));
     let middle = 17 * 32 + 15;
     assert_eq!((view.color[middle], view.depth[middle]), ([1.0; 3], 2.0));
     both.faces.swap(0, 1);
-    assert_eq!(draw(&both, &camera(32, 32), &flat(2)).color, view.color, "whatever the order");
-    // Behind the camera there is nothing to see.
-    let nothing = draw(&triangle(-2.0, false), &camera(32, 32), &flat(2));
+    assert_eq!(draw(&both, &camera(32, 32), &flat(2)).color, view.color, "in either order");
+    // A triangle behind the camera is invisible.
+    let nothing = draw(&triangle(-2.0), &camera(32, 32), &flat(2));
     assert!(nothing.alpha.iter().all(|a| *a == 0.0) && nothing.depth.iter().all(|d| *d == 0.0));
 }
