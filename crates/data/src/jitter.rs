@@ -5,6 +5,8 @@ use rand::Rng;
 use serde::{Deserialize, Serialize};
 use snapsnap_splat::Orbit;
 
+use crate::limits::outside;
+
 /// Uniform deviations of cameras within ± each value.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -47,18 +49,15 @@ impl JitterConfig {
 impl Jitter {
     fn problem(&self) -> Option<(&'static str, String)> {
         let Self { yaw, pitch, roll, distance, focal, look_at } = *self;
-        let limits = [
-            ("yaw", yaw, 180.0),
-            ("pitch", pitch, 80.0),
-            ("roll", roll, 180.0),
+        outside([
+            ("yaw", yaw, 0.0..=180.0),
+            ("pitch", pitch, 0.0..=80.0),
+            ("roll", roll, 0.0..=180.0),
             // Larger deviations would put the camera into the subject, or the subject out of view.
-            ("distance", distance, 0.7),
-            ("focal", focal, 0.5),
-            ("look_at", look_at, 0.5),
-        ];
-        let (key, value, limit) =
-            limits.into_iter().find(|(_, value, limit)| !(0.0..=*limit).contains(value))?;
-        Some((key, format!("is {value}, must be 0 to {limit}")))
+            ("distance", distance, 0.0..=0.7),
+            ("focal", focal, 0.0..=0.5),
+            ("look_at", look_at, 0.0..=0.5),
+        ])
     }
 
     /// Sum of both deviations.

@@ -2,6 +2,7 @@
 
 pub mod dataset;
 mod jitter;
+pub mod limits;
 pub mod photo;
 pub mod prepare;
 mod resize;

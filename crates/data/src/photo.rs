@@ -4,15 +4,17 @@ mod placing;
 #[cfg(test)]
 mod tests;
 
+use std::borrow::Cow;
 use std::path::Path;
 
 use image::{DynamicImage, GrayImage, RgbImage};
 
-use crate::resize::{Filter, resize};
+use crate::resize::bilinear;
 use snapsnap_base::FileError;
 use snapsnap_mesh::picture::{self, MAX_BYTES};
 
-pub use placing::{Mapping, place};
+pub use placing::Mapping;
+pub(crate) use placing::place;
 use placing::{Standing, placed, together};
 
 /// Least side of a photograph in pixels.
@@ -96,41 +98,34 @@ impl<'a> Cutout<'a> {
         placement: Placement,
     ) -> Result<Self, FileError> {
         let picture = picture::decode(path, MAX_BYTES)?;
-        let refuse = |message: String| FileError::Unsuitable { path: path.to_owned(), message };
         let (width, height) = (picture.width(), picture.height());
-        if placement == Placement::AsIs {
-            if (width as usize, height as usize) != (side, side) {
-                return Err(refuse(format!(
-                    "is {width}×{height}, --as-is needs a picture of the canvas's size, {side}×{side}"
-                )));
-            }
-        } else if width.min(height) < MIN_SIDE {
-            return Err(refuse(format!(
-                "is {width}×{height}; both sides must have at least {MIN_SIDE} pixels"
-            )));
+        if placement == Placement::AsIs && (width as usize, height as usize) != (side, side) {
+            let message =
+                format!("is {width}×{height}, --as-is needs a picture of the canvas's size, {side}×{side}");
+            return Err(FileError::unsuitable(path, message));
+        }
+        if placement != Placement::AsIs && width.min(height) < MIN_SIDE {
+            let message = format!("is {width}×{height}; both sides must have at least {MIN_SIDE} pixels");
+            return Err(FileError::unsuitable(path, message));
         }
         let (mask, mask_path) = match mask {
-            Some(mask_path) => {
-                let mask = grey(&picture::decode(mask_path, MAX_BYTES)?);
-                if mask.dimensions() != (width, height) {
-                    let message = format!(
-                        "the mask is {}×{}, its picture {} is {width}×{height}",
-                        mask.width(),
-                        mask.height(),
-                        path.display()
-                    );
-                    return Err(FileError::Unsuitable { path: mask_path.to_owned(), message });
-                }
-                (mask, mask_path)
-            }
-            None => (alpha(&picture).map_err(refuse)?, path),
+            Some(mask_path) => (grey(&picture::decode(mask_path, MAX_BYTES)?), mask_path),
+            None => (alpha(&picture).map_err(|message| FileError::unsuitable(path, message))?, path),
         };
+        let (mask_width, mask_height) = mask.dimensions();
+        if (mask_width, mask_height) != (width, height) {
+            let path = path.display();
+            let message =
+                format!("the mask is {mask_width}×{mask_height}, its picture {path} is {width}×{height}");
+            return Err(FileError::unsuitable(mask_path, message));
+        }
         let rgb = picture.into_rgb8();
         // The demo includes every pixel that is not 0. Lossy masks have many such pixels outside the person.
         let least = if matches!(placement, Placement::Demo { .. }) { 1 } else { u8::MAX.div_ceil(2) };
         let person = Rect::around(&mask, least).ok_or_else(|| nobody(mask_path, placement))?;
         if is_single_colour(&rgb, &mask) {
-            return Err(refuse("the person is of a single colour: this is no photograph".into()));
+            let message = "the person is of a single colour: this is no photograph";
+            return Err(FileError::unsuitable(path, message));
         }
         let source = format!(
             "{width}×{height}, person's box {}×{} at ({}, {})",
@@ -148,7 +143,7 @@ impl<'a> Cutout<'a> {
     ) -> Result<Canvas, FileError> {
         let Self { mask_path, rgb, mask, person, source } = self;
         let canvas = match placement {
-            Placement::AsIs => on_canvas(&rgb, &mask, side, source + ", used as it is"),
+            Placement::AsIs => on_canvas(&rgb, &mask, source + ", used as it is"),
             Placement::Training { height } => {
                 let source = if common.is_some() { source + ", with the other" } else { source };
                 placed(&rgb, &mask, common.unwrap_or(Standing::alone(person)), [height, side], &source)
@@ -163,7 +158,7 @@ fn nobody(mask_path: &Path, placement: Placement) -> FileError {
     let least =
         if matches!(placement, Placement::Demo { .. }) { "255, which `mode.compat` needs" } else { "128" };
     let message = format!("the mask is empty: no pixel of the person reaches {least}");
-    FileError::Unsuitable { path: mask_path.to_owned(), message }
+    FileError::unsuitable(mask_path, message)
 }
 
 /// A mask picture's brightness, black where it is transparent.
@@ -176,27 +171,20 @@ fn grey(picture: &DynamicImage) -> GrayImage {
 }
 
 /// The alpha channel as a mask.
-fn alpha(picture: &DynamicImage) -> Result<GrayImage, String> {
+fn alpha(picture: &DynamicImage) -> Result<GrayImage, &'static str> {
     if !picture.color().has_alpha() {
         return Err(
-            "has no alpha channel: cut the person out, or give masks with --masks FRONT_MASK BACK_MASK"
-                .into(),
+            "has no alpha channel: cut the person out, or give masks with --masks FRONT_MASK BACK_MASK",
         );
     }
     // The usual case needs no copy.
-    let converted;
-    let rgba = match picture {
-        DynamicImage::ImageRgba8(rgba) => rgba,
-        other => {
-            converted = other.to_rgba8();
-            &converted
-        }
-    };
+    let rgba = picture.as_rgba8().map_or_else(|| Cow::Owned(picture.to_rgba8()), Cow::Borrowed);
     let mask = GrayImage::from_fn(rgba.width(), rgba.height(), |x, y| image::Luma([rgba.get_pixel(x, y)[3]]));
     if mask.pixels().all(|p| p[0] == u8::MAX) {
-        let message = "is opaque everywhere, so its alpha channel does not show the person: cut the person out, or \
-                       give masks with --masks FRONT_MASK BACK_MASK";
-        return Err(message.into());
+        return Err(
+            "is opaque everywhere, so its alpha channel does not show the person: cut the person out, or \
+                    give masks with --masks FRONT_MASK BACK_MASK",
+        );
     }
     Ok(mask)
 }
@@ -238,9 +226,9 @@ impl Rect {
 }
 
 /// The picture without a resize (docs/method.md, "Photographs on the canvas").
-fn on_canvas(rgb: &RgbImage, mask: &GrayImage, side: usize, report: String) -> Canvas {
-    let area = side * side;
+pub(crate) fn on_canvas(rgb: &RgbImage, mask: &GrayImage, report: String) -> Canvas {
     let mask: Vec<f32> = mask.pixels().map(|p| unit(p[0])).collect();
+    let area = mask.len();
     let mut values = vec![0.0; 3 * area];
     for (i, pixel) in rgb.pixels().enumerate() {
         for c in 0..3 {
@@ -269,7 +257,7 @@ fn placed_as_demo(
     let width = (scaled / 2 * 2).clamp(2.min(side), side / 2 * 2);
     let (left, top) = ((side - width) / 2, (side - height) / 2);
     let mapping = Mapping::of(person, [left, top], [width, height]);
-    let [r, g, b, m] = planes(rgb, mask, person, |color, _| unit(color), [height, width], Filter::Bilinear);
+    let [r, g, b, m] = planes(rgb, mask, person, |color, _| unit(color), [height, width], bilinear);
     let area = side * side;
     let (mut values, mut on_canvas) = (vec![0.0; 3 * area], vec![0.0; area]);
     for y in 0..height {
@@ -297,7 +285,7 @@ fn planes(
     person: Rect,
     color: impl Fn(u8, u8) -> f32,
     size: [usize; 2],
-    filter: Filter,
+    resize: fn(Vec<f32>, [usize; 2], [usize; 2]) -> Vec<f32>,
 ) -> [Vec<f32>; 4] {
     std::array::from_fn(|channel| {
         let rows = person.y..person.y + person.height;
@@ -306,7 +294,7 @@ fn planes(
             let m = mask.get_pixel(x, y)[0];
             if channel == 3 { unit(m) } else { color(rgb.get_pixel(x, y)[channel], m) }
         };
-        resize(places.map(value).collect(), [person.height as usize, person.width as usize], size, filter)
+        resize(places.map(value).collect(), [person.height as usize, person.width as usize], size)
     })
 }
 

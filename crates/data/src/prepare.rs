@@ -11,6 +11,7 @@ use crate::JitterConfig;
 use crate::dataset::{
     Arrangement, Description, Drawn, Folder, Layout, MAX_RESOLUTION, MAX_VIEWS, Made, Split,
 };
+use crate::limits::outside;
 use snapsnap_base::FileError;
 use snapsnap_base::config::Schema;
 use snapsnap_base::random::stream;
@@ -72,17 +73,18 @@ impl Schema for DataConfig {
     const RENAMED: &'static [(&'static str, &'static str)] = &[("views.samples", "views.samples_per_axis")];
 
     fn refusal(&self) -> Option<(String, String)> {
-        let ViewsConfig {
-            count,
-            arrangement,
-            front_within_degrees,
-            resolution,
-            samples_per_axis,
-            layout,
-            ..
-        } = self.views;
-        if count == 0 || count > MAX_VIEWS {
-            return Some(("views.count".into(), format!("is {count}, must be 1 to {MAX_VIEWS}")));
+        let ViewsConfig { count, arrangement, layout, .. } = self.views;
+        let most = if self.views.high_resolution { MAX_RESOLUTION / 2 } else { MAX_RESOLUTION };
+        let ranges = [
+            ("count", count as f64, 1.0..=MAX_VIEWS as f64),
+            ("front_within_degrees", self.views.front_within_degrees, 0.0..=180.0),
+            ("pitch", self.views.pitch, -60.0..=60.0),
+            ("distance", self.views.distance, 0.5..=10.0),
+            ("resolution", f64::from(self.views.resolution), 1.0..=f64::from(most)),
+            ("samples_per_axis", self.views.samples_per_axis as f64, 1.0..=6.0),
+        ];
+        if let Some((key, message)) = outside(ranges) {
+            return Some((format!("views.{key}"), message));
         }
         if arrangement == Arrangement::Groups && !count.is_multiple_of(4) {
             return Some(("views.count".into(), format!("is {count}, must be a multiple of 4 in groups")));
@@ -90,26 +92,6 @@ impl Schema for DataConfig {
         if arrangement == Arrangement::Groups && layout == Layout::Authors {
             let message = "is \"groups\", which the authors' layout does not support".into();
             return Some(("views.arrangement".into(), message));
-        }
-        if !(0.0..=180.0).contains(&front_within_degrees) {
-            let message = format!("is {front_within_degrees}, must be 0 to 180");
-            return Some(("views.front_within_degrees".into(), message));
-        }
-        let orbits = [
-            ("views.pitch", self.views.pitch, -60.0..=60.0),
-            ("views.distance", self.views.distance, 0.5..=10.0),
-        ];
-        if let Some((key, value, range)) = orbits.into_iter().find(|(_, value, range)| !range.contains(value))
-        {
-            return Some((key.into(), format!("is {value}, must be {} to {}", range.start(), range.end())));
-        }
-        let most = if self.views.high_resolution { MAX_RESOLUTION / 2 } else { MAX_RESOLUTION };
-        if resolution == 0 || resolution > most {
-            return Some(("views.resolution".into(), format!("is {resolution}, must be 1 to {most}")));
-        }
-        if !(1..=6).contains(&samples_per_axis) {
-            let message = format!("is {samples_per_axis}, must be 1 to 6");
-            return Some(("views.samples_per_axis".into(), message));
         }
         self.jitter.problem().map(|(key, message)| (format!("jitter.{key}"), message))
     }

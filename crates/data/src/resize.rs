@@ -4,28 +4,17 @@ use image::imageops::{self, FilterType};
 use image::{ImageBuffer, Luma};
 use snapsnap_base::bilinear::taps;
 
-/// Filter of a resize.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Filter {
-    /// The image crate's Lanczos filter, antialiased when shrinking.
-    Lanczos3,
-    /// The four samples around each target pixel's centre, with repeated edges. It aliases when shrinking.
-    Bilinear,
+/// Resizes `values` of `from` (rows, columns) to `to` with the image crate's Lanczos filter, antialiased when shrinking.
+/// Values are in [0, 1].
+pub fn lanczos3(values: Vec<f32>, from: [usize; 2], to: [usize; 2]) -> Vec<f32> {
+    let plane = ImageBuffer::<Luma<f32>, _>::from_raw(from[1] as u32, from[0] as u32, values)
+        .expect("as many values as pixels");
+    imageops::resize(&plane, to[1] as u32, to[0] as u32, FilterType::Lanczos3).into_raw()
 }
 
-/// Resizes `values` of `from` (rows, columns) to `to`. Values are in [0, 1].
-pub fn resize(values: Vec<f32>, from: [usize; 2], to: [usize; 2], filter: Filter) -> Vec<f32> {
-    match filter {
-        Filter::Bilinear => bilinear(&values, from, to),
-        Filter::Lanczos3 => {
-            let plane = ImageBuffer::<Luma<f32>, _>::from_raw(from[1] as u32, from[0] as u32, values)
-                .expect("as many values as pixels");
-            imageops::resize(&plane, to[1] as u32, to[0] as u32, FilterType::Lanczos3).into_raw()
-        }
-    }
-}
-
-fn bilinear(values: &[f32], [rows, columns]: [usize; 2], to: [usize; 2]) -> Vec<f32> {
+/// Resizes `values` of `from` (rows, columns) to `to` with the four samples around each target pixel's centre and with
+/// repeated edges. It aliases when shrinking.
+pub fn bilinear(values: Vec<f32>, [rows, columns]: [usize; 2], to: [usize; 2]) -> Vec<f32> {
     let (down, across) = (taps(rows, to[0], false), taps(columns, to[1], false));
     let mut out = Vec::with_capacity(to[0] * to[1]);
     for &(y0, y1, fy) in &down {
@@ -44,15 +33,15 @@ mod tests {
     /// [0, 1] → [0, ¼, ¾, 1] (docs/method.md, "Check values").
     #[test]
     fn bilinear_has_its_published_check_value() {
-        assert_eq!(resize(vec![0.0, 1.0], [1, 2], [1, 4], Filter::Bilinear), [0.0, 0.25, 0.75, 1.0]);
+        assert_eq!(bilinear(vec![0.0, 1.0], [1, 2], [1, 4]), [0.0, 0.25, 0.75, 1.0]);
     }
 
     #[test]
     fn lanczos_keeps_constants_and_averages_fine_detail_away() {
-        let flat = resize(vec![0.25; 48], [6, 8], [3, 5], Filter::Lanczos3);
+        let flat = lanczos3(vec![0.25; 48], [6, 8], [3, 5]);
         assert!(flat.iter().all(|v| (v - 0.25).abs() < 1e-6), "{flat:?}");
         let stripes: Vec<f32> = (0..64 * 64).map(|i| (i % 2) as f32).collect();
-        let small = resize(stripes, [64, 64], [8, 8], Filter::Lanczos3);
+        let small = lanczos3(stripes, [64, 64], [8, 8]);
         assert!(small.iter().all(|v| (v - 0.5).abs() < 0.05), "{small:?}");
     }
 }

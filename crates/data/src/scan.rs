@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 
 use glam::{Mat3, Vec3};
 use rand::Rng;
+use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use crate::dataset::Split;
@@ -85,7 +86,7 @@ impl Collection {
 }
 
 /// Subjects of THuman2.0 for validation.
-pub const VALIDATION: [u32; 100] = [
+const VALIDATION: [u32; 100] = [
     0, 1, 2, 3, 6, 9, 12, 18, 19, 21, 23, 24, 25, 30, 36, 42, 48, 54, 60, 66, 68, 72, 78, 84, 90, 96, 102,
     108, 114, 120, 126, 132, 138, 144, 150, 156, 162, 168, 174, 180, 186, 192, 198, 204, 210, 216, 222, 228,
     234, 240, 246, 252, 258, 264, 270, 276, 282, 288, 294, 300, 302, 306, 312, 318, 324, 330, 336, 342, 348,
@@ -94,7 +95,7 @@ pub const VALIDATION: [u32; 100] = [
 ];
 
 /// Subjects of THuman2.1 in loose clothes, for testing.
-pub const LOOSE: [u32; 50] = [
+const LOOSE: [u32; 50] = [
     2397, 1685, 2396, 2398, 2414, 2403, 1678, 2252, 835, 1403, 2251, 836, 951, 1321, 2410, 1679, 2199, 1391,
     2264, 1350, 1982, 1981, 1122, 2413, 1819, 1043, 1267, 2186, 865, 2148, 1392, 2092, 2198, 2409, 839, 2250,
     1681, 837, 2109, 1398, 1115, 659, 1123, 1816, 2230, 1693, 1367, 713, 2258, 1124,
@@ -168,10 +169,9 @@ fn search(
     if !visited.insert(folder.canonicalize().unwrap_or_else(|_| folder.to_owned())) {
         return Ok(());
     }
-    let mut entries = Vec::new();
-    for entry in fs::read_dir(folder).map_err(FileError::read(folder))? {
-        entries.push(entry.map_err(FileError::read(folder))?.path());
-    }
+    let entries = fs::read_dir(folder).map_err(FileError::read(folder))?;
+    let entries = entries.map(|entry| entry.map(|entry| entry.path()));
+    let mut entries: Vec<PathBuf> = entries.collect::<Result<_, _>>().map_err(FileError::read(folder))?;
     entries.sort_unstable();
     let is_scan = |path: &Path| {
         let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
@@ -183,9 +183,8 @@ fn search(
         return Ok(());
     }
     for path in entries {
-        let hidden = path.file_name().is_some_and(|name| name.to_string_lossy().starts_with('.'));
         // Some systems add hidden files to copied folders.
-        if hidden {
+        if path.file_name().is_some_and(|name| name.to_string_lossy().starts_with('.')) {
             continue;
         }
         if is_scan(&path) {
@@ -205,7 +204,7 @@ fn search(
 pub fn normalise(
     mesh: &mut Mesh,
     collection: Collection,
-    jitter: Option<&mut impl Rng>,
+    jitter: Option<&mut ChaCha8Rng>,
 ) -> Result<(), MeshError> {
     let axes = collection.axes();
     mesh.positions.iter_mut().for_each(|p| *p = axes * *p);
@@ -240,16 +239,11 @@ pub fn normalise(
 #[cfg(test)]
 mod tests {
     use rand::SeedableRng;
-    use rand_chacha::ChaCha8Rng;
 
     use super::*;
 
     fn cloud(positions: &[[f32; 3]]) -> Mesh {
         Mesh { positions: positions.iter().map(|p| Vec3::from_array(*p)).collect(), ..Mesh::default() }
-    }
-
-    fn none() -> Option<&'static mut ChaCha8Rng> {
-        None
     }
 
     #[test]
@@ -273,20 +267,12 @@ mod tests {
         let subjects = |below: &str| -> Vec<String> {
             find(&root.join(below)).expect("finds").into_iter().map(|source| source.subject).collect()
         };
-        [
-            "th/0007/0007.obj",
-            "th/0007/other.ply",
-            "th/12/12.OBJ",
-            "th/.x/a.obj",
-            "th/notes.txt",
-            "th/._7.obj",
-        ]
-        .into_iter()
-        .for_each(touch);
+        ["th/0007/0007.obj", "th/0007/other.ply", "th/12/12.OBJ"].into_iter().for_each(touch);
+        ["th/.x/a.obj", "th/notes.txt", "th/._7.obj"].into_iter().for_each(touch);
         assert_eq!(subjects("th"), ["0007", "0012"]);
         ["ch/a/mesh-f00011.obj", "ch/a/mesh-f00021.obj", "ch/b/mesh-f00011.obj"].into_iter().for_each(touch);
         assert_eq!(subjects("ch"), ["a-mesh-f00011", "a-mesh-f00021", "b-mesh-f00011"]);
-        ["2k/Training/00003/00003.ply"].into_iter().for_each(touch);
+        touch("2k/Training/00003/00003.ply");
         assert_eq!(subjects("2k"), ["0003"]);
         assert_eq!(subjects("2k/Training/00003/00003.ply"), ["0003"]);
         ["twice/0001.obj", "twice/1.ply"].into_iter().for_each(touch);
@@ -325,7 +311,7 @@ mod tests {
     #[test]
     fn a_normalised_scan_stands_on_the_floor_at_its_height() {
         let mut mesh = cloud(&[[0.2, -3.0, 0.1], [0.4, 9.0, -0.3]]);
-        normalise(&mut mesh, Collection::Thuman20, none()).expect("has height");
+        normalise(&mut mesh, Collection::Thuman20, None).expect("has height");
         let (low, high) = mesh.bounds();
         assert!(low.y.abs() < 1e-6 && (high.y - 1.8).abs() < 1e-6);
         // Not moved sideways, only scaled by 0.15.
@@ -335,7 +321,7 @@ mod tests {
     #[test]
     fn scans_without_height_are_refused() {
         for positions in [&[][..], &[[1.0, 2.0, 3.0]], &[[0.0, 1.0, 0.0], [1.0, 1.0, 0.0]]] {
-            let result = normalise(&mut cloud(positions), Collection::Other, none());
+            let result = normalise(&mut cloud(positions), Collection::Other, None);
             assert_eq!(result, Err(MeshError::NoHeight));
         }
     }
@@ -344,10 +330,10 @@ mod tests {
     fn sets_with_other_axes_and_places_are_turned_and_centred() {
         // M·(a, b, c) = (−b, c, −a): height runs along the third axis.
         let mut mesh = cloud(&[[1.0, 2.0, 0.0], [1.0, 2.0, 3.6]]);
-        normalise(&mut mesh, Collection::Thuman21, none()).expect("has height");
+        normalise(&mut mesh, Collection::Thuman21, None).expect("has height");
         assert!((mesh.positions[1] - Vec3::new(-1.0, 1.8, -0.5)).length() < 1e-6, "{mesh:?}");
         let mut mesh = cloud(&[[5.0, 0.0, 7.0], [5.4, 1.8, 7.2], [5.2, 0.9, 7.4]]);
-        normalise(&mut mesh, Collection::TwoK2K, none()).expect("has height");
+        normalise(&mut mesh, Collection::TwoK2K, None).expect("has height");
         let mean = mesh.positions.iter().sum::<Vec3>() / 3.0;
         assert!(mean.x.abs() < 1e-5 && mean.z.abs() < 1e-5);
     }
@@ -363,12 +349,10 @@ mod tests {
                 normalise(&mut mesh, Collection::Thuman20, Some(&mut random)).expect("has height");
                 let (low, high) = mesh.bounds();
                 let middle = (low + high) / 2.0;
-                let reach = if wide {
-                    0.01
-                } else if high.y < 1.8 {
-                    0.1
-                } else {
-                    0.05
+                let reach = match wide {
+                    true => 0.01,
+                    false if high.y < 1.8 => 0.1,
+                    false => 0.05,
                 };
                 assert!(middle.x.abs() <= reach + 1e-6 && middle.z.abs() <= reach + 1e-6);
                 assert!(low.y.abs() < 1e-6);

@@ -9,8 +9,7 @@ use std::rc::Rc;
 
 use serde_json::Value as Json;
 
-use snapsnap_base::FileError;
-use snapsnap_base::file;
+use snapsnap_base::{FileError, file};
 
 /// Largest file that is read, in bytes. Parameters take a few kilobytes.
 const MAX_BYTES: u64 = 16 << 20;
@@ -55,8 +54,9 @@ fn from_json(bytes: &[u8]) -> Result<Vec<f64>, String> {
 fn from_pickle(bytes: &[u8]) -> Result<Vec<f64>, String> {
     let Value::Dict(entries) = unpickle(bytes)? else { return Err("it holds no dictionary".into()) };
     let entries = entries.borrow();
-    let value =
-        entries.chunks_exact(2).find(|pair| matches!(&pair[0], Value::Text(key) if **key == *ORIENTATION));
+    let value = entries
+        .chunks_exact(2)
+        .find(|pair| matches!(&pair[0], Value::Bytes(key) if **key == *ORIENTATION.as_bytes()));
     let value = &value.ok_or_else(|| format!("`{ORIENTATION}` is missing"))?[1];
     numbers(value, &mut { MAX_NODES }).ok_or_else(|| format!("`{ORIENTATION}` is no array of numbers"))
 }
@@ -67,8 +67,8 @@ enum Value {
     None,
     Mark,
     Number(f64),
+    /// Bytes, or text in UTF-8. Strings of Python 2 may be either.
     Bytes(Rc<[u8]>),
-    Text(Rc<str>),
     /// A list or a tuple.
     List(Rc<RefCell<Vec<Value>>>),
     /// Keys and values in turn.
@@ -95,36 +95,24 @@ fn numbers(value: &Value, nodes: &mut usize) -> Option<Vec<f64>> {
         Value::Object(parts) => {
             let parts = parts.borrow();
             // _reconstruct(…) with the state (version, shape, dtype, is_fortran, bytes).
-            let [Value::Text(_), _, Value::List(state)] = parts.as_slice() else { return None };
+            let [Value::Bytes(_), _, Value::List(state)] = parts.as_slice() else { return None };
             let state = state.borrow();
             let [_, _, Value::Object(dtype), _, bytes] = state.as_slice() else { return None };
             let bytes = raw(bytes)?;
             let dtype = dtype.borrow();
             let Some(Value::List(arguments)) = dtype.get(1) else { return None };
             let arguments = arguments.borrow();
-            let Some(Value::Text(kind)) = arguments.first() else { return None };
-            let big = match dtype.get(2) {
-                Some(Value::List(state)) => {
-                    matches!(state.borrow().get(1), Some(Value::Text(order)) if **order == *">")
-                }
-                _ => false,
-            };
-            let eight = |bytes: &[u8]| {
-                let mut out = [0; 8];
-                out[..bytes.len()].copy_from_slice(bytes);
-                if big {
-                    out[..bytes.len()].reverse();
-                }
-                out
-            };
+            let Some(Value::Bytes(kind)) = arguments.first() else { return None };
+            let is_big_endian = matches!(dtype.get(2), Some(Value::List(state))
+                if matches!(state.borrow().get(1), Some(Value::Bytes(order)) if **order == *b">"));
             match &**kind {
-                "f8" => Some(bytes.chunks_exact(8).map(|b| f64::from_le_bytes(eight(b))).collect()),
-                "f4" => {
-                    let four = |b: &[u8]| {
-                        let [a, b, c, d, ..] = eight(b);
-                        f64::from(f32::from_le_bytes([a, b, c, d]))
-                    };
-                    Some(bytes.chunks_exact(4).map(four).collect())
+                b"f8" => {
+                    let read = if is_big_endian { f64::from_be_bytes } else { f64::from_le_bytes };
+                    Some(bytes.as_chunks().0.iter().map(|b| read(*b)).collect())
+                }
+                b"f4" => {
+                    let read = if is_big_endian { f32::from_be_bytes } else { f32::from_le_bytes };
+                    Some(bytes.as_chunks().0.iter().map(|b| f64::from(read(*b))).collect())
                 }
                 _ => None,
             }
@@ -137,15 +125,14 @@ fn numbers(value: &Value, nodes: &mut usize) -> Option<Vec<f64>> {
 fn raw(value: &Value) -> Option<Rc<[u8]>> {
     match value {
         Value::Bytes(bytes) => Some(bytes.clone()),
-        // Strings of Python 2 that are valid text.
-        Value::Text(text) => Some(text.as_bytes().into()),
         Value::Object(parts) => {
             let parts = parts.borrow();
-            let [Value::Text(name), Value::List(arguments)] = parts.as_slice() else { return None };
+            let [Value::Bytes(name), Value::List(arguments)] = parts.as_slice() else { return None };
             let arguments = arguments.borrow();
-            let Some(Value::Text(text)) = arguments.first().filter(|_| **name == *"_codecs.encode") else {
+            let Some(Value::Bytes(text)) = arguments.first().filter(|_| **name == *b"_codecs.encode") else {
                 return None;
             };
+            let text = std::str::from_utf8(text).ok()?;
             text.chars().map(|c| u8::try_from(u32::from(c)).ok()).collect()
         }
         _ => None,
@@ -184,21 +171,9 @@ impl<'a> Machine<'a> {
         Ok(taken.iter().rev().fold(0, |sum, byte| sum << 8 | usize::from(*byte)))
     }
 
-    fn line(&mut self) -> Result<&'a str, String> {
+    fn line(&mut self) -> Result<&'a [u8], String> {
         let end = self.rest.iter().position(|b| *b == b'\n').ok_or("it is cut off")?;
-        let line = self.take(end + 1)?;
-        std::str::from_utf8(&line[..end]).map_err(|_| "a name is not text".into())
-    }
-
-    fn text(&mut self, length: usize) -> Result<Value, String> {
-        let text = self.take(length)?;
-        // Strings of Python 2 may be bytes.
-        Ok(std::str::from_utf8(text)
-            .map_or_else(|_| Value::Bytes(text.into()), |text| Value::Text(text.into())))
-    }
-
-    fn bytes(&mut self, length: usize) -> Result<Value, String> {
-        Ok(Value::Bytes(self.take(length)?.into()))
+        Ok(&self.take(end + 1)?[..end])
     }
 
     fn pop(&mut self) -> Result<Value, String> {
@@ -269,53 +244,33 @@ impl<'a> Machine<'a> {
                 let bytes = self.take(8)?.try_into().map_err(|_| "it is cut off")?;
                 Value::Number(f64::from_be_bytes(bytes))
             }
-            b'X' | b'T' => {
-                let length = self.whole(4)?;
-                self.text(length)?
-            }
-            0x8c | b'U' => {
-                let length = self.whole(1)?;
-                self.text(length)?
-            }
-            0x8d => {
-                let length = self.whole(8)?;
-                self.text(length)?
-            }
-            b'B' => {
-                let length = self.whole(4)?;
-                self.bytes(length)?
-            }
-            b'C' => {
-                let length = self.whole(1)?;
-                self.bytes(length)?
-            }
-            0x8e | 0x96 => {
-                let length = self.whole(8)?;
-                self.bytes(length)?
+            b'X' | b'T' | b'B' | 0x8c | b'U' | b'C' | 0x8d | 0x8e | 0x96 => {
+                let length = self.whole(match operation {
+                    b'X' | b'T' | b'B' => 4,
+                    0x8c | b'U' | b'C' => 1,
+                    _ => 8,
+                })?;
+                Value::Bytes(self.take(length)?.into())
             }
             b'}' => Value::Dict(shared(Vec::new())),
             b']' | b')' => Value::List(shared(Vec::new())),
             b't' => Value::List(shared(self.above_mark()?)),
             0x85..=0x87 => Value::List(shared(self.last(usize::from(operation) - 0x84)?)),
-            b'a' => {
-                let values = self.last(1)?;
-                return self.add(values);
-            }
-            b's' => {
-                let values = self.last(2)?;
-                return self.add(values);
-            }
-            b'e' | b'u' => {
-                let values = self.above_mark()?;
+            b'a' | b's' | b'e' | b'u' => {
+                let values = match operation {
+                    b'a' => self.last(1)?,
+                    b's' => self.last(2)?,
+                    _ => self.above_mark()?,
+                };
                 return self.add(values);
             }
             b'c' => {
                 let (module, name) = (self.line()?, self.line()?);
-                Value::Text(format!("{module}.{name}").into())
+                Value::Bytes([module, name].join(&b'.').into())
             }
             0x93 => {
                 self.last(2)?;
-                Value::Text("a name".into())
+                Value::Bytes(b"a name".as_slice().into())
             }
             // A call, or a new object: function and arguments.
             b'R' | 0x81 => Value::Object(shared(self.last(2)?)),

@@ -16,7 +16,7 @@ pub fn person() -> &'static Mesh {
     static PERSON: OnceLock<Mesh> = OnceLock::new();
     PERSON.get_or_init(|| {
         let mut mesh = synth::person("test/data");
-        normalise(&mut mesh, Collection::Other, None::<&mut rand_chacha::ChaCha8Rng>).expect("has height");
+        normalise(&mut mesh, Collection::Other, None).expect("has height");
         mesh
     })
 }
@@ -27,14 +27,8 @@ pub fn rectangle() -> (Mesh, Vec3) {
     let centre = Vec3::new(0.0, 0.9, 0.05);
     let corners = [(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)];
     let normal = right.cross(up).normalize();
-    let mesh = Mesh {
-        positions: corners.map(|(a, b)| centre + a * right + b * up).to_vec(),
-        faces: [[0, 1, 2], [0, 2, 3]]
-            .map(|positions| Face { positions, texcoords: None, material: 0 })
-            .to_vec(),
-        materials: vec![Material { color: Vec3::new(0.9, 0.5, 0.2), texture: None }],
-        ..Mesh::default()
-    };
+    let positions = corners.map(|(a, b)| centre + a * right + b * up).to_vec();
+    let mesh = mesh(positions, [[0, 1, 2, 3]], Vec3::new(0.9, 0.5, 0.2));
     (mesh, normal * (0.9 / normal.dot(centre)))
 }
 
@@ -46,11 +40,17 @@ pub fn block() -> Mesh {
     let (middle, half) = BLOCK;
     let corner = |i: u32| Vec3::new((i & 1) as f32, (i >> 1 & 1) as f32, (i >> 2) as f32) * 2.0 - 1.0;
     let sides = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]];
-    let faces = sides.iter().flat_map(|[a, b, c, d]| [[*a, *b, *c], [*a, *c, *d]]);
+    let positions = (0..8).map(|i| middle + half * corner(i)).collect();
+    mesh(positions, sides, Vec3::new(0.3, 0.6, 0.8))
+}
+
+/// A mesh of one colour with faces of four corners.
+fn mesh<const N: usize>(positions: Vec<Vec3>, faces: [[u32; 4]; N], color: Vec3) -> Mesh {
+    let faces = faces.into_iter().flat_map(|[a, b, c, d]| [[a, b, c], [a, c, d]]);
     Mesh {
-        positions: (0..8).map(|i| middle + half * corner(i)).collect(),
+        positions,
         faces: faces.map(|positions| Face { positions, texcoords: None, material: 0 }).collect(),
-        materials: vec![Material { color: Vec3::new(0.3, 0.6, 0.8), texture: None }],
+        materials: vec![Material { color, texture: None }],
         ..Mesh::default()
     }
 }
@@ -62,7 +62,7 @@ pub fn off_block(p: Vec3) -> f32 {
     (out.max(Vec3::ZERO).length() + out.max_element().min(0.0)).abs()
 }
 
-/// A data set with `subjects` copies of a mesh in train.
+/// As [`made`], with a config of these values.
 pub fn data_set(
     mesh: &Mesh,
     layout: Layout,
@@ -71,13 +71,18 @@ pub fn data_set(
     high_resolution: bool,
     subjects: usize,
 ) -> (TempDir, Arc<Folder>) {
-    let temporary = tempfile::tempdir().expect("temporary folder");
-    let root = temporary.path().join(format!("people_{resolution}_{views}"));
     let mut config = DataConfig::default();
     config.views.layout = layout;
     config.views.resolution = resolution;
     config.views.count = views;
     config.views.high_resolution = high_resolution;
+    made(&config, mesh, subjects)
+}
+
+/// A data set of this config with `subjects` copies of a mesh in train.
+pub fn made(config: &DataConfig, mesh: &Mesh, subjects: usize) -> (TempDir, Arc<Folder>) {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let root = temporary.path().join(format!("people_{}_{}", config.views.resolution, config.views.count));
     let folder = Folder::create(&root, config.description("a test")).expect("makes the folder");
     for subject in 0..subjects {
         let name = format!("{subject:04}");

@@ -9,18 +9,14 @@ use snapsnap_base::FileError;
 use snapsnap_net::weights::{Source, WeightsError, write_tensors};
 use snapsnap_ops::host;
 
-use crate::learner::Learner;
+use crate::learner::{Learner, Progress};
 use crate::networks::{Rows, row};
-use crate::progress::Progress;
 use crate::task::Task;
 
 /// Metadata key of the progress, as JSON.
 const PROGRESS_KEY: &str = "snapsnap.training";
 
-/// Writes the state of a run.
-///
-/// # Errors
-/// [`WeightsError::File`]; the former file stays.
+/// Writes the state of a run. After an error, the former file stays.
 pub(crate) fn save<T: Task>(path: &Path, learner: &Learner<T>) -> Result<(), WeightsError> {
     let (mut rows, times) = learner.optimizer.record();
     let progress = Progress { times, ..learner.progress.clone() };
@@ -41,9 +37,6 @@ pub(crate) fn save<T: Task>(path: &Path, learner: &Learner<T>) -> Result<(), Wei
 }
 
 /// Restores a learner of the same config from the state of a run.
-///
-/// # Errors
-/// [`WeightsError`] for a file that is damaged or of other networks.
 pub(crate) fn load<T: Task>(
     path: &Path,
     learner: &mut Learner<T>,
@@ -59,16 +52,12 @@ pub(crate) fn load<T: Task>(
     if progress.loss_scale.is_some_and(|scale| !scale.is_sound()) {
         return Err(wrong(format!("{PROGRESS_KEY}: loss_scale is out of range")));
     }
-    let mut rows = BTreeMap::new();
-    for name in source.tensors().keys() {
-        rows.insert(name.clone(), source.read_f32(name)?);
-    }
+    let read = |name: &String| Ok((name.clone(), source.read_f32(name)?));
+    let mut rows = source.tensors().keys().map(read).collect::<Result<BTreeMap<_, _>, WeightsError>>()?;
     let shapes = learner.networks.shapes();
-    let size = |name: &str| shapes.get(name).map(|shape| shape.iter().product::<usize>());
     for (key, values) in &rows {
-        let name = key.split_once('/').map_or("", |(_, name)| name);
-        let fits = size(name) == Some(values.len());
-        if !fits {
+        let shape = key.split_once('/').and_then(|(_, name)| shapes.get(name));
+        if shape.is_none_or(|shape| shape.iter().product::<usize>() != values.len()) {
             return Err(wrong(format!("{key} does not fit the configured networks")));
         }
     }

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
+use snapsnap_data::limits::outside;
 use snapsnap_data::sample::SampleConfig;
 use snapsnap_eval::lpips::MIN_SIDE;
 use snapsnap_net::config::{ConfMode, Config, ModeConfig, NetworkConfig, RegressorConfig, Schema};
@@ -11,8 +12,8 @@ use crate::optimizer::OptimizerConfig;
 use crate::precision::Precision;
 use crate::schedule::Schedule;
 
-/// All settings of a training.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+/// All settings of a training. The default is the published training.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TrainConfig {
     /// The point predictor.
@@ -155,24 +156,6 @@ fn late() -> f64 {
     0.8
 }
 
-impl Default for TrainConfig {
-    /// The published training.
-    fn default() -> Self {
-        Self {
-            network: NetworkConfig::default(),
-            regressor: RegressorConfig::default(),
-            mode: ModeConfig::default(),
-            data: DataSets::default(),
-            samples: SampleConfig::default(),
-            training: TrainingConfig::default(),
-            optimizer: OptimizerConfig::default(),
-            schedule: Schedule::published(),
-            stage1: Stage1Config::default(),
-            stage2: Stage2Config::default(),
-        }
-    }
-}
-
 impl Default for TrainingConfig {
     fn default() -> Self {
         Self {
@@ -258,65 +241,64 @@ impl TrainConfig {
         let (t, two) = (&self.training, &self.stage2);
         let lpips = two.lpips.as_ref();
         let ranges = [
-            ("training.steps", t.steps as f64, 1.0, 1e8),
-            ("training.batch", t.batch as f64, 1.0, 4096.0),
-            ("training.accumulate", t.accumulate as f64, 1.0, 4096.0),
-            ("training.workers", t.workers as f64, 1.0, 256.0),
-            ("training.prefetch", t.prefetch as f64, 0.0, 256.0),
-            ("training.log_every", t.log_every as f64, 1.0, 1e6),
-            ("training.validation_samples", t.validation_samples as f64, 0.0, 1e5),
-            ("training.clip", t.clip, 1e-9, 1e9),
-            ("training.ema_decay", t.ema_decay, 0.0, 0.999_999),
-            ("stage1.confidence_weight", self.stage1.confidence_weight, 0.0, 1e6),
-            ("stage2.l1_share", two.l1_share, 0.0, 1.0),
-            ("stage2.alpha_weight", two.alpha_weight, 0.0, 1e6),
-            ("stage2.anisotropy_weight", two.anisotropy_weight, 0.0, 1e6),
-            ("stage2.anisotropy_limit", two.anisotropy_limit, 1.0, 1e6),
-            ("stage2.point_noise", two.point_noise, 0.0, 1.0),
-            ("stage2.points_weight", two.points_weight, 0.0, 1e6),
-            ("stage2.lpips.weight", lpips.map_or(0.0, |lpips| lpips.weight), 0.0, 1e6),
-            ("stage2.lpips.after", lpips.map_or(0.0, |lpips| lpips.after), 0.0, 1.0),
+            ("training.steps", t.steps as f64, 1.0..=1e8),
+            ("training.batch", t.batch as f64, 1.0..=4096.0),
+            ("training.accumulate", t.accumulate as f64, 1.0..=4096.0),
+            ("training.workers", t.workers as f64, 1.0..=256.0),
+            ("training.prefetch", t.prefetch as f64, 0.0..=256.0),
+            ("training.log_every", t.log_every as f64, 1.0..=1e6),
+            ("training.validation_samples", t.validation_samples as f64, 0.0..=1e5),
+            ("training.clip", t.clip, 1e-9..=1e9),
+            ("training.ema_decay", t.ema_decay, 0.0..=0.999_999),
+            ("stage1.confidence_weight", self.stage1.confidence_weight, 0.0..=1e6),
+            ("stage2.l1_share", two.l1_share, 0.0..=1.0),
+            ("stage2.alpha_weight", two.alpha_weight, 0.0..=1e6),
+            ("stage2.anisotropy_weight", two.anisotropy_weight, 0.0..=1e6),
+            ("stage2.anisotropy_limit", two.anisotropy_limit, 1.0..=1e6),
+            ("stage2.point_noise", two.point_noise, 0.0..=1.0),
+            ("stage2.points_weight", two.points_weight, 0.0..=1e6),
+            ("stage2.lpips.weight", lpips.map_or(0.0, |lpips| lpips.weight), 0.0..=1e6),
+            ("stage2.lpips.after", lpips.map_or(0.0, |lpips| lpips.after), 0.0..=1.0),
         ];
-        if let Some((key, value, least, most)) =
-            ranges.into_iter().find(|(_, value, least, most)| !(*least..=*most).contains(value))
-        {
-            return Some((key.into(), format!("is {value}, must be {least} to {most}")));
+        if let Some((key, message)) = outside(ranges) {
+            return Some((key.into(), message));
         }
+        let refuse = |key: &str, message: &str| Some((key.to_owned(), message.to_owned()));
         if self.network.conf_mode != ConfMode::Sigmoid {
-            return Some(("network.conf_mode".into(), "must be \"sigmoid\" to be trained".into()));
+            return refuse("network.conf_mode", "must be \"sigmoid\" to be trained");
         }
         if two.curriculum && !self.network.side_heads {
             let message =
                 "must be false beside `network.side_heads = false`: the curriculum begins with the sides";
-            return Some(("stage2.curriculum".into(), message.into()));
+            return refuse("stage2.curriculum", message);
         }
         if two.points_weight > 0.0 && two.point_noise > 0.0 {
             let message =
                 "must be 0 beside `stage2.points_weight`: a predictor in training has errors of its own";
-            return Some(("stage2.point_noise".into(), message.into()));
+            return refuse("stage2.point_noise", message);
         }
         if two.points_weight > 0.0 && two.curriculum {
             let message = "must be 0 beside `stage2.curriculum = true`, which renders parts of a person";
-            return Some(("stage2.points_weight".into(), message.into()));
+            return refuse("stage2.points_weight", message);
         }
         if lpips.is_some_and(|lpips| lpips.files.is_empty()) {
-            return Some(("stage2.lpips.files".into(), "must name AlexNet and the learned layers".into()));
+            return refuse("stage2.lpips.files", "must name AlexNet and the learned layers");
         }
         if lpips.is_some() && self.network.resolution < MIN_SIDE {
             let message = format!("needs `network.resolution` of at least {MIN_SIDE}");
-            return Some(("stage2.lpips".into(), message));
+            return refuse("stage2.lpips", &message);
         }
         if two.point_map_cache.as_ref().is_some_and(|folder| folder.as_os_str().is_empty()) {
-            return Some(("stage2.point_map_cache".into(), "must name a folder".into()));
+            return refuse("stage2.point_map_cache", "must name a folder");
         }
         if two.point_map_cache.is_some() && two.points_weight > 0.0 {
             let message = "needs a frozen predictor, `stage2.points_weight = 0`";
-            return Some(("stage2.point_map_cache".into(), message.into()));
+            return refuse("stage2.point_map_cache", message);
         }
         if two.point_map_cache.is_some() && self.samples.augment.changes_photographs() {
             let message = "needs photographs that do not change: exposure, white_balance, mask_erosion, mask_dilation \
                            and jpeg_quality of `samples.augment` must be 0, and background false";
-            return Some(("stage2.point_map_cache".into(), message.into()));
+            return refuse("stage2.point_map_cache", message);
         }
         if let Some((key, message)) = self.samples.problem() {
             return Some((format!("samples.{key}"), message));

@@ -1,22 +1,20 @@
 //! TensorBoard's event files. A record is a length, data and checksums. The data is a protocol buffer with a time, a
 //! step and named values. (Crates that write such files need protobuf's compiler or are no longer maintained.)
 
-use std::fs::{File, OpenOptions};
+use std::fs::File;
 use std::io::{self, Write};
 use std::path::Path;
 use std::time::{SystemTime, UNIX_EPOCH};
+
+use crate::log::Line;
 
 /// An open event file.
 pub struct Events(File);
 
 impl Events {
     /// Makes the file, or empties it.
-    ///
-    /// # Errors
-    /// The operating system's refusal.
     pub fn create(path: &Path) -> io::Result<Self> {
-        let file = OpenOptions::new().create(true).write(true).truncate(true).open(path)?;
-        let mut events = Self(file);
+        let mut events = Self(File::create(path)?);
         // Field 3, text: the version of the format.
         let mut event = now();
         text(&mut event, 3, b"brain.Event:2");
@@ -24,23 +22,20 @@ impl Events {
         Ok(events)
     }
 
-    /// Adds the values of a step.
-    ///
-    /// # Errors
-    /// The operating system's refusal.
-    pub fn add<'a>(&mut self, step: u64, values: impl Iterator<Item = (&'a str, f64)>) -> io::Result<()> {
+    /// Adds a line of the log.
+    pub fn add(&mut self, line: &Line) -> io::Result<()> {
         let mut summary = Vec::new();
-        for (name, value) in values {
+        for (name, value) in &line.values {
             let mut entry = Vec::new();
             text(&mut entry, 1, name.as_bytes());
             // Field 2, four bytes.
             entry.push(2 << 3 | 5);
-            entry.extend((value as f32).to_le_bytes());
+            entry.extend((*value as f32).to_le_bytes());
             text(&mut summary, 1, &entry);
         }
         let mut event = now();
         event.push(2 << 3);
-        varint(&mut event, step);
+        varint(&mut event, line.step);
         text(&mut event, 5, &summary);
         self.record(&event)
     }
@@ -112,7 +107,8 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("events");
         let mut events = Events::create(&path).expect("writes");
-        events.add(300, [("loss", 0.5)].into_iter()).expect("writes");
+        let line = Line { step: 300, seconds: 0.0, values: [("loss".to_owned(), 0.5)].into() };
+        events.add(&line).expect("writes");
         let bytes = std::fs::read(&path).expect("there");
         // The second record comes after length 8 + 4, time 9, version 2 + 13 and checksum 4.
         let second = &bytes[12 + 9 + 15 + 4..];

@@ -5,7 +5,9 @@ use std::panic::resume_unwind;
 use std::thread;
 
 use burn::data::dataset::Dataset;
+use burn::module::Module;
 use burn::tensor::{Device, Tensor};
+use serde::{Deserialize, Serialize};
 use snapsnap_data::sample::{Batches, Loader};
 use snapsnap_ops::host;
 
@@ -13,10 +15,32 @@ use crate::config::TrainConfig;
 use crate::ema::Average;
 use crate::networks::{Networks, Rows};
 use crate::optimizer::Optimizer;
-use crate::precision::{Precision, lower};
-use crate::progress::Progress;
+use crate::precision::{LossScale, Precision, lower};
 use crate::task::{Moment, Task};
 use crate::{TrainError, gradients};
+
+/// Progress of a run.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Progress {
+    /// Stage of the training, 1 or 2.
+    pub stage: u32,
+    /// Steps so far, including skipped ones.
+    pub step: u64,
+    /// Steps that were skipped because a loss or gradient was not finite, or because a sample could not be read.
+    pub skipped: u64,
+    /// Skipped steps since the last one that was made.
+    pub skipped_in_a_row: u64,
+    /// Step of the best validation, and the bits of its score, since decimals might round it.
+    pub best: Option<(u64, u64)>,
+    /// Step after which the final validation and preview were made; 0 before.
+    #[serde(default)]
+    pub shown: u64,
+    /// Scale of the loss, in f16.
+    pub loss_scale: Option<LossScale>,
+    /// Number of AdamW's steps by parameter.
+    pub times: BTreeMap<String, u64>,
+}
 
 /// A training's networks, optimiser and progress.
 pub(crate) struct Learner<'a, T: Task> {
@@ -170,7 +194,7 @@ fn on_devices<T: Task>(
             scope.spawn(move || {
                 let (device, share) = (&devices[place], how.share * part.len() as f64 / all);
                 let (at, how) = (Moment { device: place, ..at }, How { share, ..how });
-                on_device(task, &networks.fork(device), part, at, how)
+                on_device(task, &networks.clone().fork(device), part, at, how)
             })
         };
         let threads: Vec<_> = parts.into_iter().enumerate().map(start).collect();
@@ -238,7 +262,7 @@ struct Samples<'a, T: Task> {
 
 impl<'a, T: Task> Samples<'a, T> {
     fn new(task: &'a T, config: &'a TrainConfig) -> Self {
-        let per_pass = task.samples(0).len().div_ceil(config.training.batch).max(1) as u64;
+        let per_pass = task.data().pass(0).len().div_ceil(config.training.batch).max(1) as u64;
         Self { task, config, per_pass, open: None }
     }
 
@@ -249,17 +273,13 @@ impl<'a, T: Task> Samples<'a, T> {
         let mut open = self.open.take().filter(|(_, next)| *next == number && place > 0);
         let (batches, next) = open.get_or_insert_with(|| {
             let t = &self.config.training;
-            let samples = self.task.samples(pass);
-            let loader = Loader::new(samples, t.batch, t.workers, t.prefetch);
+            let loader = Loader::new(self.task.data().pass(pass), t.batch, t.workers, t.prefetch);
             let loader = if t.shuffle { loader.shuffled(t.seed) } else { loader };
             (loader.batches(pass, place as usize), number)
         });
         *next += 1;
         let made = batches.next();
         self.open = open;
-        match made {
-            Some(made) => made.map_err(|e| e.to_string()),
-            None => Err("the data ended early".to_owned()),
-        }
+        made.ok_or("the data ended early")?.map_err(|e| e.to_string())
     }
 }

@@ -2,11 +2,10 @@
 
 mod checkpoint;
 pub mod config;
-mod curves;
+pub mod data;
 mod ema;
 mod error;
 mod events;
-mod fixed;
 pub mod gradients;
 mod learner;
 pub mod log;
@@ -15,7 +14,6 @@ pub mod optimizer;
 pub mod photometric;
 pub mod points;
 pub mod precision;
-mod progress;
 pub mod run;
 pub mod schedule;
 pub mod stability;

@@ -1,4 +1,4 @@
-//! Logs of a run: `log.jsonl` and TensorBoard's events.
+//! Logs of a run: `log.jsonl`, TensorBoard's events and curves.
 
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
@@ -6,6 +6,7 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
+use snapsnap_base::plot::{Axes, Series, svg};
 use snapsnap_base::{FileError, file};
 
 use crate::events::Events;
@@ -31,7 +32,7 @@ pub struct Log {
     file: File,
     events: Events,
     /// All lines so far.
-    pub lines: Vec<Line>,
+    lines: Vec<Line>,
 }
 
 impl Log {
@@ -58,8 +59,7 @@ impl Log {
         let events_path = folder.join("events.out.tfevents.snapsnap");
         let mut events = Events::create(&events_path).map_err(FileError::write(&events_path))?;
         for line in &lines {
-            let values = line.values.iter().map(|(name, value)| (name.as_str(), *value));
-            events.add(line.step, values).map_err(FileError::write(&events_path))?;
+            events.add(line).map_err(FileError::write(&events_path))?;
         }
         Ok(Self { path, file: appended, events, lines })
     }
@@ -69,21 +69,27 @@ impl Log {
         self.lines.last().map_or(0.0, |line| line.seconds)
     }
 
+    /// An SVG of the loss over the steps and, below it, of the validations' score. Empty without values.
+    pub fn curves(&self) -> String {
+        let chart = |caption: &'static str, y: &'static str, name: &str| {
+            let values =
+                self.lines.iter().filter_map(|line| Some((line.step as f64, *line.values.get(name)?)));
+            let series = Series { name: name.into(), points: values.collect(), line: true };
+            (Axes { caption, x: "step", y, log_x: false, log_y: true }, vec![series])
+        };
+        let scores = chart("validation (less is better)", "score", "validation/score");
+        svg(&[chart("loss", "loss", "loss"), scores])
+    }
+
     /// Adds a line.
     ///
     /// # Errors
     /// [`FileError`] if a file cannot be written.
     pub fn add(&mut self, line: Line) -> Result<(), FileError> {
-        let values = line.values.iter().map(|(name, value)| (name.as_str(), *value));
-        let written = self.events.add(line.step, values);
-        written
-            .and_then(|()| self.file.write_all(text(&line).as_bytes()))
-            .map_err(FileError::write(&self.path))?;
+        let text = serde_json::to_string(&line).expect("plain numbers") + "\n";
+        let written = self.events.add(&line).and_then(|()| self.file.write_all(text.as_bytes()));
+        written.map_err(FileError::write(&self.path))?;
         self.lines.push(line);
         Ok(())
     }
-}
-
-fn text(line: &Line) -> String {
-    serde_json::to_string(line).expect("plain numbers") + "\n"
 }

@@ -11,7 +11,7 @@ use snapsnap_net::weights::{NamedMapper, NamedVisitor, map_named, visit_named};
 use snapsnap_ops::host;
 
 /// Networks whose parameters are trained.
-#[derive(Debug, Clone, Default)]
+#[derive(Module, Debug, Default)]
 pub struct Networks {
     /// The point predictor, if it is trained.
     pub predictor: Option<PointPredictor>,
@@ -20,13 +20,13 @@ pub struct Networks {
 }
 
 /// A parameter.
-struct Parameter {
+pub(crate) struct Parameter {
     /// The checkpoint's name.
-    name: String,
-    shape: Vec<usize>,
+    pub name: String,
+    pub shape: Vec<usize>,
     /// Whether the checkpoint contains the transpose of this matrix.
     is_transposed: bool,
-    values: Tensor<1>,
+    pub values: Tensor<1>,
 }
 
 /// One row of values per parameter, by the checkpoint's names.
@@ -55,22 +55,11 @@ impl Networks {
 
     /// The same networks without gradients.
     pub fn valid(&self) -> Self {
-        Self {
-            predictor: self.predictor.as_ref().map(Module::valid),
-            regressors: self.regressors.iter().map(Module::valid).collect(),
-        }
-    }
-
-    /// The same networks on another device, with gradients if they have them here.
-    pub fn fork(&self, device: &Device) -> Self {
-        Self {
-            predictor: self.predictor.clone().map(|predictor| predictor.fork(device)),
-            regressors: self.regressors.iter().map(|regressor| regressor.clone().fork(device)).collect(),
-        }
+        Module::valid(self)
     }
 
     /// All parameters with their values, without gradients.
-    fn parameters(&self) -> Vec<Parameter> {
+    pub(crate) fn parameters(&self) -> Vec<Parameter> {
         struct Collect(Vec<Parameter>);
         impl NamedVisitor for Collect {
             fn visit<const D: usize>(

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use snapsnap_ops::host;
 use snapsnap_ops::orthogonal::{COEFFICIENTS, MIN_NORM, STEPS, orthogonalised};
 
-use crate::networks::{Networks, Rows, row};
+use crate::networks::{Networks, Parameter, Rows, row};
 
 /// Values per task of a step on the CPU.
 const PIECE: usize = 1 << 14;
@@ -119,30 +119,19 @@ fn is_hidden(name: &str, rank: usize) -> bool {
     rank >= 2 && !OUTER.iter().any(|part| name.contains(part)) && !is_linear_head
 }
 
-/// A parameter that has a gradient.
-struct Work {
-    name: String,
-    shape: Vec<usize>,
-    values: Tensor<1>,
-    gradient: Tensor<1>,
-    state: Option<State>,
-}
-
 impl Optimizer {
     /// One step of all parameters that have a gradient, at `share` of the highest rates. Gradients are multiplied by
     /// `factor` first.
     pub fn step(&mut self, share: f64, networks: Networks, mut gradients: Rows, factor: f64) -> Networks {
-        let mut shapes = networks.shapes();
-        let rows = networks.rows().into_iter();
-        let work = rows.filter_map(|(name, values)| {
-            let gradient = gradients.remove(&name)?;
-            let (shape, state) = (shapes.remove(&name)?, self.states.remove(&name));
-            Some(Work { name, shape, values, gradient, state })
+        let work = networks.parameters().into_iter().filter_map(|parameter| {
+            let gradient = gradients.remove(&parameter.name)?;
+            let state = self.states.remove(&parameter.name);
+            Some((parameter, gradient, state))
         });
         let work: Vec<_> = work.collect();
-        let one = |work: Work| self.step_one(share, work, factor);
+        let one = |(parameter, gradient, state)| self.step_one(share, parameter, gradient, factor, state);
         // Parameters are many and small. On the CPU, cores share them. Other devices order work by the calling thread.
-        let is_cpu = work.first().is_some_and(|work| work.values.device() == Device::flex());
+        let is_cpu = work.first().is_some_and(|(first, ..)| first.values.device() == Device::flex());
         let done: Vec<_> = if is_cpu {
             work.into_par_iter().with_max_len(1).map(one).collect()
         } else {
@@ -156,8 +145,14 @@ impl Optimizer {
         networks.with_rows(&rows)
     }
 
-    fn step_one(&self, share: f64, work: Work, factor: f64) -> (String, Tensor<1>, State) {
-        let Work { name, shape, values, gradient, state } = work;
+    fn step_one(
+        &self,
+        share: f64,
+        Parameter { name, shape, values, .. }: Parameter,
+        gradient: Tensor<1>,
+        factor: f64,
+        state: Option<State>,
+    ) -> (String, Tensor<1>, State) {
         let (values, state) = match &self.config.muon {
             Some(settings) if is_hidden(&name, shape.len()) => {
                 let velocity = match state {
@@ -166,7 +161,8 @@ impl Optimizer {
                 };
                 // Kernels `[out, in, k, k]` become matrices `[out, in·k·k]`.
                 let size = [shape[0], shape[1..].iter().product()];
-                muon(settings, share, values, gradient, factor, velocity, size)
+                let (values, velocity) = muon(settings, share, values, gradient, factor, velocity, size);
+                (values, State::Muon { velocity })
             }
             _ => {
                 let decays = shape.len() >= 2 || self.config.decay_all;
@@ -267,8 +263,8 @@ impl Optimizer {
     }
 }
 
-/// Muon (Jordan et al.): a step along the orthogonalised Nesterov momentum. Its factor 0.2·√(longest side) makes it as
-/// long as a step of AdamW (Liu et al., "Muon is scalable").
+/// Muon (Jordan et al.): values and velocity after a step along the orthogonalised Nesterov momentum. The factor
+/// 0.2·√(longest side) makes the step as long as one of AdamW (Liu et al., "Muon is scalable").
 fn muon(
     settings: &MuonSettings,
     share: f64,
@@ -277,7 +273,7 @@ fn muon(
     factor: f64,
     velocity: Option<Tensor<1>>,
     [rows, columns]: [usize; 2],
-) -> (Tensor<1>, State) {
+) -> (Tensor<1>, Tensor<1>) {
     let (device, momentum) = (values.device(), settings.momentum);
     let rate = share * settings.rate;
     let kept = 1.0 - rate * settings.weight_decay;
@@ -290,7 +286,7 @@ fn muon(
         };
         let direction = velocity.clone() * momentum + gradient;
         let update = orthogonalised_tensor(direction.reshape([rows, columns])).reshape([-1]);
-        return (values * kept - update * pace, State::Muon { velocity });
+        return (values * kept - update * pace, velocity);
     }
     let mut velocity = velocity.map_or_else(|| vec![0.0; rows * columns], host);
     let (mut values, mut direction) = (host(values), host(gradient));
@@ -302,7 +298,7 @@ fn muon(
     }
     let update = orthogonalised(direction, [rows, columns]);
     values.iter_mut().zip(update).for_each(|(value, update)| *value = *value * kept - update * pace);
-    (row(values, &device), State::Muon { velocity: row(velocity, &device) })
+    (row(values, &device), row(velocity, &device))
 }
 
 /// [`orthogonalised`] on any device.
@@ -350,11 +346,7 @@ mod tests {
                 let (new, state) = burns.step(0.01, values, gradient.clone(), theirs);
                 (values, theirs) = (new, state);
                 let (new, state) = muon(&settings, 1.0, ours, gradient.reshape([-1]), 1.0, velocity, size);
-                ours = new;
-                velocity = match state {
-                    State::Muon { velocity } => Some(velocity),
-                    State::AdamW { .. } => panic!("not a state of Muon"),
-                };
+                (ours, velocity) = (new, Some(state));
             }
             let (ours, theirs) = (host(ours), host(values));
             let apart = ours.iter().zip(&theirs).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);

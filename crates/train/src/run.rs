@@ -13,13 +13,13 @@ use snapsnap_base::{FileError, file};
 use snapsnap_eval::preview;
 use snapsnap_net::weights;
 
+use crate::TrainError;
 use crate::checkpoint;
 use crate::config::TrainConfig;
 use crate::learner::Learner;
 use crate::log::{Line, Log};
 use crate::networks::Networks;
 use crate::task::{Task, Validation};
-use crate::{TrainError, curves};
 
 /// Number of failed steps in a row after which a run ends.
 const MAX_FAILURES: u64 = 20;
@@ -300,7 +300,7 @@ impl<'a, T: Task> Session<'a, T> {
         let folder = path.parent().expect("lies in a folder");
         fs::create_dir_all(folder).map_err(FileError::write(folder))?;
         checkpoint::save(&path, &self.learner)?;
-        let (path, svg) = (self.options.folder.join("curves.svg"), curves::draw(&self.log.lines));
+        let (path, svg) = (self.options.folder.join("curves.svg"), self.log.curves());
         Ok(file::write_whole(&path, |out| out.write_all(svg.as_bytes())).map_err(FileError::write(&path))?)
     }
 }

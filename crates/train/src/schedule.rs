@@ -3,6 +3,7 @@
 use std::f64::consts::PI;
 
 use serde::{Deserialize, Serialize};
+use snapsnap_data::limits::outside;
 
 /// A schedule as a share of the highest rate: the section `[schedule]`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -29,23 +30,23 @@ pub enum Schedule {
     },
 }
 
-impl Schedule {
+impl Default for Schedule {
     /// The schedule of the published code.
-    pub fn published() -> Self {
+    fn default() -> Self {
         Self::OneCycle { overhang: 100, rise: 0.01, start_divisor: 25.0, end_divisor: 1e4 }
     }
+}
 
+impl Schedule {
     /// The first key that makes no sense, and why.
     pub fn problem(&self) -> Option<(&'static str, String)> {
-        let range = |key, value: f64, least: f64, most: f64| {
-            let wrong = !(least..=most).contains(&value);
-            wrong.then(|| (key, format!("is {value}, must be {least} to {most}")))
-        };
         match *self {
-            Self::OneCycle { rise, start_divisor, end_divisor, .. } => range("rise", rise, 0.0, 1.0)
-                .or_else(|| range("start_divisor", start_divisor, 1.0, 1e12))
-                .or_else(|| range("end_divisor", end_divisor, 1.0, 1e12)),
-            Self::Cosine { end, .. } => range("end", end, 0.0, 1.0),
+            Self::OneCycle { rise, start_divisor, end_divisor, .. } => outside([
+                ("rise", rise, 0.0..=1.0),
+                ("start_divisor", start_divisor, 1.0..=1e12),
+                ("end_divisor", end_divisor, 1.0..=1e12),
+            ]),
+            Self::Cosine { end, .. } => outside([("end", end, 0.0..=1.0)]),
         }
     }
 
@@ -85,7 +86,7 @@ mod tests {
     /// Rates of the published run: 4e-6, 1e-4 at step 1000, 4e-10 (docs/method.md, "Check values").
     #[test]
     fn one_cycle_is_the_published_one() {
-        let schedule = Schedule::published();
+        let schedule = Schedule::default();
         let rate = |step| 1e-4 * schedule.share(step, 100_000);
         assert!((rate(0) - 4e-6).abs() < 1e-12);
         assert!((rate(1000) - 1e-4).abs() < 1e-12);

@@ -4,18 +4,18 @@
 use std::sync::Arc;
 
 use burn::data::dataloader::batcher::Batcher;
-use burn::data::dataset::Dataset;
 use burn::tensor::Device;
+use glam::Vec3;
 use image::RgbImage;
-use snapsnap_data::dataset::{Folder, Split};
-use snapsnap_data::sample::{Joined, Stage1, Stage1Batch, Stage1Batcher, Stage1Item};
+use snapsnap_data::dataset::Folder;
+use snapsnap_data::sample::{Stage1, Stage1Batch, Stage1Batcher, Stage1Item};
 use snapsnap_net::config::Config;
 use snapsnap_net::network::{PointMap, View};
 use snapsnap_ops::host;
 
 use crate::TrainError;
 use crate::config::TrainConfig;
-use crate::fixed::{Fixed, check_resolution};
+use crate::data::Data;
 use crate::networks::Networks;
 use crate::points::{Prediction, losses, predict};
 use crate::task::{Moment, Part, Task, Validation};
@@ -27,17 +27,17 @@ const PREVIEWS: usize = 2;
 /// Error in metres that is white in previews.
 const WORST: f32 = 0.2;
 
+/// Index of a view, its points `[H,W,3]` and its confidences `[H,W]`.
+type Map = (usize, Vec<f32>, Vec<f32>);
+
 /// The training of the point predictor.
 pub struct PointTask {
     networks: Config,
     /// λ.
     confidence: f64,
-    sets: Vec<Stage1>,
-    validation: Fixed<Stage1Item>,
+    data: Data<Stage1Item>,
     /// Training devices, with gradients.
     devices: Vec<Device>,
-    /// Device of validations.
-    device: Device,
 }
 
 impl PointTask {
@@ -50,32 +50,25 @@ impl PointTask {
         config: &TrainConfig,
         devices: &[Device],
     ) -> Result<Self, TrainError> {
-        let mut sets = Vec::new();
-        for folder in folders {
-            check_resolution(folder, config)?;
-            sets.push(Stage1::new(folder.clone(), Some(Split::Train), config.samples())?);
-        }
-        let validation = Fixed::new(folders, config, |folder, split, samples| {
-            Ok(Box::new(Stage1::new(folder, split, samples)?))
-        })?;
         Ok(Self {
             networks: config.networks(),
             confidence: config.stage1.confidence_weight,
-            sets,
-            validation,
+            data: Data::new(folders, config, &config.samples(), Stage1::new)?,
             devices: devices.to_vec(),
-            device: devices[0].clone().inner(),
         })
-    }
-
-    /// Number of samples of a validation.
-    pub fn validation_samples(&self) -> usize {
-        self.validation.count
     }
 
     fn predict(&self, networks: &Networks, batch: &Stage1Batch) -> Prediction {
         let predictor = networks.predictor.as_ref().expect("stage 1 trains the predictor");
         predict(predictor, &self.networks, batch.images.clone(), &batch.masks)
+    }
+
+    /// Predicted maps of a sample on the whole canvas.
+    fn maps(&self, networks: &Networks, item: &Stage1Item) -> Vec<Map> {
+        let batch = Stage1Batcher.batch(vec![item.clone()], &self.devices[0].clone().inner());
+        let maps = self.predict(networks, &batch).on_canvas(&self.networks.network, &batch.masks);
+        let read = |(view, map): (View, PointMap)| (view as usize, host(map.points), host(map.conf));
+        maps.into_iter().map(read).collect()
     }
 }
 
@@ -83,9 +76,8 @@ impl Task for PointTask {
     type Item = Stage1Item;
     const STAGE: u32 = 1;
 
-    fn samples(&self, pass: u64) -> Joined<Stage1Item> {
-        let sets = self.sets.iter().map(|set| Box::new(set.with_epoch(pass)) as Box<dyn Dataset<_>>);
-        Joined::new(sets.collect())
+    fn data(&self) -> &Data<Stage1Item> {
+        &self.data
     }
 
     fn name(item: &Stage1Item) -> &str {
@@ -107,32 +99,26 @@ impl Task for PointTask {
     }
 
     fn validate(&self, networks: &Networks) -> Result<Option<Validation>, TrainError> {
-        if self.validation.count == 0 {
+        if self.data.count == 0 {
             return Ok(None);
         }
         let mut errors = Errors::default();
-        for index in self.validation.indices(self.validation.count) {
-            let item = self.validation.get(index)?;
-            let batch = Stage1Batcher.batch(vec![item.clone()], &self.device);
-            errors.add(
-                &item,
-                &self.predict(networks, &batch).on_canvas(&self.networks.network, &batch.masks),
-                self.networks.network.conf_threshold,
-            );
+        for item in self.data.validation(self.data.count) {
+            let item = item?;
+            errors.add(&item, &self.maps(networks, &item), self.networks.network.conf_threshold);
         }
         Ok(Some(errors.validation()))
     }
 
     fn preview(&self, networks: &Networks) -> Result<Option<RgbImage>, TrainError> {
         let mut rows: Vec<Vec<RgbImage>> = Vec::new();
-        for (place, index) in self.validation.indices(PREVIEWS).enumerate() {
-            let item = self.validation.get(index)?;
+        for item in self.data.validation(PREVIEWS) {
+            let item = item?;
             let (side, area) = (item.side, item.side * item.side);
-            let batch = Stage1Batcher.batch(vec![item.clone()], &self.device);
-            let maps = self.predict(networks, &batch).on_canvas(&self.networks.network, &batch.masks);
-            for (row, (view, map)) in maps.iter().enumerate() {
-                let (points, conf) = (host(map.points.clone()), host(map.conf.clone()));
-                let view = *view as usize;
+            let maps = self.maps(networks, &item);
+            rows.resize(maps.len(), Vec::new());
+            for ((view, points, conf), row) in maps.into_iter().zip(&mut rows) {
+                let at = |points: &[f32], i: usize| Vec3::from_slice(&points[3 * i..]);
                 let truth = |i: usize| at(&item.points, view * area + i);
                 let there = |i: usize| item.valid[view * area + i] > 0.5;
                 let threshold = self.networks.network.conf_threshold;
@@ -142,37 +128,23 @@ impl Task for PointTask {
                     0 | 1 => [0, 1, 2].map(|c| item.images[(3 * view + c) * area + i] * 0.5 + 0.5),
                     _ => [1.0; 3],
                 };
-                let shown = |there: bool, p: [f32; 3]| if there { place_color(p) } else { [0.0; 3] };
-                let error = |i: usize| if there(i) { distance(at(&points, i), truth(i)) } else { 0.0 };
-                let pictures = [
+                let shown = |there: bool, p: Vec3| if there { place_color(p) } else { [0.0; 3] };
+                let error = |i: usize| if there(i) { at(&points, i).distance(truth(i)) } else { 0.0 };
+                row.extend([
                     picture(side, photo),
                     picture(side, |i| shown(seen(i), at(&points, i))),
                     picture(side, |i| shown(there(i), truth(i))),
                     picture(side, |i| heat(error(i), WORST)),
-                ];
-                if place == 0 {
-                    rows.push(Vec::new());
-                }
-                if let Some(row) = rows.get_mut(row) {
-                    row.extend(pictures);
-                }
+                ]);
             }
         }
         Ok(grid(&rows))
     }
 }
 
-fn at(points: &[f32], i: usize) -> [f32; 3] {
-    [points[3 * i], points[3 * i + 1], points[3 * i + 2]]
-}
-
-fn distance(a: [f32; 3], b: [f32; 3]) -> f32 {
-    (0..3).map(|i| (a[i] - b[i]).powi(2)).sum::<f32>().sqrt()
-}
-
 /// Colour of a point in the front camera's frame. In the published cameras the body is two metres away.
-fn place_color([x, y, z]: [f32; 3]) -> [f32; 3] {
-    [x / 1.8 + 0.5, y / 1.8 + 0.5, (z - 2.0) / 0.8 + 0.5]
+fn place_color(p: Vec3) -> [f32; 3] {
+    [p.x / 1.8 + 0.5, p.y / 1.8 + 0.5, (p.z - 2.0) / 0.8 + 0.5]
 }
 
 /// Distances between predicted and true points, as sums over people.
@@ -185,12 +157,8 @@ struct Errors {
 }
 
 impl Errors {
-    fn add(&mut self, item: &Stage1Item, maps: &[(View, PointMap)], threshold: f32) {
+    fn add(&mut self, item: &Stage1Item, maps: &[Map], threshold: f32) {
         let area = item.side * item.side;
-        let maps: Vec<_> = maps
-            .iter()
-            .map(|(view, map)| (*view as usize, host(map.points.clone()), host(map.conf.clone())))
-            .collect();
         let pairs: Vec<Pair> = maps
             .iter()
             .map(|(view, points, _)| Pair {

@@ -4,9 +4,9 @@ use std::collections::BTreeMap;
 
 use burn::tensor::Tensor;
 use image::RgbImage;
-use snapsnap_data::sample::Joined;
 
 use crate::TrainError;
+use crate::data::Data;
 use crate::networks::Networks;
 
 /// A part of a loss.
@@ -43,13 +43,18 @@ pub struct Validation {
 /// A stage of the training.
 pub trait Task: Sync {
     /// A sample on the host.
-    type Item: Send + Sync + 'static;
+    type Item: Clone + Send + Sync + 'static;
 
     /// 1 or 2.
     const STAGE: u32;
 
-    /// The samples of a pass over the data. Each pass has its own random choices.
-    fn samples(&self, pass: u64) -> Joined<Self::Item>;
+    /// Samples of the training and of its validations.
+    fn data(&self) -> &Data<Self::Item>;
+
+    /// Number of samples of a validation.
+    fn validation_samples(&self) -> usize {
+        self.data().count
+    }
 
     /// Name of a sample: its data set, subject and view.
     fn name(item: &Self::Item) -> &str;

@@ -83,7 +83,7 @@ fn follow(steps: usize) {
     let optimizer = OptimizerConfig { rate: 1e-3, ..OptimizerConfig::default() };
     let mut optimizer = optimizer.init();
     // The published schedule of 20 steps; its cycle is 100 steps longer.
-    let schedule = Schedule::published();
+    let schedule = Schedule::default();
 
     let tracked = device.clone().autodiff();
     let images: Tensor<5> = trace.tensor("images", &tracked);

@@ -4,7 +4,7 @@ use glam::{DVec2, DVec3};
 use image::GrayImage;
 use snapsnap_splat::{Camera, RigidTransform};
 
-use super::stored::{StoredView, unproject};
+use super::unproject;
 
 /// Largest side of a silhouette in cells. Silhouettes are coarser than the pictures.
 const CELLS: u32 = 256;
@@ -29,15 +29,13 @@ pub struct Seen {
 
 impl Seen {
     /// `camera` has the first pixel's sample at (½, ½); `depth` is `[H,W]` in metres.
-    pub fn new(camera: &Camera, mask: &GrayImage, depth: Vec<f32>) -> Self {
+    pub fn new(camera: &Camera, mask: &GrayImage, depth: &[f32]) -> Self {
         let width = camera.width;
         let side = width.min(CELLS);
         let mut outline = vec![false; (side * side) as usize];
         let mut is_cut = false;
-        let stored =
-            StoredView { color: Default::default(), mask: Default::default(), depth, camera: *camera };
         for (x, y, pixel) in mask.enumerate_pixels() {
-            if pixel.0[0] < 128 && stored.depth[(y * width + x) as usize] <= 0.0 {
+            if pixel.0[0] < 128 && depth[(y * width + x) as usize] <= 0.0 {
                 continue;
             }
             is_cut |= x == 0 || y == 0 || x + 1 == width || y + 1 == width;
@@ -48,12 +46,10 @@ impl Seen {
                 }
             }
         }
-        let mut world = *camera;
-        world.world_to_camera = RigidTransform::IDENTITY;
-        let points = unproject(&stored, camera, &world, 0.0);
+        let points = unproject(depth, camera, &RigidTransform::IDENTITY, 0.0);
         let points: Vec<DVec3> = points
             .chunks_exact(3)
-            .zip(&stored.depth)
+            .zip(depth)
             .filter(|(_, z)| **z > 0.0)
             .map(|(p, _)| DVec3::new(p[0].into(), p[1].into(), p[2].into()))
             .collect();

@@ -60,8 +60,8 @@ pub fn check(root: &Path, mut progress: impl FnMut(usize, usize)) -> Result<Chec
             .collect();
         let (problems, seen): (Vec<_>, Vec<_>) = found.into_iter().unzip();
         // A fault in a file of all views is reported once.
-        let mut said = HashSet::new();
-        checked.problems.extend(problems.into_iter().flatten().filter(|p| said.insert(p.clone())));
+        let mut reported = HashSet::new();
+        checked.problems.extend(problems.into_iter().flatten().filter(|p| reported.insert(p.clone())));
         let at = folder.path(*split, "img", subject);
         // A quarter turn; in groups, from a photograph to a side.
         let step = match folder.description().arrangement {
@@ -76,9 +76,8 @@ pub fn check(root: &Path, mut progress: impl FnMut(usize, usize)) -> Result<Chec
 
 /// Parts of subjects that have no pictures.
 fn orphans(folder: &Folder, split: Option<Split>, subjects: &[String]) -> Vec<String> {
-    let kinds = folder.kinds();
     let mut problems = Vec::new();
-    for kind in kinds.iter().filter(|kind| **kind != "img") {
+    for kind in folder.kinds().iter().filter(|kind| **kind != "img") {
         let path = folder.split_path(split).join(kind);
         for entry in fs::read_dir(&path).into_iter().flatten().flatten() {
             let name = entry.file_name().to_string_lossy().into_owned();
@@ -148,6 +147,6 @@ fn faults(folder: &Folder, split: Option<Split>, subject: &str, view: usize) -> 
     }
     // Empty and tiny views cannot be compared.
     let camera = camera.filter(|_| person != Some(0) && width >= LEAST_SIDE);
-    let seen = camera.map(|camera| Seen::new(&folder.exact_camera(&camera), &mask, depth));
+    let seen = camera.map(|camera| Seen::new(&folder.exact_camera(&camera), &mask, &depth));
     (problems, seen)
 }

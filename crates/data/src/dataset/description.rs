@@ -7,8 +7,8 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use crate::JitterConfig;
-use snapsnap_base::FileError;
-use snapsnap_base::file;
+use crate::limits::outside;
+use snapsnap_base::{FileError, file};
 
 /// Name of the description's file.
 pub const DESCRIPTION: &str = "dataset.toml";
@@ -126,17 +126,16 @@ pub struct Drawn {
 
 impl Description {
     pub(super) fn problem(&self) -> Option<String> {
-        if self.views == 0 || self.views > MAX_VIEWS {
-            return Some(format!("`views` is {}, must be 1 to {MAX_VIEWS}", self.views));
+        let views = ("views", self.views as u64, 1..=MAX_VIEWS as u64);
+        let resolution = ("resolution", self.resolution.into(), 1..=MAX_RESOLUTION.into());
+        if let Some((key, message)) = outside([views, resolution]) {
+            return Some(format!("`{key}` {message}"));
         }
         if self.arrangement == Arrangement::Groups && !self.views.is_multiple_of(4) {
             return Some(format!(
                 "`views` is {}, must be a multiple of 4 for `arrangement` = \"groups\"",
                 self.views
             ));
-        }
-        if self.resolution == 0 || self.resolution > MAX_RESOLUTION {
-            return Some(format!("`resolution` is {}, must be 1 to {MAX_RESOLUTION}", self.resolution));
         }
         if self.pixel_centre != 0.0 && self.pixel_centre != 0.5 {
             return Some(format!("`pixel_centre` is {}, must be 0 or 0.5", self.pixel_centre));
@@ -168,9 +167,9 @@ pub fn differences(there: &Description, wanted: &Description) -> String {
     let all: BTreeSet<&String> = there.keys().chain(wanted.keys()).collect();
     let value = |of: &BTreeMap<String, String>, key: &str| of.get(key).map_or("unset".into(), String::clone);
     let differing = all.into_iter().filter(|key| there.get(*key) != wanted.get(*key));
-    let said =
+    let messages =
         differing.map(|key| format!("`{key}` is {} there, not {}", value(&there, key), value(&wanted, key)));
-    said.collect::<Vec<_>>().join(", ")
+    messages.collect::<Vec<_>>().join(", ")
 }
 
 fn flatten(before: &str, table: &toml::Table, keys: &mut BTreeMap<String, String>) {

@@ -14,10 +14,8 @@ use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipArchive, ZipWriter};
 
 use super::MAX_RESOLUTION;
-use snapsnap_base::FileError;
-use snapsnap_base::file;
-use snapsnap_mesh::picture::unreadable;
-use snapsnap_mesh::picture::{MAX_BYTES, decode};
+use snapsnap_base::{FileError, file};
+use snapsnap_mesh::picture::{MAX_BYTES, decode, unreadable};
 use snapsnap_mesh::view::View;
 
 /// Stored depths of the authors' layout are ⌊2¹⁵/z⌋ (docs/method.md, "Layouts").
@@ -194,10 +192,8 @@ pub fn read_camera(folder: &Path, view: usize, side: u32) -> Result<Camera, File
         let cannot = FileError::read(&path);
         file::open(&path).map_err(&cannot)?.take(4096).read_to_end(&mut bytes).map_err(cannot)?;
         if !holds_its_shape(&bytes) {
-            return Err(FileError::unsuitable(
-                &path,
-                "is no matrix: its header announces more numbers than it contains",
-            ));
+            let message = "is no matrix: its header announces more numbers than it contains";
+            return Err(FileError::unsuitable(&path, message));
         }
         let matrix = Array2::<f64>::read_npy(bytes.as_slice())
             .or_else(|e| Array2::<f32>::read_npy(bytes.as_slice()).map(|m| m.mapv(f64::from)).map_err(|_| e));

@@ -18,7 +18,6 @@ mod agree;
 mod check;
 mod description;
 mod files;
-mod stored;
 #[cfg(test)]
 mod tests;
 mod write;
@@ -27,19 +26,29 @@ use std::fmt::Display;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use glam::DVec2;
+use glam::{DVec2, DVec3};
 use image::{DynamicImage, GrayImage, RgbImage};
-use snapsnap_base::file;
-use snapsnap_splat::{Camera, cameras};
+use snapsnap_base::{FileError, file};
+use snapsnap_splat::{Camera, RigidTransform, cameras};
 
 pub use check::{Checked, check};
 use description::DESCRIPTION;
 pub use description::{Arrangement, Description, Drawn, Layout, MAX_RESOLUTION, MAX_VIEWS, Split};
-use snapsnap_base::FileError;
-use snapsnap_mesh::picture;
-use snapsnap_mesh::picture::{MAX_BYTES, decode};
-pub use stored::{StoredView, unproject};
+use snapsnap_mesh::picture::{self, MAX_BYTES, decode};
 pub use write::Made;
+
+/// One stored view.
+#[derive(Debug, Clone)]
+pub struct StoredView {
+    /// `[H,W]` colours, undefined where the mask is 0.
+    pub color: RgbImage,
+    /// `[H,W]` coverage.
+    pub mask: GrayImage,
+    /// `[H,W]` metres along the optical axis; 0 for the background.
+    pub depth: Vec<f32>,
+    /// The stored camera, in the pixel coordinates of [`Description::pixel_centre`].
+    pub camera: Camera,
+}
 
 /// A data-set folder.
 #[derive(Debug, Clone)]
@@ -59,8 +68,7 @@ impl Folder {
             let description = description::read(&path)?;
             return Ok(Self { root: root.to_owned(), description });
         }
-        let entries = fs::read_dir(root).map_err(FileError::read(root))?;
-        drop(entries);
+        fs::read_dir(root).map(drop).map_err(FileError::read(root))?;
         let foreign = |message: &str| {
             FileError::unsuitable(root, format!("is no data set: it has no {DESCRIPTION}, and {message}"))
         };
@@ -152,14 +160,11 @@ impl Folder {
     /// [`FileError::Read`] for a missing split.
     pub fn subjects(&self, split: Option<Split>) -> Result<Vec<String>, FileError> {
         let folder = self.split_path(split).join("img");
-        let mut subjects = Vec::new();
-        for entry in fs::read_dir(&folder).map_err(FileError::read(&folder))? {
-            let entry = entry.map_err(FileError::read(&folder))?;
-            let name = entry.file_name().to_string_lossy().into_owned();
-            if !name.starts_with('.') && entry.path().is_dir() {
-                subjects.push(name);
-            }
-        }
+        let entries = fs::read_dir(&folder).and_then(Iterator::collect::<Result<Vec<_>, _>>);
+        let entries = entries.map_err(FileError::read(&folder))?;
+        let folders = entries.iter().filter(|entry| entry.path().is_dir());
+        let names = folders.map(|entry| entry.file_name().to_string_lossy().into_owned());
+        let mut subjects: Vec<String> = names.filter(|name| !name.starts_with('.')).collect();
         subjects.sort_unstable();
         Ok(subjects)
     }
@@ -261,7 +266,7 @@ impl Folder {
                 Ok(camera)
             }
             Layout::Exact => {
-                let path = self.split_path(split).join("cameras").join(format!("{subject}.json"));
+                let path = self.path(split, "cameras", subject);
                 let cameras = cameras::read(&path)?;
                 let views = self.description.views;
                 if cameras.len() != views {
@@ -308,9 +313,27 @@ impl Folder {
         }
     }
 
+    /// A subject's folder with files of one kind, or its file of cameras.
     fn path(&self, split: Option<Split>, kind: &str, subject: &str) -> PathBuf {
-        self.split_path(split).join(kind).join(subject)
+        let name = if kind == "cameras" { format!("{subject}.json") } else { subject.to_owned() };
+        self.split_path(split).join(kind).join(name)
     }
+}
+
+/// Points `[H,W,3]` of a depth map `[H,W]` in the frame `to` (from the world), in metres. A pixel's ray passes through
+/// its centre, at +½ in the coordinates of `camera`. The background has the depth `far`.
+pub(crate) fn unproject(depth: &[f32], camera: &Camera, to: &RigidTransform, far: f32) -> Vec<f32> {
+    let width = camera.width as usize;
+    let there = camera.world_to_camera.inverse().then(to);
+    let (f, c) = (camera.focal, camera.principal_point);
+    let mut points = Vec::with_capacity(3 * depth.len());
+    for (pixel, z) in depth.iter().enumerate() {
+        let z = f64::from(if *z > 0.0 { *z } else { far });
+        let (x, y) = ((pixel % width) as f64 + 0.5, (pixel / width) as f64 + 0.5);
+        let point = there.apply(z * DVec3::new((x - c.x) / f.x, (y - c.y) / f.y, 1.0));
+        points.extend(point.as_vec3().to_array());
+    }
+    points
 }
 
 /// Colours and coverage of a picture with alpha.

@@ -165,17 +165,18 @@ fn a_check_lists_everything_that_is_wrong() {
     all.push(all[0].clone());
     fs::write(at("cameras/0001.json"), serde_json::to_string(&all).expect("JSON")).expect("write");
     let problems = check(folder.root(), |_, _| {}).expect("checks").problems;
-    let said = problems.iter().filter(|p| p.contains("holds 5 cameras, the data set has 4 views")).count();
-    assert_eq!(said, 1, "{problems:#?}");
+    let reported =
+        problems.iter().filter(|p| p.contains("holds 5 cameras, the data set has 4 views")).count();
+    assert_eq!(reported, 1, "{problems:#?}");
 
     fs::write(folder.root().join(DESCRIPTION), "layout = \"exact\"\nviews = 4\n").expect("write");
     let error = check(folder.root(), |_, _| {}).expect_err("no description").to_string();
     assert!(error.contains(DESCRIPTION) && error.contains("resolution"), "{error}");
 }
 
-/// Depths that 16 bits of inverse depth cannot store are refused.
+/// 16 bits of inverse depth cannot store depths below half a metre.
 #[test]
-fn nearer_than_the_authors_layout_can_say_is_refused() {
+fn depths_that_the_authors_layout_cannot_store_are_refused() {
     let mut wall = crate::testing::block();
     // Every camera, 2 m from the middle, stands before a wall 40 cm away.
     wall.positions.iter_mut().for_each(|p| {
@@ -193,10 +194,10 @@ fn nearer_than_the_authors_layout_can_say_is_refused() {
     assert!(!folder.has(Split::Train, "0000"));
     config.views.layout = Layout::Exact;
     let folder = Folder::create(&temporary.path().join("b"), config.description("walls")).expect("makes");
-    config.add(&folder, &Subject::plain(Split::Train, "0000"), &wall).expect("f32 can say it");
+    config.add(&folder, &Subject::plain(Split::Train, "0000"), &wall).expect("f32 stores them");
 }
 
-/// Each file of the authors' layout is checked, whatever the faults of the others.
+/// Each file of the authors' layout is checked, also after faults of the others.
 #[test]
 fn a_check_looks_at_every_file_of_the_authors_layout() {
     let (_temporary, folder) = small(Layout::Authors);
@@ -222,7 +223,7 @@ fn a_check_looks_at_every_file_of_the_authors_layout() {
 
 /// Cameras that are valid, but not those of the renders.
 #[test]
-fn a_check_sees_cameras_that_do_not_fit_their_views() {
+fn a_check_reports_cameras_that_do_not_fit_their_views() {
     type Change = fn(&mut Camera);
     let changes: [(&str, Change); 4] = [
         ("of a picture four times the size", |camera| {
@@ -283,6 +284,6 @@ fn unfinished_subjects_are_faults_and_names_are_checked() {
     let mut away = rectangle().0;
     away.positions.iter_mut().for_each(|p| p.x += 50.0);
     let subject = Subject { origin: Path::new("scans/p.obj"), ..Subject::plain(Split::Train, "p") };
-    let error = config.add(&folder, &subject, &away).expect_err("is not seen").to_string();
+    let error = config.add(&folder, &subject, &away).expect_err("is out of view").to_string();
     assert_eq!(error, "scans/p.obj: view 0 sees nothing of p");
 }

@@ -2,24 +2,14 @@
 
 use std::fs::{self, TryLockError};
 use std::io;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use rayon::prelude::*;
-use snapsnap_base::file;
-use snapsnap_base::quoted;
+use snapsnap_base::{FileError, file, quoted};
 use snapsnap_splat::{Camera, cameras};
 
 use super::{Folder, Layout, Split, files};
-use snapsnap_base::FileError;
 use snapsnap_mesh::view::View;
-
-/// Refuses names of other folders than the subject's own, and hidden names.
-fn check_name(subject: &str) -> Result<(), String> {
-    if subject.is_empty() || subject.starts_with('.') || subject.contains(['/', '\\']) {
-        return Err(format!("`{}` is no name of a subject", quoted(subject)));
-    }
-    Ok(())
-}
 
 /// Folder of unfinished subjects in the data set's root.
 pub(super) const UNFINISHED: &str = ".unfinished";
@@ -37,10 +27,14 @@ impl Folder {
     /// Whether the subject is complete: every kind of file, up to the last view.
     pub fn has(&self, split: Split, subject: &str) -> bool {
         let last = self.description.views - 1;
-        self.kinds().into_iter().all(|kind| match kind {
-            "cameras" => self.split_path(Some(split)).join(kind).join(format!("{subject}.json")).is_file(),
-            "parm" => self.path(Some(split), kind, subject).join(format!("{last}_extrinsic.npy")).is_file(),
-            _ => self.path(Some(split), kind, subject).join(self.file_name(kind, last)).is_file(),
+        self.kinds().iter().all(|kind| {
+            let path = self.path(Some(split), kind, subject);
+            let last = match *kind {
+                "cameras" => path,
+                "parm" => path.join(format!("{last}_extrinsic.npy")),
+                _ => path.join(self.file_name(kind, last)),
+            };
+            last.is_file()
         })
     }
 
@@ -65,7 +59,11 @@ impl Folder {
         assert_eq!(cameras.len(), description.views, "cameras");
         let side = description.resolution;
         assert!(cameras.iter().all(|c| (c.width, c.height) == (side, side)), "a camera of another size");
-        check_name(subject).map_err(|problem| FileError::unsuitable(origin, problem))?;
+        // Other folders than the subject's own, and hidden names.
+        if subject.is_empty() || subject.starts_with('.') || subject.contains(['/', '\\']) {
+            let message = format!("`{}` is no name of a subject", quoted(subject));
+            return Err(FileError::unsuitable(origin, message));
+        }
         let unfinished = self.root.join(UNFINISHED);
         fs::create_dir_all(&unfinished).map_err(FileError::write(&unfinished))?;
         let temporary = unfinished.join(format!("{split}-{subject}"));
@@ -121,7 +119,7 @@ impl Folder {
         cameras: &[Camera],
         draw: &(impl Fn(&Camera) -> View + Sync),
     ) -> Result<(), FileError> {
-        for kind in self.kinds() {
+        for kind in self.kinds().iter().filter(|kind| **kind != "cameras") {
             let path = folder.join(kind);
             fs::create_dir_all(&path).map_err(FileError::write(&path))?;
         }
@@ -134,7 +132,7 @@ impl Folder {
                 && drawn.depth.iter().any(|z| *z > 0.0 && *z <= files::NEAREST)
             {
                 let message = format!(
-                    "view {view} sees {subject} within half a metre, which the authors' layout cannot store"
+                    "view {view} has {subject} within half a metre, which the authors' layout cannot store"
                 );
                 return Err(FileError::unsuitable(origin, message));
             }
@@ -157,27 +155,18 @@ impl Folder {
                 Layout::Exact => files::write_depth(&at("depth"), &drawn),
             }
         });
-        // The error of the first failed view, whatever the order of the threads.
+        // The error of the first failed view, in any order of the threads.
         views.collect::<Vec<_>>().into_iter().collect::<Result<(), _>>()?;
         if self.description.layout == Layout::Exact {
-            let path = folder.join("cameras").join(format!("{subject}.json"));
-            cameras::write(cameras, &path)?;
+            cameras::write(cameras, &folder.join("cameras"))?;
         }
         Ok(())
     }
 
     /// Moves a complete subject to its place, `img` last.
     fn reveal(&self, temporary: &Path, split: Split, subject: &str) -> Result<(), FileError> {
-        let mut kinds = self.kinds();
-        kinds.reverse();
-        for kind in kinds {
-            let (from, to): (PathBuf, PathBuf) = match kind {
-                "cameras" => {
-                    let name = format!("{subject}.json");
-                    (temporary.join(kind).join(&name), self.split_path(Some(split)).join(kind).join(name))
-                }
-                _ => (temporary.join(kind), self.path(Some(split), kind, subject)),
-            };
+        for kind in self.kinds().iter().rev() {
+            let (from, to) = (temporary.join(kind), self.path(Some(split), kind, subject));
             let parent = to.parent().unwrap_or(&self.root);
             fs::create_dir_all(parent).map_err(FileError::write(parent))?;
             // A part of a subject that is not complete.
@@ -190,10 +179,10 @@ impl Folder {
     }
 
     /// The kinds of a subject's files, `img` first.
-    pub(super) fn kinds(&self) -> Vec<&'static str> {
+    pub(super) fn kinds(&self) -> &'static [&'static str] {
         match self.description.layout {
-            Layout::Authors => vec!["img", "mask", "depth", "parm"],
-            Layout::Exact => vec!["img", "depth", "cameras"],
+            Layout::Authors => &["img", "mask", "depth", "parm"],
+            Layout::Exact => &["img", "depth", "cameras"],
         }
     }
 }

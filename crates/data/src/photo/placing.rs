@@ -4,7 +4,7 @@ use glam::DVec2;
 use image::{GenericImageView, GrayImage, RgbImage, imageops};
 
 use super::{Canvas, REFERENCE_SIDE, Rect, THRESHOLD, planes, unit};
-use crate::resize::Filter;
+use crate::resize::lanczos3;
 
 /// Middle row of a training subject on a canvas of 1024. The subject covers rows 124.39 to 862.52
 /// (docs/method.md, "Cameras").
@@ -33,32 +33,6 @@ impl Mapping {
     /// The place on the photograph of a place on the canvas.
     pub fn source(&self, canvas: DVec2) -> DVec2 {
         (canvas - self.origin) / self.scale
-    }
-}
-
-/// The person's box on a canvas.
-struct Fit {
-    scale: f32,
-    is_limited: bool,
-    left: usize,
-    top: usize,
-    width: usize,
-    height: usize,
-}
-
-impl Fit {
-    fn new(Standing { person, axis }: Standing, [height, side]: [usize; 2]) -> Self {
-        let canvas = side as f32;
-        let by_height = height as f32 / REFERENCE_SIDE * canvas / person.height as f32;
-        // A person with outstretched arms may be wider than high.
-        let (before, behind) = (axis - person.x as f32, (person.x + person.width) as f32 - axis);
-        let scale = by_height.min(canvas / 2.0 / before.max(behind));
-        let size = |length: u32| ((length as f32 * scale).round() as usize).clamp(1, side);
-        let (width, height) = (size(person.width), size(person.height));
-        let left = ((canvas / 2.0 - before * scale - 0.5).ceil().max(0.0) as usize).min(side - width);
-        let centre = TRAINING_CENTRE / REFERENCE_SIDE * canvas;
-        let top = ((centre - height as f32 / 2.0).round().max(0.0) as usize).min(side - height);
-        Self { scale, is_limited: scale < by_height, left, top, width, height }
     }
 }
 
@@ -118,14 +92,14 @@ fn median_column(mask: &GrayImage, person: Rect) -> u32 {
 
 /// Places photographs on canvases of `side` pixels as [`super::Placement::Training`] does, two photographs from one
 /// place together; `None` if a mask is empty.
-pub fn place(photographs: &[(&RgbImage, &GrayImage)], height: usize, side: usize) -> Option<Vec<Canvas>> {
+pub fn place(photographs: &[(RgbImage, GrayImage)], height: usize, side: usize) -> Option<Vec<Canvas>> {
     let people = photographs.iter().map(|(_, mask)| Rect::around(mask, u8::MAX.div_ceil(2)));
     let people: Vec<Rect> = people.collect::<Option<_>>()?;
     let common = match (photographs, people.as_slice()) {
         ([(_, front), (_, back)], [a, b]) => together([front, back], [*a, *b]),
         _ => None,
     };
-    let placed = |((rgb, mask), person): (&(&RgbImage, &GrayImage), &Rect)| {
+    let placed = |((rgb, mask), person): (&(RgbImage, GrayImage), &Rect)| {
         placed(rgb, mask, common.unwrap_or(Standing::alone(*person)), [height, side], "")
     };
     Some(photographs.iter().zip(&people).map(placed).collect())
@@ -135,13 +109,21 @@ pub fn place(photographs: &[(&RgbImage, &GrayImage)], height: usize, side: usize
 pub(super) fn placed(
     rgb: &RgbImage,
     mask: &GrayImage,
-    standing: Standing,
-    size: [usize; 2],
+    Standing { person, axis }: Standing,
+    [height, side]: [usize; 2],
     source: &str,
 ) -> Canvas {
-    let (side, canvas) = (size[1], size[1] as f32);
-    let Fit { scale, is_limited, left, top, width, height } = Fit::new(standing, size);
-    let person = standing.person;
+    let canvas = side as f32;
+    let by_height = height as f32 / REFERENCE_SIDE * canvas / person.height as f32;
+    // A person with outstretched arms may be wider than high.
+    let (before, behind) = (axis - person.x as f32, (person.x + person.width) as f32 - axis);
+    let scale = by_height.min(canvas / 2.0 / before.max(behind));
+    let limited = if scale < by_height { " (limited by the width)" } else { "" };
+    let size = |length: u32| ((length as f32 * scale).round() as usize).clamp(1, side);
+    let (width, height) = (size(person.width), size(person.height));
+    let left = ((canvas / 2.0 - before * scale - 0.5).ceil().max(0.0) as usize).min(side - width);
+    let centre = TRAINING_CENTRE / REFERENCE_SIDE * canvas;
+    let top = ((centre - height as f32 / 2.0).round().max(0.0) as usize).min(side - height);
     let mapping = Mapping::of(person, [left, top], [width, height]);
 
     // The box of all pixels with any coverage, cut to the reach of the canvas, and its place relative to the person's
@@ -158,7 +140,7 @@ pub(super) fn placed(
 
     // Colours are resized after multiplication by the mask, so that the background does not bleed into them.
     let premultiplied = |color, m| unit(color) * unit(m);
-    let [r, g, b, m] = planes(rgb, mask, touched, premultiplied, [high, wide], Filter::Lanczos3);
+    let [r, g, b, m] = planes(rgb, mask, touched, premultiplied, [high, wide], lanczos3);
     let area = side * side;
     let (mut values, mut on_canvas) = (vec![0.0; 3 * area], vec![0.0; area]);
     for y in (0..high).filter(|y| (0..side as i64).contains(&(y0 + *y as i64))) {
@@ -174,7 +156,6 @@ pub(super) fn placed(
         }
     }
     let valid = on_canvas.iter().map(|m| *m >= THRESHOLD).collect();
-    let limited = if is_limited { " (limited by the width)" } else { "" };
     let report = format!(
         "{source}, scaled by {scale:.4}{limited} to {width}×{height} at ({left}, {top}) of {side}×{side}"
     );

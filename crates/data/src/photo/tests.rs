@@ -5,6 +5,12 @@ use image::{Rgba, RgbaImage};
 
 const SIDE: usize = 256;
 
+fn saved(picture: &RgbaImage) -> tempfile::NamedTempFile {
+    let file = tempfile::Builder::new().suffix(".png").tempfile().expect("temporary file");
+    picture.save(file.path()).expect("PNG");
+    file
+}
+
 /// A person of 40 × 80 pixels in a picture of 100 × 120: upper left red, upper right green, lower left blue, lower
 /// right white. The surroundings are bright, transparent noise.
 fn quarters() -> tempfile::NamedTempFile {
@@ -18,9 +24,7 @@ fn quarters() -> tempfile::NamedTempFile {
             },
             _ => Rgba([255, (x * 37) as u8, (y * 91) as u8, 0]),
         });
-    let file = tempfile::Builder::new().suffix(".png").tempfile().expect("temporary file");
-    picture.save(file.path()).expect("PNG");
-    file
+    saved(&picture)
 }
 
 /// The canvas of a photograph that is front and back.
@@ -77,8 +81,7 @@ fn soft_edges_stay_soft_and_outside_the_box() {
         };
         Rgba([200, (x * 2) as u8, y as u8, alpha])
     });
-    let file = tempfile::Builder::new().suffix(".png").tempfile().expect("temporary file");
-    picture.save(file.path()).expect("PNG");
+    let file = saved(&picture);
     let canvas = one(file.path(), Placement::Training { height: 739 }).expect("a person");
     let column: Vec<f32> = (0..SIDE).map(|row| canvas.mask[row * SIDE + SIDE / 2]).collect();
     let soft = column.iter().filter(|m| (0.3..0.5).contains(*m)).count();
@@ -92,8 +95,7 @@ fn a_person_wider_than_the_canvas_gets_smaller_not_narrower() {
     let picture = RgbaImage::from_fn(400, 100, |x, y| {
         Rgba([x as u8, y as u8, 0, if (10..390).contains(&x) && (40..78).contains(&y) { 255 } else { 0 }])
     });
-    let file = tempfile::Builder::new().suffix(".png").tempfile().expect("temporary file");
-    picture.save(file.path()).expect("PNG");
+    let file = saved(&picture);
     for placement in [Placement::Training { height: 739 }, Placement::Demo { height: 700 }] {
         let canvas = one(file.path(), placement).expect("a person");
         let rows = (0..SIDE).filter(|y| canvas.valid[y * SIDE + SIDE / 2]).count();
@@ -114,8 +116,7 @@ fn a_speck_far_from_a_tiny_person_costs_nothing() {
         };
         Rgba([(x % 256) as u8, (y % 256) as u8, 0, alpha])
     });
-    let file = tempfile::Builder::new().suffix(".png").tempfile().expect("temporary file");
-    picture.save(file.path()).expect("PNG");
+    let file = saved(&picture);
     let canvas = one(file.path(), Placement::Training { height: 739 }).expect("a person");
     let valid = canvas.valid.iter().filter(|v| **v).count();
     assert!((170 * 170..200 * 200).contains(&valid), "{valid}");
@@ -138,7 +139,7 @@ fn photographs_from_one_place_are_placed_together() {
         (set[0] / SIDE, set[set.len() - 1] / SIDE, middle)
     };
     let placed = |a: &(RgbImage, GrayImage), b: &(RgbImage, GrayImage)| {
-        let made = place(&[(&a.0, &a.1), (&b.0, &b.1)], 800, SIDE).expect("two people");
+        let made = place(&[a.clone(), b.clone()], 800, SIDE).expect("two people");
         (rows(&made[0]), rows(&made[1]), made[0].mapping, made[1].mapping)
     };
     // Toes reach 10 pixels lower than heels; the axis is at 130.

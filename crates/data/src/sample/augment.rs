@@ -8,6 +8,8 @@ use image::{GrayImage, Rgb, RgbImage};
 use rand::Rng;
 use serde::{Deserialize, Serialize};
 
+use crate::limits::outside;
+
 /// Ranges of the changes; 0 or false disables one. Front and back are changed independently.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -68,16 +70,13 @@ impl Augment {
     }
 
     pub(super) fn problem(&self) -> Option<(&'static str, String)> {
-        let limits = [
-            ("exposure", self.exposure, 0.9),
-            ("white_balance", self.white_balance, 0.9),
-            ("mask_erosion", self.mask_erosion, 16.0),
-            ("mask_dilation", self.mask_dilation, 16.0),
-            ("jpeg_quality", f32::from(self.jpeg_quality), 100.0),
-        ];
-        let (key, value, limit) =
-            limits.into_iter().find(|(_, value, limit)| !(0.0..=*limit).contains(value))?;
-        Some((key, format!("is {value}, must be 0 to {limit}")))
+        outside([
+            ("exposure", self.exposure, 0.0..=0.9),
+            ("white_balance", self.white_balance, 0.0..=0.9),
+            ("mask_erosion", self.mask_erosion, 0.0..=16.0),
+            ("mask_dilation", self.mask_dilation, 0.0..=16.0),
+            ("jpeg_quality", f32::from(self.jpeg_quality), 0.0..=100.0),
+        ])
     }
 
     /// The changed photograph and its mask.

@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::augment::moved;
 use super::place::{scale_of, shift};
+use crate::limits::outside;
 use crate::photo::{Mapping, Rect};
 use snapsnap_splat::{Camera, RigidTransform};
 
@@ -34,22 +35,20 @@ impl Handling {
         if self.place != 0 && !(16..=1024).contains(&self.place) {
             return Some(("place", format!("is {}, must be 0 or 16 to 1024", self.place)));
         }
-        let limits = [
+        outside([
             ("exposure", self.exposure, -4.0..=4.0),
             ("mask", self.mask, -64.0..=64.0),
             ("cut", self.cut, 0.0..=0.9),
-        ];
-        let (key, value, range) = limits.into_iter().find(|(_, value, range)| !range.contains(value))?;
-        Some((key, format!("is {value}, must be {} to {}", range.start(), range.end())))
+        ])
     }
 
     /// The changed photograph number `place` of a person, and its mask.
     pub(super) fn apply(
         &self,
         place: usize,
-        (color, mask): (&RgbImage, &GrayImage),
+        mut color: RgbImage,
+        mut mask: GrayImage,
     ) -> (RgbImage, GrayImage) {
-        let (mut color, mut mask) = (color.clone(), mask.clone());
         if self.exposure != 0.0 {
             let gain = (if place == 0 { 0.5 } else { -0.5 } * self.exposure).exp2();
             color.iter_mut().for_each(|v| *v = (f32::from(*v) * gain).round().min(255.0) as u8);

@@ -1,10 +1,9 @@
 //! A data loader with bounded memory, whose order does not depend on the number of workers. (Burn's loader keeps up to
 //! 100 batches per iterator and mixes the orders of its workers.)
 
-use std::collections::BTreeMap;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::mpsc::{Receiver, Sender, channel};
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, sync_channel};
 use std::thread::{Builder, JoinHandle};
 
 use burn::data::dataset::{Dataset, DatasetError};
@@ -40,52 +39,14 @@ impl<I: 'static> Loader<I> {
     }
 }
 
-/// State that the workers and the consumer share.
-#[derive(Default)]
-struct Turn {
-    /// The batch for the next free worker.
-    next: usize,
-    /// Number of taken batches.
-    taken: usize,
-    stop: bool,
-}
-
-#[derive(Default)]
-struct Turns {
-    turn: Mutex<Turn>,
-    moved: Condvar,
-}
-
-impl Turns {
-    fn lock(&self) -> MutexGuard<'_, Turn> {
-        self.turn.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// Waits until a worker may load another batch, and returns its number; `None` at the end.
-    fn claim(&self, total: usize, ahead: usize) -> Option<usize> {
-        let mut turn = self.lock();
-        while !turn.stop && turn.next < total && turn.next >= turn.taken + ahead {
-            turn = self.moved.wait(turn).unwrap_or_else(PoisonError::into_inner);
-        }
-        let claimed = turn.next;
-        (!turn.stop && claimed < total).then(|| {
-            turn.next += 1;
-            claimed
-        })
-    }
-}
-
 type Loaded<I> = Result<Vec<I>, DatasetError>;
 
 /// Batches of one pass, in their order.
 pub struct Batches<I> {
-    turns: Arc<Turns>,
-    loaded: Receiver<(usize, Loaded<I>)>,
-    /// Batches that were loaded before their turn.
-    early: BTreeMap<usize, Loaded<I>>,
+    /// The workers' batches. Workers load batches in turn.
+    loaded: Vec<Receiver<Loaded<I>>>,
     workers: Vec<JoinHandle<()>>,
-    batch: usize,
-    items: usize,
+    count: usize,
     taken: usize,
 }
 
@@ -98,39 +59,27 @@ impl<I: Send + Sync + 'static> Loader<I> {
         }
         order.drain(..(skipped * self.batch).min(order.len()));
         let order = Arc::new(order);
-        let turns = Arc::new(Turns::default());
-        let (sender, loaded) = channel();
-        let (batch, ahead) = (self.batch, self.workers + self.prefetch);
-        let workers = (0..self.workers)
-            .map(|worker| {
-                let (turns, order, sender) = (turns.clone(), order.clone(), sender.clone());
-                let dataset = self.dataset.clone();
-                let work = move || work(&turns, &order, batch, ahead, &*dataset, &sender);
-                Builder::new().name(format!("loader-{worker}")).spawn(work).expect("a thread starts")
-            })
-            .collect();
-        let items = order.len();
-        Batches { turns, loaded, early: BTreeMap::new(), workers, batch, items, taken: 0 }
-    }
-}
-
-fn work<I>(
-    turns: &Turns,
-    order: &[usize],
-    batch: usize,
-    ahead: usize,
-    dataset: &dyn Dataset<I>,
-    sender: &Sender<(usize, Loaded<I>)>,
-) {
-    while let Some(claimed) = turns.claim(order.len().div_ceil(batch), ahead) {
-        let rows: Vec<usize> = order[claimed * batch..].iter().take(batch).copied().collect();
-        let named = format!("a loader's worker panicked, at samples {rows:?}");
-        // Without its answer the consumer would wait for ever.
-        let loaded = catch_unwind(AssertUnwindSafe(|| dataset.get_many(rows)))
-            .unwrap_or_else(|_| Err(DatasetError::new(std::io::Error::other(named))));
-        if sender.send((claimed, loaded)).is_err() {
-            return;
-        }
+        let (batch, count) = (self.batch, self.workers);
+        let start = |worker: usize| {
+            let (dataset, order) = (self.dataset.clone(), order.clone());
+            // The prefetched batches are divided among the workers. Each worker holds one more, which it loads.
+            let (sender, loaded) = sync_channel((self.prefetch + count - 1 - worker) / count);
+            let work = move || {
+                for rows in order.chunks(batch).skip(worker).step_by(count) {
+                    let panicked = |_| {
+                        let message = format!("a loader's worker panicked, at samples {rows:?}");
+                        Err(DatasetError::new(std::io::Error::other(message)))
+                    };
+                    let get = AssertUnwindSafe(|| dataset.get_many(rows.to_vec()));
+                    if sender.send(catch_unwind(get).unwrap_or_else(panicked)).is_err() {
+                        return;
+                    }
+                }
+            };
+            (loaded, Builder::new().name(format!("loader-{worker}")).spawn(work).expect("a thread starts"))
+        };
+        let (loaded, workers) = (0..count).map(start).unzip();
+        Batches { loaded, workers, count: order.len().div_ceil(batch), taken: 0 }
     }
 }
 
@@ -138,27 +87,19 @@ impl<I> Iterator for Batches<I> {
     type Item = Loaded<I>;
 
     fn next(&mut self) -> Option<Loaded<I>> {
-        if self.taken * self.batch >= self.items {
+        if self.taken == self.count {
             return None;
         }
-        let loaded = loop {
-            if let Some(loaded) = self.early.remove(&self.taken) {
-                break loaded;
-            }
-            let (place, loaded) = self.loaded.recv().ok()?;
-            self.early.insert(place, loaded);
-        };
+        let loaded = self.loaded[self.taken % self.loaded.len()].recv().ok()?;
         self.taken += 1;
-        self.turns.lock().taken = self.taken;
-        self.turns.moved.notify_all();
         Some(loaded)
     }
 }
 
 impl<I> Drop for Batches<I> {
     fn drop(&mut self) {
-        self.turns.lock().stop = true;
-        self.turns.moved.notify_all();
+        // Workers end when their batches have no receiver.
+        self.loaded.clear();
         for worker in self.workers.drain(..) {
             // Panics of its items were caught.
             let _ = worker.join();

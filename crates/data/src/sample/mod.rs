@@ -2,7 +2,6 @@
 
 mod augment;
 mod handling;
-mod joined;
 mod loader;
 mod place;
 mod stage1;
@@ -13,17 +12,18 @@ mod tests;
 
 use std::sync::Arc;
 
+use burn::data::dataset::{Dataset, DatasetError};
 use image::{GrayImage, RgbImage};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use snapsnap_splat::Camera;
 
-use crate::dataset::{Arrangement, Folder, Layout, Split, StoredView};
-use crate::photo::{Canvas, Mapping, place};
+use crate::dataset::{Arrangement, Folder, Layout, Split};
+use crate::limits::outside;
+use crate::photo::{Canvas, on_canvas, place};
 pub use augment::Augment;
 pub use handling::Handling;
-pub use joined::Joined;
 pub use loader::{Batches, Loader};
 use snapsnap_base::FileError;
 use snapsnap_base::random::stream;
@@ -90,29 +90,57 @@ impl SampleConfig {
 
     /// The first key that makes no sense, and why.
     pub fn problem(&self) -> Option<(String, String)> {
-        if self.repeat == 0 || self.repeat > 1_000_000 {
-            return Some(("repeat".into(), format!("is {}, must be 1 to 1000000", self.repeat)));
+        let ranges = [
+            ("repeat", self.repeat as f32, 1.0..=1e6),
+            ("front_within_degrees", self.front_within_degrees, 0.0..=180.0),
+            ("random_targets", self.random_targets as f32, 0.0..=64.0),
+            ("placed_share", self.placed_share, 0.0..=1.0),
+        ];
+        if let Some((key, message)) = outside(ranges) {
+            return Some((key.into(), message));
         }
-        if !(0.0..=180.0).contains(&self.front_within_degrees) {
-            let message = format!("is {}, must be 0 to 180", self.front_within_degrees);
-            return Some(("front_within_degrees".into(), message));
-        }
-        if self.compat && self.front_within_degrees != 180.0 {
-            return Some(("front_within_degrees".into(), "must be 180 beside `compat = true`".into()));
-        }
-        if self.random_targets > 64 {
-            return Some(("random_targets".into(), format!("is {}, must be 0 to 64", self.random_targets)));
-        }
-        if self.compat && self.augment != Augment::none() {
-            return Some(("augment".into(), "must be off beside `compat = true`".into()));
-        }
-        if !(0.0..=1.0).contains(&self.placed_share) {
-            return Some(("placed_share".into(), format!("is {}, must be 0 to 1", self.placed_share)));
-        }
-        if self.compat && self.placed_share > 0.0 {
-            return Some(("placed_share".into(), "must be 0 beside `compat = true`".into()));
+        let beside_compat = [
+            ("front_within_degrees", "must be 180", self.front_within_degrees != 180.0),
+            ("augment", "must be off", self.augment != Augment::none()),
+            ("placed_share", "must be 0", self.placed_share > 0.0),
+        ];
+        if let Some((key, message, _)) = beside_compat.into_iter().find(|(.., wrong)| self.compat && *wrong) {
+            return Some((key.into(), format!("{message} beside `compat = true`")));
         }
         self.augment.problem().map(|(key, message)| (format!("augment.{key}"), message))
+    }
+}
+
+/// Samples of a training stage from a split of a data set.
+#[derive(Debug, Clone)]
+pub struct Stage<I> {
+    source: Source,
+    make: fn(&Source, usize) -> Result<I, FileError>,
+}
+
+impl<I> Stage<I> {
+    /// The same subjects with the random choices of another epoch.
+    pub fn with_epoch(&self, epoch: u64) -> Self {
+        Self { source: Source { epoch, ..self.source.clone() }, make: self.make }
+    }
+
+    /// One sample.
+    ///
+    /// # Errors
+    /// [`FileError`] for files that are missing or damaged.
+    pub fn sample(&self, index: usize) -> Result<I, FileError> {
+        (self.make)(&self.source, index)
+    }
+}
+
+impl<I: Send + Sync> Dataset<I> for Stage<I> {
+    fn get(&self, index: usize) -> Result<I, DatasetError> {
+        assert!(index < self.len(), "sample {index} of {}", self.len());
+        self.sample(index).map_err(DatasetError::new)
+    }
+
+    fn len(&self) -> usize {
+        self.source.len()
     }
 }
 
@@ -182,15 +210,6 @@ impl Source {
         (count + random.random_range(0..=2 * reach) - reach) % count
     }
 
-    /// A view, with its picture or without.
-    fn view_for(&self, subject: &str, view: usize, picture: bool) -> Result<StoredView, FileError> {
-        if picture {
-            self.folder.view(self.split, subject, view)
-        } else {
-            self.folder.depth(self.split, subject, view)
-        }
-    }
-
     /// The camera that unprojects depths: the exact camera, or, with `compat`, the stored one as in the published code.
     fn camera(&self, stored: &Camera) -> Camera {
         if self.config.compat { *stored } else { self.folder.exact_camera(stored) }
@@ -225,10 +244,9 @@ impl Source {
         views: [(&RgbImage, &GrayImage); 2],
         is_placed: bool,
         random: &mut impl Rng,
-    ) -> Vec<Photograph> {
+    ) -> Vec<Canvas> {
         let changed = views.map(|(color, mask)| self.config.augment.apply(color, mask, random));
-        let changed = [0, 1].map(|i| (&changed[i].0, &changed[i].1));
-        Photograph::all(&changed, if is_placed { self.config.person_height } else { 0 }, self.config.compat)
+        canvases(&changed, if is_placed { self.config.person_height } else { 0 }, self.config.compat)
     }
 
     /// Whether a sample's photographs are placed like a user's.
@@ -241,56 +259,24 @@ impl Source {
     }
 }
 
-/// A photograph on its canvas.
-struct Photograph {
-    /// `[3,H,W]` in [−1, 1] times the mask.
-    image: Vec<f32>,
-    /// `[H,W]` share of the person. In the published code it is 1 or 0.
-    mask: Vec<f32>,
-    mapping: Mapping,
+/// Photographs of a person as the networks' input. They are placed on their canvas like a user's, with a person of
+/// `height` pixels of 1024. With 0 they are used unchanged. With `compat`, masks are 0 or 1 as in the published code.
+fn canvases(photographs: &[(RgbImage, GrayImage)], height: usize, compat: bool) -> Vec<Canvas> {
+    let side = photographs.first().map_or(0, |(color, _)| color.width() as usize);
+    let placed = (height > 0).then(|| place(photographs, height, side)).flatten();
+    let unchanged = |(color, mask): &(_, _)| on_canvas(color, mask, String::new());
+    let mut canvases = placed.unwrap_or_else(|| photographs.iter().map(unchanged).collect());
+    if compat {
+        let inside = |share: f32| f32::from(u8::from(share >= f32::from(INSIDE) / 255.0));
+        let masks = canvases.iter_mut().flat_map(|canvas| &mut canvas.mask);
+        masks.for_each(|share| *share = inside(*share));
+    }
+    canvases
 }
 
-impl Photograph {
-    /// Photographs of a person as the networks' input. They are placed on their canvas like a user's, with a person of
-    /// `height` pixels of 1024. With 0 they are used unchanged.
-    fn all(photographs: &[(&RgbImage, &GrayImage)], height: usize, compat: bool) -> Vec<Self> {
-        let side = photographs.first().map_or(0, |(color, _)| color.width() as usize);
-        let placed = (height > 0).then(|| place(photographs, height, side)).flatten();
-        let mut photographs: Vec<Self> = match placed {
-            Some(canvases) => canvases.into_iter().map(Self::of_canvas).collect(),
-            None => photographs.iter().map(|(color, mask)| Self::unchanged(color, mask)).collect(),
-        };
-        if compat {
-            let inside = |share: f32| f32::from(u8::from(share >= f32::from(INSIDE) / 255.0));
-            let masks = photographs.iter_mut().map(|photograph| &mut photograph.mask);
-            masks.flatten().for_each(|share| *share = inside(*share));
-        }
-        photographs
-    }
-
-    /// All images, and all masks.
-    fn joined(photographs: Vec<Self>) -> (Vec<f32>, Vec<f32>) {
-        let (images, masks): (Vec<_>, Vec<_>) =
-            photographs.into_iter().map(|photograph| (photograph.image, photograph.mask)).unzip();
-        (images.concat(), masks.concat())
-    }
-
-    fn of_canvas(canvas: Canvas) -> Self {
-        Self { image: canvas.rgb, mask: canvas.mask, mapping: canvas.mapping }
-    }
-
-    fn unchanged(color: &RgbImage, mask: &GrayImage) -> Self {
-        // Channels first; the background is 0.
-        let channel = |channel: usize| {
-            let pixels = color.pixels().zip(mask.pixels());
-            pixels.map(move |(c, m)| {
-                (2.0 * f32::from(c.0[channel]) / 255.0 - 1.0) * (f32::from(m.0[0]) / 255.0)
-            })
-        };
-        Self {
-            image: (0..3).flat_map(channel).collect(),
-            mask: mask.as_raw().iter().map(|m| f32::from(*m) / 255.0).collect(),
-            mapping: Mapping::AS_IT_IS,
-        }
-    }
+/// All colours, and all masks.
+fn joined(canvases: Vec<Canvas>) -> (Vec<f32>, Vec<f32>) {
+    let (images, masks): (Vec<_>, Vec<_>) =
+        canvases.into_iter().map(|canvas| (canvas.rgb, canvas.mask)).unzip();
+    (images.concat(), masks.concat())
 }

@@ -4,12 +4,11 @@
 //! the nominal camera's distance. One shift per sample then aligns the front's points with the rays of its pixels.
 
 use glam::{DMat3, DVec2, DVec3};
-use image::{GrayImage, RgbImage};
 use rand::Rng;
 use snapsnap_base::FileError;
 use snapsnap_splat::{Camera, Orbit};
 
-use super::{INSIDE, Photograph, Source};
+use super::{INSIDE, Source, joined};
 use crate::dataset::{StoredView, unproject};
 use crate::photo::Mapping;
 
@@ -42,17 +41,22 @@ impl Source {
         random: &mut impl Rng,
     ) -> Result<Four, FileError> {
         let compat = self.config.compat;
-        let views = (0..4).map(|i| self.view_for(subject, order[i], i < 2 || compat));
-        let views: Vec<StoredView> = views.collect::<Result<_, _>>()?;
-        let cameras: Vec<Camera> = views.iter().map(|view| self.camera(&view.camera)).collect();
+        let view = |(i, view): (usize, &usize)| {
+            let stored = match i < 2 || compat {
+                true => self.folder.view(self.split, subject, *view),
+                false => self.folder.depth(self.split, subject, *view),
+            }?;
+            Ok(StoredView { camera: self.camera(&stored.camera), ..stored })
+        };
+        let views: Vec<_> = order.iter().enumerate().map(view).collect::<Result<_, FileError>>()?;
         let photographs =
             self.photographs([0, 1].map(|i| (&views[i].color, &views[i].mask)), is_placed, random);
-        let (mut front, mut scale) = (cameras[0], 1.0);
+        let (mut front, mut scale) = (views[0].camera, 1.0);
         let (mut points, mut valid) = (Vec::new(), Vec::new());
-        let sights = views.iter().zip(&cameras).map(|(view, camera)| Sight { view, camera });
         if !is_placed {
-            for Sight { view, camera } in sights {
-                points.extend(unproject(view, camera, &front, if compat { COMPAT_FAR } else { 0.0 }));
+            for view in &views {
+                let far = if compat { COMPAT_FAR } else { 0.0 };
+                points.extend(unproject(&view.depth, &view.camera, &front.world_to_camera, far));
                 let there = |pixel: usize| match compat {
                     true => view.mask.as_raw()[pixel] >= INSIDE,
                     false => view.depth[pixel] > 0.0,
@@ -60,48 +64,29 @@ impl Source {
                 valid.extend((0..view.depth.len()).map(|pixel| f32::from(u8::from(there(pixel)))));
             }
         } else {
-            let sights: Vec<Sight> = sights.collect();
             let nominal = Camera::orbit_at_yaw_degrees(0.0, front.width);
             scale = scale_of(&photographs[0].mapping, &front);
-            let seen = sights[0].through(&photographs[0].mapping, &front, scale);
+            let seen = views[0].through(&photographs[0].mapping, &front, scale);
             let rays = centres(front.width).map(|place| (place - nominal.principal_point) / nominal.focal);
             front.world_to_camera.translation +=
                 scale * shift(rays.zip(seen).filter_map(|(ray, point)| Some((ray, point?))));
-            let [front_seen, back_seen] =
-                [0, 1].map(|i| sights[i].through(&photographs[i].mapping, &front, scale));
-            let [right, left] =
-                [(2, 90.0), (3, 270.0)].map(|(i, degrees)| sights[i].as_nominal(&front, scale, degrees));
-            for seen in [front_seen, back_seen, right, left].into_iter().flatten() {
+            let photographed = [0, 1].map(|i| views[i].through(&photographs[i].mapping, &front, scale));
+            let sides =
+                [(2, 90.0), (3, 270.0)].map(|(i, degrees)| views[i].as_nominal(&front, scale, degrees));
+            for seen in photographed.into_iter().chain(sides).flatten() {
                 points.extend(seen.unwrap_or_default().as_vec3().to_array());
                 valid.push(f32::from(u8::from(seen.is_some())));
             }
         }
-        let (images, masks) = Photograph::joined(photographs);
+        let (images, masks) = joined(photographs);
         Ok(Four { images, masks, points, valid, front, scale })
-    }
-
-    /// The photographs of front and back without points.
-    pub(super) fn two(
-        &self,
-        pictures: [&(RgbImage, GrayImage); 2],
-        random: &mut impl Rng,
-    ) -> (Vec<f32>, Vec<f32>) {
-        let pictures = pictures.map(|(color, mask)| (color, mask));
-        Photograph::joined(self.photographs(pictures, false, random))
     }
 }
 
 /// Points of a canvas's pixels, row by row, in the front's frame; `None` for pixels without a point.
 type Seen = Vec<Option<DVec3>>;
 
-/// A view and its camera.
-#[derive(Clone, Copy)]
-struct Sight<'a> {
-    view: &'a StoredView,
-    camera: &'a Camera,
-}
-
-impl Sight<'_> {
+impl StoredView {
     /// The point at a place of the view, from its pixel's depth, in the camera's frame.
     fn point(&self, place: DVec2) -> Option<DVec3> {
         let side = self.camera.width as usize;
@@ -109,7 +94,7 @@ impl Sight<'_> {
         if column < 0.0 || row < 0.0 || column as usize >= side || row as usize >= side {
             return None;
         }
-        let z = self.view.depth[row as usize * side + column as usize];
+        let z = self.depth[row as usize * side + column as usize];
         let ray = (place - self.camera.principal_point) / self.camera.focal;
         (z > 0.0).then(|| f64::from(z) * ray.extend(1.0))
     }
@@ -134,7 +119,7 @@ impl Sight<'_> {
         let all = centres(self.camera.width).filter_map(|place| self.point(place));
         let (sum, count) = all.fold((0.0, 0.0), |(sum, count), p| (sum + from_view(p).z, count + 1.0));
         if count == 0.0 {
-            return vec![None; self.view.depth.len()];
+            return vec![None; self.depth.len()];
         }
         let seen = |place: DVec2| {
             let ray = ((place - nominal.principal_point) / nominal.focal).extend(1.0);

@@ -3,19 +3,17 @@
 use std::sync::Arc;
 
 use burn::data::dataloader::batcher::Batcher;
-use burn::data::dataset::{Dataset, DatasetError};
 use burn::tensor::{Device, Tensor, TensorData};
 use rand::Rng;
 
 use super::place::Four;
-use super::{SampleConfig, Source};
+use super::{SampleConfig, Source, Stage};
 use crate::dataset::{Folder, Split};
 use snapsnap_base::FileError;
 
 /// Samples of stage 1 (docs/method.md, "Samples"). Any view is the front, the opposite view the back. Views at right
 /// angles are the sides.
-#[derive(Debug, Clone)]
-pub struct Stage1(Source);
+pub type Stage1 = Stage<Stage1Item>;
 
 /// One sample; H and W are the side of the data set's views.
 #[derive(Debug, Clone)]
@@ -55,20 +53,13 @@ impl Stage1 {
     /// itself or the data set.
     pub fn new(folder: Arc<Folder>, split: Option<Split>, config: SampleConfig) -> Result<Self, FileError> {
         // Only stage 2 has targets of high resolution.
-        Source::new(folder, split, SampleConfig { high_resolution: false, ..config }, 4).map(Self)
+        let config = SampleConfig { high_resolution: false, ..config };
+        Ok(Self { source: Source::new(folder, split, config, 4)?, make: Stage1Item::new })
     }
+}
 
-    /// The same subjects with the random choices of another epoch.
-    pub fn with_epoch(&self, epoch: u64) -> Self {
-        Self(Source { epoch, ..self.0.clone() })
-    }
-
-    /// One sample.
-    ///
-    /// # Errors
-    /// [`FileError`] for files that are missing or damaged.
-    pub fn sample(&self, index: usize) -> Result<Stage1Item, FileError> {
-        let source = &self.0;
+impl Stage1Item {
+    fn new(source: &Source, index: usize) -> Result<Self, FileError> {
         let (subject, mut random) = source.subject(1, index);
         let count = source.folder.description().views;
         let first = source.front(&mut random);
@@ -78,16 +69,14 @@ impl Stage1 {
         let is_placed = source.is_placed(&mut random);
         let Four { images, masks, points, valid, .. } =
             source.four(subject, &order, is_placed, &mut random)?;
-        let mut item = Stage1Item { name: String::new(), side, images, masks, points, valid };
+        let name = format!("{}: {subject}, view {first}", source.folder.root().display());
+        let mut item = Self { name, side, images, masks, points, valid };
         if source.config.augment.flip && random.random() {
             item.flip();
         }
-        item.name = format!("{}: {subject}, view {first}", source.folder.root().display());
         Ok(item)
     }
-}
 
-impl Stage1Item {
     /// Mirrors the sample: left becomes right, also for the sides.
     fn flip(&mut self) {
         let (side, area) = (self.side, self.side * self.side);
@@ -104,17 +93,6 @@ impl Stage1Item {
         right.swap_with_slice(left);
         let (right, left) = self.valid[2 * area..].split_at_mut(area);
         right.swap_with_slice(left);
-    }
-}
-
-impl Dataset<Stage1Item> for Stage1 {
-    fn get(&self, index: usize) -> Result<Stage1Item, DatasetError> {
-        assert!(index < self.len(), "sample {index} of {}", self.len());
-        self.sample(index).map_err(DatasetError::new)
-    }
-
-    fn len(&self) -> usize {
-        self.0.len()
     }
 }
 

@@ -2,19 +2,17 @@
 
 use std::sync::Arc;
 
-use burn::data::dataset::{Dataset, DatasetError};
 use rand::Rng;
 use snapsnap_splat::Camera;
 
 use super::place::Four;
-use super::{SampleConfig, Source};
+use super::{SampleConfig, Source, Stage, joined};
 use crate::dataset::{Folder, Layout, Split};
 use snapsnap_base::FileError;
 
 /// Samples of stage 2 (docs/method.md, "Samples"). The front is the first view with `compat`, else any view that the
 /// config allows. The back is the opposite view. Targets are random views and the sides.
-#[derive(Debug, Clone)]
-pub struct Stage2(Source);
+pub type Stage2 = Stage<Stage2Item>;
 
 /// One sample; H and W are the side of the data set's views, h and w the side of the targets.
 #[derive(Debug, Clone)]
@@ -59,35 +57,26 @@ impl Stage2 {
                 "has no masks at twice the side, which `background_color` needs beside `high_resolution`";
             return Err(FileError::unsuitable(folder.root(), message));
         }
-        Source::new(folder, split, config, 4).map(Self)
+        Ok(Self { source: Source::new(folder, split, config, 4)?, make: Stage2Item::new })
     }
+}
 
-    /// The same subjects with the random choices of another epoch.
-    pub fn with_epoch(&self, epoch: u64) -> Self {
-        Self(Source { epoch, ..self.0.clone() })
-    }
-
-    /// One sample.
-    ///
-    /// # Errors
-    /// [`FileError`] for files that are missing or damaged.
-    pub fn sample(&self, index: usize) -> Result<Stage2Item, FileError> {
-        let source = &self.0;
+impl Stage2Item {
+    fn new(source: &Source, index: usize) -> Result<Self, FileError> {
         let Source { folder, split, config, .. } = source;
         let (subject, mut random) = source.subject(2, index);
         let description = folder.description();
         let count = description.views;
         let first = if config.compat { 0 } else { source.front(&mut random) };
-        let [front, back, right, left] = description.arrangement.four(first, count);
-        let order = [front, back, right, left];
+        let order = description.arrangement.four(first, count);
+        let [front, back, right, left] = order;
         let camera = |view: usize| folder.camera(*split, subject, view).map(|stored| source.camera(&stored));
         let mut cameras = [camera(front)?, camera(back)?, camera(right)?, camera(left)?];
         let random_views =
             (0..config.random_targets).map(|_| random.random_range(0..count)).collect::<Vec<_>>();
         let background =
             if config.augment.background_color { [(); 3].map(|()| random.random()) } else { [0.0; 3] };
-        let scale = if config.high_resolution { 2 } else { 1 };
-        let target_side = description.resolution * scale;
+        let target_side = description.resolution * if config.high_resolution { 2 } else { 1 };
         let (mut targets, mut target_masks, mut target_cameras) = (Vec::new(), Vec::new(), Vec::new());
         for view in random_views.into_iter().chain([right, left]) {
             let (target, mask) = source.target(subject, view, config.high_resolution, background)?;
@@ -98,19 +87,19 @@ impl Stage2 {
             target_cameras.push(source.camera(&stored));
         }
         let is_placed = source.is_placed(&mut random);
-        let mut scale = 1.0;
-        let (images, masks, points, valid) = if config.points || is_placed {
-            let Four { images, masks, points, valid, front, scale: of_four } =
-                source.four(subject, &order, is_placed, &mut random)?;
-            (cameras[0], scale) = (front, of_four);
-            let (points, valid) = if config.points { (points, valid) } else { Default::default() };
-            (images, masks, points, valid)
+        let four = if config.points || is_placed {
+            source.four(subject, &order, is_placed, &mut random)?
         } else {
             let picture = |view: usize| folder.picture(*split, subject, view, false);
-            let (images, masks) = source.two([&picture(front)?, &picture(back)?], &mut random);
-            (images, masks, Vec::new(), Vec::new())
+            let pictures = [picture(front)?, picture(back)?];
+            let pictures = pictures.each_ref().map(|(color, mask)| (color, mask));
+            let (images, masks) = joined(source.photographs(pictures, false, &mut random));
+            Four { images, masks, points: Vec::new(), valid: Vec::new(), front: cameras[0], scale: 1.0 }
         };
-        Ok(Stage2Item {
+        let Four { images, masks, points, valid, front, scale } = four;
+        cameras[0] = front;
+        let (points, valid) = if config.points { (points, valid) } else { Default::default() };
+        Ok(Self {
             name: format!("{}: {subject}, view {first}", folder.root().display()),
             side: description.resolution as usize,
             images,
@@ -125,16 +114,5 @@ impl Stage2 {
             target_cameras,
             background,
         })
-    }
-}
-
-impl Dataset<Stage2Item> for Stage2 {
-    fn get(&self, index: usize) -> Result<Stage2Item, DatasetError> {
-        assert!(index < self.len(), "sample {index} of {}", self.len());
-        self.sample(index).map_err(DatasetError::new)
-    }
-
-    fn len(&self) -> usize {
-        self.0.len()
     }
 }

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use snapsnap_splat::Camera;
 
-use super::{Augment, Handling, Photograph, SampleConfig, Source};
+use super::{Augment, Handling, SampleConfig, Source, canvases, joined};
 use crate::dataset::{Folder, Split, unproject};
 use crate::photo::Mapping;
 use snapsnap_base::FileError;
@@ -62,19 +62,18 @@ impl Test {
     /// [`FileError`] for files that are missing or damaged.
     pub fn sample(&self, index: usize, views: &[usize], handling: &Handling) -> Result<TestItem, FileError> {
         let source = &self.0;
-        let (subject, _) = source.subject(3, index);
+        let subject = self.name(index);
         let description = source.folder.description();
-        let picture = |view: &usize| source.folder.picture(source.split, subject, *view, false);
-        let pictures = views.iter().map(picture).collect::<Result<Vec<_>, _>>()?;
-        let changed = pictures.iter().enumerate();
-        let changed = changed.map(|(place, (color, mask))| handling.apply(place, (color, mask)));
-        let changed: Vec<_> = changed.collect();
-        let changed: Vec<_> = changed.iter().map(|(color, mask)| (color, mask)).collect();
-        let photographs = Photograph::all(&changed, handling.place, source.config.compat);
-        let mappings = photographs.iter().map(|photograph| photograph.mapping).collect();
+        let photograph = |(place, view): (usize, &usize)| {
+            let (color, mask) = source.folder.picture(source.split, subject, *view, false)?;
+            Ok(handling.apply(place, color, mask))
+        };
+        let photographs = views.iter().enumerate().map(photograph).collect::<Result<Vec<_>, FileError>>()?;
+        let canvases = canvases(&photographs, handling.place, source.config.compat);
+        let mappings = canvases.iter().map(|canvas| canvas.mapping).collect();
         let camera = |view: usize| source.folder.camera(source.split, subject, view);
         let cameras = (0..description.views).map(|view| camera(view).map(|stored| source.camera(&stored)));
-        let (images, masks) = Photograph::joined(photographs);
+        let (images, masks) = joined(canvases);
         Ok(TestItem {
             subject: subject.to_owned(),
             side: description.resolution as usize,
@@ -96,7 +95,7 @@ impl Test {
         view: usize,
         background: [f32; 3],
     ) -> Result<(Vec<f32>, Vec<f32>), FileError> {
-        self.0.target(self.0.subject(3, index).0, view, false, background)
+        self.0.target(self.name(index), view, false, background)
     }
 
     /// Points of some views of a subject, `[V,H,W,3]` in metres in the first view's frame, and their validity
@@ -106,12 +105,12 @@ impl Test {
     /// As [`Self::sample`].
     pub fn points(&self, index: usize, views: &[usize]) -> Result<(Vec<f32>, Vec<f32>), FileError> {
         let source = &self.0;
-        let (subject, _) = source.subject(3, index);
         let (mut points, mut valid, mut front) = (Vec::new(), Vec::new(), None);
         for view in views {
-            let stored = source.folder.depth(source.split, subject, *view)?;
+            let stored = source.folder.depth(source.split, self.name(index), *view)?;
             let camera = source.camera(&stored.camera);
-            points.extend(unproject(&stored, &camera, front.get_or_insert(camera), 0.0));
+            let front = front.get_or_insert(camera.world_to_camera);
+            points.extend(unproject(&stored.depth, &camera, front, 0.0));
             valid.extend(stored.depth.iter().map(|z| f32::from(u8::from(*z > 0.0))));
         }
         Ok((points, valid))

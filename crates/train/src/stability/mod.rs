@@ -48,6 +48,7 @@ const SETTINGS: [&str; 2] = ["network.net_resolution=32", "network.conf_threshol
 /// All cases of losses, optimiser and training. `many_steps` is the number of steps of the longest case.
 pub fn cases(many_steps: u64) -> Vec<Case> {
     let mut cases = Vec::new();
+    let once = |case: Case| Case { once: true, ..case };
     for (name, count) in [("empty", 0), ("of one pixel", 1)] {
         let input = format!("stage 1 with a mask {name}, points elsewhere NaN and 1e30");
         let holds = "loss as in f64 and finite; no gradient outside the mask";
@@ -67,20 +68,17 @@ pub fn cases(many_steps: u64) -> Vec<Case> {
         cases.push(case(&input, holds, 1.3e-4, move |device| constant_pictures(a, b, device)));
     }
     let holds = "∞, printed as inf; exactly 1";
-    let of_pictures = case("PSNR and SSIM of identical pictures", holds, 0.0, |_| identical_pictures());
-    cases.push(Case { once: true, ..of_pictures });
+    cases.push(once(case("PSNR and SSIM of identical pictures", holds, 0.0, |_| identical_pictures())));
     // Each step rounds a product.
     let holds = "weights finite, changed by their decay alone, but for 1000 roundings of f32";
     cases.push(case("zero gradients, 1000 steps of AdamW and of Muon", holds, 6e-5, zero_gradients));
     // Each step adds a millionth of a weight to it and rounds the sum to 24 bits.
     let input = format!("{many_steps} AdamW steps with gradients of 1e-12, 1e-20, 1e-30 and 1e3");
     let holds = "weights as f64's, relative, but for the rounding of a million sums in f32: 1 %";
-    let of_steps = case(&input, holds, 1e-2, move |_| many_adamw_steps(many_steps));
-    cases.push(Case { once: true, ..of_steps });
+    cases.push(once(case(&input, holds, 1e-2, move |_| many_adamw_steps(many_steps))));
     let holds = "between 0 and the highest, finite, first and last as the schedule says";
-    let of_rates =
-        case("the ends of the learning rate, runs of 1 to 10⁶ steps", holds, 1e-9, |_| ends_of_the_rate());
-    cases.push(Case { once: true, ..of_rates });
+    let input = "the ends of the learning rate, runs of 1 to 10⁶ steps";
+    cases.push(once(case(input, holds, 1e-9, |_| ends_of_the_rate())));
     cases.extend(trainings::cases());
     cases
 }
@@ -135,10 +133,8 @@ fn constant_pictures(a: f32, b: f32, device: &Device) -> Found {
     let (height, width) = (24, 24);
     let flat = |v: f32| Tensor::<4>::full([1, 3, height, width], v, &device);
     let image = flat(a).require_grad();
-    let gradient = {
-        let loss = Photometric::new(image.clone(), flat(b)).loss(0.8);
-        host(image.grad(&loss.backward()).expect("tracked"))
-    };
+    let loss = Photometric::new(image.clone(), flat(b)).loss(0.8);
+    let gradient = host(image.grad(&loss.backward()).expect("tracked"));
     let map = host(snapsnap_eval::similarity::ssim_gaussian(flat(a), flat(b)));
     let (a, b) = (f64::from(a), f64::from(b));
     let expected = (2.0 * a * b + 1e-4) / (a * a + b * b + 1e-4);
@@ -241,7 +237,7 @@ fn ends_of_the_rate() -> Found {
             sound &=
                 [0, steps / 2, steps - 1, steps, 10 * steps].iter().all(|s| (0.0..=1.0).contains(&at(*s)));
         }
-        let published = Schedule::published();
+        let published = Schedule::default();
         let at = |step: usize| published.share(step, steps);
         sound &=
             [0, steps / 2, steps - 1, steps + 99, 10 * steps].iter().all(|s| (0.0..=1.0).contains(&at(*s)));

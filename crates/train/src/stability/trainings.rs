@@ -9,7 +9,7 @@ use burn::tensor::Device;
 use glam::Vec3;
 use snapsnap_data::dataset::{Folder, Split};
 use snapsnap_data::prepare::{DataConfig, Subject};
-use snapsnap_data::sample::{Joined, Stage1Item};
+use snapsnap_data::sample::Stage1Item;
 use snapsnap_eval::stability::{Case, Found};
 use snapsnap_net::weights::{Source, random_predictor, random_regressors};
 use snapsnap_people::synth;
@@ -18,6 +18,7 @@ use tempfile::TempDir;
 use super::config;
 use crate::TrainError;
 use crate::config::TrainConfig;
+use crate::data::Data;
 use crate::log::Line;
 use crate::networks::Networks;
 use crate::run::{Options, Outcome, Watch, on_best_thread, train};
@@ -28,24 +29,22 @@ use crate::task::{Moment, Part, Task, Validation};
 /// Stiff trainings, and one sample whose loss is not a number (docs/method.md, "Stability cases").
 pub(super) fn cases() -> Vec<Case> {
     let holds = "its step is skipped and counted, training goes on, weights finite";
-    let mut cases = vec![case("one sample whose loss is NaN", holds, || told(poisoned()))];
+    let mut cases = vec![case("one sample whose loss is NaN", holds, poisoned)];
     for (name, factor) in [("×10", 10.0), ("÷10", 0.1)] {
         let input = format!(
             "rate {name}, people nearly black, over-exposed, filling 1 % and 99 % of the frame; 24 steps of either stage"
         );
         let holds = "no step skipped, every logged number finite";
-        cases.push(case(&input, holds, move || told(stiff(factor))));
+        cases.push(case(&input, holds, move || stiff(factor)));
     }
     cases
 }
 
 /// A case that does not depend on the device.
-fn case(input: &str, holds: &str, run: impl Fn() -> Found + 'static) -> Case {
-    Case { area: "Stiff training", once: true, ..super::case(input, holds, 0.0, move |_| run()) }
-}
-
-fn told(found: Result<Found, TrainError>) -> Found {
-    found.unwrap_or_else(|e| Found { broken: Some(e.to_string()), ..Found::default() })
+fn case(input: &str, holds: &str, run: impl Fn() -> Result<Found, TrainError> + 'static) -> Case {
+    let failed = |e: TrainError| Found { broken: Some(e.to_string()), ..Found::default() };
+    let run = move |_: &Device| run().unwrap_or_else(failed);
+    Case { area: "Stiff training", once: true, ..super::case(input, holds, 0.0, run) }
 }
 
 fn temporary() -> Result<TempDir, TrainError> {
@@ -148,8 +147,8 @@ impl Task for Poisoned {
     type Item = Stage1Item;
     const STAGE: u32 = 1;
 
-    fn samples(&self, pass: u64) -> Joined<Stage1Item> {
-        self.0.samples(pass)
+    fn data(&self) -> &Data<Stage1Item> {
+        self.0.data()
     }
 
     fn name(item: &Stage1Item) -> &str {

@@ -2,20 +2,18 @@
 //! (docs/method.md, "Losses of stage 2").
 
 mod frozen;
-mod maps;
 mod scene;
 mod scores;
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, OnceLock};
 
-use burn::data::dataset::Dataset;
 use burn::tensor::{Device, Tensor, TensorData};
 use image::RgbImage;
 use rand::Rng;
 use snapsnap_base::random::stream;
-use snapsnap_data::dataset::{Folder, Split};
-use snapsnap_data::sample::{Joined, SampleConfig, Stage2, Stage2Item};
+use snapsnap_data::dataset::Folder;
+use snapsnap_data::sample::{SampleConfig, Stage2, Stage2Item};
 use snapsnap_eval::lpips::Lpips;
 use snapsnap_net::Window;
 use snapsnap_net::config::{Config, RegressorStart};
@@ -26,7 +24,7 @@ use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
 
 use crate::TrainError;
 use crate::config::{LpipsConfig, Stage2Config, TrainConfig};
-use crate::fixed::{Fixed, check_resolution};
+use crate::data::Data;
 use crate::networks::Networks;
 use crate::photometric::Photometric;
 use crate::points::{Prediction, losses as points_losses};
@@ -56,8 +54,7 @@ pub struct GaussianTask {
     lpips: Vec<Lpips>,
     /// First step with the perceptual distance.
     lpips_from: u64,
-    sets: Vec<Stage2>,
-    validation: Fixed<Stage2Item>,
+    data: Data<Stage2Item>,
     /// Scores of the billboard, computed once.
     billboard: OnceLock<Scores>,
     /// Training devices, with gradients.
@@ -77,15 +74,8 @@ impl GaussianTask {
         predictor: Option<PointPredictor>,
         devices: &[Device],
     ) -> Result<Self, TrainError> {
-        let mut sets = Vec::new();
         let samples = SampleConfig { points: config.stage2.points_weight > 0.0, ..config.samples() };
-        for folder in folders {
-            check_resolution(folder, config)?;
-            sets.push(Stage2::new(folder.clone(), Some(Split::Train), samples.clone())?);
-        }
-        let validation = Fixed::new(folders, config, |folder, split, samples| {
-            Ok(Box::new(Stage2::new(folder, split, samples)?))
-        })?;
+        let data = Data::new(folders, config, &samples, Stage2::new)?;
         let (mut lpips, mut lpips_from) = (Vec::new(), 0);
         if let Some(LpipsConfig { weight, after, files }) = &config.stage2.lpips
             && *weight > 0.0
@@ -102,16 +92,10 @@ impl GaussianTask {
             frozen: predictor.map(|predictor| Frozen::new(config, predictor, devices)),
             lpips,
             lpips_from,
-            sets,
-            validation,
+            data,
             billboard: OnceLock::new(),
             devices: devices.to_vec(),
         })
-    }
-
-    /// Number of samples of a validation.
-    pub fn validation_samples(&self) -> usize {
-        self.validation.count
     }
 
     /// Predicts the points of a sample's photographs with the trained or the frozen predictor. `place` is the index of
@@ -175,8 +159,8 @@ impl GaussianTask {
         config.regressor.start = Some(RegressorStart::Geometric);
         let networks = Networks { predictor: None, regressors: random_regressors(&config, 0, &device) };
         let mut sums = Scores::default();
-        for index in self.validation.indices(self.validation.count) {
-            let item = self.validation.get(index)?;
+        for item in self.data.validation(self.data.count) {
+            let item = item?;
             let window = Window::whole(item.side);
             let map = |view: View| {
                 let points = anchors(view, item.side, &window, &device);
@@ -208,9 +192,8 @@ impl Task for GaussianTask {
     type Item = Stage2Item;
     const STAGE: u32 = 2;
 
-    fn samples(&self, pass: u64) -> Joined<Stage2Item> {
-        let sets = self.sets.iter().map(|set| Box::new(set.with_epoch(pass)) as Box<dyn Dataset<_>>);
-        Joined::new(sets.collect())
+    fn data(&self) -> &Data<Stage2Item> {
+        &self.data
     }
 
     fn name(item: &Stage2Item) -> &str {
@@ -229,20 +212,16 @@ impl Task for GaussianTask {
         let losses = &self.losses;
         for item in &items {
             let count = item.target_cameras.len();
-            let all: Vec<usize> = (0..count).collect();
             // The sides are the last two views.
-            let chosen = match (&phase.views, phase.one_view) {
-                (views, true) if views.start == 2 => vec![random.random_range(count - 2..count)],
-                (_, true) => vec![random.random_range(0..count)],
-                _ => all,
-            };
+            let first = if phase.views.start == 2 { count - 2 } else { 0 };
+            let chosen =
+                if phase.one_view { vec![random.random_range(first..count)] } else { (0..count).collect() };
             let deviation = self.losses.point_noise as f32;
             let mut noise = || {
                 // A sum of uniform numbers is nearly normal, and bounded.
                 deviation * (0..3).map(|_| random.random_range(-1.0_f32..1.0)).sum::<f32>()
             };
-            let noise: Option<&mut dyn FnMut() -> f32> =
-                if deviation > 0.0 { Some(&mut noise) } else { None };
+            let noise = (deviation > 0.0).then_some(&mut noise as &mut dyn FnMut() -> f32);
             let prediction = self.predict(networks, item, Some(place))?;
             let mut add = |name, weight: f64, value: Tensor<1>| {
                 sums.entry(name).or_insert((weight, Vec::new())).1.push(value);
@@ -283,13 +262,13 @@ impl Task for GaussianTask {
     }
 
     fn validate(&self, networks: &Networks) -> Result<Option<Validation>, TrainError> {
-        if self.validation.count == 0 {
+        if self.data.count == 0 {
             return Ok(None);
         }
         let device = self.devices[0].clone().inner();
         let mut sums = Scores::default();
-        for index in self.validation.indices(self.validation.count) {
-            let item = self.validation.get(index)?;
+        for item in self.data.validation(self.data.count) {
+            let item = item?;
             sums.add(&item, self.shown(&item, self.whole(networks, &item, &device)?, &device)?, &device)?;
         }
         let (scores, billboard) = (sums.mean(), self.billboard()?);
@@ -307,8 +286,8 @@ impl Task for GaussianTask {
     fn preview(&self, networks: &Networks) -> Result<Option<RgbImage>, TrainError> {
         let device = self.devices[0].clone().inner();
         let mut rows = Vec::new();
-        for index in self.validation.indices(PREVIEWS) {
-            let item = self.validation.get(index)?;
+        for item in self.data.validation(PREVIEWS) {
+            let item = item?;
             let (side, area) = (item.side, item.side * item.side);
             let photo = |view: usize| {
                 picture(side, |i| [0, 1, 2].map(|c| item.images[(3 * view + c) * area + i] * 0.5 + 0.5))

@@ -53,13 +53,8 @@ impl Scores {
     }
 
     pub fn mean(self) -> Self {
-        let mean = |sum: f64| sum / self.samples;
-        Self {
-            samples: 1.0,
-            full: mean(self.full),
-            masked: mean(self.masked),
-            sides: mean(self.sides),
-            ssim: mean(self.ssim),
-        }
+        let [full, masked, sides, ssim] =
+            [self.full, self.masked, self.sides, self.ssim].map(|sum| sum / self.samples);
+        Self { samples: 1.0, full, masked, sides, ssim }
     }
 }

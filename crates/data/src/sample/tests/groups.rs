@@ -3,21 +3,38 @@
 use super::*;
 use crate::Jitter;
 use crate::dataset::check;
-use crate::prepare::{DataConfig, Subject};
+use crate::prepare::DataConfig;
+use crate::testing::made;
+
+/// Distances in pixels between the points of the view number `view` of a sample and the centres of their pixels in
+/// `camera`. `to_world` transforms the points from the front's frame.
+fn distances(
+    (points, valid): (&[f32], &[f32]),
+    view: usize,
+    to_world: &RigidTransform,
+    camera: &Camera,
+) -> Vec<f64> {
+    let side = camera.width as usize;
+    let rows = view * side * side..(view + 1) * side * side;
+    let pixels =
+        (0..side * side).zip(&valid[rows.clone()]).zip(points_of(&points[3 * rows.start..3 * rows.end]));
+    let distance = |((pixel, _), point): ((usize, &f32), Vec3)| {
+        let (place, _) = camera.project(to_world.apply(point.as_dvec3())).expect("in front");
+        (place - DVec2::new((pixel % side) as f64, (pixel / side) as f64) - 0.5).length()
+    };
+    pixels.filter(|((_, valid), _)| **valid > 0.5).map(distance).collect()
+}
 
 /// A side's points lie on its pixels' rays from a camera at a quarter turn of the front camera. The sides' cameras
-/// follow from the front camera, whatever its deviation.
+/// follow from the front camera with any deviation.
 #[test]
 fn side_cameras_of_groups_follow_from_the_front_camera() {
-    let temporary = tempfile::tempdir().expect("temporary folder");
     let mut config = DataConfig::default();
     (config.views.count, config.views.resolution) = (8, 64);
     config.views.arrangement = Arrangement::Groups;
     let stray = Jitter { yaw: 4.0, pitch: 3.0, distance: 0.1, ..Jitter::default() };
     (config.jitter.rig, config.jitter.view) = (stray, stray);
-    let folder = Folder::create(temporary.path(), config.description("a test")).expect("makes the folder");
-    let subject = Subject::plain(Split::Train, "0000");
-    config.add(&folder, &subject, person()).expect("adds a subject");
+    let (_temporary, folder) = made(&config, person(), 1);
     let checked = check(folder.root(), |_, _| {}).expect("checks");
     assert_eq!(checked.problems, Vec::<String>::new());
     let folder = Arc::new(Folder::open(folder.root()).expect("opens"));
@@ -30,19 +47,12 @@ fn side_cameras_of_groups_follow_from_the_front_camera() {
         fronts.push(first);
         let front = folder.camera(TRAIN, "0000", first).expect("reads");
         let to_world = front.world_to_camera.inverse();
-        let (mut seen, mut worst) = (0, 0.0_f64);
-        for (side, degrees) in [(2, 90.0), (3, 270.0)] {
-            let camera = front.turned(degrees);
-            for pixel in (0..64 * 64).filter(|pixel| item.valid[side * 64 * 64 + pixel] > 0.5) {
-                let at = 3 * (side * 64 * 64 + pixel);
-                let point = Vec3::from_slice(&item.points[at..at + 3]).as_dvec3();
-                let (place, _) = camera.project(to_world.apply(point)).expect("in front");
-                let centre = DVec2::new((pixel % 64) as f64, (pixel / 64) as f64) + 0.5;
-                worst = worst.max((place - centre).length());
-                seen += 1;
-            }
-        }
-        assert!(seen > 100 && worst < 1e-3, "{seen} points, {worst} px");
+        let off = [(2, 90.0), (3, 270.0)].map(|(side, degrees)| {
+            distances((&item.points, &item.valid), side, &to_world, &front.turned(degrees))
+        });
+        let off = off.concat();
+        let worst = off.iter().copied().fold(0.0, f64::max);
+        assert!(off.len() > 100 && worst < 1e-3, "{} points, {worst} px", off.len());
     }
     assert!(fronts.iter().all(|first| [0, 4].contains(first)) && fronts.contains(&0) && fronts.contains(&4));
     let stage2 = Stage2::new(folder.clone(), TRAIN, SampleConfig { random_targets: 2, ..samples.clone() });
@@ -56,13 +66,11 @@ fn side_cameras_of_groups_follow_from_the_front_camera() {
 /// sides' points to their pixels in the nominal cameras. The moved front camera transforms them to the world.
 #[test]
 fn placed_samples_fit_the_nominal_cameras() {
-    let temporary = tempfile::tempdir().expect("temporary folder");
     let mut config = DataConfig::default();
     (config.views.count, config.views.resolution) = (4, 128);
     config.views.arrangement = Arrangement::Groups;
     config.jitter.rig = Jitter { distance: 0.3, look_at: 0.03, pitch: 2.0, ..Jitter::default() };
-    let folder = Folder::create(temporary.path(), config.description("a test")).expect("makes the folder");
-    config.add(&folder, &Subject::plain(Split::Train, "0000"), person()).expect("adds a subject");
+    let (_temporary, folder) = made(&config, person(), 1);
     let folder = Arc::new(Folder::open(folder.root()).expect("opens"));
     let samples = SampleConfig {
         placed_share: 1.0,
@@ -87,24 +95,13 @@ fn placed_samples_fit_the_nominal_cameras() {
     // point. Without placement, points are twenty pixels off.
     for (view, degrees) in [(0, 0.0), (2, 90.0), (3, 270.0)] {
         let camera = Camera::orbit_at_yaw_degrees(degrees, side as u32);
-        let (mut sum, mut most, mut seen) = (0.0, 0.0_f64, 0);
-        for pixel in (0..side * side).filter(|pixel| item.valid[view * side * side + pixel] > 0.5) {
-            let at = 3 * (view * side * side + pixel);
-            let point = Vec3::from_slice(&item.points[at..at + 3]).as_dvec3();
-            let (place, _) = camera.project(around.apply(point)).expect("in front");
-            let centre = DVec2::new((pixel % side) as f64, (pixel / side) as f64) + 0.5;
-            (sum, most, seen) =
-                (sum + (place - centre).length(), most.max((place - centre).length()), seen + 1);
-        }
-        let mean = sum / f64::from(seen);
+        let off = distances((&item.points, &item.valid), view, &around, &camera);
+        let (seen, most) = (off.len(), off.iter().copied().fold(0.0, f64::max));
+        let mean = off.iter().sum::<f64>() / seen as f64;
         assert!(seen > 300 && mean < 0.5 && most < 6.0, "view {view}: {seen} points, {mean}, {most} px");
     }
     // The true camera inverts the placement.
-    let test = Test::new(
-        folder.clone(),
-        TRAIN,
-        SampleConfig { augment: Augment::none(), ..SampleConfig::default() },
-    );
+    let test = Test::new(folder.clone(), TRAIN, SampleConfig::default());
     let handling = Handling { place: 700, ..Handling::default() };
     let shown = test.expect("a test").sample(0, &[0, 1], &handling).expect("reads");
     let valid: Vec<bool> = item.valid[..side * side].iter().map(|there| *there > 0.5).collect();

@@ -1,0 +1,76 @@
+//! The samples of a training and of its validations.
+
+use std::sync::Arc;
+
+use burn::data::dataset::Dataset;
+use burn::data::dataset::transform::ComposedDataset;
+use snapsnap_base::FileError;
+use snapsnap_data::dataset::{Folder, Split};
+use snapsnap_data::sample::{Augment, SampleConfig, Stage};
+
+use crate::TrainError;
+use crate::config::{TrainConfig, ValidationSplit};
+
+/// The samples of a training and of its validations, from all data sets.
+pub struct Data<I> {
+    training: Vec<Stage<I>>,
+    /// Samples that are the same in every validation, from the data sets with the configured split.
+    validation: ComposedDataset<Stage<I>>,
+    /// Number of samples of a validation.
+    pub(crate) count: usize,
+}
+
+impl<I: Clone + Send + Sync + 'static> Data<I> {
+    /// `new` makes the samples of one data set. `samples` is the config of the training's samples.
+    pub(crate) fn new(
+        folders: &[Arc<Folder>],
+        config: &TrainConfig,
+        samples: &SampleConfig,
+        new: fn(Arc<Folder>, Option<Split>, SampleConfig) -> Result<Stage<I>, FileError>,
+    ) -> Result<Self, TrainError> {
+        let mut training = Vec::new();
+        for folder in folders {
+            let (there, needed) = (folder.description().resolution as usize, config.network.resolution);
+            if there != needed {
+                let root = folder.root().display();
+                let message = format!("{root}: has views of {there}² pixels, network.resolution is {needed}");
+                return Err(TrainError::Unsuitable(message));
+            }
+            training.push(new(folder.clone(), Some(Split::Train), samples.clone())?);
+        }
+        let wanted = Some(match config.training.validate_on {
+            ValidationSplit::Val => Split::Val,
+            ValidationSplit::Train => Split::Train,
+        });
+        let wished = config.training.validation_samples;
+        let (mut there, mut people) = (Vec::new(), 0);
+        for folder in folders.iter().filter(|folder| wished > 0 && folder.splits().contains(&wanted)) {
+            let count = folder.subjects(wanted)?.len();
+            people += count;
+            there.extend((count > 0).then_some(folder));
+        }
+        // Photographs without augmentation, and enough samples of each person.
+        let fixed = SampleConfig {
+            repeat: wished.div_ceil(people.max(1)).max(1),
+            augment: Augment::none(),
+            seed: 0,
+            ..config.samples()
+        };
+        let sets = there.into_iter().map(|folder| new(folder.clone(), wanted, fixed.clone()));
+        let validation = ComposedDataset::new(sets.collect::<Result<_, _>>()?);
+        let count = wished.min(validation.len());
+        Ok(Self { training, validation, count })
+    }
+
+    /// The samples of a pass over the data. Each pass has its own random choices.
+    pub fn pass(&self, pass: u64) -> ComposedDataset<Stage<I>> {
+        ComposedDataset::new(self.training.iter().map(|set| set.with_epoch(pass)).collect())
+    }
+
+    /// At most `count` samples of the validation, spread over all data sets.
+    pub(crate) fn validation(&self, count: usize) -> impl Iterator<Item = Result<I, TrainError>> {
+        let (len, count) = (self.validation.len(), count.min(self.count));
+        let get = move |i| self.validation.get(i * len / count);
+        (0..count).map(move |i| get(i).map_err(|e| TrainError::Unsuitable(e.to_string())))
+    }
+}
