@@ -125,7 +125,7 @@ pub struct Footprint {
     pub determinant: f32,
 }
 
-/// Sums over the pixels of one Gaussian in one view.
+/// Sums over the pixels of one Gaussian in one view, from which the gradient of its projection follows.
 #[derive(CubeType, Clone, Copy, Debug)]
 pub struct FootprintGradient {
     /// Σ g·w₀.
@@ -140,8 +140,6 @@ pub struct FootprintGradient {
     pub s11: f32,
     /// ∂L/∂depth.
     pub depth: f32,
-    /// ∂L/∂compensation; zero without antialiasing.
-    pub compensation: f32,
 }
 
 /// ∂L/∂(parameters) of one Gaussian.
@@ -282,8 +280,16 @@ pub fn span(l0: f32, k: f32, l1: f32, radius_squared: f32, top: f32, bottom: f32
 /// * jx = fx/t_z: ∂jx/∂t_z = −jx/t_z. x = t_x/t_z where it is not clamped; a clamped x is a constant.
 /// * u = jx·t_x + cx.
 /// * R(q) entry by entry; q = p/|p| gives v_p = (v_q − q·(q·v_q))/|p|.
+///
+/// `v_compensation` is zero without antialiasing.
 #[cube]
-pub fn project_vjp(view: &View, p: &Projection, scale: &Vec3, g: &FootprintGradient) -> GaussianGradient {
+pub fn project_vjp(
+    view: &View,
+    p: &Projection,
+    scale: &Vec3,
+    g: &FootprintGradient,
+    v_compensation: f32,
+) -> GaussianGradient {
     let f = footprint(view, p);
     let n = cross(&p.m0, &p.m1);
     // F·m and v_m = Fᵀ·S·(F·m).
@@ -303,8 +309,8 @@ pub fn project_vjp(view: &View, p: &Projection, scale: &Vec3, g: &FootprintGradi
     let root = d.sqrt();
     let n_norm = raw.sqrt();
     // Divided step by step: the product of the divisors may underflow.
-    let n_factor = select(n_norm > 0.0, g.compensation * (other / d) / root / n_norm.max(1e-30), 0.0);
-    let m_factor = -(g.compensation * (n_norm / root) * p.blur / d);
+    let n_factor = select(n_norm > 0.0, v_compensation * (other / d) / root / n_norm.max(1e-30), 0.0);
+    let m_factor = -(v_compensation * (n_norm / root) * p.blur / d);
     let v_n = Vec3 { x: n.x * n_factor, y: n.y * n_factor, z: n.z * n_factor };
     let through_n0 = cross(&p.m1, &v_n);
     let through_n1 = cross(&v_n, &p.m0);

@@ -4,7 +4,7 @@ use cubecl::prelude::*;
 
 use super::job::{Job, Wanted};
 use super::splat::Offset;
-use crate::linear::Vec3;
+use crate::linear::{Vec3, add3, load3};
 use crate::vjp::FootprintGradient;
 
 /// Which sums over pixels the backward pass keeps of one intersection, in this order: colour (3), opacity (1),
@@ -50,18 +50,7 @@ pub struct SplatGradient {
     pub color: Vec3,
     /// ∂L/∂opacity after antialiasing.
     pub opacity: f32,
-    /// Σ g·w₀ (see [`crate::vjp`]).
-    pub r0: f32,
-    /// Σ g·w₁.
-    pub r1: f32,
-    /// Σ g·w₀².
-    pub s00: f32,
-    /// Σ g·w₀·w₁.
-    pub s01: f32,
-    /// Σ g·w₁².
-    pub s11: f32,
-    /// ∂L/∂depth.
-    pub depth: f32,
+    pub footprint: FootprintGradient,
 }
 
 #[cube]
@@ -71,12 +60,14 @@ impl SplatGradient {
         SplatGradient {
             color: Vec3 { x: 0.0f32, y: 0.0f32, z: 0.0f32 },
             opacity: 0.0f32,
-            r0: 0.0f32,
-            r1: 0.0f32,
-            s00: 0.0f32,
-            s01: 0.0f32,
-            s11: 0.0f32,
-            depth: 0.0f32,
+            footprint: FootprintGradient {
+                r0: 0.0f32,
+                r1: 0.0f32,
+                s00: 0.0f32,
+                s01: 0.0f32,
+                s11: 0.0f32,
+                depth: 0.0f32,
+            },
         }
     }
 
@@ -85,46 +76,31 @@ impl SplatGradient {
     pub fn add_shape(&mut self, g: f32, w: &Offset) {
         let g_0 = g * w.w0;
         let g_1 = g * w.w1;
-        self.r0 += g_0;
-        self.r1 += g_1;
-        self.s00 += g_0 * w.w0;
-        self.s01 += g_0 * w.w1;
-        self.s11 += g_1 * w.w1;
-    }
-
-    /// The sums that the projection's gradient follows from.
-    pub fn footprint(&self, compensation: f32) -> FootprintGradient {
-        FootprintGradient {
-            r0: self.r0,
-            r1: self.r1,
-            s00: self.s00,
-            s01: self.s01,
-            s11: self.s11,
-            depth: self.depth,
-            compensation,
-        }
+        self.footprint.r0 += g_0;
+        self.footprint.r1 += g_1;
+        self.footprint.s00 += g_0 * w.w0;
+        self.footprint.s01 += g_0 * w.w1;
+        self.footprint.s11 += g_1 * w.w1;
     }
 
     /// Adds the record that starts at `at`.
     pub fn add(&mut self, records: &[f32], at: usize, #[comptime] record: Record) {
         if comptime!(record.colors) {
-            self.color.x += records[at];
-            self.color.y += records[at + 1];
-            self.color.z += records[at + 2];
+            add3(&mut self.color, &load3(records, at));
         }
         if comptime!(record.opacities) {
             self.opacity += records[at + comptime!(record.opacity_at())];
         }
         if comptime!(record.geometry) {
             let at = at + comptime!(record.geometry_at());
-            self.r0 += records[at];
-            self.r1 += records[at + 1];
-            self.s00 += records[at + 2];
-            self.s01 += records[at + 3];
-            self.s11 += records[at + 4];
+            self.footprint.r0 += records[at];
+            self.footprint.r1 += records[at + 1];
+            self.footprint.s00 += records[at + 2];
+            self.footprint.s01 += records[at + 3];
+            self.footprint.s11 += records[at + 4];
         }
         if comptime!(record.depth) {
-            self.depth += records[at + comptime!(record.depth_at())];
+            self.footprint.depth += records[at + comptime!(record.depth_at())];
         }
     }
 
@@ -140,14 +116,14 @@ impl SplatGradient {
         }
         if comptime!(record.geometry) {
             let at = at + comptime!(record.geometry_at() * stride);
-            out[at] = self.r0;
-            out[at + stride] = self.r1;
-            out[at + comptime!(2 * stride)] = self.s00;
-            out[at + comptime!(3 * stride)] = self.s01;
-            out[at + comptime!(4 * stride)] = self.s11;
+            out[at] = self.footprint.r0;
+            out[at + stride] = self.footprint.r1;
+            out[at + comptime!(2 * stride)] = self.footprint.s00;
+            out[at + comptime!(3 * stride)] = self.footprint.s01;
+            out[at + comptime!(4 * stride)] = self.footprint.s11;
         }
         if comptime!(record.depth) {
-            out[at + comptime!(record.depth_at() * stride)] = self.depth;
+            out[at + comptime!(record.depth_at() * stride)] = self.footprint.depth;
         }
     }
 }

@@ -11,7 +11,7 @@ use super::splats::{Visible, projection};
 use super::{Scene, State, ViewState};
 use crate::linear::Vec3;
 use crate::options::{MIN_ALPHA, TILE};
-use crate::vjp::project_vjp;
+use crate::vjp::{FootprintGradient, project_vjp};
 
 /// Gaussians per task.
 const CHUNK: usize = 2048;
@@ -307,12 +307,7 @@ fn write(sums: &Sums, visible: &Visible, record: Record, out: &mut [f32]) {
     let gradient = SplatGradient {
         color: Vec3 { x: red, y: green, z: blue },
         opacity: sum(record.opacities, &sums.alpha) / visible.splat.opacity,
-        r0,
-        r1,
-        s00,
-        s01,
-        s11,
-        depth: sum(record.depth, &sums.depth),
+        footprint: FootprintGradient { r0, r1, s00, s01, s11, depth: sum(record.depth, &sums.depth) },
     };
     gradient.store(out, 0, 1, record);
 }
@@ -370,7 +365,7 @@ fn gather(
                 let gaussian = scene.gaussian(splat.gaussian as usize);
                 let v_compensation = if job.antialiased { sums.opacity * gaussian.opacity } else { 0.0 };
                 let p = projection(&gaussian, camera, job);
-                let v = project_vjp(camera, &p, &gaussian.scale, &sums.footprint(v_compensation));
+                let v = project_vjp(camera, &p, &gaussian.scale, &sums.footprint, v_compensation);
                 if !means.is_empty() {
                     add(means, 3 * i, &[v.mean.x, v.mean.y, v.mean.z]);
                 }

@@ -206,7 +206,7 @@ fn add_pixel(
         gradient.color.z += weight * upstreams[comptime!(2 * UNITS) + at];
     }
     if comptime!(record.depth) {
-        gradient.depth += weight * upstreams[comptime!(3 * UNITS) + at];
+        gradient.footprint.depth += weight * upstreams[comptime!(3 * UNITS) + at];
     }
     if comptime!(record.opacities) {
         gradient.opacity += power;
@@ -313,7 +313,7 @@ pub fn gather(
                     v_visible *= footprint(&view, &p).compensation;
                 }
                 if comptime!(record.geometry) {
-                    let v = project_vjp(&view, &p, &gaussian.scale, &sums.footprint(v_compensation));
+                    let v = project_vjp(&view, &p, &gaussian.scale, &sums.footprint, v_compensation);
                     add3(&mut total.mean, &v.mean);
                     total.rotation.w += v.rotation.w;
                     total.rotation.x += v.rotation.x;
