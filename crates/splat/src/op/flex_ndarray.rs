@@ -104,7 +104,7 @@ fn image_data(image: Vec<f32>, job: &Job) -> TensorData {
 /// In the order of the fields of [`SplatInputs`].
 fn gradient_data(gradients: cpu::Gradients, n: usize) -> [Option<TensorData>; 6] {
     let rows = |values: Vec<f32>, columns| {
-        // Nothing was wanted, or there is nothing.
+        // Empty if the gradient is unwanted, or if there are no Gaussians.
         (!values.is_empty() || n == 0).then(|| TensorData::new(values, [n, columns]))
     };
     let flat = |values: Vec<f32>| {

@@ -7,8 +7,8 @@ use super::splat::Offset;
 use crate::linear::{Vec3, add3, load3};
 use crate::vjp::FootprintGradient;
 
-/// Which sums over pixels the backward pass keeps of one intersection, in this order: colour (3), opacity (1),
-/// geometry (5), depth (1); what is not wanted has no place.
+/// The sums over pixels that the backward pass keeps of one intersection, in this order: colour (3), opacity (1),
+/// geometry (5), depth (1). Unwanted sums have no place.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(super) struct Record {
     pub colors: bool,

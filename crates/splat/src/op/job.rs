@@ -8,15 +8,15 @@ use crate::{Camera, SplatError};
 
 /// Values beyond this are treated like infinities: their products leave the range of f32.
 pub(super) const MAX_MAGNITUDE: f32 = 1e18;
-/// Least |q|² of a quaternion that still names a rotation.
+/// Least |q|² of a quaternion that defines a rotation.
 pub(super) const MIN_QUATERNION: f32 = 1e-12;
 /// Added to the squared radius inside which a splat's α can reach [`MIN_ALPHA`](crate::options::MIN_ALPHA), so that
-/// rounding does not cut off a pixel that the exact test would have taken (needles of 4,000 pixels included).
+/// rounding cuts off no pixel that the exact test would take, for needles of 4,000 pixels too.
 pub(super) const RADIUS_MARGIN: f32 = 1e-2;
 /// Largest image side; keeps pixel coordinates exact in f32 and tile numbers in 32 bits.
 pub const MAX_SIDE: u32 = 32_768;
 
-/// How many Gaussians a render saw and why it left some out, summed over its views.
+/// Numbers of visible and of culled Gaussians, summed over the views of a render.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Counts {
     /// Gaussians that reach at least one pixel's footprint.
@@ -31,7 +31,7 @@ pub struct Counts {
     pub degenerate: u64,
     /// A parameter that is NaN, infinite, or beyond ±1e18.
     pub invalid: u64,
-    /// Pairs of a splat and a 16×16 tile that it reaches: what the run time follows.
+    /// Pairs of a splat and a 16×16 tile that it reaches. The run time grows with them.
     pub intersections: u64,
 }
 
@@ -43,7 +43,7 @@ impl Counts {
     }
 }
 
-/// One call: cameras and constants in the form that the kernels use.
+/// The cameras and constants of one call, in the form that the kernels use.
 #[derive(Debug, Clone)]
 pub struct Job {
     pub(super) views: Vec<View>,
@@ -73,7 +73,7 @@ impl Job {
         let check = |field, holds: bool, allowed| {
             if holds { Ok(()) } else { Err(SplatError::Option { field, allowed }) }
         };
-        // Beyond, a single clamped splat would close the pixel and be left out itself.
+        // With a larger α, a single clamped splat would close the pixel and not be drawn itself.
         let largest = 1.0 - MIN_TRANSMITTANCE;
         check("max_alpha", max_alpha > 0.0 && max_alpha < largest, "within (0, 0.9999)")?;
         check("blur", blur > 0.0 && blur <= 1e6, "positive and at most 1e6 square pixels")?;
@@ -131,7 +131,7 @@ pub struct Wanted {
 }
 
 impl Wanted {
-    /// Whether any of those is wanted that the shape of a splat depends on: they share their sums over pixels.
+    /// Whether the gradient of a mean, rotation or scale is wanted: they share their sums over pixels.
     pub fn geometry(self) -> bool {
         self.means || self.rotations || self.scales
     }
@@ -146,7 +146,7 @@ fn view(camera: &Camera) -> View {
     let centre = camera.centre();
     let high = centre.as_vec3();
     let low = (centre - high.as_dvec3()).as_vec3();
-    // The image border as seen from the centre, plus 15 % of the image on either side.
+    // The image borders, as t/t_z, plus 15 % of the image on either side.
     let limits = |side: u32, focal: f64, principal: f64| {
         let margin = 0.15 * f64::from(side);
         ((-(principal + margin) / focal) as f32, ((f64::from(side) - principal + margin) / focal) as f32)

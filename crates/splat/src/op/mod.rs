@@ -1,7 +1,7 @@
 #![allow(deprecated, reason = "NdArray is the CPU test backend")]
 
-//! The splatting operation as a Burn backend extension. Everything that knows Burn's backend interfaces is in this
-//! file, [`flex_ndarray`] and [`gpu`]; those interfaces change with every minor version of Burn.
+//! The splatting operation as a Burn backend extension. Burn's backend interfaces change with every minor version; only
+//! this file, [`flex_ndarray`] and [`gpu`] use them.
 
 mod cpu;
 mod flex_ndarray;
@@ -38,8 +38,8 @@ pub struct SplatInputs<B: Backend> {
     pub(crate) background: FloatTensor<B>,
 }
 
-/// Colours `[V,H,W,3]`, alphas `[V,H,W,1]` and depths `[V,H,W,1]`; where no depth was asked for, alphas stand in for it. On
-/// an error they mean nothing.
+/// Colours `[V,H,W,3]`, alphas `[V,H,W,1]` and depths `[V,H,W,1]`. Without depths, the alphas take their place. After an
+/// error the tensors are meaningless.
 #[derive(ExtensionType)]
 pub struct SplatOutput<B: Backend> {
     pub(crate) color: FloatTensor<B>,
@@ -48,7 +48,7 @@ pub struct SplatOutput<B: Backend> {
     pub(crate) counts: Result<Counts, SplatError>,
 }
 
-/// Where in an image `[V,H,W,C]` colours, alphas and depths lie.
+/// Channels of colours, alphas and depths in an image `[V,H,W,C]`.
 const CHANNELS: [Range<usize>; 3] = [0..3, 3..4, 4..5];
 
 fn channels<B: Backend>(image: FloatTensor<B>, range: Range<usize>) -> FloatTensor<B> {
@@ -56,8 +56,8 @@ fn channels<B: Backend>(image: FloatTensor<B>, range: Range<usize>) -> FloatTens
     B::float_slice(image, &[full, full, full, Slice::from(range)])
 }
 
-/// ∂L/∂ of the outputs of a call, those that have none `None`: kept apart, for they are as large as pictures, and putting
-/// them together would cost several times that.
+/// ∂L/∂ of the outputs of a call; `None` for outputs without a gradient. They stay apart, since joining pictures costs
+/// several times their memory.
 #[derive(Debug, Clone, Copy)]
 pub struct Upstream<T> {
     /// Colours `[V,H,W,3]`.
@@ -80,10 +80,10 @@ impl<T> Upstream<T> {
     }
 }
 
-/// Backends that can splat. Users call [`render`](crate::render()).
+/// Backends with the splatting operation. Users call [`render`](crate::render()).
 #[backend_extension(Cube, Flex, NdArray, Autodiff)]
 pub trait SplatBackend: Backend {
-    /// Renders `inputs` as `job` says.
+    /// Renders `inputs`.
     fn splat(#[extension_type] inputs: SplatInputs<Self>, job: Arc<Job>) -> SplatOutput<Self>;
 }
 
@@ -101,7 +101,7 @@ pub trait SplatKernels: Backend {
     /// [`SplatError::TooManyIntersections`].
     fn forward(inputs: &SplatInputs<Self>, job: &Job, keep: bool) -> Forward<Self>;
 
-    /// Gradients in the order of the fields of [`SplatInputs`], those that are not wanted `None`.
+    /// Gradients in the order of the fields of [`SplatInputs`]; `None` for unwanted ones.
     fn backward(
         inputs: &SplatInputs<Self>,
         job: &Job,
@@ -152,7 +152,7 @@ impl<B: SplatKernels> Backward<B, 6> for SplatBackward {
     type State = Kept<B>;
 
     fn backward(self, ops: Ops<Self::State, 6>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
-        // Only says that something arrived.
+        // A token: the gradients themselves are in `arrived`.
         drop(grads.consume::<B>(&ops.node));
         let Kept { inputs, job, state, arrived } = ops.state;
         let [color, alpha, depth] = std::mem::take(&mut *lock(&arrived));
@@ -169,7 +169,7 @@ impl<B: SplatKernels> Backward<B, 6> for SplatBackward {
     }
 }
 
-/// Takes what arrives at one of the outputs to the operation, without the detour over an image of zeros.
+/// Passes the gradient of one output to the operation. Burn's own slice would first write it into an image of zeros.
 #[derive(Debug)]
 struct ChannelsBackward;
 
@@ -187,7 +187,7 @@ impl<B: SplatKernels> Backward<B, 1> for ChannelsBackward {
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    // Nothing is half done where it is held.
+    // No holder leaves the value incomplete.
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 

@@ -16,7 +16,7 @@ use crate::vjp::{FootprintGradient, project_vjp};
 /// Gaussians per task.
 const CHUNK: usize = 2048;
 
-/// Gradients in the shapes of the inputs; empty where not wanted.
+/// Gradients in the shapes of the inputs; empty if unwanted.
 #[derive(Debug, Default)]
 pub struct Gradients {
     pub means: Vec<f32>,
@@ -113,7 +113,7 @@ struct Band<'a> {
     record: Record,
 }
 
-/// A tile's pixels while splats are taken off them again.
+/// A tile's pixels while splats are removed from them, back to front.
 struct Pixels {
     /// Transmittance in front of the splat last visited.
     transmittance: [Lanes; TILE],
@@ -152,7 +152,7 @@ impl WithSimd for Band<'_> {
 }
 
 impl Band<'_> {
-    /// Without `SHAPE`, only colours are wanted; with it everything is computed and the record takes its share.
+    /// Without `SHAPE`, only gradients of colours are computed.
     #[inline(always)]
     fn tile<const SHAPE: bool, const DEPTH: bool>(&mut self, x: usize) {
         let tile = self.y * self.job.tiles_x() + x;

@@ -43,8 +43,8 @@ pub fn row(splat: &Splat, left: f32, y: f32) -> Row {
 /// Splats that [`fetch`] copies at once.
 pub const BATCH: usize = 64;
 
-/// Copies the splats of `entries` side by side. They lie all over a large array; loads that nothing waits for overlap,
-/// one after another they would each take the whole way to memory.
+/// Copies the splats of `entries` side by side. They are scattered over a large array; loads on which nothing depends
+/// overlap, so that the latency of memory counts once per batch.
 #[inline(always)]
 pub fn fetch(splats: &[Visible], entries: &[u32], batch: &mut [Visible; BATCH]) {
     for (slot, &entry) in batch.iter_mut().zip(entries) {

@@ -1,11 +1,10 @@
 //! The splatting operation on the CPU: all cores through rayon, pixels in SIMD rows.
 //!
-//! A view goes through four steps: project every Gaussian ([`splats`]), order what is visible by depth, hand each
-//! 16×16 tile the list of splats whose ellipse reaches one of its pixels ([`tiles`]), and blend tile by tile
-//! ([`blend`]). Empty tiles have empty lists and cost nothing but the writing of their pixels. The backward pass walks
-//! the same lists from the back ([`mod@backward`]).
+//! A view takes four steps: project every Gaussian ([`splats`]), sort the visible ones by depth, list for each 16×16
+//! tile the splats whose ellipse reaches one of its pixels ([`tiles`]), and blend tile by tile ([`blend`]). Empty tiles
+//! only cost the writing of their pixels. The backward pass visits the same lists from the back ([`mod@backward`]).
 //!
-//! Results of threads are joined in a fixed order, so that they do not depend on the number of threads.
+//! Results of threads are joined in a fixed order, so they do not depend on the number of threads.
 
 #![allow(
     clippy::needless_range_loop,
@@ -49,7 +48,7 @@ impl Scene<'_> {
     }
 }
 
-/// Values of each view that the backward pass needs.
+/// The values of each view for the backward pass.
 #[derive(Debug, Default)]
 pub struct State {
     views: Vec<ViewState>,
@@ -66,7 +65,7 @@ struct ViewState {
     last: Vec<u32>,
 }
 
-/// Renders all views of `job`: image `[V,H,W,C]`, what the backward pass needs (where `keep`), counts.
+/// Renders all views of `job`: image `[V,H,W,C]`, the state for the backward pass (with `keep`), counts.
 pub fn forward(scene: Scene, job: &Job, keep: bool) -> Result<(Vec<f32>, State, Counts), SplatError> {
     let pixels = job.width * job.height;
     let channels = job.channels();
@@ -92,10 +91,10 @@ pub fn forward(scene: Scene, job: &Job, keep: bool) -> Result<(Vec<f32>, State, 
     Ok((image, state, Counts::new(fates, intersections)))
 }
 
-/// So many zeros, or an error where the system refuses the memory.
+/// `n` zeros, or an error if the system refuses the memory.
 fn zeros(what: &'static str, n: usize) -> Result<Vec<f32>, SplatError> {
-    // Asked for and given back: `vec!` gets its zeros from the system, page by page when they are first touched, but ends
-    // the process where it gets none.
+    // A trial allocation, since `vec!` ends the process if it gets no memory. Yet `vec!` is the way to get zeros from the
+    // system, page by page when they are first touched.
     let mut probe = Vec::<f32>::new();
     let bytes = (n as u64).saturating_mul(4);
     probe.try_reserve_exact(n).map_err(|_| SplatError::Memory { what, bytes })?;

@@ -1,4 +1,4 @@
-//! Which splats each tile must look at, front to back.
+//! The splats of each tile, front to back.
 
 use rayon::prelude::*;
 
@@ -10,9 +10,9 @@ use crate::SplatError;
 /// Splats per task.
 const CHUNK: usize = 4096;
 
-/// Most entries of all lists together: 4 GB here, and as much again while they are made …
+/// Largest number of entries of all lists: 4 GB, and as much again while they are made …
 const MAX_ENTRIES: u64 = 1 << 29;
-/// … and where a gradient is wanted, whose records take 40 bytes per entry.
+/// … and with gradients, whose records take 40 bytes per entry.
 const MAX_KEPT: u64 = 1 << 28;
 
 /// One list of splats per tile, back to back in one array, tiles row by row.
@@ -20,11 +20,11 @@ const MAX_KEPT: u64 = 1 << 28;
 pub struct Lists {
     /// Splat of each entry.
     pub entries: Vec<u32>,
-    /// Where each tile's list starts in `entries`, and at last its length.
+    /// Start of each tile's list in `entries`, and the length of `entries`.
     pub starts: Vec<u32>,
-    /// Where in `entries` the entries of a splat went, splat by splat. Empty where no gradient is wanted.
+    /// Places of a splat's entries in `entries`, splat by splat. Empty without gradients.
     pub places: Vec<u32>,
-    /// Where each splat's places start in `places`, and at last their number. Empty where no gradient is wanted.
+    /// Start of each splat's places in `places`, and the length of `places`. Empty without gradients.
     pub first_place: Vec<u32>,
 }
 

@@ -29,7 +29,7 @@ struct Upstream {
     depth: f32,
 }
 
-/// A pixel while splats are taken off it again.
+/// A pixel while splats are removed from it, back to front.
 #[derive(CubeType, Clone, Copy)]
 struct Behind {
     /// Transmittance in front of the splat that was visited last.
@@ -49,7 +49,7 @@ struct Share {
 
 #[cube]
 impl Behind {
-    /// Takes a splat with unclamped α `full` off the pixel.
+    /// Removes a splat with unclamped α `full` from the pixel.
     fn take_off(
         &mut self,
         splat: &Splat,

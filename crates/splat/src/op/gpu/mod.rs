@@ -167,7 +167,7 @@ impl SplatKernels for CubeBackend {
     }
 }
 
-/// ∂L/∂image `[V,H,W,C]` for kernels: nothing arrived where nobody looked.
+/// ∂L/∂image `[V,H,W,C]`: the gradients of all outputs, 0 for outputs without one.
 fn whole(upstream: Upstream<CubeTensor>, job: &Job, device: &Device<CubeBackend>) -> CubeTensor {
     let shape = Shape::new([job.views.len(), job.height, job.width, job.channels()]);
     let Upstream { color, alpha, depth } = upstream;
@@ -182,7 +182,7 @@ fn whole(upstream: Upstream<CubeTensor>, job: &Job, device: &Device<CubeBackend>
     into_contiguous(image)
 }
 
-/// Room for a gradient. Where there is nothing, its shape says so, though the kernels need at least one number.
+/// A buffer for a gradient. Its shape may be empty, while the buffer has at least one number, as kernels require.
 fn gradient<const D: usize>(buffers: &Buffers, shape: [usize; D]) -> CubeTensor {
     let CubeTensor { client, device, handle, .. } = buffers.empty(shape, DType::F32);
     CubeTensor::new_contiguous(client, device, Shape::new(shape), handle, DType::F32)
@@ -230,7 +230,7 @@ fn contiguous(inputs: &SplatInputs<CubeBackend>) -> Inputs {
     }
 }
 
-/// Steps 1 to 3: splats, their reach, the tiles' lists, and what was counted.
+/// Steps 1 to 3: splats, their reach, the tiles' lists, and the counts.
 fn lists(
     buffers: &Buffers,
     inputs: &Inputs,
@@ -253,7 +253,7 @@ fn lists(
     let reach = buffers.u32(total * REACH);
     let keys = buffers.u32(total);
     let statistics = buffers.zeros(STATISTICS);
-    // One more for the tile that does not exist.
+    // One more for the tile that does not exist (see `emit`).
     let (starts, ends) = (buffers.zeros(all_tiles + 1), buffers.zeros(all_tiles + 1));
     if total == 0 {
         let lists = Lists { entries: buffers.u32(1), slots: buffers.u32(1), starts, ends, len: 0 };
