@@ -1,5 +1,7 @@
 //! TOML configs: a file, the file that it `extends`, and assignments on top.
 
+use std::fmt::Display;
+use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
@@ -29,14 +31,14 @@ pub enum ConfigError {
         /// The parser's message, with line and key.
         message: String,
     },
-    /// A value that makes no sense, alone or beside another.
+    /// A value that is refused, alone or beside another.
     #[error("{origin}: `{key}`: {message}")]
     Value {
         /// File or other origin of the text.
         origin: String,
         /// Dotted key.
         key: String,
-        /// What is wrong and what is allowed.
+        /// The fault and the allowed values.
         message: String,
     },
 }
@@ -46,7 +48,7 @@ pub trait Schema: DeserializeOwned + Serialize {
     /// Former names of keys with the present ones, dotted. A former name is refused with the present one in the message.
     const RENAMED: &'static [(&'static str, &'static str)] = &[];
 
-    /// The first value that makes no sense: its dotted key, and what is wrong.
+    /// The dotted key of the first refused value, and the reason.
     fn refusal(&self) -> Option<(String, String)>;
 
     /// Reads and checks a file and those that it extends; `overrides` are `a.b=c` assignments on top.
@@ -71,7 +73,7 @@ pub trait Schema: DeserializeOwned + Serialize {
         build(table, origin.to_owned(), overrides)
     }
 
-    /// The config itself, if all its values make sense; `origin` names it in errors.
+    /// The config itself, if no value is refused; `origin` names it in errors.
     ///
     /// # Errors
     /// [`ConfigError::Value`].
@@ -89,6 +91,14 @@ pub trait Schema: DeserializeOwned + Serialize {
     fn to_toml(&self) -> String {
         toml::to_string_pretty(self).expect("configs have only TOML types")
     }
+}
+
+/// The first key whose value is outside its range, and the message about it.
+pub fn outside<T: PartialOrd + Display>(
+    values: impl IntoIterator<Item = (&'static str, T, RangeInclusive<T>)>,
+) -> Option<(&'static str, String)> {
+    let (key, value, range) = values.into_iter().find(|(_, value, range)| !range.contains(value))?;
+    Some((key, format!("is {value}, must be {} to {}", range.start(), range.end())))
 }
 
 fn syntax(origin: &str, message: String) -> ConfigError {

@@ -5,7 +5,7 @@ use rand::Rng;
 use serde::{Deserialize, Serialize};
 use snapsnap_splat::Orbit;
 
-use crate::limits::outside;
+use snapsnap_base::config::outside;
 
 /// Uniform deviations of cameras within ± each value.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]

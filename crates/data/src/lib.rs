@@ -2,7 +2,6 @@
 
 pub mod dataset;
 mod jitter;
-pub mod limits;
 pub mod photo;
 pub mod prepare;
 mod resize;

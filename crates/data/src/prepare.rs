@@ -11,9 +11,9 @@ use crate::JitterConfig;
 use crate::dataset::{
     Arrangement, Description, Drawn, Folder, Layout, MAX_RESOLUTION, MAX_VIEWS, Made, Split,
 };
-use crate::limits::outside;
 use snapsnap_base::FileError;
 use snapsnap_base::config::Schema;
+use snapsnap_base::config::outside;
 use snapsnap_base::random::stream;
 use snapsnap_mesh::mesh::Mesh;
 use snapsnap_mesh::view::{Lights, Renderer, ViewOptions};

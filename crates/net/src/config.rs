@@ -270,46 +270,39 @@ impl Config {
         self.network.resolution / self.network.net_resolution
     }
 
+    /// The value in force of a key of the modes: of the published code with `mode.compat`, else the corrected one.
+    fn mode<T>(&self, key: Option<T>, published: T, corrected: T) -> T {
+        key.unwrap_or(if self.mode.compat { published } else { corrected })
+    }
+
     /// Interpolation of points and confidences.
     pub fn upsample(&self) -> Upsample {
-        self.network.upsample.unwrap_or(if self.mode.compat {
-            Upsample::Bilinear
-        } else {
-            Upsample::MaskAware
-        })
+        self.mode(self.network.upsample, Upsample::Bilinear, Upsample::MaskAware)
     }
 
     /// Frame of the predicted quaternions.
     pub fn rotation_frame(&self) -> RotationFrame {
-        self.mode.rotation_frame.unwrap_or(if self.mode.compat {
-            RotationFrame::World
-        } else {
-            RotationFrame::Camera
-        })
+        self.mode(self.mode.rotation_frame, RotationFrame::World, RotationFrame::Camera)
     }
 
     /// Reduction of the canvas to the network's input.
     pub fn downsample(&self) -> Downsample {
-        self.mode.downsample.unwrap_or(if self.mode.compat { Downsample::Nearest } else { Downsample::Area })
+        self.mode(self.mode.downsample, Downsample::Nearest, Downsample::Area)
     }
 
     /// World frame of the PLY.
     pub fn world_frame(&self) -> WorldFrame {
-        self.mode.world_frame.unwrap_or(if self.mode.compat {
-            WorldFrame::Mirrored
-        } else {
-            WorldFrame::Upright
-        })
+        self.mode(self.mode.world_frame, WorldFrame::Mirrored, WorldFrame::Upright)
     }
 
-    /// Whether the regressor sees only the person's box.
+    /// Whether the regressor's input is only the person's box.
     pub fn crop(&self) -> bool {
-        self.mode.crop.unwrap_or(!self.mode.compat)
+        self.mode(self.mode.crop, false, true)
     }
 
     /// Height to which the person is scaled, in pixels of a canvas of 1024: that of the training subjects, which cover
     /// rows 124 to 863, or the published demo's (docs/method.md, "Photographs on the canvas").
     pub fn person_height(&self) -> usize {
-        self.mode.person_height.unwrap_or(if self.mode.compat { 700 } else { 739 })
+        self.mode(self.mode.person_height, 700, 739)
     }
 }

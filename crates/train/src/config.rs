@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
-use snapsnap_data::limits::outside;
+use snapsnap_base::config::outside;
 use snapsnap_data::sample::SampleConfig;
 use snapsnap_eval::lpips::MIN_SIDE;
 use snapsnap_net::config::{ConfMode, Config, ModeConfig, NetworkConfig, RegressorConfig, Schema};

@@ -3,7 +3,7 @@
 use std::f64::consts::PI;
 
 use serde::{Deserialize, Serialize};
-use snapsnap_data::limits::outside;
+use snapsnap_base::config::outside;
 
 /// A schedule as a share of the highest rate: the section `[schedule]`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]

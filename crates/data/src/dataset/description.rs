@@ -7,7 +7,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use crate::JitterConfig;
-use crate::limits::outside;
+use snapsnap_base::config::outside;
 use snapsnap_base::{FileError, file};
 
 /// Name of the description's file.

@@ -8,7 +8,7 @@ use image::{GrayImage, Rgb, RgbImage};
 use rand::Rng;
 use serde::{Deserialize, Serialize};
 
-use crate::limits::outside;
+use snapsnap_base::config::outside;
 
 /// Ranges of the changes; 0 or false disables one. Front and back are changed independently.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

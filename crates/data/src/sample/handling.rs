@@ -6,8 +6,8 @@ use serde::{Deserialize, Serialize};
 
 use super::augment::moved;
 use super::place::{scale_of, shift};
-use crate::limits::outside;
 use crate::photo::{Mapping, Rect};
+use snapsnap_base::config::outside;
 use snapsnap_splat::{Camera, RigidTransform};
 
 /// Canvas side that lengths refer to.

@@ -20,12 +20,12 @@ use serde::{Deserialize, Serialize};
 use snapsnap_splat::Camera;
 
 use crate::dataset::{Arrangement, Folder, Layout, Split};
-use crate::limits::outside;
 use crate::photo::{Canvas, on_canvas, place};
 pub use augment::Augment;
 pub use handling::Handling;
 pub use loader::{Batches, Loader};
 use snapsnap_base::FileError;
+use snapsnap_base::config::outside;
 use snapsnap_base::random::stream;
 pub use stage1::{Stage1, Stage1Batch, Stage1Batcher, Stage1Item};
 pub use stage2::{Stage2, Stage2Item};

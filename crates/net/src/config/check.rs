@@ -1,148 +1,122 @@
-//! Which values of a config make sense, alone and beside each other.
+//! The refused values of a config, alone and beside each other.
+
+use snapsnap_base::config::outside;
 
 use crate::weights::schema::{self, TensorSpec};
 
 use super::{
-    Anchor, Body, Config, Downsample, HeadKind, RegressorColor, RegressorStart, RotationFrame, Schema,
-    Upsample, WorldFrame,
+    Anchor, Body, Config, Downsample, HeadKind, RegressorColor, RegressorStart, RotationFrame,
+    Schema, Upsample, WorldFrame,
 };
 
-/// Seven times the published size, 16 GB of f32. A larger number is taken for a typing error.
+/// Largest number of parameters: seven times the published size, 16 GB of f32.
 const MAX_PARAMETERS: usize = 4_000_000_000;
+
+/// A key and the reason why its value is refused.
+type Problem = (&'static str, String);
 
 impl Schema for Config {
     fn refusal(&self) -> Option<(String, String)> {
-        self.problem().map(|(key, message)| (key.to_owned(), message))
+        let problem = self.size_problem().or_else(|| self.problem()).or_else(|| self.contradiction());
+        problem.map(|(key, message)| (key.to_owned(), message))
     }
 }
 
 impl Config {
-    fn problem(&self) -> Option<(&'static str, String)> {
-        let n = &self.network;
+    fn size_problem(&self) -> Option<Problem> {
+        let (n, r) = (&self.network, &self.regressor);
+        let branches = n.layer_dims.map(|dim| ("network.layer_dims", dim, 1..=8_192));
         let sizes = [
-            ("network.enc_dim", n.enc_dim, 8_192),
-            ("network.enc_depth", n.enc_depth, 128),
-            ("network.enc_heads", n.enc_heads, 1_024),
-            ("network.dec_dim", n.dec_dim, 8_192),
-            ("network.dec_depth", n.dec_depth, 128),
-            ("network.dec_heads", n.dec_heads, 1_024),
-            ("network.mlp_ratio", n.mlp_ratio, 16),
-            ("network.patch", n.patch, 64),
-            ("network.layer_dims", n.layer_dims.into_iter().min().unwrap_or(0), 8_192),
-            ("network.layer_dims", n.layer_dims.into_iter().max().unwrap_or(0), 8_192),
-            ("network.feature_dim", n.feature_dim, 8_192),
-            ("network.last_dim", n.last_dim, 8_192),
-            ("network.resolution", n.resolution, 4_096),
-            ("network.net_resolution", n.net_resolution, 4_096),
-            ("regressor.channels", self.regressor.channels, 1_024),
-            ("regressor.groups", self.regressor.groups, 1_024),
+            ("network.enc_dim", n.enc_dim, 1..=8_192),
+            ("network.enc_depth", n.enc_depth, 1..=128),
+            ("network.enc_heads", n.enc_heads, 1..=1_024),
+            ("network.dec_dim", n.dec_dim, 1..=8_192),
+            ("network.dec_depth", n.dec_depth, 1..=128),
+            ("network.dec_heads", n.dec_heads, 1..=1_024),
+            ("network.mlp_ratio", n.mlp_ratio, 1..=16),
+            ("network.patch", n.patch, 1..=64),
+            ("network.feature_dim", n.feature_dim, 1..=8_192),
+            ("network.last_dim", n.last_dim, 1..=8_192),
+            ("network.resolution", n.resolution, 1..=4_096),
+            ("network.net_resolution", n.net_resolution, 1..=4_096),
+            ("network.hull_margin", n.hull_margin.unwrap_or(0), 0..=1_024),
+            ("mode.person_height", self.person_height(), 16..=1_024),
+            ("regressor.networks", r.networks, 1..=2),
+            ("regressor.channels", r.channels, 1..=1_024),
+            ("regressor.groups", r.groups, 1..=1_024),
+            ("regressor.margin", r.margin.unwrap_or(0), 0..=4_096),
         ];
-        for (key, value, most) in sizes {
-            if value == 0 || value > most {
-                return Some((key, format!("is {value}, must be between 1 and {most}")));
-            }
-        }
+        outside(sizes.into_iter().chain(branches))
+    }
+
+    /// The first refused value, for sizes that are each in their range.
+    fn problem(&self) -> Option<Problem> {
+        let (n, r) = (&self.network, &self.regressor);
+        let is_transformer = n.body == Body::Transformer;
+        let refuse = |key, message: String| Some((key, message));
         for (key, dim, heads) in
             [("network.enc_heads", n.enc_dim, n.enc_heads), ("network.dec_heads", n.dec_dim, n.dec_heads)]
         {
             if !dim.is_multiple_of(4 * heads) {
-                let message = format!(
-                    "{dim} channels over {heads} heads: the channels of one head must be a multiple of 4 (rotary \
-                     position embedding)"
-                );
-                return Some((key, message));
+                let rule = "the channels of one head must be a multiple of 4 (rotary position embedding)";
+                return refuse(key, format!("{dim} channels over {heads} heads: {rule}"));
             }
         }
         if !n.rope_base.is_finite() || n.rope_base <= 0.0 {
-            return Some(("network.rope_base", format!("is {}, must be positive", n.rope_base)));
+            return refuse("network.rope_base", format!("is {}, must be positive", n.rope_base));
         }
         if !n.feature_dim.is_multiple_of(2) {
-            return Some(("network.feature_dim", format!("is {}, must be even", n.feature_dim)));
+            return refuse("network.feature_dim", format!("is {}, must be even", n.feature_dim));
         }
-        let hooked = (n.body == Body::Transformer).then_some(n.hooks);
-        if let Some(hook) = hooked.into_iter().flatten().find(|&h| h > n.dec_depth) {
-            return Some(("network.hooks", format!("{hook} is beyond the last layer {}", n.dec_depth)));
+        if let Some(hook) = n.hooks.into_iter().find(|&h| is_transformer && h > n.dec_depth) {
+            return refuse("network.hooks", format!("{hook} is beyond the last layer {}", n.dec_depth));
         }
-        if n.body == Body::Convolution {
-            if ![8, 16].contains(&n.patch) {
-                let message = format!("is {}, a convolution has 8 or 16", n.patch);
-                return Some(("network.patch", message));
-            }
-            if n.drop_empty {
-                return Some((
-                    "network.drop_empty",
-                    "is a transformer's: a convolution has no tokens to drop".into(),
-                ));
-            }
-        } else if n.head == HeadKind::Dpt && n.patch != 16 {
-            return Some((
-                "network.patch",
-                format!("is {}; the DPT head is built for patches of 16 pixels", n.patch),
-            ));
+        if is_transformer && n.head == HeadKind::Dpt && n.patch != 16 {
+            return refuse("network.patch", format!("is {}; the DPT head has patches of 16 pixels", n.patch));
+        }
+        if !is_transformer && ![8, 16].contains(&n.patch) {
+            return refuse("network.patch", format!("is {}, a convolution has 8 or 16", n.patch));
+        }
+        if !is_transformer && n.drop_empty {
+            return refuse("network.drop_empty", "must be false: a convolution has no tokens to drop".into());
         }
         if !n.net_resolution.is_multiple_of(n.patch) {
             let message = format!("{} is no multiple of the patch {}", n.net_resolution, n.patch);
-            return Some(("network.net_resolution", message));
+            return refuse("network.net_resolution", message);
         }
         if !n.resolution.is_multiple_of(n.net_resolution) || !n.resolution.is_multiple_of(4) {
-            let message = format!(
-                "is {}, must be a multiple of `network.net_resolution` ({}) and of 4",
-                n.resolution, n.net_resolution
-            );
-            return Some(("network.resolution", message));
-        }
-        if n.hull_margin.is_some_and(|margin| margin > 1024) {
-            return Some(("network.hull_margin", "must be at most 1024 (of a canvas of 1024)".into()));
+            let rule = format!("a multiple of `network.net_resolution` ({}) and of 4", n.net_resolution);
+            return refuse("network.resolution", format!("is {}, must be {rule}", n.resolution));
         }
         if n.steepest.is_some_and(|steepest| steepest.is_nan() || steepest < 1.0) {
-            return Some((
-                "network.steepest",
-                "must be at least 1 (as on a surface that faces the camera)".into(),
-            ));
+            let message = "must be at least 1 (as on a surface that faces the camera)";
+            return refuse("network.steepest", message.into());
         }
         if n.conf_threshold.is_nan() {
-            return Some(("network.conf_threshold", "is not a number".into()));
+            return refuse("network.conf_threshold", "is not a number".into());
         }
         if !(n.delta as f32).is_normal() {
-            return Some((
-                "network.delta",
-                format!("is {}, which as f32 is zero, tiny or infinite", n.delta),
-            ));
-        }
-        if !(16..=1024).contains(&self.person_height()) {
-            let message =
-                format!("is {}, must be between 16 and 1024 (of a canvas of 1024)", self.person_height());
-            return Some(("mode.person_height", message));
-        }
-        let r = &self.regressor;
-        if !(1..=2).contains(&r.networks) {
-            return Some(("regressor.networks", format!("is {}, allowed: 1, 2", r.networks)));
+            let message = format!("is {}, which as f32 is zero, tiny or infinite", n.delta);
+            return refuse("network.delta", message);
         }
         if r.networks == 2 && !n.side_heads {
-            return Some((
-                "regressor.networks",
-                "is 2, but `network.side_heads = false` leaves the second unused".into(),
-            ));
-        }
-        if r.margin.is_some_and(|margin| margin > 4_096) {
-            return Some(("regressor.margin", format!("is {}, must be at most 4096", r.margin())));
+            let message = "is 2, but `network.side_heads = false` leaves the second unused";
+            return refuse("regressor.networks", message.into());
         }
         if r.margin.is_some() && !self.crop() {
-            return Some(("regressor.margin", "has no meaning where `mode.crop` is false".into()));
+            return refuse("regressor.margin", "has no meaning where `mode.crop` is false".into());
         }
         if !r.channels.is_multiple_of(r.groups) {
-            return Some((
-                "regressor.channels",
-                format!("{} is no multiple of {} groups", r.channels, r.groups),
-            ));
+            let message = format!("{} is no multiple of {} groups", r.channels, r.groups);
+            return refuse("regressor.channels", message);
         }
         let parameters: usize = schema::tensors(self).iter().map(TensorSpec::elements).sum();
         if parameters > MAX_PARAMETERS {
             let message =
                 format!("all sizes together make {parameters} parameters, more than {MAX_PARAMETERS}");
-            return Some(("network", message));
+            return refuse("network", message);
         }
-        self.contradiction()
+        None
     }
 
     fn contradiction(&self) -> Option<(&'static str, String)> {
