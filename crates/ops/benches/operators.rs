@@ -1,7 +1,8 @@
-//! The operators of a training step one by one, for `docs/operators_pytorch.py`, which times PyTorch's beside them. Each line
-//! of input is a question: `time SECONDS NAME SIZES…` is answered with the fastest forward and backward run in ms;
-//! `check FOLDER NAME SIZES…` reads `FOLDER/in0 …`, writes `FOLDER/out0 …` (result, then gradients) and is answered with their
-//! number.
+//! The operators of a training step one by one. `docs/operators_pytorch.py` runs this program and times PyTorch's.
+//!
+//! Each line of input is a command. `time SECONDS NAME SIZES…` prints the times of the fastest forward and backward run
+//! in ms. `check FOLDER NAME SIZES…` reads `FOLDER/in0 …`, writes `FOLDER/out0 …` (result, then gradients), and prints
+//! the number of outputs.
 
 use std::io::BufRead;
 use std::time::{Duration, Instant};
@@ -59,50 +60,31 @@ fn lengths(name: &str, s: &[usize]) -> Vec<usize> {
 /// Forward and backward pass.
 fn build<'a>(name: &str, s: &[usize], x: &'a [Vec<f32>], buffers: &'a Buffers) -> [Run<'a>; 2] {
     let dy = &x[x.len() - 1];
-    match name {
-        "conv3x3" => {
-            let [batch, inputs, outputs, height] = [s[0], s[1], s[2], s[3]];
-            let layer = Conv3x3 { batch, inputs, outputs, height, width: height, rectified: s[4] == 1 };
-            let bias = (s[5] == 1).then(|| &x[2][..]);
-            let wanted = Wanted { bias: bias.is_some(), ..Wanted::ALL };
+    // All inputs but the first two and the last one.
+    let bias = x.get(2..x.len() - 1).and_then(|rest| Some(&rest.first()?[..]));
+    let mut wanted = Wanted { bias: bias.is_some(), ..Wanted::ALL };
+    macro_rules! passes {
+        ($layer:expr) => {{
+            let layer = $layer;
             [
                 Box::new(move || vec![layer.forward(&x[0], &x[1], bias, buffers)]),
                 Box::new(move || all(layer.backward(&x[0], &x[1], dy, wanted, buffers))),
             ]
-        }
-        "conv1x1" => {
-            let [batch, inputs, outputs, side] = [s[0], s[1], s[2], s[3]];
-            let layer = Conv1x1 { batch, inputs, outputs, pixels: side * side, rectified: s[4] == 1 };
-            [
-                Box::new(move || vec![layer.forward(&x[0], &x[1], Some(&x[2]), buffers)]),
-                Box::new(move || all(layer.backward(&x[0], &x[1], dy, Wanted::ALL, buffers))),
-            ]
-        }
-        "enlarge" => {
-            let [batch, inputs, outputs, height, stride] = [s[0], s[1], s[2], s[3], s[4]];
-            let layer = Enlarge { batch, inputs, outputs, height, width: height, stride };
-            [
-                Box::new(move || vec![layer.forward(&x[0], &x[1], Some(&x[2]), buffers)]),
-                Box::new(move || all(layer.backward(&x[0], &x[1], dy, Wanted::ALL, buffers))),
-            ]
-        }
+        }};
+    }
+    let (batch, inputs, rectified) = (s[0], s[1], s.get(4) == Some(&1));
+    let [outputs, height] = [2, 3].map(|i| s.get(i).copied().unwrap_or(0));
+    let width = height;
+    match name {
+        "conv3x3" => passes!(Conv3x3 { batch, inputs, outputs, height, width, rectified }),
+        "conv1x1" => passes!(Conv1x1 { batch, inputs, outputs, pixels: height * width, rectified }),
+        "enlarge" => passes!(Enlarge { batch, inputs, outputs, height, width, stride: s[4] }),
         "halve" => {
-            let [batch, inputs, outputs, height] = [s[0], s[1], s[2], s[3]];
-            let layer =
-                Unfolded { batch, inputs, outputs, height, width: height, stride: 2, rectified: false };
-            [
-                Box::new(move || vec![layer.forward(&x[0], &x[1], Some(&x[2]), buffers)]),
-                Box::new(move || all(layer.backward(&x[0], &x[1], dy, Wanted::ALL, buffers))),
-            ]
+            passes!(Unfolded { batch, inputs, outputs, height, width, stride: 2, rectified: false })
         }
         "patches" => {
-            let [batch, inputs, outputs, height, side] = [s[0], s[1], s[2], s[3], s[4]];
-            let layer = Patches { batch, inputs, outputs, height, width: height, side };
-            let wanted = Wanted { input: false, ..Wanted::ALL };
-            [
-                Box::new(move || vec![layer.forward(&x[0], &x[1], Some(&x[2]), buffers)]),
-                Box::new(move || all(layer.backward(&x[0], &x[1], dy, wanted, buffers))),
-            ]
+            wanted.input = false;
+            passes!(Patches { batch, inputs, outputs, height, width, side: s[4] })
         }
         "resize" => {
             let size = [s[2]; 2];
@@ -114,7 +96,7 @@ fn build<'a>(name: &str, s: &[usize], x: &'a [Vec<f32>], buffers: &'a Buffers) -
         }
         "linear" => {
             let layer = Linear { rows: s[0], inputs: s[1], outputs: s[2], transposed: false };
-            let gelu = move || layer.forward_gelu(&x[0], &x[1], Some(&x[2]), buffers);
+            let gelu = move || layer.forward_gelu(&x[0], &x[1], bias, buffers);
             let before = (s[3] == 1).then(|| gelu()[1].clone());
             let activated = s[3] == 1;
             [
@@ -124,7 +106,7 @@ fn build<'a>(name: &str, s: &[usize], x: &'a [Vec<f32>], buffers: &'a Buffers) -
                         buffers.give(before);
                         vec![y]
                     } else {
-                        vec![layer.forward(&x[0], &x[1], Some(&x[2]), buffers)]
+                        vec![layer.forward(&x[0], &x[1], bias, buffers)]
                     }
                 }),
                 Box::new(move || {
@@ -185,8 +167,8 @@ fn read(path: &str, len: usize) -> Vec<f32> {
 }
 
 fn main() {
-    // On a thread of the pool: a caller from outside would wait for it at every operator, which takes longer than the
-    // small ones themselves.
+    // On a thread of the pool: a caller from outside waits for the pool at every operator, which takes longer than the
+    // small operators do.
     rayon::scope(|_| serve());
 }
 

@@ -6,7 +6,7 @@
 
 use std::time::{Duration, Instant};
 
-use burn::tensor::{Device, DeviceKind, Tensor, TensorData};
+use burn::tensor::{Device, DeviceKind, Distribution, Tensor};
 use peak_alloc::PeakAlloc;
 use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
 
@@ -16,30 +16,6 @@ static MEMORY: PeakAlloc = PeakAlloc;
 /// Time to spend on one figure.
 const TIME_PER_FIGURE: Duration = Duration::from_millis(1500);
 
-/// SplitMix64: the same scene on every machine.
-struct Random(u64);
-
-impl Random {
-    fn uniform(&mut self) -> f32 {
-        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let z = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        let z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        ((z ^ (z >> 31)) >> 40) as f32 / (1_u64 << 24) as f32
-    }
-
-    fn between(&mut self, low: f32, high: f32) -> f32 {
-        low + (high - low) * self.uniform()
-    }
-
-    /// Uniform on the unit sphere.
-    fn direction(&mut self) -> [f32; 3] {
-        let z = self.between(-1.0, 1.0);
-        let (sin, cos) = self.between(0.0, std::f32::consts::TAU).sin_cos();
-        let r = (1.0 - z * z).sqrt();
-        [r * cos, r * sin, z]
-    }
-}
-
 /// Which inputs are tracked.
 #[derive(Clone, Copy, PartialEq)]
 enum Tracked {
@@ -48,55 +24,32 @@ enum Tracked {
     Everything,
 }
 
-struct Scene {
-    gaussians: Gaussians,
-    inputs: Vec<Input>,
-}
-
-enum Input {
-    Rows(Tensor<2>),
-    Flat(Tensor<1>),
-}
-
 /// `n` Gaussians on an ellipsoid as high as a person, which covers 30 % of a training camera's square image, with a
 /// standard deviation of `sigma` pixels of an image of `size` pixels, half as thick along a random axis.
-fn human(n: usize, size: u32, sigma: f32, tracked: Tracked, device: &Device) -> Scene {
-    let mut random = Random(7);
-    let pixel = 2.0 / (0.8 * size as f32);
-    let (mut means, mut rotations, mut scales) = (Vec::new(), Vec::new(), Vec::new());
-    let (mut opacities, mut colors) = (Vec::new(), Vec::new());
-    for _ in 0..n {
-        let [x, y, z] = random.direction();
-        means.extend([0.64 * x, 0.85 + 0.9 * y, 0.3 * z]);
-        let q: [f32; 4] = std::array::from_fn(|_| random.between(-1.0, 1.0));
-        rotations.extend(q);
-        let scale = sigma * pixel * random.between(0.8, 1.25);
-        scales.extend([scale, scale, 0.5 * scale]);
-        opacities.push(random.between(0.3, 1.0));
-        colors.extend([random.uniform(), random.uniform(), random.uniform()]);
-    }
-    let all = tracked == Tracked::Everything;
+fn human(n: usize, size: u32, sigma: f32, tracked: Tracked, device: &Device) -> Gaussians {
+    device.seed(7);
+    let random = |columns: usize, low: f64, high: f64| {
+        Tensor::<2>::random([n, columns], Distribution::Uniform(low, high), device)
+    };
+    let (y, angle) = (random(1, -1.0, 1.0), random(1, 0.0, std::f64::consts::TAU));
+    let across = (-y.clone().square() + 1.0).sqrt();
+    let (x, z) = (across.clone() * angle.clone().cos(), across * angle.sin());
+    let pixel = 2.0 / (0.8 * f64::from(size));
+    let scale = random(1, 0.8, 1.25) * (f64::from(sigma) * pixel);
     let device = if tracked == Tracked::Nothing { device.clone() } else { device.clone().autodiff() };
-    let rows = |values: Vec<f32>, columns: usize, tracked: bool| {
-        let tensor = Tensor::<2>::from_data(TensorData::new(values, [n, columns]), &device);
-        if tracked { tensor.require_grad() } else { tensor }
+    let leaf = |tensor: Tensor<2>, is_tracked: bool| {
+        let tensor = Tensor::<2>::from_data(tensor.into_data(), &device);
+        if is_tracked { tensor.require_grad() } else { tensor }
     };
-    let means = rows(means, 3, all);
-    let rotations = rows(rotations, 4, all);
-    let scales = rows(scales, 3, all);
-    let colors = rows(colors, 3, tracked != Tracked::Nothing);
-    let opacities = Tensor::<1>::from_data(TensorData::new(opacities, [n]), &device);
-    let opacities = if all { opacities.require_grad() } else { opacities };
-    let inputs = match tracked {
-        Tracked::Nothing => Vec::new(),
-        Tracked::Colors => vec![Input::Rows(colors.clone())],
-        Tracked::Everything => {
-            let rows = [means.clone(), rotations.clone(), scales.clone(), colors.clone()];
-            rows.into_iter().map(Input::Rows).chain([Input::Flat(opacities.clone())]).collect()
-        }
-    };
-    let gaussians = Gaussians::new(means, rotations, scales, opacities, colors).expect("shapes");
-    Scene { gaussians, inputs }
+    let all = tracked == Tracked::Everything;
+    let gaussians = Gaussians::new(
+        leaf(Tensor::cat(vec![x * 0.64, y * 0.9 + 0.85, z * 0.3], 1), all),
+        leaf(random(4, -1.0, 1.0), all),
+        leaf(Tensor::cat(vec![scale.clone(), scale.clone(), scale * 0.5], 1), all),
+        leaf(random(1, 0.3, 1.0), all).squeeze_dim(1),
+        leaf(random(3, 0.0, 1.0), tracked != Tracked::Nothing),
+    );
+    gaussians.expect("shapes")
 }
 
 fn cameras(count: usize, size: u32) -> Vec<Camera> {
@@ -110,7 +63,7 @@ struct Figure {
     bytes: usize,
 }
 
-/// Runs `part` on what `prepare` makes, again and again.
+/// Times `part` with inputs from `prepare`, several times.
 fn measure<T, R>(device: &Device, mut prepare: impl FnMut() -> T, mut part: impl FnMut(T) -> R) -> Figure {
     let mut times = Vec::new();
     let mut bytes = 0;
@@ -144,26 +97,20 @@ struct Case {
 fn run(case: &Case, tracked: Tracked, device: &Device, on_host: bool) {
     let cameras = cameras(case.views, case.size);
     let options = RenderOptions::inria();
-    let scene = human(case.n, case.size, case.sigma, tracked, device);
-    let counts = render(&scene.gaussians, &cameras, &options).expect("rendered").counts;
-    let forward =
-        measure(device, || (), |()| render(&scene.gaussians, &cameras, &options).expect("rendered"));
+    let gaussians = human(case.n, case.size, case.sigma, tracked, device);
+    let counts = render(&gaussians, &cameras, &options).expect("rendered").counts;
+    let forward = measure(device, || (), |()| render(&gaussians, &cameras, &options).expect("rendered"));
     let shape = [case.views, case.size as usize, case.size as usize, 3];
-    let inner = scene.gaussians.device();
+    let inner = gaussians.device();
     let upstream = Tensor::<4>::ones(shape, &inner) * 0.5;
     let backward = (tracked != Tracked::Nothing).then(|| {
         let prepare = || {
-            let rendered = render(&scene.gaussians, &cameras, &options).expect("rendered");
+            let rendered = render(&gaussians, &cameras, &options).expect("rendered");
             (rendered.color * upstream.clone()).sum()
         };
         let part = |loss: Tensor<1>| {
             let gradients = loss.backward();
-            for input in &scene.inputs {
-                match input {
-                    Input::Rows(tensor) => assert!(tensor.grad(&gradients).is_some()),
-                    Input::Flat(tensor) => assert!(tensor.grad(&gradients).is_some()),
-                }
-            }
+            assert!(gaussians.colors.grad(&gradients).is_some());
             gradients
         };
         measure(device, prepare, part)

@@ -5,8 +5,8 @@ use snapsnap_base::config::outside;
 use crate::weights::schema::{self, TensorSpec};
 
 use super::{
-    Anchor, Body, Config, Downsample, HeadKind, RegressorColor, RegressorStart, RotationFrame,
-    Schema, Upsample, WorldFrame,
+    Anchor, Body, Config, Downsample, HeadKind, RegressorColor, RegressorStart, RotationFrame, Schema,
+    Upsample, WorldFrame,
 };
 
 /// Largest number of parameters: seven times the published size, 16 GB of f32.
