@@ -37,19 +37,20 @@ fn human(n: usize, size: u32, sigma: f32, tracked: Tracked, device: &Device) -> 
     let pixel = 2.0 / (0.8 * f64::from(size));
     let scale = random(1, 0.8, 1.25) * (f64::from(sigma) * pixel);
     let device = if tracked == Tracked::Nothing { device.clone() } else { device.clone().autodiff() };
-    let leaf = |tensor: Tensor<2>, is_tracked: bool| {
-        let tensor = Tensor::<2>::from_data(tensor.into_data(), &device);
-        if is_tracked { tensor.require_grad() } else { tensor }
-    };
     let all = tracked == Tracked::Everything;
     let gaussians = Gaussians::new(
-        leaf(Tensor::cat(vec![x * 0.64, y * 0.9 + 0.85, z * 0.3], 1), all),
-        leaf(random(4, -1.0, 1.0), all),
-        leaf(Tensor::cat(vec![scale.clone(), scale.clone(), scale * 0.5], 1), all),
-        leaf(random(1, 0.3, 1.0), all).squeeze_dim(1),
-        leaf(random(3, 0.0, 1.0), tracked != Tracked::Nothing),
+        leaf(Tensor::cat(vec![x * 0.64, y * 0.9 + 0.85, z * 0.3], 1), &device, all),
+        leaf(random(4, -1.0, 1.0), &device, all),
+        leaf(Tensor::cat(vec![scale.clone(), scale.clone(), scale * 0.5], 1), &device, all),
+        leaf(random(1, 0.3, 1.0).reshape([n]), &device, all),
+        leaf(random(3, 0.0, 1.0), &device, tracked != Tracked::Nothing),
     );
     gaussians.expect("shapes")
+}
+
+fn leaf<const D: usize>(tensor: Tensor<D>, device: &Device, is_tracked: bool) -> Tensor<D> {
+    let tensor = Tensor::from_data(tensor.into_data(), device);
+    if is_tracked { tensor.require_grad() } else { tensor }
 }
 
 fn cameras(count: usize, size: u32) -> Vec<Camera> {
