@@ -1,8 +1,7 @@
-//! The oracle of the splatting operation: every Gaussian at every pixel, in f64, without tiles, lists or tricks.
+//! The reference of the splatting operation: every Gaussian at every pixel, in f64, without tiles and lists.
 //!
-//! Slow and plain, to be checked against the formulas by eye: Σ = R(q)·S²·R(q)ᵀ, Σ' = J·W·Σ·Wᵀ·Jᵀ + ε·I,
-//! α = min(α_max, o·exp(−½·dᵀ·Σ'⁻¹·d)), front to back. Gradients come from dual numbers, not from formulas of their
-//! own.
+//! It is slow and follows the formulas literally: Σ = R(q)·S²·R(q)ᵀ, Σ' = J·W·Σ·Wᵀ·Jᵀ + ε·I,
+//! α = min(α_max, o·exp(−½·dᵀ·Σ'⁻¹·d)), front to back. Gradients come from dual numbers, not from formulas.
 
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
@@ -11,7 +10,7 @@ use rayon::prelude::*;
 use crate::options::{MIN_ALPHA, MIN_TRANSMITTANCE};
 use crate::{Camera, RenderOptions};
 
-/// Number type of the oracle: f64, f64 with derivatives, or f32 for comparison.
+/// Number type of the reference: f64, f64 with derivatives, or f32 for comparison.
 pub trait Number:
     Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> + Div<Output = Self> + Neg<Output = Self>
 {
@@ -25,42 +24,30 @@ pub trait Number:
     fn sqrt(self) -> Self;
 }
 
-impl Number for f64 {
-    fn new(value: f64) -> Self {
-        value
-    }
+macro_rules! floats {
+    ($($float:ty),*) => {$(
+        impl Number for $float {
+            fn new(value: f64) -> Self {
+                value as $float
+            }
 
-    fn value(self) -> f64 {
-        self
-    }
+            fn value(self) -> f64 {
+                f64::from(self)
+            }
 
-    fn exp(self) -> Self {
-        f64::exp(self)
-    }
+            fn exp(self) -> Self {
+                <$float>::exp(self)
+            }
 
-    fn sqrt(self) -> Self {
-        f64::sqrt(self)
-    }
+            fn sqrt(self) -> Self {
+                <$float>::sqrt(self)
+            }
+        }
+    )*};
 }
 
-/// Only to show what the plain formulas reach in single precision.
-impl Number for f32 {
-    fn new(value: f64) -> Self {
-        value as f32
-    }
-
-    fn value(self) -> f64 {
-        f64::from(self)
-    }
-
-    fn exp(self) -> Self {
-        f32::exp(self)
-    }
-
-    fn sqrt(self) -> Self {
-        f32::sqrt(self)
-    }
-}
+// f32 only shows the accuracy of the plain formulas in single precision.
+floats!(f32, f64);
 
 /// A number and its derivatives with respect to `K` inputs.
 #[derive(Clone, Copy, Debug)]
@@ -178,7 +165,7 @@ impl<T: Copy> Pixel<T> {
     }
 }
 
-/// How a splat ends.
+/// Cut-off of splats.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Cutoff {
     /// As specified: skipped below α = 1/255, closed at T = 1e-4.
@@ -189,6 +176,8 @@ pub enum Cutoff {
 
 /// A splat at its place.
 struct Splat<T> {
+    /// Row of the Gaussian.
+    index: usize,
     centre: [T; 2],
     /// Σ'⁻¹: xx, xy, yy.
     conic: [T; 3],
@@ -215,19 +204,27 @@ pub fn pixels<T: Number>(
     cutoff: Cutoff,
     which: impl Iterator<Item = u32>,
 ) -> Vec<Pixel<T>> {
-    let mut splats: Vec<Splat<T>> =
-        scene.gaussians.iter().filter_map(|g| splat(g, camera, options)).collect();
-    // A stable sort: ties stay in input order.
-    splats.sort_by(|a, b| a.depth.value().total_cmp(&b.depth.value()));
-    let pixel = |at: u32| {
-        let x = f64::from(at % camera.width) + 0.5;
-        let y = f64::from(at / camera.width) + 0.5;
-        composite(&splats, [x, y], scene.background, options, cutoff)
-    };
+    let splats = splats(scene, camera, options);
+    let pixel =
+        |at: u32| composite(&splats, centre(at, camera), scene.background, options, cutoff, |_, _| ());
     which.map(pixel).collect()
 }
 
-/// Pixels so close to a cut-off (α = 1/255, T = 1e-4, α_max) that f32 may decide otherwise.
+/// All splats, front to back.
+fn splats<T: Number>(scene: &Scene<T>, camera: &Camera, options: &RenderOptions) -> Vec<Splat<T>> {
+    let rows = scene.gaussians.iter().enumerate();
+    let mut splats: Vec<Splat<T>> = rows.filter_map(|(i, g)| splat(i, g, camera, options)).collect();
+    // A stable sort: ties stay in input order.
+    splats.sort_by(|a, b| a.depth.value().total_cmp(&b.depth.value()));
+    splats
+}
+
+/// Centre of a pixel.
+fn centre(at: u32, camera: &Camera) -> [f64; 2] {
+    [f64::from(at % camera.width) + 0.5, f64::from(at / camera.width) + 0.5]
+}
+
+/// Pixels so close to a cut-off (α = 1/255, T = 1e-4, α_max) that f32 may be on its other side.
 pub fn banded(scene: &Scene<f64>, camera: &Camera, options: &RenderOptions) -> Vec<bool> {
     let with = |scale: f64| {
         let mut scene = scene.clone();
@@ -239,41 +236,19 @@ pub fn banded(scene: &Scene<f64>, camera: &Camera, options: &RenderOptions) -> V
     less.into_iter().zip(more).map(|(a, b)| a != b).collect()
 }
 
-/// Which splats each pixel takes, and which of them are clamped, as a list of numbers.
+/// The splats that each pixel takes, and whether they are clamped.
 fn contributors(scene: &Scene<f64>, camera: &Camera, options: &RenderOptions) -> Vec<Vec<(usize, bool)>> {
-    let max = f64::from(options.max_alpha);
-    let mut splats: Vec<(usize, Splat<f64>)> = scene
-        .gaussians
-        .iter()
-        .enumerate()
-        .filter_map(|(i, g)| Some((i, splat(g, camera, options)?)))
-        .collect();
-    splats.sort_by(|a, b| a.1.depth.total_cmp(&b.1.depth));
+    let splats = splats(scene, camera, options);
     let pixel = |at: u32| {
-        let (x, y) = (f64::from(at % camera.width) + 0.5, f64::from(at / camera.width) + 0.5);
-        let mut transmittance = 1.0;
         let mut taken = Vec::new();
-        for (index, splat) in &splats {
-            let d = [x - splat.centre[0], y - splat.centre[1]];
-            let [xx, xy, yy] = splat.conic;
-            let full =
-                splat.opacity * (-0.5 * (d[0] * d[0] * xx + 2.0 * d[0] * d[1] * xy + d[1] * d[1] * yy)).exp();
-            let alpha = full.min(max);
-            if alpha < f64::from(MIN_ALPHA) {
-                continue;
-            }
-            transmittance *= 1.0 - alpha;
-            if transmittance < f64::from(MIN_TRANSMITTANCE) {
-                break;
-            }
-            taken.push((*index, full > max));
-        }
+        let take = |index, is_clamped| taken.push((index, is_clamped));
+        composite(&splats, centre(at, camera), scene.background, options, Cutoff::Hard, take);
         taken
     };
     (0..camera.width * camera.height).map(pixel).collect()
 }
 
-fn splat<T: Number>(g: &[T; 14], camera: &Camera, options: &RenderOptions) -> Option<Splat<T>> {
+fn splat<T: Number>(index: usize, g: &[T; 14], camera: &Camera, options: &RenderOptions) -> Option<Splat<T>> {
     let [mx, my, mz, w, x, y, z, sx, sy, sz, opacity, red, green, blue] = *g;
     let n = T::new;
     let dot = |a: [T; 3], b: [T; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -331,6 +306,7 @@ fn splat<T: Number>(g: &[T; 14], camera: &Camera, options: &RenderOptions) -> Op
         opacity
     };
     Some(Splat {
+        index,
         centre: [n(f.x) * t[0] / t[2] + n(c.x), n(f.y) * t[1] / t[2] + n(c.y)],
         conic: [yy / determinant, -xy / determinant, xx / determinant],
         opacity,
@@ -339,12 +315,14 @@ fn splat<T: Number>(g: &[T; 14], camera: &Camera, options: &RenderOptions) -> Op
     })
 }
 
+/// Composites a pixel. `take` is called with the index of each splat that it takes and with whether α is clamped.
 fn composite<T: Number>(
     splats: &[Splat<T>],
     pixel: [f64; 2],
     background: [T; 3],
     options: &RenderOptions,
     cutoff: Cutoff,
+    mut take: impl FnMut(usize, bool),
 ) -> Pixel<T> {
     let n = T::new;
     let (least, closed) = (f64::from(MIN_ALPHA), f64::from(MIN_TRANSMITTANCE));
@@ -355,7 +333,8 @@ fn composite<T: Number>(
         let [xx, xy, yy] = splat.conic;
         let form = d[0] * d[0] * xx + n(2.0) * d[0] * d[1] * xy + d[1] * d[1] * yy;
         let mut alpha = splat.opacity * (n(-0.5) * form).exp();
-        if alpha.value() > f64::from(options.max_alpha) {
+        let is_clamped = alpha.value() > f64::from(options.max_alpha);
+        if is_clamped {
             alpha = n(f64::from(options.max_alpha));
         }
         match cutoff {
@@ -375,6 +354,7 @@ fn composite<T: Number>(
         if cutoff == Cutoff::Hard && next.value() < closed {
             break;
         }
+        take(splat.index, is_clamped);
         let weight = alpha * transmittance;
         for (sum, color) in out.color.iter_mut().zip(splat.color) {
             *sum = *sum + color * weight;
