@@ -53,7 +53,7 @@ pub enum FileError {
     Unsuitable {
         /// The file.
         path: PathBuf,
-        /// What is wrong and what to do.
+        /// The fault and the remedy.
         message: String,
     },
 }

@@ -148,7 +148,7 @@ impl Camera {
     /// Whether an image can be rendered into this camera.
     ///
     /// # Errors
-    /// What is wrong with it.
+    /// The camera's fault.
     pub fn check(&self) -> Result<(), String> {
         for (field, side) in [("width", self.width), ("height", self.height)] {
             if side == 0 || side > MAX_SIDE {

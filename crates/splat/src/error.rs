@@ -23,7 +23,7 @@ pub enum SplatError {
     Camera {
         /// Position in the list, from 0.
         index: usize,
-        /// What is wrong with it.
+        /// Its fault.
         problem: String,
     },
     /// A constant of the rasteriser that makes no sense.
@@ -31,7 +31,7 @@ pub enum SplatError {
     Option {
         /// Name of the option.
         field: &'static str,
-        /// What it may be.
+        /// The allowed values.
         allowed: &'static str,
     },
     /// An array that memory does not hold, or that the device does not allow in one piece.

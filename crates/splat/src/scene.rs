@@ -1,4 +1,5 @@
-//! Files of Gaussians, PLY or SPZ. The first bytes of a file decide its kind when it is read, its name when it is written.
+//! Files of Gaussians, PLY or SPZ. The first bytes of a file decide its kind when it is read; its name decides when it
+//! is written.
 
 use std::io::{self, Read, Write};
 use std::path::Path;
@@ -20,7 +21,7 @@ pub enum Kind {
 }
 
 impl Kind {
-    /// The kind that `path`'s extension names, if it is one.
+    /// The kind of `path`'s extension, if there is one.
     pub fn named(path: &Path) -> Option<Self> {
         let extension = path.extension()?.to_str()?.to_ascii_lowercase();
         match extension.as_str() {
@@ -40,7 +41,7 @@ impl Stored {
     /// Reads a file of either kind.
     ///
     /// # Errors
-    /// [`SplatError::File`] if it cannot be read, is of neither kind, is cut short, or lacks something.
+    /// [`SplatError::File`] if it cannot be read, is of neither kind, is truncated, or lacks a property.
     pub fn read(path: &Path) -> Result<Self, SplatError> {
         let cannot = FileError::read(path);
         let mut file = file::open(path).map_err(&cannot)?;
@@ -59,7 +60,7 @@ impl Stored {
         Ok(read?)
     }
 
-    /// Writes the kind of file that `path`'s extension says, whole or not at all.
+    /// Writes the kind of file of `path`'s extension, whole or not at all.
     ///
     /// # Errors
     /// [`SplatError::NotFinite`]; [`SplatError::File`] for values that an SPZ cannot hold, or if the file cannot be written.
@@ -127,7 +128,7 @@ pub fn write(gaussians: &Gaussians, path: &Path) -> Result<(), SplatError> {
     Stored::of(gaussians)?.write(path)
 }
 
-/// Reads until `buffer` is full or the input ends; returns how much there was.
+/// Reads until `buffer` is full or the input ends; returns the number of bytes.
 fn fill(input: &mut impl Read, buffer: &mut [u8]) -> io::Result<usize> {
     let mut length = 0;
     while length < buffer.len() {

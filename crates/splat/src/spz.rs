@@ -1,8 +1,8 @@
-//! Niantic's SPZ: quantised Gaussians, column by column, in one gzip stream. Written: version 3. Read: versions 1 to 3; of SH
-//! degree 4 the first three.
+//! Niantic's SPZ: quantised Gaussians, column by column, in one gzip stream. Version 3 is written, versions 1 to 3 are
+//! read. SH of degree 4 lose their highest degree.
 //!
-//! Its axes are x right, y up, z back, as those of our worlds; nothing is turned. Layout: github.com/nianticlabs/spz, README
-//! ("File Format").
+//! The axes are x right, y up, z back, as in the world frame; nothing is rotated. Layout: github.com/nianticlabs/spz,
+//! README ("File Format").
 
 use std::io::{self, Read, Write};
 use std::ops::Range;
@@ -20,15 +20,16 @@ pub(crate) const GZIP: [u8; 2] = [0x1f, 0x8b];
 pub(crate) const BARE: [u8; 2] = *b"NG";
 const MAGIC: u32 = 0x5053_474e;
 const VERSION: u32 = 3;
-/// Largest file that Niantic's library reads; it is what bounds a hostile one, which may be a thousandth of its content.
+/// Number of Gaussians of the largest file that Niantic's library reads. It limits the memory for a hostile file, whose
+/// content may be a thousand times its size.
 const MAX_POINTS: usize = 10_000_000;
-/// Bits behind the point of coordinates, where they fit: a quarter of a millimetre up to 2 km.
+/// Fractional bits of coordinates, if they fit: steps of a quarter of a millimetre up to 2 km.
 const FRACTIONAL_BITS: u8 = 12;
 /// Largest coordinate in 24 bits.
 const MAX_FIXED: f64 = 8_388_607.0;
 /// Coefficients of SH degree 0 to its byte.
 const COLOR_SCALE: f32 = 0.15;
-/// Steps of SH coefficients, of degree 1 and of those above: what Niantic's library writes, so that gzip finds something.
+/// Steps of SH coefficients, of degree 1 and of higher ones, as in Niantic's library. Coarse steps compress well.
 const SH_STEPS: [i32; 2] = [8, 16];
 /// Values per channel of SH degrees 0 to 4.
 const COEFFICIENTS: [usize; 5] = [1, 4, 9, 16, 25];
@@ -125,7 +126,8 @@ pub(crate) fn check(stored: &Stored) -> Result<(), String> {
     Ok(())
 }
 
-/// Losses beyond the usual steps of an SPZ, a sentence each. Scales below e⁻¹⁰ m (45 µm) become that, which is invisible.
+/// Losses beyond the usual steps of an SPZ, a sentence each. Scales below e⁻¹⁰ m (45 µm) silently become that value, an
+/// invisible change.
 pub(crate) fn losses(stored: &Stored) -> Vec<String> {
     let mut losses = Vec::new();
     let bits = fractional_bits(stored);
@@ -159,7 +161,7 @@ fn largest(stored: &Stored) -> f64 {
     stored.columns[..3].iter().flatten().fold(0.0, |most, v| most.max(f64::from(v.abs())))
 }
 
-/// Writes a gzip stream; [`check`] has been asked before.
+/// Writes a gzip stream of Gaussians that [`check`] accepts.
 pub(crate) fn write(stored: &Stored, out: &mut impl Write) -> io::Result<()> {
     let (n, bits) = (stored.len(), fractional_bits(stored));
     let mut out = GzEncoder::new(out, Compression::best());
@@ -168,7 +170,7 @@ pub(crate) fn write(stored: &Stored, out: &mut impl Write) -> io::Result<()> {
     out.write_all(&u32::try_from(n).map_err(io::Error::other)?.to_le_bytes())?;
     out.write_all(&[u8::try_from(stored.degree()).map_err(io::Error::other)?, bits, 0, 0])?;
 
-    // Row after row of some columns, each value as its bytes.
+    // Writes some columns row after row; `bytes` encodes a row.
     let mut rows = |range: Range<usize>, bytes: &dyn Fn(&[f32], &mut Vec<u8>)| {
         let mut row = vec![0.0; range.len()];
         let mut block = Vec::new();
@@ -208,7 +210,7 @@ pub(crate) fn write(stored: &Stored, out: &mut impl Write) -> io::Result<()> {
     out.finish().map(drop)
 }
 
-/// Content of the stream, of which no more memory is taken than is there.
+/// Content of the stream. Memory grows with the data, not with the header's promises.
 struct Bytes<R> {
     input: R,
 }
@@ -225,8 +227,8 @@ impl<R: Read> Bytes<R> {
         Ok(bytes)
     }
 
-    /// Lets the decoder compare its checksum. What follows the Gaussians are extensions, which nothing here needs; beyond some
-    /// megabytes of them nobody waits for it.
+    /// Reads to the end, so that the decoder compares its checksum. Extensions may follow the Gaussians; their first
+    /// megabytes are skipped, and of longer ones the rest is not read.
     fn finish(&mut self) -> Result<(), Problem> {
         const EXTENSIONS: u64 = 1 << 24;
         io::copy(&mut (&mut self.input).take(EXTENSIONS), &mut io::sink()).map_err(damaged)?;
@@ -234,7 +236,7 @@ impl<R: Read> Bytes<R> {
     }
 }
 
-/// A stream that ends early or whose checksum is wrong is a bad file, not a bad disk.
+/// The problem of a stream: one that ends early or has a wrong checksum is a damaged file, not a failing disk.
 fn damaged(e: io::Error) -> Problem {
     match e.kind() {
         io::ErrorKind::UnexpectedEof => "the file ends too early: its gzip stream is cut".to_owned().into(),
@@ -245,7 +247,7 @@ fn damaged(e: io::Error) -> Problem {
     }
 }
 
-/// The nearest byte; a NaN, which nobody passes, is 0.
+/// The nearest byte; 0 for NaN.
 fn byte(value: f32) -> u8 {
     value.round().clamp(0.0, 255.0) as u8
 }
@@ -271,7 +273,8 @@ fn first_three(packed: [u8; 3]) -> [f32; 4] {
 /// Bits of a component of version 3, beside its sign.
 const COMPONENT: u32 = (1 << 9) - 1;
 
-/// A quaternion (w, x, y, z) of version 3: which of (x, y, z, w) is the largest, and sign and size of the others over √½.
+/// A quaternion (w, x, y, z) of version 3: the index of the largest of (x, y, z, w), and signs and sizes of the others
+/// over √½.
 fn smallest_three(mut packed: u32) -> [f32; 4] {
     let largest = (packed >> 30) as usize;
     let mut q = [0.0_f32; 4];

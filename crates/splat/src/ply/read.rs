@@ -10,7 +10,7 @@ use snapsnap_base::quoted;
 /// Longest line of a body in text.
 const MAX_LINE: u64 = 1 << 20;
 
-/// Reads a PLY's Gaussians, and no more than its header promises of an input that may go on for ever.
+/// Reads a PLY's Gaussians. An input that never ends is read only as far as the header promises.
 pub(crate) fn read(mut input: impl Read) -> Result<Stored, Problem> {
     let mut start = Vec::new();
     (&mut input).take(MAX_HEADER as u64 + 1).read_to_end(&mut start)?;
@@ -63,7 +63,7 @@ fn table(header: &Header, body: &mut impl BufRead) -> Result<Stored, Problem> {
     Ok(Stored { coefficients, columns })
 }
 
-/// Where `vertex` cannot be read to its end.
+/// The problem of a file that ends within its vertices.
 fn truncated(vertex: &Element, detail: &str) -> Problem {
     let count = vertex.count;
     format!("the file ends too early: the header promises {count} vertices, {detail}").into()
@@ -157,13 +157,13 @@ fn binary(
             }
             kind.read(bytes)
         };
-        // No property is wanted twice, so that each is reversed once.
+        // No property is wanted twice, so each is reversed only once.
         rows.chunks_exact_mut(stride).map(value).collect()
     };
     Ok(wanted.iter().map(column).collect())
 }
 
-/// Leaves an element out; `false` if the file is too short for it.
+/// Skips an element; `false` if the file is too short for it.
 fn skip(element: &Element, body: &mut impl BufRead, big: bool) -> io::Result<bool> {
     let pass = |body: &mut dyn BufRead, bytes: Option<u64>| -> io::Result<bool> {
         let Some(bytes) = bytes else { return Ok(false) };
