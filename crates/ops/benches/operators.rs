@@ -7,7 +7,7 @@
 use std::io::BufRead;
 use std::time::{Duration, Instant};
 
-use snapsnap_ops::buffers::Buffers;
+use snapsnap_ops::buffers::give;
 use snapsnap_ops::train::{
     Attention, Conv1x1, Conv3x3, Enlarge, Gradients, LayerNorm, Linear, Patches, Tokens, Unfolded, Wanted,
     resize, resize_gradient, taps,
@@ -58,7 +58,7 @@ fn lengths(name: &str, s: &[usize]) -> Vec<usize> {
 }
 
 /// Forward and backward pass.
-fn build<'a>(name: &str, s: &[usize], x: &'a [Vec<f32>], buffers: &'a Buffers) -> [Run<'a>; 2] {
+fn build<'a>(name: &str, s: &[usize], x: &'a [Vec<f32>]) -> [Run<'a>; 2] {
     let dy = &x[x.len() - 1];
     // All inputs but the first two and the last one.
     let bias = x.get(2..x.len() - 1).and_then(|rest| Some(&rest.first()?[..]));
@@ -67,8 +67,8 @@ fn build<'a>(name: &str, s: &[usize], x: &'a [Vec<f32>], buffers: &'a Buffers) -
         ($layer:expr) => {{
             let layer = $layer;
             [
-                Box::new(move || vec![layer.forward(&x[0], &x[1], bias, buffers)]),
-                Box::new(move || all(layer.backward(&x[0], &x[1], dy, wanted, buffers))),
+                Box::new(move || vec![layer.forward(&x[0], &x[1], bias)]),
+                Box::new(move || all(layer.backward(&x[0], &x[1], dy, wanted))),
             ]
         }};
     }
@@ -91,35 +91,33 @@ fn build<'a>(name: &str, s: &[usize], x: &'a [Vec<f32>], buffers: &'a Buffers) -
             let (axis, copy) = (taps(s[2], 2 * s[2], true), taps(s[2], 2 * s[2], true));
             [
                 Box::new(move || vec![resize(&x[0], size, &axis, &axis)]),
-                Box::new(move || vec![resize_gradient(dy, size, &copy, &copy, buffers)]),
+                Box::new(move || vec![resize_gradient(dy, size, &copy, &copy)]),
             ]
         }
         "linear" => {
             let layer = Linear { rows: s[0], inputs: s[1], outputs: s[2], transposed: false };
-            let gelu = move || layer.forward_gelu(&x[0], &x[1], bias, buffers);
+            let gelu = move || layer.forward_gelu(&x[0], &x[1], bias);
             let before = (s[3] == 1).then(|| gelu()[1].clone());
             let activated = s[3] == 1;
             [
                 Box::new(move || {
                     if activated {
                         let [y, before] = gelu();
-                        buffers.give(before);
+                        give(before);
                         vec![y]
                     } else {
-                        vec![layer.forward(&x[0], &x[1], bias, buffers)]
+                        vec![layer.forward(&x[0], &x[1], bias)]
                     }
                 }),
-                Box::new(move || {
-                    all(layer.backward(&x[0], &x[1], before.as_deref(), dy, Wanted::ALL, buffers))
-                }),
+                Box::new(move || all(layer.backward(&x[0], &x[1], before.as_deref(), dy, Wanted::ALL))),
             ]
         }
         "norm" => {
             let norm = LayerNorm { channels: s[1], epsilon: 1e-6 };
-            let statistics = norm.forward(&x[0], &x[1], &x[2], buffers).1;
+            let statistics = norm.forward(&x[0], &x[1], &x[2]).1;
             [
-                Box::new(move || vec![norm.forward(&x[0], &x[1], &x[2], buffers).0]),
-                Box::new(move || all(norm.backward(&x[0], &x[1], &statistics, dy, Wanted::ALL, buffers))),
+                Box::new(move || vec![norm.forward(&x[0], &x[1], &x[2]).0]),
+                Box::new(move || all(norm.backward(&x[0], &x[1], &statistics, dy, Wanted::ALL))),
             ]
         }
         "attention" => {
@@ -127,12 +125,10 @@ fn build<'a>(name: &str, s: &[usize], x: &'a [Vec<f32>], buffers: &'a Buffers) -
             let attention = Attention { batch: s[0], queries: n, keys: n, heads: s[3], head_dim: s[4] };
             let (rope, copy) = (tables(s[1], s[2], s[4]), tables(s[1], s[2], s[4]));
             let qkv = Tokens::apart([&x[0], &x[1], &x[2]], s[3] * s[4]);
-            let logarithms = attention.forward(qkv, [&rope[0], &rope[1]], buffers).1;
+            let logarithms = attention.forward(qkv, [&rope[0], &rope[1]]).1;
             [
-                Box::new(move || vec![attention.forward(qkv, [&copy[0], &copy[1]], buffers).0]),
-                Box::new(move || {
-                    attention.backward(qkv, [&rope[0], &rope[1]], &logarithms, dy, buffers).into()
-                }),
+                Box::new(move || vec![attention.forward(qkv, [&copy[0], &copy[1]]).0]),
+                Box::new(move || attention.backward(qkv, [&rope[0], &rope[1]], &logarithms, dy).into()),
             ]
         }
         _ => panic!("no operator is called {name}"),
@@ -179,14 +175,13 @@ fn serve() {
         let words: Vec<&str> = line.split_whitespace().collect();
         let (mode, argument, name) = (words[0], words[1], words[2]);
         let sizes: Vec<usize> = words[3..].iter().map(|word| word.parse().expect("a size")).collect();
-        let buffers = Buffers::new();
         let lengths = lengths(name, &sizes);
         let input = |(i, &len): (usize, &usize)| match mode {
             "time" => random(len, i as u32 + 1),
             _ => read(&format!("{argument}/in{i}"), len),
         };
         let inputs: Vec<Vec<f32>> = lengths.iter().enumerate().map(input).collect();
-        let [forward, backward] = build(name, &sizes, &inputs, &buffers);
+        let [forward, backward] = build(name, &sizes, &inputs);
         if mode == "time" {
             let seconds = Duration::from_secs_f64(argument.parse().expect("a number of seconds"));
             let (mut best, mut count, begin) = ([f64::INFINITY; 2], 0, Instant::now());
@@ -195,7 +190,7 @@ fn serve() {
                     let begin = Instant::now();
                     let out = run();
                     *best = best.min(begin.elapsed().as_secs_f64() * 1e3);
-                    out.into_iter().for_each(|out| buffers.give(out));
+                    out.into_iter().for_each(give);
                 }
                 count += 1;
             }

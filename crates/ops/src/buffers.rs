@@ -1,27 +1,34 @@
-//! Memory to use again. The system clears every fresh page, which for planes of this size takes about as long as their
-//! arithmetic.
+//! Memory that operators use again. The system clears every fresh page, which for planes of this size takes about as
+//! long as their arithmetic.
 
 use std::sync::{Mutex, PoisonError};
 
-/// Most floats that wait to be used again: 1 GiB.
-const MOST: usize = 1 << 28;
+/// Largest number of unused floats: 2 GiB.
+const MOST: usize = 1 << 29;
 
-/// Blocks of floats that nobody needs at the moment.
-#[derive(Debug, Default)]
-pub struct Buffers {
+/// The unused memory of all operators.
+static POOL: Pool = Pool { free: Mutex::new(Vec::new()) };
+
+/// `len` floats of any value.
+pub fn take(len: usize) -> Vec<f32> {
+    POOL.take(len)
+}
+
+/// Memory for later calls of [`take`].
+pub fn give(buffer: Vec<f32>) {
+    POOL.give(buffer);
+}
+
+/// Unused blocks of floats.
+#[derive(Default)]
+struct Pool {
     free: Mutex<Vec<Vec<f32>>>,
 }
 
-impl Buffers {
-    /// None yet.
-    pub const fn new() -> Self {
-        Self { free: Mutex::new(Vec::new()) }
-    }
-
-    /// `len` floats of any value.
-    pub fn take(&self, len: usize) -> Vec<f32> {
+impl Pool {
+    fn take(&self, len: usize) -> Vec<f32> {
         let mut free = self.free.lock().unwrap_or_else(PoisonError::into_inner);
-        // Much larger ones are left for those who need them.
+        // Much larger blocks stay for larger requests.
         let fitting = (0..free.len()).filter(|&i| (len..=2 * len).contains(&free[i].capacity()));
         let best = fitting.min_by_key(|&i| free[i].capacity()).map(|i| free.swap_remove(i));
         drop(free);
@@ -30,13 +37,30 @@ impl Buffers {
         buffer
     }
 
-    /// Takes back what nobody needs any more; beyond 2²⁸ floats (1 GiB), those that have waited longest are let go.
-    pub fn give(&self, buffer: Vec<f32>) {
+    /// Beyond [`MOST`], the oldest blocks are freed.
+    fn give(&self, buffer: Vec<f32>) {
         let mut free = self.free.lock().unwrap_or_else(PoisonError::into_inner);
         free.push(buffer);
         let mut sum: usize = free.iter().map(Vec::capacity).sum();
         while sum > MOST {
             sum -= free.remove(0).capacity();
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn returned_memory_is_used_again_unless_it_is_far_too_large() {
+        let buffers = Pool::default();
+        let buffer = buffers.take(1000);
+        let address = buffer.as_ptr();
+        buffers.give(buffer);
+        let small = buffers.take(100);
+        assert_ne!(small.as_ptr(), address);
+        let again = buffers.take(900);
+        assert_eq!((again.as_ptr(), again.len()), (address, 900));
     }
 }

@@ -7,15 +7,12 @@ use burn::nn::conv::{Conv2d, ConvTranspose2d};
 use burn::tensor::Tensor;
 use burn::tensor::activation::relu;
 
-use crate::buffers::Buffers;
+use crate::buffers::give;
 use crate::op::{self, Kept, Kernel};
 use crate::train::{
     Conv1x1, Conv3x3, Enlarge, Gradients, LayerNorm, Linear, Patches, Statistics, Unfolded, Wanted,
 };
 use crate::{in_f32, is_fast, is_trained_fast};
-
-/// Memory of intermediate results, for the next call.
-pub(crate) static BUFFERS: Buffers = Buffers::new();
 
 /// `[B, N, inputs]` → `[B, N, outputs]`.
 pub fn linear(layer: &nn::Linear, x: Tensor<3>) -> Tensor<3> {
@@ -109,11 +106,11 @@ macro_rules! keeps_nothing {
             type Kept = ();
 
             fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>) -> (Vec<f32>, ()) {
-                (<$layer>::forward(self, x, weight, bias, &BUFFERS), ())
+                (<$layer>::forward(self, x, weight, bias), ())
             }
 
             fn backward(&self, x: &[f32], weight: &[f32], (): (), dy: &[f32], wanted: Wanted) -> Gradients {
-                <$layer>::backward(self, x, weight, dy, wanted, &BUFFERS)
+                <$layer>::backward(self, x, weight, dy, wanted)
             }
         })+
     };
@@ -125,11 +122,11 @@ impl Layer for Linear {
     type Kept = ();
 
     fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>) -> (Vec<f32>, ()) {
-        (Self::forward(self, x, weight, bias, &BUFFERS), ())
+        (Self::forward(self, x, weight, bias), ())
     }
 
     fn backward(&self, x: &[f32], weight: &[f32], (): (), dy: &[f32], wanted: Wanted) -> Gradients {
-        Self::backward(self, x, weight, None, dy, wanted, &BUFFERS)
+        Self::backward(self, x, weight, None, dy, wanted)
     }
 }
 
@@ -141,13 +138,13 @@ impl Layer for Gelu {
     type Kept = Vec<f32>;
 
     fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>) -> (Vec<f32>, Vec<f32>) {
-        let [out, before] = self.0.forward_gelu(x, weight, bias, &BUFFERS);
+        let [out, before] = self.0.forward_gelu(x, weight, bias);
         (out, before)
     }
 
     fn backward(&self, x: &[f32], weight: &[f32], before: Vec<f32>, dy: &[f32], wanted: Wanted) -> Gradients {
-        let gradients = self.0.backward(x, weight, Some(&before), dy, wanted, &BUFFERS);
-        BUFFERS.give(before);
+        let gradients = self.0.backward(x, weight, Some(&before), dy, wanted);
+        give(before);
         gradients
     }
 }
@@ -156,7 +153,7 @@ impl Layer for LayerNorm {
     type Kept = Vec<Statistics>;
 
     fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>) -> (Vec<f32>, Vec<Statistics>) {
-        Self::forward(self, x, weight, bias.expect("the published norms have biases"), &BUFFERS)
+        Self::forward(self, x, weight, bias.expect("the published norms have biases"))
     }
 
     fn backward(
@@ -167,7 +164,7 @@ impl Layer for LayerNorm {
         dy: &[f32],
         wanted: Wanted,
     ) -> Gradients {
-        Self::backward(self, x, weight, &statistics, dy, wanted, &BUFFERS)
+        Self::backward(self, x, weight, &statistics, dy, wanted)
     }
 }
 

@@ -29,7 +29,6 @@ use burn::tensor::module::{attention, interpolate};
 use burn::tensor::ops::{InterpolateMode, InterpolateOptions};
 use burn::tensor::{DType, Device, FloatDType, Tensor, TensorData};
 
-use buffers::Buffers;
 pub use rope::Rope;
 use snapsnap_base::bilinear::{Tap, taps};
 use train::{Attention, Tokens};
@@ -71,7 +70,7 @@ pub fn rotary_attention(q: Tensor<3>, k: Tensor<3>, v: Tensor<3>, rope: &Rope, h
     let (cos, sin) = (host(rope.cos.clone()), host(rope.sin.clone()));
     let attention = Attention { batch: b, queries: n, keys: m, heads, head_dim: c / heads };
     let [q, k, v] = [q, k, v].map(host);
-    let (out, _) = attention.forward(Tokens::apart([&q, &k, &v], c), [&cos, &sin], &Buffers::new());
+    let (out, _) = attention.forward(Tokens::apart([&q, &k, &v], c), [&cos, &sin]);
     Tensor::from_data(TensorData::new(out, [b, n, c]), &device)
 }
 

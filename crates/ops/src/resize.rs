@@ -1,11 +1,10 @@
 //! Bilinear resize of planes: every input row is stretched once, every output row blends two stretched ones. Its
 //! gradient goes the same way back.
 
+use crate::buffers::take;
 use pulp::Arch;
 use rayon::prelude::*;
 use snapsnap_base::bilinear::Tap;
-
-use crate::wide::Buffers;
 
 /// Taps as a matrix `[taps.len(), from]`, row-major.
 pub fn matrix(taps: &[Tap], from: usize) -> Vec<f32> {
@@ -57,10 +56,9 @@ pub fn resize_gradient(
     [rows, columns]: [usize; 2],
     down: &[Tap],
     across: &[Tap],
-    buffers: &Buffers,
 ) -> Vec<f32> {
     let size = down.len() * across.len();
-    let mut out = buffers.take(gradient.len() / size * rows * columns);
+    let mut out = take(gradient.len() / size * rows * columns);
     let (down, across) = (Back::new(down, rows), Back::new(across, columns));
     let tasks = out.par_chunks_exact_mut(rows * columns).zip(gradient.par_chunks_exact(size));
     tasks.for_each_init(

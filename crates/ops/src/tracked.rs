@@ -2,7 +2,6 @@
 
 use burn::tensor::Tensor;
 
-use crate::layers::BUFFERS;
 use crate::op::{self, Kept, Kernel};
 use snapsnap_base::bilinear::Tap;
 
@@ -33,7 +32,7 @@ impl Kernel for Attend {
 
     fn forward(&self, inputs: [&[f32]; 3], keep: bool) -> (Vec<f32>, Kept) {
         let tables = self.tables.each_ref().map(Vec::as_slice);
-        let (out, logarithms) = self.sizes.forward(self.tokens(inputs), tables, &BUFFERS);
+        let (out, logarithms) = self.sizes.forward(self.tokens(inputs), tables);
         let kept: Kept = if keep { Some(Box::new(logarithms)) } else { None };
         (out, kept)
     }
@@ -49,10 +48,10 @@ impl Kernel for Attend {
             kept.and_then(|kept| kept.downcast::<Vec<f32>>().ok()).expect("kept by the forward pass");
         let (tokens, tables) = (self.tokens(inputs), self.tables.each_ref().map(Vec::as_slice));
         if !self.apart {
-            let gradient = self.sizes.backward_parts(tokens, tables, &logarithms, upstream, &BUFFERS);
+            let gradient = self.sizes.backward_parts(tokens, tables, &logarithms, upstream);
             return [Some(gradient), None, None];
         }
-        let gradients = self.sizes.backward(tokens, tables, &logarithms, upstream, &BUFFERS);
+        let gradients = self.sizes.backward(tokens, tables, &logarithms, upstream);
         let mut wanted = wanted.into_iter();
         gradients.map(|gradient| wanted.next().expect("three of each").then_some(gradient))
     }
@@ -103,7 +102,7 @@ impl Kernel for Resize {
         _wanted: [bool; 3],
     ) -> [Option<Vec<f32>>; 3] {
         let size = [self.from[2], self.from[3]];
-        [Some(resize_gradient(upstream, size, &self.down, &self.across, &BUFFERS)), None, None]
+        [Some(resize_gradient(upstream, size, &self.down, &self.across)), None, None]
     }
 }
 

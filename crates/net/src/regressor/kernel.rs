@@ -6,7 +6,6 @@ use std::sync::{Arc, Mutex, PoisonError};
 use burn::module::Param;
 use burn::nn::conv::Conv2d;
 use burn::tensor::{Tensor, TensorData};
-use snapsnap_ops::buffers::Buffers;
 use snapsnap_ops::conv::{Layer, Wanted};
 use snapsnap_ops::op::{self, Kept, Kernel};
 use snapsnap_ops::unet::{FEATURES, Network, Saved};
@@ -14,9 +13,6 @@ use snapsnap_ops::unet::{FEATURES, Network, Saved};
 use super::statistics::Statistics;
 use super::unet::UNet;
 use crate::names::{NamedVisitor, visit_named};
-
-/// Memory of planes, for the next pass.
-static BUFFERS: Buffers = Buffers::new();
 
 /// One pass of the network.
 #[derive(Debug)]
@@ -36,7 +32,7 @@ impl Kernel for Pass {
 
     fn forward(&self, [input, parameters, _]: [&[f32]; 3], keep: bool) -> (Vec<f32>, Kept) {
         let frozen = self.frozen.as_deref();
-        let pass = self.network.forward(parameters, input, self.size, frozen, keep, &BUFFERS);
+        let pass = self.network.forward(parameters, input, self.size, frozen, keep);
         *self.measured.lock().unwrap_or_else(PoisonError::into_inner) = pass.statistics;
         (pass.features, pass.saved.map(|saved| Box::new(saved) as _))
     }
@@ -50,7 +46,7 @@ impl Kernel for Pass {
     ) -> [Option<Vec<f32>>; 3] {
         let saved = kept.and_then(|kept| kept.downcast::<Saved>().ok()).expect("kept by the forward pass");
         let wanted = Wanted { input: wants_input, parameters: wants_parameters };
-        let gradients = self.network.backward(parameters, input, *saved, upstream, wanted, &BUFFERS);
+        let gradients = self.network.backward(parameters, input, *saved, upstream, wanted);
         [wants_input.then_some(gradients.input), wants_parameters.then_some(gradients.parameters), None]
     }
 }

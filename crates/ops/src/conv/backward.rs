@@ -11,7 +11,7 @@ use super::kernels::{Products, Row, Strided, Tap, square};
 use super::rows::{Activate, Descend, Fill, Sum, Upstream, double, halve};
 use super::weights::transpose;
 use super::{CHANNELS, Plane, Source};
-use crate::buffers::Buffers;
+use crate::buffers::take;
 
 /// Columns that are worked on while they are in the first cache; a multiple of every kernel's block of pixels.
 const CHUNK: usize = 120;
@@ -84,12 +84,12 @@ impl Plane {
 }
 
 impl Backward<'_> {
-    /// The gradients on all cores, those of the inputs in memory from `buffers`; the same bits for any number of cores.
-    pub fn run(&self, buffers: &Buffers) -> Gradients {
+    /// The gradients on all cores; the same bits for any number of them.
+    pub fn run(&self) -> Gradients {
         let plane = self.sources[0].plane;
         let line = plane.width * CHANNELS;
         let count = if self.wanted.input { self.sources.len() } else { 0 };
-        let mut inputs: Vec<Vec<f32>> = (0..count).map(|_| buffers.take(plane.height * line)).collect();
+        let mut inputs: Vec<Vec<f32>> = (0..count).map(|_| take(plane.height * line)).collect();
         // Enough bands for many cores, and few rows of gradients made twice.
         let band = (plane.height / 16).clamp(4, 16);
         let mut outs: Vec<Vec<&mut [f32]>> =

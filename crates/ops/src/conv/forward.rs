@@ -5,7 +5,7 @@ use rayon::prelude::*;
 
 use super::kernels::{Row, Strided, Tap, square};
 use super::{CHANNELS, Moments, Plane, RowMoments, Source};
-use crate::buffers::Buffers;
+use crate::buffers::take;
 use crate::math::silu;
 
 /// Output rows per task.
@@ -42,20 +42,15 @@ pub struct Conv<'a> {
 impl Conv<'_> {
     /// The convolution on all cores; the same bits for any number of them.
     pub fn run(&self) -> Plane {
-        self.run_into(&Buffers::default())
-    }
-
-    /// The same in memory from `buffers`.
-    pub fn run_into(&self, buffers: &Buffers) -> Plane {
         let factor = if self.enlarge { 2 } else { 1 };
         let input = self.sources[0].plane;
         let (rows, columns) = (input.height * factor, input.width * factor);
         let (height, width) = (rows.div_ceil(self.stride), columns.div_ceil(self.stride));
-        let mut data = buffers.take(height * width * CHANNELS);
+        let mut data = take(height * width * CHANNELS);
         let band = |(i, out): (usize, &mut [f32])| self.band(i * BAND, [rows, columns], width, out);
         let moments: Vec<Moments> =
             data.par_chunks_mut(BAND * width * CHANNELS).enumerate().map(band).collect();
-        // Joined in the order of the rows, whatever thread they ran on.
+        // Joined in the order of the rows, for the same bits with any number of threads.
         let moments = moments.iter().fold(Moments::default(), Moments::join);
         Plane { height, width, data, moments }
     }

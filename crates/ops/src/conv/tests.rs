@@ -6,7 +6,6 @@ use super::{
     Backward, CHANNELS, Conv, Moments, Plane, Shortcut, Source, Upstream, Wanted, arrange, rearrange,
     transpose,
 };
-use crate::buffers::Buffers;
 
 /// Uniform in ±1; the same numbers on every run.
 fn random(n: usize, seed: u64) -> Vec<f32> {
@@ -29,7 +28,6 @@ fn wide(values: &[f32]) -> impl Iterator<Item = f64> {
 /// ⟨conv x, g⟩ = ⟨x, ∂x⟩ = ⟨w, ∂w⟩ without bias: the convolution is linear in both.
 #[test]
 fn gradients_are_adjoint_to_the_convolution() {
-    let buffers = Buffers::default();
     for ([height, width], stride, enlarge) in [
         ([12, 20], 1, false),
         ([7, 13], 1, false),
@@ -54,7 +52,7 @@ fn gradients_are_adjoint_to_the_convolution() {
         let expected = dot(wide(&out.data), &gradient);
         let wanted = Wanted { input: true, parameters: true };
         let upstream = Upstream::Scaled(&gradient, 1.0);
-        let got = Backward { sources, weights, upstream, stride, enlarge, wanted }.run(&buffers);
+        let got = Backward { sources, weights, upstream, stride, enlarge, wanted }.run();
         let by_input: f64 = planes.iter().zip(&got.inputs).map(|(plane, g)| dot(wide(g), &plane.data)).sum();
         let by_weight = dot(got.weights.iter().copied(), weights);
         // Each of the outputs carries the rounding of 288 products.

@@ -7,9 +7,9 @@
 use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
 
+use crate::buffers::{give, take};
 use crate::math::exp;
 use crate::multiply::Multiply;
-use crate::wide::Buffers;
 
 /// Queries per block of the forward pass: 128 × 1024 scores of 4 bytes fit a second-level cache.
 const FORWARD_BLOCK: usize = 128;
@@ -58,17 +58,17 @@ impl<'a> Tokens<'a> {
 impl Attention {
     /// softmax(rotated q · rotated kᵀ / √head_dim) · v: queries `[B, queries, C]`, keys and values `[B, keys, C]` →
     /// `[B, queries, C]`, and the logarithms of the rows' sums `[B, heads, queries]`.
-    pub fn forward(&self, [q, k, v]: [Tokens; 3], rope: Tables, buffers: &Buffers) -> (Vec<f32>, Vec<f32>) {
+    pub fn forward(&self, [q, k, v]: [Tokens; 3], rope: Tables) -> (Vec<f32>, Vec<f32>) {
         let Self { queries, keys, head_dim: d, .. } = *self;
         let arch = Arch::new();
-        let mut by_head = buffers.take(self.batch * queries * self.heads * d);
+        let mut by_head = take(self.batch * queries * self.heads * d);
         let mut logarithms = vec![0.0; self.batch * self.heads * queries];
         let heads = by_head.par_chunks_exact_mut(queries * d).zip(logarithms.par_chunks_exact_mut(queries));
         heads.enumerate().for_each(|(i, (out, logarithms))| {
             let [packed_q, packed_k] = [(q, queries, self.scale()), (k, keys, 1.0)]
-                .map(|(x, tokens, factor)| self.pack(x, tokens, i, rope, factor, buffers));
+                .map(|(x, tokens, factor)| self.pack(x, tokens, i, rope, factor));
             let values = self.head(v, keys, i);
-            let mut scores = buffers.take(FORWARD_BLOCK.min(queries) * keys);
+            let mut scores = take(FORWARD_BLOCK.min(queries) * keys);
             let blocks = packed_q.chunks(FORWARD_BLOCK * d).zip(out.chunks_mut(FORWARD_BLOCK * d));
             for ((block, out), logarithms) in blocks.zip(logarithms.chunks_mut(FORWARD_BLOCK)) {
                 let rows = logarithms.len();
@@ -80,65 +80,44 @@ impl Attention {
                     row.iter_mut().for_each(|x| *x /= sum);
                 }
             }
-            [packed_q, packed_k, scores].into_iter().for_each(|buffer| buffers.give(buffer));
+            [packed_q, packed_k, scores].into_iter().for_each(give);
         });
-        let out = self.by_token([&by_head], queries, buffers);
-        buffers.give(by_head);
+        let out = self.by_token([&by_head], queries);
+        give(by_head);
         (out, logarithms)
     }
 
     /// Gradients of queries, keys and values from that of the output, `dy` `[B, queries, C]`. They come together: each
     /// needs nearly all of the others' work.
-    pub fn backward(
-        &self,
-        qkv: [Tokens; 3],
-        rope: Tables,
-        logarithms: &[f32],
-        dy: &[f32],
-        buffers: &Buffers,
-    ) -> [Vec<f32>; 3] {
-        let by_head = self.by_head(qkv, rope, logarithms, dy, buffers);
+    pub fn backward(&self, qkv: [Tokens; 3], rope: Tables, logarithms: &[f32], dy: &[f32]) -> [Vec<f32>; 3] {
+        let by_head = self.by_head(qkv, rope, logarithms, dy);
         let tokens = [self.queries, self.keys, self.keys];
-        let out = [0, 1, 2].map(|i| self.by_token([&by_head[i]], tokens[i], buffers));
-        by_head.into_iter().for_each(|buffer| buffers.give(buffer));
+        let out = [0, 1, 2].map(|i| self.by_token([&by_head[i]], tokens[i]));
+        by_head.into_iter().for_each(give);
         out
     }
 
     /// As [`Attention::backward`], in one tensor `[B, tokens, 3·C]`.
-    pub fn backward_parts(
-        &self,
-        qkv: [Tokens; 3],
-        rope: Tables,
-        logarithms: &[f32],
-        dy: &[f32],
-        buffers: &Buffers,
-    ) -> Vec<f32> {
-        let by_head = self.by_head(qkv, rope, logarithms, dy, buffers);
-        let out = self.by_token(by_head.each_ref().map(Vec::as_slice), self.queries, buffers);
-        by_head.into_iter().for_each(|buffer| buffers.give(buffer));
+    pub fn backward_parts(&self, qkv: [Tokens; 3], rope: Tables, logarithms: &[f32], dy: &[f32]) -> Vec<f32> {
+        let by_head = self.by_head(qkv, rope, logarithms, dy);
+        let out = self.by_token(by_head.each_ref().map(Vec::as_slice), self.queries);
+        by_head.into_iter().for_each(give);
         out
     }
 
     /// Gradients of queries, keys and values, `[B, heads, tokens, head_dim]`.
-    fn by_head(
-        &self,
-        [q, k, v]: [Tokens; 3],
-        rope: Tables,
-        logarithms: &[f32],
-        dy: &[f32],
-        buffers: &Buffers,
-    ) -> [Vec<f32>; 3] {
+    fn by_head(&self, [q, k, v]: [Tokens; 3], rope: Tables, logarithms: &[f32], dy: &[f32]) -> [Vec<f32>; 3] {
         let Self { queries, keys, head_dim: d, .. } = *self;
         let (arch, width) = (Arch::new(), self.heads * d);
-        let mut by_head = [queries, keys, keys].map(|tokens| buffers.take(self.batch * tokens * width));
+        let mut by_head = [queries, keys, keys].map(|tokens| take(self.batch * tokens * width));
         let [dq, dk, dv] = &mut by_head;
         let heads = dq.par_chunks_exact_mut(queries * d).zip(dk.par_chunks_exact_mut(keys * d));
         let heads = heads.zip(dv.par_chunks_exact_mut(keys * d)).enumerate();
         heads.for_each(|(i, ((dq, dk), dv))| {
             let [packed_q, packed_k] = [(q, queries, self.scale()), (k, keys, 1.0)]
-                .map(|(x, tokens, factor)| self.pack(x, tokens, i, rope, factor, buffers));
+                .map(|(x, tokens, factor)| self.pack(x, tokens, i, rope, factor));
             let (values, dy) = (self.head(v, keys, i), self.head(Tokens { values: dy, width }, queries, i));
-            let [mut scores, mut gradients] = [(); 2].map(|()| buffers.take(BLOCK.min(queries) * keys));
+            let [mut scores, mut gradients] = [(); 2].map(|()| take(BLOCK.min(queries) * keys));
             let blocks = packed_q.chunks(BLOCK * d).zip(dq.chunks_mut(BLOCK * d));
             let logarithms = logarithms[i * queries..][..queries].chunks(BLOCK);
             for (b, ((block, dq), logarithms)) in blocks.zip(logarithms).enumerate() {
@@ -154,7 +133,7 @@ impl Attention {
             }
             arch.dispatch(Unrotate { x: dq, d, rope, factor: self.scale() });
             arch.dispatch(Unrotate { x: dk, d, rope, factor: 1.0 });
-            [packed_q, packed_k, scores, gradients].into_iter().for_each(|buffer| buffers.give(buffer));
+            [packed_q, packed_k, scores, gradients].into_iter().for_each(give);
         });
         by_head
     }
@@ -169,33 +148,20 @@ impl Attention {
     }
 
     /// The i-th head's tokens `[tokens, head_dim]`, rotated and scaled.
-    fn pack(
-        &self,
-        x: Tokens,
-        tokens: usize,
-        i: usize,
-        rope: Tables,
-        factor: f32,
-        buffers: &Buffers,
-    ) -> Vec<f32> {
+    fn pack(&self, x: Tokens, tokens: usize, i: usize, rope: Tables, factor: f32) -> Vec<f32> {
         let (d, width) = (self.head_dim, x.width);
-        let mut out = buffers.take(tokens * d);
+        let mut out = take(tokens * d);
         let x = self.head(x, tokens, i);
         Arch::new().dispatch(Rotate { x, width, d, rope, factor, out: &mut out });
         out
     }
 
     /// Parts `[B, heads, tokens, head_dim]` → `[B, tokens, parts·C]`.
-    fn by_token<const PARTS: usize>(
-        &self,
-        parts: [&[f32]; PARTS],
-        tokens: usize,
-        buffers: &Buffers,
-    ) -> Vec<f32> {
+    fn by_token<const PARTS: usize>(&self, parts: [&[f32]; PARTS], tokens: usize) -> Vec<f32> {
         /// Tokens per task.
         const TOKENS: usize = 64;
         let (d, width) = (self.head_dim, self.heads * self.head_dim);
-        let mut out = buffers.take(PARTS * self.batch * tokens * width);
+        let mut out = take(PARTS * self.batch * tokens * width);
         out.par_chunks_mut(TOKENS * PARTS * width).enumerate().for_each(|(i, out)| {
             for (j, out) in out.chunks_exact_mut(PARTS * width).enumerate() {
                 let (b, n) = ((i * TOKENS + j) / tokens, (i * TOKENS + j) % tokens);

@@ -8,8 +8,9 @@ use super::elements::{add_constant, mask, rectify, total};
 use super::planes::{Planes, Transposer};
 use super::transposed::Accumulate;
 use super::{Gradients, Wanted, join};
+use crate::buffers::{give, take};
 use crate::multiply::Multiply;
-use crate::wide::{Buffers, GROUP, pieces};
+use crate::wide::{GROUP, pieces};
 
 /// Floats of a block's inputs and outputs: 128 KiB.
 const BLOCK_FLOATS: usize = 32 * 1024;
@@ -41,13 +42,13 @@ struct Block<'a> {
 
 impl Conv1x1 {
     /// `x` `[B, inputs, H, W]`, `weight` `[outputs, inputs]`, `bias` `[outputs]` → `[B, outputs, H, W]`.
-    pub fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>, buffers: &Buffers) -> Vec<f32> {
+    pub fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>) -> Vec<f32> {
         let Self { inputs, outputs, pixels, .. } = *self;
-        let mut out = buffers.take(self.batch * outputs * pixels);
+        let mut out = take(self.batch * outputs * pixels);
         self.blocks(Some((&mut out, outputs))).into_par_iter().for_each(|block| {
             let (n, x) = (block.count, &x[block.image * inputs * pixels + block.first..]);
-            let mut read = buffers.take(if self.rectified { inputs * n } else { 0 });
-            let mut results = buffers.take(outputs * n);
+            let mut read = take(if self.rectified { inputs * n } else { 0 });
+            let mut results = take(outputs * n);
             let x = self.read(x, n, &mut read);
             Multiply { size: [outputs, n, inputs], lhs: (weight, [1, inputs]), rhs: x, add: false }
                 .write(&mut results, n);
@@ -55,26 +56,19 @@ impl Conv1x1 {
                 let bias = bias.map_or(0.0, |bias| bias[c]);
                 add_constant(results, bias, out);
             }
-            [read, results].into_iter().for_each(|buffer| buffers.give(buffer));
+            [read, results].into_iter().for_each(give);
         });
         out
     }
 
     /// Gradients from that of the output, `dy` `[B, outputs, H, W]`.
-    pub fn backward(
-        &self,
-        x: &[f32],
-        weight: &[f32],
-        dy: &[f32],
-        wanted: Wanted,
-        buffers: &Buffers,
-    ) -> Gradients {
+    pub fn backward(&self, x: &[f32], weight: &[f32], dy: &[f32], wanted: Wanted) -> Gradients {
         let Self { inputs, outputs, .. } = *self;
-        let mut dx = wanted.input.then(|| buffers.take(x.len()));
+        let mut dx = wanted.input.then(|| take(x.len()));
         let mut blocks = self.blocks(dx.as_deref_mut().map(|dx| (dx, inputs)));
         let size = blocks.len().div_ceil(PARTS);
         let parts: Vec<_> =
-            blocks.par_chunks_mut(size).map(|part| self.part(part, x, weight, dy, wanted, buffers)).collect();
+            blocks.par_chunks_mut(size).map(|part| self.part(part, x, weight, dy, wanted)).collect();
         let width = inputs.next_multiple_of(GROUP);
         let weight = wanted.weight.then(|| {
             let size = outputs.next_multiple_of(GROUP) * width;
@@ -96,7 +90,6 @@ impl Conv1x1 {
         weight: &[f32],
         dy: &[f32],
         wanted: Wanted,
-        buffers: &Buffers,
     ) -> (Vec<f32>, Vec<f32>) {
         let Self { inputs, outputs, pixels, rectified, .. } = *self;
         let [left, right] = [outputs, inputs].map(|channels| channels.next_multiple_of(GROUP));
@@ -107,12 +100,12 @@ impl Conv1x1 {
             let (n, x) = (*n, &x[*image * inputs * pixels..][..inputs * pixels]);
             let dy = &dy[*image * outputs * pixels..][..outputs * pixels];
             if wanted.weight {
-                let [mut gradients, mut values] = [left, right].map(|channels| buffers.take(channels * n));
+                let [mut gradients, mut values] = [left, right].map(|channels| take(channels * n));
                 self.group(dy, *first, false, n, &mut gradients);
                 self.group(x, *first, rectified, n, &mut values);
                 let (left, right, out) = (&gradients, &values, &mut weights);
                 Arch::new().dispatch(Accumulate { left, right, stride: n, tiles: n, add, out });
-                [gradients, values].into_iter().for_each(|buffer| buffers.give(buffer));
+                [gradients, values].into_iter().for_each(give);
                 add = true;
             }
             if wanted.bias {
@@ -121,7 +114,7 @@ impl Conv1x1 {
                 }
             }
             if wanted.input {
-                let mut results = buffers.take(inputs * n);
+                let mut results = take(inputs * n);
                 let (lhs, rhs) = ((weight, [inputs, 1]), (&dy[*first..], [1, pixels]));
                 Multiply { size: [inputs, n, outputs], lhs, rhs, add: false }.write(&mut results, n);
                 let channels = out.iter_mut().zip(results.chunks_exact(n)).zip(x.chunks_exact(pixels));
@@ -131,7 +124,7 @@ impl Conv1x1 {
                         mask(&x[*first..][..n], out);
                     }
                 }
-                buffers.give(results);
+                give(results);
             }
         }
         (weights, biases)

@@ -11,9 +11,10 @@ use rayon::prelude::*;
 use super::elements::channel_sums;
 use super::planes::{Planes, Scatter, Transposer};
 use super::{Gradients, Unfolded, Wanted};
+use crate::buffers::{give, take};
 use crate::wide::convolution::{Bands, Weights};
 use crate::wide::transforms::{POINTS, TILE};
-use crate::wide::{Buffers, GROUP, pieces};
+use crate::wide::{GROUP, pieces};
 
 /// Floats that a block's transformed inputs and products take together: 1 MiB, of which a core's second-level cache
 /// holds most.
@@ -43,33 +44,26 @@ pub struct Conv3x3 {
 
 impl Conv3x3 {
     /// `x` `[B, inputs, H, W]`, `weight` `[outputs, inputs, 3, 3]`, `bias` `[outputs]` → `[B, outputs, H, W]`.
-    pub fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>, buffers: &Buffers) -> Vec<f32> {
+    pub fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>) -> Vec<f32> {
         let filters = Weights { values: weight, strides: [9 * self.inputs, 9], turned: false };
-        self.run(x, self.rectified, filters, bias, None, buffers)
+        self.run(x, self.rectified, filters, bias, None)
     }
 
     /// Gradients from that of the output, `dy` `[B, outputs, H, W]`.
-    pub fn backward(
-        &self,
-        x: &[f32],
-        weight: &[f32],
-        dy: &[f32],
-        wanted: Wanted,
-        buffers: &Buffers,
-    ) -> Gradients {
+    pub fn backward(&self, x: &[f32], weight: &[f32], dy: &[f32], wanted: Wanted) -> Gradients {
         let input = wanted.input.then(|| {
             let filters = Weights { values: weight, strides: [9, 9 * self.inputs], turned: true };
             let back = Self { inputs: self.outputs, outputs: self.inputs, ..*self };
-            back.run(dy, false, filters, None, self.rectified.then_some(x), buffers)
+            back.run(dy, false, filters, None, self.rectified.then_some(x))
         });
         if wanted.weight && self.batch * self.height * self.width <= FEW_PIXELS {
             let Self { batch, inputs, outputs, height, width, rectified } = *self;
             let direct = Unfolded { batch, inputs, outputs, height, width, stride: 1, rectified };
-            let gradients = direct.backward(x, weight, dy, Wanted { input: false, ..wanted }, buffers);
+            let gradients = direct.backward(x, weight, dy, Wanted { input: false, ..wanted });
             Gradients { input, ..gradients }
         } else if wanted.weight {
             // The bias's gradient is a by-product.
-            let [weight, bias] = self.weight_gradient(x, dy, buffers);
+            let [weight, bias] = self.weight_gradient(x, dy);
             Gradients { input, weight: Some(weight), bias: wanted.bias.then_some(bias) }
         } else {
             let bias = wanted.bias.then(|| channel_sums(dy, self.batch, self.outputs));
@@ -85,14 +79,13 @@ impl Conv3x3 {
         filters: Weights,
         bias: Option<&[f32]>,
         mask: Option<&[f32]>,
-        buffers: &Buffers,
     ) -> Vec<f32> {
         let (plane, width) = (self.height * self.width, self.width);
         assert_eq!(x.len(), self.batch * self.inputs * plane);
-        let transformed = filters.transform([self.inputs, self.outputs], buffers);
+        let transformed = filters.transform([self.inputs, self.outputs]);
         let mut padded = bias.unwrap_or_default().to_vec();
         padded.resize(self.outputs.next_multiple_of(GROUP), 0.0);
-        let mut out = buffers.take(self.batch * self.outputs * plane);
+        let mut out = take(self.batch * self.outputs * plane);
         let (band, transposer) = (self.band_rows(), Transposer::new());
         let tasks: Vec<_> = out
             .chunks_exact_mut(self.outputs * plane)
@@ -108,18 +101,18 @@ impl Conv3x3 {
         tasks.into_par_iter().for_each(|(image, data, row, mut out)| {
             let planes = Planes { data, height: self.height, width, rectified, transposer };
             let pixels = out[0].len();
-            let mut grouped = buffers.take(padded.len() * pixels);
+            let mut grouped = take(padded.len() * pixels);
             let mut slices: Vec<_> = grouped.chunks_exact_mut(pixels * GROUP).collect();
-            bands.run(&planes, row, &mut slices, buffers);
+            bands.run(&planes, row, &mut slices);
             for (group, planes) in out.chunks_mut(GROUP).enumerate() {
                 let first = (image * self.outputs + group * GROUP) * plane + row * TILE * width;
                 let mask = mask.map(|mask| (&mask[first..], plane));
                 let pixels = &grouped[group * pixels * GROUP..][..pixels * GROUP];
                 Scatter { pixels, planes, mask }.run(transposer);
             }
-            buffers.give(grouped);
+            give(grouped);
         });
-        buffers.give(transformed);
+        give(transformed);
         out
     }
 

@@ -5,8 +5,9 @@ use rayon::prelude::*;
 
 use super::elements::total;
 use super::{Gradients, Wanted, join};
+use crate::buffers::{give, take};
 use crate::multiply::Multiply;
-use crate::wide::{Buffers, pieces};
+use crate::wide::pieces;
 
 /// Floats of a block's inputs and squares: 256 KiB.
 const BLOCK_FLOATS: usize = 64 * 1024;
@@ -42,14 +43,14 @@ struct Block<'a> {
 impl Enlarge {
     /// `x` `[B, inputs, H, W]`, `weight` `[inputs, outputs, stride, stride]`, `bias` `[outputs]` →
     /// `[B, outputs, stride·H, stride·W]`.
-    pub fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>, buffers: &Buffers) -> Vec<f32> {
+    pub fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>) -> Vec<f32> {
         let Self { inputs, outputs, width, stride: s, .. } = *self;
         let (plane, squares) = (self.height * width, s * s);
-        let mut out = buffers.take(self.batch * outputs * plane * squares);
+        let mut out = take(self.batch * outputs * plane * squares);
         self.blocks(Some((&mut out, outputs, squares))).into_par_iter().for_each(|block| {
             let n = block.rows * width;
             let x = &x[block.image * inputs * plane + block.row * width..];
-            let mut places = buffers.take(outputs * squares * n);
+            let mut places = take(outputs * squares * n);
             let lhs = (weight, [outputs * squares, 1]);
             Multiply { size: [outputs * squares, n, inputs], lhs, rhs: (x, [1, plane]), add: false }
                 .write(&mut places, n);
@@ -64,25 +65,18 @@ impl Enlarge {
                     }
                 }
             }
-            buffers.give(places);
+            give(places);
         });
         out
     }
 
     /// Gradients from that of the output, `dy` `[B, outputs, stride·H, stride·W]`.
-    pub fn backward(
-        &self,
-        x: &[f32],
-        weight: &[f32],
-        dy: &[f32],
-        wanted: Wanted,
-        buffers: &Buffers,
-    ) -> Gradients {
-        let mut dx = wanted.input.then(|| buffers.take(x.len()));
+    pub fn backward(&self, x: &[f32], weight: &[f32], dy: &[f32], wanted: Wanted) -> Gradients {
+        let mut dx = wanted.input.then(|| take(x.len()));
         let mut blocks = self.blocks(dx.as_deref_mut().map(|dx| (dx, self.inputs, 1)));
         let size = blocks.len().div_ceil(PARTS);
         let parts: Vec<_> =
-            blocks.par_chunks_mut(size).map(|part| self.part(part, x, weight, dy, wanted, buffers)).collect();
+            blocks.par_chunks_mut(size).map(|part| self.part(part, x, weight, dy, wanted)).collect();
         Gradients {
             input: dx,
             weight: wanted.weight.then(|| join(parts.iter().map(|(weights, _)| &weights[..]), weight.len())),
@@ -98,7 +92,6 @@ impl Enlarge {
         weight: &[f32],
         dy: &[f32],
         wanted: Wanted,
-        buffers: &Buffers,
     ) -> (Vec<f32>, Vec<f32>) {
         let Self { inputs, outputs, width, stride: s, .. } = *self;
         let (plane, columns) = (self.height * width, outputs * s * s);
@@ -108,7 +101,7 @@ impl Enlarge {
         for Block { image, row, rows, out } in part {
             let n = *rows * width;
             let x = &x[*image * inputs * plane + *row * width..];
-            let mut places = buffers.take(columns * n);
+            let mut places = take(columns * n);
             for (c, places) in places.chunks_exact_mut(s * s * n).enumerate() {
                 let dy = &dy[((*image * outputs + c) * plane + *row * width) * s * s..][..n * s * s];
                 for (y, line) in dy.chunks_exact(s * width).enumerate() {
@@ -127,13 +120,13 @@ impl Enlarge {
                 add = true;
             }
             if wanted.input {
-                let mut results = buffers.take(inputs * n);
+                let mut results = take(inputs * n);
                 let (lhs, rhs) = ((weight, [1, columns]), (&places[..], [1, n]));
                 Multiply { size: [inputs, n, columns], lhs, rhs, add: false }.write(&mut results, n);
                 out.iter_mut().zip(results.chunks_exact(n)).for_each(|(out, dx)| out.copy_from_slice(dx));
-                buffers.give(results);
+                give(results);
             }
-            buffers.give(places);
+            give(places);
         }
         (weights, biases)
     }

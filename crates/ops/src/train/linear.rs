@@ -6,9 +6,9 @@ use rayon::prelude::*;
 
 use super::elements::{add_rows, add_to_rows};
 use super::{Gradients, Wanted, join, parts};
+use crate::buffers::{give, take};
 use crate::math::{gelu, gelu_derivative};
 use crate::multiply::Multiply;
-use crate::wide::Buffers;
 
 /// Rows per task of the products over rows.
 const ROWS: usize = 128;
@@ -32,22 +32,16 @@ pub struct Linear {
 
 impl Linear {
     /// x · weight + bias: `x` `[rows, inputs]` → `[rows, outputs]`.
-    pub fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>, buffers: &Buffers) -> Vec<f32> {
-        let mut out = buffers.take(self.rows * self.outputs);
+    pub fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>) -> Vec<f32> {
+        let mut out = take(self.rows * self.outputs);
         let tasks = out.par_chunks_mut(ROWS * self.outputs).zip(x.par_chunks(ROWS * self.inputs));
         tasks.for_each(|(out, x)| self.product(x, weight, bias, out));
         out
     }
 
     /// gelu(z) and z = x · weight + bias, which [`Linear::backward`] needs: `[rows, outputs]` each.
-    pub fn forward_gelu(
-        &self,
-        x: &[f32],
-        weight: &[f32],
-        bias: Option<&[f32]>,
-        buffers: &Buffers,
-    ) -> [Vec<f32>; 2] {
-        let [mut out, mut before] = [(); 2].map(|()| buffers.take(self.rows * self.outputs));
+    pub fn forward_gelu(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>) -> [Vec<f32>; 2] {
+        let [mut out, mut before] = [(); 2].map(|()| take(self.rows * self.outputs));
         let arch = Arch::new();
         let tasks = out.par_chunks_mut(ROWS * self.outputs).zip(before.par_chunks_mut(ROWS * self.outputs));
         tasks.zip(x.par_chunks(ROWS * self.inputs)).for_each(|((out, before), x)| {
@@ -69,12 +63,11 @@ impl Linear {
         before: Option<&[f32]>,
         dy: &[f32],
         wanted: Wanted,
-        buffers: &Buffers,
     ) -> Gradients {
         let Self { rows, inputs, outputs, .. } = *self;
         let blocks = rows.div_ceil(ROWS);
-        let mut dx = wanted.input.then(|| buffers.take(rows * inputs));
-        let mut dz = before.map(|_| buffers.take(rows * outputs));
+        let mut dx = wanted.input.then(|| take(rows * inputs));
+        let mut dz = before.map(|_| take(rows * outputs));
         let mut sums = vec![0.0; if wanted.bias { blocks * outputs } else { 0 }];
         let results = parts(dx.as_deref_mut(), ROWS * inputs, blocks).into_par_iter();
         let changed = parts(dz.as_deref_mut(), ROWS * outputs, blocks);
@@ -99,19 +92,19 @@ impl Linear {
                     .write(dx, inputs);
             }
         });
-        let weight = wanted.weight.then(|| self.weight_gradient(x, dz.as_deref().unwrap_or(dy), buffers));
+        let weight = wanted.weight.then(|| self.weight_gradient(x, dz.as_deref().unwrap_or(dy)));
         if let Some(dz) = dz {
-            buffers.give(dz);
+            give(dz);
         }
         Gradients { input: dx, weight, bias: wanted.bias.then(|| join(sums.chunks_exact(outputs), outputs)) }
     }
 
-    fn weight_gradient(&self, x: &[f32], dz: &[f32], buffers: &Buffers) -> Vec<f32> {
+    fn weight_gradient(&self, x: &[f32], dz: &[f32]) -> Vec<f32> {
         // Rows and columns of the weight as it is stored.
         let (inputs, outputs) = ((x, self.inputs), (dz, self.outputs));
         let ((left, rows), (right, columns)) =
             if self.transposed { (outputs, inputs) } else { (inputs, outputs) };
-        let mut out = buffers.take(rows * columns);
+        let mut out = take(rows * columns);
         let block = rows.div_ceil(WEIGHT_TASKS).clamp(WEIGHT_ROWS[0], WEIGHT_ROWS[1]);
         out.par_chunks_mut(block * columns).enumerate().for_each(|(i, out)| {
             let size = [out.len() / columns, columns, self.rows];

@@ -4,7 +4,7 @@ use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
 
 use super::{Gradients, Wanted, join, parts};
-use crate::wide::Buffers;
+use crate::buffers::take;
 
 /// Rows per task.
 const ROWS: usize = 64;
@@ -25,14 +25,8 @@ pub type Statistics = [f32; 2];
 
 impl LayerNorm {
     /// `x` `[rows, channels]`, `weight` and `bias` `[channels]` → `[rows, channels]` and what the backward pass needs.
-    pub fn forward(
-        &self,
-        x: &[f32],
-        weight: &[f32],
-        bias: &[f32],
-        buffers: &Buffers,
-    ) -> (Vec<f32>, Vec<Statistics>) {
-        let mut out = buffers.take(x.len());
+    pub fn forward(&self, x: &[f32], weight: &[f32], bias: &[f32]) -> (Vec<f32>, Vec<Statistics>) {
+        let mut out = take(x.len());
         let mut statistics = vec![[0.0; 2]; x.len() / self.channels];
         let (arch, piece) = (Arch::new(), ROWS * self.channels);
         let tasks = out.par_chunks_mut(piece).zip(x.par_chunks(piece)).zip(statistics.par_chunks_mut(ROWS));
@@ -51,13 +45,12 @@ impl LayerNorm {
         statistics: &[Statistics],
         dy: &[f32],
         wanted: Wanted,
-        buffers: &Buffers,
     ) -> Gradients {
         let (c, piece) = (self.channels, ROWS * self.channels);
         let (arch, blocks) = (Arch::new(), statistics.len().div_ceil(ROWS));
         let summed = wanted.weight || wanted.bias;
         let mut sums = vec![0.0; if summed { 2 * blocks * c } else { 0 }];
-        let mut dx = wanted.input.then(|| buffers.take(x.len()));
+        let mut dx = wanted.input.then(|| take(x.len()));
         let results = parts(dx.as_deref_mut(), piece, blocks).into_par_iter();
         let totals = parts(summed.then_some(&mut sums), 2 * c, blocks);
         let given = x.par_chunks(piece).zip(dy.par_chunks(piece)).zip(statistics.par_chunks(ROWS));

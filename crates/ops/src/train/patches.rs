@@ -4,7 +4,7 @@
 use rayon::prelude::*;
 
 use super::{Gradients, Linear, Wanted};
-use crate::wide::Buffers;
+use crate::buffers::{give, take};
 
 /// Sizes of an embedding.
 #[derive(Debug, Clone, Copy)]
@@ -26,28 +26,21 @@ pub struct Patches {
 impl Patches {
     /// `x` `[B, inputs, H, W]`, `weight` `[outputs, inputs, side, side]`, `bias` `[outputs]` → tokens
     /// `[B, H/side · W/side, outputs]`.
-    pub fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>, buffers: &Buffers) -> Vec<f32> {
-        let rows = self.gather(x, buffers);
-        let out = self.layer().forward(&rows, weight, bias, buffers);
-        buffers.give(rows);
+    pub fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>) -> Vec<f32> {
+        let rows = self.gather(x);
+        let out = self.layer().forward(&rows, weight, bias);
+        give(rows);
         out
     }
 
     /// Gradients from that of the tokens, `dy` `[B, H/side · W/side, outputs]`.
-    pub fn backward(
-        &self,
-        x: &[f32],
-        weight: &[f32],
-        dy: &[f32],
-        wanted: Wanted,
-        buffers: &Buffers,
-    ) -> Gradients {
-        let rows = wanted.weight.then(|| self.gather(x, buffers));
+    pub fn backward(&self, x: &[f32], weight: &[f32], dy: &[f32], wanted: Wanted) -> Gradients {
+        let rows = wanted.weight.then(|| self.gather(x));
         let given = rows.as_deref().unwrap_or_default();
-        let gradients = self.layer().backward(given, weight, None, dy, wanted, buffers);
-        rows.into_iter().for_each(|rows| buffers.give(rows));
+        let gradients = self.layer().backward(given, weight, None, dy, wanted);
+        rows.into_iter().for_each(give);
         let input = gradients.input.map(|rows| {
-            let mut dx = buffers.take(x.len());
+            let mut dx = take(x.len());
             dx.par_chunks_exact_mut(self.side * self.width).enumerate().for_each(|(band, dx)| {
                 for (at, patch) in self.places(band) {
                     for (y, line) in dx.chunks_exact_mut(self.width).enumerate() {
@@ -56,7 +49,7 @@ impl Patches {
                     }
                 }
             });
-            buffers.give(rows);
+            give(rows);
             dx
         });
         Gradients { input, ..gradients }
@@ -69,10 +62,10 @@ impl Patches {
     }
 
     /// Patches as rows `[B · H/side · W/side, inputs · side · side]`.
-    fn gather(&self, x: &[f32], buffers: &Buffers) -> Vec<f32> {
+    fn gather(&self, x: &[f32]) -> Vec<f32> {
         let (area, width) = (self.side * self.side, self.width);
         let (rows, columns) = (self.height / self.side, width / self.side);
-        let mut out = buffers.take(x.len());
+        let mut out = take(x.len());
         // One task writes the patches of one row of them.
         out.par_chunks_exact_mut(columns * self.inputs * area).enumerate().for_each(|(i, out)| {
             let (image, row) = (i / rows, i % rows);

@@ -3,7 +3,6 @@
 
 use super::reference::{self as plain, Convolution};
 use super::*;
-use crate::wide::Buffers;
 use rand::{RngCore, SeedableRng};
 use snapsnap_base::bilinear::taps;
 
@@ -90,7 +89,6 @@ fn convolutions_of_three_taps_equal_plain_loops() {
         sizes.into_iter().flat_map(|size| [1, 2].map(|stride| (size, stride)))
     {
         for rectified in [false, true] {
-            let buffers = Buffers::default();
             let what =
                 format!("{batch}×{inputs}→{outputs} at {height}×{width}, stride {stride}, {rectified}");
             let reference =
@@ -100,12 +98,12 @@ fn convolutions_of_three_taps_equal_plain_loops() {
             let dy = random(batch * outputs * height.div_ceil(stride) * width.div_ceil(stride), 4);
             let (result, gradients) = if stride == 1 {
                 let conv = Conv3x3 { batch, inputs, outputs, height, width, rectified };
-                let result = conv.forward(&x, &weight, Some(&bias), &buffers);
-                (result, conv.backward(&x, &weight, &dy, Wanted::ALL, &buffers))
+                let result = conv.forward(&x, &weight, Some(&bias));
+                (result, conv.backward(&x, &weight, &dy, Wanted::ALL))
             } else {
                 let conv = Unfolded { batch, inputs, outputs, height, width, stride, rectified };
-                let result = conv.forward(&x, &weight, Some(&bias), &buffers);
-                (result, conv.backward(&x, &weight, &dy, Wanted::ALL, &buffers))
+                let result = conv.forward(&x, &weight, Some(&bias));
+                (result, conv.backward(&x, &weight, &dy, Wanted::ALL))
             };
             let plain = |x: &[Vec<f64>]| reference.run(&x[0], &x[1], &x[2]);
             check_layer(&what, [&x, &weight, &bias], plain, &result, &dy, &gradients);
@@ -121,7 +119,7 @@ fn taps_that_see_nothing_have_no_gradient() {
     x[0] = 0.7;
     let mut dy = vec![0.0; 1024];
     dy[0] = 0.3;
-    let gradients = conv.backward(&x, &[0.1; 9], &dy, Wanted::ALL, &Buffers::default());
+    let gradients = conv.backward(&x, &[0.1; 9], &dy, Wanted::ALL);
     let expected: Vec<f32> = (0..9).map(|tap| if tap == 4 { 0.7 * 0.3 } else { 0.0 }).collect();
     assert_eq!(gradients.weight, Some(expected));
 }
@@ -132,7 +130,6 @@ fn convolutions_of_one_tap_equal_plain_loops() {
         [[1, 1, 1, 1, 1], [2, 35, 4, 9, 7], [3, 20, 40, 1, 300], [1, 4, 3, 130, 90]]
     {
         for rectified in [false, true] {
-            let buffers = Buffers::default();
             let reference = Convolution {
                 batch,
                 inputs,
@@ -148,8 +145,8 @@ fn convolutions_of_one_tap_equal_plain_loops() {
             let x = random(batch * inputs * height * width, 1);
             let (weight, bias) = (random(outputs * inputs, 2), random(outputs, 3));
             let dy = random(batch * outputs * height * width, 4);
-            let result = conv.forward(&x, &weight, Some(&bias), &buffers);
-            let gradients = conv.backward(&x, &weight, &dy, Wanted::ALL, &buffers);
+            let result = conv.forward(&x, &weight, Some(&bias));
+            let gradients = conv.backward(&x, &weight, &dy, Wanted::ALL);
             let plain = |x: &[Vec<f64>]| reference.run(&x[0], &x[1], &x[2]);
             let what = format!("{batch}×{inputs}→{outputs} at {height}×{width}, {rectified}");
             check_layer(&what, [&x, &weight, &bias], plain, &result, &dy, &gradients);
@@ -162,13 +159,12 @@ fn transposed_convolutions_equal_plain_loops() {
     for (stride, [batch, inputs, outputs, height, width]) in
         [(2, [2, 18, 35, 3, 5]), (4, [1, 16, 8, 4, 4]), (3, [3, 1, 1, 1, 2]), (2, [1, 40, 70, 30, 9])]
     {
-        let buffers = Buffers::default();
         let layer = Enlarge { batch, inputs, outputs, height, width, stride };
         let x = random(batch * inputs * height * width, 1);
         let (weight, bias) = (random(inputs * outputs * stride * stride, 2), random(outputs, 3));
         let dy = random(batch * outputs * height * width * stride * stride, 4);
-        let result = layer.forward(&x, &weight, Some(&bias), &buffers);
-        let gradients = layer.backward(&x, &weight, &dy, Wanted::ALL, &buffers);
+        let result = layer.forward(&x, &weight, Some(&bias));
+        let gradients = layer.backward(&x, &weight, &dy, Wanted::ALL);
         let plain = |x: &[Vec<f64>]| plain::enlarge(&layer, &x[0], &x[1], &x[2]);
         let what = format!("{batch}×{inputs}→{outputs} at {height}×{width}, {stride} times as large");
         check_layer(&what, [&x, &weight, &bias], plain, &result, &dy, &gradients);
@@ -180,7 +176,6 @@ fn patch_embeddings_equal_plain_loops() {
     for [batch, inputs, outputs, height, width, side] in
         [[2, 3, 19, 6, 4, 2], [1, 8, 5, 3, 12, 3], [3, 1, 1, 16, 16, 16]]
     {
-        let buffers = Buffers::default();
         let layer = Patches { batch, inputs, outputs, height, width, side };
         let reference = Convolution {
             batch,
@@ -197,8 +192,8 @@ fn patch_embeddings_equal_plain_loops() {
         let (weight, bias) = (random(outputs * inputs * side * side, 2), random(outputs, 3));
         let tokens = height / side * (width / side);
         let dy = random(batch * tokens * outputs, 4);
-        let result = layer.forward(&x, &weight, Some(&bias), &buffers);
-        let gradients = layer.backward(&x, &weight, &dy, Wanted::ALL, &buffers);
+        let result = layer.forward(&x, &weight, Some(&bias));
+        let gradients = layer.backward(&x, &weight, &dy, Wanted::ALL);
         let plain = |x: &[Vec<f64>]| {
             let planes = reference.run(&x[0], &x[1], &x[2]);
             let place =
@@ -213,17 +208,16 @@ fn patch_embeddings_equal_plain_loops() {
 fn linear_layers_equal_plain_loops() {
     for [rows, inputs, outputs] in [[1, 1, 16], [7, 20, 37], [131, 9, 70], [300, 5, 3]] {
         for (gelu, transposed) in [(false, false), (false, true), (true, false), (true, true)] {
-            let buffers = Buffers::default();
             let layer = Linear { rows, inputs, outputs, transposed };
             let (x, weight) = (random(rows * inputs, 1), random(inputs * outputs, 2));
             let (bias, dy) = (random(outputs, 3), random(rows * outputs, 4));
             let (result, before) = if gelu {
-                let [result, before] = layer.forward_gelu(&x, &weight, Some(&bias), &buffers);
+                let [result, before] = layer.forward_gelu(&x, &weight, Some(&bias));
                 (result, Some(before))
             } else {
-                (layer.forward(&x, &weight, Some(&bias), &buffers), None)
+                (layer.forward(&x, &weight, Some(&bias)), None)
             };
-            let gradients = layer.backward(&x, &weight, before.as_deref(), &dy, Wanted::ALL, &buffers);
+            let gradients = layer.backward(&x, &weight, before.as_deref(), &dy, Wanted::ALL);
             let plain = |x: &[Vec<f64>]| {
                 let y = plain::linear(&layer, &x[0], &x[1], &x[2]);
                 if gelu { y.into_iter().map(plain::gelu).collect() } else { y }
@@ -237,12 +231,11 @@ fn linear_layers_equal_plain_loops() {
 #[test]
 fn layer_norm_equals_plain_loops() {
     for [rows, channels] in [[1, 3], [130, 37], [3, 192]] {
-        let buffers = Buffers::default();
         let norm = LayerNorm { channels, epsilon: 1e-6 };
         let x = random(rows * channels, 1);
         let (weight, bias, dy) = (random(channels, 2), random(channels, 3), random(rows * channels, 4));
-        let (result, statistics) = norm.forward(&x, &weight, &bias, &buffers);
-        let gradients = norm.backward(&x, &weight, &statistics, &dy, Wanted::ALL, &buffers);
+        let (result, statistics) = norm.forward(&x, &weight, &bias);
+        let gradients = norm.backward(&x, &weight, &statistics, &dy, Wanted::ALL);
         let plain = |x: &[Vec<f64>]| plain::layer_norm(1e-6, &x[0], &x[1], &x[2]);
         check_layer(&format!("{rows}×{channels}"), [&x, &weight, &bias], plain, &result, &dy, &gradients);
     }
@@ -251,7 +244,6 @@ fn layer_norm_equals_plain_loops() {
 #[test]
 fn rotary_attention_equals_plain_loops() {
     for [batch, queries, keys, heads, head_dim] in [[1, 1, 1, 1, 4], [2, 5, 5, 3, 8], [1, 70, 66, 2, 4]] {
-        let buffers = Buffers::default();
         let attention = Attention { batch, queries, keys, heads, head_dim };
         let channels = heads * head_dim;
         let inputs = [queries, keys, keys].map(|n| batch * n * channels);
@@ -259,8 +251,8 @@ fn rotary_attention_equals_plain_loops() {
         let dy = random(batch * queries * channels, 4);
         let tables = plain::tables(queries.max(keys), head_dim);
         let (qkv, rope) = (Tokens::apart([&q, &k, &v], channels), [&tables[0][..], &tables[1]]);
-        let (result, logarithms) = attention.forward(qkv, rope, &buffers);
-        let gradients = attention.backward(qkv, rope, &logarithms, &dy, &buffers);
+        let (result, logarithms) = attention.forward(qkv, rope);
+        let gradients = attention.backward(qkv, rope, &logarithms, &dy);
         let what = format!("{queries} and {keys} tokens");
         let plain = |x: &[Vec<f64>]| plain::attention(&attention, rope, &x[0], &x[1], &x[2]);
         let gradients = gradients.each_ref().map(|gradient| Some(&gradient[..]));
@@ -270,8 +262,7 @@ fn rotary_attention_equals_plain_loops() {
 
 #[test]
 fn attention_of_parts_equals_that_of_tensors() {
-    let (attention, buffers) =
-        (Attention { batch: 2, queries: 67, keys: 67, heads: 2, head_dim: 8 }, Buffers::default());
+    let attention = Attention { batch: 2, queries: 67, keys: 67, heads: 2, head_dim: 8 };
     let (channels, tokens) = (16, 2 * 67);
     let (qkv, dy) = (random(tokens * 3 * channels, 1), random(tokens * channels, 2));
     let part = |i: usize| -> Vec<f32> {
@@ -282,10 +273,10 @@ fn attention_of_parts_equals_that_of_tensors() {
     let rope = [&tables[0][..], &tables[1]];
     let (parts, tensors) =
         (Tokens::parts(&qkv, channels), Tokens::apart(apart.each_ref().map(|x| &x[..]), channels));
-    let (result, logarithms) = attention.forward(parts, rope, &buffers);
-    assert_eq!(result, attention.forward(tensors, rope, &buffers).0);
-    let joined = attention.backward_parts(parts, rope, &logarithms, &dy, &buffers);
-    let gradients = attention.backward(tensors, rope, &logarithms, &dy, &buffers);
+    let (result, logarithms) = attention.forward(parts, rope);
+    assert_eq!(result, attention.forward(tensors, rope).0);
+    let joined = attention.backward_parts(parts, rope, &logarithms, &dy);
+    let gradients = attention.backward(tensors, rope, &logarithms, &dy);
     for (i, got) in joined.chunks_exact(channels).enumerate() {
         assert_eq!(got, &gradients[i % 3][i / 3 * channels..][..channels]);
     }
@@ -295,11 +286,10 @@ fn attention_of_parts_equals_that_of_tensors() {
 fn resizing_back_equals_plain_loops() {
     for (from, to) in [([1, 1], [2, 2]), ([3, 5], [6, 10]), ([9, 2], [4, 7]), ([5, 6], [5, 13])] {
         for align_corners in [false, true] {
-            let buffers = Buffers::default();
             let [down, across] = [0, 1].map(|axis| taps(from[axis], to[axis], align_corners));
             let (x, dy) = (random(3 * from[0] * from[1], 1), random(3 * to[0] * to[1], 2));
             let result = resize(&x, from, &down, &across);
-            let gradient = resize_gradient(&dy, from, &down, &across, &buffers);
+            let gradient = resize_gradient(&dy, from, &down, &across);
             let plain = |x: &[Vec<f64>]| plain::resize(&x[0], from, &down, &across);
             check(
                 &format!("{from:?} → {to:?}, {align_corners}"),
@@ -315,24 +305,24 @@ fn resizing_back_equals_plain_loops() {
 
 /// Results and gradients of all operators, at sizes of several tasks.
 fn everything() -> Vec<Vec<f32>> {
-    let (buffers, mut all) = (Buffers::default(), Vec::new());
+    let mut all = Vec::new();
     let keep = |all: &mut Vec<_>, g: Gradients| all.extend([g.input, g.weight, g.bias].into_iter().flatten());
     let (x, dy) = (random(2 * 40 * 30 * 50, 1), random(2 * 72 * 30 * 50, 2));
     let (weight, bias) = (random(72 * 40 * 9, 3), random(72, 4));
     let conv = Conv3x3 { batch: 2, inputs: 40, outputs: 72, height: 30, width: 50, rectified: true };
-    all.push(conv.forward(&x, &weight, Some(&bias), &buffers));
-    keep(&mut all, conv.backward(&x, &weight, &dy, Wanted::ALL, &buffers));
+    all.push(conv.forward(&x, &weight, Some(&bias)));
+    keep(&mut all, conv.backward(&x, &weight, &dy, Wanted::ALL));
     let conv = Conv1x1 { batch: 2, inputs: 40, outputs: 72, pixels: 1500, rectified: true };
-    all.push(conv.forward(&x, &weight, Some(&bias), &buffers));
-    keep(&mut all, conv.backward(&x, &weight, &dy, Wanted::ALL, &buffers));
+    all.push(conv.forward(&x, &weight, Some(&bias)));
+    keep(&mut all, conv.backward(&x, &weight, &dy, Wanted::ALL));
     let linear = Linear { rows: 1500, inputs: 80, outputs: 72, transposed: false };
-    let [result, before] = linear.forward_gelu(&x, &weight, Some(&bias), &buffers);
+    let [result, before] = linear.forward_gelu(&x, &weight, Some(&bias));
     all.push(result);
-    keep(&mut all, linear.backward(&x, &weight, Some(&before), &dy, Wanted::ALL, &buffers));
+    keep(&mut all, linear.backward(&x, &weight, Some(&before), &dy, Wanted::ALL));
     let norm = LayerNorm { channels: 80, epsilon: 1e-6 };
-    let (result, statistics) = norm.forward(&x, &weight[..80], &weight[..80], &buffers);
+    let (result, statistics) = norm.forward(&x, &weight[..80], &weight[..80]);
     all.push(result);
-    keep(&mut all, norm.backward(&x, &weight[..80], &statistics, &dy[..x.len()], Wanted::ALL, &buffers));
+    keep(&mut all, norm.backward(&x, &weight[..80], &statistics, &dy[..x.len()], Wanted::ALL));
     all
 }
 
@@ -348,13 +338,12 @@ fn the_number_of_threads_changes_no_bit() {
 
 #[test]
 fn only_wanted_gradients_are_found_and_they_are_the_same() {
-    let buffers = Buffers::default();
     let conv = Conv3x3 { batch: 1, inputs: 3, outputs: 5, height: 6, width: 7, rectified: false };
     let (x, weight, dy) = (random(3 * 42, 1), random(135, 2), random(5 * 42, 3));
-    let all = conv.backward(&x, &weight, &dy, Wanted::ALL, &buffers);
+    let all = conv.backward(&x, &weight, &dy, Wanted::ALL);
     for bits in 0..8 {
         let wanted = Wanted { input: bits & 1 > 0, weight: bits & 2 > 0, bias: bits & 4 > 0 };
-        let got = conv.backward(&x, &weight, &dy, wanted, &buffers);
+        let got = conv.backward(&x, &weight, &dy, wanted);
         assert_eq!(got.input, all.input.clone().filter(|_| wanted.input));
         assert_eq!(got.weight, all.weight.clone().filter(|_| wanted.weight));
         assert_eq!(got.bias.is_some(), wanted.bias);

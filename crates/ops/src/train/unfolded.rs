@@ -6,8 +6,9 @@ use rayon::prelude::*;
 
 use super::elements::{add_constant, channel_sums, mask, rectify};
 use super::{Gradients, Wanted};
+use crate::buffers::{give, take};
 use crate::multiply::Multiply;
-use crate::wide::{Buffers, pieces};
+use crate::wide::pieces;
 
 /// Taps of a filter.
 const TAPS: usize = 9;
@@ -39,11 +40,11 @@ pub struct Unfolded {
 impl Unfolded {
     /// `x` `[B, inputs, H, W]`, `weight` `[outputs, inputs, 3, 3]`, `bias` `[outputs]` →
     /// `[B, outputs, ⌈H/stride⌉, ⌈W/stride⌉]`.
-    pub fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>, buffers: &Buffers) -> Vec<f32> {
+    pub fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>) -> Vec<f32> {
         let Self { inputs, outputs, .. } = *self;
         let [rows, columns] = self.size();
         let plane = self.height * self.width;
-        let mut out = buffers.take(self.batch * outputs * rows * columns);
+        let mut out = take(self.batch * outputs * rows * columns);
         let band = rows.div_ceil(BANDS).max(PIXELS.div_ceil(columns)).min(rows);
         let tasks: Vec<_> = out
             .chunks_exact_mut(outputs * rows * columns)
@@ -55,33 +56,26 @@ impl Unfolded {
             .collect();
         tasks.into_par_iter().for_each(|(image, row, out)| {
             let n = out[0].len();
-            let mut taps = buffers.take(inputs * TAPS * n);
-            self.unfold(&x[image * inputs * plane..][..inputs * plane], row, &mut taps, buffers);
-            let mut results = buffers.take(outputs * n);
+            let mut taps = take(inputs * TAPS * n);
+            self.unfold(&x[image * inputs * plane..][..inputs * plane], row, &mut taps);
+            let mut results = take(outputs * n);
             let lhs = (weight, [1, inputs * TAPS]);
             Multiply { size: [outputs, n, inputs * TAPS], lhs, rhs: (&taps, [1, n]), add: false }
                 .write(&mut results, n);
             for (c, (out, results)) in out.into_iter().zip(results.chunks_exact(n)).enumerate() {
                 add_constant(results, bias.map_or(0.0, |bias| bias[c]), out);
             }
-            [taps, results].into_iter().for_each(|buffer| buffers.give(buffer));
+            [taps, results].into_iter().for_each(give);
         });
         out
     }
 
     /// Gradients from that of the output, `dy` `[B, outputs, ⌈H/stride⌉, ⌈W/stride⌉]`.
-    pub fn backward(
-        &self,
-        x: &[f32],
-        weight: &[f32],
-        dy: &[f32],
-        wanted: Wanted,
-        buffers: &Buffers,
-    ) -> Gradients {
+    pub fn backward(&self, x: &[f32], weight: &[f32], dy: &[f32], wanted: Wanted) -> Gradients {
         let Self { batch, inputs, outputs, .. } = *self;
         let [rows, columns] = self.size();
         let (plane, n) = (self.height * self.width, rows * columns);
-        let mut dx = wanted.input.then(|| buffers.take(x.len()));
+        let mut dx = wanted.input.then(|| take(x.len()));
         // Every task has its channels of all images.
         let slices: Vec<Vec<&mut [f32]>> = match &mut dx {
             Some(dx) => pieces(dx, inputs * plane, CHANNELS * plane),
@@ -91,13 +85,13 @@ impl Unfolded {
             let first = block * CHANNELS;
             let channels = CHANNELS.min(inputs - first);
             let width = channels * TAPS;
-            let mut sums = buffers.take(if wanted.weight { outputs * width } else { 0 });
-            let mut taps = buffers.take(width * n);
+            let mut sums = take(if wanted.weight { outputs * width } else { 0 });
+            let mut taps = take(width * n);
             for image in 0..batch {
                 let x = &x[(image * inputs + first) * plane..][..channels * plane];
                 let dy = &dy[image * outputs * n..][..outputs * n];
                 if wanted.weight {
-                    self.unfold(x, 0, &mut taps, buffers);
+                    self.unfold(x, 0, &mut taps);
                     let (lhs, rhs) = ((dy, [1, n]), (&taps[..], [n, 1]));
                     Multiply { size: [outputs, width, n], lhs, rhs, add: image > 0 }.write(&mut sums, width);
                 }
@@ -111,12 +105,12 @@ impl Unfolded {
                     }
                 }
             }
-            buffers.give(taps);
+            give(taps);
             sums
         };
         let sums: Vec<_> = slices.into_par_iter().enumerate().map(task).collect();
         let weight = wanted.weight.then(|| {
-            let mut weight = buffers.take(outputs * inputs * TAPS);
+            let mut weight = take(outputs * inputs * TAPS);
             weight.par_chunks_exact_mut(inputs * TAPS).enumerate().for_each(|(output, out)| {
                 for (out, sums) in out.chunks_mut(CHANNELS * TAPS).zip(&sums) {
                     out.copy_from_slice(&sums[output * out.len()..][..out.len()]);
@@ -124,7 +118,7 @@ impl Unfolded {
             });
             weight
         });
-        sums.into_iter().for_each(|buffer| buffers.give(buffer));
+        sums.into_iter().for_each(give);
         let bias = wanted.bias.then(|| channel_sums(dy, batch, outputs));
         Gradients { input: dx, weight, bias }
     }
@@ -136,9 +130,9 @@ impl Unfolded {
 
     /// Planes `x` → what the nine taps of every channel see, `[channels, 9, rows, columns]`, for output rows from `row`
     /// on.
-    fn unfold(&self, x: &[f32], row: usize, taps: &mut [f32], buffers: &Buffers) {
+    fn unfold(&self, x: &[f32], row: usize, taps: &mut [f32]) {
         let (plane, [_, columns]) = (self.height * self.width, self.size());
-        let mut positive = buffers.take(if self.rectified { x.len() } else { 0 });
+        let mut positive = take(if self.rectified { x.len() } else { 0 });
         let x = if self.rectified {
             rectify(x, &mut positive);
             &positive
@@ -163,7 +157,7 @@ impl Unfolded {
                 out[first..last].iter_mut().zip(values).for_each(|(out, x)| *out = *x);
             }
         }
-        buffers.give(positive);
+        give(positive);
     }
 
     /// The transpose of `unfold`, for all rows and without max(x, 0).

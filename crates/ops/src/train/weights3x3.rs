@@ -9,8 +9,9 @@ use rayon::prelude::*;
 use super::Conv3x3;
 use super::planes::{Planes, Transposer};
 use super::transposed::{Accumulate, OutputGradients, Taps};
+use crate::buffers::{give, take};
+use crate::wide::GROUP;
 use crate::wide::transforms::{Block, Inputs, POINTS, TILE, lines};
-use crate::wide::{Buffers, GROUP};
 
 /// At most so many parts: enough for the cores of a desktop computer.
 const PARTS: usize = 16;
@@ -21,19 +22,17 @@ const TASK_POINTS: usize = 6;
 
 impl Conv3x3 {
     /// Gradients of weight and bias.
-    pub(super) fn weight_gradient(&self, x: &[f32], dy: &[f32], buffers: &Buffers) -> [Vec<f32>; 2] {
+    pub(super) fn weight_gradient(&self, x: &[f32], dy: &[f32]) -> [Vec<f32>; 2] {
         let [rows, columns] = [self.height, self.width].map(|side| side.div_ceil(TILE));
         let band = self.band_rows();
         let blocks: Vec<_> = (0..self.batch)
             .flat_map(|image| (0..rows).step_by(band).map(move |row| (image, row, band.min(rows - row))))
             .collect();
         let parts = (self.batch * rows * columns / PART_TILES).clamp(1, PARTS.min(blocks.len()));
-        let mut sums: Vec<_> = blocks
-            .par_chunks(blocks.len().div_ceil(parts))
-            .map(|blocks| self.part(x, dy, blocks, buffers))
-            .collect();
+        let mut sums: Vec<_> =
+            blocks.par_chunks(blocks.len().div_ceil(parts)).map(|blocks| self.part(x, dy, blocks)).collect();
         let [inputs, outputs] = [self.inputs, self.outputs].map(|n| n.next_multiple_of(GROUP));
-        let mut weight = buffers.take(self.outputs * self.inputs * 9);
+        let mut weight = take(self.outputs * self.inputs * 9);
         let arch = Arch::new();
         weight.par_chunks_exact_mut(self.inputs * 9).enumerate().for_each(|(output, out)| {
             let parts: Vec<_> = sums.iter().map(|(sums, _)| &sums[output * inputs..]).collect();
@@ -41,28 +40,22 @@ impl Conv3x3 {
         });
         let bias = |c: usize| sums.iter().map(|(_, bias)| bias[c]).sum::<f64>() as f32;
         let bias = (0..self.outputs).map(bias).collect();
-        sums.drain(..).for_each(|(sums, _)| buffers.give(sums));
+        sums.drain(..).for_each(|(sums, _)| give(sums));
         [weight, bias]
     }
 
     /// Sums `[36][outputs][inputs]`, channels in whole groups, of rows of tiles (image, first row, rows), and those of
     /// the output's gradient.
-    fn part(
-        &self,
-        x: &[f32],
-        dy: &[f32],
-        blocks: &[(usize, usize, usize)],
-        buffers: &Buffers,
-    ) -> (Vec<f32>, Vec<f64>) {
+    fn part(&self, x: &[f32], dy: &[f32], blocks: &[(usize, usize, usize)]) -> (Vec<f32>, Vec<f64>) {
         let (arch, transposer) = (Arch::new(), Transposer::new());
         let (plane, columns) = (self.height * self.width, self.width.div_ceil(TILE));
         let [inputs, outputs] = [self.inputs, self.outputs].map(|n| n.next_multiple_of(GROUP));
         let part = columns.div_ceil(columns.div_ceil(self.block_tiles()));
         let stride = (self.band_rows() * part) | 1;
-        let mut read = buffers.take(lines(part));
-        let mut values = buffers.take(POINTS * inputs * stride);
-        let mut gradients = buffers.take(POINTS * outputs * stride);
-        let mut sums = buffers.take(POINTS * outputs * inputs);
+        let mut read = take(lines(part));
+        let mut values = take(POINTS * inputs * stride);
+        let mut gradients = take(POINTS * outputs * stride);
+        let mut sums = take(POINTS * outputs * inputs);
         let mut bias = vec![0.0; outputs];
         let mut add = false;
         let image =
@@ -93,7 +86,7 @@ impl Conv3x3 {
                 add = true;
             }
         }
-        [read, values, gradients].into_iter().for_each(|buffer| buffers.give(buffer));
+        [read, values, gradients].into_iter().for_each(give);
         (sums, bias)
     }
 }

@@ -5,7 +5,7 @@ use rayon::prelude::*;
 use super::forward::{Sample, Saved, arranged, compose, cut, pad};
 use super::layout::{Conv as Place, Network, Norm, Residual, Step};
 use super::{BRANCH_SCALE, FEATURES, INPUT_CHANNELS};
-use crate::buffers::Buffers;
+use crate::buffers::give;
 use crate::conv::{
     Backward, Branch, CHANNELS, Gradients as ConvGradients, Linear, Merge, Plane, Source, Sums, Upstream,
     Wanted, add, arrange, rearrange, transpose,
@@ -32,7 +32,6 @@ impl Network {
         saved: Saved,
         upstream: &[f32],
         wanted: Wanted,
-        buffers: &Buffers,
     ) -> Gradients {
         let count = saved.samples.len().max(1);
         let (inputs, features) = (input.len() / count, upstream.len() / count);
@@ -45,7 +44,6 @@ impl Network {
                 gradients: vec![None; sample.planes.len()],
                 sample,
                 sums: vec![0.0; if wanted.parameters { self.parameters() } else { 0 }],
-                buffers,
             };
             pass.run(&input[i * inputs..][..inputs], &upstream[i * features..][..features]);
             (pass.gradients.swap_remove(0), pass.sums)
@@ -58,7 +56,7 @@ impl Network {
             sums.iter_mut().zip(part).for_each(|(sum, g)| *sum += g);
             if let Some(plane) = plane {
                 cut::<INPUT_CHANNELS>(&plane, &mut gradient[i * inputs..][..inputs]);
-                buffers.give(plane);
+                give(plane);
             }
         }
         let parameters = sums.iter().map(|&sum| sum as f32).collect();
@@ -76,7 +74,6 @@ struct Pass<'a> {
     gradients: Vec<Option<Vec<f32>>>,
     /// Of the parameters.
     sums: Vec<f64>,
-    buffers: &'a Buffers,
 }
 
 impl Pass<'_> {
@@ -85,15 +82,15 @@ impl Pass<'_> {
         let size = [self.sample.plane(1).height, self.sample.plane(1).width];
         assert_eq!(input.len(), size[0] * size[1] * INPUT_CHANNELS);
         assert_eq!(upstream.len(), size[0] * size[1] * FEATURES);
-        self.last(pad::<FEATURES>(upstream, size, self.buffers).data);
+        self.last(pad::<FEATURES>(upstream, size).data);
         for (i, step) in network.steps.iter().enumerate().rev() {
             let upstream = self.gradients[i + 1].take().expect("every plane has a reader");
             let plane = self.sample.planes[i + 1].take().expect("a plane outlives its readers");
-            self.buffers.give(plane.data);
+            give(plane.data);
             match step {
                 Step::Convolve { conv, from, stride, enlarge } => {
                     if *from == 0 {
-                        self.sample.planes[0] = Some(pad::<INPUT_CHANNELS>(input, size, self.buffers));
+                        self.sample.planes[0] = Some(pad::<INPUT_CHANNELS>(input, size));
                     }
                     self.plain(conv, *from, *stride, *enlarge, &upstream);
                 }
@@ -103,9 +100,9 @@ impl Pass<'_> {
                     self.residual(block, &inputs, hidden, &upstream);
                 }
             }
-            self.buffers.give(upstream);
+            give(upstream);
         }
-        self.sample.planes[0].take().into_iter().for_each(|plane| self.buffers.give(plane.data));
+        self.sample.planes[0].take().into_iter().for_each(|plane| give(plane.data));
     }
 
     /// Normalisation, SiLU and the two convolutions at the end.
@@ -116,7 +113,7 @@ impl Pass<'_> {
         let plane = self.sample.planes[index].take().expect("the last plane");
         let gradients =
             self.normalised(&network.norm_out, &[&plane], &weights, Upstream::Scaled(&upstream, 1.0));
-        self.buffers.give(upstream);
+        give(upstream);
         let maps = self.norm(&network.norm_out, &[&plane], &gradients.sums);
         if self.wanted.parameters {
             self.split(&gradients);
@@ -160,13 +157,12 @@ impl Pass<'_> {
         let wanted = Wanted { input: self.wanted.input || from > 0, ..self.wanted };
         let sources = &[Source { plane: &plane, affine: None }];
         let upstream = Upstream::Scaled(upstream, 1.0);
-        let gradients =
-            Backward { sources, weights: &weights, upstream, stride, enlarge, wanted }.run(self.buffers);
+        let gradients = Backward { sources, weights: &weights, upstream, stride, enlarge, wanted }.run();
         self.conv(place, &gradients.weights, &gradients.bias);
         if let Some(mut gradient) = gradients.inputs.into_iter().next() {
             if let Some(other) = self.gradients[from].take() {
                 add(&mut gradient, &other);
-                self.buffers.give(other);
+                give(other);
             }
             self.gradients[from] = Some(gradient);
         }
@@ -189,8 +185,8 @@ impl Pass<'_> {
         let first = self.normalised(&block.norm1, &planes, &weights, behind);
         self.conv(&block.conv1, &first.weights, &first.bias);
         let maps = self.norm(&block.norm1, &planes, &first.sums);
-        self.buffers.give(hidden.data);
-        second.inputs.into_iter().for_each(|gradient| self.buffers.give(gradient));
+        give(hidden.data);
+        second.inputs.into_iter().for_each(give);
 
         let matrices = block
             .shortcut
@@ -209,7 +205,7 @@ impl Pass<'_> {
                 parameters: self.wanted.parameters,
             };
             projected.extend(merge.run(&mut gradient));
-            other.into_iter().for_each(|gradient| self.buffers.give(gradient));
+            other.into_iter().for_each(give);
             self.gradients[inputs[k]] = Some(gradient);
         }
         if let Some(place) = &block.shortcut {
@@ -232,7 +228,7 @@ impl Pass<'_> {
         let pairs = planes.iter().zip(affines);
         let sources: Vec<_> = pairs.map(|(&plane, affine)| Source { plane, affine: Some(affine) }).collect();
         let wanted = Wanted { input: true, ..self.wanted };
-        Backward { sources: &sources, weights, upstream, stride: 1, enlarge: false, wanted }.run(self.buffers)
+        Backward { sources: &sources, weights, upstream, stride: 1, enlarge: false, wanted }.run()
     }
 
     /// A normalisation's own gradients; gives the maps through it.

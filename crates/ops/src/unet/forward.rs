@@ -4,7 +4,7 @@ use rayon::prelude::*;
 
 use super::layout::{Conv as Place, Network, Norm, Residual, Step};
 use super::{BRANCH_SCALE, FEATURES, INPUT_CHANNELS};
-use crate::buffers::Buffers;
+use crate::buffers::{give, take};
 use crate::conv::{Affine, CHANNELS, Conv, Layer, Moments, Plane, Shortcut, Source, arrange};
 
 /// Pixels that are copied at once.
@@ -59,7 +59,6 @@ impl Network {
         [b, h, w]: [usize; 3],
         frozen: Option<&[Layer]>,
         keep: bool,
-        buffers: &Buffers,
     ) -> Forward {
         assert!(h % 4 == 0 && w % 4 == 0, "regressor input {h}×{w}: both sides must be multiples of 4");
         assert_eq!(parameters.len(), self.parameters());
@@ -70,11 +69,10 @@ impl Network {
             let part = |values: &Vec<f32>| values[i * self.groups..(i + 1) * self.groups].to_vec();
             let frozen = frozen.map(|layers| layers.iter().map(|layer| layer.each_ref().map(part)).collect());
             let sample = Sample::default();
-            let mut pass =
-                Pass { network: self, parameters, frozen, sample, last_readers: &last_readers, buffers };
-            let out = pass.run(pad::<INPUT_CHANNELS>(input, [h, w], buffers));
+            let mut pass = Pass { network: self, parameters, frozen, sample, last_readers: &last_readers };
+            let out = pass.run(pad::<INPUT_CHANNELS>(input, [h, w]));
             cut::<FEATURES>(&out.data, features);
-            buffers.give(out.data);
+            give(out.data);
             pass.sample
         };
         let [inputs, outputs] = [INPUT_CHANNELS, FEATURES].map(|channels| h * w * channels);
@@ -98,8 +96,8 @@ impl Network {
 }
 
 /// `[h, w, N]` → plane, the other channels 0.
-pub(super) fn pad<const N: usize>(values: &[f32], [height, width]: [usize; 2], buffers: &Buffers) -> Plane {
-    let mut data = buffers.take(height * width * CHANNELS);
+pub(super) fn pad<const N: usize>(values: &[f32], [height, width]: [usize; 2]) -> Plane {
+    let mut data = take(height * width * CHANNELS);
     let pixels = data.as_chunks_mut::<CHANNELS>().0.par_iter_mut().zip(values.as_chunks::<N>().0);
     pixels.with_min_len(TASK).for_each(|(pixel, values)| {
         *pixel = std::array::from_fn(|c| if c < N { values[c] } else { 0.0 });
@@ -142,14 +140,13 @@ struct Pass<'a> {
     sample: Sample,
     /// Of each plane; empty if planes are kept.
     last_readers: &'a [usize],
-    buffers: &'a Buffers,
 }
 
 impl Pass<'_> {
     /// Releases the planes that no step after `step` reads.
     fn release(&mut self, step: usize) {
         for (plane, last) in self.sample.planes.iter_mut().zip(self.last_readers) {
-            plane.take_if(|_| *last <= step).into_iter().for_each(|plane| self.buffers.give(plane.data));
+            plane.take_if(|_| *last <= step).into_iter().for_each(|plane| give(plane.data));
         }
     }
 
@@ -170,20 +167,20 @@ impl Pass<'_> {
             if self.last_readers.is_empty() {
                 self.sample.hidden.push(hidden);
             } else {
-                hidden.into_iter().for_each(|plane| self.buffers.give(plane.data));
+                hidden.into_iter().for_each(|plane| give(plane.data));
                 self.release(i);
             }
             // The caller has the input.
             let input = self.sample.planes[0].take();
-            input.into_iter().for_each(|plane| self.buffers.give(plane.data));
+            input.into_iter().for_each(|plane| give(plane.data));
         }
         let last = self.network.steps.len();
         let affine = self.normalise(&self.network.norm_out, &[last], None)[0];
         let (weights, bias) = compose(&self.network.conv_out, &self.network.gs_conv, self.parameters);
         let sources = [Source { plane: self.sample.plane(last), affine: Some(affine) }];
         let (stride, enlarge, shortcut) = (1, false, Shortcut::None);
-        let out = Conv { sources: &sources, weights: &weights, bias, stride, enlarge, shortcut, scale: 1.0 }
-            .run_into(self.buffers);
+        let out =
+            Conv { sources: &sources, weights: &weights, bias, stride, enlarge, shortcut, scale: 1.0 }.run();
         self.release(last);
         out
     }
@@ -193,8 +190,7 @@ impl Pass<'_> {
         let (weights, bias) = arranged(conv, self.parameters);
         let sources = [Source { plane: self.sample.plane(from), affine: None }];
         let shortcut = Shortcut::None;
-        Conv { sources: &sources, weights: &weights, bias, stride, enlarge, shortcut, scale: 1.0 }
-            .run_into(self.buffers)
+        Conv { sources: &sources, weights: &weights, bias, stride, enlarge, shortcut, scale: 1.0 }.run()
     }
 
     /// The first half of a residual block.
@@ -204,8 +200,7 @@ impl Pass<'_> {
         let sources: Vec<_> = inputs.iter().zip(affines).map(source).collect();
         let (weights, bias) = arranged(&block.conv1, self.parameters);
         let (stride, enlarge, shortcut) = (1, false, Shortcut::None);
-        Conv { sources: &sources, weights: &weights, bias, stride, enlarge, shortcut, scale: 1.0 }
-            .run_into(self.buffers)
+        Conv { sources: &sources, weights: &weights, bias, stride, enlarge, shortcut, scale: 1.0 }.run()
     }
 
     /// The second half.
@@ -223,8 +218,7 @@ impl Pass<'_> {
         };
         let sources = [Source { plane: hidden, affine: Some(affine) }];
         let scale = BRANCH_SCALE as f32;
-        Conv { sources: &sources, weights: &weights, bias, stride: 1, enlarge: false, shortcut, scale }
-            .run_into(self.buffers)
+        Conv { sources: &sources, weights: &weights, bias, stride: 1, enlarge: false, shortcut, scale }.run()
     }
 
     /// The group normalisation of planes on the tape and one that is not there yet, as affine maps.

@@ -6,7 +6,6 @@ use std::collections::HashMap;
 use rand::{RngCore, SeedableRng};
 
 use super::{FEATURES, INPUT_CHANNELS, Network, Saved};
-use crate::buffers::Buffers;
 use crate::conv::{CHANNELS, Wanted};
 
 const BOTH: Wanted = Wanted { input: true, parameters: true };
@@ -75,13 +74,11 @@ fn images([b, h, w]: [usize; 3], seed: u64) -> Vec<f32> {
 
 #[test]
 fn untracked_sides_cost_nothing_and_change_nothing() {
-    let (network, size, buffers) = (network(16), [2, 12, 20], Buffers::default());
+    let (network, size) = (network(16), [2, 12, 20]);
     let (parameters, input) = (parameters(&network, 1), images(size, 2));
     let upstream = random(2 * 12 * 20 * FEATURES, 3);
-    let forward = network.forward(&parameters, &input, size, None, true, &buffers);
-    let run = |wanted| {
-        network.backward(&parameters, &input, kept(forward.saved.clone()), &upstream, wanted, &buffers)
-    };
+    let forward = network.forward(&parameters, &input, size, None, true);
+    let run = |wanted| network.backward(&parameters, &input, kept(forward.saved.clone()), &upstream, wanted);
     let both = run(BOTH);
     let only_input = run(Wanted { input: true, parameters: false });
     let only_parameters = run(Wanted { input: false, parameters: true });
@@ -92,9 +89,9 @@ fn untracked_sides_cost_nothing_and_change_nothing() {
 
 #[test]
 fn a_pass_that_keeps_nothing_computes_the_same() {
-    let (network, size, buffers) = (network(8), [2, 12, 20], Buffers::default());
+    let (network, size) = (network(8), [2, 12, 20]);
     let (parameters, input) = (parameters(&network, 1), images(size, 2));
-    let run = |keep| network.forward(&parameters, &input, size, None, keep, &buffers);
+    let run = |keep| network.forward(&parameters, &input, size, None, keep);
     let (kept, released) = (run(true), run(false));
     assert!(released.saved.is_none());
     assert_eq!((kept.features, kept.statistics), (released.features, released.statistics));
@@ -102,15 +99,14 @@ fn a_pass_that_keeps_nothing_computes_the_same() {
 
 #[test]
 fn bits_do_not_depend_on_the_number_of_threads() {
-    let (network, size, buffers) = (network(8), [2, 36, 68], Buffers::default());
+    let (network, size) = (network(8), [2, 36, 68]);
     let (parameters, input) = (parameters(&network, 1), images(size, 2));
     let upstream = random(2 * 36 * 68 * FEATURES, 3);
     let run = |threads| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads");
         pool.install(|| {
-            let forward = network.forward(&parameters, &input, size, None, true, &buffers);
-            let gradients =
-                network.backward(&parameters, &input, kept(forward.saved), &upstream, BOTH, &buffers);
+            let forward = network.forward(&parameters, &input, size, None, true);
+            let gradients = network.backward(&parameters, &input, kept(forward.saved), &upstream, BOTH);
             [forward.features, gradients.input, gradients.parameters]
         })
     };

@@ -8,9 +8,10 @@
 use pulp::Arch;
 use rayon::prelude::*;
 
+use super::GROUP;
 use super::product::{Left, PANEL, Product, Right};
 use super::transforms::{Block, Filters, Inputs, Lines, Outputs, POINTS, TILE, lines};
-use super::{Buffers, GROUP};
+use crate::buffers::{give, take};
 
 /// Filters, `strides` floats from one output to the next and from one input to the next, perhaps turned by 180°.
 #[derive(Debug, Clone, Copy)]
@@ -22,10 +23,10 @@ pub struct Weights<'a> {
 
 impl Weights<'_> {
     /// `[panels][36][inputs in whole groups][32]`.
-    pub fn transform(self, [inputs, outputs]: [usize; 2], buffers: &Buffers) -> Vec<f32> {
+    pub fn transform(self, [inputs, outputs]: [usize; 2]) -> Vec<f32> {
         let Self { values, strides, turned } = self;
         let panel = POINTS * inputs.next_multiple_of(GROUP) * PANEL;
-        let mut filters = buffers.take(outputs.div_ceil(PANEL) * panel);
+        let mut filters = take(outputs.div_ceil(PANEL) * panel);
         let arch = Arch::new();
         filters.par_chunks_exact_mut(panel).enumerate().for_each(|(i, out)| {
             let weights = &values[i * PANEL * strides[0]..];
@@ -52,7 +53,7 @@ pub struct Bands<'a> {
 
 impl Bands<'_> {
     /// Output rows from tile row `row` on, as many as `out` `[rows][width][16]` holds per group.
-    pub fn run(&self, source: &impl Lines, row: usize, out: &mut [&mut [f32]], buffers: &Buffers) {
+    pub fn run(&self, source: &impl Lines, row: usize, out: &mut [&mut [f32]]) {
         let Self { filters, bias, width, .. } = *self;
         let arch = Arch::new();
         let rows = (out[0].len() / (width * GROUP)).div_ceil(TILE);
@@ -62,9 +63,9 @@ impl Bands<'_> {
         let (inputs, outputs) = (self.inputs.next_multiple_of(GROUP), bias.len());
         // An odd distance puts the 36 points of a tile into different sets of the cache.
         let stride = (rows * part) | 1;
-        let mut read = buffers.take(lines(part));
-        let mut points = buffers.take(POINTS * inputs * stride);
-        let mut products = buffers.take(POINTS * outputs * stride);
+        let mut read = take(lines(part));
+        let mut points = take(POINTS * inputs * stride);
+        let mut products = take(POINTS * outputs * stride);
         for column in (0..columns).step_by(part) {
             let block = Block { row, column, rows, columns: part.min(columns - column) };
             let lines = &mut read[..lines(block.columns)];
@@ -82,6 +83,6 @@ impl Bands<'_> {
             let products = &products;
             arch.dispatch(Outputs { products, block, stride, bias, width, out });
         }
-        [read, points, products].into_iter().for_each(|buffer| buffers.give(buffer));
+        [read, points, products].into_iter().for_each(give);
     }
 }

@@ -10,8 +10,6 @@ pub(crate) mod transforms;
 #[cfg(test)]
 mod tests;
 
-pub use crate::buffers::Buffers;
-
 /// Channels that stand together.
 pub const GROUP: usize = 16;
 

@@ -2,8 +2,8 @@
 
 use pulp::{Arch, Scalar, Simd, WithSimd};
 
+use super::GROUP;
 use super::product::{Left, PANEL, Product, Right};
-use super::{Buffers, GROUP};
 use crate::host;
 use crate::tests::random;
 use crate::train::Conv3x3;
@@ -16,7 +16,7 @@ fn winograd_is_accurate() {
     let (weights, biases) = (host(random([channels * channels * 9], 1)), host(random([channels], 2)));
     let (inputs, outputs, rectified) = (channels, channels, false);
     let layer = Conv3x3 { batch: 1, inputs, outputs, height: side, width: side, rectified };
-    let got = layer.forward(&x_values, &weights, Some(&biases), &Buffers::default());
+    let got = layer.forward(&x_values, &weights, Some(&biases));
     let exact = |output: usize, y: usize, x: usize| {
         let mut sum = f64::from(biases[output]);
         for (input, tap) in (0..channels).flat_map(|input| (0..9).map(move |tap| (input, tap))) {
@@ -86,16 +86,4 @@ fn every_width_of_vectors_computes_the_same_product() {
             );
         }
     }
-}
-
-#[test]
-fn returned_memory_is_used_again_unless_it_is_far_too_large() {
-    let buffers = Buffers::default();
-    let buffer = buffers.take(1000);
-    let address = buffer.as_ptr();
-    buffers.give(buffer);
-    let small = buffers.take(100);
-    assert_ne!(small.as_ptr(), address);
-    let again = buffers.take(900);
-    assert_eq!((again.as_ptr(), again.len()), (address, 900));
 }
