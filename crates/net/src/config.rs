@@ -13,12 +13,12 @@ pub use modes::{
     Upsample, WorldFrame,
 };
 
-/// How far from an output pixel of the regressor an input pixel can matter, statistics aside: the reach of the 3×3 convolutions on the
-/// longest path, in pixels of the input: 14 at full size, 12 at half size (·2), 14 at a quarter (·4), and up to 3 more
-/// because an enlarged pixel lies beside, not on, the one it came from. Rounded up to a multiple of 4.
+/// Largest distance, in pixels, of an input pixel that influences an output pixel of the regressor, statistics aside. It is
+/// the reach of the 3×3 convolutions on the longest path: 14 at full size, 12 at half size (·2), 14 at a quarter (·4), and
+/// up to 3 more because an enlarged pixel lies beside its source. Rounded up to a multiple of 4.
 pub const RECEPTIVE_RADIUS: usize = 100;
 
-/// Everything that decides what the networks compute.
+/// The config of the networks.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Config {
@@ -34,9 +34,9 @@ pub struct Config {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct NetworkConfig {
-    /// Network between photographs and raw points. A `convolution` takes of the sizes below those of the encoder, whose
-    /// tokens lie where it is coarsest, of the decoder, which are the sides', `mlp_ratio`, `patch` (8 or 16), `rope_base`,
-    /// `layer_dims`, the channels at 1, 2, 4 and 8 times the finest pixel, and `last_dim`.
+    /// Network between photographs and raw points. A `convolution` uses these sizes: those of the encoder for its coarsest
+    /// level, those of the decoder for the sides, `mlp_ratio`, `patch` (8 or 16), `rope_base`, `layer_dims` for the channels at
+    /// 1, 2, 4 and 8 times the finest pixel, and `last_dim`.
     pub body: Body,
     /// Channels of an encoder token.
     pub enc_dim: usize,
@@ -63,24 +63,24 @@ pub struct NetworkConfig {
     pub feature_dim: usize,
     /// Channels before the last DPT convolution.
     pub last_dim: usize,
-    /// Which token maps feed the DPT branches: 0 is the encoder's output, l the l-th decoder layer's.
+    /// Token maps that feed the DPT branches: 0 is the encoder's output, l the l-th decoder layer's.
     #[serde(deserialize_with = "snapsnap_base::config::four")]
     pub hooks: [usize; 4],
     /// Kind of head.
     pub head: HeadKind,
     /// Whether the right and left heads exist; without them only the two photographed sides are predicted.
     pub side_heads: bool,
-    /// How the tokens of the two photographs become those of the unseen sides.
+    /// Fusion of the tokens of the two photographs into those of the unseen sides.
     pub fusion: Fusion,
     /// Activation of the confidence channel.
     pub conf_mode: ConfMode,
     /// Side of the square canvas in pixels, on which points and Gaussians live.
     pub resolution: usize,
-    /// Side of the square image that the point predictor sees, in pixels.
+    /// Side of the square image that the point predictor receives, in pixels.
     pub net_resolution: usize,
     /// A side pixel becomes a Gaussian where its confidence exceeds this.
     pub conf_threshold: f32,
-    /// How points and confidences get from `net_resolution` to `resolution`; unset: as `mode.compat` says.
+    /// Enlargement of points and confidences from `net_resolution` to `resolution`; unset: as in `mode.compat`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub upsample: Option<Upsample>,
     /// Initial value of δ, the learned global scale of the points (metres per network unit).
@@ -90,22 +90,22 @@ pub struct NetworkConfig {
     /// Whether the predictor's input is only the window of the canvas that holds the person
     /// (docs/method.md, "Window").
     pub window: bool,
-    /// Whether the predictor sees each pixel's share of the person as a channel of its own.
+    /// Whether the predictor receives each pixel's share of the person as a channel.
     pub mask_channel: bool,
-    /// Whether the predictor sees where each pixel lies on the canvas, as the direction of its ray, in two channels.
+    /// Whether the predictor receives the direction of each pixel's ray in two channels.
     pub ray_channels: bool,
-    /// Whether the back photograph is seen in a mirror, so that both show a limb at the same place.
+    /// Whether the back photograph is mirrored, so that both show a limb at the same place.
     pub mirror: bool,
-    /// Whether maps are the mean of what the predictor makes of the photographs and of their mirror images.
+    /// Whether maps are the means of the predictions for the photographs and for their mirror images.
     pub both_ways: bool,
     /// Whether the photographs' points are moved onto the rays of their pixels.
     pub on_rays: bool,
-    /// How far, in pixels of a canvas of 1024, a point of an unseen side may lie outside of the photographs' silhouettes; what
-    /// lies further outside is left out. Unset: sides are taken as they are.
+    /// Largest distance, in pixels of a canvas of 1024, of a point of an unseen side from the photographs' silhouettes. Points
+    /// beyond are left out. Unset: all points are kept.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub hull_margin: Option<usize>,
-    /// How many times as far as on a surface that faces the camera a pixel's point may lie from its neighbours'; what lies further
-    /// is on no surface but between two, and left out. Unset: points are taken as they are.
+    /// Largest distance of a pixel's point from its neighbours', relative to that on a surface that faces the camera. Points
+    /// beyond lie between two surfaces and are left out. Unset: all points are kept.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub steepest: Option<f32>,
     /// Whether a transformer's tokens without a person in either photograph are left out.
@@ -153,7 +153,7 @@ impl Default for NetworkConfig {
 }
 
 impl NetworkConfig {
-    /// Channels of a photograph as the network sees it: colours, and what else the config adds.
+    /// Channels of a photograph for the network: colours, and the channels that the config adds.
     pub fn input_channels(&self) -> usize {
         3 + usize::from(self.mask_channel) + 2 * usize::from(self.ray_channels)
     }
@@ -177,13 +177,13 @@ pub struct RegressorConfig {
     /// Start of the network's output; unset: as published.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub start: Option<RegressorStart>,
-    /// Where a Gaussian's colour comes from; unset: the pixel's with a geometric start, else the network's own.
+    /// Source of a Gaussian's colour; unset: the pixel with a geometric start, else the network.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub color: Option<RegressorColor>,
-    /// Whether pixels that the person covers in part have the person's colour whole, and not mixed with grey.
+    /// Whether pixels that the person covers in part have the person's colour, not mixed with grey.
     pub straight_color: bool,
-    /// With `mode.crop`, pixels around the person's box that the network sees; unset: as far as any pixel of the person can
-    /// be reached from. What is trained with less does with less.
+    /// With `mode.crop`, pixels around the person's box that the network receives; unset: all that influence the person's
+    /// pixels. Training and inference should use the same value.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub margin: Option<usize>,
 }
@@ -199,7 +199,7 @@ impl RegressorConfig {
         self.start.unwrap_or(RegressorStart::Published)
     }
 
-    /// Where a Gaussian's colour comes from.
+    /// Source of a Gaussian's colour.
     pub fn color(&self) -> RegressorColor {
         self.color.unwrap_or(match self.start() {
             RegressorStart::Published => RegressorColor::Free,
@@ -231,14 +231,14 @@ pub struct ModeConfig {
     /// Axes that predicted quaternions refer to.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub rotation_frame: Option<RotationFrame>,
-    /// How the canvas gets from `resolution` to `net_resolution`.
+    /// Reduction of the canvas from `resolution` to `net_resolution`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub downsample: Option<Downsample>,
     /// World frame of the PLY.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub world_frame: Option<WorldFrame>,
-    /// Whether the regressor sees only the person's box (with the margin its receptive field needs). Its group norms
-    /// then measure less background, which changes what weights trained on the whole canvas give (docs/inference.md).
+    /// Whether the regressor receives only the person's box, with the margin of its receptive field. Its group norms then
+    /// measure less background, which changes the results of weights trained on the whole canvas (docs/inference.md).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub crop: Option<bool>,
     /// Height to which the person is scaled, in pixels of a canvas of 1024.
@@ -247,7 +247,7 @@ pub struct ModeConfig {
 }
 
 impl Config {
-    /// The same config with every key set that follows `mode.compat` otherwise.
+    /// The same config with all keys set that follow `mode.compat` if unset.
     pub fn resolved(&self) -> Self {
         let mut config = self.clone();
         config.network.upsample = Some(self.upsample());
@@ -265,7 +265,7 @@ impl Config {
         config
     }
 
-    /// The size the network wants: canvas pixels per network pixel.
+    /// Canvas pixels per network pixel, along an axis.
     pub fn upsample_factor(&self) -> usize {
         self.network.resolution / self.network.net_resolution
     }

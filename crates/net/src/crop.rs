@@ -1,4 +1,4 @@
-//! The part of the canvas that the regressor looks at.
+//! Windows: the parts of the canvas that the networks receive.
 
 use std::fmt;
 use std::ops::Range;
@@ -49,14 +49,14 @@ impl Window {
         if config.network.mirror || config.network.both_ways { window.symmetric(side) } else { window }
     }
 
-    /// Grown until a mirror image of the canvas has it at the same place.
+    /// Grown until it is the same in a mirror image of the canvas.
     fn symmetric(&self, side: usize) -> Self {
         let start = self.columns.start.min(side - self.columns.end);
         Self { rows: self.rows.clone(), columns: start..side - start }
     }
 
-    /// Grown by `margin` pixels to aligned edges inside the canvas (whose side is a multiple of 4). By the regressor's
-    /// receptive radius, what lies outside cannot matter.
+    /// Grown by `margin` pixels to aligned edges inside the canvas, whose side is a multiple of 4. With the regressor's
+    /// receptive radius as the margin, pixels outside have no influence.
     pub fn padded(&self, margin: usize, side: usize) -> Self {
         let grow = |r: &Range<usize>| {
             let start = r.start.saturating_sub(margin) / ALIGNMENT * ALIGNMENT;
@@ -65,8 +65,8 @@ impl Window {
         Self { rows: grow(&self.rows), columns: grow(&self.columns) }
     }
 
-    /// Grown to whole cells of `cell` pixels, of which the canvas has a whole number, for the point predictor. The sides'
-    /// pictures are no wider than half a person's height, nearly always; what is narrower is widened to that.
+    /// Grown to whole cells of `cell` pixels, of which the canvas has a whole number, for the point predictor. Windows are at
+    /// least half as wide as the person is high, since the unseen sides are seldom wider than that.
     pub fn in_cells(&self, cell: usize, side: usize) -> Self {
         let (middle, width) =
             ((self.columns.start + self.columns.end) / 2, self.columns.len().max(self.rows.len() / 2).max(1));

@@ -17,9 +17,9 @@ use crate::sides::{Cloud, EMPTY, is_finite};
 pub struct Seen<'a> {
     /// `[3, S, S]` colours in [−1, 1], a photograph's or a side's pseudo image.
     pub image: &'a [f32],
-    /// `[1, S, S, 3]` metres, front camera's frame; tracked where the predictor is trained as well.
+    /// `[1, S, S, 3]` metres, front camera's frame; tracked if the predictor is trained too.
     pub points: Tensor<4>,
-    /// `[S, S]`: which pixels become Gaussians.
+    /// `[S, S]`: whether a pixel becomes a Gaussian.
     pub valid: &'a [bool],
 }
 
@@ -30,21 +30,21 @@ pub struct Part {
     geometry: Option<Geometry>,
 }
 
-/// Which pixels of each view become Gaussians.
+/// The pixels of each view that become Gaussians.
 pub struct Chosen {
     /// `[S, S]` of every view.
     pub valid: Vec<Vec<bool>>,
     /// Pixels left out because their points are not finite.
     pub lost: usize,
-    /// Pixels of the sides left out because the photographs show that nobody is there.
+    /// Pixels of the sides left out because they lie outside of the photographs' silhouettes.
     pub outside: usize,
-    /// Pixels left out because their points hang between two surfaces.
+    /// Pixels left out because their points lie between two surfaces.
     pub between: usize,
 }
 
 impl Chosen {
-    /// Photographs' pixels by their masks `[S, S]`, those of the sides by their confidences `[V, S, S]` and by where the points
-    /// `[V, S, S, 3]` lie, in metres, front camera's frame.
+    /// Selects pixels of photographs by their masks `[S, S]`, and pixels of the sides by their confidences `[V, S, S]` and
+    /// their points `[V, S, S, 3]`, metres, front camera's frame.
     pub fn new(config: &NetworkConfig, masks: [&[bool]; 2], points: &[f32], conf: &[f32]) -> Self {
         let (side, area) = (config.resolution, config.resolution * config.resolution);
         let views = conf.len() / area;
@@ -81,8 +81,8 @@ impl Chosen {
     }
 }
 
-/// Leaves those pixels of a view out whose points `[S, S, 3]`, metres, lie further from a neighbour's than `steepest` times the
-/// width of a pixel at the person's distance, and says how many.
+/// Leaves out the pixels of a view whose points `[S, S, 3]`, metres, are further from a neighbour's than `steepest` times the
+/// width of a pixel at the person's distance. Returns their number.
 fn leave_out_steep(valid: &mut [bool], points: &[f32], side: usize, steepest: f32) -> usize {
     let nominal = Camera::orbit_at_yaw_degrees(0.0, side as u32);
     let pixel = (nominal.centre() * DVec3::new(1.0, 0.0, 1.0)).length() / nominal.focal.x;
@@ -102,9 +102,9 @@ fn leave_out_steep(valid: &mut [bool], points: &[f32], side: usize, steepest: f3
     steep.into_iter().filter(|steep| *steep).count()
 }
 
-/// Colours `[3, S, S]` in [−1, 1] of a photograph as Gaussians take them. They come multiplied by the `mask` `[S, S]`, so that the rim,
-/// which is what the sides are coloured by, fades to grey; with `regressor.straight_color` they are divided by it where at
-/// least half of a pixel is the person.
+/// Colours `[3, S, S]` in [−1, 1] of a photograph for its Gaussians. The input is multiplied by the `mask` `[S, S]`, so
+/// the rim, from which the sides get their colours, fades to grey. With `regressor.straight_color` it is divided by the mask
+/// where the person covers at least half of a pixel.
 pub fn photograph_colors<'a>(config: &RegressorConfig, rgb: &'a [f32], mask: &[f32]) -> Cow<'a, [f32]> {
     if !config.straight_color {
         return Cow::Borrowed(rgb);
@@ -151,7 +151,7 @@ fn pixel(rgb: &[f32], area: usize, i: usize) -> [f32; 3] {
     [rgb[i], rgb[area + i], rgb[2 * area + i]]
 }
 
-/// The regressor on a window of some views, which are one batch; views without a valid pixel give nothing.
+/// The regressor on a window of some views, which are one batch. Views without a valid pixel have no part.
 pub fn regress(network: &Regressor, config: &Config, views: &[Seen], window: &Window) -> Vec<Part> {
     let (side, device) = (config.network.resolution, views[0].points.device());
     let (h, w) = (window.rows.len(), window.columns.len());
@@ -208,13 +208,13 @@ pub fn geometric(views: &[Seen], device: &Device) -> Gaussians {
     assemble(&config, parts, device).0
 }
 
-/// Activates and joins the parts: Gaussians in the front camera's frame, and how many were left out because they are not
-/// finite.
+/// Activates and joins the parts: Gaussians in the front camera's frame, and the number of those left out because they
+/// are not finite.
 pub fn assemble(config: &Config, parts: Vec<Part>, device: &Device) -> (Gaussians, usize) {
     /// Coordinates beyond this could overflow on their way to the world frame.
     const FARTHEST: f32 = 1e30;
     if parts.is_empty() {
-        return (nobody(device), 0);
+        return (none(device), 0);
     }
     let (mut features, mut points, mut attributes) = (Vec::new(), Vec::new(), Vec::new());
     for part in parts {
@@ -233,7 +233,7 @@ pub fn assemble(config: &Config, parts: Vec<Part>, device: &Device) -> (Gaussian
         rows.filter(|(_, (raw, centre))| sound(raw, centre)).map(|(i, _)| i as i64).collect();
     let (n, kept) = (means.dims()[0], keep.len());
     if kept == 0 {
-        return (nobody(device), n);
+        return (none(device), n);
     }
     let index = Tensor::<1, Int>::from_data(TensorData::new(keep, [kept]), &means.device());
     let pick = |x: Tensor<2>| if kept < n { x.select(0, index.clone()) } else { x };
@@ -247,7 +247,7 @@ pub fn assemble(config: &Config, parts: Vec<Part>, device: &Device) -> (Gaussian
     (gaussians.expect("consistent by construction"), n - kept)
 }
 
-fn nobody(device: &Device) -> Gaussians {
+fn none(device: &Device) -> Gaussians {
     let empty = |c: usize| Tensor::<2>::zeros([0, c], device);
     Gaussians::new(empty(3), empty(4), empty(3), Tensor::zeros([0], device), empty(3))
         .expect("consistent by construction")
@@ -265,9 +265,9 @@ pub fn placed(config: &Config, gaussians: Gaussians, camera_to_world: &RigidTran
 mod tests {
     use super::*;
 
-    /// A wall at two metres, half of which stands a metre closer: the pixels along the step are between both.
+    /// A wall at two metres, half of which is a metre closer. The pixels along the step lie between both.
     #[test]
-    fn what_hangs_between_two_surfaces_is_left_out() {
+    fn points_between_two_surfaces_are_left_out() {
         let side = 8;
         let point = |i: usize| {
             let (x, y) = ((i % side) as f32, (i / side) as f32);
@@ -286,7 +286,7 @@ mod tests {
     }
 
     #[test]
-    fn rims_have_the_persons_colour_whole_where_that_is_asked_for() {
+    fn straight_colours_of_rims_are_not_mixed_with_grey() {
         // Five pixels: background, less than half, half, a tenth of background, all of them the person's.
         let mask = [0.0, 0.4, 0.5, 0.9, 1.0];
         let own = [0.8, -0.6, 1.0];

@@ -1,9 +1,9 @@
-//! The visual hull of the two photographs: points outside of a silhouette are not on the person.
+//! The visual hull of the two photographs. Points outside of a silhouette are not on the person.
 
 use glam::DVec3;
 use snapsnap_splat::{Camera, RigidTransform};
 
-/// The space that the nominal front and back cameras see within the masks of the two photographs.
+/// The space inside the masks of the two photographs, for the nominal front and back cameras.
 pub struct Hull {
     side: usize,
     /// Masks, grown.
@@ -14,8 +14,8 @@ pub struct Hull {
 }
 
 impl Hull {
-    /// Of masks `[S, S]` of the front and the back, each grown by `margin` pixels: cameras stand nearly where they should,
-    /// and predicted points are nearly right.
+    /// The hull of masks `[S, S]` of the front and the back, each grown by `margin` pixels, since cameras and predicted points
+    /// have small errors.
     pub fn new(masks: [&[bool]; 2], side: usize, margin: usize) -> Self {
         let [camera, back] = [0.0, 180.0].map(|yaw| Camera::orbit_at_yaw_degrees(yaw, side as u32));
         let to_back = camera.world_to_camera.inverse().then(&back.world_to_camera);

@@ -1,9 +1,9 @@
-//! Parameters of the networks by the names that checkpoints give them.
+//! Parameters of the networks by their names in checkpoints.
 
 use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::tensor::Tensor;
 
-/// Where in a module a traversal is, as the checkpoint's key.
+/// The place of a traversal in a module, as the checkpoint's key.
 pub(crate) struct Path<'a> {
     prefix: &'a str,
     /// Component of the key and container type, per open module.
@@ -91,8 +91,8 @@ pub trait NamedMapper {
     fn map<const D: usize>(&mut self, name: &str, values: Tensor<D>) -> Tensor<D>;
 }
 
-/// Changes every parameter of `module`, whose names begin with `prefix`, in the order of [`visit_named`]. What is tracked
-/// stays so.
+/// Changes every parameter of `module`, whose names begin with `prefix`, in the order of [`visit_named`]. Tracked parameters
+/// stay tracked.
 pub fn map_named<M: Module>(module: M, prefix: &str, mapper: &mut impl NamedMapper) -> M {
     struct Adapter<'a, V> {
         path: Path<'a>,

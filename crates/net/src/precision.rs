@@ -1,5 +1,5 @@
-//! The point predictor in 16 bits: its matrix products and convolutions. The regressor, which reads coordinates, is left alone,
-//! as are norms, activations and the rasteriser.
+//! The point predictor in 16 bits: its matrix products and convolutions. Norms, activations, the rasteriser and the
+//! regressor, whose input is coordinates, stay in f32.
 
 use burn::module::{Module, ModuleMapper, Param};
 use burn::tensor::{FloatDType, Tensor};
@@ -22,7 +22,7 @@ pub enum Precision {
 }
 
 impl Precision {
-    /// As in configs.
+    /// Name in configs.
     pub fn name(self) -> &'static str {
         match self {
             Self::F32 => "f32",
@@ -40,8 +40,8 @@ impl Precision {
         }
     }
 
-    /// A predictor in this precision; gradients lead back to the one that was given. Norms, δ and the last layers of the heads
-    /// stay as they are.
+    /// The predictor in this precision. Gradients reach the given predictor. Norms, δ and the last layers of the heads stay
+    /// in f32.
     pub fn lower(self, predictor: PointPredictor) -> PointPredictor {
         if self == Self::F32 {
             return predictor;
@@ -53,7 +53,7 @@ impl Precision {
 
 struct Lower<'a> {
     dtype: FloatDType,
-    /// Tells the layers that give raw points by their names: points of 2 m would be rounded by a centimetre in bf16.
+    /// Whether the layer of a name gives raw points, which stay in f32: bf16 rounds points at 2 m by a centimetre.
     is_last: fn(&str) -> bool,
     path: Path<'a>,
 }

@@ -26,7 +26,7 @@ pub struct Photograph {
     pub valid: Vec<bool>,
 }
 
-/// Gaussians in the front camera's frame, and everything on the way to them.
+/// Gaussians in the front camera's frame, and the intermediate results.
 pub struct Reconstruction {
     /// Views that were computed, in the order of the Gaussians.
     pub views: Vec<View>,
@@ -36,7 +36,7 @@ pub struct Reconstruction {
     pub valid: Vec<Vec<bool>>,
     /// Pseudo images of the right and the left `[3, S, S]` in [−1, 1], −1 where there is no point.
     pub side_images: Vec<Vec<f32>>,
-    /// The Gaussians, view after view, row-major; means and rotations as the regressor gave them.
+    /// The Gaussians, view after view, row-major, in the front camera's frame.
     pub gaussians: Gaussians,
     /// Pixels and Gaussians that were left out because they were not finite.
     pub lost: usize,
@@ -47,7 +47,7 @@ pub struct Reconstruction {
 }
 
 impl Reconstruction {
-    /// The Gaussians in the world frame that the config asks for.
+    /// The Gaussians in the configured world frame.
     pub fn in_world(&self, config: &Config) -> Gaussians {
         let gaussians = self.gaussians.clone();
         let camera_to_world = match config.world_frame() {
@@ -88,7 +88,7 @@ impl Reconstructor {
         })
     }
 
-    /// Leaves the unseen sides out, which scenes of many photographs do not have: their heads, colours and Gaussians.
+    /// Leaves the unseen sides out, with their heads, colours and Gaussians, for scenes of many photographs.
     pub fn without_sides(mut self) -> Self {
         self.predictor = self.predictor.without_sides();
         self
@@ -100,7 +100,7 @@ impl Reconstructor {
         self
     }
 
-    /// Leaves the colours of the unseen sides out: the regressor sees them as [`EMPTY`] everywhere.
+    /// Leaves the colours of the unseen sides out: the regressor gets [`EMPTY`] instead.
     pub fn without_side_colors(mut self) -> Self {
         self.side_colors = false;
         self
@@ -111,7 +111,7 @@ impl Reconstructor {
         &self.config
     }
 
-    /// Turns a front and a back photograph into Gaussians; `stage` hears the name of each module before it runs.
+    /// Turns a front and a back photograph into Gaussians. `stage` is called with the name of each module before it runs.
     ///
     /// # Panics
     /// If a photograph's arrays do not have the canvas size.
@@ -174,7 +174,7 @@ impl Run<'_> {
         }
         if outside > 0 {
             self.plan
-                .push(format!("{outside} pixels of the sides left out: no photograph shows anybody there"));
+                .push(format!("{outside} pixels of the sides left out: they lie outside of the silhouettes"));
         }
 
         if between > 0 {
@@ -194,7 +194,7 @@ impl Run<'_> {
             Vec::new()
         };
 
-        // One overflow would spoil the normalisation of a whole view.
+        // One value that is not finite would spoil the normalisation of a whole view.
         let usable = if points.iter().all(|v| v.is_finite()) {
             maps.points.clone()
         } else {
@@ -236,7 +236,7 @@ impl Run<'_> {
         if input.grid.kept.is_some() {
             let all: usize = input.grid.size.iter().product();
             self.plan
-                .push(format!("{} of {all} tokens left out: they show nobody", all - input.grid.tokens()));
+                .push(format!("{} of {all} tokens left out: they show no person", all - input.grid.tokens()));
         }
         let encoded = self.timed("encoder", |_| net.encode(input));
         let decoded = self.timed("decoders", |_| net.decode(encoded));

@@ -6,14 +6,14 @@ use crate::neighbours::Neighbours;
 /// Value of a side pixel without a point.
 pub const EMPTY: f32 = -1.0;
 
-/// Coloured points that side points look themselves up in.
+/// Coloured points among which the nearest of each side point is found.
 pub struct Cloud {
     neighbours: Neighbours,
     colors: Vec<[f32; 3]>,
 }
 
 impl Cloud {
-    /// Puts points (metres) and their colours together; points that are not finite are left out.
+    /// A cloud of points (metres) with colours. Points that are not finite are left out.
     ///
     /// `None` if no finite point is left.
     ///
@@ -36,8 +36,8 @@ impl Cloud {
 
     /// Colour of the exact nearest neighbour of each point (metres), on all cores.
     ///
-    /// Among neighbours at the same squared distance in f32, `(dx² + dy²) + dz²`, the one given first wins; so does
-    /// it for a point that is not finite or so far away that all squared distances overflow.
+    /// Among neighbours at the same squared distance in f32, `(dx² + dy²) + dz²`, the first one wins, also for points that
+    /// are not finite or so far away that all squared distances overflow.
     pub fn nearest_colors(&self, points: &[[f32; 3]]) -> Vec<[f32; 3]> {
         self.neighbours.nearest(points).into_iter().map(|row| self.colors[row as usize]).collect()
     }

@@ -45,10 +45,11 @@ impl Stored {
     pub fn read(path: &Path) -> Result<Self, SplatError> {
         let cannot = FileError::read(path);
         let mut file = file::open(path).map_err(&cannot)?;
-        let mut start = [0; 2];
-        let length = fill(&mut file, &mut start).map_err(&cannot)?;
-        let whole = start[..length].chain(file);
-        let read = match start {
+        let mut start = Vec::new();
+        (&mut file).take(2).read_to_end(&mut start).map_err(&cannot)?;
+        let magic = <[u8; 2]>::try_from(&start[..]).unwrap_or_default();
+        let whole = start.as_slice().chain(file);
+        let read = match magic {
             spz::GZIP => spz::read(whole),
             spz::BARE => Err("SPZ of version 4 or later; 1 to 3 are read".to_owned().into()),
             _ => ply::read(whole),
@@ -126,18 +127,4 @@ pub fn read(path: &Path, device: &Device) -> Result<Loaded, SplatError> {
 /// Theirs; `path` is then left as it was.
 pub fn write(gaussians: &Gaussians, path: &Path) -> Result<(), SplatError> {
     Stored::of(gaussians)?.write(path)
-}
-
-/// Reads until `buffer` is full or the input ends; returns the number of bytes.
-fn fill(input: &mut impl Read, buffer: &mut [u8]) -> io::Result<usize> {
-    let mut length = 0;
-    while length < buffer.len() {
-        match input.read(&mut buffer[length..]) {
-            Ok(0) => break,
-            Ok(n) => length += n,
-            Err(e) if e.kind() == io::ErrorKind::Interrupted => {}
-            Err(e) => return Err(e),
-        }
-    }
-    Ok(length)
 }

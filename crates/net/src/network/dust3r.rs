@@ -19,7 +19,7 @@ use snapsnap_ops::{Rope, as_weight, host};
 /// One side of the person. The sides are named as seen in the front picture.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum View {
-    /// Photographed; its camera's frame is everybody's frame.
+    /// Photographed; all points are in the frame of its camera.
     Front,
     /// Photographed.
     Back,
@@ -51,12 +51,12 @@ enum Head {
     Linear(LinearHead),
 }
 
-/// Which tokens an image has: all of a grid, or those of it where somebody is.
+/// The tokens of an image: all of a grid, or those that show the person.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Grid {
     /// Rows and columns.
     pub size: [usize; 2],
-    /// The tokens there are, by their place in the grid, row by row; all of them without this.
+    /// Places of the tokens in the grid, row by row; `None` for all of them.
     pub kept: Option<Vec<usize>>,
 }
 
@@ -66,7 +66,7 @@ impl Grid {
         Self { size, kept: None }
     }
 
-    /// The tokens of which some patch of `patch`² pixels has a mask `[N, 1, H, W]` above 0; all of them if nobody is seen.
+    /// The tokens whose patch of `patch`² pixels has a mask `[N, 1, H, W]` above 0 in some image; all of them if no token has.
     pub fn of_persons(masks: &Tensor<4>, patch: usize) -> Self {
         let [_, _, h, w] = masks.dims();
         let size = [h / patch, w / patch];
@@ -83,7 +83,7 @@ impl Grid {
         self.kept.as_ref().map_or(self.size[0] * self.size[1], Vec::len)
     }
 
-    /// Rotary tables for the tokens there are.
+    /// Rotary tables for the kept tokens.
     fn rope(&self, head_dim: usize, base: f64, device: &Device) -> Rope {
         let [rows, columns] = self.size;
         match &self.kept {
@@ -101,7 +101,7 @@ impl Grid {
         Some(Tensor::from_data(TensorData::new(kept, [count]), device))
     }
 
-    /// The tokens there are of all of a grid's.
+    /// The kept tokens of all of a grid's.
     fn pick(&self, tokens: Tensor<3>) -> Tensor<3> {
         match self.index(&tokens.device()) {
             Some(index) => tokens.select(1, index),
@@ -109,7 +109,7 @@ impl Grid {
         }
     }
 
-    /// All of a grid's tokens, 0 where there is none.
+    /// All of a grid's tokens, 0 for those that are not kept.
     fn spread(&self, tokens: Tensor<3>) -> Tensor<3> {
         let device = tokens.device();
         let Some(index) = self.index(&device) else { return tokens };
@@ -174,7 +174,7 @@ impl Dust3r {
         }
     }
 
-    /// The same network without the heads of the unseen sides, for scenes that have none.
+    /// The same network without the heads of the unseen sides.
     pub fn without_sides(self) -> Self {
         Self { downstream_head3: None, downstream_head4: None, ..self }
     }

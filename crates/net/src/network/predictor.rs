@@ -1,4 +1,4 @@
-//! The point predictor as Snap-Snap uses it: the two-view network, the activations of its raw points, and δ.
+//! The point predictor: the two-view network, the activations of its raw points, and δ.
 
 use burn::module::{Module, Param};
 use burn::tensor::activation::sigmoid;
@@ -24,9 +24,9 @@ pub struct PointMap {
 }
 
 impl PointMap {
-    /// A view's map of a window on the whole canvas of `config`; what lies outside is 0. With `network.on_rays` points of a
-    /// photograph, whose `mask` is `[B, 1, S, S]`, are moved onto their pixels' rays. Stage 1's losses are of maps before that,
-    /// else nothing would teach the network where the rays are that it thinks of.
+    /// A view's map of a window on the whole canvas of `config`, 0 outside of the window. With `network.on_rays`, the points
+    /// of a photograph with the `mask` `[B, 1, S, S]` are moved onto their pixels' rays. The losses of stage 1 compare maps
+    /// before that move, so that the network still learns where the rays are.
     pub fn on_canvas(
         self,
         config: &NetworkConfig,
@@ -47,7 +47,7 @@ impl PointMap {
     }
 }
 
-/// Exponents beyond this leave f32's range; what a network says there is no depth, but must stay a number.
+/// Largest exponent whose result is in the range of f32. Such outputs are no depths, but must stay finite.
 const MAX_EXPONENT: f64 = 88.0;
 
 /// Raw x, y, z, confidence `[B, 4, H, W]` → point map: p = r / ‖r‖ · (e^‖r‖ − 1), or p = r with anchors
@@ -74,7 +74,7 @@ pub fn activate(raw: Tensor<4>, config: &NetworkConfig) -> PointMap {
 
 /// (e^x − 1) / x for x > 0, without the cancellation of `exp(x) − 1` near 0: a series for small x.
 fn growth(x: Tensor<4>) -> Tensor<4> {
-    /// Where the series hands over: the first term left out, x⁶/5040, is 2e-7 of the sum here.
+    /// End of the series' range: the first omitted term, x⁶/5040, is 2e-7 of the sum here.
     const SMALL: f64 = 0.3;
     let terms = [1.0 / 720.0, 1.0 / 120.0, 1.0 / 24.0, 1.0 / 6.0, 0.5];
     let series = terms.iter().fold(x.zeros_like(), |sum, &term| (sum + term) * x.clone()) + 1.0;
@@ -82,8 +82,8 @@ fn growth(x: Tensor<4>) -> Tensor<4> {
     direct.mask_where(x.lower_elem(SMALL), series)
 }
 
-/// The mean of the maps of the first half of a batch and of those of the second, which saw the first in a mirror: there x is −x
-/// and each side the other one.
+/// The means of the maps of a batch's first half and of its second half, whose photographs are mirrored: there x is −x,
+/// and each side is the other one.
 fn means(maps: &[(View, PointMap)]) -> Vec<(View, PointMap)> {
     let mirrored = |view: View| match view {
         View::Right => View::Left,
@@ -142,7 +142,7 @@ pub struct PointPredictor {
 }
 
 impl PointPredictor {
-    /// A predictor whose parameters wait to be loaded.
+    /// A predictor without values for its parameters yet.
     pub fn new(config: &NetworkConfig, device: &Device) -> Self {
         let scale = Param::from_tensor(Tensor::full([1], config.delta, device));
         let body = match config.body {
@@ -179,7 +179,8 @@ impl PointPredictor {
         if sides { &View::ALL } else { &View::ALL[..2] }
     }
 
-    /// Tells by a layer's name in a checkpoint whether its output is the raw points, with nothing but activations behind it.
+    /// Whether the layer of this name in a checkpoint is a last one: its output is the raw points, which only activations
+    /// follow.
     pub(crate) fn is_last_layer(&self) -> fn(&str) -> bool {
         match &self.body {
             Body::Transformer(_) => Dust3r::is_last_layer,
@@ -213,9 +214,9 @@ impl PointPredictor {
                 /// A canvas pixel with less body than this around it keeps the plain interpolation.
                 const MIN_WEIGHT: f64 = 1e-4;
                 let total = up(weights.clone());
-                // Where there is no body the point may be anything, an overflow included.
-                let nobody = weights.clone().lower_equal_elem(0.0).expand(points.dims());
-                let weighted = (points * weights).mask_fill(nobody, 0.0);
+                // Points of the background may be anything, an overflow included.
+                let background = weights.clone().lower_equal_elem(0.0).expand(points.dims());
+                let weighted = (points * weights).mask_fill(background, 0.0);
                 let inside = up(weighted) / total.clone().clamp_min(MIN_WEIGHT);
                 let outside = total.lower_elem(MIN_WEIGHT).expand(plain.dims());
                 inside.mask_where(outside, plain)
@@ -239,9 +240,9 @@ impl PointPredictor {
         }
     }
 
-    /// A head's map of a view, activated, on the `window` of the canvas that the network saw, in metres. `mask`
-    /// `[B, 1, S, S]` is the photograph's own; sides, which have none, go by the network's own opinion of where the person
-    /// is, which gets no gradient from this.
+    /// A head's map of a view, activated, on the `window` of the canvas that the network received, in metres. `mask`
+    /// `[B, 1, S, S]` is the photograph's. Sides have none; their mask is the predicted confidence above the threshold,
+    /// without a gradient.
     pub fn finished(
         &self,
         config: &Config,
@@ -298,7 +299,7 @@ impl PointPredictor {
             _ => panic!("decoded by another network"),
         };
         let map = |(&view, raw): (&View, Tensor<4>)| {
-            // A mirrored photograph gives a mirrored map.
+            // The map of a mirrored photograph is mirrored.
             let raw = if self.config.mirror && view == View::Back { raw.flip([3]) } else { raw };
             (view, activate(raw, &self.config))
         };

@@ -1,4 +1,4 @@
-//! Points of photographs on the rays of their pixels: what a network says of them across the line of sight is known better.
+//! Points of photographs on the rays of their pixels. Across the line of sight, rays are more accurate than predictions.
 
 use burn::tensor::{Tensor, TensorData};
 use glam::{DMat3, DQuat, DVec2, DVec3};
@@ -9,9 +9,8 @@ use super::View;
 use crate::crop::Window;
 
 /// Points `[B, h, w, 3]` of a photograph's `window` of a canvas of `side`² pixels, metres in the front camera's frame, moved
-/// onto their pixels' rays; their depths stay. The front's rays are those of the frame. The back's camera stands nearly
-/// opposite; where exactly, is what fits the points best where its `mask` `[B, 1, S, S]` has the person. That choice gets no
-/// gradient.
+/// onto their pixels' rays; their depths stay. The front's rays are those of the frame. The back's camera is nearly
+/// opposite; its pose is fitted to the points inside the `mask` `[B, 1, S, S]`, without a gradient.
 pub fn on_rays(view: View, side: usize, window: &Window, points: Tensor<4>, mask: &Tensor<4>) -> Tensor<4> {
     let ([b, h, w, _], device) = (points.dims(), points.device());
     let camera = Camera::orbit_at_yaw_degrees(0.0, side as u32);
@@ -53,22 +52,23 @@ pub fn on_rays(view: View, side: usize, window: &Window, points: Tensor<4>, mask
     Tensor::cat(moved, 0)
 }
 
-/// Every pixel of a canvas of so many is asked where the camera stands, of larger ones as many.
+/// Side of the canvas whose pixels are all used for the fit of the camera; larger canvases use as many.
 const FITTED_SIDE: usize = 256;
 
-/// From the front camera's frame to that of the camera behind the person whose `rays` (x/z, y/z) meet the `points` (metres,
-/// front camera's frame): least squares from the nominal one on, which holds where the points say nothing.
+/// From the front camera's frame to that of the camera behind the person. The pose minimises the distance of the rays
+/// (x/z, y/z) to their points (metres, front camera's frame), with the nominal pose as the prior.
 fn opposite_camera(pairs: &[(DVec3, DVec2)]) -> RigidTransform {
-    /// Steps of Gauss and Newton: what strays so little is nearly linear.
+    /// Gauss-Newton steps. Such small deviations are nearly linear.
     const STEPS: usize = 3;
-    /// How far a camera strays, rad about the person's middle and metres from there.
-    const STRAYS: [f64; 6] = [0.07, 0.07, 0.04, 0.05, 0.05, 0.1];
-    /// All points together are worth so many that err each by itself, by so much of their distance: errors of neighbours are alike.
-    const WORTH: f64 = 100.0;
-    const WRONG: f64 = 2e-3;
-    /// No camera strays so many times as far; what an untrained network says might.
+    /// Standard deviations of the prior: rad around the person's middle, and metres.
+    const PRIOR: [f64; 6] = [0.07, 0.07, 0.04, 0.05, 0.05, 0.1];
+    /// Number of independent points that all points together count as, since errors of neighbours are alike, and the error
+    /// of each relative to its distance.
+    const COUNT: f64 = 100.0;
+    const ERROR: f64 = 2e-3;
+    /// Largest deviation in standard deviations. Points of an untrained network may ask for more.
     const MOST: f64 = 3.0;
-    /// Metres between which points count.
+    /// Range of distances of points that count, metres.
     const NEAREST: f64 = 0.1;
     const FARTHEST: f64 = 1e3;
     let [front, back] = [0.0, 180.0].map(|yaw| Camera::orbit_at_yaw_degrees(yaw, 1024));
@@ -86,11 +86,11 @@ fn opposite_camera(pairs: &[(DVec3, DVec2)]) -> RigidTransform {
         let shift = DVec3::new(s[3], s[4], s[5]);
         RigidTransform { rotation, translation: middle - rotation * middle + shift }
     };
-    let weight = WORTH / (pairs.len().max(1) as f64 * WRONG * WRONG);
+    let weight = COUNT / (pairs.len().max(1) as f64 * ERROR * ERROR);
     for _ in 0..STEPS {
         let mut normal = [[0.0; 6]; 6];
         let mut right = [0.0; 6];
-        for (i, stray) in STRAYS.iter().enumerate() {
+        for (i, stray) in PRIOR.iter().enumerate() {
             normal[i][i] = 1.0 / (stray * stray);
             right[i] = -strayed[i] / (stray * stray);
         }
@@ -102,7 +102,7 @@ fn opposite_camera(pairs: &[(DVec3, DVec2)]) -> RigidTransform {
             }
             let arm = p - now.apply(middle);
             let off = *ray - p.truncate() / p.z;
-            // How x and y of the picture follow the three turns and the three shifts.
+            // Derivatives of x and y of the picture by the three rotations and the three shifts.
             for (axis, off) in [(DVec3::X, off.x), (DVec3::Y, off.y)] {
                 let gradient = (axis - DVec3::Z * (p.dot(axis) / p.z)) / p.z;
                 let turn = arm.cross(gradient);
@@ -115,7 +115,7 @@ fn opposite_camera(pairs: &[(DVec3, DVec2)]) -> RigidTransform {
                 }
             }
         }
-        for ((value, step), stray) in strayed.iter_mut().zip(solved(normal, right)).zip(STRAYS) {
+        for ((value, step), stray) in strayed.iter_mut().zip(solved(normal, right)).zip(PRIOR) {
             *value = (*value + step).clamp(-MOST * stray, MOST * stray);
         }
     }
@@ -146,8 +146,8 @@ mod tests {
 
     const SIDE: usize = 64;
 
-    /// A person's back, as a camera sees it that strays by `motion` from the nominal one, in a window: points `[h, w, 3]` in the
-    /// front camera's frame, metres.
+    /// A person's back in a window of a camera that differs by `motion` from the nominal one: points `[h, w, 3]` in the front
+    /// camera's frame, metres.
     fn back(window: &Window, motion: &RigidTransform) -> (Vec<f32>, RigidTransform) {
         let [front, back] = [0.0, 180.0].map(|yaw| Camera::orbit_at_yaw_degrees(yaw, SIDE as u32));
         let pose = front.world_to_camera.inverse().then(&back.world_to_camera).then(motion);
@@ -156,7 +156,7 @@ mod tests {
             for column in window.columns.clone() {
                 let pixel = DVec2::new(column as f64 + 0.5, row as f64 + 0.5);
                 let ray = (pixel - back.principal_point) / back.focal;
-                // Round as a body is, and deeper at the hips.
+                // Rounded like a body, and deeper at the hips.
                 let depth = 1.9 + 0.8 * ray.x * ray.x - 0.2 * (ray.y - 0.1) * (ray.y - 0.1);
                 let point = pose.inverse().apply(depth * DVec3::new(ray.x, ray.y, 1.0));
                 points.extend(point.as_vec3().to_array());
@@ -183,7 +183,7 @@ mod tests {
     }
 
     #[test]
-    fn points_of_the_front_come_to_lie_on_the_rays_of_their_pixels() {
+    fn points_of_the_front_are_moved_onto_the_rays_of_their_pixels() {
         let window = Window { rows: 8..56, columns: 16..40 };
         let camera = Camera::orbit_at_yaw_degrees(0.0, SIDE as u32);
         let points: Vec<f32> = (0..48 * 24).flat_map(|i| [0.3, -0.2, 1.5 + 0.001 * i as f32]).collect();
@@ -196,9 +196,9 @@ mod tests {
         }
     }
 
-    /// Points that are right stay, wherever the camera behind the person stands; what errs across the line of sight is mended.
+    /// Exact points stay, for any pose of the camera behind the person; errors across the line of sight vanish.
     #[test]
-    fn points_of_the_back_come_to_lie_on_the_rays_of_a_camera_that_they_speak_for() {
+    fn points_of_the_back_are_moved_onto_the_rays_of_the_fitted_camera() {
         let window = Window { rows: 8..56, columns: 16..48 };
         for (motion, tolerance) in [(RigidTransform::IDENTITY, 1e-6), (strayed(), 4e-4)] {
             let (points, pose) = back(&window, &motion);
@@ -221,7 +221,7 @@ mod tests {
     }
 
     #[test]
-    fn a_camera_of_which_no_point_speaks_stands_where_it_should() {
+    fn a_camera_without_points_is_the_nominal_one() {
         let [front, back] = [0.0, 180.0].map(|yaw| Camera::orbit_at_yaw_degrees(yaw, 1024));
         let nominal = front.world_to_camera.inverse().then(&back.world_to_camera);
         let hostile = [DVec3::NAN, DVec3::splat(1e30), DVec3::new(0.0, 0.0, 9.0), DVec3::INFINITY];
@@ -229,7 +229,7 @@ mod tests {
         for pairs in [&[][..], &hostile] {
             assert_eq!(opposite_camera(pairs), nominal);
         }
-        // Points of an untrained network: anywhere, and as sure as any.
+        // Points of an untrained network, anywhere.
         let anywhere: Vec<_> = (0..500)
             .map(|i| {
                 let [a, b, c] = [1.3, 2.7, 0.9].map(|f| (f * f64::from(i)).sin());

@@ -38,17 +38,18 @@ const START_SCALE: f64 = 0.3;
 const START_OPACITY: f64 = 2.197_224_577_336_219;
 /// The network changes a scale by up to this factor's logarithm.
 const LOG_SCALE: f64 = 2.0;
-/// A point's neighbours are no further than so many times the distance of the pixels there: beyond lies another limb.
+/// Largest distance of a point from its neighbours, relative to the width of a pixel there. Points beyond are on another
+/// limb.
 const MOST_SPACING: f32 = 3.0;
 
 impl Geometry {
-    /// Whether a config measures anything from it.
+    /// Whether a config uses it.
     pub fn is_needed(config: &RegressorConfig) -> bool {
         config.start() == RegressorStart::Geometric || config.color() == RegressorColor::Residual
     }
 
-    /// Of the valid pixels of a view on a canvas of `side`² pixels, row by row: colours `[3, S, S]` and points
-    /// `[1, S, S, 3]`.
+    /// The geometry of the valid pixels of a view on a canvas of `side`² pixels, row by row, from colours `[3, S, S]` and
+    /// points `[1, S, S, 3]`.
     pub fn new(image: &[f32], points: &Tensor<4>, valid: &[bool], side: usize) -> Self {
         let device = points.device();
         let points = host(points.clone());
@@ -83,7 +84,7 @@ impl Geometry {
 }
 
 impl Attributes {
-    /// Features `[N, 14]`, measured from what the config says; `geometry` where it asks for it.
+    /// Attributes of features `[N, 14]`, relative to the `geometry` if the config uses it.
     pub fn new(config: &RegressorConfig, features: Tensor<2>, geometry: Option<Geometry>) -> Self {
         let Some(Geometry { spacing, colors }) = geometry else { return Self::from_features(features) };
         let part = |from: usize, width: usize| features.clone().narrow(1, from, width);
@@ -165,7 +166,7 @@ mod tests {
         }
     }
 
-    /// At zero output: grey or the pixel's colour, whatever the rest begins with.
+    /// At zero output the colour is grey or the pixel's, for every start of the other attributes.
     #[test]
     fn colours_are_the_networks_or_corrections_of_the_pixels() {
         let device = Device::flex();

@@ -33,7 +33,7 @@ pub struct Regressor {
 }
 
 impl Regressor {
-    /// A regressor whose parameters wait to be loaded.
+    /// A regressor without values for its parameters yet.
     pub fn new(config: &RegressorConfig, device: &Device) -> Self {
         Self {
             pred_unet: UNet::new(config, device),

@@ -12,7 +12,7 @@ use super::statistics::{Statistics, normalise};
 use super::{FEATURES, INPUT_CHANNELS};
 use crate::config::RegressorConfig;
 
-/// Every sum of two branches is scaled by this, so that its variance stays put.
+/// Factor of every sum of two branches, which keeps its variance.
 pub(crate) const BRANCH_SCALE: f64 = std::f64::consts::FRAC_1_SQRT_2;
 
 fn conv3x3(from: usize, to: usize, stride: usize, device: &Device) -> Conv2d {

@@ -1,6 +1,6 @@
-//! Our weight file: writing it tensor by tensor, and opening it.
+//! The weight file: writing it tensor by tensor, and opening it.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::io::{self, Write};
 use std::path::Path;
 
@@ -20,8 +20,8 @@ pub type Progress<'a> = &'a dyn Fn(u64, u64);
 /// Values per task: a second-level cache holds them.
 const CHUNK: usize = 1 << 16;
 
-/// Writes `tensors` in order, asking `values` for one at a time, so that never more than one is in memory. All that are not
-/// finite are named at the end, as `origin`'s, and nothing is written.
+/// Writes `tensors` in order. `values` returns one at a time, so that only one is in memory. Values that are not finite are
+/// an error that names all their tensors, as `origin`'s, and no file is written.
 pub(super) fn write(
     path: &Path,
     origin: &str,
@@ -37,12 +37,12 @@ pub(super) fn write(
     write_floats(path, origin, metadata, infos.collect(), float, |i| values(&tensors[i]), progress)
 }
 
-/// Writes f32 tensors, names and shapes, in order, asking `values` for one at a time; `metadata` of more than one entry comes
-/// in no fixed order.
+/// Writes f32 tensors, by names and shapes, in order; `values` returns one at a time. `metadata` of more than one entry has
+/// no fixed order.
 ///
 /// # Errors
 /// [`WeightsError`] of `values`, for values that are not finite, which are named as `origin`'s, or if the file cannot be
-/// written. What was there before stays.
+/// written. The former file then stays.
 pub fn write_tensors(
     path: &Path,
     origin: &str,
@@ -111,17 +111,17 @@ fn write_floats(
     })
 }
 
-/// Writes the values of parameters by name, as checkpoints lay them out, as a weight file of `config`. Values of only one
+/// Writes the values of parameters, by names and layouts of checkpoints, as a weight file of `config`. Values of only one
 /// part make a file of that part.
 ///
 /// # Errors
 /// [`WeightsError::File`], or [`WeightsError::Tensors`] for values that are not finite.
 ///
 /// # Panics
-/// If a tensor of a part that is there is missing or has another size.
+/// If a tensor of a present part is missing or has another size.
 pub fn save(config: &Config, values: &BTreeMap<String, Vec<f32>>, path: &Path) -> Result<(), WeightsError> {
     let parts = parts_of(values.keys());
-    let tensors: Vec<_> = schema::tensors(config).into_iter().filter(|t| parts.contains(t.part)).collect();
+    let tensors: Vec<_> = schema::tensors(config).into_iter().filter(|t| parts.contains(&t.part)).collect();
     let read = |spec: &TensorSpec| {
         let values = &values[&spec.name];
         assert_eq!(values.len(), spec.elements(), "{}", spec.name);
@@ -140,7 +140,7 @@ pub fn not_finite(name: &str, values: &[f32]) -> Option<String> {
 /// An opened weight file whose tensors fit its config.
 pub struct WeightFile {
     pub(super) source: Source,
-    /// The config the tensors were checked against.
+    /// The config that the tensors fit.
     pub config: Config,
 }
 
@@ -171,7 +171,7 @@ impl WeightFile {
         let mut problems = Vec::new();
         let parts = parts_of(source.tensors().keys());
         let expected: Vec<_> =
-            schema::tensors(&config).into_iter().filter(|t| parts.contains(t.part)).collect();
+            schema::tensors(&config).into_iter().filter(|t| parts.contains(&t.part)).collect();
         for spec in &expected {
             match source.tensors().get(&spec.name) {
                 None => problems.push(format!("missing: {} {:?}", spec.name, spec.shape)),
@@ -205,7 +205,7 @@ impl WeightFile {
     /// [`WeightsError::File`], saying which checkpoint to import as well.
     pub fn require(&self, part: Part) -> Result<(), WeightsError> {
         let parts = parts_of(self.source.tensors().keys());
-        if parts.contains(part) {
+        if parts.contains(&part) {
             return Ok(());
         }
         let message = match part {
@@ -220,31 +220,12 @@ impl WeightFile {
     }
 }
 
-/// Which parts a set of keys touches.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Parts {
-    point_predictor: bool,
-    regressor: bool,
-}
-
-impl Parts {
-    pub(super) fn contains(self, part: Part) -> bool {
-        match part {
-            Part::PointPredictor => self.point_predictor,
-            Part::Regressor => self.regressor,
-        }
-    }
-}
-
-pub(super) fn parts_of<'a>(keys: impl Iterator<Item = &'a String>) -> Parts {
-    let mut parts = Parts { point_predictor: false, regressor: false };
-    for key in keys {
-        let regressor =
-            ["pred_unet.", "gs_conv."].iter().any(|p| key.trim_start_matches(schema::SIDE).starts_with(p));
-        parts.regressor |= regressor;
-        parts.point_predictor |= !regressor;
-    }
-    parts
+/// The parts that a set of keys belongs to.
+pub(super) fn parts_of<'a>(keys: impl Iterator<Item = &'a String>) -> HashSet<Part> {
+    let is_regressors = |key: &str| {
+        ["pred_unet.", "gs_conv."].iter().any(|p| key.trim_start_matches(schema::SIDE).starts_with(p))
+    };
+    keys.map(|key| if is_regressors(key) { Part::Regressor } else { Part::PointPredictor }).collect()
 }
 
 /// A line for a tensor of the wrong shape or type.

@@ -21,10 +21,10 @@ pub struct ImportOptions {
     pub float: Float,
 }
 
-/// The config stored in a weight file of ours; `None` for a checkpoint of somebody else's.
+/// The config in the metadata of a weight file; `None` for other checkpoints.
 ///
 /// # Errors
-/// [`WeightsError`] for a file that is no checkpoint, or whose config makes no sense.
+/// [`WeightsError`] for a file that is no checkpoint, or whose config is refused.
 pub fn stored_config(path: &Path) -> Result<Option<Config>, WeightsError> {
     let source = Source::open(path)?;
     source.metadata.contains_key(CONFIG_KEY).then(|| source.config()).transpose()
@@ -49,7 +49,7 @@ enum Origin<'a> {
     Drawn,
 }
 
-/// Keys of the authors' files that play no part in inference or training here.
+/// Keys of the authors' files that neither inference nor training uses.
 fn is_ignored(key: &str) -> bool {
     key == "mask_token" || key.starts_with("prediction_head.")
 }
@@ -61,7 +61,7 @@ pub(super) fn alias_of(name: &str) -> Option<String> {
     Some(format!("{head}scratch.layer_rn.{}.weight", n - 1))
 }
 
-/// The name we keep for a key of the authors' files: prefix added, alias replaced.
+/// The name in a weight file for a key of the authors' files: prefix added, alias replaced.
 fn canonical(key: &str) -> String {
     let bare = key.strip_prefix(DUST3R).unwrap_or(key);
     if bare == SCALE || ["pred_unet.", "gs_conv.", SIDE, UNET].iter().any(|p| bare.starts_with(p)) {
@@ -75,7 +75,7 @@ fn canonical(key: &str) -> String {
     format!("{DUST3R}{bare}")
 }
 
-/// Reads checkpoints of the authors, DUSt3R or CroCo, checks every tensor against `config` and writes one file of ours.
+/// Reads checkpoints of the authors, DUSt3R or CroCo, checks every tensor against `config` and writes one weight file.
 ///
 /// Each of the two parts (point predictor, regressor) must be complete or wholly absent, except that files without δ,
 /// without side heads or without any heads, as DUSt3R's and CroCo's are, get those from the config and the seed.
@@ -96,7 +96,7 @@ pub fn import(
     let mut found = collect(&sources, &mut problems, &mut report)?;
     copy_decoder(&mut found, &mut report);
     let parts = parts_of(found.keys());
-    let specs: Vec<_> = schema::tensors(config).into_iter().filter(|t| parts.contains(t.part)).collect();
+    let specs: Vec<_> = schema::tensors(config).into_iter().filter(|t| parts.contains(&t.part)).collect();
     if specs.is_empty() {
         problems.push("no tensor of a point predictor or a regressor".into());
     }
@@ -121,7 +121,7 @@ fn head(k: usize) -> String {
     format!("{DUST3R}downstream_head{k}.")
 }
 
-/// One origin per tensor of `specs`, in order; what has none, and what no tensor wants, are problems.
+/// One origin per tensor of `specs`, in order. Tensors without an origin and unused keys are problems.
 fn plan<'a>(
     specs: &[TensorSpec],
     mut found: Found<'a>,

@@ -10,7 +10,7 @@ use crate::network::PointPredictor;
 use crate::regressor::Regressor;
 
 /// The part of a checkpoint that a tensor belongs to.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Part {
     /// Stage 1: the point predictor.
     PointPredictor,

@@ -58,15 +58,15 @@ impl Source {
     pub fn open(path: &Path) -> Result<Self, WeightsError> {
         let read = FileError::read(path);
         let mut file = file::open(path).map_err(&read)?;
-        let mut start = [0_u8; 9];
-        let filled = read_up_to(&mut file, &mut start).map_err(&read)?;
+        let mut start = Vec::new();
+        (&mut file).take(9).read_to_end(&mut start).map_err(&read)?;
         // A safetensors file starts with a little-endian header length and then JSON; every PyTorch container starts
         // with bytes that would make that length absurd.
-        let header = u64::from_le_bytes([
-            start[0], start[1], start[2], start[3], start[4], start[5], start[6], start[7],
-        ]);
-        if filled == 9 && start[8] == b'{' && (1..=MAX_HEADER).contains(&header) {
-            return Self::safetensors(path, file, header);
+        if let Some((length, b"{")) = start.split_first_chunk() {
+            let header = u64::from_le_bytes(*length);
+            if (1..=MAX_HEADER).contains(&header) {
+                return Self::safetensors(path, file, header);
+            }
         }
         if path.extension().is_some_and(|e| e == "safetensors") {
             return Err(FileError::unsuitable(path, "not a safetensors file (no header)").into());
@@ -77,7 +77,7 @@ impl Source {
     /// A safetensors file that is part of the program; `name` stands for its path.
     ///
     /// # Errors
-    /// [`WeightsError`] if it is none.
+    /// [`WeightsError`] for other bytes.
     pub fn embedded(name: &str, bytes: &'static [u8]) -> Result<Self, WeightsError> {
         let path = Path::new(name);
         let Some((start, rest)) = bytes.split_first_chunk::<8>() else {
@@ -126,7 +126,8 @@ impl Source {
                 FileError::unsuitable(path, format!("neither safetensors nor a PyTorch checkpoint: {e}"))
             })?
             .into_tensors();
-        // Snap-Snap keeps its weights under `network`, DUSt3R and CroCo under `model`; beside them lie optimiser states.
+        // The weights of Snap-Snap are below `network`, those of DUSt3R and CroCo below `model`; optimiser states are beside
+        // them.
         let wrapper =
             ["network.", "model."].into_iter().find(|w| all.keys().any(|k| k.starts_with(w))).unwrap_or("");
         let reader: BTreeMap<_, _> =
@@ -154,7 +155,7 @@ impl Source {
     /// The config in the file's metadata.
     ///
     /// # Errors
-    /// [`WeightsError`] if there is none, or none that makes sense.
+    /// [`WeightsError`] if there is none, or if it is refused.
     pub(super) fn config(&self) -> Result<Config, WeightsError> {
         let text = self.metadata.get(CONFIG_KEY).ok_or_else(|| {
             let message = "has no config in its metadata; give one with --config, or import it first";
@@ -274,7 +275,7 @@ impl Float {
     }
 }
 
-/// Values that are read and widened at a time: small enough to stay in the second-level cache on the way.
+/// Values that are read and widened at a time: few enough to stay in the second-level cache.
 const CHUNK: usize = 1 << 16;
 
 /// The values of one tensor, read by all cores. Most of the time goes into the first touch of fresh memory, so each page
@@ -312,16 +313,4 @@ fn read_at(file: &File, mut buffer: &mut [u8], mut offset: u64) -> io::Result<()
         }
     }
     Ok(())
-}
-
-/// Fills as much of `buffer` as the reader has.
-fn read_up_to(reader: &mut impl Read, buffer: &mut [u8]) -> io::Result<usize> {
-    let mut filled = 0;
-    while filled < buffer.len() {
-        match reader.read(&mut buffer[filled..])? {
-            0 => break,
-            n => filled += n,
-        }
-    }
-    Ok(filled)
 }
