@@ -1,4 +1,4 @@
-//! Tells the program which commit it is built from, which its reports name.
+//! Sets the program's commit for its reports.
 
 use std::path::Path;
 use std::process::Command;
@@ -10,7 +10,7 @@ fn main() {
     };
     let commit = git(&["rev-parse", "--short=10", "HEAD"]).unwrap_or_else(|| "unknown".into());
     println!("cargo:rustc-env=SNAPSNAP_COMMIT={commit}");
-    // Where HEAD leads: a file that changes with every commit on the branch.
+    // The file of HEAD's branch changes with every commit.
     for name in ["HEAD".to_owned(), git(&["symbolic-ref", "-q", "HEAD"]).unwrap_or_default()] {
         let path = git(&["rev-parse", "--git-path", &name]).filter(|path| Path::new(path).is_file());
         if let Some(path) = path {

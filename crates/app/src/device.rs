@@ -1,4 +1,6 @@
-//! `--device`: names of devices, and which of them this build and this machine have.
+//! `--device`: the devices of this build and this machine, and their names.
+
+use std::panic;
 
 use burn::tensor::{Device, DeviceKind, DeviceType};
 use snapsnap_splat::adapter;
@@ -9,7 +11,7 @@ use crate::memory;
 /// The device called `name`.
 ///
 /// # Errors
-/// [`Failure::Input`] listing what there is.
+/// [`Failure::Input`] with a list of the devices.
 pub fn choose(name: &str) -> Result<Device, Failure> {
     let (kind, index) = match name.split_once(':') {
         Some((kind, index)) => {
@@ -22,7 +24,10 @@ pub fn choose(name: &str) -> Result<Device, Failure> {
         return Err(unknown(name, "this device has no index"));
     }
     match kind {
-        "auto" => return Ok(real_gpu().unwrap_or_else(Device::flex)),
+        "auto" => {
+            let card = gpus().into_iter().flat_map(|(_, kind)| devices(kind)).find(is_card);
+            return Ok(card.unwrap_or_else(Device::flex));
+        }
         "cpu" | "flex" => return Ok(Device::flex()),
         "ndarray" => return Ok(ndarray()),
         _ => {}
@@ -36,18 +41,17 @@ pub fn choose(name: &str) -> Result<Device, Failure> {
     }
 }
 
-/// Every device there is: both CPU backends, and of every compiled kind the first card, or the software adapter if it can run
-/// kernels.
+/// Both CPU backends, and of every compiled kind the first card, or else a software adapter that can run kernels.
 pub fn all() -> Vec<Device> {
     let gpus = gpus().into_iter().filter_map(|(name, _)| choose(name).ok());
     [Device::flex(), ndarray()].into_iter().chain(gpus).collect()
 }
 
-/// A device that answers.
+/// A working device.
 pub struct Found {
-    /// As `--device` wants it.
+    /// Its name for `--device`.
     pub name: String,
-    /// As it calls itself.
+    /// Name of the processor or the graphics adapter.
     pub adapter: String,
     /// Backend.
     pub backend: &'static str,
@@ -55,11 +59,11 @@ pub struct Found {
     pub software: bool,
     /// Whether it is a GPU that `auto` takes.
     pub card: bool,
-    /// Bytes, where they are known.
+    /// Memory in bytes, if it is known.
     pub memory: Option<u64>,
 }
 
-/// Every device that answers, of all kinds that are compiled in.
+/// Every working device of the compiled kinds.
 pub fn found() -> Vec<Found> {
     let processor = |name: &str, backend| Found {
         name: name.into(),
@@ -84,7 +88,7 @@ pub fn found() -> Vec<Found> {
                 },
                 software: !is_card(device),
                 card: is_card(device),
-                // The graphics layer does not tell.
+                // The graphics layer has no function for the memory of cards.
                 memory: (!is_card(device)).then(memory::there),
             });
         }
@@ -131,50 +135,40 @@ fn ndarray() -> Device {
     Device::ndarray()
 }
 
-/// A device that is a card, not a software adapter.
-fn real_gpu() -> Option<Device> {
-    gpus().into_iter().flat_map(|(_, kind)| devices(kind)).find(is_card)
-}
-
+/// The devices of a kind. Without a driver the graphics layer panics, and there are none.
 fn devices(kind: DeviceType) -> Vec<Device> {
     let is_wgpu = matches!(kind, DeviceType::Wgpu);
-    quietly(|| if is_wgpu && adapter::is_opengl() { Vec::new() } else { Device::enumerate(kind).into_vec() })
-}
-
-/// Runs `look`, taking a panic for "nothing there": the graphics layer panics where no driver answers.
-fn quietly(look: impl FnOnce() -> Vec<Device> + std::panic::UnwindSafe) -> Vec<Device> {
-    let hook = std::panic::take_hook();
-    std::panic::set_hook(Box::new(|_| {}));
-    let found = std::panic::catch_unwind(look);
-    std::panic::set_hook(hook);
+    let hook = panic::take_hook();
+    panic::set_hook(Box::new(|_| {}));
+    let found = panic::catch_unwind(|| match is_wgpu && adapter::is_opengl() {
+        true => Vec::new(),
+        false => Device::enumerate(kind).into_vec(),
+    });
+    panic::set_hook(hook);
     found.unwrap_or_default()
 }
 
 fn nth(name: &str, kind: DeviceType, index: Option<usize>) -> Result<Device, Failure> {
     let devices = devices(kind);
     let found = devices.len();
-    match index {
-        _ if found == 0 => Err(unknown(
-            name,
-            "no adapter answers; is there a card, and is its driver installed (Vulkan, not OpenGL)?",
-        )),
-        // Without an index the runtime's own choice: the fastest card.
-        None if name == "wgpu" => Ok(Device::wgpu(DeviceKind::DefaultDevice)),
-        _ => {
-            let message = format!("there are {found}, numbered from 0");
-            let device = match index {
-                Some(index) => devices.into_iter().nth(index),
-                None => devices.iter().find(|device| is_card(device)).or(devices.first()).cloned(),
-            };
-            let device = device.ok_or_else(|| unknown(name, &message))?;
-            if name.starts_with("vulkan") && !is_card(&device) {
-                // Mesa's ends the program on the first kernel.
-                let message = format!("{} does not bear SPIR-V kernels: use wgpu", describe(&device));
-                return Err(unknown(name, &message));
-            }
-            Ok(device)
-        }
+    if found == 0 {
+        let message =
+            "no adapter answers; is there a card, and is its driver installed (Vulkan, not OpenGL)?";
+        return Err(unknown(name, message));
     }
+    let device = match index {
+        // The runtime chooses the fastest card.
+        None if name == "wgpu" => return Ok(Device::wgpu(DeviceKind::DefaultDevice)),
+        None => devices.iter().find(|device| is_card(device)).or(devices.first()),
+        Some(index) => devices.get(index),
+    };
+    let device = device.ok_or_else(|| unknown(name, &format!("there are {found}, numbered from 0")))?;
+    if name.starts_with("vulkan") && !is_card(device) {
+        // Mesa's software adapter aborts the program on the first kernel.
+        let message = format!("{} does not bear SPIR-V kernels: use wgpu", describe(device));
+        return Err(unknown(name, &message));
+    }
+    Ok(device.clone())
 }
 
 fn is_card(device: &Device) -> bool {
@@ -183,9 +177,9 @@ fn is_card(device: &Device) -> bool {
 
 fn unknown(name: &str, why: &str) -> Failure {
     let mut there = vec!["auto".to_owned(), "cpu (= flex)".into(), "ndarray".into()];
-    for (kind, devices) in gpus().into_iter().map(|(name, kind)| (name, devices(kind))) {
-        let listed = devices.iter().enumerate().map(|(i, d)| format!("{kind}:{i} ({})", describe(d)));
-        there.extend(listed);
+    for (kind, device_type) in gpus() {
+        let devices = devices(device_type).into_iter().enumerate();
+        there.extend(devices.map(|(i, device)| format!("{kind}:{i} ({})", describe(&device))));
     }
     Failure::Input(format!("--device {name}: {why}. Here there are: {}", there.join(", ")))
 }

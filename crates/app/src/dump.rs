@@ -1,4 +1,4 @@
-//! `--dump`: every intermediate tensor, named and shaped as in the `pipeline` fixture.
+//! `--dump`: every intermediate tensor, with the names and shapes of the `pipeline` fixture.
 
 use std::path::Path;
 
@@ -14,28 +14,24 @@ use crate::output;
 pub fn write(result: &Reconstruction, path: &Path) -> Result<(), Failure> {
     let [views, height, width, _] = result.maps.points.dims();
     let g = &result.gaussians;
-    let mut tensors = Vec::new();
-    let mut push = |name: &str, dtype: Dtype, shape: Vec<usize>, bytes: Vec<u8>| {
-        tensors.push((name.to_owned(), dtype, shape, bytes));
-    };
     let float = Dtype::F32;
-    push("points", float, vec![views, height, width, 3], bytes(&result.maps.points));
-    push("conf", float, vec![views, height, width], bytes(&result.maps.conf));
     let valid = result.valid.iter().flatten().map(|v| u8::from(*v)).collect();
-    push("valid", Dtype::U8, vec![views, height, width], valid);
+    let mut tensors = vec![
+        ("points", float, vec![views, height, width, 3], bytes(&result.maps.points)),
+        ("conf", float, vec![views, height, width], bytes(&result.maps.conf)),
+        ("valid", Dtype::U8, vec![views, height, width], valid),
+        ("means", float, g.means.dims().to_vec(), bytes(&g.means)),
+        ("opacity", float, vec![g.len(), 1], bytes(&g.opacities)),
+        ("scale", float, g.scales.dims().to_vec(), bytes(&g.scales)),
+        ("rotation", float, g.rotations.dims().to_vec(), bytes(&g.rotations)),
+        ("rgb", float, g.colors.dims().to_vec(), bytes(&g.colors)),
+    ];
     if !result.side_images.is_empty() {
         let values = result.side_images.iter().flatten().flat_map(|v| v.to_le_bytes()).collect();
-        push("side_images", float, vec![result.side_images.len(), 3, height, width], values);
+        tensors.push(("side_images", float, vec![result.side_images.len(), 3, height, width], values));
     }
-    push("means", float, g.means.dims().to_vec(), bytes(&g.means));
-    push("opacity", float, vec![g.len(), 1], bytes(&g.opacities));
-    push("scale", float, g.scales.dims().to_vec(), bytes(&g.scales));
-    push("rotation", float, g.rotations.dims().to_vec(), bytes(&g.rotations));
-    push("rgb", float, g.colors.dims().to_vec(), bytes(&g.colors));
-
     let views = tensors.iter().map(|(name, dtype, shape, bytes)| {
-        let view = TensorView::new(*dtype, shape.clone(), bytes).expect("as many bytes as the shape says");
-        (name.as_str(), view)
+        (name, TensorView::new(*dtype, shape.clone(), bytes).expect("the size of the shape"))
     });
     let file = safetensors::serialize(views, None).expect("valid tensors");
     output::write(path, &file)

@@ -1,4 +1,4 @@
-//! How a command fails: bad input (exit code 2) or everything else (exit code 1).
+//! Failures of commands: bad input (exit code 2) or other errors (exit code 1).
 
 use std::fmt;
 use std::io;
@@ -16,23 +16,36 @@ use snapsnap_train::TrainError;
 /// A failed command.
 #[derive(Debug)]
 pub enum Failure {
-    /// The user can mend it: a path, a file's content, a config, a device.
+    /// An error that the user can correct: a path, a file's content, a config, a device.
     Input(String),
-    /// The user cannot.
+    /// Any other error.
     Internal(String),
 }
 
+/// Returns [`Failure::Input`] with a formatted message.
+macro_rules! bail {
+    ($($argument:tt)*) => {
+        return Err($crate::failure::Failure::Input(format!($($argument)*)))
+    };
+}
+pub(crate) use bail;
+
 impl Failure {
-    /// The operating system refused to write this file.
-    pub fn cannot_write(path: &Path, e: &io::Error) -> Self {
-        Self::Input(format!("{}: cannot write: {e}", path.display()))
+    /// An error of the user's that concerns this file or folder.
+    pub fn file(path: &Path, message: impl fmt::Display) -> Self {
+        Self::Input(format!("{}: {message}", path.display()))
     }
 
-    /// With the file that it is about.
+    /// The operating system refused to write this file.
+    pub fn cannot_write(path: &Path, e: &io::Error) -> Self {
+        Self::file(path, format_args!("cannot write: {e}"))
+    }
+
+    /// The same message after the name of a file.
     pub fn about(self, path: &Path) -> Self {
         match self {
-            Self::Input(said) => Self::Input(format!("{}: {said}", path.display())),
-            Self::Internal(said) => Self::Internal(format!("{}: {said}", path.display())),
+            Self::Input(message) => Self::file(path, message),
+            Self::Internal(message) => Self::Internal(format!("{}: {message}", path.display())),
         }
     }
 

@@ -1,4 +1,4 @@
-//! Ctrl-C: most commands end at once and leave nothing half-written; a training first writes down where it is.
+//! Ctrl-C. Most commands end at once, without temporary files. A training saves its state first.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -6,23 +6,22 @@ use snapsnap_base::file;
 
 use crate::say;
 
-/// Whether the command ends by itself once it is asked to.
+/// Whether the command ends itself after the first Ctrl-C.
 static PATIENT: AtomicBool = AtomicBool::new(false);
-/// Whether it was asked to.
+/// Whether the command must end itself.
 static STOP: AtomicBool = AtomicBool::new(false);
-
-/// Whether being ended from outside is how the command ends.
+/// Whether Ctrl-C is the normal end of the command.
 static WELL: AtomicBool = AtomicBool::new(false);
 
-/// Listens to Ctrl-C and to the signal that ends programs.
+/// Installs the handler of Ctrl-C and of termination signals.
 pub fn listen() {
     let handler = ctrlc::set_handler(|| {
         if PATIENT.load(Ordering::Relaxed) && !STOP.swap(true, Ordering::Relaxed) {
             say::err("stopping after this step; once more ends it at once");
             return;
         }
-        // 130 as shells expect, and no temporary file stays behind.
         file::remove_unfinished();
+        // 130 is the convention of shells for an interrupted command.
         std::process::exit(if WELL.load(Ordering::Relaxed) { 0 } else { 130 });
     });
     if let Err(e) = handler {
@@ -30,13 +29,13 @@ pub fn listen() {
     }
 }
 
-/// From now on the first Ctrl-C sets the flag that is returned instead of ending the program.
+/// From now on the first Ctrl-C sets the returned flag instead of ending the program.
 pub fn patiently() -> &'static AtomicBool {
     PATIENT.store(true, Ordering::Relaxed);
     &STOP
 }
 
-/// From now on Ctrl-C is how the command ends, and no failure.
+/// From now on Ctrl-C ends the program with exit code 0.
 pub fn end_well() {
     WELL.store(true, Ordering::Relaxed);
 }

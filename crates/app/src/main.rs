@@ -1,9 +1,9 @@
-//! snapsnap turns two photographs of a person into 3D Gaussians. This crate is its command line, one file per subcommand.
+//! snapsnap turns two photographs of a person into 3D Gaussians. This crate is its command line.
 //!
 //! The other crates are libraries. [`snapsnap_net::Reconstructor`] turns photographs into Gaussians. [`snapsnap_splat::render`]
 //! is the differentiable renderer. [`snapsnap_train::points`] has the losses of stage 1. The folder `examples` of the
 //! repository has a program for each: `cargo run --release --example reconstruct`, `fit_gaussians` or `train_predictor`.
-// Only rustdoc reads the page, so that a change of it builds nothing.
+// The page is part of the documentation only. A change of it does not rebuild the program.
 #![cfg_attr(doc, doc = "\n", doc = include_str!("../../../docs/architecture.md"))]
 
 mod commands;
@@ -27,8 +27,8 @@ use std::process::ExitCode;
 
 use clap::{CommandFactory, Parser, Subcommand};
 
-/// Large tensors are allocated and freed on every operation; mimalloc keeps their pages, the system allocator returns
-/// them to the kernel and faults them in again.
+/// Every operation allocates and frees large tensors. mimalloc keeps their pages, while the system allocator returns them to the
+/// kernel and causes page faults.
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
@@ -55,7 +55,7 @@ struct Arguments {
 
 #[derive(Subcommand)]
 enum Command {
-    /// The sample pair that comes with the program: Gaussians, pictures and a report.
+    /// Gaussians, pictures and a report of the program's sample pair.
     #[command(after_help = "Example: snapsnap demo")]
     Demo(commands::demo::Arguments),
     /// Turn a front and a back photograph into a Gaussian PLY.
@@ -66,7 +66,7 @@ enum Command {
     /// Render a Gaussian PLY into pictures.
     #[command(after_help = "Example: snapsnap render human.ply --orbit 12 --size 1024x1024 -o renders")]
     Render(commands::render::Arguments),
-    /// Look at a file of Gaussians in the browser.
+    /// Show a file of Gaussians in the browser.
     #[command(after_help = "Example: snapsnap view human.ply --open")]
     View(commands::view::Arguments),
     /// Make one closed surface of Gaussians: a mesh for modelling programs and game engines.
@@ -86,26 +86,26 @@ enum Command {
         after_help = "Example: snapsnap train-stage1 --config configs/tiny/stage1.toml --data people/synth -o runs/points"
     )]
     TrainStage1(commands::train::Arguments),
-    /// Train the Gaussian regressor on what a trained point predictor gives.
+    /// Train the Gaussian regressor on the output of a trained point predictor.
     #[command(
         name = "train-stage2",
         after_help = "Example: snapsnap train-stage2 --config configs/tiny/stage2.toml --data people/synth --weights runs/points/best.safetensors -o runs/human"
     )]
     TrainStage2(commands::train::Arguments),
-    /// Judge a model on a data set, beside baselines and others.
+    /// Evaluate a model on a data set, beside baselines and other models.
     #[command(
         after_help = "Example: snapsnap evaluate --config configs/eval.toml --data people/test -o reports/human"
     )]
     Evaluate(commands::evaluate::Arguments),
-    /// Error against run time: a model in different settings.
+    /// Measure error and run time of a model in different settings.
     #[command(
         after_help = "Example: snapsnap bench --config configs/bench.toml --data people/test -o reports/bench"
     )]
     Bench(commands::bench::Arguments),
-    /// Extreme and degenerate inputs on every device, and what must hold of them.
+    /// Check the results of extreme and degenerate inputs on every device.
     #[command(after_help = "Example: snapsnap stability -o reports/stability")]
     Stability(commands::stability::Arguments),
-    /// How alike two pictures are, or two folders of pictures: PSNR, SSIM, LPIPS.
+    /// Compare two pictures, or two folders of pictures: PSNR, SSIM, LPIPS.
     #[command(after_help = "Example: snapsnap compare a.png b.png")]
     Compare(commands::compare::Arguments),
     /// Fetch published weights: DUSt3R, and AlexNet and the learned layers of LPIPS.
@@ -113,15 +113,15 @@ enum Command {
     FetchWeights(commands::fetch_weights::Arguments),
     /// Read checkpoints of Snap-Snap, DUSt3R or CroCo and write one weight file.
     #[command(after_help = "Example: snapsnap import-weights stage1.pth stage2.pth -o weights.safetensors")]
-    ImportWeights(commands::import_weights::Arguments),
+    ImportWeights(commands::weight_files::ImportArguments),
     /// Write random weights for a config.
     #[command(
         after_help = "Example: snapsnap init-weights --config configs/tiny.toml --seed 1 -o random.safetensors"
     )]
-    InitWeights(commands::init_weights::Arguments),
+    InitWeights(commands::weight_files::InitArguments),
     /// Write a weight file back in the authors' layout.
     #[command(after_help = "Example: snapsnap export-weights weights.safetensors -o authors.safetensors")]
-    ExportWeights(commands::export_weights::Arguments),
+    ExportWeights(commands::weight_files::ExportArguments),
     /// List devices, features, weights and missing parts, each with its remedy.
     #[command(after_help = "Example: snapsnap doctor --json")]
     Doctor(commands::doctor::Arguments),
@@ -136,7 +136,7 @@ enum Command {
 }
 
 fn main() -> ExitCode {
-    // A library that panics on a damaged file is an error of that file's, which is reported as such.
+    // Panics of libraries on damaged files become errors, which are reported without this hook.
     let hook = std::panic::take_hook();
     std::panic::set_hook(Box::new(move |panic| {
         if !snapsnap_base::is_guarded() {
@@ -146,38 +146,39 @@ fn main() -> ExitCode {
     interrupt::listen();
     let Arguments { quiet, command } = match Arguments::try_parse() {
         Ok(arguments) => arguments,
-        // clap prints usage errors and help itself, with exit codes 2 and 0, but arguments as they are.
         Err(e) => {
+            // clap prints usage errors and help with exit codes 2 and 0, but does not escape control characters.
             let mut arguments = std::env::args_os().map(|argument| argument.to_string_lossy().into_owned());
             if arguments.all(|argument| say::printable(&argument) == argument) {
                 e.exit();
             }
             let say = if e.use_stderr() { say::err } else { say::out };
             say(e.to_string().trim_end());
-            return if e.use_stderr() { ExitCode::from(2) } else { ExitCode::SUCCESS };
+            return ExitCode::from(e.exit_code() as u8);
         }
     };
+    say::set_quiet(quiet);
     let result = match command {
-        Command::Demo(arguments) => commands::demo::run(&arguments, quiet),
-        Command::Reconstruct(arguments) => commands::reconstruct::run(&arguments, quiet),
-        Command::Render(arguments) => commands::render::run(&arguments, quiet),
-        Command::View(arguments) => commands::view::run(&arguments, quiet),
-        Command::Mesh(arguments) => commands::mesh::run(&arguments, quiet),
-        Command::Convert(arguments) => commands::convert::run(&arguments, quiet),
-        Command::Prepare(arguments) => commands::prepare::run(&arguments, quiet),
-        Command::TrainStage1(arguments) => commands::train::stage1(&arguments, quiet),
-        Command::TrainStage2(arguments) => commands::train::stage2(&arguments, quiet),
-        Command::Evaluate(arguments) => commands::evaluate::run(&arguments, quiet),
-        Command::Bench(arguments) => commands::bench::run(&arguments, quiet),
-        Command::Stability(arguments) => commands::stability::run(&arguments, quiet),
+        Command::Demo(arguments) => commands::demo::run(&arguments),
+        Command::Reconstruct(arguments) => commands::reconstruct::run(&arguments),
+        Command::Render(arguments) => commands::render::run(&arguments),
+        Command::View(arguments) => commands::view::run(&arguments),
+        Command::Mesh(arguments) => commands::mesh::run(&arguments),
+        Command::Convert(arguments) => commands::convert::run(&arguments),
+        Command::Prepare(arguments) => commands::prepare::run(&arguments),
+        Command::TrainStage1(arguments) => commands::train::stage1(&arguments),
+        Command::TrainStage2(arguments) => commands::train::stage2(&arguments),
+        Command::Evaluate(arguments) => commands::evaluate::run(&arguments),
+        Command::Bench(arguments) => commands::bench::run(&arguments),
+        Command::Stability(arguments) => commands::stability::run(&arguments),
         Command::Compare(arguments) => commands::compare::run(&arguments),
-        Command::FetchWeights(arguments) => commands::fetch_weights::run(&arguments, quiet),
-        Command::ImportWeights(arguments) => commands::import_weights::run(&arguments, quiet),
-        Command::InitWeights(arguments) => commands::init_weights::run(&arguments, quiet),
-        Command::ExportWeights(arguments) => commands::export_weights::run(&arguments, quiet),
+        Command::FetchWeights(arguments) => commands::fetch_weights::run(&arguments),
+        Command::ImportWeights(arguments) => commands::weight_files::import(&arguments),
+        Command::InitWeights(arguments) => commands::weight_files::init(&arguments),
+        Command::ExportWeights(arguments) => commands::weight_files::export(&arguments),
         Command::Doctor(arguments) => commands::doctor::run(&arguments),
         Command::Completions(arguments) => commands::manuals::completions(&arguments, Arguments::command()),
-        Command::Man(arguments) => commands::manuals::pages(&arguments, Arguments::command(), quiet),
+        Command::Man(arguments) => commands::manuals::pages(&arguments, Arguments::command()),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

@@ -1,4 +1,4 @@
-//! How much memory there is, so that what cannot fit is refused before any work instead of ending in an abort.
+//! Limits and use of memory. Work that cannot fit is refused instead of aborted.
 
 use std::fs;
 
@@ -8,28 +8,24 @@ use sysinfo::{MemoryRefreshKind, RefreshKind, System};
 
 use crate::failure::Failure;
 
-/// Refuses work on the CPU that needs more bytes than this process can ever get; `what` and `mend` say what it is and
-/// how it needs less.
+/// Refuses work on the CPU that needs more bytes than this process can have. The message contains the work (`what`) and
+/// the remedy (`mend`).
 pub fn check(what: &str, needed: u64, mend: &str) -> Result<(), Failure> {
     let there = there();
     if needed <= there {
         return Ok(());
     }
-    let gigabytes = |bytes: u64| bytes as f64 / 1e9;
-    let message = format!(
-        "{what} needs {:.1} GB of memory, this machine has {:.1} GB: {mend}",
-        gigabytes(needed),
-        gigabytes(there)
-    );
+    let [needed, there] = [needed, there].map(|bytes| bytes as f64 / 1e9);
+    let message = format!("{what} needs {needed:.1} GB of memory, this machine has {there:.1} GB: {mend}");
     Err(Failure::Input(message))
 }
 
-/// Whether the device is the processor, whose memory is the machine's.
+/// Whether the device is the CPU, which uses the machine's memory.
 pub fn is_cpu(device: &Device) -> bool {
     device.identity().is_none()
 }
 
-/// Refuses networks whose canvas this process can never compute on the CPU.
+/// Refuses networks that need more memory on the CPU than this process can have.
 pub fn check_networks(weights: &WeightFile, device: &Device) -> Result<(), Failure> {
     if !is_cpu(device) {
         return Ok(());
@@ -38,23 +34,23 @@ pub fn check_networks(weights: &WeightFile, device: &Device) -> Result<(), Failu
     check(&what, weights.config.memory_needed(weights.parameters()), "choose a smaller `network.resolution`")
 }
 
-/// Bytes that the machine has, or, where that is less, that this process is allowed.
+/// Memory of the machine in bytes, or the limit of this process if it is smaller.
 pub fn there() -> u64 {
     let memory = RefreshKind::nothing().with_memory(MemoryRefreshKind::everything());
     let system = System::new_with_specifics(memory);
-    // 0 where the system is not known.
+    // 0 on unknown systems.
     let total =
         Some(system.total_memory() + system.total_swap()).filter(|bytes| *bytes > 0).unwrap_or(u64::MAX);
     let group = system.cgroup_limits().map_or(u64::MAX, |limits| limits.total_memory);
     total.min(group).min(address_space().unwrap_or(u64::MAX))
 }
 
-/// Bytes that this process has at the moment, where the system tells.
+/// Current memory of this process in bytes, on Linux.
 pub fn used() -> Option<u64> {
     status("VmRSS")
 }
 
-/// Bytes that this process had at most, where the system tells.
+/// Largest memory of this process so far in bytes, on Linux.
 pub fn most_used() -> Option<u64> {
     status("VmHWM")
 }

@@ -1,6 +1,7 @@
-//! Files that a command writes.
+//! Output files and folders.
 
-use std::io::Write;
+use std::fs;
+use std::io::{ErrorKind, Write};
 use std::path::Path;
 
 use snapsnap_base::file::write_whole;
@@ -10,4 +11,17 @@ use crate::failure::Failure;
 /// Writes a file, whole or not at all.
 pub fn write(path: &Path, bytes: &[u8]) -> Result<(), Failure> {
     write_whole(path, |out| out.write_all(bytes)).map_err(|e| Failure::cannot_write(path, &e))
+}
+
+/// Removes a file unless it is missing.
+pub fn remove(path: &Path) -> Result<(), Failure> {
+    match fs::remove_file(path) {
+        Err(e) if e.kind() != ErrorKind::NotFound => Err(Failure::cannot_write(path, &e)),
+        _ => Ok(()),
+    }
+}
+
+/// Makes a folder and its parents unless they exist.
+pub fn make_folder(path: &Path) -> Result<(), Failure> {
+    fs::create_dir_all(path).map_err(|e| Failure::file(path, format_args!("cannot make this folder: {e}")))
 }

@@ -15,38 +15,24 @@ pub const FOLDER: &str = "weights";
 pub struct Arguments {
     /// Folder with the published weights of AlexNet and LPIPS, as `cargo xtask fetch-weights` makes it, or weight files
     /// of your own [default: weights].
-    #[arg(long, value_name = "DIR|FILE", num_args = 1..)]
-    lpips: Vec<PathBuf>,
+    #[arg(long = "lpips", value_name = "DIR|FILE", num_args = 1..)]
+    pub files: Vec<PathBuf>,
 }
 
 impl Arguments {
-    /// Files of the command line.
-    pub fn files(&self) -> &[PathBuf] {
-        &self.lpips
-    }
-
-    /// The network on the device of this name, or the reason for its absence. The device is chosen only if there are
-    /// weights.
+    /// The network on the device of this name, or the reason for its absence. The device is chosen only if weights exist.
     ///
     /// # Errors
     /// If weights of the command line are missing, or weights are damaged.
-    pub fn load(&self, device: &str) -> Result<Result<Lpips, String>, Failure> {
-        self.load_or(Path::new(FOLDER), device)
-    }
-
-    /// The same with another default folder.
-    ///
-    /// # Errors
-    /// As [`Self::load`].
-    pub fn load_or(&self, default: &Path, device: &str) -> Result<Result<Lpips, String>, Failure> {
-        let folder = match self.lpips.as_slice() {
+    pub fn load(&self, default: &Path, device: &str) -> Result<Result<Lpips, String>, Failure> {
+        let folder = match self.files.as_slice() {
             [] => default,
             [folder] if folder.is_dir() => folder,
             files => return Ok(Ok(Lpips::load(files, &device::choose(device)?)?)),
         };
         match missing(folder) {
             None => Ok(Ok(Lpips::published(folder, &device::choose(device)?)?)),
-            Some(why) if self.lpips.is_empty() => Ok(Err(why)),
+            Some(why) if self.files.is_empty() => Ok(Err(why)),
             Some(why) => Err(Failure::Input(format!("--lpips: {why}"))),
         }
     }

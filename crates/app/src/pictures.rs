@@ -1,12 +1,11 @@
 //! Rendered views as picture files.
 
-use std::fs;
 use std::path::Path;
 
 use burn::tensor::Tensor;
+use image::buffer::ConvertBuffer;
 use image::codecs::gif::{GifEncoder, Repeat};
-use image::{Delay, Frame, RgbImage, RgbaImage, imageops};
-
+use image::{Delay, Frame, RgbImage, imageops};
 use snapsnap_eval::preview;
 
 use crate::failure::Failure;
@@ -23,7 +22,7 @@ pub fn picture(color: &Tensor<4>) -> Result<RgbImage, Failure> {
     Ok(RgbImage::from_raw(width as u32, height as u32, bytes).expect("three bytes per pixel"))
 }
 
-/// Values of a render on the host.
+/// Values of a render, copied to the host.
 pub fn read_back<const D: usize>(tensor: Tensor<D>) -> Result<Vec<f32>, Failure> {
     let data =
         tensor.try_into_data().map_err(|e| Failure::Internal(format!("reading a picture back: {e:?}")))?;
@@ -39,20 +38,15 @@ pub fn write_png(path: &Path, picture: &RgbImage) -> Result<(), Failure> {
 pub fn write_gif(path: &Path, pictures: &[RgbImage], frames_per_second: u32) -> Result<(), Failure> {
     let mut bytes = Vec::new();
     let mut encoder = GifEncoder::new_with_speed(&mut bytes, GIF_SPEED);
-    encoder.set_repeat(Repeat::Infinite).map_err(|e| failed(path, &e))?;
-    for picture in pictures {
-        let rgba = RgbaImage::from_fn(picture.width(), picture.height(), |x, y| {
-            let [r, g, b] = picture.get_pixel(x, y).0;
-            image::Rgba([r, g, b, 255])
-        });
-        let delay = Delay::from_numer_denom_ms(1000, frames_per_second);
-        encoder.encode_frame(Frame::from_parts(rgba, 0, 0, delay)).map_err(|e| failed(path, &e))?;
-    }
+    let delay = Delay::from_numer_denom_ms(1000, frames_per_second);
+    let frames = pictures.iter().map(|picture| Frame::from_parts(picture.convert(), 0, 0, delay));
+    let encoded = encoder.set_repeat(Repeat::Infinite).and_then(|()| encoder.encode_frames(frames));
+    encoded.map_err(|e| Failure::Internal(format!("{}: cannot encode: {e}", path.display())))?;
     drop(encoder);
     write(path, &bytes)
 }
 
-/// Pictures of one size side by side, so many in a row.
+/// Pictures of one size in rows of `columns`.
 pub fn sheet(pictures: &[RgbImage], columns: u32) -> RgbImage {
     let (width, height) = pictures.first().map_or((0, 0), RgbImage::dimensions);
     let rows = (pictures.len() as u32).div_ceil(columns);
@@ -62,14 +56,4 @@ pub fn sheet(pictures: &[RgbImage], columns: u32) -> RgbImage {
         imageops::replace(&mut sheet, picture, x, y);
     }
     sheet
-}
-
-/// Makes the folder `path` and those around it, unless it is there.
-pub fn make_folder(path: &Path) -> Result<(), Failure> {
-    fs::create_dir_all(path)
-        .map_err(|e| Failure::Input(format!("{}: cannot make this folder: {e}", path.display())))
-}
-
-fn failed(path: &Path, e: &image::ImageError) -> Failure {
-    Failure::Internal(format!("{}: cannot encode: {e}", path.display()))
 }

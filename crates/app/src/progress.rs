@@ -4,12 +4,12 @@ use std::cell::Cell;
 use std::io::IsTerminal;
 use std::time::{Duration, Instant};
 
-use crate::say;
 use indicatif::{ProgressBar, ProgressStyle};
+
+use crate::say;
 
 /// Bytes between two plain lines.
 const LINE_BYTES: u64 = 500_000_000;
-
 /// Plain lines over all steps of a command.
 const LINES: u64 = 10;
 
@@ -23,25 +23,35 @@ pub struct Progress {
 }
 
 impl Progress {
-    /// Named modules one after another.
-    pub fn stages(quiet: bool) -> Self {
-        Self::new(quiet, ProgressBar::new_spinner(), "{spinner} {msg} [{elapsed}]")
+    /// Progress of named modules, one after another.
+    pub fn stages() -> Self {
+        Self::new(ProgressBar::new_spinner(), "{spinner} {msg} [{elapsed}]")
     }
 
-    /// Bytes of a file, with rate and time left.
-    pub fn bytes(quiet: bool) -> Self {
+    /// Progress in bytes of a file, with rate and time left.
+    pub fn bytes() -> Self {
         let template = "{bar:40} {bytes}/{total_bytes} {bytes_per_sec} {eta} left";
-        Self::new(quiet, ProgressBar::new(0), template)
+        Self::new(ProgressBar::new(0), template)
     }
 
-    /// Equal steps of a known number, with rate and time left.
-    pub fn steps(quiet: bool, total: usize, unit: &str) -> Self {
+    /// Progress in equal steps of a known number, with rate and time left.
+    pub fn steps(total: usize, unit: &str) -> Self {
         let template = format!("{{bar:40}} {{pos}}/{{len}} {unit} {{per_sec}} {{eta}} left");
-        Self::new(quiet, ProgressBar::new(total as u64), &template)
+        Self::new(ProgressBar::new(total as u64), &template)
     }
 
-    fn new(quiet: bool, bar: ProgressBar, template: &str) -> Self {
-        let terminal = std::io::stderr().is_terminal();
+    /// Iterates over `items` and counts each as a step when the next one is requested.
+    pub fn over<T>(items: impl ExactSizeIterator<Item = T>, unit: &str) -> impl Iterator<Item = T> {
+        let total = items.len();
+        let progress = Self::steps(total, unit);
+        items.map(Some).chain([None]).enumerate().map_while(move |(done, item)| {
+            progress.step(done, total, unit);
+            item
+        })
+    }
+
+    fn new(bar: ProgressBar, template: &str) -> Self {
+        let (quiet, terminal) = (say::is_quiet(), std::io::stderr().is_terminal());
         let bar = (!quiet && terminal).then(|| {
             bar.set_style(ProgressStyle::with_template(template).expect("a valid template"));
             bar.enable_steady_tick(Duration::from_millis(100));
@@ -50,7 +60,7 @@ impl Progress {
         Self { bar, plain: !quiet && !terminal, reported: Cell::new(0), start: Instant::now() }
     }
 
-    /// A module starts.
+    /// Reports the start of a module.
     pub fn stage(&self, name: &str) {
         if let Some(bar) = &self.bar {
             bar.set_message(name.to_owned());
@@ -59,7 +69,7 @@ impl Progress {
         }
     }
 
-    /// So many steps of so many are done.
+    /// Reports the number of finished steps.
     pub fn step(&self, done: usize, total: usize, unit: &str) {
         let (done, total) = (done as u64, total as u64);
         if let Some(bar) = &self.bar {
@@ -76,7 +86,7 @@ impl Progress {
         }
     }
 
-    /// So many bytes of so many are done.
+    /// Reports the number of finished bytes.
     pub fn advance(&self, done: u64, total: u64) {
         if let Some(bar) = &self.bar {
             bar.set_length(total);

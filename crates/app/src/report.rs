@@ -2,10 +2,8 @@
 
 use std::cell::RefCell;
 use std::fs;
-use std::io;
 use std::path::{Path, PathBuf};
 
-use image::RgbImage;
 use serde_json::Value;
 use snapsnap_base::file;
 use snapsnap_eval::evaluate::LeftOut;
@@ -13,10 +11,10 @@ use snapsnap_eval::report::{Header, today};
 
 use crate::commands::check_outputs;
 use crate::failure::Failure;
-use crate::pictures::{make_folder, write_png};
-use crate::{output, say};
+use crate::output::{self, make_folder};
+use crate::say;
 
-/// Files of the reports of all commands but those that pass their own.
+/// Files of the reports of all commands but `demo`.
 const FILES: &[&str] = &[
     "report.md",
     "config.toml",
@@ -37,7 +35,7 @@ const MOST: u64 = 256 << 20;
 
 /// Files of one report.
 pub struct ReportFolder {
-    path: PathBuf,
+    pub path: PathBuf,
     /// All possible files.
     files: &'static [&'static str],
     is_new: bool,
@@ -45,16 +43,16 @@ pub struct ReportFolder {
 }
 
 impl ReportFolder {
-    /// Makes the folder. Refuses one in which a report's files cannot be written, or would replace one of the `inputs`
-    /// or files that belong to no older report.
+    /// Makes the folder. Refuses folders in which the report's files cannot be written, or would replace one of the `inputs` or a
+    /// file that is not part of an older report.
     pub fn new(path: &Path, inputs: &[&Path]) -> Result<Self, Failure> {
         Self::of(path, FILES, inputs)
     }
 
-    /// The same for a report with other files, the last of which is [`REPORT`].
+    /// [`ReportFolder::new`] for a report with other files, the last of which is [`REPORT`].
     pub fn of(path: &Path, files: &'static [&'static str], inputs: &[&Path]) -> Result<Self, Failure> {
         if path.exists() && !path.is_dir() {
-            return Err(Failure::Input(format!("{}: exists and is no folder", path.display())));
+            return Err(Failure::file(path, "exists and is no folder"));
         }
         let is_new = !path.exists();
         make_folder(path)?;
@@ -63,16 +61,11 @@ impl ReportFolder {
         let there = outputs.iter().find(|file| file.symlink_metadata().is_ok());
         if let Some(file) = there.filter(|_| !is_report(path)) {
             let message = "exists and belongs to no report of this program: give another folder";
-            return Err(Failure::Input(format!("{}: {message}", file.display())));
+            return Err(Failure::file(file, message));
         }
         let outputs: Vec<&Path> = outputs.iter().map(PathBuf::as_path).collect();
         check_outputs(&outputs, inputs)?;
         Ok(folder)
-    }
-
-    /// The folder.
-    pub fn path(&self) -> &Path {
-        &self.path
     }
 
     /// Writes a text unless it is empty.
@@ -83,24 +76,14 @@ impl ReportFolder {
         output::write(&self.file(name), text.as_bytes())
     }
 
-    /// Writes a picture, if there is one.
-    pub fn picture(&self, name: &str, picture: Option<&RgbImage>) -> Result<(), Failure> {
-        picture.map_or(Ok(()), |picture| write_png(&self.file(name), picture))
-    }
-
-    /// Writes the report's JSON, and removes files of an older report that this one does not have.
+    /// Writes the report's JSON, and removes files that only an older report contained.
     pub fn finish(&self, value: &Value) -> Result<(), Failure> {
         let text = serde_json::to_string_pretty(value).expect("a value") + "\n";
         self.text(REPORT, &text)?;
         let written = self.written.borrow();
         for name in self.files.iter().filter(|name| !written.iter().any(|file| file == *name)) {
             let path = self.path.join(name);
-            match fs::remove_file(&path) {
-                Err(e) if e.kind() != io::ErrorKind::NotFound => {
-                    return Err(Failure::cannot_write(&path, &e));
-                }
-                _ => {}
-            }
+            output::remove(&path)?;
         }
         Ok(())
     }
@@ -135,8 +118,15 @@ pub fn complete(left_out: &[LeftOut], rest: &str) -> Result<(), Failure> {
     if left_out.is_empty() {
         return Ok(());
     }
-    left_out.iter().for_each(|l| say::err(&format!("left out: {}: {}", l.name, l.why)));
+    print_left_out(left_out);
     Err(Failure::Internal(format!("{} left out, {rest}", left_out.len())))
+}
+
+/// Prints the failed parts of a command.
+pub fn print_left_out(left_out: &[LeftOut]) {
+    for LeftOut { name, why, .. } in left_out {
+        say::err(&format!("left out: {name}: {why}"));
+    }
 }
 
 /// The error of a command without any successful part.

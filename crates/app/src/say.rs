@@ -1,9 +1,44 @@
-//! Printing that never fails: a closed pipe or a full disk on the other end is no reason to lose a result. What files are
-//! called and what they hold reaches the terminal as text, never as a command to it.
+//! Messages on stdout and stderr. Control characters in names and contents of files are escaped, since a terminal would obey
+//! them. Only [`lines`], [`json`] and [`result`] can fail.
 
 use std::io::{ErrorKind, Write};
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use snapsnap_base::file;
 
 use crate::failure::Failure;
+
+static QUIET: AtomicBool = AtomicBool::new(false);
+
+/// Sets --quiet, with which [`info`], [`note`] and progress print nothing.
+pub fn set_quiet(quiet: bool) {
+    QUIET.store(quiet, Ordering::Relaxed);
+}
+
+/// Whether --quiet is given.
+pub fn is_quiet() -> bool {
+    QUIET.load(Ordering::Relaxed)
+}
+
+/// A line on stdout unless --quiet is given.
+pub fn info(line: &str) {
+    if !is_quiet() {
+        out(line);
+    }
+}
+
+/// A line on stderr unless --quiet is given.
+pub fn note(line: &str) {
+    if !is_quiet() {
+        err(line);
+    }
+}
+
+/// [`out`], or [`err`] if the output file is a pipe or a device, whose data messages must not enter.
+pub fn beside(output: &Path) -> fn(&str) {
+    if file::is_special(output) { err } else { out }
+}
 
 /// A line on stdout.
 pub fn out(line: &str) {
@@ -15,12 +50,12 @@ pub fn err(line: &str) {
     let _ = writeln!(std::io::stderr(), "{}", printable(line));
 }
 
-/// Lines on stdout that are all of the command's result.
+/// Writes the result of a command, as lines, to stdout.
 pub fn lines(text: &str) -> Result<(), Failure> {
     result(format!("{}\n", printable(text)).as_bytes())
 }
 
-/// The same as JSON, in which only strings have control characters.
+/// Writes the result of a command, as JSON, to stdout. Only strings contain control characters.
 pub fn json(text: &str) -> Result<(), Failure> {
     let escaped = |c: char| match c {
         c if c.is_control() && c != '\n' => format!("\\u{:04x}", u32::from(c)),
@@ -29,7 +64,7 @@ pub fn json(text: &str) -> Result<(), Failure> {
     result(text.chars().map(escaped).chain(["\n".into()]).collect::<String>().as_bytes())
 }
 
-/// Writes the whole result of a command to stdout, unchanged. A full disk is an error; a reader that closes the pipe is none.
+/// Writes the result of a command, unchanged, to stdout. A full disk is an error, a closed pipe is not.
 pub fn result(text: &[u8]) -> Result<(), Failure> {
     let mut stdout = std::io::stdout();
     match stdout.write_all(text).and_then(|()| stdout.flush()) {
@@ -40,15 +75,16 @@ pub fn result(text: &[u8]) -> Result<(), Failure> {
     }
 }
 
-/// The text with control characters written out; line breaks and tabs stay.
+/// The text with escaped control characters, but for line breaks and tabs.
 pub fn printable(text: &str) -> String {
-    let is_plain = |c: char| !c.is_control() || c == '\n' || c == '\t';
-    text.chars()
-        .flat_map(|c| {
-            let plain = is_plain(c).then_some(c);
-            plain.into_iter().chain((!is_plain(c)).then(|| c.escape_default()).into_iter().flatten())
-        })
-        .collect()
+    let mut printable = String::with_capacity(text.len());
+    for c in text.chars() {
+        match c {
+            c if c.is_control() && c != '\n' && c != '\t' => printable.extend(c.escape_default()),
+            c => printable.push(c),
+        }
+    }
+    printable
 }
 
 #[cfg(test)]
@@ -56,7 +92,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn control_characters_are_written_out() {
+    fn control_characters_are_escaped() {
         assert_eq!(printable("\x1b[31mrot\r\u{9b}\n\tünd"), "\\u{1b}[31mrot\\r\\u{9b}\n\tünd");
     }
 }

@@ -1,5 +1,4 @@
-//! A small web server for this machine alone: GET and HEAD, one request a connection. Whatever a client sends or leaves out, it
-//! costs a bounded time and memory.
+//! A small web server for local clients, with one request per connection. Time and memory of a connection are bounded.
 
 use std::borrow::Cow;
 use std::io::{self, Read, Write};
@@ -8,41 +7,43 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
-/// Most connections at once; more are closed.
+use ureq::http::StatusCode;
+
+/// Largest number of simultaneous connections. Further ones are closed.
 const CONNECTIONS: usize = 64;
-/// Longest request line with headers, bytes.
+/// Largest size of a request line with headers, in bytes.
 const LONGEST: usize = 16 << 10;
-/// Most headers.
+/// Largest number of headers.
 const HEADERS: usize = 64;
-/// A request must be there after so long.
+/// Time limit of a request.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// A client that takes nothing for so long is gone.
+/// Time limit of each write.
 const STALLED: Duration = Duration::from_secs(20);
 
 /// A request.
 pub struct Request {
-    /// The path, without what follows `?` or `#`.
+    /// The path, without query and fragment.
     pub path: String,
-    /// The one `Host` header.
+    /// The `Host` header.
     pub host: Option<String>,
-    /// GET, or whatever else it is.
+    /// The method, for example GET.
     pub method: String,
 }
 
 /// An answer.
 pub struct Answer {
-    pub status: u16,
+    pub status: StatusCode,
     pub headers: Vec<(&'static str, String)>,
     pub content: Cow<'static, [u8]>,
 }
 
-/// Answers requests for ever.
+/// Answers requests until the program ends.
 pub fn serve(listener: &TcpListener, answer: &(dyn Fn(&Request) -> Answer + Sync)) -> ! {
     let open = AtomicUsize::new(0);
     thread::scope(|scope| {
         loop {
             let Ok((stream, _)) = listener.accept() else {
-                // A client that is gone already, or no file descriptor left: both pass.
+                // The client has left, or no file descriptor is free. Both are temporary.
                 thread::sleep(Duration::from_millis(50));
                 continue;
             };
@@ -52,7 +53,7 @@ pub fn serve(listener: &TcpListener, answer: &(dyn Fn(&Request) -> Answer + Sync
                 continue;
             }
             let connection = move || {
-                // A connection that breaks is the client's business.
+                // Errors of a connection concern only its client.
                 let _ = converse(stream, answer);
                 open.fetch_sub(1, Ordering::Relaxed);
             };
@@ -70,8 +71,8 @@ fn converse(mut stream: TcpStream, answer: &dyn Fn(&Request) -> Answer) -> io::R
         Err((status, why)) => (false, Answer { status, headers: Vec::new(), content: why.as_bytes().into() }),
     };
     let Answer { status, headers, content } = answered;
-    let mut head = format!("HTTP/1.1 {status} {}\r\nConnection: close\r\n", reason(status));
-    head += &format!("Content-Length: {}\r\n", content.len());
+    let length = content.len();
+    let mut head = format!("HTTP/1.1 {status}\r\nConnection: close\r\nContent-Length: {length}\r\n");
     headers.iter().for_each(|(name, value)| head += &format!("{name}: {value}\r\n"));
     head += "\r\n";
     stream.write_all(head.as_bytes())?;
@@ -79,7 +80,7 @@ fn converse(mut stream: TcpStream, answer: &dyn Fn(&Request) -> Answer) -> io::R
         stream.write_all(&content)?;
     }
     drop(content);
-    // The rest of the request is read for a moment: after an immediate close, the client might lose the answer.
+    // After an immediate close the client might lose the answer. Hence the rest of the request is read first.
     stream.shutdown(Shutdown::Write)?;
     stream.set_read_timeout(Some(Duration::from_millis(500)))?;
     let end = Instant::now() + Duration::from_secs(2);
@@ -88,8 +89,11 @@ fn converse(mut stream: TcpStream, answer: &dyn Fn(&Request) -> Answer) -> io::R
     Ok(())
 }
 
-/// Reads a request's head, or says with which status it is refused.
-fn request(stream: &mut TcpStream) -> io::Result<Result<Request, (u16, &'static str)>> {
+/// Status and message of a refused request.
+type Refusal = (StatusCode, &'static str);
+
+/// Reads a request line and its headers.
+fn request(stream: &mut TcpStream) -> io::Result<Result<Request, Refusal>> {
     let end = Instant::now() + PATIENCE;
     let mut bytes = Vec::new();
     let mut part = [0; 2048];
@@ -107,40 +111,26 @@ fn request(stream: &mut TcpStream) -> io::Result<Result<Request, (u16, &'static 
         let mut headers = [httparse::EMPTY_HEADER; HEADERS];
         let mut parsed = httparse::Request::new(&mut headers);
         match parsed.parse(&bytes) {
-            Ok(httparse::Status::Complete(_)) => return Ok(understood(&parsed)),
+            Ok(httparse::Status::Complete(_)) => return Ok(checked(&parsed)),
             Ok(httparse::Status::Partial) if bytes.len() < LONGEST => {}
             Ok(httparse::Status::Partial) | Err(httparse::Error::TooManyHeaders) => {
-                return Ok(Err((431, "too long a request")));
+                return Ok(Err((StatusCode::REQUEST_HEADER_FIELDS_TOO_LARGE, "too long a request")));
             }
-            Err(_) => return Ok(Err((400, "no HTTP request"))),
+            Err(_) => return Ok(Err((StatusCode::BAD_REQUEST, "no HTTP request"))),
         }
     }
 }
 
-fn understood(parsed: &httparse::Request) -> Result<Request, (u16, &'static str)> {
+fn checked(parsed: &httparse::Request) -> Result<Request, Refusal> {
     let mut hosts = parsed.headers.iter().filter(|header| header.name.eq_ignore_ascii_case("host"));
     let host = hosts.next().map(|header| String::from_utf8_lossy(header.value).into_owned());
     if hosts.next().is_some() {
-        return Err((400, "two Host headers"));
+        return Err((StatusCode::BAD_REQUEST, "two Host headers"));
     }
     let target = parsed.path.unwrap_or_default();
-    // As proxies are asked.
+    // Requests to proxies contain the whole address.
     let path =
         target.strip_prefix("http://").map_or(target, |rest| rest.find('/').map_or("/", |at| &rest[at..]));
     let path = path.split(['?', '#']).next().unwrap_or_default().to_owned();
     Ok(Request { path, host, method: parsed.method.unwrap_or_default().to_owned() })
-}
-
-fn reason(status: u16) -> &'static str {
-    match status {
-        200 => "OK",
-        400 => "Bad Request",
-        403 => "Forbidden",
-        404 => "Not Found",
-        405 => "Method Not Allowed",
-        422 => "Unprocessable Content",
-        431 => "Request Header Fields Too Large",
-        503 => "Service Unavailable",
-        _ => "",
-    }
 }

@@ -1,77 +1,68 @@
-//! A folder of rendered views: `000.png`, `001.png`, … and the `cameras.json` that they were seen from.
+//! A folder of rendered views: `000.png`, `001.png`, … and their cameras, `cameras.json`.
 
-use std::fs;
-use std::io;
 use std::path::{Path, PathBuf};
 
 use image::RgbImage;
 use snapsnap_base::file;
 use snapsnap_splat::{Camera, cameras};
 
-use crate::commands::is_same_file;
+use crate::commands::{is_same_file, place};
 use crate::failure::Failure;
-use crate::pictures::{make_folder, write_png};
+use crate::output::{make_folder, remove};
+use crate::pictures::write_png;
 
-/// Name of the cameras beside the pictures.
+/// Name of the file of cameras.
 const CAMERAS: &str = "cameras.json";
 
-/// A folder that so many views are to be written into.
+/// An output folder of a number of views.
 pub struct ViewFolder {
-    path: PathBuf,
+    pub path: PathBuf,
     views: usize,
-    /// The cameras beside the pictures are an input, and stay as they are.
+    /// The folder's cameras are an input of the command and are not replaced.
     keeps_cameras: bool,
 }
 
 impl ViewFolder {
-    /// Refuses a path that is no folder or that nothing can be written into; `given` are the cameras that the command was
-    /// given.
+    /// Refuses paths that are no writable folder. `given` is the file of the command's cameras.
     pub fn new(path: &Path, views: usize, given: Option<&Path>) -> Result<Self, Failure> {
         if path.exists() && !path.is_dir() {
-            return Err(Failure::Input(format!("{}: exists and is no folder", path.display())));
+            return Err(Failure::file(path, "exists and is no folder"));
         }
-        check_writable(path).map_err(|e| Failure::cannot_write(path, &e))?;
+        let existing = path.ancestors().find(|path| path.exists()).unwrap_or(Path::new("."));
+        tempfile::tempfile_in(existing).map_err(|e| Failure::cannot_write(path, &e))?;
         let keeps_cameras = given.is_some_and(|given| is_same_file(given, &path.join(CAMERAS)));
         Ok(Self { path: path.to_owned(), views, keeps_cameras })
     }
 
-    /// The folder.
-    pub fn path(&self) -> &Path {
-        &self.path
-    }
-
+    /// Names of the files that will be written.
     fn names(&self) -> impl Iterator<Item = String> {
         let cameras = (!self.keeps_cameras).then(|| CAMERAS.to_owned());
         (0..self.views).map(name).chain(cameras)
     }
 
-    /// Files that are there already and will be replaced; a folder that is yet to be made holds nothing to lose.
+    /// Existing files that will be replaced.
     pub fn replaced(&self) -> Vec<PathBuf> {
         self.names().map(|name| self.path.join(name)).filter(|path| path.symlink_metadata().is_ok()).collect()
     }
 
-    /// Refuses another output that would be one of these files.
+    /// Refuses another output with the path of one of the files.
     pub fn check_apart(&self, other: &Path) -> Result<(), Failure> {
-        let parent = other.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
         let name = other.file_name().unwrap_or_default().to_string_lossy();
-        if is_same_folder(parent, &self.path) && (name == CAMERAS || self.names().any(|own| own == name)) {
-            return Err(Failure::Input(format!("{}: is given for two outputs", other.display())));
+        let is_taken = name == CAMERAS || self.names().any(|own| own == name);
+        if is_taken && place(other) == place(&self.path.join(&*name)) {
+            return Err(Failure::file(other, "is given for two outputs"));
         }
         Ok(())
     }
 
-    /// Makes the folder. Where there are cameras, there are all of their pictures: those of an older render go first.
+    /// Makes the folder. Removes older cameras, since a folder with cameras must contain all of their pictures.
     pub fn begin(&self) -> Result<(), Failure> {
         make_folder(&self.path)?;
         if self.keeps_cameras {
             return Ok(());
         }
-        // A link stays, as it does when it is written through.
-        let path = file::target_of(&self.path.join(CAMERAS));
-        match fs::remove_file(&path) {
-            Err(e) if e.kind() != io::ErrorKind::NotFound => Err(Failure::cannot_write(&path, &e)),
-            _ => Ok(()),
-        }
+        // A link to the file stays.
+        remove(&file::target_of(&self.path.join(CAMERAS)))
     }
 
     /// Writes one view.
@@ -79,7 +70,7 @@ impl ViewFolder {
         write_png(&self.path.join(name(view)), picture)
     }
 
-    /// Writes the cameras, when all pictures are there.
+    /// Writes the cameras, after all pictures.
     pub fn finish(&self, views: &[Camera]) -> Result<(), Failure> {
         if self.keeps_cameras {
             return Ok(());
@@ -91,24 +82,4 @@ impl ViewFolder {
 /// Name of a view's picture.
 fn name(view: usize) -> String {
     format!("{view:03}.png")
-}
-
-/// Whether files can be made in the folder, or, if it is yet to be made, in the nearest one around it.
-fn check_writable(folder: &Path) -> io::Result<()> {
-    let there = folder.ancestors().find(|path| path.exists()).unwrap_or(Path::new("."));
-    if !there.is_dir() {
-        return Err(io::Error::new(
-            io::ErrorKind::NotADirectory,
-            format!("{} is no folder", there.display()),
-        ));
-    }
-    tempfile::tempfile_in(there).map(drop)
-}
-
-/// Whether two paths lead to one folder, which need not be there yet.
-fn is_same_folder(a: &Path, b: &Path) -> bool {
-    match (a.canonicalize(), b.canonicalize()) {
-        (Ok(a), Ok(b)) => a == b,
-        _ => a.components().eq(b.components()),
-    }
 }

@@ -1,6 +1,6 @@
-//! Finding and opening the weights a command was given.
+//! The weights of a command.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use snapsnap_base::config::Schema;
 use snapsnap_net::config::Config;
@@ -13,14 +13,13 @@ use crate::failure::Failure;
 const IN_FOLDER: &str = "weights.safetensors";
 /// The default weights, trained on synthetic people (docs/weights.md).
 const DEFAULT: &[u8] = include_bytes!("../../../assets/weights/default.safetensors");
-/// Their name in place of a path.
+/// Name of the default weights, in place of a path.
 pub const DEFAULT_NAME: &str = "the default weights";
 
-/// Opens a weight file, or `weights.safetensors` in a folder, or, without a path, the default weights; --config and --set win
-/// over the config stored with it.
+/// Opens a weight file, or `weights.safetensors` in a folder, or without a path the default weights. --config and --set override the
+/// stored config.
 pub fn open(path: Option<&Path>, arguments: &ConfigArguments) -> Result<WeightFile, Failure> {
-    let path: Option<PathBuf> =
-        path.map(|path| if path.is_dir() { path.join(IN_FOLDER) } else { path.to_owned() });
+    let path = path.map(|path| if path.is_dir() { path.join(IN_FOLDER) } else { path.to_owned() });
     let opened = |config: Option<Config>| match &path {
         Some(path) => WeightFile::open(path, config),
         None => WeightFile::embedded(DEFAULT_NAME, DEFAULT, config),
@@ -32,7 +31,7 @@ pub fn open(path: Option<&Path>, arguments: &ConfigArguments) -> Result<WeightFi
     if arguments.set.is_empty() {
         return Ok(file);
     }
-    let stored = (format!("{} (metadata)", file.path().display()), file.config.to_toml());
-    let config = Config::from_toml(&stored.1, &stored.0, &arguments.set)?;
+    let origin = format!("{} (metadata)", file.path().display());
+    let config = Config::from_toml(&file.config.to_toml(), &origin, &arguments.set)?;
     Ok(opened(Some(config))?)
 }

@@ -3,7 +3,7 @@ import { defineConfig } from "vite";
 
 const outDir = "../../../assets/viewer";
 
-// Spark comes with fflate in it, which Vite's list therefore lacks.
+// Spark contains fflate, which is therefore missing in Vite's list.
 const bundledInSpark = {
   name: "bundled-in-spark",
   closeBundle() {
@@ -13,7 +13,7 @@ const bundledInSpark = {
   },
 };
 
-// Three files with fixed names, so that the Rust program can embed them.
+// Three files with fixed names, so that the Rust program can embed them beside index.html.
 export default defineConfig({
   base: "./",
   plugins: [bundledInSpark],
@@ -23,6 +23,7 @@ export default defineConfig({
     chunkSizeWarningLimit: 8000,
     license: { fileName: "LICENSES.md" },
     rollupOptions: {
+      input: "src/main.js",
       output: {
         entryFileNames: "viewer.js",
         assetFileNames: "viewer[extname]",

@@ -31,7 +31,7 @@ pub struct Arguments {
     /// Data set with people to compare [default: the first of data.folders in the config].
     #[arg(long, value_name = "DATASET")]
     data: Option<PathBuf>,
-    /// Weights of all settings that name none [default: model.weights of the config].
+    /// Weights of all settings without weights [default: model.weights of the config].
     #[arg(long, value_name = "FILE|DIR")]
     weights: Option<PathBuf>,
     /// Folders of trainings whose validations become a curve.
@@ -45,7 +45,7 @@ pub struct Arguments {
     /// auto, cpu, ndarray, wgpu, vulkan, cuda or metal [default: model.device of the config].
     #[arg(long)]
     device: Option<String>,
-    /// Few runs of few people, to check that everything works.
+    /// Few runs of few people, as a test of the config.
     #[arg(long)]
     quick: bool,
     /// Measure this setting alone and print its figures.
@@ -53,7 +53,7 @@ pub struct Arguments {
     one: Option<String>,
 }
 
-pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
+pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let config = config_of(arguments)?;
     check_data(&config.data.folders)?;
     if let Some(name) = &arguments.one {
@@ -65,14 +65,14 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     outside_data(output, config.data.folders.iter().chain(own).map(PathBuf::as_path))?;
     let inputs: Vec<&Path> = std::iter::once(&arguments.config)
         .chain(variants.iter().filter_map(|(_, variant)| variant.weights.as_ref()))
-        .chain(arguments.lpips.files())
+        .chain(&arguments.lpips.files)
         .map(PathBuf::as_path)
         .collect();
     // One error instead of one for each setting.
     if let Some(path) = &config.model.weights
         && let Err(e) = path.metadata()
     {
-        return Err(Failure::Input(format!("{}: cannot read: {e}", path.display())));
+        return Err(Failure::file(path, format_args!("cannot read: {e}")));
     }
     let folder = ReportFolder::new(output, &inputs)?;
     let (mut left_out, mut training, mut measured) = (Vec::new(), Vec::new(), Vec::new());
@@ -82,15 +82,12 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
             Err(why) => left_out.push(LeftOut::new(run.display().to_string(), why)),
         }
     }
-    let progress = Progress::steps(quiet, variants.len(), "settings");
-    for (done, (name, _)) in variants.iter().enumerate() {
+    for (name, _) in Progress::over(variants.iter(), "settings") {
         match in_process(name) {
             Ok(found) => measured.push(found),
             Err(why) => left_out.push(LeftOut::new(name, why)),
         }
-        progress.step(done + 1, variants.len(), "settings");
     }
-    drop(progress);
     let Some(Measured { device, .. }) = measured.first() else {
         return Err(nothing_left("nothing could be measured", &left_out));
     };
@@ -105,14 +102,11 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     folder.text("config.toml", &config.to_toml())?;
     folder.text("report.md", &report.markdown(&drawn))?;
     folder.finish(&report.json())?;
-    if !quiet {
-        for (m, by) in measured.iter().zip(dominated(&measured)) {
-            let by =
-                by.map_or("on the front".into(), |index| format!("dominated by {}", measured[index].name));
-            say::out(&format!("{:<24} {:>8.1} ms   {:>6.2} dB   {by}", m.name, 1e3 * m.p50, m.psnr));
-        }
-        say::out(&format!("{}: report.md, report.json, plots and a table", folder.path().display()));
+    for (m, by) in measured.iter().zip(dominated(&measured)) {
+        let by = by.map_or("on the front".into(), |index| format!("dominated by {}", measured[index].name));
+        say::info(&format!("{:<24} {:>8.1} ms   {:>6.2} dB   {by}", m.name, 1e3 * m.p50, m.psnr));
     }
+    say::info(&format!("{}: report.md, report.json, plots and a table", folder.path.display()));
     complete(&report.failures(), "the rest was measured")
 }
 
@@ -121,12 +115,8 @@ fn config_of(arguments: &Arguments) -> Result<BenchConfig, Failure> {
     if let Some(data) = &arguments.data {
         config.data.folders = vec![data.clone()];
     }
-    if arguments.weights.is_some() {
-        config.model.weights.clone_from(&arguments.weights);
-    }
-    if arguments.device.is_some() {
-        config.model.device.clone_from(&arguments.device);
-    }
+    config.model.weights = arguments.weights.clone().or(config.model.weights);
+    config.model.device = arguments.device.clone().or(config.model.device);
     if !arguments.runs.is_empty() {
         config.training.runs.clone_from(&arguments.runs);
     }
@@ -161,7 +151,7 @@ fn one(arguments: &Arguments, config: &BenchConfig, name: &str) -> Result<(), Fa
     let (_, variant) = variant.ok_or_else(|| Failure::Input(format!("no setting {name}")))?;
     let (weights, device) = opened(&variant)?;
     let chosen = variant.device.as_deref().unwrap_or("auto");
-    let lpips = arguments.lpips.load_or(&config.bench.lpips, chosen)?;
+    let lpips = arguments.lpips.load(&config.bench.lpips, chosen)?;
     let measured = measure(
         config,
         (name, &variant),

@@ -14,7 +14,8 @@ use snapsnap_eval::score::Score;
 use snapsnap_eval::similarity::{check_sizes, ssim_of_loss};
 use snapsnap_mesh::picture::{self, MAX_BYTES, decode};
 
-use crate::failure::Failure;
+use crate::failure::{Failure, bail};
+use crate::report::print_left_out;
 use crate::{memory, perceptual, say};
 
 /// Bytes per pixel of two pictures: decoded, as planes, and the compared parts.
@@ -65,26 +66,25 @@ struct Compared {
 
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     match (arguments.window, &arguments.mask) {
-        (Some(Window::Mask), None) => return Err(Failure::Input("--window mask needs --mask MASK".into())),
-        (Some(Window::All | Window::Paper), Some(_)) => {
-            return Err(Failure::Input("--mask goes with --window mask alone".into()));
-        }
+        (Some(Window::Mask), None) => bail!("--window mask needs --mask MASK"),
+        (Some(Window::All | Window::Paper), Some(_)) => bail!("--mask goes with --window mask alone"),
         _ => {}
     }
     if arguments.margin.is_some() && arguments.mask.is_none() {
-        return Err(Failure::Input("--margin needs --mask".into()));
+        bail!("--margin needs --mask");
     }
-    let lpips = arguments.lpips.load(&arguments.device)?;
-    if !arguments.a.is_dir() && !arguments.b.is_dir() {
-        let compared = compare(arguments, &arguments.a, &arguments.b, arguments.mask.as_deref(), &lpips)?;
-        if arguments.json {
-            let mut value = json_of(&compared);
-            value["lpips_weights"] = perceptual::describe(&lpips).into();
-            return say::json(&value.to_string());
-        }
+    let lpips = arguments.lpips.load(perceptual::FOLDER.as_ref(), &arguments.device)?;
+    let Arguments { a, b, mask, .. } = arguments;
+    if a.is_dir() || b.is_dir() {
+        return folders(arguments, &lpips);
+    }
+    let compared = compare(arguments, a, b, mask.as_deref(), &lpips)?;
+    if !arguments.json {
         return say::lines(&text_of(&compared, &lpips));
     }
-    folders(arguments, &lpips)
+    let mut value = json_of(&compared);
+    value["lpips_weights"] = perceptual::describe(&lpips).into();
+    say::json(&value.to_string())
 }
 
 fn folders(arguments: &Arguments, lpips: &Result<Lpips, String>) -> Result<(), Failure> {
@@ -92,7 +92,7 @@ fn folders(arguments: &Arguments, lpips: &Result<Lpips, String>) -> Result<(), F
     for path in [Some(a), Some(b), mask.as_ref()].into_iter().flatten() {
         if !path.is_dir() {
             let message = "is no folder: compare two pictures, or two folders of equally named pictures";
-            return Err(Failure::Input(format!("{}: {message}", path.display())));
+            return Err(Failure::file(path, message));
         }
     }
     let (ours, truths) = (pictures_in(a)?, pictures_in(b)?);
@@ -113,12 +113,10 @@ fn folders(arguments: &Arguments, lpips: &Result<Lpips, String>) -> Result<(), F
     let scores: Vec<Score> = compared.iter().map(|c| c.score).collect();
     let mean = Score::mean(&scores);
     if arguments.json {
-        let named = |c: &Compared| {
-            let mut value = json_of(c);
-            value["name"] = c.name.clone().into();
-            value
-        };
-        let pictures: Vec<Value> = compared.iter().map(named).collect();
+        let mut pictures: Vec<Value> = compared.iter().map(json_of).collect();
+        for (value, compared) in pictures.iter_mut().zip(&compared) {
+            value["name"] = json!(compared.name);
+        }
         let found = json!({
             "pictures": pictures, "mean": mean, "left_out": left_out, "lpips_weights": perceptual::describe(lpips),
         });
@@ -129,7 +127,7 @@ fn folders(arguments: &Arguments, lpips: &Result<Lpips, String>) -> Result<(), F
         lines.extend(mean.map(|mean| line(&format!("mean of {}", compared.len()), &mean)));
         lines.push(format!("LPIPS: {}", perceptual::describe(lpips)));
         say::lines(&lines.join("\n"))?;
-        left_out.iter().for_each(|l| say::err(&format!("left out: {}: {}", l.name, l.why)));
+        print_left_out(&left_out);
     }
     match (compared.len(), left_out.len()) {
         (0, 0) => Err(Failure::Input(format!("{} and {}: contain no picture", a.display(), b.display()))),
@@ -140,7 +138,7 @@ fn folders(arguments: &Arguments, lpips: &Result<Lpips, String>) -> Result<(), F
 
 /// Names of the pictures of a folder.
 fn pictures_in(folder: &Path) -> Result<BTreeSet<String>, Failure> {
-    let failed = |e| Failure::Input(format!("{}: cannot read this folder: {e}", folder.display()));
+    let failed = |e| Failure::file(folder, format_args!("cannot read this folder: {e}"));
     let mut names = BTreeSet::new();
     for entry in fs::read_dir(folder).map_err(failed)? {
         let path = entry.map_err(failed)?.path();
@@ -163,7 +161,7 @@ fn compare(
         let [width, height] = picture::size(path)?;
         let bytes = BYTES * u64::from(width) * u64::from(height);
         memory::check(&format!("{}, {width}×{height},", path.display()), bytes, "make the pictures smaller")?;
-        let named = |e| Failure::Input(format!("{}: {e}", path.display()));
+        let named = |e| Failure::file(path, e);
         Picture::from_file(decode(path, MAX_BYTES)?, "picture").map_err(named)
     };
     let (image, target) = (read(a)?, read(b)?);
@@ -174,19 +172,15 @@ fn compare(
             let mask = decode(path, MAX_BYTES)?;
             let found = [mask.height() as usize, mask.width() as usize];
             if found != [target.height, target.width] {
-                let ([h, w], name) = (found, path.display());
-                let message =
-                    format!("{name}: is {w}×{h}, the pictures are {}×{}", target.width, target.height);
-                return Err(Failure::Input(message));
+                let ([h, w], Picture { height, width, .. }) = (found, &target);
+                let message = format!("is {w}×{h}, the pictures are {width}×{height}");
+                return Err(Failure::file(path, message));
             }
             let mask: Vec<f32> = mask.into_luma16().pixels().map(|p| f32::from(p.0[0])).collect();
             let margin = arguments.margin.unwrap_or_else(|| margin(target.height));
-            Region::masked(&mask, found, margin)
-                .map_err(|e| Failure::Input(format!("{}: {e}", path.display())))?
+            Region::masked(&mask, found, margin).map_err(|e| Failure::file(path, e))?
         }
-        (Some(Window::Paper), _) => {
-            Region::paper(&target).map_err(|e| Failure::Input(format!("{}: {e}", b.display())))?
-        }
+        (Some(Window::Paper), _) => Region::paper(&target).map_err(|e| Failure::file(b, e))?,
         _ => Region::all(&target),
     };
     Ok(Compared {

@@ -3,7 +3,6 @@
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use snapsnap_base::file;
 use snapsnap_splat::scene::{Kind, Stored};
 
 use super::{check_kind, check_outputs};
@@ -18,22 +17,19 @@ pub struct Arguments {
     output: PathBuf,
 }
 
-pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
+pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let Arguments { input, output } = arguments;
     check_kind(output)?;
     check_outputs(&[output], &[input])?;
     let (stored, dropped) = finite(input)?;
     stored.write(output)?;
-    if quiet {
+    if say::is_quiet() {
         return Ok(());
     }
-    // Messages must not enter a pipe of data.
-    let say = if file::is_special(output) { say::err } else { say::out };
+    let say = say::beside(output);
     if dropped > 0 {
-        say(&format!(
-            "{}: {dropped} Gaussians with values that are not finite were left out",
-            input.display()
-        ));
+        let input = input.display();
+        say(&format!("{input}: {dropped} Gaussians with values that are not finite were left out"));
     }
     for loss in stored.losses(Kind::of(output)) {
         say(&format!("{}: {loss}", output.display()));
@@ -50,18 +46,12 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Reads the Gaussians whose values are finite, and how many others there are.
-///
-/// # Errors
-/// For a file that cannot be read, or that has Gaussians of which none is finite.
+/// Reads a file's finite Gaussians, and counts the others. Refuses a file of which no Gaussian is finite.
 pub fn finite(input: &Path) -> Result<(Stored, usize), Failure> {
     let mut stored = Stored::read(input)?;
     let dropped = stored.drop_not_finite();
     if stored.is_empty() && dropped > 0 {
-        return Err(Failure::Input(format!(
-            "{}: none of its {dropped} Gaussians is finite",
-            input.display()
-        )));
+        return Err(Failure::file(input, format_args!("none of its {dropped} Gaussians is finite")));
     }
     Ok((stored, dropped))
 }

@@ -1,4 +1,4 @@
-//! `snapsnap demo`: the sample pair that comes with the program, through everything a newcomer wants to see.
+//! `snapsnap demo`: Gaussians, pictures and a report of the program's sample pair.
 
 use std::path::PathBuf;
 use std::time::Instant;
@@ -33,19 +33,19 @@ const FILES: &[&str] = &[
     REPORT,
 ];
 
-/// Front and back of a made person nobody was trained on, RGBA, `[1024, 1024]`, as the nominal cameras see them.
+/// Front and back of a held-out synthetic person through the nominal cameras, RGBA, `[1024, 1024]`.
 const PHOTOGRAPHS: [(&str, &[u8]); 2] = [
     ("front.png", include_bytes!("../../../../assets/sample/front.png")),
     ("back.png", include_bytes!("../../../../assets/sample/back.png")),
 ];
-/// Ground truth from other cameras: degrees around the person from the front, and a picture of [`TRUTH`]² pixels over black.
+/// Ground truth of other cameras: degrees around the person from the front, and a picture of [`TRUTH`]² pixels over black.
 const TRUTHS: [(f64, &[u8]); 3] = [
     (45.0, include_bytes!("../../../../assets/sample/45.png")),
     (135.0, include_bytes!("../../../../assets/sample/135.png")),
     (270.0, include_bytes!("../../../../assets/sample/270.png")),
 ];
 const TRUTH: u32 = 512;
-/// Columns of such a picture that the person needs.
+/// First and last columns of the ground truth in the comparison.
 const COLUMNS: [u32; 2] = [144, 368];
 
 #[derive(Args)]
@@ -58,25 +58,24 @@ pub struct Arguments {
     device: String,
 }
 
-pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
+pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let start = Instant::now();
     let folder = ReportFolder::of(&arguments.output, FILES, &[])?;
     let device = device::choose(&arguments.device)?;
-    let progress = Progress::stages(quiet);
+    let progress = Progress::stages();
     progress.stage("photographs");
     let header = header(&device::describe(&device));
-    // First, so that the next demo replaces what an interrupted one leaves.
+    // Written first, so that the next demo may replace the files of an interrupted one.
     folder.text(REPORT, &header.json().to_string())?;
     for (name, bytes) in PHOTOGRAPHS {
         output::write(&folder.file(name), bytes)?;
     }
-    let weights = weights::open(None, &ConfigArguments { config: None, set: Vec::new() })?;
+    let weights = weights::open(None, &ConfigArguments::default())?;
     let config = weights.config.clone();
     let since = Instant::now();
-    // The sample lies on its canvas already, so that its cameras are known and other views can be compared.
-    let paths = PHOTOGRAPHS.map(|(name, _)| folder.path().join(name));
-    let canvases =
-        photo::load([&paths[0], &paths[1]], [None; 2], config.network.resolution, Placement::AsIs)?;
+    // The sample pair fills its canvas. Hence its cameras are known, and other views can be compared.
+    let [front, back] = PHOTOGRAPHS.map(|(name, _)| folder.path.join(name));
+    let canvases = photo::load([&front, &back], [None; 2], config.network.resolution, Placement::AsIs)?;
     let [front, back] = canvases.map(|Canvas { rgb, mask, valid, .. }| Photograph { rgb, mask, valid });
     let reconstructor = Reconstructor::load(&weights, &device)?;
     let made = reconstructor.reconstruct(&front, &back, &|name| progress.stage(name));
@@ -86,7 +85,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     scene::write(&world, &folder.file("human.ply"))?;
     drop(progress);
     for name in ["turntable.gif", "turntable.png"] {
-        Turntable::new(&folder.file(name))?.write(&world, quiet)?;
+        Turntable::new(&folder.file(name))?.write(&world)?;
     }
     let (pictures, errors) = comparison(&world)?;
     write_png(&folder.file("comparison.png"), &sheet(&pictures, pictures.len() as u32))?;
@@ -94,7 +93,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let mut text = header.markdown("Demo");
     text += &format!(
         "* {} Gaussians in {seconds:.1} s, photographs and weights read; all of it in {:.1} s\n\n\
-         ![turntable](turntable.png)\n\nThe photographs, then what was made of them beside the truth, from elsewhere:\n\n\
+         ![turntable](turntable.png)\n\nThe photographs, then unseen views beside the ground truth:\n\n\
          ![comparison](comparison.png)\n\n| seen from | PSNR on the person, dB |\n|---|---|\n",
         world.len(),
         start.elapsed().as_secs_f64(),
@@ -108,10 +107,8 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     value["reconstruction_s"] = json!(seconds);
     value["psnr_masked"] = errors.iter().map(|(degrees, psnr)| (format!("{degrees}"), json!(psnr))).collect();
     folder.finish(&value)?;
-    if !quiet {
-        for name in FILES {
-            say::out(&arguments.output.join(name).display().to_string());
-        }
+    for name in FILES {
+        say::info(&arguments.output.join(name).display().to_string());
     }
     Ok(())
 }
@@ -119,7 +116,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
 /// Degrees and dB.
 type Errors = Vec<(f64, f64)>;
 
-/// The photographs, and each of [`TRUTHS`] behind what was made of it; and how alike these are on the person, in dB.
+/// The photographs, then each rendered view and its ground truth, and the views' PSNR on the person.
 fn comparison(world: &Gaussians) -> Result<(Vec<RgbImage>, Errors), Failure> {
     let side = TRUTH as usize;
     let mut pictures = Vec::new();
@@ -132,7 +129,7 @@ fn comparison(world: &Gaussians) -> Result<(Vec<RgbImage>, Errors), Failure> {
         let truth = decoded("true picture", bytes)?;
         let mask: Vec<f32> = truth.to_rgba8().pixels().map(|pixel| f32::from(pixel[3]) / 255.0).collect();
         let truth = Picture::from_file(truth, "true picture")?;
-        // As `evaluate` does it: twice as large, and shrunk.
+        // Rendered at twice the size and shrunk, as in `evaluate`.
         let camera = Camera::orbit_at_yaw_degrees(degrees, 2 * TRUTH);
         let rendered = render(world, &[camera], &RenderOptions::inria())?;
         let made = Picture::rendered(&read_back(rendered.color)?, [2 * side; 2], 2)?;

@@ -1,7 +1,8 @@
-//! `snapsnap doctor`: devices, features, weights and missing parts, each with its remedy.
+//! `snapsnap doctor`: devices, features, weights, and missing parts with their remedies.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
+use burn::tensor::Device;
 use clap::Args;
 use serde_json::{Value, json};
 use snapsnap_eval::lpips::Lpips;
@@ -13,33 +14,33 @@ use crate::{memory, perceptual, say, weights};
 
 #[derive(Args)]
 pub struct Arguments {
-    /// Weights to look at as well: a file, or a folder with weights.safetensors.
+    /// Further weights to check: a file, or a folder with weights.safetensors.
     #[arg(long, value_name = "FILE|DIR")]
     weights: Option<PathBuf>,
-    /// Print it as JSON.
+    /// Print JSON.
     #[arg(long)]
     json: bool,
 }
 
-/// Bytes that a reconstruction with the default weights takes, about (docs/weights.md).
+/// Approximate memory of a reconstruction with the default weights, in bytes (docs/weights.md).
 const COMFORTABLE: u64 = 1_000_000_000;
 
-/// Weights that were looked for.
+/// Weights and their state.
 struct Weights {
     name: String,
     /// Their description, or their fault.
     state: Result<String, String>,
-    /// How sound ones are got.
+    /// Remedy of a fault.
     mend: &'static str,
 }
 
-const GET_WEIGHTS: &str = "make them again with import-weights or init-weights, or train them; docs/formats.md says what is in them";
+const GET_WEIGHTS: &str = "make them again with import-weights or init-weights, or train them; docs/formats.md describes their content";
 const GET_LPIPS: &str = "snapsnap fetch-weights alexnet lpips";
 
-/// Something that could be better, and how.
+/// A missing part and its remedy.
 struct Missing {
     what: String,
-    mend: String,
+    mend: &'static str,
 }
 
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
@@ -56,11 +57,8 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
             })
         };
         let weight = |w: &Weights| {
-            let (sound, text) = match &w.state {
-                Ok(text) => (true, text),
-                Err(text) => (false, text),
-            };
-            json!({ "name": w.name, "sound": sound, "description": text })
+            let (Ok(text) | Err(text)) = &w.state;
+            json!({ "name": w.name, "sound": w.state.is_ok(), "description": text })
         };
         let report = json!({
             "version": env!("CARGO_PKG_VERSION"),
@@ -102,14 +100,17 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     broken(&weights)
 }
 
-/// Weights that were asked for and are not sound are a failure; what merely could be better is none.
+/// The failure of the first damaged weights. Missing parts are no failure.
 fn broken(weights: &[Weights]) -> Result<(), Failure> {
-    match weights.iter().find_map(|w| w.state.as_ref().err().map(|state| (&w.name, state))) {
-        // A message about a file begins with its name.
-        Some((name, state)) if state.starts_with(name) => Err(Failure::Input(state.clone())),
-        Some((name, state)) => Err(Failure::Input(format!("{name}: {state}"))),
-        None => Ok(()),
+    for Weights { name, state, .. } in weights {
+        if let Err(message) = state {
+            // Messages about files begin with the file's name already.
+            let is_named = message.starts_with(name);
+            let message = if is_named { message.clone() } else { format!("{name}: {message}") };
+            return Err(Failure::Input(message));
+        }
     }
+    Ok(())
 }
 
 /// The name of the device that `--device auto` takes, and the reason.
@@ -124,48 +125,36 @@ fn chosen(devices: &[Found]) -> (String, &'static str) {
 }
 
 fn weights_found(arguments: &Arguments) -> Vec<Weights> {
-    let look = |path: Option<&PathBuf>, name: String| {
-        let defaults = ConfigArguments { config: None, set: Vec::new() };
-        let state = match weights::open(path.map(PathBuf::as_path), &defaults) {
-            Ok(file) => {
-                let (config, parameters) = (&file.config, file.parameters());
-                Ok(format!(
-                    "{:.1} million parameters, canvas of {}²",
-                    parameters as f64 / 1e6,
-                    config.network.resolution
-                ))
-            }
-            Err(e) => Err(e.to_string()),
-        };
-        Weights { name, state, mend: GET_WEIGHTS }
-    };
-    let mut found = vec![look(None, weights::DEFAULT_NAME.into())];
-    if let Some(path) = &arguments.weights {
-        found.push(look(Some(path), path.display().to_string()));
-    }
-    let folder = PathBuf::from(perceptual::FOLDER);
-    if Lpips::missing(&folder).is_empty() {
-        let name = format!("LPIPS in {}", folder.display());
-        let loaded = Lpips::published(&folder, &burn::tensor::Device::flex());
-        found.push(Weights {
-            name,
-            state: loaded.map(|_| "the published ones".into()).map_err(|e| e.to_string()),
-            mend: GET_LPIPS,
+    let open = |path: Option<&Path>, name: String| {
+        let opened = weights::open(path, &ConfigArguments::default()).map(|file| {
+            let (millions, side) = (file.parameters() as f64 / 1e6, file.config.network.resolution);
+            format!("{millions:.1} million parameters, canvas of {side}²")
         });
+        Weights { name, state: opened.map_err(|e| e.to_string()), mend: GET_WEIGHTS }
+    };
+    let mut found = vec![open(None, weights::DEFAULT_NAME.into())];
+    if let Some(path) = &arguments.weights {
+        found.push(open(Some(path), path.display().to_string()));
+    }
+    let folder = Path::new(perceptual::FOLDER);
+    if Lpips::missing(folder).is_empty() {
+        let name = format!("LPIPS in {}", folder.display());
+        let loaded = Lpips::published(folder, &Device::flex()).map(|_| "the published ones".into());
+        found.push(Weights { name, state: loaded.map_err(|e| e.to_string()), mend: GET_LPIPS });
     }
     found
 }
 
 fn missing(devices: &[Found], weights: &[Weights], memory: u64) -> Vec<Missing> {
     let mut missing = Vec::new();
-    let mut add = |what: &str, mend: &str| missing.push(Missing { what: what.into(), mend: mend.into() });
+    let mut add = |what: &str, mend| missing.push(Missing { what: what.into(), mend });
     if !devices.iter().any(|found| found.card) {
         let mend = if snapsnap_splat::adapter::is_opengl() {
-            "OpenGL alone knows a card here, and it is not used: install the card's Vulkan driver (Debian, Ubuntu: apt-get install \
+            "the card works with OpenGL only, which is not used: install its Vulkan driver (Debian, Ubuntu: apt-get install \
              libvulkan1 mesa-vulkan-drivers, or NVIDIA's own)"
         } else {
             "a card needs its Vulkan driver (Debian, Ubuntu: apt-get install libvulkan1 mesa-vulkan-drivers, or NVIDIA's own); \
-             without a card all is well: the CPU takes about a second"
+             no card is necessary: the CPU takes about a second"
         };
         add("no real GPU answers", mend);
     }

@@ -2,10 +2,12 @@
 
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
+use std::slice;
 use std::time::Instant;
 
 use burn::tensor::Device;
-use clap::{Args, ValueEnum};
+use clap::Args;
+use serde_json::Value;
 use snapsnap_base::config::Schema;
 use snapsnap_eval::baselines::MeanPictures;
 use snapsnap_eval::evaluate::config::EvalConfig;
@@ -18,8 +20,9 @@ use snapsnap_eval::report::evaluation::{Cost, Evaluation};
 use snapsnap_eval::variant::Variant;
 use snapsnap_net::weights::WeightFile;
 
-use super::{ConfigArguments, outside_data};
-use crate::failure::Failure;
+use super::{ConfigArguments, one_of, outside_data};
+use crate::failure::{Failure, bail};
+use crate::pictures::write_png;
 use crate::progress::Progress;
 use crate::report::{ReportFolder, complete, header, nothing_left};
 use crate::{device, memory, perceptual, say, weights};
@@ -35,7 +38,7 @@ pub struct Arguments {
     /// Data sets [default: data.folders of the config].
     #[arg(long, value_name = "DATASET", num_args = 1..)]
     data: Vec<PathBuf>,
-    /// Weights of the model [default: model.weights of the config, else those that come with the program].
+    /// Weights of the model [default: model.weights of the config, else the program's own].
     #[arg(long, value_name = "FILE|DIR")]
     weights: Option<PathBuf>,
     /// Other weights, which are compared with the model person by person.
@@ -45,8 +48,8 @@ pub struct Arguments {
     #[arg(long, value_name = "DIR", conflicts_with_all = ["weights", "against"])]
     mesh_dir: Option<PathBuf>,
     /// Align meshes with the ground truth first: turned and moved (rigid), or scaled as well (similarity).
-    #[arg(long, value_enum, value_name = "HOW", num_args = 0..=1, default_missing_value = "rigid")]
-    icp: Option<Icp>,
+    #[arg(long, value_parser = one_of(ICP), value_name = "HOW", num_args = 0..=1, default_missing_value = "rigid")]
+    icp: Option<Align>,
     #[command(flatten)]
     lpips: perceptual::Arguments,
     /// Folder of the report.
@@ -57,39 +60,34 @@ pub struct Arguments {
     device: Option<String>,
 }
 
-#[derive(Clone, Copy, ValueEnum)]
-enum Icp {
-    Rigid,
-    Similarity,
-}
-
+const ICP: [(&str, &str, Align); 2] = [("rigid", "", Align::Rigidly), ("similarity", "", Align::Similarly)];
 /// The end of the message about failed parts.
 const REST: &str = "the rest, if there is any, was evaluated";
 
-pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
+pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     if arguments.icp.is_some() && arguments.mesh_dir.is_none() {
-        return Err(Failure::Input("--icp needs --mesh-dir: only meshes are moved".into()));
+        bail!("--icp needs --mesh-dir: only meshes are moved");
     }
     let config = config_of(arguments)?;
     let (sets, mut missing) = data_sets(&config)?;
     let roots = sets.iter().map(|set| set.folder().root());
     outside_data(&arguments.output, roots.chain(config.baselines.mean.iter().map(PathBuf::as_path)))?;
     if let Some(meshes) = &arguments.mesh_dir {
-        return judge_meshes(arguments, &config, &sets, meshes, missing, quiet);
+        return judge_meshes(arguments, &config, &sets, meshes, missing);
     }
     let names = match (&arguments.device, config.model.devices.as_slice()) {
-        (Some(name), _) => vec![name.clone()],
-        (None, []) => vec!["auto".to_owned()],
-        (None, names) => names.to_vec(),
+        (Some(name), _) => slice::from_ref(name),
+        (None, []) => &["auto".to_owned()],
+        (None, names) => names,
     };
     let devices = names.iter().map(|name| device::choose(name)).collect::<Result<Vec<_>, _>>()?;
-    let variants = config.variants(&names);
+    let variants = config.variants(names);
     let inputs: Vec<&Path> = std::iter::once(&arguments.config)
         .chain(variants.iter().filter_map(|(_, variant)| variant.weights.as_ref()))
-        .chain(arguments.lpips.files())
+        .chain(&arguments.lpips.files)
         .map(PathBuf::as_path)
         .collect();
-    let lpips = arguments.lpips.load_or(&config.metrics.lpips, &names[0])?;
+    let lpips = arguments.lpips.load(&config.metrics.lpips, &names[0])?;
     let contestants = contestants(&config, &sets, &variants, &devices[0], &mut missing);
     if contestants.is_empty() {
         return Err(nothing_left("nothing is left to evaluate", &missing));
@@ -97,7 +95,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let folder = ReportFolder::new(&arguments.output, &inputs)?;
 
     let people = sets.iter().map(|set| set.chosen().len()).sum();
-    let progress = Progress::steps(quiet, people, "people");
+    let progress = Progress::steps(people, "people");
     let done = |done: usize, total: usize| progress.step(done, total, "people");
     let start = Instant::now();
     let mut outcome = evaluate(&config, &sets, &contestants, lpips.as_ref().ok(), &done);
@@ -106,50 +104,50 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     outcome.left_out.splice(0..0, missing);
     let (header, lpips) = (header(&device::describe(&devices[0])), perceptual::describe(&lpips));
     let mut report = Evaluation { header, config: &config, outcome, lpips, cost };
+    let mut pictures = Vec::new();
     let ranked = report.ranked(config.report.people);
-    let mut people = None;
     // The first contestant is the model, without which the ranking is empty.
     if !ranked.is_empty() {
         let (picture, left_out) = sheet(&config, &sets, &contestants[0], &ranked);
-        people = picture;
         report.outcome.left_out.extend(left_out);
+        if let Some(picture) = picture {
+            write_png(&folder.file("people.png"), &picture)?;
+            pictures.push("people.png");
+        }
     }
     let by_view = report.by_view();
-    let pictures: Vec<&str> = [(people.is_some(), "people.png"), (!by_view.is_empty(), "by_view.svg")]
-        .into_iter()
-        .filter_map(|(there, name)| there.then_some(name))
-        .collect();
-    folder.picture("people.png", people.as_ref())?;
-    folder.text("by_view.svg", &by_view)?;
+    if !by_view.is_empty() {
+        folder.text("by_view.svg", &by_view)?;
+        pictures.push("by_view.svg");
+    }
     folder.text("views.csv", &report.views_csv())?;
     folder.text("subjects.csv", &report.subjects_csv())?;
     folder.text("config.toml", &config.to_toml())?;
     folder.text("report.md", &report.markdown(&pictures))?;
     let json = report.json();
     folder.finish(&json)?;
-    if !quiet {
-        say::out(&summary(&json));
-        say::out(&format!("{}: report.md, report.json, pictures and tables", folder.path().display()));
-    }
+    summarise(&json);
+    say::info(&format!("{}: report.md, report.json, pictures and tables", folder.path.display()));
     complete(&report.outcome.left_out, REST)
 }
 
 /// Refuses a config without data sets.
 pub(super) fn check_data(folders: &[PathBuf]) -> Result<(), Failure> {
-    let message = "no data: give --data DATASET, made with `snapsnap prepare`, or data.folders in the config";
-    if folders.is_empty() { Err(Failure::Input(message.into())) } else { Ok(()) }
+    if folders.is_empty() {
+        bail!("no data: give --data DATASET, made with `snapsnap prepare`, or data.folders in the config");
+    }
+    Ok(())
 }
 
 /// The data sets that can be opened, at least one, and failures of the others.
 fn data_sets(config: &EvalConfig) -> Result<(Vec<People>, Vec<LeftOut>), Failure> {
-    let folders = &config.data.folders;
-    check_data(folders)?;
+    check_data(&config.data.folders)?;
     let mut known = HashSet::new();
-    if let Some(again) = folders.iter().find(|f| !known.insert(f.canonicalize().unwrap_or((*f).clone()))) {
-        return Err(Failure::Input(format!("data.folders: {} is there twice", again.display())));
-    }
     let (mut sets, mut missing, mut first) = (Vec::new(), Vec::new(), None);
-    for path in folders {
+    for path in &config.data.folders {
+        if !known.insert(path.canonicalize().unwrap_or(path.clone())) {
+            bail!("data.folders: {} is there twice", path.display());
+        }
         match People::open(path, &config.data, &config.views) {
             Ok(set) => sets.push(set),
             Err(e) => {
@@ -170,19 +168,19 @@ fn judge_meshes(
     sets: &[People],
     meshes: &Path,
     missing: Vec<LeftOut>,
-    quiet: bool,
 ) -> Result<(), Failure> {
     if !meshes.is_dir() {
-        return Err(Failure::Input(format!("--mesh-dir {}: is no folder", meshes.display())));
+        bail!("--mesh-dir {}: is no folder", meshes.display());
     }
     let folder = ReportFolder::new(&arguments.output, &[&arguments.config])?;
-    let (align, alignment) = match arguments.icp {
-        None => (Align::No, "none: as the meshes are"),
-        Some(Icp::Rigid) => (Align::Rigidly, "rigid, by iterated closest points"),
-        Some(Icp::Similarity) => (Align::Similarly, "rigid and scale, by iterated closest points"),
+    let align = arguments.icp.unwrap_or(Align::No);
+    let alignment = match align {
+        Align::No => "none: as the meshes are",
+        Align::Rigidly => "rigid, by iterated closest points",
+        Align::Similarly => "rigid and scale, by iterated closest points",
     };
     let total = sets.iter().map(|set| set.chosen().len()).sum();
-    let progress = Progress::steps(quiet, total, "people");
+    let progress = Progress::steps(total, "people");
     let done = |done: usize, total: usize| progress.step(done, total, "people");
     let (figures, mut left_out) = evaluate_meshes(config, sets, meshes, align, &done);
     drop(progress);
@@ -192,14 +190,10 @@ fn judge_meshes(
     folder.text("report.md", &report::meshes::markdown(&header, &figures, &left_out, alignment))?;
     let json = report::meshes::json(&header, &figures, &left_out);
     folder.finish(&json)?;
-    if !quiet {
-        for (name, figure) in json["geometry_cm"].as_object().into_iter().flatten() {
-            say::out(&format!(
-                "{name:<20} {}{}",
-                figure["mean"].as_f64().map_or("n/a".into(), |v| format!("{v:.4}")),
-                if name == "normal_consistency" { "" } else { " cm" }
-            ));
-        }
+    for (name, figure) in json["geometry_cm"].as_object().into_iter().flatten() {
+        let mean = figure["mean"].as_f64().map_or("n/a".into(), |v| format!("{v:.4}"));
+        let unit = if name == "normal_consistency" { "" } else { " cm" };
+        say::info(&format!("{name:<20} {mean}{unit}"));
     }
     complete(&left_out, REST)
 }
@@ -209,9 +203,7 @@ fn config_of(arguments: &Arguments) -> Result<EvalConfig, Failure> {
     if !arguments.data.is_empty() {
         config.data.folders.clone_from(&arguments.data);
     }
-    if arguments.weights.is_some() {
-        config.model.weights.clone_from(&arguments.weights);
-    }
+    config.model.weights = arguments.weights.clone().or(config.model.weights);
     if let Some(against) = &arguments.against {
         let other = Variant { weights: Some(against.clone()), ..Variant::default() };
         config.ablations.insert("against".into(), other);
@@ -222,7 +214,7 @@ fn config_of(arguments: &Arguments) -> Result<EvalConfig, Failure> {
 /// The weights and the device of a variant.
 pub(super) fn opened(variant: &Variant) -> Result<(WeightFile, Device), Failure> {
     let device = device::choose(variant.device.as_deref().unwrap_or("auto"))?;
-    let arguments = ConfigArguments { config: None, set: variant.set.clone() };
+    let arguments = ConfigArguments { set: variant.set.clone(), ..ConfigArguments::default() };
     let weights = weights::open(variant.weights.as_deref(), &arguments)?;
     memory::check_networks(&weights, &device)?;
     Ok((weights, device))
@@ -261,16 +253,15 @@ fn contestants(
     contestants
 }
 
-/// The most important lines.
-fn summary(report: &serde_json::Value) -> String {
-    let mut lines = Vec::new();
-    let mut line = |name: &str, figures: &serde_json::Value| {
+/// Prints the most important figures.
+fn summarise(report: &Value) {
+    let line = |name: &str, figures: &Value| {
         let figure = |key: &str| match &figures[key]["mean"] {
-            serde_json::Value::Null => "n/a".to_owned(),
+            Value::Null => "n/a".to_owned(),
             value => value.as_f64().map_or("inf".into(), |v| format!("{v:.4}")),
         };
         let (psnr, ssim, lpips) = (figure("psnr"), figure("ssim"), figure("lpips"));
-        lines.push(format!("{name:<28} PSNR {psnr:>8} dB   SSIM {ssim}   LPIPS {lpips}"));
+        say::info(&format!("{name:<28} PSNR {psnr:>8} dB   SSIM {ssim}   LPIPS {lpips}"));
     };
     for (protocol, found) in report["protocols"].as_object().into_iter().flatten() {
         line(&format!("model, {protocol}"), &found["overall"]);
@@ -281,5 +272,4 @@ fn summary(report: &serde_json::Value) -> String {
             }
         }
     }
-    lines.join("\n")
 }

@@ -1,27 +1,27 @@
-//! `snapsnap fetch-weights`: published weights, checked byte by byte.
+//! `snapsnap fetch-weights`: downloads published weights and checks their SHA-256.
 
-use std::fs::{self, File, OpenOptions, TryLockError};
+use std::fs::{self, File, TryLockError};
 use std::io::{self, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::{Args, ValueEnum};
 use sha2::{Digest, Sha256};
-use snapsnap_base::file;
+use snapsnap_base::{FileError, file};
 use snapsnap_eval::lpips;
 use ureq::Agent;
 use ureq::http::StatusCode;
 
-use crate::failure::Failure;
-use crate::pictures::make_folder;
+use crate::failure::{Failure, bail};
+use crate::output::make_folder;
 use crate::progress::Progress;
 use crate::say;
 
-/// Attempts in a row that bring nothing, after which it ends.
+/// Attempts in a row without new bytes after which the download fails.
 const ATTEMPTS: u32 = 4;
-/// Longest time for the first attempt, and for any: what it brought is kept and the next one, twice as long, goes on from there.
+/// Time limits of the first attempt and of any attempt. The limit doubles after an attempt with new bytes, which are kept.
 const ATTEMPT: [Duration; 2] = [Duration::from_secs(60), Duration::from_secs(20 * 60)];
-/// Longest silence before an answer begins.
+/// Time limit of the connection, and of the wait for a response.
 const SILENCE: Duration = Duration::from_secs(60);
 /// Bytes read at a time.
 const CHUNK: usize = 1 << 16;
@@ -31,20 +31,20 @@ pub struct Arguments {
     /// Names to fetch [default: all].
     #[arg(value_enum)]
     what: Vec<Name>,
-    /// A folder with the files, or a mirror's address below which they lie, instead of where they were published.
+    /// A folder with the files, or the address of a mirror, instead of the published addresses.
     #[arg(long, value_name = "DIR|URL")]
     from: Option<String>,
-    /// Folder to put them into.
+    /// Folder of the downloaded files.
     #[arg(short, long, value_name = "DIR", default_value = "weights")]
     output: PathBuf,
-    /// Only show what there is to fetch.
+    /// Only list the files.
     #[arg(long)]
     list: bool,
 }
 
 #[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum Name {
-    /// DUSt3R, for `import-weights`: what the paper's training begins with.
+    /// DUSt3R, for `import-weights`: the initial weights of the paper's training.
     Dust3r,
     /// The network of LPIPS.
     Alexnet,
@@ -55,7 +55,7 @@ enum Name {
 /// A published file.
 struct Item {
     name: Name,
-    /// Here and on mirrors.
+    /// File name, also on mirrors.
     file: &'static str,
     url: &'static str,
     bytes: u64,
@@ -63,8 +63,8 @@ struct Item {
     licence: &'static str,
 }
 
-/// Sizes and sums: of the LPIPS file as the `lpips` package on PyPI holds it; of the other two as several projects that pin them
-/// report them (the first eight digits of AlexNet's are in its name).
+/// Size and sum of the LPIPS file are those of the file in the `lpips` package on PyPI. Size and sum of the other two are those that
+/// several projects pin. AlexNet's name contains the first eight digits of its sum.
 const ITEMS: [Item; 3] = [
     Item {
         name: Name::Dust3r,
@@ -93,152 +93,111 @@ const ITEMS: [Item; 3] = [
     },
 ];
 
-/// Where a file comes from.
-enum Origin {
-    Folder(PathBuf),
-    Address(String),
-}
-
-pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
-    let wanted: Vec<&Item> = ITEMS
+pub fn run(arguments: &Arguments) -> Result<(), Failure> {
+    let wanted: Vec<(&Item, String)> = ITEMS
         .iter()
         .filter(|item| arguments.what.is_empty() || arguments.what.contains(&item.name))
+        .map(|item| (item, origin(arguments, item)))
         .collect();
-    for item in &wanted {
-        say::out(&format!("{}\n  {}", item.file, origin(arguments, item).describe()));
+    for (item, origin) in &wanted {
+        say::out(&format!("{}\n  {origin}", item.file));
         say::out(&format!("  {} bytes, SHA-256 {}\n  licence: {}", item.bytes, item.sha256, item.licence));
     }
     if arguments.list {
         return Ok(());
     }
-    if let Origin::Folder(folder) = origin(arguments, wanted[0])
-        && !folder.is_dir()
+    if let Some(from) = &arguments.from
+        && !is_address(from)
+        && !Path::new(from).is_dir()
     {
-        return Err(Failure::Input(format!(
-            "--from {}: is neither a folder nor an address",
-            folder.display()
-        )));
+        bail!("--from {from}: is neither a folder nor an address");
     }
     make_folder(&arguments.output)?;
-    for item in wanted {
-        fetch(item, &origin(arguments, item), &arguments.output, quiet)?;
+    for (item, origin) in &wanted {
+        let path = arguments.output.join(item.file);
+        let outcome = if path.symlink_metadata().is_ok() {
+            check_existing(item, &path)?;
+            "is there"
+        } else {
+            if is_address(origin) {
+                download(item, origin, &path)?;
+            } else {
+                copy(item, Path::new(origin), &path)?;
+            }
+            "fetched"
+        };
+        say::out(&format!("{}: {outcome}, and sound", path.display()));
     }
     Ok(())
 }
 
-fn origin(arguments: &Arguments, item: &Item) -> Origin {
+/// The folder or the URL that a file comes from.
+fn origin(arguments: &Arguments, item: &Item) -> String {
     match &arguments.from {
-        None => Origin::Address(item.url.into()),
-        Some(from) if from.starts_with("http://") || from.starts_with("https://") => {
-            Origin::Address(format!("{}/{}", from.trim_end_matches('/'), item.file))
-        }
-        Some(from) => Origin::Folder(from.into()),
+        None => item.url.into(),
+        Some(from) if is_address(from) => format!("{}/{}", from.trim_end_matches('/'), item.file),
+        Some(from) => from.clone(),
     }
 }
 
-impl Origin {
-    fn describe(&self) -> String {
-        match self {
-            Self::Folder(folder) => folder.display().to_string(),
-            Self::Address(address) => address.clone(),
-        }
-    }
+fn is_address(origin: &str) -> bool {
+    origin.starts_with("http://") || origin.starts_with("https://")
 }
 
-fn fetch(item: &Item, origin: &Origin, folder: &Path, quiet: bool) -> Result<(), Failure> {
-    let path = folder.join(item.file);
-    let failed = |e: &io::Error| Failure::cannot_write(&path, e);
-    if path.symlink_metadata().is_ok() {
-        let unreadable = |e| Failure::Input(format!("{}: is there, and cannot be read: {e}", path.display()));
-        let mut there = file::open(&path).map_err(unreadable)?;
-        let is_sound = there.metadata().is_ok_and(|m| m.len() == item.bytes)
-            && sum_of(&mut there).map_err(|e| failed(&e))? == item.sha256;
-        if is_sound {
-            say::out(&format!("{}: is there, and sound", path.display()));
-            return Ok(());
-        }
-        let message = "is there, but is not the published file; move it away to fetch it";
-        return Err(Failure::Input(format!("{}: {message}", path.display())));
+/// Refuses an existing file that is not the published one.
+fn check_existing(item: &Item, path: &Path) -> Result<(), Failure> {
+    let unreadable = |e| Failure::file(path, format!("is there, and cannot be read: {e}"));
+    let mut file = file::open(path).map_err(unreadable)?;
+    if file.metadata().is_ok_and(|m| m.len() == item.bytes)
+        && sum_of(&mut file).map_err(unreadable)? == item.sha256
+    {
+        return Ok(());
     }
-    let address = match origin {
-        Origin::Folder(from) => return copy(item, &from.join(item.file), &path, quiet),
-        Origin::Address(address) => address,
-    };
-    let part = folder.join(format!("{}.part", item.file));
+    Err(Failure::file(path, "is there, but is not the published file; move it away to fetch it"))
+}
+
+/// Copies a file from a folder, whole or not at all.
+fn copy(item: &Item, folder: &Path, path: &Path) -> Result<(), Failure> {
+    let from = folder.join(item.file);
+    let mut source = file::open(&from).map_err(FileError::read(&from))?;
+    let progress = Progress::bytes();
+    let written = file::write_whole(path, |out| {
+        take(&mut source, out, 0, item, &progress)?;
+        out.flush()?;
+        check_sum(item, &from.display().to_string(), out.get_mut())
+    });
+    written.map_err(|e| match e {
+        Broken::Write(e) => Failure::cannot_write(path, &e),
+        Broken::Source(message) => Failure::file(&from, format!("cannot read: {message}")),
+        Broken::Refused(message) => Failure::Input(message),
+    })
+}
+
+/// Downloads a file into `FILE.part`, which is renamed once its sum is right.
+fn download(item: &Item, address: &str, path: &Path) -> Result<(), Failure> {
+    let part = path.with_file_name(format!("{}.part", item.file));
     // A file of another kind with that name is left alone.
     if part.symlink_metadata().is_ok_and(|there| !there.is_file() || is_shared(&there)) {
         let message = "is no unfinished download: a link, or no regular file; move it away";
-        return Err(Failure::Input(format!("{}: {message}", part.display())));
+        return Err(Failure::file(&part, message));
     }
-    let file = OpenOptions::new().create(true).truncate(false).read(true).write(true).open(&part);
-    let mut file = file.map_err(|e| failed(&e))?;
+    let cannot_write = |e: io::Error| Failure::cannot_write(&part, &e);
+    let file = File::options().create(true).truncate(false).read(true).write(true).open(&part);
+    let mut file = file.map_err(cannot_write)?;
     if matches!(file.try_lock(), Err(TryLockError::WouldBlock)) {
-        return Err(Failure::Input(format!("{}: is being fetched by another process", part.display())));
+        return Err(Failure::file(&part, "is being fetched by another process"));
     }
-    let progress = Progress::bytes(quiet);
-    download(address, &mut file, item, &progress, &part)?;
-    drop(progress);
-    file.seek(SeekFrom::Start(0)).map_err(|e| failed(&e))?;
-    let (found, length) =
-        (sum_of(&mut file).map_err(|e| failed(&e))?, file.metadata().map_or(0, |m| m.len()));
-    if found != item.sha256 || length != item.bytes {
-        // Nothing of it can be trusted, so nothing is gone on from.
-        let _ = fs::remove_file(&part);
-        return Err(Failure::Input(other(&origin.describe(), item, length, &found)));
-    }
-    file.sync_all().map_err(|e| failed(&e))?;
-    fs::rename(&part, &path).map_err(|e| failed(&e))?;
-    say::out(&format!("{}: fetched, and sound", path.display()));
-    Ok(())
-}
-
-/// Takes a file from a folder, whole or not at all.
-fn copy(item: &Item, from: &Path, path: &Path, quiet: bool) -> Result<(), Failure> {
-    let mut source =
-        file::open(from).map_err(|e| Failure::Input(format!("{}: cannot read: {e}", from.display())))?;
-    let progress = Progress::bytes(quiet);
-    // The checksum is that of the written bytes, even if the source changes meanwhile.
-    let written = file::write_whole(path, |out| {
-        let mut out = Summed { out, hasher: Sha256::new() };
-        let length = take(&mut source, &mut out, 0, item, &progress)?;
-        let found = hexadecimal(out.hasher);
-        match found == item.sha256 && length == item.bytes {
-            true => Ok(()),
-            false => Err(io::Error::new(
-                io::ErrorKind::InvalidData,
-                other(&from.display().to_string(), item, length, &found),
-            )),
+    fill(&mut file, item, address, &Progress::bytes(), &part)?;
+    match check_sum(item, address, &mut file) {
+        Ok(()) => {}
+        Err(Broken::Write(e)) => return Err(cannot_write(e)),
+        Err(Broken::Source(message) | Broken::Refused(message)) => {
+            // A later attempt must not continue from wrong bytes.
+            let _ = fs::remove_file(&part);
+            return Err(Failure::Input(message));
         }
-    });
-    written.map_err(|e: io::Error| match e.kind() {
-        io::ErrorKind::InvalidData => Failure::Input(e.to_string()),
-        _ => Failure::cannot_write(path, &e),
-    })?;
-    drop(progress);
-    say::out(&format!("{}: fetched, and sound", path.display()));
-    Ok(())
-}
-
-fn other(origin: &str, item: &Item, length: u64, found: &str) -> String {
-    format!("{origin}: what came is not {}: {length} bytes with SHA-256 {found}; nothing was kept", item.file)
-}
-
-/// Sums what it writes.
-struct Summed<'a, W> {
-    out: &'a mut W,
-    hasher: Sha256,
-}
-
-impl<W: Write> Write for Summed<'_, W> {
-    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        let n = self.out.write(bytes)?;
-        self.hasher.update(&bytes[..n]);
-        Ok(n)
     }
-
-    fn flush(&mut self) -> io::Result<()> {
-        self.out.flush()
-    }
+    file.sync_all().and_then(|()| fs::rename(&part, path)).map_err(|e| Failure::cannot_write(path, &e))
 }
 
 /// Whether a file has another name as well.
@@ -252,36 +211,54 @@ fn is_shared(_: &fs::Metadata) -> bool {
     false
 }
 
+/// Why bytes of a file could not be fetched.
+enum Broken {
+    /// The source broke off. Another attempt may succeed.
+    Source(String),
+    /// Every attempt will fail.
+    Refused(String),
+    /// The disk.
+    Write(io::Error),
+}
+
+impl From<io::Error> for Broken {
+    fn from(e: io::Error) -> Self {
+        Self::Write(e)
+    }
+}
+
+/// Checks the size and the sum of a written file.
+fn check_sum(item: &Item, origin: &str, file: &mut File) -> Result<(), Broken> {
+    file.rewind()?;
+    let (found, length) = (sum_of(file)?, file.metadata()?.len());
+    if found == item.sha256 && length == item.bytes {
+        return Ok(());
+    }
+    Err(Broken::Refused(format!(
+        "{origin}: what came is not {}: {length} bytes with SHA-256 {found}; nothing was kept",
+        item.file
+    )))
+}
+
 /// SHA-256 of the rest of a file, in hexadecimal digits.
 fn sum_of(file: &mut File) -> io::Result<String> {
     let mut hasher = Sha256::new();
-    let mut chunk = vec![0; CHUNK];
-    loop {
-        match file.read(&mut chunk)? {
-            0 => break,
-            n => hasher.update(&chunk[..n]),
-        }
-    }
-    Ok(hexadecimal(hasher))
+    io::copy(file, &mut hasher)?;
+    Ok(hasher.finalize().iter().map(|byte| format!("{byte:02x}")).collect())
 }
 
-fn hexadecimal(hasher: Sha256) -> String {
-    hasher.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
-}
-
-/// Copies until the source ends or there is one byte too many; returns how many bytes there are then.
+/// Copies until the source ends or there is one byte too many. `at` bytes are there already.
 fn take(
     source: &mut dyn Read,
     file: &mut dyn Write,
-    from: u64,
+    mut at: u64,
     item: &Item,
     progress: &Progress,
-) -> io::Result<u64> {
-    let mut at = from;
+) -> Result<(), Broken> {
     let mut chunk = vec![0; CHUNK];
     while at <= item.bytes {
         let most = CHUNK.min((item.bytes + 1 - at) as usize);
-        let n = source.read(&mut chunk[..most])?;
+        let n = source.read(&mut chunk[..most]).map_err(|e| Broken::Source(e.to_string()))?;
         if n == 0 {
             break;
         }
@@ -289,27 +266,19 @@ fn take(
         at += n as u64;
         progress.advance(at, item.bytes);
     }
-    Ok(at)
+    Ok(())
 }
 
-/// Fills the file from where it ends; an attempt that breaks off is followed by another that goes on.
-fn download(
-    address: &str,
+/// Downloads the rest of an unfinished file, in several attempts if connections break.
+fn fill(
     file: &mut File,
     item: &Item,
+    address: &str,
     progress: &Progress,
     part: &Path,
 ) -> Result<(), Failure> {
-    let agent = |time: Duration| -> Agent {
-        let config = Agent::config_builder()
-            .timeout_connect(Some(SILENCE))
-            .timeout_recv_response(Some(SILENCE))
-            .timeout_recv_body(Some(time))
-            .http_status_as_error(false);
-        config.build().into()
-    };
     let cannot_write = |e: io::Error| Failure::cannot_write(part, &e);
-    // The most that there ever was: a server that makes us begin again brings nothing.
+    // Progress is counted from the largest length so far. Servers that restart the download make none.
     let (mut fruitless, mut most, mut time) = (0, 0, ATTEMPT[0]);
     loop {
         let before = file.seek(SeekFrom::End(0)).map_err(cannot_write)?;
@@ -321,13 +290,13 @@ fn download(
             continue;
         }
         most = most.max(before);
-        let why = match attempt(&agent(time), address, file, before, item, progress) {
+        let why = match attempt(time, address, file, before, item, progress) {
             Ok(()) => "the connection ended early".to_owned(),
             Err(Broken::Refused(message)) => {
                 return Err(Failure::Internal(format!("{address}: {message}")));
             }
             Err(Broken::Write(e)) => return Err(cannot_write(e)),
-            Err(Broken::Connection(message)) => message,
+            Err(Broken::Source(message)) => message,
         };
         let after = file.metadata().map_err(cannot_write)?.len();
         if after >= item.bytes {
@@ -346,69 +315,43 @@ fn download(
     }
 }
 
-/// Why an attempt ended.
-enum Broken {
-    /// Another attempt may bring more.
-    Connection(String),
-    /// No other attempt will.
-    Refused(String),
-    /// The disk.
-    Write(io::Error),
-}
-
+/// Requests the bytes from `from` on and appends them to the file.
 fn attempt(
-    agent: &Agent,
+    time: Duration,
     address: &str,
     file: &mut File,
     from: u64,
     item: &Item,
     progress: &Progress,
 ) -> Result<(), Broken> {
-    let mut request = agent.get(address);
+    let config = Agent::config_builder()
+        .timeout_connect(Some(SILENCE))
+        .timeout_recv_response(Some(SILENCE))
+        .timeout_recv_body(Some(time))
+        .http_status_as_error(false);
+    let mut request = Agent::from(config.build()).get(address);
     if from > 0 {
         request = request.header("Range", format!("bytes={from}-"));
     }
-    let mut answer = request.call().map_err(|e| Broken::Connection(e.to_string()))?;
+    let mut answer = request.call().map_err(|e| Broken::Source(e.to_string()))?;
     let status = answer.status();
-    let start = answer.headers().get("content-range").and_then(|range| range.to_str().ok());
-    let goes_on = status == StatusCode::PARTIAL_CONTENT
-        && start.is_some_and(|range| range.starts_with(&format!("bytes {from}-")));
+    let range = answer.headers().get("content-range").and_then(|range| range.to_str().ok());
+    let continues = range.is_some_and(|range| range.starts_with(&format!("bytes {from}-")));
     let from = match status {
-        StatusCode::PARTIAL_CONTENT if goes_on => from,
-        // The server knows no ranges: from the beginning.
+        StatusCode::PARTIAL_CONTENT if continues => from,
+        // The server does not support ranges and sends the whole file.
         StatusCode::OK => 0,
         StatusCode::PARTIAL_CONTENT | StatusCode::RANGE_NOT_SATISFIABLE => {
-            file.set_len(0).map_err(Broken::Write)?;
-            return Err(Broken::Connection(format!("the server answers with another range than {from}-")));
+            file.set_len(0)?;
+            return Err(Broken::Source(format!("the server answers with another range than {from}-")));
         }
         _ if status.is_server_error() || status == StatusCode::TOO_MANY_REQUESTS => {
-            return Err(Broken::Connection(format!("the server answers {status}")));
+            return Err(Broken::Source(format!("the server answers {status}")));
         }
         _ => return Err(Broken::Refused(format!("the server answers {status}"))),
     };
-    file.set_len(from).map_err(Broken::Write)?;
-    file.seek(SeekFrom::Start(from)).map_err(Broken::Write)?;
+    file.set_len(from)?;
+    file.seek(SeekFrom::Start(from))?;
     let mut body = answer.body_mut().with_config().limit(u64::MAX).reader();
-    let mut source = Source { body: &mut body, broken: None };
-    let taken = take(&mut source, file, from, item, progress);
-    match (taken, source.broken) {
-        (_, Some(why)) => Err(Broken::Connection(why)),
-        (Err(e), None) => Err(Broken::Write(e)),
-        (Ok(_), None) => Ok(()),
-    }
-}
-
-/// A body whose errors are told from those of the disk.
-struct Source<'a> {
-    body: &'a mut dyn Read,
-    broken: Option<String>,
-}
-
-impl Read for Source<'_> {
-    fn read(&mut self, chunk: &mut [u8]) -> io::Result<usize> {
-        self.body.read(chunk).or_else(|e| {
-            self.broken = Some(e.to_string());
-            Ok(0)
-        })
-    }
+    take(&mut body, file, from, item, progress)
 }

@@ -1,4 +1,4 @@
-//! `snapsnap completions` and `snapsnap man`: what shells and `man` want to know of the command line.
+//! `snapsnap completions` and `snapsnap man`.
 
 use std::path::PathBuf;
 
@@ -7,8 +7,8 @@ use clap_complete::Shell;
 use clap_mangen::Man;
 
 use crate::failure::Failure;
-use crate::pictures::make_folder;
-use crate::{output, say};
+use crate::output::{self, make_folder};
+use crate::say;
 
 #[derive(Args)]
 pub struct CompletionArguments {
@@ -31,9 +31,9 @@ pub fn completions(arguments: &CompletionArguments, mut command: Command) -> Res
     say::result(&text)
 }
 
-/// Writes the manual pages of `command` and of each of its own.
-pub fn pages(arguments: &ManArguments, mut command: Command, quiet: bool) -> Result<(), Failure> {
-    // Names of commands within commands.
+/// Writes the manual pages of `command` and of its subcommands.
+pub fn pages(arguments: &ManArguments, mut command: Command) -> Result<(), Failure> {
+    // Computes the display names of subcommands.
     command.build();
     make_folder(&arguments.output)?;
     let mut count = 0;
@@ -45,12 +45,10 @@ pub fn pages(arguments: &ManArguments, mut command: Command, quiet: bool) -> Res
         rendered.map_err(|e| Failure::Internal(e.to_string()))?;
         output::write(&arguments.output.join(format!("{name}.1")), &page)?;
         count += 1;
-        // `help` repeats them all.
+        // `help` contains all other commands again.
         let visible = |command: &&Command| !command.is_hide_set() && command.get_name() != "help";
         waiting.extend(command.get_subcommands().filter(visible).cloned());
     }
-    if !quiet {
-        say::out(&format!("{}: {count} pages", arguments.output.display()));
-    }
+    say::info(&format!("{}: {count} pages", arguments.output.display()));
     Ok(())
 }

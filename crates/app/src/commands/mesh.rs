@@ -13,6 +13,9 @@ use crate::failure::Failure;
 use crate::progress::Progress;
 use crate::{device, memory, say};
 
+/// Bytes per texel: position, normal, colour, and sums over views.
+const TEXEL: u64 = 60;
+
 #[derive(Args)]
 pub struct Arguments {
     /// File of Gaussians, PLY or SPZ.
@@ -25,7 +28,7 @@ pub struct Arguments {
     /// auto, cpu, ndarray, wgpu, vulkan, cuda or metal; wgpu:1 is the second adapter.
     #[arg(long, default_value = "auto")]
     device: String,
-    /// Print what was closed and dropped, and the time.
+    /// Print the closed and dropped parts, and the time.
     #[arg(short, long)]
     verbose: bool,
 }
@@ -33,16 +36,16 @@ pub struct Arguments {
 /// Options of a surface.
 #[derive(Args)]
 pub struct SurfaceArguments {
-    /// Triangles of the mesh, about; 0 keeps all [default: 100000].
+    /// Approximate number of triangles of the mesh; 0 keeps all [default: 100000].
     #[arg(long, value_name = "N")]
     faces: Option<usize>,
-    /// A texture of so many pixels' side instead of colours at the corners (not in a .ply).
+    /// Side in pixels of a texture, which replaces the colours of vertices (not in a .ply).
     #[arg(long, value_name = "SIZE", value_parser = clap::value_parser!(u32).range(64..=16384))]
     texture: Option<u32>,
 }
 
 impl SurfaceArguments {
-    /// Refuses arguments that nothing would come of.
+    /// Refuses options without effect.
     pub fn refuse<T>(&self, why: &str) -> Result<Option<T>, Failure> {
         let given = [("--faces", self.faces.is_some()), ("--texture", self.texture.is_some())];
         match given.iter().find(|(_, given)| *given) {
@@ -52,25 +55,23 @@ impl SurfaceArguments {
     }
 }
 
-pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
+pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let since = Instant::now();
     let target = Target::new(&arguments.output, &arguments.surface)?;
     check_outputs(&target.files(), &[&arguments.input])?;
     let device = device::choose(&arguments.device)?;
     let loaded = scene::read(&arguments.input, &device)?;
-    let fused = target.write(&loaded, &arguments.input, quiet)?;
+    let fused = target.write(&loaded, &arguments.input)?;
     if arguments.verbose {
-        say::out(&told(&fused));
+        say::out(&describe(&fused));
         say::out(&format!("{:.1} s", since.elapsed().as_secs_f64()));
     }
-    if !quiet {
-        let (file, faces) = (arguments.output.display(), fused.mesh.faces.len());
-        say::out(&format!("{file}: {faces} triangles, {} positions", fused.mesh.positions.len()));
-    }
+    let (file, faces) = (arguments.output.display(), fused.mesh.faces.len());
+    say::info(&format!("{file}: {faces} triangles, {} positions", fused.mesh.positions.len()));
     Ok(())
 }
 
-/// A mesh that is to be written.
+/// An output file of a mesh, with its companions.
 pub struct Target {
     path: PathBuf,
     companions: Vec<PathBuf>,
@@ -78,42 +79,37 @@ pub struct Target {
 }
 
 impl Target {
-    /// Refuses what is no kind of mesh.
+    /// Refuses unknown kinds of meshes and unsuitable options.
     pub fn new(path: &Path, surface: &SurfaceArguments) -> Result<Self, Failure> {
-        if Kind::named(path).is_none() {
+        let Some(kind) = Kind::named(path) else {
             let message = "is neither .glb nor .obj nor .ply; the extension says what to write";
-            return Err(Failure::Input(format!("{}: {message}", path.display())));
-        }
+            return Err(Failure::file(path, message));
+        };
         let name = path.file_name().unwrap_or_default().to_str();
-        if Kind::named(path) == Some(Kind::Obj) && name.is_none_or(|name| name.contains(char::is_control)) {
+        if kind == Kind::Obj && name.is_none_or(|name| name.contains(char::is_control)) {
             let message = "an OBJ names its materials' file, so its own name must be plain text (UTF-8)";
-            return Err(Failure::Input(format!("{}: {message}", path.display())));
+            return Err(Failure::file(path, message));
         }
         let texture = surface.texture.unwrap_or(0) as usize;
-        if texture > 0 && Kind::named(path) == Some(Kind::Ply) {
+        if texture > 0 && kind == Kind::Ply {
             let message = "a PLY has no texture: leave out --texture, or write a .glb or .obj";
-            return Err(Failure::Input(format!("{}: {message}", path.display())));
+            return Err(Failure::file(path, message));
         }
-        // Texels of the surface with their places, normals and colours, and what views said of them.
-        const BYTES: u64 = 60;
-        memory::check(
-            &format!("--texture {texture}"),
-            BYTES * (texture as u64).pow(2),
-            "choose a smaller one",
-        )?;
+        let bytes = TEXEL * (texture as u64).pow(2);
+        memory::check(&format!("--texture {texture}"), bytes, "choose a smaller one")?;
         let options = Options { faces: surface.faces.unwrap_or(Options::default().faces), texture };
         Ok(Self { path: path.to_owned(), companions: export::companions(path, texture > 0), options })
     }
 
-    /// Everything that will be written.
+    /// All output files.
     pub fn files(&self) -> Vec<&Path> {
         let companions = self.companions.iter().map(PathBuf::as_path);
         companions.chain([self.path.as_path()]).collect()
     }
 
-    /// Makes the mesh of Gaussians and writes it; `name` is the file that they are from.
-    pub fn write(&self, scene: &Loaded, name: &Path, quiet: bool) -> Result<Fused, Failure> {
-        let progress = Progress::stages(quiet);
+    /// Makes the mesh of Gaussians and writes it. Errors contain `name`, the Gaussians' file.
+    pub fn write(&self, scene: &Loaded, name: &Path) -> Result<Fused, Failure> {
+        let progress = Progress::stages();
         let fused = fuse(scene, self.options, &|name| progress.stage(name));
         let fused = fused.map_err(|e| Failure::from(e).about(name))?;
         progress.stage("writing");
@@ -122,8 +118,8 @@ impl Target {
     }
 }
 
-/// How a surface came about.
-pub fn told(fused: &Fused) -> String {
+/// A description of the fusion.
+pub fn describe(fused: &Fused) -> String {
     format!(
         "surface from a field of {:.1} mm: gaps between the shells closed: {}, hollows filled: {}, \
          parts joined with the body: {}, flying pieces dropped: {}; {} triangles reduced to {}",

@@ -1,4 +1,4 @@
-//! One module per subcommand.
+//! The subcommands.
 
 pub mod bench;
 pub mod compare;
@@ -6,10 +6,7 @@ pub mod convert;
 pub mod demo;
 pub mod doctor;
 pub mod evaluate;
-pub mod export_weights;
 pub mod fetch_weights;
-pub mod import_weights;
-pub mod init_weights;
 pub mod manuals;
 pub mod mesh;
 pub mod prepare;
@@ -18,10 +15,12 @@ pub mod render;
 pub mod stability;
 pub mod train;
 pub mod view;
+pub mod weight_files;
 
 use std::path::{Component, Path, PathBuf};
 
 use clap::Args;
+use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use snapsnap_base::config::Schema;
 use snapsnap_base::file;
 use snapsnap_net::config::Config;
@@ -29,8 +28,8 @@ use snapsnap_splat::scene::Kind;
 
 use crate::failure::Failure;
 
-/// Where a config comes from.
-#[derive(Args)]
+/// Options of a config.
+#[derive(Args, Default)]
 pub struct ConfigArguments {
     /// TOML config; without one, the config stored with the weights, or the published size.
     #[arg(long, value_name = "TOML")]
@@ -41,12 +40,7 @@ pub struct ConfigArguments {
 }
 
 impl ConfigArguments {
-    /// The config file, if one is given.
-    pub fn file(&self) -> Option<&Path> {
-        self.config.as_deref()
-    }
-
-    /// The config of the file given, or else of `fallback` (name and TOML text), with the overrides applied.
+    /// The config of the file, or without one that of `fallback` (name and TOML text), with the overrides applied.
     pub fn resolve(&self, fallback: (&str, &str)) -> Result<Config, Failure> {
         Ok(match &self.config {
             Some(path) => Config::from_file(path, &self.set)?,
@@ -55,35 +49,46 @@ impl ConfigArguments {
     }
 }
 
-/// Refuses output paths that could not be written in the end, that are one another, or that are an input.
+/// An argument with these values: name, help, value.
+pub fn one_of<T: Copy + Send + Sync + 'static, const N: usize>(
+    values: [(&'static str, &'static str, T); N],
+) -> impl TypedValueParser<Value = T> {
+    let possible = values.map(|(name, help, _)| match help {
+        "" => PossibleValue::new(name),
+        help => PossibleValue::new(name).help(help),
+    });
+    PossibleValuesParser::new(possible).map(move |name| {
+        let (_, _, value) = values.iter().find(|(other, ..)| *other == name).expect("a possible value");
+        *value
+    })
+}
+
+/// Refuses outputs that cannot be written, that are given twice or that are inputs.
 pub fn check_outputs(outputs: &[&Path], inputs: &[&Path]) -> Result<(), Failure> {
     for (i, output) in outputs.iter().enumerate() {
         file::check_writable(output).map_err(|e| Failure::cannot_write(output, &e))?;
         if inputs.iter().any(|input| is_same_file(output, input)) {
-            let message = "is an input of this command and would be overwritten";
-            return Err(Failure::Input(format!("{}: {message}", output.display())));
+            return Err(Failure::file(output, "is an input of this command and would be overwritten"));
         }
         if outputs[..i].iter().any(|other| place(output) == place(other) || is_same_file(output, other)) {
-            return Err(Failure::Input(format!("{}: is given for two outputs", output.display())));
+            return Err(Failure::file(output, "is given for two outputs"));
         }
     }
     Ok(())
 }
 
-/// Refuses a file of Gaussians whose extension does not say what to write. A pipe or a device without one gets a PLY.
+/// Refuses a file of Gaussians with an unknown extension. A pipe or a device without one receives a PLY.
 pub fn check_kind(path: &Path) -> Result<(), Failure> {
     if Kind::named(path).is_some() || file::is_special(path) {
         return Ok(());
     }
-    let message = "is neither .ply nor .spz; the extension says what to write";
-    Err(Failure::Input(format!("{}: {message}", path.display())))
+    Err(Failure::file(path, "is neither .ply nor .spz; the extension says what to write"))
 }
 
-/// Refuses a folder to write into that lies in a data set (roots), before it is made: an empty folder among a data set's would be
-/// a subject without pictures.
+/// Refuses an output folder in a data set (one of `roots`). There it would be a subject without pictures.
 pub fn outside_data<'a>(path: &Path, roots: impl IntoIterator<Item = &'a Path>) -> Result<(), Failure> {
     let whole = std::path::absolute(path).map_err(|e| Failure::cannot_write(path, &e))?;
-    // Links are followed as far as there are any; `..` behind what is not there yet is taken literally.
+    // Links of existing folders are followed. `..` after a missing folder is taken literally.
     let mut there = PathBuf::new();
     for part in whole.components() {
         match part {
@@ -95,14 +100,14 @@ pub fn outside_data<'a>(path: &Path, roots: impl IntoIterator<Item = &'a Path>) 
     for root in roots {
         let root = root.canonicalize().ok();
         if root.is_some_and(|root| there.starts_with(root)) {
-            return Err(Failure::Input(format!("{}: lies in a data set", path.display())));
+            return Err(Failure::file(path, "lies in a data set"));
         }
     }
     Ok(())
 }
 
-/// Where a file is or will be, however its path is spelled.
-fn place(path: &Path) -> PathBuf {
+/// The canonical path of a file, which may be missing.
+pub fn place(path: &Path) -> PathBuf {
     let path = file::target_of(path);
     let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let folder = folder.canonicalize().unwrap_or_else(|_| folder.to_owned());

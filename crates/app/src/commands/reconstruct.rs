@@ -12,15 +12,15 @@ use snapsnap_net::weights::schema::Part;
 use snapsnap_net::{Photograph, Reconstructor};
 use snapsnap_splat::scene;
 
-use super::mesh::{SurfaceArguments, Target, told};
+use super::mesh::{self, SurfaceArguments, Target};
 use super::{ConfigArguments, check_kind, check_outputs, is_same_file};
-use crate::failure::Failure;
+use crate::failure::{Failure, bail};
 use crate::progress::Progress;
 use crate::turntable::Turntable;
 use crate::{device, dump, memory, output, say, weights};
 
-/// Bytes per pixel of a photograph while it is placed on its canvas: as it is decoded, as red, green, blue and mask, and one
-/// plane of numbers; beside red, green, blue and mask of another as large.
+/// Bytes per pixel of a photograph while it is placed on its canvas: the decoded picture, its colours and mask, one plane of
+/// numbers, and colours and mask of the other photograph.
 const PHOTOGRAPH: u64 = 18;
 
 #[derive(Args)]
@@ -32,10 +32,10 @@ pub struct Arguments {
     /// Masks of the two photographs (white: person).
     #[arg(long, num_args = 2, value_names = ["FRONT_MASK", "BACK_MASK"])]
     masks: Option<Vec<PathBuf>>,
-    /// The pictures already are the canvas: no box, no scaling, no centring.
+    /// Use the pictures as the canvas, without cropping, scaling and centring.
     #[arg(long)]
     as_is: bool,
-    /// Weight file, or a folder that holds `weights.safetensors` [default: those that come with the program].
+    /// Weight file, or a folder that contains `weights.safetensors` [default: the program's own].
     #[arg(long, value_name = "FILE|DIR")]
     weights: Option<PathBuf>,
     #[command(flatten)]
@@ -43,7 +43,7 @@ pub struct Arguments {
     /// auto, cpu, ndarray, wgpu, vulkan, cuda or metal; wgpu:1 is the second adapter.
     #[arg(long, default_value = "auto")]
     device: String,
-    /// Gaussians to write, .ply or .spz; the config in force is written beside them.
+    /// File of Gaussians to write, .ply or .spz. The resolved config is written beside it.
     #[arg(short, long, default_value = "human.ply")]
     output: PathBuf,
     /// Also render the result all around: an animation, a sheet of eight views, or a folder of pictures.
@@ -57,12 +57,12 @@ pub struct Arguments {
     /// Also write every intermediate tensor.
     #[arg(long, value_name = "FILE.safetensors")]
     dump: Option<PathBuf>,
-    /// Print what ran, what was left out and why, and the time of every module.
+    /// Print the modules that ran, the omitted ones with the reasons, and the time of each.
     #[arg(short, long)]
     verbose: bool,
 }
 
-pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
+pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let start = Instant::now();
     let weights = weights::open(arguments.weights.as_deref(), &arguments.config)?;
     weights.require(Part::PointPredictor)?;
@@ -71,18 +71,17 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let mut times = vec![("opening weights", start.elapsed())];
     let mut timed = |name: &'static str, since: Instant| times.push((name, since.elapsed()));
     let turntable = arguments.turntable.as_deref().map(Turntable::new).transpose()?;
-    let mesh = match &arguments.mesh {
+    let target = match &arguments.mesh {
         Some(path) => Some(Target::new(path, &arguments.surface)?),
         None => arguments.surface.refuse("without --mesh there is no mesh to shape")?,
     };
-    let config_path = check_paths(arguments, weights.path(), turntable.as_ref(), mesh.as_ref())?;
+    let config_path = check_paths(arguments, weights.path(), turntable.as_ref(), target.as_ref())?;
     let since = Instant::now();
     let device = device::choose(&arguments.device)?;
     timed("finding the device", since);
+    memory::check_networks(&weights, &device)?;
     if memory::is_cpu(&device) {
         let network = config.memory_needed(weights.parameters());
-        let what = format!("a canvas of {0}×{0} pixels", config.network.resolution);
-        memory::check(&what, network, "choose a smaller `network.resolution`")?;
         for path in [&arguments.front, &arguments.back] {
             let [width, height] = picture::size(path)?;
             let bytes = PHOTOGRAPH * u64::from(width) * u64::from(height);
@@ -102,7 +101,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let canvases = photo::load(paths, masks, config.network.resolution, placement)?;
     timed("photographs", since);
 
-    let progress = Progress::stages(quiet);
+    let progress = Progress::stages();
     progress.stage("loading weights");
     let since = Instant::now();
     let reconstructor = Reconstructor::load(&weights, &device)?;
@@ -120,8 +119,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     times.append(&mut result.times);
     if result.gaussians.is_empty() {
         let (file, plan) = (weights.path().display(), plan.join("\n  "));
-        let message = format!("{file}: no Gaussian came out, nothing was written; what happened:\n  {plan}");
-        return Err(Failure::Input(message));
+        bail!("{file}: no Gaussian came out, nothing was written; what happened:\n  {plan}");
     }
 
     progress.stage("writing");
@@ -138,27 +136,27 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     drop(progress);
     if let Some(turntable) = &turntable {
         let since = Instant::now();
-        turntable.write(&world, quiet)?;
+        turntable.write(&world)?;
         times.push(("turntable", since.elapsed()));
     }
-    if let Some(mesh) = &mesh {
+    if let Some(target) = &target {
         let since = Instant::now();
-        plan.push(told(&mesh.write(&world.clone().into(), &arguments.output, quiet)?));
+        plan.push(mesh::describe(&target.write(&world.clone().into(), &arguments.output)?));
         times.push(("mesh", since.elapsed()));
     }
-    // Messages must not enter a pipe of data.
-    let say = if file::is_special(&arguments.output) { say::err } else { say::out };
+    let say = say::beside(&arguments.output);
     if arguments.verbose {
-        report(say, &plan, &times, start.elapsed());
+        times.push(("total", start.elapsed()));
+        report(say, &plan, &times);
     }
-    if !quiet {
+    if !say::is_quiet() {
         say(&format!("{}: {} Gaussians", arguments.output.display(), result.gaussians.len()));
     }
     Ok(())
 }
 
-/// Refuses outputs that cannot be written or would destroy an input; returns where the config goes. Beside a pipe or a
-/// device there is no place for it, and a config that was given is not overwritten by itself.
+/// Refuses outputs that cannot be written or would destroy an input. Returns the path of the output config, which is not written
+/// beside a pipe or a device, or over the given config.
 fn check_paths(
     arguments: &Arguments,
     weights: &Path,
@@ -170,29 +168,29 @@ fn check_paths(
     let mut config_path = arguments.output.clone().into_os_string();
     config_path.push(".config.toml");
     let config_path = PathBuf::from(config_path);
-    let given = arguments.config.file();
-    let itself = given.is_some_and(|given| is_same_file(given, &config_path));
-    let config_path = (!itself && !file::is_special(&arguments.output)).then_some(config_path);
+    let given = arguments.config.config.as_deref();
+    let is_given = given.is_some_and(|given| is_same_file(given, &config_path));
+    let config_path = (!is_given && !file::is_special(&arguments.output)).then_some(config_path);
     inputs.extend(given);
     let outputs = [Some(&arguments.output), arguments.dump.as_ref(), config_path.as_ref()];
     let mut outputs: Vec<&Path> = outputs.into_iter().flatten().map(PathBuf::as_path).collect();
     outputs.extend(mesh.map(Target::files).unwrap_or_default());
-    for output in &outputs {
-        turntable.map_or(Ok(()), |turntable| turntable.check_apart(output))?;
+    let mut pictures = Vec::new();
+    if let Some(turntable) = turntable {
+        outputs.iter().try_for_each(|output| turntable.check_apart(output))?;
+        pictures = turntable.outputs();
     }
-    let pictures = turntable.map(Turntable::outputs).unwrap_or_default();
     outputs.extend(pictures.iter().map(PathBuf::as_path));
     check_outputs(&outputs, &inputs)?;
     check_kind(&arguments.output)?;
     Ok(config_path)
 }
 
-fn report(say: fn(&str), plan: &[String], times: &[(&str, Duration)], total: Duration) {
-    let time =
-        |name: &str, time: Duration| say(&format!("  {name:<26} {:>9.1} ms", time.as_secs_f64() * 1e3));
+fn report(say: fn(&str), plan: &[String], times: &[(&str, Duration)]) {
     say("plan");
     plan.iter().for_each(|line| say(&format!("  {line}")));
     say("time, device synchronised");
-    times.iter().for_each(|(name, spent)| time(name, *spent));
-    time("total", total);
+    for (name, time) in times {
+        say(&format!("  {name:<26} {:>9.1} ms", time.as_secs_f64() * 1e3));
+    }
 }

@@ -32,7 +32,7 @@ pub struct Arguments {
     /// Only cases whose area or input contains this text.
     #[arg(long, value_name = "TEXT")]
     only: Option<String>,
-    /// Fewer steps instead of a million.
+    /// Run fewer steps than the full million.
     #[arg(long)]
     quick: bool,
     /// Folder of the report.
@@ -57,7 +57,7 @@ fn photographs(side: usize) -> [Photograph; 2] {
     })
 }
 
-pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
+pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let devices = match arguments.device.as_slice() {
         [] => device::all(),
         names => names.iter().map(|name| device::choose(name)).collect::<Result<_, _>>()?,
@@ -65,7 +65,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let mut cases = splats::cases();
     cases.extend(networks::cases());
     if let Some(path) = &arguments.weights {
-        let weights = weights::open(Some(path), &ConfigArguments { config: None, set: Vec::new() })?;
+        let weights = weights::open(Some(path), &ConfigArguments::default())?;
         let photographs = photographs(weights.config.network.resolution);
         cases.extend(networks::sixteen_bits(weights, photographs));
     }
@@ -83,35 +83,30 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let rounds: Vec<(&Case, &Device)> = cases
         .iter()
         .flat_map(|case| {
-            devices.iter().take(if case.once { 1 } else { devices.len() }).map(move |d| (case, d))
+            let count = if case.once { 1 } else { devices.len() };
+            devices[..count].iter().map(move |device| (case, device))
         })
         .collect();
-    let progress = Progress::steps(quiet, rounds.len(), "cases");
-    // Panics are rows of the table and print nothing.
+    // The table contains panics. They print nothing.
     let hook = std::panic::take_hook();
     std::panic::set_hook(Box::new(|_| {}));
-    let mut rows: Vec<Row> = Vec::new();
-    for (done, (case, device)) in rounds.iter().enumerate() {
-        rows.push(run_case(case, device, &device::describe(device)));
-        progress.step(done + 1, rounds.len(), "cases");
-    }
+    let rows: Vec<Row> = Progress::over(rounds.iter(), "cases")
+        .map(|(case, device)| run_case(case, device, &device::describe(device)))
+        .collect();
     std::panic::set_hook(hook);
-    drop(progress);
     let names: Vec<String> = devices.iter().map(device::describe).collect();
     let header = header(&names.join(", "));
     folder.text("report.md", &report::markdown(&header, &rows))?;
     folder.finish(&report::json(&header, &rows))?;
     let failed: Vec<&Row> = rows.iter().filter(|row| row.verdict == "fails").collect();
-    if !quiet {
-        let count = |verdict: &str| rows.iter().filter(|row| row.verdict == verdict).count();
-        say::out(&format!("{} hold, {} fail, {} skipped", count("holds"), failed.len(), count("skipped")));
-        say::out(&format!("{}: report.md, report.json", folder.path().display()));
-    }
+    let count = |verdict: &str| rows.iter().filter(|row| row.verdict == verdict).count();
+    say::info(&format!("{} hold, {} fail, {} skipped", count("holds"), failed.len(), count("skipped")));
+    say::info(&format!("{}: report.md, report.json", folder.path.display()));
     if failed.is_empty() {
         return Ok(());
     }
-    failed
-        .iter()
-        .for_each(|row| say::err(&format!("fails: {}, on {}: {}", row.case.input, row.device, row.note)));
+    for row in &failed {
+        say::err(&format!("fails: {}, on {}: {}", row.case.input, row.device, row.note));
+    }
     Err(Failure::Internal(format!("{} of {} cases fail", failed.len(), rows.len())))
 }

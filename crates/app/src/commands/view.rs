@@ -1,4 +1,4 @@
-//! `snapsnap view`: a page on this machine that shows Gaussians. It is made of crates/app/viewer.
+//! `snapsnap view`: a local web page (crates/app/viewer) that shows Gaussians.
 
 use std::borrow::Cow;
 use std::io;
@@ -11,6 +11,7 @@ use clap::Args;
 use snapsnap_mesh::export;
 use snapsnap_mesh::fuse::{Options, fuse};
 use snapsnap_splat::scene::{Kind, Stored};
+use ureq::http::StatusCode;
 
 use super::convert::finite;
 use crate::failure::Failure;
@@ -29,9 +30,9 @@ pub struct Arguments {
     open: bool,
 }
 
-/// Held by whoever makes a mesh: one at a time, each takes all cores and a gigabyte.
+/// Locked while a mesh is made. A mesh takes all cores and a gigabyte.
 static MESH: Mutex<()> = Mutex::new(());
-/// Nothing from elsewhere, and nothing to elsewhere.
+/// Content security policy without any other host.
 const POLICY: &str = "default-src 'none'; script-src 'self' 'wasm-unsafe-eval' blob:; worker-src 'self' blob:; \
                       connect-src 'self' blob: data:; img-src 'self' blob: data:; style-src 'self'; base-uri 'none'; \
                       form-action 'none'; frame-ancestors 'none'";
@@ -40,15 +41,15 @@ const POLICY: &str = "default-src 'none'; script-src 'self' 'wasm-unsafe-eval' b
 type PageFile = (&'static str, &'static str, &'static [u8]);
 
 const PAGE: [PageFile; 4] = [
-    ("/", "text/html; charset=utf-8", include_bytes!("../../../../assets/viewer/index.html")),
+    ("/", "text/html; charset=utf-8", include_bytes!("../../viewer/index.html")),
     ("/viewer.js", "text/javascript; charset=utf-8", include_bytes!("../../../../assets/viewer/viewer.js")),
     ("/viewer.css", "text/css; charset=utf-8", include_bytes!("../../../../assets/viewer/viewer.css")),
     ("/LICENSES.md", "text/markdown; charset=utf-8", include_bytes!("../../../../assets/viewer/LICENSES.md")),
 ];
 
-pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
+pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let input = arguments.input.as_path();
-    // Unsuitable files are refused here and not in the browser.
+    // Refuses unsuitable files before the browser starts.
     finite(input)?;
     let wanted = arguments.port.unwrap_or(0);
     let cannot = |e: io::Error| Failure::Input(format!("--port {wanted}: cannot listen on 127.0.0.1: {e}"));
@@ -58,9 +59,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     interrupt::end_well();
     // The address is printed with --quiet as well.
     say::out(&url);
-    if !quiet {
-        say::err(&format!("shows {}; Ctrl-C ends it", input.display()));
-    }
+    say::note(&format!("shows {}; Ctrl-C ends it", input.display()));
     if arguments.open
         && let Err(e) = open::that_detached(&url)
     {
@@ -70,78 +69,81 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
 }
 
 fn respond(request: &Request, input: &Path, port: u16) -> Answer {
-    // A page elsewhere whose name was pointed at 127.0.0.1 may not read the file.
-    let is_ours = |host: &String| {
+    // Other names may belong to a page of another host whose name resolves to 127.0.0.1.
+    let is_local = |host: &String| {
         let host = host.to_ascii_lowercase();
-        // Browsers leave out the usual port.
+        // Browsers omit port 80.
         let name = host.strip_suffix(&format!(":{port}")).or((port == 80).then_some(host.as_str()));
         name.is_some_and(|name| ["127.0.0.1", "localhost"].contains(&name))
     };
-    if !request.host.as_ref().is_some_and(is_ours) {
-        return text(403, "only for http://127.0.0.1");
+    if !request.host.as_ref().is_some_and(is_local) {
+        return text(StatusCode::FORBIDDEN, "only for http://127.0.0.1");
     }
     let is_head = request.method == "HEAD";
     if request.method != "GET" && !is_head {
-        return text(405, "GET and HEAD only");
+        return text(StatusCode::METHOD_NOT_ALLOWED, "GET and HEAD only");
     }
     let path = request.path.as_str();
     if let Some((_, kind, content)) = PAGE.iter().find(|(name, ..)| *name == path) {
-        return answer(200, kind, (*content).into());
+        return answer(StatusCode::OK, kind, (*content).into());
     }
     let made = match path {
         "/scene.ply" => bytes(input, Kind::Ply),
         "/scene.spz" => bytes(input, Kind::Spz),
         "/scene.glb" if is_head => finite(input).map(|_| Vec::new()),
         "/scene.glb" => match MESH.try_lock() {
-            Err(TryLockError::WouldBlock) => return text(503, "a mesh is being made; try again in a minute"),
+            Err(TryLockError::WouldBlock) => {
+                let message = "a mesh is being made; try again in a minute";
+                return text(StatusCode::SERVICE_UNAVAILABLE, message);
+            }
             _one => mesh(input),
         },
-        _ => return text(404, "no such page"),
+        _ => return text(StatusCode::NOT_FOUND, "no such page"),
     };
-    let extension = &path["/scene".len()..];
     match made {
         Ok(content) => {
-            let stem = input.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
-            let name = percent_encoded(&format!("{stem}{extension}"));
-            let mut answer = answer(200, "application/octet-stream", content.into());
+            let extension = path.trim_start_matches("/scene.");
+            let name = input.with_extension(extension);
+            let name = percent_encoded(&name.file_name().unwrap_or_default().to_string_lossy());
+            let mut answer = answer(StatusCode::OK, "application/octet-stream", content.into());
             let disposition = format!("attachment; filename*=UTF-8''{name}");
             answer.headers.extend([("Content-Disposition", disposition), ("X-Name", name)]);
             answer
         }
-        Err(e) => text(422, &e.to_string()),
+        Err(e) => text(StatusCode::UNPROCESSABLE_ENTITY, &e.to_string()),
     }
 }
 
-/// The file as it is now, without what is not finite: whatever kind it is, the page gets the kind it knows.
+/// The finite Gaussians of the current file as a file of this kind.
 fn bytes(input: &Path, kind: Kind) -> Result<Vec<u8>, Failure> {
-    // One at a time: each takes memory for the whole file.
+    // One request at a time, since each needs memory for the whole file.
     static ONE: Mutex<()> = Mutex::new(());
     let _one = ONE.lock().unwrap_or_else(PoisonError::into_inner);
     Ok(finite(input)?.0.to_bytes(kind)?)
 }
 
-/// A mesh as `snapsnap mesh` makes it.
+/// The mesh that `snapsnap mesh` makes.
 fn mesh(input: &Path) -> Result<Vec<u8>, Failure> {
     let fused = fuse(&Stored::read(input)?.load(&Device::flex()), Options::default(), &|_| {})?;
     export::glb_bytes(&fused.mesh).map_err(|e| Failure::Internal(e.to_string()))
 }
 
-fn text(status: u16, message: &str) -> Answer {
+fn text(status: StatusCode, message: &str) -> Answer {
     answer(status, "text/plain; charset=utf-8", say::printable(message).into_bytes().into())
 }
 
-fn answer(status: u16, kind: &str, content: Cow<'static, [u8]>) -> Answer {
+fn answer(status: StatusCode, kind: &str, content: Cow<'static, [u8]>) -> Answer {
     let headers = vec![
         ("Content-Type", kind.to_owned()),
         ("Content-Security-Policy", POLICY.to_owned()),
         ("X-Content-Type-Options", "nosniff".to_owned()),
-        // The next program on this port may serve another person.
+        // Another program may use the port later.
         ("Cache-Control", "no-store".to_owned()),
     ];
     Answer { status, headers, content }
 }
 
-/// For a header: everything but letters, digits and the like as the bytes of its UTF-8.
+/// The text with percent codes for all bytes but unreserved characters (RFC 3986).
 fn percent_encoded(text: &str) -> String {
     let plain = |byte: u8| byte.is_ascii_alphanumeric() || b"-._~".contains(&byte);
     text.bytes()

@@ -1,14 +1,14 @@
-// Spark draws each Gaussian as an instance of its own. Software GPUs begin each instance anew, which costs them far more than its
-// four corners: frames of a person took 20 s. Many Gaussians to an instance cost a real GPU nothing.
+// Spark draws each Gaussian as its own instance. On software GPUs the start of an instance costs far more than its four corners:
+// frames of a person took 20 s. Real GPUs are as fast with many Gaussians per instance.
 
 import * as THREE from "three";
 
-/** Gaussians to an instance. */
+/** Gaussians per instance. */
 const BATCH = 512;
 
 const corners = [[-1, -1], [1, -1], [1, 1], [-1, 1]];
 
-/** Lets a renderer of Spark's draw so; one whose shader does not look as expected is left as it is. */
+/** Changes Spark's renderer to instances of several Gaussians. A renderer with an unexpected shader is not changed. */
 export function inBatches(spark) {
   const { geometry, material } = spark;
   const begin = "void main() {";
@@ -18,7 +18,7 @@ export function inBatches(spark) {
   }
   const count = { value: 0 };
   material.uniforms.gaussianCount = count;
-  // The row of a Gaussian in its batch comes as the third coordinate of its corners, which is 0 elsewhere.
+  // The third coordinate of the corners, which Spark sets to 0, is the index of a Gaussian in its batch.
   const row = `
     int gaussian = gl_InstanceID * ${BATCH} + int(position.z);
     if (gaussian >= gaussianCount) {

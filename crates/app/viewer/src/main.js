@@ -4,18 +4,19 @@ import { SparkRenderer, SplatFileType, SplatMesh } from "@sparkjsdev/spark";
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { inBatches } from "./batches.js";
+import "./style.css";
 
 const element = (id) => document.getElementById(id);
 const canvas = element("canvas");
 
 const renderer = new THREE.WebGLRenderer({ canvas, antialias: false });
 const scene = new THREE.Scene();
-// Drawn is what has changed: a page that nobody touches costs nothing.
+// The page draws only after changes.
 let changed = true;
 const redraw = () => {
   changed = true;
 };
-// The kernel of the program's own rasteriser: 0.3 pixels² wider and no less opaque, to where alpha falls below 1/255.
+// The kernel of the program's rasteriser: variances grow by 0.3 pixels², opacity stays, and alpha below 1/255 is omitted.
 const spark = new SparkRenderer({
   renderer,
   preBlurAmount: 0.3,
@@ -23,7 +24,7 @@ const spark = new SparkRenderer({
   maxStdDev: 3,
   minAlpha: 1 / 255,
   sortRadial: false,
-  // Sorted for a camera once that has been drawn.
+  // Spark sorts the Gaussians for a camera after its first frame.
   onDirty: redraw,
 });
 inBatches(spark);
@@ -40,7 +41,7 @@ const controls = new OrbitControls(camera, canvas);
 controls.enableDamping = true;
 controls.listenToKeyEvents(canvas);
 
-/** Frames without a visible move after which the camera is held: damping alone never quite ends. */
+/** Frames without a visible move after which the camera stops. Damping alone does not stop it. */
 const REST = 60;
 let still = 0;
 let pressed = false;
@@ -56,20 +57,20 @@ controls.addEventListener("end", () => {
   still = 0;
 });
 
-/** Ends what a drag has left to run. */
+/** Ends the damped movement after a drag. */
 function hold() {
   controls.enableDamping = false;
   controls.update();
   controls.enableDamping = true;
 }
 
-/** Where the camera looks and from how far: from the person's box, so that anybody, of any size, is whole in the picture. */
+/** Target and distance of the camera, chosen so that the picture contains the whole person. */
 let view = { centre: CENTRE.clone(), distance: DISTANCE };
 
 function lookFrom(yawDegrees) {
   const yaw = (yawDegrees * Math.PI) / 180;
   const away = new THREE.Vector3(Math.cos(PITCH) * Math.sin(yaw), Math.sin(PITCH), Math.cos(PITCH) * Math.cos(yaw));
-  // A window that is higher than wide shows less of the sides.
+  // Narrow windows need a larger distance.
   const distance = view.distance * Math.max(1, 0.45 / camera.aspect);
   hold();
   controls.target.copy(view.centre);
@@ -77,7 +78,7 @@ function lookFrom(yawDegrees) {
   controls.update();
 }
 
-/** The box of what is not nearly transparent, without the outermost few, which may fly about. */
+/** The bounding box of opaque Gaussians, without the outermost 0.2 % at each end, which may be outliers. */
 function bounds(mesh) {
   const along = { x: [], y: [], z: [] };
   mesh.forEachSplat((_, centre, __, ___, opacity) => {
@@ -103,7 +104,7 @@ function frame(box) {
   const centre = box.getCenter(new THREE.Vector3());
   const height = Math.max(size.y, 0.5 * Math.max(size.x, size.z));
   const person = !box.isEmpty() && Number.isFinite(height) && height > 0;
-  // As the nominal camera sees it: standing at the origin, and no higher than its picture.
+  // The nominal camera fits people who stand at the origin and are no higher than its picture.
   const standing = Math.abs(box.min.y) < 0.3 && Math.hypot(centre.x, centre.z) < 0.3;
   const nominal = standing && height > 1 && box.max.y < 1.95;
   view = nominal || !person
@@ -123,7 +124,7 @@ function resize() {
 }
 window.addEventListener("resize", resize);
 canvas.addEventListener("webglcontextrestored", () => {
-  // What Spark had made of the Gaussians is gone.
+  // The new context needs Spark's textures again.
   shown?.updateVersion();
   redraw();
 });
@@ -136,7 +137,7 @@ function say(text) {
 let shown = null;
 let asked = 0;
 
-/** Shows what `read` gives, unless something else was asked for meanwhile. */
+/** Shows the file that `read` returns, unless another one is requested meanwhile. */
 async function show(what, read) {
   asked += 1;
   const own = asked;
@@ -170,13 +171,13 @@ async function show(what, read) {
   const count = (mesh.extSplats ?? mesh.packedSplats).numSplats;
   element("count").textContent = `${count.toLocaleString("en")} Gaussians`;
   document.title = `${name} – snapsnap`;
-  // The downloads are of the file that the program serves.
+  // The downloads contain the served file only.
   element("downloads").classList.toggle("hidden", !served);
   say("");
 }
 
 async function served() {
-  // What lies there now, and not what a cache remembers.
+  // The current file, without caches.
   const answer = await fetch("./scene.ply", { cache: "no-store" });
   if (!answer.ok) {
     throw new Error(await answer.text());
@@ -215,17 +216,17 @@ function save(blob, name) {
 const stem = () => element("name").textContent.replace(/\.[^.]*$/, "") || "scene";
 
 function screenshot() {
-  // In one go with the drawing: afterwards the canvas is empty.
+  // The canvas is empty after the current task. Hence it is drawn and read in one task.
   renderer.render(scene, camera);
   return new Promise((done) => canvas.toBlob(done));
 }
 element("screenshot").addEventListener("click", async () => save(await screenshot(), `${stem()}.png`));
 
-/** What is seen now as an entry of `cameras.json`: OpenCV axes, pixels of the canvas. */
+/** The current camera as an entry of `cameras.json`: OpenCV axes, pixels of the canvas. */
 function cameraEntry() {
   camera.updateMatrixWorld();
   const m = camera.matrixWorldInverse.elements;
-  // Columns to rows; y and z point the other way.
+  // Columns become rows. The y and z axes are reversed.
   const row = (i, sign) => [0, 1, 2, 3].map((j) => sign * m[4 * j + i]);
   const { width, height } = canvas;
   const focal = (0.5 * height) / Math.tan((0.5 * camera.fov * Math.PI) / 180);
@@ -243,7 +244,7 @@ element("camera").addEventListener("click", () => {
   save(new Blob([JSON.stringify([cameraEntry()], null, 1)], { type: "application/json" }), "cameras.json");
 });
 
-// Frames that followed one another, and how long they took, milliseconds.
+// Number of consecutive frames, and their time in milliseconds.
 let drawn = 0;
 let busy = 0;
 let last = null;
@@ -275,5 +276,5 @@ renderer.setAnimationLoop((now) => {
 background();
 lookFrom(0);
 const ready = show("Cannot show the file", served);
-// For tests and for whoever has the console open.
+// For tests and the browser's console.
 window.snapsnap = { ready, camera: cameraEntry, screenshot, lookFrom, renderer, spark };

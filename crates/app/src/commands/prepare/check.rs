@@ -15,8 +15,8 @@ pub struct Arguments {
     dataset: PathBuf,
 }
 
-pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
-    let progress = Progress::steps(quiet, 0, "subjects");
+pub fn run(arguments: &Arguments) -> Result<(), Failure> {
+    let progress = Progress::steps(0, "subjects");
     let checked = dataset::check(&arguments.dataset, |done, all| progress.step(done, all, "subjects"))?;
     drop(progress);
     for problem in &checked.problems {
@@ -26,8 +26,6 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     if !checked.problems.is_empty() {
         return Err(Failure::Input(format!("{looked}: {} faults", checked.problems.len())));
     }
-    if !quiet {
-        say::out(&format!("{looked}: no fault"));
-    }
+    say::info(&format!("{looked}: no fault"));
     Ok(())
 }

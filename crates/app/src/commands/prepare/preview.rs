@@ -3,8 +3,9 @@
 use std::path::Path;
 
 use image::{RgbImage, imageops};
-use snapsnap_data::dataset::{Folder, Split};
+use snapsnap_data::dataset::Folder;
 
+use super::Work;
 use crate::failure::Failure;
 use crate::pictures::{sheet, write_png};
 
@@ -18,12 +19,12 @@ const COLUMNS: u32 = 9;
 const BACKGROUND: [u8; 3] = [235; 3];
 
 /// Writes a sheet of the first of these subjects. There must be at least one.
-pub fn write(path: &Path, folder: &Folder, subjects: &[(Split, &str)]) -> Result<(), Failure> {
+pub fn write(path: &Path, folder: &Folder, subjects: &[&Work]) -> Result<(), Failure> {
     let views = folder.description().views;
     let mut pictures = Vec::new();
-    for (split, subject) in subjects.iter().take(MOST) {
+    for work in subjects.iter().take(MOST) {
         for view in [0, views / 2, views / 4] {
-            let (color, mask) = folder.picture(Some(*split), subject, view, false)?;
+            let (color, mask) = folder.picture(Some(work.split), &work.subject, view, false)?;
             pictures.push(shrink(&color, &mask));
         }
     }

@@ -3,47 +3,29 @@
 use std::cell::Cell;
 use std::path::{Path, PathBuf};
 
-use clap::{Args, ValueEnum};
+use clap::Args;
 use snapsnap_base::FileError;
 use snapsnap_data::dataset::Split;
 use snapsnap_data::scan::{Collection, Source, find};
 use snapsnap_data::smplx;
 use snapsnap_mesh::import;
 
-use super::{Common, Person, SplitArgument, Work, make};
+use super::super::one_of;
+use super::{Common, Person, SPLITS, Work, make};
 use crate::failure::Failure;
 use crate::say;
 
-#[derive(Clone, Copy, ValueEnum)]
-enum CollectionArgument {
-    /// Subjects 0 to 525. Subjects of the published validation list become val.
-    #[value(name = "thuman2.0")]
-    Thuman20,
-    /// THuman2.0 and the subjects from 526 on. The published subjects in loose clothes become test.
-    #[value(name = "thuman2.1")]
-    Thuman21,
-    #[value(name = "customhumans")]
-    CustomHumans,
-    #[value(name = "2k2k")]
-    TwoK2K,
-    #[value(name = "4d-dress")]
-    FourDDress,
-    /// Any scan, y up and facing +z.
-    Other,
-}
-
-impl From<CollectionArgument> for Collection {
-    fn from(collection: CollectionArgument) -> Self {
-        match collection {
-            CollectionArgument::Thuman20 => Self::Thuman20,
-            CollectionArgument::Thuman21 => Self::Thuman21,
-            CollectionArgument::CustomHumans => Self::CustomHumans,
-            CollectionArgument::TwoK2K => Self::TwoK2K,
-            CollectionArgument::FourDDress => Self::FourDDress,
-            CollectionArgument::Other => Self::Other,
-        }
-    }
-}
+const THUMAN20: &str = "Subjects 0 to 525. Subjects of the published validation list become val";
+const THUMAN21: &str =
+    "THuman2.0 and the subjects from 526 on. The published subjects in loose clothes become test";
+const COLLECTIONS: [(&str, &str, Collection); 6] = [
+    ("thuman2.0", THUMAN20, Collection::Thuman20),
+    ("thuman2.1", THUMAN21, Collection::Thuman21),
+    ("customhumans", "", Collection::CustomHumans),
+    ("2k2k", "", Collection::TwoK2K),
+    ("4d-dress", "", Collection::FourDDress),
+    ("other", "Any scan, y up and facing +z", Collection::Other),
+];
 
 #[derive(Args)]
 pub struct Arguments {
@@ -52,31 +34,29 @@ pub struct Arguments {
     #[command(flatten)]
     common: Common,
     /// Collection of the scans. It decides axes, positions and splits.
-    #[arg(long, value_enum, default_value = "other")]
-    collection: CollectionArgument,
+    #[arg(long, value_parser = one_of(COLLECTIONS), default_value = "other")]
+    collection: Collection,
     /// Folder of SMPL-X parameters (ID/smplx_param.pkl, ID.pkl or .json), which contain the direction that a subject
     /// faces [default: the scan's folder].
     #[arg(long, value_name = "DIR")]
     smplx: Option<PathBuf>,
     /// Split of all subjects [default: the published lists; the first 100 of 2K2K and all of 4D-Dress test, others
     /// train].
-    #[arg(long, value_enum)]
-    split: Option<SplitArgument>,
+    #[arg(long, value_parser = one_of(SPLITS))]
+    split: Option<Split>,
     /// Leave out the subjects of other splits.
-    #[arg(long, value_enum, value_name = "SPLIT", conflicts_with = "split")]
-    only: Option<SplitArgument>,
+    #[arg(long, value_parser = one_of(SPLITS), value_name = "SPLIT", conflicts_with = "split")]
+    only: Option<Split>,
 }
 
-pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
-    let collection = Collection::from(arguments.collection);
-    let sources = find(&arguments.source)?;
-    let only = arguments.only.map(Split::from);
-    let (sources, works): (Vec<Source>, Vec<Work>) = sources
+pub fn run(arguments: &Arguments) -> Result<(), Failure> {
+    let Arguments { collection, only, .. } = *arguments;
+    let (sources, works): (Vec<Source>, Vec<Work>) = find(&arguments.source)?
         .into_iter()
         .enumerate()
         .map(|(place, source)| {
             let subject = source.subject.clone();
-            let split = arguments.split.map_or_else(|| collection.split(&subject, place), Split::from);
+            let split = arguments.split.unwrap_or_else(|| collection.split(&subject, place));
             let identity = format!("scan/{}/{split}/{subject}", arguments.common.seed);
             (source, Work { split, subject, identity })
         })
@@ -90,7 +70,7 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     let mut inputs = vec![arguments.source.as_path()];
     inputs.extend(arguments.smplx.as_deref());
     let unknown = Cell::new(0);
-    let made = make(&arguments.common, quiet, &description, &inputs, &works, |place, work| {
+    let made = make(&arguments.common, &description, &inputs, &works, |place, work| {
         let path = &sources[place].path;
         // A test of a person who was trained on would not be fair.
         let is_in = |split: Split| arguments.common.pictures(split, &work.subject).exists();
@@ -100,14 +80,14 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
         }
         let collection = collection.of(&work.subject);
         let parameters = parameters(path, &work.subject, arguments.smplx.as_deref())?;
-        let yaw_degrees =
-            match parameters.filter(|_| collection.has_orientation() || arguments.smplx.is_some()) {
-                Some(parameters) => smplx::yaw_degrees(&parameters)?,
-                None => {
-                    unknown.set(unknown.get() + usize::from(collection.has_orientation()));
-                    0.0
-                }
-            };
+        let needs_parameters = collection.has_orientation() || arguments.smplx.is_some();
+        let yaw_degrees = match parameters.filter(|_| needs_parameters) {
+            Some(parameters) => smplx::yaw_degrees(&parameters)?,
+            None => {
+                unknown.set(unknown.get() + usize::from(collection.has_orientation()));
+                0.0
+            }
+        };
         let mut mesh = import::read(path)?;
         super::place(&mut mesh, work, collection, path)?;
         Ok(Person { mesh, yaw_degrees, origin: path.clone() })
@@ -123,11 +103,11 @@ pub fn run(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
 
 /// The source in the data set's description: everything on which the subjects depend.
 fn describe(arguments: &Arguments) -> String {
-    // Without the path, which differs from machine to machine.
+    // Without the folders of the path, which differ between machines.
     let path = arguments.source.canonicalize().unwrap_or_else(|_| arguments.source.clone());
     let name = path.file_name().unwrap_or_default().to_string_lossy();
-    let collection =
-        arguments.collection.to_possible_value().map_or(String::new(), |v| v.get_name().to_owned());
+    let collection = COLLECTIONS.iter().find(|(.., collection)| *collection == arguments.collection);
+    let collection = collection.map_or("", |(name, ..)| name);
     let smplx = if arguments.smplx.is_some() { ", with SMPL-X parameters" } else { "" };
     format!("scans of {name} ({collection}{smplx}), seed {}", arguments.common.seed)
 }
@@ -137,22 +117,16 @@ fn parameters(scan: &Path, subject: &str, folder: Option<&Path>) -> Result<Optio
     let stem = scan.file_stem().unwrap_or_default();
     let names = [stem.to_string_lossy().into_owned(), subject.to_owned()];
     let beside = scan.parent().unwrap_or(Path::new("."));
-    let mut candidates = Vec::new();
-    match folder {
-        Some(folder) => {
-            for name in &names {
-                let below = folder.join(name);
-                candidates.extend(["smplx_param.pkl", "smplx_param.json"].map(|file| below.join(file)));
-                candidates.extend(["pkl", "json"].map(|kind| folder.join(format!("{name}.{kind}"))));
-            }
-        }
-        None => candidates.extend(["smplx_param.pkl", "smplx_param.json"].map(|file| beside.join(file))),
-    }
-    let found = candidates.into_iter().find(|path| path.is_file());
-    match (folder, &found) {
-        (Some(folder), None) => {
-            Err(FileError::unsuitable(folder, format!("has no SMPL-X parameters of subject {subject}")))
-        }
-        _ => Ok(found),
+    let within = |folder: &Path| ["pkl", "json"].map(|kind| folder.join(format!("smplx_param.{kind}")));
+    let Some(folder) = folder else {
+        return Ok(within(beside).into_iter().find(|path| path.is_file()));
+    };
+    let candidates = names.iter().flat_map(|name| {
+        let named = ["pkl", "json"].map(|kind| folder.join(format!("{name}.{kind}")));
+        within(&folder.join(name)).into_iter().chain(named)
+    });
+    match candidates.into_iter().find(|path| path.is_file()) {
+        Some(found) => Ok(Some(found)),
+        None => Err(FileError::unsuitable(folder, format!("has no SMPL-X parameters of subject {subject}"))),
     }
 }

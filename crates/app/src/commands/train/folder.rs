@@ -1,6 +1,6 @@
 //! The folder of a run: its lock and its config.
 
-use std::fs::{self, File, OpenOptions, TryLockError};
+use std::fs::{File, TryLockError};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -9,26 +9,21 @@ use snapsnap_data::dataset::Folder;
 use snapsnap_train::config::TrainConfig;
 use snapsnap_train::run::{BEST, CONFIG, LAST, STATE};
 
-use super::super::outside_data;
+use super::super::{is_same_file, outside_data};
 use super::Arguments;
 use crate::failure::Failure;
+use crate::output::make_folder;
 
-/// The config of a run: the file --config, or the config of the run that is continued, under the options of the command
-/// line.
+/// The config of --config or of the continued run, with the options of the command line.
 pub fn config(arguments: &Arguments) -> Result<TrainConfig, Failure> {
-    let own = arguments.output.as_ref().map(|run| run.join(CONFIG));
-    let path = match (&arguments.config, own) {
-        (Some(path), _) => path.clone(),
-        (None, Some(path)) => path,
-        (None, None) => return Err(Failure::Input("give --config TOML".into())),
-    };
+    let own = || arguments.output.as_ref().map(|run| run.join(CONFIG));
+    let path = arguments.config.clone().or_else(own);
+    let path = path.ok_or_else(|| Failure::Input("give --config TOML".into()))?;
     let mut config = TrainConfig::from_file(&path, &arguments.set)?;
     if !arguments.data.is_empty() {
         config.data.folders.clone_from(&arguments.data);
     }
-    if let Some(weights) = &arguments.weights {
-        config.training.weights = Some(weights.clone());
-    }
+    config.training.weights = arguments.weights.clone().or(config.training.weights);
     // Absolute paths, since a run may be continued from another working directory.
     let lpips = config.stage2.lpips.iter_mut().flat_map(|lpips| &mut lpips.files);
     let others = config.training.weights.iter_mut().chain(&mut config.stage2.point_map_cache).chain(lpips);
@@ -36,9 +31,7 @@ pub fn config(arguments: &Arguments) -> Result<TrainConfig, Failure> {
     for path in paths {
         *path = std::path::absolute(&*path).unwrap_or_else(|_| path.clone());
         if path.to_str().is_none() {
-            let message =
-                format!("{}: the path is not UTF-8, which the run's config must be", path.display());
-            return Err(Failure::Input(message));
+            return Err(Failure::file(path, "the path is not UTF-8, which the run's config must be"));
         }
     }
     Ok(config)
@@ -46,35 +39,31 @@ pub fn config(arguments: &Arguments) -> Result<TrainConfig, Failure> {
 
 /// The locked folder of a run.
 pub struct RunFolder {
-    path: PathBuf,
+    pub path: PathBuf,
     /// Locked until it is dropped.
     _lock: File,
 }
 
 impl RunFolder {
-    /// Makes or opens the folder, and locks it.
-    ///
-    /// # Errors
-    /// [`Failure::Input`] if the folder contains a run that is not to be continued, one of other networks, or one that
-    /// another process is training.
+    /// Makes or opens the folder, and locks it. Refuses runs of other networks or of other processes, and existing runs without
+    /// --resume.
     pub fn open(
         path: &Path,
         arguments: &Arguments,
         config: &TrainConfig,
         data: &[Arc<Folder>],
     ) -> Result<Self, Failure> {
-        let wrong = |message: &str| Failure::Input(format!("{}: {message}", path.display()));
+        let wrong = |message: &str| Failure::file(path, message);
         outside_data(path, data.iter().map(|folder| folder.root()))?;
-        fs::create_dir_all(path).map_err(|e| Failure::cannot_write(path, &e))?;
+        make_folder(path)?;
         let lock = path.join("lock");
-        let file = OpenOptions::new().create(true).truncate(false).write(true).open(&lock);
+        let file = File::options().create(true).truncate(false).write(true).open(&lock);
         let file = file.map_err(|e| Failure::cannot_write(&lock, &e))?;
         // Some file systems have no locks. The run goes on without one.
         if matches!(file.try_lock(), Err(TryLockError::WouldBlock)) {
             return Err(wrong("is being trained by another process"));
         }
         let own = path.join(CONFIG);
-        let same = |a: &Path, b: &Path| super::super::is_same_file(a, b);
         if path.join(STATE).exists() {
             if !arguments.resume {
                 return Err(wrong("contains a run: add --resume to continue it, or give another folder"));
@@ -92,20 +81,13 @@ impl RunFolder {
             }
             let start = config.training.weights.as_deref().into_iter();
             let lpips = config.stage2.lpips.iter().flat_map(|lpips| &lpips.files).map(PathBuf::as_path);
-            let mut inputs = start.chain(arguments.config.as_deref()).chain(lpips);
-            if let Some(input) =
-                inputs.find(|input| [BEST, LAST, CONFIG].iter().any(|name| same(input, &path.join(name))))
-            {
-                let message =
-                    format!("{}: would be replaced by the run: give another folder", input.display());
-                return Err(Failure::Input(message));
+            let outputs = [BEST, LAST, CONFIG].map(|name| path.join(name));
+            for input in start.chain(arguments.config.as_deref()).chain(lpips) {
+                if outputs.iter().any(|output| is_same_file(input, output)) {
+                    return Err(Failure::file(input, "would be replaced by the run: give another folder"));
+                }
             }
         }
         Ok(Self { path: path.to_owned(), _lock: file })
-    }
-
-    /// Its path.
-    pub fn path(&self) -> &Path {
-        &self.path
     }
 }

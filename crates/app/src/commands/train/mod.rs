@@ -19,8 +19,9 @@ use snapsnap_train::stage1::PointTask;
 use snapsnap_train::stage2::GaussianTask;
 use snapsnap_train::task::Task;
 
+use super::evaluate::check_data;
 use super::outside_data;
-use crate::failure::Failure;
+use crate::failure::{Failure, bail};
 use crate::{device, interrupt, memory, say};
 
 use folder::RunFolder;
@@ -43,7 +44,7 @@ pub struct Arguments {
     /// Weight file to begin with [default: training.weights of the config; stage 1: random weights].
     #[arg(long, value_name = "FILE")]
     weights: Option<PathBuf>,
-    /// End this session after so many minutes. --resume continues the run.
+    /// Time limit of this session in minutes. --resume continues the run.
     #[arg(long, value_name = "M")]
     minutes: Option<f64>,
     /// Continue the run in this folder, or begin it.
@@ -72,17 +73,17 @@ struct Plan<'a> {
     folders: Vec<Arc<Folder>>,
     /// With gradients.
     devices: Vec<Device>,
-    quiet: bool,
 }
 
-pub fn stage1(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
-    let plan = Plan::new(arguments, quiet)?;
+pub fn stage1(arguments: &Arguments) -> Result<(), Failure> {
+    let plan = Plan::new(arguments)?;
     let task = PointTask::new(&plan.folders, &plan.config, &plan.devices)?;
     plan.check_validation(task.validation_samples());
     plan.run(&task, |tracked| {
         let networks = plan.config.networks();
         // The state of a continued run contains its weights.
-        let predictor = match plan.start().filter(|_| arguments.begun().is_none()) {
+        let start = plan.config.training.weights.as_deref();
+        let predictor = match start.filter(|_| arguments.begun().is_none()) {
             Some(path) => open(path, &plan.config)?.point_predictor(tracked)?,
             None => random_predictor(&networks, plan.config.training.seed, tracked),
         };
@@ -90,14 +91,15 @@ pub fn stage1(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
     })
 }
 
-pub fn stage2(arguments: &Arguments, quiet: bool) -> Result<(), Failure> {
-    let plan = Plan::new(arguments, quiet)?;
+pub fn stage2(arguments: &Arguments) -> Result<(), Failure> {
+    let plan = Plan::new(arguments)?;
     // The latest weights of a continued run contain its point predictor.
-    let start = arguments.begun().map(|run| run.join(LAST)).or_else(|| plan.start().map(Path::to_owned));
-    let Some(start) = start else {
-        let message = "stage 2 needs a trained point predictor: give --weights FILE, as train-stage1 writes it, or \
-                       training.weights in the config";
-        return Err(Failure::Input(message.into()));
+    let latest = arguments.begun().map(|run| run.join(LAST));
+    let Some(start) = latest.or_else(|| plan.config.training.weights.clone()) else {
+        bail!(
+            "stage 2 needs a trained point predictor: give --weights FILE, as train-stage1 writes it, or \
+             training.weights in the config"
+        );
     };
     let weights = open(&start, &plan.config)?;
     if let Some(maps) = &plan.config.stage2.point_map_cache {
@@ -125,9 +127,9 @@ fn open(path: &Path, config: &TrainConfig) -> Result<WeightFile, Failure> {
 }
 
 impl<'a> Plan<'a> {
-    fn new(arguments: &'a Arguments, quiet: bool) -> Result<Self, Failure> {
+    fn new(arguments: &'a Arguments) -> Result<Self, Failure> {
         if let Some(minutes) = arguments.minutes.filter(|minutes| !(*minutes > 0.0 && *minutes < 1e6)) {
-            return Err(Failure::Input(format!("--minutes {minutes}: must be more than 0")));
+            bail!("--minutes {minutes}: must be more than 0");
         }
         let mut config = folder::config(arguments)?;
         if arguments.dry_run {
@@ -135,22 +137,13 @@ impl<'a> Plan<'a> {
             // The estimate includes the steps with the perceptual distance.
             config.stage2.lpips.iter_mut().for_each(|lpips| lpips.after = 0.0);
         }
-        if config.data.folders.is_empty() {
-            let message =
-                "no data: give --data DATASET, made with `snapsnap prepare`, or data.folders in the config";
-            return Err(Failure::Input(message.into()));
-        }
+        check_data(&config.data.folders)?;
         let folders = config.data.folders.iter().map(|path| Folder::open(path).map(Arc::new));
         let folders = folders.collect::<Result<_, _>>()?;
         let devices = arguments.device.split(',').map(device::choose).collect::<Result<Vec<_>, _>>()?;
         if devices.len() > config.training.batch {
-            let message = format!(
-                "--device {}: {} devices share a batch of {}: set training.batch higher",
-                arguments.device,
-                devices.len(),
-                config.training.batch
-            );
-            return Err(Failure::Input(message));
+            let (names, count, batch) = (&arguments.device, devices.len(), config.training.batch);
+            bail!("--device {names}: {count} devices share a batch of {batch}: set training.batch higher");
         }
         if memory::is_cpu(&devices[0]) {
             memory::check("this training", least_memory(&config), "a smaller network or batch needs less")?;
@@ -158,11 +151,8 @@ impl<'a> Plan<'a> {
         let precision = config.training.precision;
         for (name, device) in arguments.device.split(',').zip(&devices) {
             if !device.supports_dtype(precision.dtype()) {
-                let message = format!(
-                    "--device {name}: does not compute in {}: set training.precision to f32",
-                    precision.name()
-                );
-                return Err(Failure::Input(message));
+                let precision = precision.name();
+                bail!("--device {name}: does not compute in {precision}: set training.precision to f32");
             }
         }
         let tracked = |device: Device| match config.training.gradient_checkpointing {
@@ -170,20 +160,15 @@ impl<'a> Plan<'a> {
             false => device.autodiff(),
         };
         let devices = devices.into_iter().map(tracked).collect();
-        Ok(Self { arguments, config, folders, devices, quiet })
+        Ok(Self { arguments, config, folders, devices })
     }
 
     fn check_validation(&self, samples: usize) {
-        if samples == 0 && self.config.training.validation_samples > 0 && !self.quiet {
-            say::err(
+        if samples == 0 && self.config.training.validation_samples > 0 {
+            say::note(
                 "note: no data set has held-out people (split val) for validations: only the latest weights are kept",
             );
         }
-    }
-
-    /// Weights to begin with.
-    fn start(&self) -> Option<&Path> {
-        self.config.training.weights.as_deref()
     }
 
     /// A rehearsal, or a session in the run's folder.
@@ -204,16 +189,14 @@ impl<'a> Plan<'a> {
         let folder = RunFolder::open(path, self.arguments, &self.config, &self.folders)?;
         let limit = self.arguments.minutes.map(|minutes| Duration::from_secs_f64(60.0 * minutes));
         let stop = interrupt::patiently();
-        let options = Options { folder: folder.path(), devices: &self.devices, limit, stop };
-        let mut reporter = Reporter::new(self.quiet, &self.config, limit);
+        let options = Options { folder: &folder.path, devices: &self.devices, limit, stop };
+        let mut reporter = Reporter::new(&self.config, limit);
         let start = Instant::now();
         let outcome = run::on_best_thread(&self.devices, || {
             Ok::<_, Failure>(run::train(task, &self.config, networks(tracked)?, &options, &mut reporter)?)
         })?;
         drop(reporter);
-        if !self.quiet {
-            summarise(T::STAGE, folder.path(), &outcome, start.elapsed());
-        }
+        summarise(T::STAGE, &folder.path, &outcome, start.elapsed());
         Ok(())
     }
 }
@@ -235,30 +218,28 @@ fn least_memory(config: &TrainConfig) -> u64 {
 fn summarise(stage: u32, folder: &Path, outcome: &Outcome, session: Duration) {
     let run = folder.display();
     let state = if outcome.finished { "finished" } else { "interrupted" };
-    let minutes = |seconds: f64| seconds / 60.0;
-    say::out(&format!(
-        "{run}: {state} after {} steps, {:.1} minutes of training, {:.1} of them in this session",
-        outcome.step,
-        minutes(outcome.seconds),
-        minutes(session.as_secs_f64()),
+    let [total, session] = [outcome.seconds, session.as_secs_f64()].map(|seconds| seconds / 60.0);
+    let step = outcome.step;
+    say::info(&format!(
+        "{run}: {state} after {step} steps, {total:.1} minutes of training, {session:.1} of them in this session"
     ));
     if outcome.skipped > 0 {
-        say::out(&format!("{} steps were skipped", outcome.skipped));
+        say::info(&format!("{} steps were skipped", outcome.skipped));
     }
     let weights = match outcome.best {
         Some((step, score)) => {
-            say::out(&format!("best validation: {score:.3} after step {step}, {run}/{BEST}"));
+            say::info(&format!("best validation: {score:.3} after step {step}, {run}/{BEST}"));
             BEST
         }
         None => LAST,
     };
-    say::out(&format!("curves: {run}/curves.svg; TensorBoard: tensorboard --logdir {run}"));
+    say::info(&format!("curves: {run}/curves.svg; TensorBoard: tensorboard --logdir {run}"));
     if !outcome.finished {
-        say::out(&format!("resume:  snapsnap train-stage{stage} --resume -o {run}"));
+        say::info(&format!("resume:  snapsnap train-stage{stage} --resume -o {run}"));
     }
     let next = match stage {
         1 => format!("snapsnap train-stage2 --config CONFIG --weights {run}/{weights} -o RUN2"),
         _ => format!("snapsnap reconstruct FRONT BACK --weights {run}/{weights} --turntable turn.png"),
     };
-    say::out(&format!("next:    {next}"));
+    say::info(&format!("next:    {next}"));
 }

@@ -18,7 +18,6 @@ const PAUSE: Duration = Duration::from_secs(10);
 /// Prints a bar on a terminal, plain lines elsewhere, and nothing with --quiet.
 pub struct Reporter {
     bar: Option<ProgressBar>,
-    quiet: bool,
     start: Instant,
     limit: Option<Duration>,
     /// The first step that was logged.
@@ -27,25 +26,24 @@ pub struct Reporter {
 }
 
 impl Reporter {
-    pub fn new(quiet: bool, config: &TrainConfig, limit: Option<Duration>) -> Self {
-        let bar = (!quiet && std::io::stderr().is_terminal()).then(|| {
+    pub fn new(config: &TrainConfig, limit: Option<Duration>) -> Self {
+        let bar = (!say::is_quiet() && std::io::stderr().is_terminal()).then(|| {
             let bar = ProgressBar::new(config.training.steps as u64);
             let style = ProgressStyle::with_template("{bar:30} {pos}/{len} {msg}").expect("a valid template");
             bar.set_style(style);
             bar
         });
-        Self { bar, quiet, start: Instant::now(), limit, first: None, printed: None }
+        Self { bar, start: Instant::now(), limit, first: None, printed: None }
     }
 
     fn line(&self, message: &str) {
         match &self.bar {
             Some(bar) => bar.println(say::printable(message)),
-            None if !self.quiet => say::err(message),
-            None => {}
+            None => say::note(message),
         }
     }
 
-    /// Time until the end of the run or of the session, whichever is first.
+    /// Time until the end of the run or, if it is earlier, of the session.
     fn left(&self, line: &Line, steps: u64) -> String {
         let rate = line.values.get("steps_per_second").copied().unwrap_or_default();
         let run = (steps.saturating_sub(line.step)) as f64 / rate.max(1e-9);
@@ -59,7 +57,7 @@ impl Reporter {
 
 impl Watch for Reporter {
     fn step(&mut self, line: &Line, steps: u64, skipped: u64) {
-        if self.quiet {
+        if say::is_quiet() {
             return;
         }
         let value = |name: &str| line.values.get(name).copied().unwrap_or_default();
@@ -101,14 +99,6 @@ impl Watch for Reporter {
 
     fn note(&mut self, message: &str) {
         self.line(&format!("note: {message}"));
-    }
-}
-
-impl Drop for Reporter {
-    fn drop(&mut self) {
-        if let Some(bar) = &self.bar {
-            bar.finish_and_clear();
-        }
     }
 }
 

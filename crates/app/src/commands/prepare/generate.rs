@@ -1,0 +1,108 @@
+//! `snapsnap prepare synth` and `snapsnap prepare makehuman`.
+
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use snapsnap_base::FileError;
+use snapsnap_data::dataset::Split;
+use snapsnap_data::scan::Collection;
+use snapsnap_mesh::export;
+use snapsnap_mesh::mesh::Mesh;
+use snapsnap_people::makehuman::{self, Library};
+use snapsnap_people::synth;
+
+use super::super::one_of;
+use super::{Common, Person, SPLITS, Work, make, place};
+use crate::failure::{Failure, bail};
+use crate::progress::Progress;
+
+/// Largest number of people of one command.
+const MAX_SUBJECTS: usize = 1_000_000;
+
+#[derive(Args)]
+pub struct SynthArguments {
+    #[command(flatten)]
+    common: Common,
+    #[command(flatten)]
+    generate: Generate,
+}
+
+#[derive(Args)]
+pub struct MakehumanArguments {
+    /// MakeHuman's folder `data`, or a checkout that contains it.
+    folder: PathBuf,
+    #[command(flatten)]
+    common: Common,
+    #[command(flatten)]
+    generate: Generate,
+}
+
+/// Options of the commands that generate people.
+#[derive(Args)]
+struct Generate {
+    /// Number of people.
+    #[arg(long, value_name = "N", default_value_t = 100)]
+    subjects: usize,
+    /// Split of the people. Different splits have different people.
+    #[arg(long, value_parser = one_of(SPLITS), default_value = "train")]
+    split: Split,
+    /// Also write each person as a scan, OBJ with texture, to scans/SPLIT/ID in the data set.
+    #[arg(long)]
+    save_scans: bool,
+}
+
+pub fn synth(SynthArguments { common, generate }: &SynthArguments) -> Result<(), Failure> {
+    generate.run(common, "synth", &[], |name| Ok(synth::person(name)))
+}
+
+pub fn makehuman(arguments: &MakehumanArguments) -> Result<(), Failure> {
+    let library = Library::open(&arguments.folder)?;
+    let person = |name: &str| makehuman::person(&library, name);
+    arguments.generate.run(&arguments.common, "makehuman", &[library.root()], person)
+}
+
+impl Generate {
+    /// Generates people from their names.
+    fn run(
+        &self,
+        common: &Common,
+        kind: &str,
+        inputs: &[&Path],
+        person: impl Fn(&str) -> Result<Mesh, FileError>,
+    ) -> Result<(), Failure> {
+        if self.subjects == 0 || self.subjects > MAX_SUBJECTS {
+            bail!("--subjects is {}, must be 1 to {MAX_SUBJECTS}", self.subjects);
+        }
+        let split = self.split;
+        let works: Vec<Work> = (0..self.subjects)
+            .map(|index| Work {
+                split,
+                subject: format!("{index:04}"),
+                identity: format!("{kind}/{}/{split}/{index}", common.seed),
+            })
+            .collect();
+        let source = format!("{kind}, seed {}", common.seed);
+        let scan = |work: &Work| {
+            let Work { split, subject, .. } = work;
+            common.output.join("scans").join(split.name()).join(subject).join(format!("{subject}.obj"))
+        };
+        // A scan that exists may have been edited.
+        let is_due = |work: &Work| self.save_scans && !scan(work).exists();
+        let made = make(common, &source, inputs, &works, |_, work| {
+            let mut mesh = person(&work.identity)?;
+            if is_due(work) {
+                export::write_obj(&mesh, &scan(work))?;
+            }
+            place(&mut mesh, work, Collection::Other, &common.output)?;
+            Ok(Person { mesh, yaw_degrees: 0.0, origin: common.output.clone() })
+        });
+        // Older subjects without scans.
+        let has = |work: &Work| common.pictures(work.split, &work.subject).is_dir();
+        let mut due = common.mine(&works);
+        due.retain(|(_, work)| is_due(work) && has(work));
+        for (_, work) in Progress::over(due.iter(), "scans") {
+            export::write_obj(&person(&work.identity)?, &scan(work))?;
+        }
+        made
+    }
+}

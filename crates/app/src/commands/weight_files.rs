@@ -1,0 +1,118 @@
+//! `snapsnap init-weights`, `snapsnap import-weights` and `snapsnap export-weights`.
+
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use snapsnap_base::config::Schema;
+use snapsnap_net::config::Config;
+use snapsnap_net::weights::{self, Float, ImportOptions, SideHeads};
+
+use super::{ConfigArguments, check_outputs, one_of};
+use crate::failure::Failure;
+use crate::progress::Progress;
+use crate::say;
+
+/// Name of the default config.
+const PUBLISHED: &str = "the published size";
+const SIDE_HEADS: [(&str, &str, SideHeads); 2] = [
+    ("seed", "Drawn from --seed, as the authors do", SideHeads::Seed),
+    ("copy", "Copied: right from front, left from back", SideHeads::Copy),
+];
+
+#[derive(Args)]
+pub struct InitArguments {
+    #[command(flatten)]
+    config: ConfigArguments,
+    /// Seed of the random weights; the same seed gives the same file on every machine.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Weight file to write.
+    #[arg(short, long, value_name = "FILE.safetensors")]
+    output: PathBuf,
+}
+
+#[derive(Args)]
+pub struct ImportArguments {
+    /// Checkpoints: DUSt3R or CroCo (`.safetensors`, `.pth`), Snap-Snap stage 1 and stage 2 (`.pth`), or weight files of
+    /// this program.
+    #[arg(required = true)]
+    sources: Vec<PathBuf>,
+    #[command(flatten)]
+    config: ConfigArguments,
+    /// Source of the right and left heads if no checkpoint contains them.
+    #[arg(long, value_parser = one_of(SIDE_HEADS), default_value = "seed")]
+    side_heads: SideHeads,
+    /// Seed of the tensors that no checkpoint has.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Write 16 bits per value: half the size, each value to the nearest of them.
+    #[arg(long)]
+    half: bool,
+    /// Weight file to write.
+    #[arg(short, long, value_name = "FILE.safetensors")]
+    output: PathBuf,
+}
+
+#[derive(Args)]
+pub struct ExportArguments {
+    /// Weight file written by `import-weights`, `init-weights` or training.
+    input: PathBuf,
+    /// File to write, with the key names and aliases of the authors' state dicts.
+    #[arg(short, long, value_name = "FILE.safetensors")]
+    output: PathBuf,
+}
+
+pub fn init(InitArguments { config, seed, output }: &InitArguments) -> Result<(), Failure> {
+    let resolved = config.resolve((PUBLISHED, ""))?;
+    let inputs: Vec<&Path> = config.config.iter().map(PathBuf::as_path).collect();
+    check_outputs(&[output], &inputs)?;
+    let progress = Progress::bytes();
+    let parameters = weights::init(&resolved, *seed, output, &|done, total| progress.advance(done, total))?;
+    drop(progress);
+    say::info(&format!("{}: {parameters} random parameters from seed {seed}", output.display()));
+    Ok(())
+}
+
+pub fn import(arguments: &ImportArguments) -> Result<(), Failure> {
+    let ImportArguments { sources, output, .. } = arguments;
+    let config = import_config(arguments)?;
+    let inputs: Vec<&Path> = sources.iter().chain(&arguments.config.config).map(PathBuf::as_path).collect();
+    check_outputs(&[output], &inputs)?;
+    let float = if arguments.half { Float::F16 } else { Float::F32 };
+    let options = ImportOptions { side_heads: arguments.side_heads, seed: arguments.seed, float };
+    let progress = Progress::bytes();
+    let advance = |done, total| progress.advance(done, total);
+    let report = weights::import(sources, &config, options, output, &advance)?;
+    drop(progress);
+    for note in &report.notes {
+        say::info(note);
+    }
+    let (file, tensors) = (output.display(), report.tensors);
+    say::info(&format!("{file}: {tensors} tensors, {} parameters", report.parameters));
+    Ok(())
+}
+
+/// The config of --config, or the one stored in a source, or the published size. The published weights of that size need
+/// `compat`.
+fn import_config(ImportArguments { sources, config, .. }: &ImportArguments) -> Result<Config, Failure> {
+    if config.config.is_none() {
+        // A pickle contains no config.
+        let is_safetensors = |path: &&PathBuf| path.extension().is_some_and(|e| e == "safetensors");
+        for path in sources.iter().filter(is_safetensors) {
+            if let Some(stored) = weights::stored_config(path)? {
+                let origin = format!("{} (metadata)", path.display());
+                return Ok(Config::from_toml(&stored.to_toml(), &origin, &config.set)?);
+            }
+        }
+    }
+    config.resolve((PUBLISHED, "[mode]\ncompat = true\n"))
+}
+
+pub fn export(ExportArguments { input, output }: &ExportArguments) -> Result<(), Failure> {
+    check_outputs(&[output], &[input])?;
+    let progress = Progress::bytes();
+    let tensors = weights::export(input, output, &|done, total| progress.advance(done, total))?;
+    drop(progress);
+    say::info(&format!("{}: {tensors} tensors", output.display()));
+    Ok(())
+}
