@@ -3,9 +3,8 @@
 pub mod evaluation;
 pub mod meshes;
 
-use std::time::{SystemTime, UNIX_EPOCH};
-
 use serde_json::{Value, json};
+use time::OffsetDateTime;
 
 use crate::evaluate::LeftOut;
 use crate::statistics::Interval;
@@ -38,23 +37,9 @@ impl Header {
     }
 }
 
-/// Today, UTC.
+/// Today, UTC, `YYYY-MM-DD`.
 pub fn today() -> String {
-    let seconds = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs());
-    let (year, month, day) = civil(seconds / 86_400);
-    format!("{year:04}-{month:02}-{day:02}")
-}
-
-/// The date of a day since 1970-01-01. Years start in March, so that leap days come last.
-fn civil(days: u64) -> (u64, u64, u64) {
-    let days = days + 719_468;
-    let (era, day) = (days / 146_097, days % 146_097);
-    let year = (day - day / 1460 + day / 36_524 - day / 146_096) / 365;
-    let day = day - (365 * year + year / 4 - year / 100);
-    let month = (5 * day + 2) / 153;
-    let day = day - (153 * month + 2) / 5 + 1;
-    let (month, late) = if month < 10 { (month + 3, 0) } else { (month - 9, 1) };
-    (era * 400 + year + late, month, day)
+    OffsetDateTime::now_utc().date().to_string()
 }
 
 /// A figure with its interval in a table of Markdown, multiplied by `times`.
@@ -112,22 +97,4 @@ pub fn table_markdown(header: &[&str], rows: impl Iterator<Item = Vec<String>>) 
 /// Text within a Markdown table.
 pub fn escaped(text: &str) -> String {
     text.replace('|', "\\|").replace(['\n', '\r'], " ")
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn days_have_their_dates() {
-        for (days, date) in [
-            (0, (1970, 1, 1)),
-            (59, (1970, 3, 1)),
-            (11_016, (2000, 2, 29)),
-            (19_723, (2024, 1, 1)),
-            (20_779, (2026, 11, 22)),
-        ] {
-            assert_eq!(civil(days), date);
-        }
-    }
 }
