@@ -1,6 +1,5 @@
-//! Operators that are slow on Burn's CPU backends. Each is one function with two implementations: kernels of our own on Burn's
-//! `flex` device, with gradients of their own, and plain tensor code on every other device and in 16 bits. Tests compare the
-//! two.
+//! Operators that are slow on Burn's CPU backends. Each is one function with two implementations: kernels with their own
+//! gradients on Burn's `flex` device, and plain tensor code on every other device and in 16 bits. Tests compare the two.
 
 pub mod buffers;
 pub mod conv;
@@ -33,13 +32,13 @@ pub use rope::Rope;
 use snapsnap_base::bilinear::{Tap, taps};
 use train::{Attention, Tokens};
 
-/// Whether `x` lives where this crate's own kernels apply: in f32 on `flex`, with nothing tracked for gradients.
+/// Whether this crate's kernels apply to `x`: in f32 on `flex`, without autodiff.
 pub fn is_fast<const D: usize>(x: &Tensor<D>) -> bool {
     let device = x.device();
     x.dtype() == DType::F32 && !device.is_autodiff() && device == Device::flex()
 }
 
-/// Whether `x` lives where kernels with gradients of their own apply: in f32 on `flex`, in training.
+/// Whether this crate's kernels with gradients apply to `x`: in f32 on `flex`, with autodiff.
 pub fn is_trained_fast<const D: usize>(x: &Tensor<D>) -> bool {
     let device = x.device();
     x.dtype() == DType::F32 && device.is_autodiff() && device.inner() == Device::flex()
@@ -64,7 +63,7 @@ pub fn rotary_attention(q: Tensor<3>, k: Tensor<3>, v: Tensor<3>, rope: &Rope, h
         return tracked::apart(q, k, v, rope, heads);
     }
     if !is_fast(&q) {
-        return plain_attention(q, k, v, rope, heads);
+        return plain_attention(q, k, v, [rope, rope], heads);
     }
     let ([b, n, c], m, device) = (q.dims(), k.dims()[1], q.device());
     let (cos, sin) = (host(rope.cos.clone()), host(rope.sin.clone()));
@@ -84,13 +83,13 @@ pub fn rotary_self_attention(qkv: Tensor<3>, rope: &Rope, heads: usize) -> Tenso
     rotary_attention(part(0), part(1), part(2), rope, heads)
 }
 
-fn plain_attention(q: Tensor<3>, k: Tensor<3>, v: Tensor<3>, rope: &Rope, heads: usize) -> Tensor<3> {
+fn plain_attention(q: Tensor<3>, k: Tensor<3>, v: Tensor<3>, ropes: [&Rope; 2], heads: usize) -> Tensor<3> {
     let [b, n, c] = q.dims();
     let split = |x: Tensor<3>| {
         let tokens = x.dims()[1];
         x.reshape([b, tokens, heads, c / heads]).swap_dims(1, 2)
     };
-    let (q, k) = (rope.apply(split(q)), rope.apply(split(k)));
+    let (q, k) = (ropes[0].apply(split(q)), ropes[1].apply(split(k)));
     let out = attention(q, k, split(v), None, None, Default::default());
     out.swap_dims(1, 2).reshape([b, n, c])
 }
@@ -144,7 +143,7 @@ pub fn bilinear(x: Tensor<4>, size: [usize; 2], align_corners: bool) -> Tensor<4
     interpolate(x, options.with_output_size(size))
 }
 
-/// Values on the host; without a copy if the tensor is contiguous and nobody else holds it.
+/// Values on the host, without a copy if the tensor is contiguous and has no other owner.
 ///
 /// # Panics
 /// If the values are not f32.

@@ -1,4 +1,4 @@
-//! The fast roads against the plain tensor code, at sizes that reach their corners.
+//! The kernels against the plain tensor code, at sizes that reach their corners.
 
 use burn::module::Param;
 use burn::nn::LinearConfig;
@@ -15,7 +15,7 @@ pub(crate) fn random<const D: usize>(shape: [usize; D], seed: u64) -> Tensor<D> 
     Tensor::from_data(TensorData::new(values.collect::<Vec<f32>>(), shape), &Device::flex())
 }
 
-/// Relative L2 error; both roads are f32, whose rounding over some hundred terms stays below a few 1e-6.
+/// Relative L2 error. Both are f32, whose rounding over some hundred terms stays below a few 1e-6.
 pub(crate) fn assert_equal<const D: usize>(what: &str, got: Tensor<D>, expected: Tensor<D>) {
     assert_eq!(got.dims(), expected.dims(), "{what}");
     let norm = |x: Tensor<D>| x.square().sum().sqrt().into_scalar::<f32>();
@@ -30,7 +30,7 @@ fn rotary_attention_equals_its_composition() {
         let (n, dim) = (rows * columns, heads * head_dim);
         let rope = Rope::new(rows, columns, head_dim, 100.0, &Device::flex());
         let [q, k, v] = [1, 2, 3].map(|seed| random([2, n, dim], seed));
-        let expected = super::plain_attention(q.clone(), k.clone(), v.clone(), &rope, heads);
+        let expected = super::plain_attention(q.clone(), k.clone(), v.clone(), [&rope, &rope], heads);
         assert_equal(&format!("{n} tokens"), super::rotary_attention(q, k, v, &rope, heads), expected);
     }
 }

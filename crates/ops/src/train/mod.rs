@@ -19,8 +19,6 @@ mod unfolded;
 mod weights3x3;
 
 #[cfg(test)]
-mod reference;
-#[cfg(test)]
 mod tests;
 
 use rayon::prelude::*;

@@ -1,10 +1,14 @@
-//! Every operator against plain loops in f64, at sizes that reach the corners: channels that fill no group, tiles and
-//! blocks that overhang, single rows. Gradients are compared with central differences of those loops.
+//! The operators against Burn's in f64, forward and backward, at sizes that reach the corners: channels that fill no
+//! group, tiles and blocks that overhang, single rows.
 
-use super::reference::{self as plain, Convolution};
-use super::*;
+use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
+use burn::nn::conv::{Conv2dConfig, ConvTranspose2dConfig};
+use burn::nn::{LayerNormConfig, LinearConfig, PaddingConfig2d};
+use burn::tensor::{Device, FloatDType, Gradients as Found, Tensor, TensorData};
 use rand::{RngCore, SeedableRng};
-use snapsnap_base::bilinear::taps;
+
+use super::*;
+use crate::{Rope, bilinear, host, layers, linear_gelu, plain_attention, rotary_attention};
 
 /// Uniform in ±1; the same numbers on every run.
 pub fn random(len: usize, seed: u64) -> Vec<f32> {
@@ -12,70 +16,75 @@ pub fn random(len: usize, seed: u64) -> Vec<f32> {
     (0..len).map(|_| random.next_u32() as f32 / u32::MAX as f32 * 2.0 - 1.0).collect()
 }
 
-fn wide(values: &[f32]) -> Vec<f64> {
-    values.iter().copied().map(f64::from).collect()
+fn tensor<const D: usize>(shape: [usize; D], seed: u64, float: FloatDType) -> Tensor<D> {
+    let data = TensorData::new(random(shape.iter().product(), seed), shape);
+    Tensor::<D>::from_data(data, &Device::flex().autodiff()).cast(float)
+}
+
+fn values<const D: usize>(x: Tensor<D>) -> Vec<f64> {
+    x.into_data().convert::<f64>().try_into_vec().expect("f64")
 }
 
 /// Relative L2 error. Sums here have up to some thousand terms of 24 bits, and Winograd's points magnify their rounding:
 /// the worst of all is 2.5e-6, of a weight gradient.
-fn assert_equal(what: &str, got: &[f32], expected: &[f64]) {
+fn assert_equal(what: &str, got: &[f64], expected: &[f64]) {
     assert_eq!(got.len(), expected.len(), "{what}");
-    let square = |x: f64| x * x;
-    let difference: f64 = got.iter().zip(expected).map(|(g, e)| square(f64::from(*g) - e)).sum();
-    let error = (difference / expected.iter().copied().map(square).sum::<f64>().max(1e-30)).sqrt();
+    let norm = |values: &mut dyn Iterator<Item = f64>| values.map(|x| x * x).sum::<f64>().sqrt();
+    let difference = norm(&mut got.iter().zip(expected).map(|(got, expected)| got - expected));
+    let error = difference / norm(&mut expected.iter().copied()).max(1e-15);
     println!("{what}: {error:e}");
     assert!(error < 5e-6, "{what}: {error:e}");
 }
 
-/// Compares a result and gradients (nothing for inputs without one) with those of `plain`, a function of the inputs.
-fn check(
-    what: &str,
-    inputs: &[&[f32]],
-    plain: impl Fn(&[Vec<f64>]) -> Vec<f64>,
-    result: &[f32],
-    dy: &[f32],
-    gradients: &[Option<&[f32]>],
-) {
-    /// Elements per input whose difference is taken.
-    const SAMPLES: usize = 16;
-    /// Half the distance: f64's rounding over it, and its square, are 1e-10.
-    const STEP: f64 = 1e-5;
-    let inputs: Vec<_> = inputs.iter().map(|x| wide(x)).collect();
-    assert_equal(&format!("{what}, result"), result, &plain(&inputs));
-    let loss =
-        |inputs: &[Vec<f64>]| -> f64 { plain(inputs).iter().zip(dy).map(|(y, g)| y * f64::from(*g)).sum() };
-    for (i, gradient) in gradients.iter().enumerate() {
-        let Some(gradient) = gradient else { continue };
-        assert_eq!(gradient.len(), inputs[i].len(), "{what}, gradient {i}");
-        let step = inputs[i].len().div_ceil(SAMPLES);
-        let slope = |at: usize| {
-            let mut moved = inputs.clone();
-            moved[i][at] += STEP;
-            let above = loss(&moved);
-            moved[i][at] -= 2.0 * STEP;
-            (above - loss(&moved)) / (2.0 * STEP)
-        };
-        let places = (0..inputs[i].len()).step_by(step);
-        let (got, expected): (Vec<_>, Vec<_>) = places.map(|at| (gradient[at], slope(at))).unzip();
-        assert_equal(&format!("{what}, gradient {i}"), &got, &expected);
+/// Random parameters in a float type.
+struct Filled {
+    float: FloatDType,
+    seed: u64,
+}
+
+impl ModuleMapper for Filled {
+    fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
+        let (id, values, mapper) = param.consume();
+        self.seed += 1;
+        let values = tensor(values.dims(), self.seed, self.float);
+        Param::from_mapped_value(id, values.require_grad(), mapper)
     }
 }
 
-/// The same for an input, a weight and a bias.
-fn check_layer(
+/// The gradients of all parameters.
+struct Collect<'a>(&'a Found, Vec<Vec<f64>>);
+
+impl ModuleVisitor for Collect<'_> {
+    fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+        self.1.push(values(param.val().grad(self.0).expect("every parameter counts")));
+    }
+}
+
+/// Compares the result of `run`, and its gradients by the input and by the module's parameters, in f32 and in f64. Only
+/// tensors in f32 reach the operators of this crate.
+fn check<M: Module, const A: usize, const D: usize>(
     what: &str,
-    inputs: [&[f32]; 3],
-    plain: impl Fn(&[Vec<f64>]) -> Vec<f64>,
-    result: &[f32],
-    dy: &[f32],
-    gradients: &Gradients,
+    module: M,
+    shape: [usize; A],
+    run: impl Fn(&M, Tensor<A>) -> Tensor<D>,
 ) {
-    let Gradients { input, weight, bias } = gradients;
-    check(what, &inputs, plain, result, dy, &[input.as_deref(), weight.as_deref(), bias.as_deref()]);
+    let [got, expected] = [FloatDType::F32, FloatDType::F64].map(|float| {
+        let module = module.clone().map(&mut Filled { float, seed: 10 });
+        let x = tensor(shape, 1, float).require_grad();
+        let y = run(&module, x.clone());
+        let all = (y.clone() * tensor(y.dims(), 2, float)).sum().backward();
+        let of_input = values(x.grad(&all).expect("tracked"));
+        let mut collect = Collect(&all, vec![values(y), of_input]);
+        module.visit(&mut collect);
+        collect.1
+    });
+    for (i, (got, expected)) in got.iter().zip(&expected).enumerate() {
+        assert_equal(&format!("{what}, tensor {i}"), got, expected);
+    }
 }
 
 #[test]
-fn convolutions_of_three_taps_equal_plain_loops() {
+fn convolutions_of_three_taps_equal_burns() {
     let sizes = [
         [1, 1, 1, 1, 1],
         [2, 5, 7, 2, 3],
@@ -88,25 +97,14 @@ fn convolutions_of_three_taps_equal_plain_loops() {
     for ([batch, inputs, outputs, height, width], stride) in
         sizes.into_iter().flat_map(|size| [1, 2].map(|stride| (size, stride)))
     {
+        let padding = PaddingConfig2d::Explicit(1, 1, 1, 1);
+        let layer =
+            Conv2dConfig::new([inputs, outputs], [3, 3]).with_stride([stride; 2]).with_padding(padding);
         for rectified in [false, true] {
             let what =
                 format!("{batch}×{inputs}→{outputs} at {height}×{width}, stride {stride}, {rectified}");
-            let reference =
-                Convolution { batch, inputs, outputs, height, width, side: 3, stride, padding: 1, rectified };
-            let x = random(batch * inputs * height * width, 1);
-            let (weight, bias) = (random(outputs * inputs * 9, 2), random(outputs, 3));
-            let dy = random(batch * outputs * height.div_ceil(stride) * width.div_ceil(stride), 4);
-            let (result, gradients) = if stride == 1 {
-                let conv = Conv3x3 { batch, inputs, outputs, height, width, rectified };
-                let result = conv.forward(&x, &weight, Some(&bias));
-                (result, conv.backward(&x, &weight, &dy, Wanted::ALL))
-            } else {
-                let conv = Unfolded { batch, inputs, outputs, height, width, stride, rectified };
-                let result = conv.forward(&x, &weight, Some(&bias));
-                (result, conv.backward(&x, &weight, &dy, Wanted::ALL))
-            };
-            let plain = |x: &[Vec<f64>]| reference.run(&x[0], &x[1], &x[2]);
-            check_layer(&what, [&x, &weight, &bias], plain, &result, &dy, &gradients);
+            let layer = layer.init(&Device::flex().autodiff());
+            check(&what, layer, [batch, inputs, height, width], |l, x| layers::conv2d(l, x, rectified));
         }
     }
 }
@@ -125,138 +123,90 @@ fn taps_that_see_nothing_have_no_gradient() {
 }
 
 #[test]
-fn convolutions_of_one_tap_equal_plain_loops() {
+fn convolutions_of_one_tap_equal_burns() {
     for [batch, inputs, outputs, height, width] in
         [[1, 1, 1, 1, 1], [2, 35, 4, 9, 7], [3, 20, 40, 1, 300], [1, 4, 3, 130, 90]]
     {
         for rectified in [false, true] {
-            let reference = Convolution {
-                batch,
-                inputs,
-                outputs,
-                height,
-                width,
-                side: 1,
-                stride: 1,
-                padding: 0,
-                rectified,
-            };
-            let conv = Conv1x1 { batch, inputs, outputs, pixels: height * width, rectified };
-            let x = random(batch * inputs * height * width, 1);
-            let (weight, bias) = (random(outputs * inputs, 2), random(outputs, 3));
-            let dy = random(batch * outputs * height * width, 4);
-            let result = conv.forward(&x, &weight, Some(&bias));
-            let gradients = conv.backward(&x, &weight, &dy, Wanted::ALL);
-            let plain = |x: &[Vec<f64>]| reference.run(&x[0], &x[1], &x[2]);
+            let layer = Conv2dConfig::new([inputs, outputs], [1, 1]).init(&Device::flex().autodiff());
             let what = format!("{batch}×{inputs}→{outputs} at {height}×{width}, {rectified}");
-            check_layer(&what, [&x, &weight, &bias], plain, &result, &dy, &gradients);
+            check(&what, layer, [batch, inputs, height, width], |l, x| layers::conv2d(l, x, rectified));
         }
     }
 }
 
 #[test]
-fn transposed_convolutions_equal_plain_loops() {
+fn transposed_convolutions_equal_burns() {
     for (stride, [batch, inputs, outputs, height, width]) in
         [(2, [2, 18, 35, 3, 5]), (4, [1, 16, 8, 4, 4]), (3, [3, 1, 1, 1, 2]), (2, [1, 40, 70, 30, 9])]
     {
-        let layer = Enlarge { batch, inputs, outputs, height, width, stride };
-        let x = random(batch * inputs * height * width, 1);
-        let (weight, bias) = (random(inputs * outputs * stride * stride, 2), random(outputs, 3));
-        let dy = random(batch * outputs * height * width * stride * stride, 4);
-        let result = layer.forward(&x, &weight, Some(&bias));
-        let gradients = layer.backward(&x, &weight, &dy, Wanted::ALL);
-        let plain = |x: &[Vec<f64>]| plain::enlarge(&layer, &x[0], &x[1], &x[2]);
+        let layer = ConvTranspose2dConfig::new([inputs, outputs], [stride; 2]).with_stride([stride; 2]);
+        let layer = layer.init(&Device::flex().autodiff());
         let what = format!("{batch}×{inputs}→{outputs} at {height}×{width}, {stride} times as large");
-        check_layer(&what, [&x, &weight, &bias], plain, &result, &dy, &gradients);
+        check(&what, layer, [batch, inputs, height, width], layers::enlarge);
     }
 }
 
 #[test]
-fn patch_embeddings_equal_plain_loops() {
+fn patch_embeddings_equal_burns() {
     for [batch, inputs, outputs, height, width, side] in
         [[2, 3, 19, 6, 4, 2], [1, 8, 5, 3, 12, 3], [3, 1, 1, 16, 16, 16]]
     {
-        let layer = Patches { batch, inputs, outputs, height, width, side };
-        let reference = Convolution {
-            batch,
-            inputs,
-            outputs,
-            height,
-            width,
-            side,
-            stride: side,
-            padding: 0,
-            rectified: false,
-        };
-        let x = random(batch * inputs * height * width, 1);
-        let (weight, bias) = (random(outputs * inputs * side * side, 2), random(outputs, 3));
-        let tokens = height / side * (width / side);
-        let dy = random(batch * tokens * outputs, 4);
-        let result = layer.forward(&x, &weight, Some(&bias));
-        let gradients = layer.backward(&x, &weight, &dy, Wanted::ALL);
-        let plain = |x: &[Vec<f64>]| {
-            let planes = reference.run(&x[0], &x[1], &x[2]);
-            let place =
-                |i: usize| (i / outputs / tokens * outputs + i % outputs) * tokens + i / outputs % tokens;
-            (0..planes.len()).map(|i| planes[place(i)]).collect()
-        };
-        check_layer(&format!("patches of {side}"), [&x, &weight, &bias], plain, &result, &dy, &gradients);
+        let layer = Conv2dConfig::new([inputs, outputs], [side; 2]).with_stride([side; 2]);
+        let layer = layer.with_padding(PaddingConfig2d::Valid).init(&Device::flex().autodiff());
+        check(&format!("patches of {side}"), layer, [batch, inputs, height, width], layers::patches);
     }
 }
 
 #[test]
-fn linear_layers_equal_plain_loops() {
+fn linear_layers_equal_burns() {
     for [rows, inputs, outputs] in [[1, 1, 16], [7, 20, 37], [131, 9, 70], [300, 5, 3]] {
-        for (gelu, transposed) in [(false, false), (false, true), (true, false), (true, true)] {
-            let layer = Linear { rows, inputs, outputs, transposed };
-            let (x, weight) = (random(rows * inputs, 1), random(inputs * outputs, 2));
-            let (bias, dy) = (random(outputs, 3), random(rows * outputs, 4));
-            let (result, before) = if gelu {
-                let [result, before] = layer.forward_gelu(&x, &weight, Some(&bias));
-                (result, Some(before))
-            } else {
-                (layer.forward(&x, &weight, Some(&bias)), None)
-            };
-            let gradients = layer.backward(&x, &weight, before.as_deref(), &dy, Wanted::ALL);
-            let plain = |x: &[Vec<f64>]| {
-                let y = plain::linear(&layer, &x[0], &x[1], &x[2]);
-                if gelu { y.into_iter().map(plain::gelu).collect() } else { y }
-            };
-            let what = format!("{rows}×{inputs}→{outputs}, GELU {gelu}, transposed {transposed}");
-            check_layer(&what, [&x, &weight, &bias], plain, &result, &dy, &gradients);
-        }
+        let layer = LinearConfig::new(inputs, outputs).init(&Device::flex().autodiff());
+        let (what, shape) = (format!("{rows}×{inputs}→{outputs}"), [1, rows, inputs]);
+        check(&what, layer.clone(), shape, layers::linear);
+        check(&format!("{what}, GELU"), layer, shape, linear_gelu);
     }
 }
 
 #[test]
-fn layer_norm_equals_plain_loops() {
+fn layer_norm_equals_burns() {
     for [rows, channels] in [[1, 3], [130, 37], [3, 192]] {
-        let norm = LayerNorm { channels, epsilon: 1e-6 };
-        let x = random(rows * channels, 1);
-        let (weight, bias, dy) = (random(channels, 2), random(channels, 3), random(rows * channels, 4));
-        let (result, statistics) = norm.forward(&x, &weight, &bias);
-        let gradients = norm.backward(&x, &weight, &statistics, &dy, Wanted::ALL);
-        let plain = |x: &[Vec<f64>]| plain::layer_norm(1e-6, &x[0], &x[1], &x[2]);
-        check_layer(&format!("{rows}×{channels}"), [&x, &weight, &bias], plain, &result, &dy, &gradients);
+        let layer = LayerNormConfig::new(channels).with_epsilon(1e-6).init(&Device::flex().autodiff());
+        let norm = |l: &_, x| layers::layer_norm(l, 1e-6, x);
+        check(&format!("{rows}×{channels}"), layer, [1, rows, channels], norm);
     }
 }
 
+/// Keys and values.
+#[derive(Module, Debug)]
+struct Pairs {
+    keys: Param<Tensor<3>>,
+    values: Param<Tensor<3>>,
+}
+
 #[test]
-fn rotary_attention_equals_plain_loops() {
+fn rotary_attention_equals_burns() {
+    let device = Device::flex().autodiff();
     for [batch, queries, keys, heads, head_dim] in [[1, 1, 1, 1, 4], [2, 5, 5, 3, 8], [1, 70, 66, 2, 4]] {
-        let attention = Attention { batch, queries, keys, heads, head_dim };
-        let channels = heads * head_dim;
-        let inputs = [queries, keys, keys].map(|n| batch * n * channels);
-        let [q, k, v] = [0, 1, 2].map(|i| random(inputs[i], i as u64));
-        let dy = random(batch * queries * channels, 4);
-        let tables = plain::tables(queries.max(keys), head_dim);
-        let (qkv, rope) = (Tokens::apart([&q, &k, &v], channels), [&tables[0][..], &tables[1]]);
-        let (result, logarithms) = attention.forward(qkv, rope);
-        let gradients = attention.backward(qkv, rope, &logarithms, &dy);
-        let what = format!("{queries} and {keys} tokens");
-        let plain = |x: &[Vec<f64>]| plain::attention(&attention, rope, &x[0], &x[1], &x[2]);
-        let gradients = gradients.each_ref().map(|gradient| Some(&gradient[..]));
-        check(&what, &[&q, &k, &v], plain, &result, &dy, &gradients);
+        let c = heads * head_dim;
+        let zeros = || Param::from_tensor(Tensor::zeros([batch, keys, c], &device));
+        let ropes = [queries, keys].map(|n| {
+            let positions: Vec<_> = (0..n).map(|token| [token / 4, token % 4]).collect();
+            Rope::at(&positions, head_dim, 100.0, &device)
+        });
+        let run = |pairs: &Pairs, q: Tensor<3>| {
+            let (k, v) = (pairs.keys.val(), pairs.values.val());
+            if crate::is_trained_fast(&q) {
+                return rotary_attention(q, k, v, &ropes[0], heads);
+            }
+            let [rope_q, rope_k] = ropes.clone().map(|Rope { cos, sin }| Rope {
+                cos: cos.cast(FloatDType::F64),
+                sin: sin.cast(FloatDType::F64),
+            });
+            plain_attention(q, k, v, [&rope_q, &rope_k], heads)
+        };
+        let pairs = Pairs { keys: zeros(), values: zeros() };
+        check(&format!("{queries} and {keys} tokens"), pairs, [batch, queries, c], run);
     }
 }
 
@@ -269,8 +219,9 @@ fn attention_of_parts_equals_that_of_tensors() {
         qkv.chunks_exact(3 * channels).flat_map(|token| &token[i * channels..][..channels]).copied().collect()
     };
     let apart = [part(0), part(1), part(2)];
-    let tables = plain::tables(67, 8);
-    let rope = [&tables[0][..], &tables[1]];
+    let Rope { cos, sin } = Rope::new(1, 67, 8, 100.0, &Device::flex());
+    let (cos, sin) = (host(cos), host(sin));
+    let rope = [&cos[..], &sin];
     let (parts, tensors) =
         (Tokens::parts(&qkv, channels), Tokens::apart(apart.each_ref().map(|x| &x[..]), channels));
     let (result, logarithms) = attention.forward(parts, rope);
@@ -283,22 +234,12 @@ fn attention_of_parts_equals_that_of_tensors() {
 }
 
 #[test]
-fn resizing_back_equals_plain_loops() {
+fn resizing_equals_burns() {
     for (from, to) in [([1, 1], [2, 2]), ([3, 5], [6, 10]), ([9, 2], [4, 7]), ([5, 6], [5, 13])] {
         for align_corners in [false, true] {
-            let [down, across] = [0, 1].map(|axis| taps(from[axis], to[axis], align_corners));
-            let (x, dy) = (random(3 * from[0] * from[1], 1), random(3 * to[0] * to[1], 2));
-            let result = resize(&x, from, &down, &across);
-            let gradient = resize_gradient(&dy, from, &down, &across);
-            let plain = |x: &[Vec<f64>]| plain::resize(&x[0], from, &down, &across);
-            check(
-                &format!("{from:?} → {to:?}, {align_corners}"),
-                &[&x],
-                plain,
-                &result,
-                &dy,
-                &[Some(&gradient)],
-            );
+            let nothing = Vec::<Param<Tensor<1>>>::new();
+            let what = format!("{from:?} → {to:?}, {align_corners}");
+            check(&what, nothing, [1, 3, from[0], from[1]], |_, x| bilinear(x, to, align_corners));
         }
     }
 }
@@ -348,6 +289,7 @@ fn only_wanted_gradients_are_found_and_they_are_the_same() {
         assert_eq!(got.weight, all.weight.clone().filter(|_| wanted.weight));
         assert_eq!(got.bias.is_some(), wanted.bias);
         let bias = got.bias.unwrap_or_else(|| all.bias.clone().expect("all are wanted"));
-        assert_equal("bias", &bias, &wide(all.bias.as_ref().expect("all are wanted")));
+        let wide = |values: &[f32]| values.iter().copied().map(f64::from).collect::<Vec<_>>();
+        assert_equal("bias", &wide(&bias), &wide(all.bias.as_ref().expect("all are wanted")));
     }
 }
