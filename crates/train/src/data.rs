@@ -26,7 +26,7 @@ impl<I: Clone + Send + Sync + 'static> Data<I> {
         folders: &[Arc<Folder>],
         config: &TrainConfig,
         samples: &SampleConfig,
-        new: fn(Arc<Folder>, Option<Split>, SampleConfig) -> Result<Stage<I>, FileError>,
+        new: impl Fn(Arc<Folder>, Option<Split>, SampleConfig) -> Result<Stage<I>, FileError>,
     ) -> Result<Self, TrainError> {
         let mut training = Vec::new();
         for folder in folders {

@@ -217,6 +217,7 @@ fn pixels_between(low: f32, high: f32, side: u32) -> Extent {
 
 /// The tiles of these pixels.
 #[cube]
+#[allow(clippy::manual_div_ceil, reason = "CubeCL has no `div_ceil`")]
 pub fn tiles_of(pixels: &Extent) -> Extent {
     let tile = comptime!(TILE as u32);
     Extent { first: pixels.first / tile, end: (pixels.end + tile - 1u32) / tile }

@@ -49,33 +49,16 @@ struct Share {
 
 #[cube]
 impl Behind {
-    /// Removes a splat with unclamped α `full` from the pixel.
-    fn take_off(
-        &mut self,
-        splat: &Splat,
-        color: &Vec3,
-        full: f32,
-        upstream: &Upstream,
-        max_alpha: f32,
-        #[comptime] shape: bool,
-        #[comptime] depth: bool,
-    ) -> Share {
+    /// Removes a splat with unclamped α `full` from the pixel. `e` is its e_j.
+    fn take_off(&mut self, full: f32, e: f32, max_alpha: f32) -> Share {
         let alpha = full.min(max_alpha);
         let inverse = 1.0 / (1.0 - alpha);
         self.transmittance *= inverse;
         let weight = alpha * self.transmittance;
-        let mut power = 0.0f32;
-        if comptime!(shape) {
-            let mut e = dot(color, &upstream.color) + upstream.alpha;
-            if comptime!(depth) {
-                e += splat.depth * upstream.depth;
-            }
-            let v_alpha = self.transmittance * e - self.sum * inverse;
-            self.sum += weight * e;
-            // Where α is clamped it does not depend on the splat.
-            power = select(full < max_alpha, v_alpha * alpha, 0.0f32);
-        }
-        Share { weight, power }
+        let v_alpha = self.transmittance * e - self.sum * inverse;
+        self.sum += weight * e;
+        // Where α is clamped it does not depend on the splat.
+        Share { weight, power: select(full < max_alpha, v_alpha * alpha, 0.0f32) }
     }
 }
 
@@ -139,8 +122,15 @@ pub fn pixels(
                     let w = offset(&splat, pixel.x, pixel.y);
                     let full = weight(&splat, &w);
                     if full.min(uniforms.max_alpha) >= comptime!(MIN_ALPHA) {
-                        let color = load3(colors, entry % uniforms.n * 3);
-                        share = behind.take_off(&splat, &color, full, &own, uniforms.max_alpha, shape, depth);
+                        let mut e = 0.0f32;
+                        if comptime!(shape) {
+                            let color = load3(colors, entry % uniforms.n * 3);
+                            e = dot(&color, &own.color) + own.alpha;
+                            if comptime!(depth) {
+                                e += splat.depth * own.depth;
+                            }
+                        }
+                        share = behind.take_off(full, e, uniforms.max_alpha);
                     }
                 }
             }
@@ -360,7 +350,8 @@ pub fn background_rows(
         terminate!();
     }
     let mut sum = Vec3 { x: 0.0f32, y: 0.0f32, z: 0.0f32 };
-    for pixel in row * width..(row + 1) * width {
+    for x in 0..width {
+        let pixel = row * width + x;
         let t = transmittance[pixel];
         let color = load3(upstream, pixel * comptime!(channels(depth)));
         sum.x += t * color.x;
