@@ -1,12 +1,11 @@
 //! TensorBoard's event files. A record is a length, data and checksums. The data is a protocol buffer with a time, a
 //! step and named values. (Crates that write such files need protobuf's compiler or are no longer maintained.)
 
+use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{self, Write};
 use std::path::Path;
 use std::time::{SystemTime, UNIX_EPOCH};
-
-use crate::log::Line;
 
 /// An open event file.
 pub struct Events(File);
@@ -22,10 +21,10 @@ impl Events {
         Ok(events)
     }
 
-    /// Adds a line of the log.
-    pub fn add(&mut self, line: &Line) -> io::Result<()> {
+    /// Adds the values of a step.
+    pub fn add(&mut self, step: u64, values: &BTreeMap<String, f64>) -> io::Result<()> {
         let mut summary = Vec::new();
-        for (name, value) in &line.values {
+        for (name, value) in values {
             let mut entry = Vec::new();
             text(&mut entry, 1, name.as_bytes());
             // Field 2, four bytes.
@@ -35,7 +34,7 @@ impl Events {
         }
         let mut event = now();
         event.push(2 << 3);
-        varint(&mut event, line.step);
+        varint(&mut event, step);
         text(&mut event, 5, &summary);
         self.record(&event)
     }
@@ -107,8 +106,7 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("events");
         let mut events = Events::create(&path).expect("writes");
-        let line = Line { step: 300, seconds: 0.0, values: [("loss".to_owned(), 0.5)].into() };
-        events.add(&line).expect("writes");
+        events.add(300, &[("loss".to_owned(), 0.5)].into()).expect("writes");
         let bytes = std::fs::read(&path).expect("there");
         // The second record comes after length 8 + 4, time 9, version 2 + 13 and checksum 4.
         let second = &bytes[12 + 9 + 15 + 4..];

@@ -59,7 +59,7 @@ impl Log {
         let events_path = folder.join("events.out.tfevents.snapsnap");
         let mut events = Events::create(&events_path).map_err(FileError::write(&events_path))?;
         for line in &lines {
-            events.add(line).map_err(FileError::write(&events_path))?;
+            events.add(line.step, &line.values).map_err(FileError::write(&events_path))?;
         }
         Ok(Self { path, file: appended, events, lines })
     }
@@ -87,7 +87,8 @@ impl Log {
     /// [`FileError`] if a file cannot be written.
     pub fn add(&mut self, line: Line) -> Result<(), FileError> {
         let text = serde_json::to_string(&line).expect("plain numbers") + "\n";
-        let written = self.events.add(&line).and_then(|()| self.file.write_all(text.as_bytes()));
+        let written =
+            self.events.add(line.step, &line.values).and_then(|()| self.file.write_all(text.as_bytes()));
         written.map_err(FileError::write(&self.path))?;
         self.lines.push(line);
         Ok(())

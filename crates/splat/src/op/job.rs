@@ -6,13 +6,6 @@ use crate::options::{MIN_TRANSMITTANCE, RenderOptions, TILE};
 use crate::vjp::View;
 use crate::{Camera, SplatError};
 
-/// Values beyond this are treated like infinities: their products leave the range of f32.
-pub(super) const MAX_MAGNITUDE: f32 = 1e18;
-/// Least |q|² of a quaternion that defines a rotation.
-pub(super) const MIN_QUATERNION: f32 = 1e-12;
-/// Added to the squared radius inside which a splat's α can reach [`MIN_ALPHA`](crate::options::MIN_ALPHA), so that
-/// rounding cuts off no pixel that the exact test would take, for needles of 4,000 pixels too.
-pub(super) const RADIUS_MARGIN: f32 = 1e-2;
 /// Largest image side; keeps pixel coordinates exact in f32 and tile numbers in 32 bits.
 pub const MAX_SIDE: u32 = 32_768;
 

@@ -6,11 +6,18 @@
 use cubecl::CubeTypeMut;
 use cubecl::prelude::*;
 
-use super::job::{MAX_MAGNITUDE, MIN_QUATERNION, RADIUS_MARGIN};
 use super::twofold::{exp, to_f32, to_u32};
 use crate::linear::{Quat, Vec3, load3};
 use crate::options::{MIN_ALPHA, TILE};
 use crate::vjp::{Footprint, View, footprint, project, span, to_camera};
+
+/// Values beyond this are treated like infinities: their products leave the range of f32.
+const MAX_MAGNITUDE: f32 = 1e18;
+/// Least |q|² of a quaternion that defines a rotation.
+const MIN_QUATERNION: f32 = 1e-12;
+/// Added to the squared radius inside which a splat's α can reach [`MIN_ALPHA`](crate::options::MIN_ALPHA), so that
+/// rounding cuts off no pixel that the exact test would take, for needles of 4,000 pixels too.
+const RADIUS_MARGIN: f32 = 1e-2;
 
 /// A visible Gaussian as the pixels of one view use it.
 #[derive(CubeType, Clone, Copy, Debug, Default)]
@@ -109,7 +116,7 @@ pub const OUTSIDE: u32 = 2;
 pub const TRANSPARENT: u32 = 3;
 /// No rotation, or a projection beyond f32.
 pub const DEGENERATE: u32 = 4;
-/// A parameter that is not finite, or beyond ±[`MAX_MAGNITUDE`].
+/// A parameter that is not finite, or beyond ±1e18.
 pub const INVALID: u32 = 5;
 /// Number of fates.
 pub const FATES: usize = 6;
