@@ -8,7 +8,7 @@ thread_local! {
     static GUARDED: Cell<bool> = const { Cell::new(false) };
 }
 
-/// Whether this thread is inside [`guarded`]: what panics there becomes an error, and a panic hook need not report it.
+/// Whether this thread is inside [`guarded`], where a panic becomes an error that a panic hook need not report.
 pub fn is_guarded() -> bool {
     GUARDED.get()
 }

@@ -46,7 +46,7 @@ pub fn remove_unfinished() {
     }
 }
 
-/// Whether [`remove_unfinished`] was called, in which case what fails now fails for that.
+/// Whether [`remove_unfinished`] was called. Later failures are its consequence.
 pub fn is_ending() -> bool {
     unfinished().ending
 }
@@ -99,7 +99,8 @@ fn create(path: &Path) -> io::Result<File> {
     let mut options = File::options();
     options.read(true).write(true).create_new(true);
     let file = options.open(path)?;
-    // Tells a file in the making from one that a killed run has left. Some file systems know no locks.
+    // Distinguishes an unfinished file of a running process from one that a killed run has left. Some file systems have no
+    // locks.
     let _ = file.lock();
     // Another run may have taken it for left in between.
     if !path.exists() {
@@ -133,17 +134,16 @@ fn tidy(folder: &Path) {
             age.is_ok_and(|age| age.is_ok_and(|age| age > LEFT))
         };
         let Ok(file) = File::open(entry.path()) else { continue };
-        // The lock is held until the file is gone: whoever has just made it waits for it.
+        // The lock is held until the file is removed, so that a process that has just made it waits.
         if is_ours && is_old(&file) && file.try_lock().is_ok() {
             let _ = fs::remove_file(entry.path());
         }
     }
 }
 
-/// Writes `path` through `fill`: into a temporary file beside it, which is renamed when `fill` has succeeded, so that
-/// a failure leaves whatever was there before. A file that is replaced hands its permissions on, and one that is
-/// write-protected is refused. A symbolic link keeps pointing at the file, which is replaced; a path that exists and is no
-/// regular file (a pipe, a device) is written in place: renaming would replace the device itself.
+/// Writes `path` through `fill` into a temporary file beside it, which is renamed after success. A failure leaves the former
+/// file. The new file keeps the permissions of the former one; a write-protected file is refused. A symbolic link stays and
+/// its target is replaced. A pipe or a device is written in place, since renaming would replace it.
 ///
 /// # Errors
 /// The error of `fill`, or the operating system's refusal to create, write or rename the file.
@@ -209,8 +209,8 @@ pub fn target_of(path: &Path) -> PathBuf {
     path
 }
 
-/// Checks, before any work, that `path` can be written: its folder exists and lets us create a file, and what is there is
-/// not write-protected. A pipe or a device is not touched: opening it is already an event for whoever reads it.
+/// Checks, before any work, that `path` can be written: a file can be created in its folder, and an existing file is not
+/// write-protected. A pipe or a device is not opened, since its reader would notice.
 ///
 /// # Errors
 /// The operating system's reason.
@@ -323,7 +323,7 @@ mod tests {
             for entry in fs::read_dir(folder.path()).expect("lists") {
                 old(&entry.expect("entry").path());
             }
-            // Another run that begins now does not know of this one.
+            // Another run that begins now is independent of this one.
             tidied().lock().unwrap_or_else(PoisonError::into_inner).clear();
             tidy(folder.path());
             out.write_all(b"whole")

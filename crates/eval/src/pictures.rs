@@ -25,7 +25,7 @@ impl Picture {
     /// [`EvalError::Value`] for a value that is not finite or not in [0, 1].
     ///
     /// # Panics
-    /// If there are not as many values as the size says.
+    /// If the number of values does not fit the size.
     pub fn new(values: Vec<f32>, [height, width]: [usize; 2], what: &'static str) -> Result<Self, EvalError> {
         assert_eq!(values.len(), 3 * height * width, "planes of {width}×{height}");
         if let Some(at) = values.iter().position(|v| !(0.0..=1.0).contains(v)) {
@@ -42,7 +42,7 @@ impl Picture {
     /// [`EvalError::Value`] for a value that is not finite.
     ///
     /// # Panics
-    /// If there are not as many values as the size says, or the size is no multiple of `times`.
+    /// If the number of values does not fit the size, or if the size is no multiple of `times`.
     pub fn rendered(values: &[f32], [height, width]: [usize; 2], times: usize) -> Result<Self, EvalError> {
         assert_eq!(values.len(), 3 * height * width, "pixels of {width}×{height}");
         assert!(height % times == 0 && width % times == 0, "{width}×{height} in parts of {times}");

@@ -74,7 +74,7 @@ pub struct NetworkConfig {
     pub fusion: Fusion,
     /// Activation of the confidence channel.
     pub conf_mode: ConfMode,
-    /// Side of the square canvas in pixels, on which points and Gaussians live.
+    /// Side of the square canvas in pixels, of points and Gaussians.
     pub resolution: usize,
     /// Side of the square image that the point predictor receives, in pixels.
     pub net_resolution: usize,

@@ -27,7 +27,7 @@ impl Hull {
         }
     }
 
-    /// Whether both cameras see a point `[x, y, z]`, metres in the front camera's frame, within their masks.
+    /// Whether a point `[x, y, z]`, metres in the front camera's frame, is within the masks of both cameras.
     pub fn contains(&self, point: [f32; 3]) -> bool {
         let point = DVec3::from(point.map(f64::from));
         self.masks.iter().zip(&self.to_camera).all(|(mask, to_camera)| {

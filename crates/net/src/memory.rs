@@ -4,9 +4,8 @@ use crate::config::Config;
 
 /// Bytes of an f32.
 const F32: u64 = 4;
-/// Bytes per pixel of the canvas where a person stands as high as training subjects do and is seen from the sides as well:
-/// photographs, point maps on the device and on the host, side images, the regressor's planes of 16 channels and the
-/// Gaussians; measured (docs/inference.md). Twice as much is needed where every pixel of every view becomes a Gaussian.
+/// Bytes per pixel of the canvas for a person of the training subjects' height, with unseen sides: photographs, point maps on the device and on the host, side images, the regressor's planes of 16 channels and the
+/// Gaussians; measured (docs/inference.md). The double is needed if every pixel of every view becomes a Gaussian.
 const PER_PIXEL: u64 = 500;
 /// Memory that depends neither on size nor on weights: code, buffers of the threads.
 const BASE: u64 = 200 << 20;

@@ -18,7 +18,7 @@
 //! For a point p of a box, |p − q| along an axis is at least g = max(low − q, q − high, 0). Rounding is monotone, so
 //! the same holds after rounding the differences, their squares and the sums, if both sides do the same operations
 //! in the same order: the rounded bound never exceeds the rounded distance. A box whose bound *equals* the best
-//! distance may hold an equal with a smaller row; every box knows its smallest row.
+//! distance may hold an equal with a smaller row; every box has its smallest row.
 
 use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;

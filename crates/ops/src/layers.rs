@@ -34,7 +34,7 @@ fn linear_sizes(layer: &nn::Linear, x: &Tensor<3>) -> (Linear, [usize; 3]) {
     (Linear { rows: b * n, inputs, outputs, transposed: false }, [b, n, outputs])
 }
 
-/// Layer normalisation of tokens `[B, N, C]`. `epsilon` is what the layer was made with, which it does not tell.
+/// Layer normalisation of tokens `[B, N, C]`. `epsilon` is that of the layer, whose field is private.
 pub fn layer_norm(layer: &nn::LayerNorm, epsilon: f64, x: Tensor<3>) -> Tensor<3> {
     let Some(bias) = layer.beta.as_ref().filter(|_| is_trained_fast(&x)) else {
         return in_f32(x, |x| layer.forward(x));

@@ -9,7 +9,7 @@ pub struct Multiply<'a> {
     pub lhs: (&'a [f32], [usize; 2]),
     /// The same of the right factor.
     pub rhs: (&'a [f32], [usize; 2]),
-    /// Adds to what is there.
+    /// Adds to the present values.
     pub add: bool,
 }
 

@@ -21,8 +21,7 @@ pub trait Kernel: Debug + Send + Sync + 'static {
     /// Shape of the result.
     fn shape(&self) -> Vec<usize>;
 
-    /// The result, and, where `keep`, what the backward pass needs beside the inputs. An input that was not given is one
-    /// zero.
+    /// The result, and, with `keep`, values for the backward pass beside the inputs. An absent input is one zero.
     fn forward(&self, inputs: [&[f32]; 3], keep: bool) -> (Vec<f32>, Kept);
 
     /// ∂L/∂ of the inputs that are wanted, each of the size of its input, from ∂L/∂result.

@@ -1,4 +1,4 @@
-//! The nearest matrix with orthonormal rows, roughly: what Muon makes of a direction (Jordan et al., "Muon").
+//! An approximation of the nearest matrix with orthonormal rows, as Muon uses it for directions (Jordan et al., "Muon").
 
 use crate::multiply::Multiply;
 
@@ -49,7 +49,7 @@ pub fn orthogonalised(matrix: Vec<f32>, [rows, columns]: [usize; 2]) -> Vec<f32>
 mod tests {
     use super::*;
 
-    /// A diagonal matrix stays one, and each of its values goes the polynomial's way by itself.
+    /// A diagonal matrix stays diagonal, and the polynomial maps each of its values.
     #[test]
     fn singular_values_go_the_polynomials_way() {
         let values = [3.0_f32, 1.0, 0.25];

@@ -3,8 +3,8 @@
 use cubecl_wgpu::wgpu::Backend;
 use cubecl_wgpu::{AutoGraphicsApi, GraphicsApi};
 
-/// Whether wgpu would take OpenGL, for want of Vulkan, Metal and DirectX 12, or of a card that answers to them. Nothing here uses
-/// such a device: kernels that are right everywhere else give wrong numbers on Mesa's.
+/// Whether wgpu would use OpenGL, because no device has Vulkan, Metal or DirectX 12. Such devices are not used: kernels that
+/// are right on all others give wrong numbers on Mesa's OpenGL.
 pub fn is_opengl() -> bool {
     AutoGraphicsApi::backend() == Backend::Gl
 }

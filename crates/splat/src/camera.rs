@@ -56,7 +56,7 @@ pub struct Orbit {
     pub centre: DVec3,
     /// Distance of the camera from `centre` in metres.
     pub radius: f64,
-    /// Angle around the world's y axis in degrees; 0 stands on +z and sees the front of a subject that faces +z.
+    /// Angle around the world's y axis in degrees; 0 is on +z, in front of a subject that faces +z.
     pub yaw_degrees: f64,
     /// How far the camera looks down, in degrees.
     pub pitch_degrees: f64,
@@ -108,7 +108,7 @@ impl Orbit {
 impl Camera {
     /// The training orbit's camera at `yaw_degrees` with a square image of `size` pixels: 2 m from
     /// (0, 0.85, 0), 8° downward pitch, focal length 0.8·size, principal point moved down by 25/1024 of the size.
-    /// World: y up, floor at y = 0; yaw 0 stands on +z and sees the front of a subject that faces +z.
+    /// World: y up, floor at y = 0; yaw 0 is on +z, in front of a subject that faces +z.
     pub fn orbit_at_yaw_degrees(yaw_degrees: f64, size: u32) -> Self {
         Orbit { yaw_degrees, ..Orbit::default() }.camera(size)
     }
@@ -139,7 +139,7 @@ impl Camera {
         Self { world_to_camera: RigidTransform { rotation, translation }, ..*self }
     }
 
-    /// Where the camera stands in the world, metres. By the true inverse: a matrix from a file may be orthonormal to a few
+    /// Centre of the camera in the world, metres. By the true inverse: a matrix from a file may be orthonormal to a few
     /// digits only.
     pub fn centre(&self) -> DVec3 {
         -(self.world_to_camera.rotation.inverse() * self.world_to_camera.translation)

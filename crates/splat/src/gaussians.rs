@@ -97,7 +97,7 @@ impl Gaussians {
         assert!(transform.rotation.determinant() > 0.0, "a reflection cannot rotate quaternions");
         let q = DQuat::from_mat3(&transform.rotation);
         let (w, x, y, z) = (q.w as f32, q.x as f32, q.y as f32, q.z as f32);
-        // Row i is what component i of the right factor contributes to q ⊗ r, in (w, x, y, z) order.
+        // Row i is the contribution of component i of the right factor to q ⊗ r, in (w, x, y, z) order.
         let product = [[w, x, y, z], [-x, w, z, -y], [-y, -z, w, x], [-z, y, -x, w]];
         self.rotations = times(self.rotations, &product);
         self.with_means_transformed(transform)

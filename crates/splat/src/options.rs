@@ -29,7 +29,7 @@ pub struct RenderOptions {
 }
 
 impl RenderOptions {
-    /// Constants of the original 3D Gaussian splatting rasteriser; what the published weights were trained with.
+    /// Constants of the original 3D Gaussian splatting rasteriser, with which the published weights were trained.
     pub fn inria() -> Self {
         Self { max_alpha: 0.99, blur: 0.3, near: 0.2, antialiased: false, depth: false, background: None }
     }

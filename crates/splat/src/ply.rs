@@ -1,5 +1,5 @@
-//! 3D Gaussian PLY files in the layout of the INRIA viewer. Written: binary little-endian. Read: whatever follows that
-//! layout.
+//! 3D Gaussian PLY files in the layout of the INRIA viewer. Binary little-endian files are written; all
+//! files of that layout are read.
 
 pub mod header;
 mod read;
@@ -24,7 +24,7 @@ pub(crate) fn write(stored: &Stored, out: &mut impl Write) -> io::Result<()> {
     let rest = stored.columns.len() - Stored::COLUMNS.len();
     let of = |name: &&str| {
         let at = Stored::COLUMNS.iter().position(|column| column == name);
-        // Normals are nobody's.
+        // Normals are not used.
         ((*name).to_owned(), at.map(|at| stored.columns[at].as_slice()))
     };
     let mut properties: Vec<(String, Option<&[f32]>)> = PROPERTIES.iter().map(of).collect();

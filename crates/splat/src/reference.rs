@@ -231,7 +231,7 @@ pub fn banded(scene: &Scene<f64>, camera: &Camera, options: &RenderOptions) -> V
         scene.gaussians.iter_mut().for_each(|g| g[10] *= scale);
         contributors(&scene, camera, options)
     };
-    // A relative change of every α, larger than what rounding does to it.
+    // A relative change of every α, larger than its rounding error.
     let (less, more) = (with(1.0 - 1e-4), with(1.0 + 1e-4));
     less.into_iter().zip(more).map(|(a, b)| a != b).collect()
 }

@@ -1,4 +1,4 @@
-//! The differentiable render: what callers see of the splatting operation.
+//! The differentiable render, the public interface of the splatting operation.
 
 use std::sync::Arc;
 
@@ -24,7 +24,7 @@ pub struct Rendered {
 /// Renders `gaussians` into `cameras`, all of one image size, by front-to-back alpha compositing of their elliptical
 /// projections (EWA splatting; docs/method.md, "Splatting").
 ///
-/// Differentiable in means, rotations, scales, opacities, colours and background; what nobody tracks costs nothing in
+/// Differentiable in means, rotations, scales, opacities, colours and background. Untracked inputs cost nothing in
 /// the backward pass. On the CPU and on the GPU, equal inputs give equal bits, forward and backward. A Gaussian whose
 /// parameters are not finite or leave f32's range when projected is left out, counted, and gets a zero gradient.
 ///
@@ -51,7 +51,7 @@ pub struct Rendered {
 /// # Errors
 /// [`SplatError::NoCamera`], [`SplatError::Camera`] for a camera that cannot be used, [`SplatError::Option`],
 /// [`SplatError::Shape`] for tensors that do not fit together, [`SplatError::TooManyIntersections`] and
-/// [`SplatError::Memory`] for what the device cannot hold.
+/// [`SplatError::Memory`] for more than the device can hold.
 pub fn render(
     gaussians: &Gaussians,
     cameras: &[Camera],
@@ -87,7 +87,7 @@ pub fn render(
     })
 }
 
-/// The kernels compute in f32 whatever the model's precision is.
+/// The kernels compute in f32 for models of every precision.
 fn f32<const D: usize>(tensor: &Tensor<D>) -> Tensor<D> {
     if tensor.dtype() == DType::F32 { tensor.clone() } else { tensor.clone().cast(DType::F32) }
 }

@@ -15,7 +15,7 @@ const C2: [f32; 3] = [1.092_548_4, 0.315_391_57, 0.546_274_2];
 /// Degree 3: √(35/(32π)), √(105/(4π)), √(21/(32π)), √(7/(16π)), √(105/(16π)).
 const C3: [f32; 5] = [0.590_043_6, 2.890_611_4, 0.457_045_8, 0.373_176_33, 1.445_305_7];
 
-/// Colours `[N,3]` of Gaussians at `means` `[N,3]` (world) as `camera` sees them: max(0, ½ + Σ_k Y_k(d)·c_k) with d the
+/// Colours `[N,3]` of Gaussians at `means` `[N,3]` (world) for `camera`: max(0, ½ + Σ_k Y_k(d)·c_k) with d the
 /// unit vector from the camera's centre to the mean, and the signs and order of the INRIA files. `coefficients`
 /// `[N,K,3]`, K ∈ {1, 4, 9, 16}. Differentiable in both tensors.
 ///

@@ -21,7 +21,7 @@ pub struct Loaded {
 }
 
 impl Loaded {
-    /// The Gaussians in the colours that a camera sees.
+    /// The Gaussians with their colours for a camera.
     ///
     /// # Errors
     /// [`SplatError::Shape`] for coefficients of no degree.
@@ -42,7 +42,7 @@ impl From<Gaussians> for Loaded {
     }
 }
 
-/// Gaussians as files hold them, before activation, column by column: see [`Stored::COLUMNS`].
+/// Gaussians before activation, as in files, column by column: see [`Stored::COLUMNS`].
 #[derive(Debug, Clone)]
 pub struct Stored {
     /// SH coefficients per channel: 1, 4, 9 or 16.

@@ -28,7 +28,7 @@
 //! g = ∂L/∂α·α (zero where α is clamped) and w = F·d, so that the power is −½|w|². Then ∂power/∂u = Λd = Fᵀw and
 //! ∂power/∂Σ' = ½·(Λd)(Λd)ᵀ, and a splat's gradients follow from five sums over pixels, r = Σ g·w and S = Σ g·w·wᵀ:
 //! v_u = Fᵀ·r, v_m = 2·v_Σ'·m = Fᵀ·S·(F·m); and v_o = Σ g/o.
-//! F·m is bounded by 1 whatever the splat's shape, because (F·m)(F·m)ᵀ = 1 − ε·F·Fᵀ; its second row
+//! F·m is bounded by 1 for every shape of the splat, because (F·m)(F·m)ᵀ = 1 − ε·F·Fᵀ; its second row
 //! l₁·(m₁ + k·m₀) would cancel for a needle, but equals l₁·(n × m₀ + ε·m₁)/a, which does not.
 //!
 //! # Gradient of a pixel
@@ -53,7 +53,7 @@ pub struct View {
     pub rotation: Mat3,
     /// Camera centre in the world, metres, rounded to f32 …
     pub centre: Vec3,
-    /// … and what the rounding left over.
+    /// … and the rounding error.
     pub centre_rest: Vec3,
     /// Focal length, pixels.
     pub fx: f32,
@@ -102,7 +102,7 @@ pub struct Projection {
     pub blur: f32,
 }
 
-/// A splat: a projected Gaussian as the pixels see it.
+/// A splat: a projected Gaussian, as the pixels use it.
 #[derive(CubeType, Clone, Copy, Debug)]
 pub struct Footprint {
     /// Centre, pixels.

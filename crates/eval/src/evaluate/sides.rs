@@ -10,7 +10,7 @@ use crate::geometry::double;
 
 /// Number of views whose points are joined to a side.
 const SOURCES: usize = 4;
-/// Largest angle between a side and such a view in degrees. Views farther away see less of the side.
+/// Largest angle between a side and such a view in degrees. Views farther away show less of the side.
 const FARTHEST: f64 = 30.0;
 /// Largest angle, in degrees, of a view that is the side itself.
 const SAME: f64 = 0.1;

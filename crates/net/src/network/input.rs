@@ -1,4 +1,4 @@
-//! Photographs on their canvas → what the point predictor sees of them.
+//! Photographs on their canvas → the input of the point predictor.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use snapsnap_splat::Camera;

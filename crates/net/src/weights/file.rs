@@ -73,7 +73,7 @@ fn write_floats(
     });
     let header = Metadata::new(Some(metadata), infos.collect()).expect("consecutive, exactly sized tensors");
     let mut header = serde_json::to_vec(&header).expect("the header has only JSON types");
-    // The format asks for data aligned to 8 bytes and allows spaces for it.
+    // The format requires data aligned to 8 bytes and allows spaces for that.
     header.resize(header.len().next_multiple_of(8), b' ');
 
     // Errors of both kinds pass through `write_whole`.

@@ -15,7 +15,7 @@ use crate::config::Config;
 pub struct ImportOptions {
     /// Where side heads come from when the checkpoints have none.
     pub side_heads: SideHeads,
-    /// Seed of what is drawn.
+    /// Seed of random values.
     pub seed: u64,
     /// Float type of the written file.
     pub float: Float,

@@ -25,7 +25,7 @@ pub use source::{CONFIG_KEY, Entry, Float, Source};
 /// Errors of weight files.
 #[derive(Debug, thiserror::Error)]
 pub enum WeightsError {
-    /// The file could not be read or written, or is not what it should be.
+    /// The file could not be read or written, or is unsuitable.
     #[error(transparent)]
     File(#[from] FileError),
     /// Tensors are missing, unused, mis-shaped, of the wrong type, not finite or given twice.

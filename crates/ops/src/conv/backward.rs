@@ -105,7 +105,7 @@ impl Backward<'_> {
             Band::new(self, &transposed, outs).run(rows)
         };
         let parts: Vec<Gradients> = outs.into_par_iter().enumerate().map(run).collect();
-        // Joined in the order of the rows, whatever thread they ran on.
+        // Joined in the order of the rows, for the same bits with any number of threads.
         let mut parts = parts.into_iter();
         let mut all = parts.next().unwrap_or_default();
         for part in parts {

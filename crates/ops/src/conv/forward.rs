@@ -59,7 +59,7 @@ impl Conv<'_> {
     fn band(&self, first: usize, [rows, columns]: [usize; 2], width: usize, out: &mut [f32]) -> Moments {
         let arch = Arch::new();
         let line = (columns + 2) * CHANNELS;
-        // Three activated rows per source, in turn; `held` says which row each slot holds.
+        // Three activated rows per source, in turn; `held` has the row of each slot.
         let mut slots: Vec<[Vec<f32>; 3]> =
             self.sources.iter().map(|_| std::array::from_fn(|_| vec![0.0; line])).collect();
         let mut held = [usize::MAX; 3];

@@ -38,9 +38,9 @@ pub struct Merge<'a> {
 }
 
 impl Merge<'_> {
-    /// `gradient` behind the normalisation becomes the gradient of the plane; on all cores, the same bits for any number.
-    /// Gives the gradient `[16 in][16 out]` of a projection's weight, nothing where nothing is projected or nobody
-    /// needs it.
+    /// Turns the gradient behind the normalisation into the gradient of the plane, on all cores, with the same bits for any
+    /// number of them. Returns the gradient `[16 in][16 out]` of a projection's weight; empty without a projection, or if it
+    /// is unwanted.
     pub fn run(&self, gradient: &mut [f32]) -> Vec<f64> {
         let task = |(i, out): (usize, &mut [f32])| self.task(i * TASK * CHANNELS, out);
         let parts: Vec<Vec<f64>> = gradient.par_chunks_mut(TASK * CHANNELS).enumerate().map(task).collect();

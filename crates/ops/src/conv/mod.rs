@@ -2,8 +2,8 @@
 //! next normalisation's moments in one pass. A band of rows keeps its three activated input rows in cache.
 //!
 //! Pixels are stored with their channels together, so that one pixel is one vector of the widest kind.
-//! `forward` and `backward` are the two passes over bands, `kernels` what both do with a row, `norm` the arithmetic of
-//! group normalisation between two passes, `merge` what joins the gradients of a plane that several operators read.
+//! `forward` and `backward` are the two passes over bands. Both use `kernels` for a row. `norm` is the arithmetic of group
+//! normalisation between two passes. `merge` joins the gradients of a plane that several operators read.
 
 use pulp::{Simd, WithSimd};
 
@@ -83,7 +83,7 @@ impl Moments {
             }
         }
         let n = f64::from(count);
-        // The deviations sum to what rounding took from the mean.
+        // The sum of the deviations is the rounding error of the mean.
         let exact = |c: usize| f64::from(mean[c]) + f64::from(residue[c]) / n;
         let around = |c: usize| f64::from(squares[c]) - f64::from(residue[c]) * f64::from(residue[c]) / n;
         Self { count: n, mean: std::array::from_fn(exact), squares: std::array::from_fn(around) }

@@ -23,7 +23,7 @@ pub fn double(input: &[f32], out: &mut [f32]) {
     }
 }
 
-/// Sums of neighbouring pixels, added to what the row above left if there is one.
+/// Sums of neighbouring pixels, added to those of the row above if there is one.
 pub fn halve(doubled: &[f32], out: &mut [f32], add: bool) {
     let pairs = doubled.as_chunks::<CHANNELS>().0.chunks_exact(2);
     for (pixel, pair) in out.as_chunks_mut::<CHANNELS>().0.iter_mut().zip(pairs) {

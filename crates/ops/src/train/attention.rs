@@ -22,9 +22,9 @@ const BLOCK: usize = 64;
 pub struct Attention {
     /// Samples.
     pub batch: usize,
-    /// Tokens that ask.
+    /// Number of queries.
     pub queries: usize,
-    /// Tokens that are asked.
+    /// Number of keys and values.
     pub keys: usize,
     /// Heads.
     pub heads: usize,

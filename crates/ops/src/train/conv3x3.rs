@@ -20,9 +20,8 @@ use crate::wide::{GROUP, pieces};
 /// holds most.
 const BLOCK_FLOATS: usize = 256 * 1024;
 
-/// Pixels of all images up to which the weight's gradient is summed tap by tap. Where a channel lives in a few pixels only,
-/// some taps see nothing of it. Winograd's method leaves the others' rounding there instead of 0, and AdamW takes that for
-/// a direction to go.
+/// Pixels of all images up to which the weight's gradient is summed tap by tap. If a channel is positive in a few pixels
+/// only, the gradients of some taps are 0. Winograd's method has rounding errors instead, which AdamW would scale up.
 const FEW_PIXELS: usize = 1024;
 
 /// Sizes of a convolution, and whether it reads max(x, 0) instead of its input x.

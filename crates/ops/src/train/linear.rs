@@ -54,8 +54,8 @@ impl Linear {
         [out, before]
     }
 
-    /// Gradients from that of the output, `dy` `[rows, outputs]`. `before` is what [`Linear::forward_gelu`] told of the
-    /// values before GELU, if there was one.
+    /// Gradients from that of the output, `dy` `[rows, outputs]`. `before` has the values before GELU from
+    /// [`Linear::forward_gelu`], if there was one.
     pub fn backward(
         &self,
         x: &[f32],

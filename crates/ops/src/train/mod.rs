@@ -3,7 +3,7 @@
 //! composed of small steps.)
 //!
 //! Images are `[B, C, H, W]` and tokens `[B, N, C]`, contiguous, of any size. Every result has the same bits for any
-//! number of threads: work is cut by sizes alone, and what several tasks sum is joined in their order.
+//! number of threads: work is cut by sizes alone, and sums of several tasks are joined in their order.
 
 mod attention;
 mod conv1x1;
@@ -35,7 +35,7 @@ pub use unfolded::Unfolded;
 pub use crate::resize::{resize, resize_gradient};
 pub use snapsnap_base::bilinear::{Tap, taps};
 
-/// Which gradients are needed; what is not costs nothing.
+/// The wanted gradients. Unwanted ones cost nothing.
 #[derive(Debug, Clone, Copy)]
 pub struct Wanted {
     /// Of the operator's input.
@@ -51,7 +51,7 @@ impl Wanted {
     pub const ALL: Self = Self { input: true, weight: true, bias: true };
 }
 
-/// Gradients that were wanted, in the shapes of what they belong to.
+/// The wanted gradients, in the shapes of the input, the weight and the bias.
 #[derive(Debug)]
 pub struct Gradients {
     /// Of the operator's input.
@@ -78,7 +78,7 @@ fn join<'a>(parts: impl Iterator<Item = &'a [f32]>, len: usize) -> Vec<f32> {
     out
 }
 
-/// `count` pieces of what there is, or of nothing.
+/// `count` pieces of the data, or `count` times nothing.
 fn parts(data: Option<&mut [f32]>, piece: usize, count: usize) -> Vec<Option<&mut [f32]>> {
     match data {
         Some(data) => data.chunks_mut(piece).map(Some).collect(),

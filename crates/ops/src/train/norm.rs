@@ -24,7 +24,7 @@ pub struct LayerNorm {
 pub type Statistics = [f32; 2];
 
 impl LayerNorm {
-    /// `x` `[rows, channels]`, `weight` and `bias` `[channels]` → `[rows, channels]` and what the backward pass needs.
+    /// `x` `[rows, channels]`, `weight` and `bias` `[channels]` → `[rows, channels]` and the statistics for the backward pass.
     pub fn forward(&self, x: &[f32], weight: &[f32], bias: &[f32]) -> (Vec<f32>, Vec<Statistics>) {
         let mut out = take(x.len());
         let mut statistics = vec![[0.0; 2]; x.len() / self.channels];

@@ -109,7 +109,7 @@ fn convolutions_of_three_taps_equal_burns() {
     }
 }
 
-/// A channel that lives in one corner: eight taps see it nowhere beside an output's gradient.
+/// A channel that is positive in one corner only: eight taps never meet it together with a gradient.
 #[test]
 fn taps_that_see_nothing_have_no_gradient() {
     let conv = Conv3x3 { batch: 1, inputs: 1, outputs: 1, height: 32, width: 32, rectified: true };

@@ -121,7 +121,7 @@ pub struct Accumulate<'a> {
     /// Tiles from one group to the next.
     pub stride: usize,
     pub tiles: usize,
-    /// Adds to what is there.
+    /// Adds to the present values.
     pub add: bool,
     pub out: &'a mut [f32],
 }

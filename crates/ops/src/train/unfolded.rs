@@ -128,7 +128,7 @@ impl Unfolded {
         [self.height.div_ceil(self.stride), self.width.div_ceil(self.stride)]
     }
 
-    /// Planes `x` → what the nine taps of every channel see, `[channels, 9, rows, columns]`, for output rows from `row`
+    /// Planes `x` → the inputs of the nine taps of every channel, `[channels, 9, rows, columns]`, for output rows from `row`
     /// on.
     fn unfold(&self, x: &[f32], row: usize, taps: &mut [f32]) {
         let (plane, [_, columns]) = (self.height * self.width, self.size());

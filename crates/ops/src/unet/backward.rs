@@ -51,7 +51,7 @@ impl Network {
         let parts: Vec<_> = saved.samples.into_par_iter().enumerate().map(run).collect();
         let mut sums = vec![0.0; self.parameters()];
         let mut gradient = vec![0.0; if wanted.input { input.len() } else { 0 }];
-        // Joined in the order of the images, whatever thread they ran on.
+        // Joined in the order of the images, for the same bits with any number of threads.
         for (i, (plane, part)) in parts.into_iter().enumerate() {
             sums.iter_mut().zip(part).for_each(|(sum, g)| *sum += g);
             if let Some(plane) = plane {

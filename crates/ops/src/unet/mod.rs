@@ -1,6 +1,6 @@
 //! The regressor's network as one differentiable function over the fused convolutions.
 //!
-//! `layout` says which operators there are and where their parameters lie, `forward` and `backward` walk along them.
+//! `layout` lists the operators and the places of their parameters; `forward` and `backward` run them.
 //! The tape between the two holds the planes that group normalisations or convolutions read, and nothing else.
 
 mod backward;

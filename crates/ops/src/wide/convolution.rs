@@ -3,7 +3,7 @@
 //!
 //! Filters are transformed once. Then tasks take bands of rows: transform the inputs of a block of tiles, multiply by the
 //! filters of each of the 36 points, transform the products and write them where they belong. A block is large enough
-//! that reading all filters for it costs little, and small enough that what lies between the steps stays in the cache.
+//! that reading all filters for it costs little, and small enough that intermediate results stay in the cache.
 
 use pulp::Arch;
 use rayon::prelude::*;

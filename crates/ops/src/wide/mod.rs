@@ -1,6 +1,6 @@
 //! Parts of 3×3 convolutions by Winograd's method: transforms, and matrix products per point of a tile.
 //!
-//! Channels stand in groups of 16, one vector of the widest kind. The kernel in `product` reads them
+//! Channels are in groups of 16, one vector of the widest kind. The kernel in `product` reads them
 //! as the left factor of a matrix product, and every step between products works on whole vectors.
 
 pub(crate) mod convolution;
@@ -10,7 +10,7 @@ pub(crate) mod transforms;
 #[cfg(test)]
 mod tests;
 
-/// Channels that stand together.
+/// Channels of a group.
 pub const GROUP: usize = 16;
 
 /// Cuts every plane of `plane` floats into pieces of `piece` (the last may be shorter): piece after piece, the slices of

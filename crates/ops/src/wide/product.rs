@@ -1,13 +1,13 @@
 //! Matrix products whose factors are stored as the kernel reads them, so that nothing is packed for a product.
 //!
 //! The kernel keeps a block of the result in registers (12 rows of 32 columns with AVX-512), sums over the whole inner
-//! dimension and writes the block once. Every element is one sum in one order, whatever the split among threads.
+//! dimension and writes the block once. Every element is one sum in one order, for any number of threads.
 
 use pulp::{Simd, WithSimd};
 
 use super::GROUP;
 
-/// Columns of the right factor that stand together.
+/// Adjacent columns of the right factor.
 pub const PANEL: usize = 2 * GROUP;
 
 /// Left factor `[rows, 16·groups]`: one `[rows][16]` per group, `stride` floats from one to the next.
@@ -78,11 +78,11 @@ fn rows<S: Simd, const VECTORS: usize, const ROWS: usize>(
     bias: &[f32],
     out: &mut [&mut [f32]],
 ) {
-    /// Rows of the smaller block for what the larger leaves over.
+    /// Rows of the smaller block, for the rest of the rows.
     const FEW: usize = 4;
     let mut row = 0;
     while row < left.rows {
-        // The last block begins earlier instead of being smaller: what it computes twice is the same twice.
+        // The last block begins earlier instead of being smaller. Rows that are computed twice get the same values.
         if left.rows >= ROWS && left.rows - row > FEW {
             row = row.min(left.rows - ROWS);
             block::<S, VECTORS, ROWS>(simd, left, row, panel, bias, out);

@@ -5,7 +5,7 @@ use serde_json::Value;
 
 use super::*;
 
-/// Files of Niantic's library, made by docs/spz_reference.mjs, and what went into it and came out of it.
+/// Files of Niantic's library, made by docs/spz_reference.mjs, with their input and their decoded values.
 fn reference(name: &str) -> (Vec<u8>, Value) {
     let folder = PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/data/spz"));
     let bytes = fs::read(folder.join(format!("{name}.spz"))).expect("a file");
@@ -104,7 +104,7 @@ fn what_is_no_spz_or_a_damaged_one_is_refused() {
     let at = sum.len() - 6;
     sum[at] ^= 1;
     assert!(problem(&sum).contains("damaged"));
-    // Nothing is taken for what a header merely promises.
+    // No memory is allocated for the promises of a header.
     let mut header = content(&good)[..16].to_vec();
     header[8..12].copy_from_slice(&10_000_000_u32.to_le_bytes());
     assert!(problem(&packed(&header)).contains("0 of 90000000 bytes"));

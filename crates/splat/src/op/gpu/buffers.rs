@@ -123,7 +123,7 @@ pub mod testing {
 
     use super::*;
 
-    /// Runs `test` on the machine's wgpu adapter, or says that there is none.
+    /// Runs `test` on the machine's wgpu adapter, or prints that there is none.
     pub fn with_buffers(test: impl FnOnce(&Buffers)) {
         let found = std::panic::catch_unwind(|| !Device::enumerate(DeviceType::Wgpu).into_vec().is_empty());
         if !found.unwrap_or(false) {

@@ -91,7 +91,7 @@ fn exclusive_in_cube(own: u32) -> u32 {
     shared[unit] - own
 }
 
-/// Adds to each block what comes before it.
+/// Adds the sum of all earlier blocks to each block.
 #[cube(launch)]
 fn add_blocks(before: &[u32], output: &mut [u32], n: usize, blocks: usize) {
     if CUBE_POS >= blocks {
