@@ -9,10 +9,13 @@ use rand::{RngCore, SeedableRng};
 use super::Rope;
 
 /// Uniform in ±1; the same numbers on every run.
-pub(crate) fn random<const D: usize>(shape: [usize; D], seed: u64) -> Tensor<D> {
+pub(crate) fn uniform(len: usize, seed: u64) -> Vec<f32> {
     let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
-    let values = (0..shape.iter().product()).map(|_| random.next_u32() as f32 / u32::MAX as f32 * 2.0 - 1.0);
-    Tensor::from_data(TensorData::new(values.collect::<Vec<f32>>(), shape), &Device::flex())
+    (0..len).map(|_| random.next_u32() as f32 / u32::MAX as f32 * 2.0 - 1.0).collect()
+}
+
+pub(crate) fn random<const D: usize>(shape: [usize; D], seed: u64) -> Tensor<D> {
+    Tensor::from_data(TensorData::new(uniform(shape.iter().product(), seed), shape), &Device::flex())
 }
 
 /// Relative L2 error. Both are f32, whose rounding over some hundred terms stays below a few 1e-6.

@@ -1,17 +1,11 @@
 //! Every convolution against its adjoint, and the kernels' order of weights against PyTorch's.
 
-use rand::{RngCore, SeedableRng};
-
 use super::{
     Backward, CHANNELS, Conv, Moments, Plane, Shortcut, Source, Upstream, Wanted, arrange, rearrange,
     transpose,
 };
 
-/// Uniform in ±1; the same numbers on every run.
-fn random(n: usize, seed: u64) -> Vec<f32> {
-    let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
-    (0..n).map(|_| random.next_u32() as f32 / u32::MAX as f32 * 2.0 - 1.0).collect()
-}
+use crate::tests::uniform as random;
 
 fn dot(a: impl IntoIterator<Item = f64>, b: &[f32]) -> f64 {
     a.into_iter().zip(b).map(|(a, b)| a * f64::from(*b)).sum()

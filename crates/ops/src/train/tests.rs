@@ -1,20 +1,13 @@
 //! The operators against Burn's in f64, forward and backward, at sizes that reach the corners: channels that fill no
 //! group, tiles and blocks that overhang, single rows.
 
+use super::*;
+use crate::tests::uniform as random;
+use crate::{Rope, bilinear, host, layers, linear_gelu, plain_attention, rotary_attention};
 use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::nn::conv::{Conv2dConfig, ConvTranspose2dConfig};
 use burn::nn::{LayerNormConfig, LinearConfig, PaddingConfig2d};
 use burn::tensor::{Device, FloatDType, Gradients as Found, Tensor, TensorData};
-use rand::{RngCore, SeedableRng};
-
-use super::*;
-use crate::{Rope, bilinear, host, layers, linear_gelu, plain_attention, rotary_attention};
-
-/// Uniform in ±1; the same numbers on every run.
-pub fn random(len: usize, seed: u64) -> Vec<f32> {
-    let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
-    (0..len).map(|_| random.next_u32() as f32 / u32::MAX as f32 * 2.0 - 1.0).collect()
-}
 
 fn tensor<const D: usize>(shape: [usize; D], seed: u64, float: FloatDType) -> Tensor<D> {
     let data = TensorData::new(random(shape.iter().product(), seed), shape);

@@ -3,18 +3,11 @@
 
 use std::collections::HashMap;
 
-use rand::{RngCore, SeedableRng};
-
 use super::{FEATURES, INPUT_CHANNELS, Network, Saved};
 use crate::conv::{CHANNELS, Wanted};
+use crate::tests::uniform as random;
 
 const BOTH: Wanted = Wanted { input: true, parameters: true };
-
-/// Uniform in ±1; the same numbers on every run.
-fn random(n: usize, seed: u64) -> Vec<f32> {
-    let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
-    (0..n).map(|_| random.next_u32() as f32 / u32::MAX as f32 * 2.0 - 1.0).collect()
-}
 
 /// The published network with normalisations of so many groups.
 fn network(groups: usize) -> Network {
