@@ -15,7 +15,7 @@ use crate::vjp::{Footprint, View, footprint, project, span, to_camera};
 const MAX_MAGNITUDE: f32 = 1e18;
 /// Least |q|² of a quaternion that defines a rotation.
 const MIN_QUATERNION: f32 = 1e-12;
-/// Added to the squared radius inside which a splat's α can reach [`MIN_ALPHA`](crate::options::MIN_ALPHA), so that
+/// Added to the squared radius inside which a splat's α can reach [`MIN_ALPHA`], so that
 /// rounding cuts off no pixel that the exact test would take, for needles of 4,000 pixels too.
 const RADIUS_MARGIN: f32 = 1e-2;
 
