@@ -40,10 +40,7 @@ ROWS = [
     ("conv1x1", (2, 64, 64, 32, 0), 4),
     ("conv1x1", (2, 64, 64, 64, 0), 4),
     ("conv1x1", (2, 32, 4, 256, 1), 4),
-    ("enlarge", (2, 32, 32, 16, 4), 4),
-    ("enlarge", (2, 64, 64, 16, 2), 4),
     ("halve", (2, 128, 128, 16), 4),
-    ("patches", (4, 3, 192, 256, 16), 1),
     ("resize", (2, 64, 8), 4),
     ("resize", (2, 64, 16), 4),
     ("resize", (2, 64, 32), 4),
@@ -95,18 +92,10 @@ def build(name, size, dtype=torch.float32):
         b, i, o, h, rectified = size
         inputs = [random(b, i, h, h), random(o, i, 1, 1), random(o)]
         run = lambda x, w, c: F.conv2d(F.relu(x) if rectified else x, w, c)
-    elif name == "enlarge":
-        b, i, o, h, s = size
-        inputs = [random(b, i, h, h), random(i, o, s, s), random(o)]
-        run = lambda x, w, c: F.conv_transpose2d(x, w, c, stride=s)
     elif name == "halve":
         b, i, o, h = size
         inputs = [random(b, i, h, h), random(o, i, 3, 3), random(o)]
         run = lambda x, w, c: F.conv2d(x, w, c, stride=2, padding=1)
-    elif name == "patches":
-        b, i, o, h, p = size
-        inputs = [random(b, i, h, h).detach(), random(o, i, p, p), random(o)]
-        run = lambda x, w, c: F.conv2d(x, w, c, stride=p).flatten(2).transpose(1, 2)
     elif name == "resize":
         b, c, h = size
         inputs = [random(b, c, h, h)]

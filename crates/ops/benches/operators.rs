@@ -9,8 +9,8 @@ use std::time::{Duration, Instant};
 
 use snapsnap_ops::buffers::give;
 use snapsnap_ops::train::{
-    Attention, Conv1x1, Conv3x3, Enlarge, Gradients, LayerNorm, Linear, Patches, Tokens, Unfolded, Wanted,
-    resize, resize_gradient, taps,
+    Attention, Conv1x1, Conv3x3, Gradients, LayerNorm, Linear, Tokens, Unfolded, Wanted, resize,
+    resize_gradient, taps,
 };
 
 #[global_allocator]
@@ -38,16 +38,8 @@ fn lengths(name: &str, s: &[usize]) -> Vec<usize> {
             inputs.into_iter().chain(bias).chain([s[0] * s[2] * s[3] * s[3]]).collect()
         }
         "conv1x1" => vec![s[0] * s[1] * s[3] * s[3], s[1] * s[2], s[2], s[0] * s[2] * s[3] * s[3]],
-        "enlarge" => {
-            let area = s[4] * s[4];
-            vec![s[0] * s[1] * s[3] * s[3], s[1] * s[2] * area, s[2], s[0] * s[2] * s[3] * s[3] * area]
-        }
         "halve" => {
             vec![s[0] * s[1] * s[3] * s[3], s[1] * s[2] * 9, s[2], s[0] * s[2] * s[3].div_ceil(2).pow(2)]
-        }
-        "patches" => {
-            let tokens = s[0] * (s[3] / s[4]).pow(2);
-            vec![s[0] * s[1] * s[3] * s[3], s[1] * s[2] * s[4] * s[4], s[2], tokens * s[2]]
         }
         "resize" => vec![s[0] * s[1] * s[2] * s[2], s[0] * s[1] * s[2] * s[2] * 4],
         "linear" => vec![s[0] * s[1], s[1] * s[2], s[2], s[0] * s[2]],
@@ -62,7 +54,7 @@ fn build<'a>(name: &str, s: &[usize], x: &'a [Vec<f32>]) -> [Run<'a>; 2] {
     let dy = &x[x.len() - 1];
     // All inputs but the first two and the last one.
     let bias = x.get(2..x.len() - 1).and_then(|rest| Some(&rest.first()?[..]));
-    let mut wanted = Wanted { bias: bias.is_some(), ..Wanted::ALL };
+    let wanted = Wanted { bias: bias.is_some(), ..Wanted::ALL };
     macro_rules! passes {
         ($layer:expr) => {{
             let layer = $layer;
@@ -78,13 +70,8 @@ fn build<'a>(name: &str, s: &[usize], x: &'a [Vec<f32>]) -> [Run<'a>; 2] {
     match name {
         "conv3x3" => passes!(Conv3x3 { batch, inputs, outputs, height, width, rectified }),
         "conv1x1" => passes!(Conv1x1 { batch, inputs, outputs, pixels: height * width, rectified }),
-        "enlarge" => passes!(Enlarge { batch, inputs, outputs, height, width, stride: s[4] }),
         "halve" => {
             passes!(Unfolded { batch, inputs, outputs, height, width, stride: 2, rectified: false })
-        }
-        "patches" => {
-            wanted.input = false;
-            passes!(Patches { batch, inputs, outputs, height, width, side: s[4] })
         }
         "resize" => {
             let size = [s[2]; 2];

@@ -9,9 +9,7 @@ use burn::tensor::activation::relu;
 
 use crate::buffers::give;
 use crate::op::{self, Kept, Kernel};
-use crate::train::{
-    Conv1x1, Conv3x3, Enlarge, Gradients, LayerNorm, Linear, Patches, Statistics, Unfolded, Wanted,
-};
+use crate::train::{Conv1x1, Conv3x3, Gradients, LayerNorm, Linear, Statistics, Unfolded, Wanted};
 use crate::{in_f32, is_fast, is_trained_fast};
 
 /// `[B, N, inputs]` → `[B, N, outputs]`.
@@ -20,13 +18,13 @@ pub fn linear(layer: &nn::Linear, x: Tensor<3>) -> Tensor<3> {
         return layer.forward(x);
     }
     let (sizes, shape) = linear_sizes(layer, &x);
-    run(sizes, shape, x, layer.weight.val(), layer.bias.as_ref())
+    run(sizes, shape, x, layer.weight.val(), bias(&layer.bias))
 }
 
 /// GELU (erf form) of a linear layer, in training on `flex`.
 pub(crate) fn trained_linear_gelu(layer: &nn::Linear, x: Tensor<3>) -> Tensor<3> {
     let (sizes, shape) = linear_sizes(layer, &x);
-    run(Gelu(sizes), shape, x, layer.weight.val(), layer.bias.as_ref())
+    run(Gelu(sizes), shape, x, layer.weight.val(), bias(&layer.bias))
 }
 
 fn linear_sizes(layer: &nn::Linear, x: &Tensor<3>) -> (Linear, [usize; 3]) {
@@ -41,13 +39,13 @@ pub fn layer_norm(layer: &nn::LayerNorm, epsilon: f64, x: Tensor<3>) -> Tensor<3
     };
     let (weight, shape) = (layer.gamma.val(), x.dims());
     let sizes = LayerNorm { channels: shape[2], epsilon: epsilon as f32 };
-    run(sizes, shape, x, weight, Some(bias))
+    run(sizes, shape, x, weight, Some(bias.val()))
 }
 
 /// A convolution of images `[B, C, H, W]`, or, where `rectified`, of max(x, 0).
 pub fn conv2d(layer: &Conv2d, x: Tensor<4>, rectified: bool) -> Tensor<4> {
     let ([batch, inputs, height, width], [outputs, _, rows, columns]) = (x.dims(), layer.weight.dims());
-    let (weight, bias) = (layer.weight.val(), layer.bias.as_ref());
+    let (weight, bias) = (layer.weight.val(), bias(&layer.bias));
     let plain = layer.groups == 1 && layer.dilation == [1, 1] && (is_trained_fast(&x) || is_fast(&x));
     match (plain, [rows, columns], layer.stride) {
         (true, [3, 3], [1, 1]) => {
@@ -66,15 +64,26 @@ pub fn conv2d(layer: &Conv2d, x: Tensor<4>, rectified: bool) -> Tensor<4> {
     }
 }
 
-/// A transposed convolution whose kernel is as large as its stride: `[B, C, H, W]` → `[B, D, stride·H, stride·W]`.
+/// A transposed convolution whose kernel is as large as its stride: `[B, C, H, W]` → `[B, D, stride·H, stride·W]`. Every
+/// pixel becomes a square of its own, so that it is a 1×1 convolution to `[B, D · stride · stride, H, W]` and a
+/// rearrangement.
 pub fn enlarge(layer: &ConvTranspose2d, x: Tensor<4>) -> Tensor<4> {
     if !is_trained_fast(&x) && !is_fast(&x) {
         return layer.forward(x);
     }
-    let ([batch, inputs, height, width], [_, outputs, stride, _]) = (x.dims(), layer.weight.dims());
-    assert_eq!(layer.stride, [stride; 2], "the kernel is as large as the stride");
-    let sizes = Enlarge { batch, inputs, outputs, height, width, stride };
-    run(sizes, [batch, outputs, stride * height, stride * width], x, layer.weight.val(), layer.bias.as_ref())
+    let ([batch, inputs, height, width], [_, outputs, s, _]) = (x.dims(), layer.weight.dims());
+    assert_eq!(layer.stride, [s; 2], "the kernel is as large as the stride");
+    let squares = outputs * s * s;
+    let weight: Tensor<2> = layer.weight.val().reshape([inputs, squares]).transpose();
+    let bias =
+        layer.bias.as_ref().map(|bias| bias.val().reshape([outputs, 1]).repeat_dim(1, s * s).flatten(0, 1));
+    let sizes = Conv1x1 { batch, inputs, outputs: squares, pixels: height * width, rectified: false };
+    run(sizes, [batch, outputs, s, s, height, width], x, weight, bias).permute([0, 1, 4, 2, 5, 3]).reshape([
+        batch,
+        outputs,
+        s * height,
+        s * width,
+    ])
 }
 
 /// A convolution whose kernel is as large as its stride, from images `[B, C, H, W]` to tokens
@@ -83,11 +92,17 @@ pub fn patches(layer: &Conv2d, x: Tensor<4>) -> Tensor<3> {
     if !is_trained_fast(&x) {
         return layer.forward(x).flatten::<3>(2, 3).swap_dims(1, 2);
     }
-    let ([batch, inputs, height, width], [outputs, _, side, _]) = (x.dims(), layer.weight.dims());
+    let ([batch, channels, height, width], [outputs, _, side, _]) = (x.dims(), layer.weight.dims());
     assert_eq!(layer.stride, [side; 2], "the kernel is as large as the stride");
-    let sizes = Patches { batch, inputs, outputs, height, width, side };
-    let shape = [batch, height / side * (width / side), outputs];
-    run(sizes, shape, x, layer.weight.val(), layer.bias.as_ref())
+    let (rows, columns, inputs) = (height / side, width / side, channels * side * side);
+    let patches = x.reshape([batch, channels, rows, side, columns, side]).permute([0, 2, 4, 1, 3, 5]);
+    let sizes = Linear { rows: batch * rows * columns, inputs, outputs, transposed: true };
+    let x: Tensor<2> = patches.reshape([sizes.rows, inputs]);
+    run(sizes, [batch, rows * columns, outputs], x, layer.weight.val(), bias(&layer.bias))
+}
+
+fn bias(bias: &Option<Param<Tensor<1>>>) -> Option<Tensor<1>> {
+    bias.as_ref().map(Param::val)
 }
 
 /// A function of an input, a weight and perhaps a bias, with its gradients.
@@ -116,7 +131,7 @@ macro_rules! keeps_nothing {
     };
 }
 
-keeps_nothing!(Conv1x1, Conv3x3, Enlarge, Patches, Unfolded);
+keeps_nothing!(Conv1x1, Conv3x3, Unfolded);
 
 impl Layer for Linear {
     type Kept = ();
@@ -206,8 +221,8 @@ fn run<const A: usize, const W: usize, const D: usize>(
     shape: [usize; D],
     x: Tensor<A>,
     weight: Tensor<W>,
-    bias: Option<&Param<Tensor<1>>>,
+    bias: Option<Tensor<1>>,
 ) -> Tensor<D> {
     let operator = Operator { layer, shape: shape.to_vec(), has_bias: bias.is_some() };
-    op::run(operator, x, Some(weight), bias.map(Param::val))
+    op::run(operator, x, Some(weight), bias)
 }

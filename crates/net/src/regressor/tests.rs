@@ -138,3 +138,44 @@ fn each_path_reads_the_statistics_of_the_other() {
     // Both paths are f32 here.
     assert!(error(&got, &expected) < 2.0 * FEATURE, "{:e}", error(&got, &expected));
 }
+
+/// Features, and gradients by the input and by the parameters, where tracked.
+type Pass = (Vec<f64>, Option<Vec<f64>>, Option<BTreeMap<String, Vec<f64>>>);
+
+/// A pass of the kernels with some of its inputs tracked.
+fn pass(track_input: bool, track_parameters: bool) -> Pass {
+    let (device, size) = (Device::flex().autodiff(), [2, 36, 68]);
+    let [b, height, width] = size;
+    let [mut regressor, _] = regressors(8, &device);
+    if !track_parameters {
+        regressor = regressor.no_grad();
+    }
+    let input = (random([b, 6, height, width], 2, &device) + 1.0).set_require_grad(track_input);
+    let features = regressor.forward(input.clone(), &mut Statistics::measured());
+    let got = values(features.clone());
+    if !track_input && !track_parameters {
+        return (got, None, None);
+    }
+    let all = (features * random([b, height, width, FEATURES], 3, &device)).sum().backward();
+    let by_input = track_input.then(|| values(input.grad(&all).expect("tracked")));
+    (got, by_input, track_parameters.then(|| gradients(&regressor, &all)))
+}
+
+#[test]
+fn what_is_not_tracked_changes_no_bit_of_the_rest() {
+    let (features, by_input, by_parameters) = pass(true, true);
+    assert_eq!(pass(true, false), (features.clone(), by_input, None));
+    assert_eq!(pass(false, true), (features.clone(), None, by_parameters));
+    assert_eq!(pass(false, false), (features, None, None));
+}
+
+#[test]
+fn bits_do_not_depend_on_the_number_of_threads() {
+    let run = |threads| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads");
+        pool.install(|| pass(true, true))
+    };
+    let one = run(1);
+    assert_eq!(one, run(2));
+    assert_eq!(one, run(5));
+}

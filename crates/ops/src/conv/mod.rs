@@ -13,8 +13,6 @@ mod kernels;
 mod merge;
 mod norm;
 mod rows;
-#[cfg(test)]
-mod tests;
 mod weights;
 
 pub use backward::{Backward, Gradients, Sums, Wanted};

@@ -6,8 +6,6 @@
 mod backward;
 mod forward;
 mod layout;
-#[cfg(test)]
-mod tests;
 
 pub use backward::Gradients;
 pub use forward::{Forward, Saved};
