@@ -1,11 +1,11 @@
 //! The point predictor in 16 bits: its matrix products and convolutions. Norms, activations, the rasteriser and the
 //! regressor, whose input is coordinates, stay in f32.
 
-use burn::module::{Module, ModuleMapper, Param};
+use burn::module::Param;
 use burn::tensor::{FloatDType, Tensor};
 use serde::{Deserialize, Serialize};
 
-use crate::names::Path;
+use crate::names::{NamedMapper, Path, map_named};
 use crate::network::PointPredictor;
 
 /// Float type of the point predictor's layers.
@@ -47,31 +47,22 @@ impl Precision {
             return predictor;
         }
         let is_last = predictor.is_last_layer();
-        predictor.map(&mut Lower { dtype: self.dtype(), is_last, path: Path::new("") })
+        map_named(predictor, "", &mut Lower { dtype: self.dtype(), is_last })
     }
 }
 
-struct Lower<'a> {
+struct Lower {
     dtype: FloatDType,
     /// Whether the layer of a name gives raw points, which stay in f32: bf16 rounds points at 2 m by a centimetre.
     is_last: fn(&str) -> bool,
-    path: Path<'a>,
 }
 
-impl ModuleMapper for Lower<'_> {
-    fn enter_module(&mut self, name: &str, container_type: &str) {
-        self.path.enter(name, container_type);
-    }
-
-    fn exit_module(&mut self, _name: &str, _container_type: &str) {
-        self.path.leave();
-    }
-
-    fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
-        let name = self.path.name();
+impl NamedMapper for Lower {
+    fn map<const D: usize>(&mut self, path: &Path, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
+        let name = path.name();
         let layer = name.rsplit_once('.').map_or("", |(layer, _)| layer);
         let is_layer =
-            ["Struct:Linear", "Struct:Conv2d", "Struct:ConvTranspose2d"].contains(&self.path.container());
+            ["Struct:Linear", "Struct:Conv2d", "Struct:ConvTranspose2d"].contains(&path.container());
         if !is_layer || (self.is_last)(layer) {
             return param;
         }
@@ -92,9 +83,9 @@ mod tests {
     fn in_f32(config: &Config) -> Vec<String> {
         struct Collect(Vec<String>);
         impl NamedVisitor for Collect {
-            fn visit<const D: usize>(&mut self, name: &str, _: bool, parameter: &Param<Tensor<D>>) {
+            fn visit<const D: usize>(&mut self, path: &Path, parameter: &Param<Tensor<D>>) {
                 if D > 1 && parameter.val().dtype() == DType::F32 {
-                    self.0.push(name.to_owned());
+                    self.0.push(path.name());
                 }
             }
         }

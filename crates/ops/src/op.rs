@@ -58,50 +58,17 @@ pub trait KernelBackend: Backend {
     fn run(#[extension_type] inputs: Inputs<Self>, kernel: Arc<dyn Kernel>) -> Output<Self>;
 }
 
-/// Operations of a backend without autodiff.
-pub trait Untracked: Backend {
-    /// As [`Kernel::forward`].
-    fn forward(inputs: &Inputs<Self>, kernel: &dyn Kernel, keep: bool) -> (FloatTensor<Self>, Kept);
-
-    /// As [`Kernel::backward`].
-    fn backward(
-        inputs: &Inputs<Self>,
-        kernel: &dyn Kernel,
-        kept: Kept,
-        upstream: FloatTensor<Self>,
-        wanted: [bool; 3],
-    ) -> [Option<FloatTensor<Self>>; 3];
-}
-
 impl KernelBackend for Flex {
     fn run(inputs: Inputs<Self>, kernel: Arc<dyn Kernel>) -> Output<Self> {
-        Output { tensor: <Self as Untracked>::forward(&inputs, &*kernel, false).0 }
+        Output { tensor: forward(&inputs, &*kernel, false).0 }
     }
 }
 
-impl Untracked for Flex {
-    fn forward(inputs: &Inputs<Self>, kernel: &dyn Kernel, keep: bool) -> (FlexTensor, Kept) {
-        let fields = contiguous(inputs);
-        let (values, kept) = kernel.forward(fields.each_ref().map(slice), keep);
-        (FlexTensor::from_data(TensorData::new(values, kernel.shape())), kept)
-    }
-
-    fn backward(
-        inputs: &Inputs<Self>,
-        kernel: &dyn Kernel,
-        kept: Kept,
-        upstream: FlexTensor,
-        wanted: [bool; 3],
-    ) -> [Option<FlexTensor>; 3] {
-        let fields = contiguous(inputs);
-        let upstream = upstream.to_contiguous();
-        let values = kernel.backward(fields.each_ref().map(slice), kept, slice(&upstream), wanted);
-        let mut fields = fields.into_iter();
-        values.map(|values| {
-            let shape = fields.next().expect("three of each").shape();
-            values.map(|values| FlexTensor::from_data(TensorData::new(values, shape)))
-        })
-    }
+/// As [`Kernel::forward`].
+fn forward(inputs: &Inputs<Flex>, kernel: &dyn Kernel, keep: bool) -> (FlexTensor, Kept) {
+    let fields = contiguous(inputs);
+    let (values, kept) = kernel.forward(fields.each_ref().map(slice), keep);
+    (FlexTensor::from_data(TensorData::new(values, kernel.shape())), kept)
 }
 
 fn contiguous(inputs: &Inputs<Flex>) -> [FlexTensor; 3] {
@@ -117,30 +84,31 @@ struct KernelBackward;
 
 /// A call, for the backward pass.
 #[derive(Debug, Clone)]
-struct Call<B: Backend> {
-    inputs: Inputs<B>,
+struct Call {
+    inputs: Inputs<Flex>,
     kernel: Arc<dyn Kernel>,
     kept: Arc<Mutex<Kept>>,
 }
 
-impl<B: Untracked> Backward<B, 3> for KernelBackward {
-    type State = Call<B>;
+impl Backward<Flex, 3> for KernelBackward {
+    type State = Call;
 
-    fn backward(self, ops: Ops<Self::State, 3>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
-        let upstream = grads.consume::<B>(&ops.node);
+    fn backward(self, ops: Ops<Call, 3>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
+        let upstream = grads.consume::<Flex>(&ops.node).to_contiguous();
         let Call { inputs, kernel, kept } = ops.state;
-        let wanted = ops.parents.each_ref().map(Option::is_some);
+        let (fields, wanted) = (contiguous(&inputs), ops.parents.each_ref().map(Option::is_some));
         let kept = kept.lock().unwrap_or_else(PoisonError::into_inner).take();
-        let gradients = B::backward(&inputs, &*kernel, kept, upstream, wanted);
-        for (parent, gradient) in ops.parents.into_iter().zip(gradients) {
+        let gradients = kernel.backward(fields.each_ref().map(slice), kept, slice(&upstream), wanted);
+        for ((parent, gradient), field) in ops.parents.into_iter().zip(gradients).zip(fields) {
             if let Some((parent, gradient)) = parent.zip(gradient) {
-                grads.register::<B>(parent.id, gradient);
+                let gradient = FlexTensor::from_data(TensorData::new(gradient, field.shape()));
+                grads.register::<Flex>(parent.id, gradient);
             }
         }
     }
 }
 
-impl<B: Untracked, C: CheckpointStrategy> KernelBackend for Autodiff<B, C> {
+impl<C: CheckpointStrategy> KernelBackend for Autodiff<Flex, C> {
     fn run(inputs: Inputs<Self>, kernel: Arc<dyn Kernel>) -> Output<Self> {
         let nodes = [inputs.x.node(), inputs.y.node(), inputs.z.node()];
         let inputs = Inputs {
@@ -150,10 +118,10 @@ impl<B: Untracked, C: CheckpointStrategy> KernelBackend for Autodiff<B, C> {
         };
         let tensor = match KernelBackward.prepare::<C>(nodes).compute_bound().stateful() {
             OpsKind::Tracked(prepared) => {
-                let (tensor, kept) = B::forward(&inputs, &*kernel, true);
+                let (tensor, kept) = forward(&inputs, &*kernel, true);
                 prepared.finish(Call { inputs, kernel, kept: Arc::new(Mutex::new(kept)) }, tensor)
             }
-            OpsKind::UnTracked(_) => Self::from_inner(B::forward(&inputs, &*kernel, false).0),
+            OpsKind::UnTracked(_) => Self::from_inner(forward(&inputs, &*kernel, false).0),
         };
         Output { tensor }
     }

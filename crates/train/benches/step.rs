@@ -14,7 +14,7 @@ use burn::tensor::{Device, Distribution, Tensor};
 use snapsnap_base::config::Schema;
 use snapsnap_net::network::{PointPredictor, View};
 use snapsnap_net::regressor::Statistics;
-use snapsnap_net::weights::{NamedVisitor, random_predictor, random_regressors, visit_named};
+use snapsnap_net::weights::{NamedVisitor, Path, random_predictor, random_regressors, visit_named};
 use snapsnap_train::config::TrainConfig;
 
 #[global_allocator]
@@ -53,7 +53,8 @@ fn main() {
 fn frozen(predictor: PointPredictor, trained: &[&str]) -> PointPredictor {
     struct Frozen<'a>(&'a [&'a str], Vec<ParamId>);
     impl NamedVisitor for Frozen<'_> {
-        fn visit<const D: usize>(&mut self, name: &str, _: bool, parameter: &Param<Tensor<D>>) {
+        fn visit<const D: usize>(&mut self, path: &Path, parameter: &Param<Tensor<D>>) {
+            let name = path.name();
             if !self.0.iter().any(|part| name.starts_with(part)) {
                 self.1.push(parameter.id);
             }

@@ -2,7 +2,7 @@
 
 use burn::module::Param;
 use burn::tensor::{Gradients, Tensor};
-use snapsnap_net::weights::NamedVisitor;
+use snapsnap_net::weights::{NamedVisitor, Path};
 use snapsnap_ops::host;
 
 use crate::networks::{Networks, Rows};
@@ -14,9 +14,9 @@ pub fn collect(networks: &Networks, gradients: &mut Gradients) -> Rows {
         rows: Rows,
     }
     impl NamedVisitor for Collect<'_> {
-        fn visit<const D: usize>(&mut self, name: &str, _: bool, parameter: &Param<Tensor<D>>) {
+        fn visit<const D: usize>(&mut self, path: &Path, parameter: &Param<Tensor<D>>) {
             if let Some(gradient) = parameter.val().grad_remove(self.gradients) {
-                self.rows.insert(name.to_owned(), gradient.reshape([-1]));
+                self.rows.insert(path.name(), gradient.reshape([-1]));
             }
         }
     }

@@ -7,7 +7,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use snapsnap_net::network::PointPredictor;
 use snapsnap_net::regressor::Regressor;
 use snapsnap_net::weights::schema::SIDE;
-use snapsnap_net::weights::{NamedMapper, NamedVisitor, map_named, visit_named};
+use snapsnap_net::weights::{NamedMapper, NamedVisitor, Path, map_named, visit_named};
 use snapsnap_ops::host;
 
 /// Networks whose parameters are trained.
@@ -62,16 +62,12 @@ impl Networks {
     pub(crate) fn parameters(&self) -> Vec<Parameter> {
         struct Collect(Vec<Parameter>);
         impl NamedVisitor for Collect {
-            fn visit<const D: usize>(
-                &mut self,
-                name: &str,
-                is_transposed: bool,
-                parameter: &Param<Tensor<D>>,
-            ) {
+            fn visit<const D: usize>(&mut self, path: &Path, parameter: &Param<Tensor<D>>) {
                 let values = parameter.val().without_autodiff();
                 let shape = values.dims().to_vec();
                 let values = values.reshape([-1]);
-                self.0.push(Parameter { name: name.to_owned(), shape, is_transposed, values });
+                let (name, is_transposed) = (path.name(), path.is_transposed());
+                self.0.push(Parameter { name, shape, is_transposed, values });
             }
         }
         let mut collect = Collect(Vec::new());
@@ -98,15 +94,21 @@ impl Networks {
         self.parameters().into_iter().map(stored).collect()
     }
 
-    /// The same networks with the values in `rows`. Other parameters keep their values.
+    /// The same networks with the values in `rows`. Other parameters keep their values, and tracked ones stay tracked.
     pub fn with_rows(self, rows: &Rows) -> Self {
         struct Replace<'a>(&'a Rows);
         impl NamedMapper for Replace<'_> {
-            fn map<const D: usize>(&mut self, name: &str, values: Tensor<D>) -> Tensor<D> {
-                match self.0.get(name) {
-                    Some(row) => row.clone().reshape(values.shape()),
+            fn map<const D: usize>(&mut self, path: &Path, parameter: Param<Tensor<D>>) -> Param<Tensor<D>> {
+                let Some(row) = self.0.get(&path.name()) else {
+                    return parameter;
+                };
+                let (id, old, mapper) = parameter.consume();
+                let values = row.clone().reshape(old.shape());
+                let values = match old.gradient_checkpointing_strategy() {
+                    Some(strategy) => values.autodiff().with_gradient_checkpointing_strategy(strategy),
                     None => values,
-                }
+                };
+                Param::from_mapped_value(id, values.set_require_grad(old.is_require_grad()), mapper)
             }
         }
         self.map(&mut Replace(rows))

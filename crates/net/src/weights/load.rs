@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 
-use burn::module::{Module, ModuleMapper, Param};
+use burn::module::{Module, Param};
 use burn::tensor::{Device, Tensor, TensorData};
 
 use super::WeightsError;
@@ -10,7 +10,7 @@ use super::file::{WeightFile, not_finite};
 use super::init::draw;
 use super::schema::{self, Part, SIDE, TensorSpec};
 use crate::config::Config;
-use crate::names::Path;
+use crate::names::{NamedMapper, Path, map_named};
 use crate::network::PointPredictor;
 use crate::regressor::Regressor;
 
@@ -72,9 +72,8 @@ fn fill<M: Module>(
     origin: &str,
     read: Read,
 ) -> Result<M, WeightsError> {
-    let path = Path::new(prefix);
-    let mut loader = Loader { source: read, device, path, problems: Vec::new(), failure: None };
-    let module = module.map(&mut loader);
+    let mut loader = Loader { source: read, device, problems: Vec::new(), failure: None };
+    let module = map_named(module, prefix, &mut loader);
     if let Some(failure) = loader.failure {
         return Err(failure);
     }
@@ -87,23 +86,20 @@ fn fill<M: Module>(
 struct Loader<'a> {
     source: Read<'a>,
     device: &'a Device,
-    path: Path<'a>,
     problems: Vec<String>,
     failure: Option<WeightsError>,
 }
 
 impl Loader<'_> {
-    /// The tensor at the current path.
-    fn read<const D: usize>(&mut self) -> Option<Tensor<D>> {
-        let name = self.path.name();
-        let (values, mut shape) = match (self.source)(&name) {
+    fn read<const D: usize>(&mut self, name: &str) -> Option<Tensor<D>> {
+        let (values, mut shape) = match (self.source)(name) {
             Ok(read) => read,
             Err(e) => {
                 self.failure.get_or_insert(e);
                 return None;
             }
         };
-        if let Some(problem) = not_finite(&name, &values) {
+        if let Some(problem) = not_finite(name, &values) {
             self.problems.push(problem);
             return None;
         }
@@ -114,23 +110,14 @@ impl Loader<'_> {
     }
 }
 
-impl ModuleMapper for Loader<'_> {
-    fn enter_module(&mut self, name: &str, container_type: &str) {
-        self.path.enter(name, container_type);
-    }
-
-    fn exit_module(&mut self, _name: &str, _container_type: &str) {
-        self.path.leave();
-    }
-
-    fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
-        let expected = param.lazy_shape();
-        let transposed = self.path.is_transposed();
-        let Some(tensor) = self.read::<D>() else {
+impl NamedMapper for Loader<'_> {
+    fn map<const D: usize>(&mut self, path: &Path, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
+        let (name, expected) = (path.name(), param.lazy_shape());
+        let Some(tensor) = self.read::<D>(&name) else {
             return param;
         };
-        let tensor = if transposed { tensor.swap_dims(0, 1) } else { tensor };
-        assert_eq!(tensor.shape(), expected, "{}: schema and network disagree", self.path.name());
+        let tensor = if path.is_transposed() { tensor.swap_dims(0, 1) } else { tensor };
+        assert_eq!(tensor.shape(), expected, "{name}: schema and network disagree");
         let id = param.id;
         param.transform_for_load(tensor, id)
     }

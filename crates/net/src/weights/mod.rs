@@ -14,7 +14,7 @@ mod source;
 use snapsnap_base::FileError;
 use snapsnap_base::config::ConfigError;
 
-pub use crate::names::{NamedMapper, NamedVisitor, map_named, visit_named};
+pub use crate::names::{NamedMapper, NamedVisitor, Path, map_named, visit_named};
 pub use export::export;
 pub use file::{Progress, WeightFile, not_finite, save, write_tensors};
 pub use import::{ImportOptions, ImportReport, import, stored_config};

@@ -1,11 +1,11 @@
 //! Name, shape and initial distribution of every tensor of a checkpoint, read from the networks' own modules
 //! (docs/method.md, "Weight files").
 
-use burn::module::{Module, ModuleVisitor, Param};
+use burn::module::{Module, Param};
 use burn::tensor::{Device, Tensor};
 
 use crate::config::{Config, RegressorStart};
-use crate::names::Path;
+use crate::names::{NamedVisitor, Path, visit_named};
 use crate::network::PointPredictor;
 use crate::regressor::Regressor;
 
@@ -83,31 +83,22 @@ pub fn parameters(config: &Config, part: Part) -> usize {
 }
 
 fn list<M: Module>(module: &M, prefix: &str, part: Part) -> Vec<TensorSpec> {
-    let mut list = List { path: Path::new(prefix), tensors: Vec::new(), part, bound: 0.0 };
-    module.visit(&mut list);
+    let mut list = List { tensors: Vec::new(), part, bound: 0.0 };
+    visit_named(module, prefix, &mut list);
     list.tensors
 }
 
-struct List<'a> {
-    path: Path<'a>,
+struct List {
     tensors: Vec<TensorSpec>,
     part: Part,
     /// PyTorch's default bound of the layer whose weight was visited last.
     bound: f32,
 }
 
-impl ModuleVisitor for List<'_> {
-    fn enter_module(&mut self, name: &str, container_type: &str) {
-        self.path.enter(name, container_type);
-    }
-
-    fn exit_module(&mut self, _name: &str, _container_type: &str) {
-        self.path.leave();
-    }
-
-    fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
-        let (name, mut shape) = (self.path.name(), param.lazy_shape().to_vec());
-        if self.path.is_transposed() {
+impl NamedVisitor for List {
+    fn visit<const D: usize>(&mut self, path: &Path, param: &Param<Tensor<D>>) {
+        let (name, mut shape) = (path.name(), param.lazy_shape().to_vec());
+        if path.is_transposed() {
             shape.reverse();
         }
         let is_weight = name.ends_with("weight");
@@ -116,8 +107,8 @@ impl ModuleVisitor for List<'_> {
             self.bound = (1.0 / shape[1..].iter().product::<usize>() as f32).sqrt();
         }
         // The trunk starts Xavier-uniform with zero biases; convolutions and heads keep PyTorch's default.
-        let is_linear = self.path.container() == "Struct:Linear" && !name.contains("downstream_head");
-        let init = if self.path.container().ends_with("Norm") {
+        let is_linear = path.container() == "Struct:Linear" && !name.contains("downstream_head");
+        let init = if path.container().ends_with("Norm") {
             Init::Constant(if is_weight { 1.0 } else { 0.0 })
         } else if is_linear || name.contains("patch_embed.") {
             let fans: usize = shape.iter().take(1).sum::<usize>() + shape.iter().skip(1).product::<usize>();

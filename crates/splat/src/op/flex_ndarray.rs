@@ -14,70 +14,47 @@ use super::cpu::{self, Scene, State};
 use super::job::{Job, Wanted};
 use super::{Forward, SplatBackend, SplatInputs, SplatKernels, SplatOutput, Upstream, splat_untracked};
 
-impl SplatBackend for Flex {
-    fn splat(inputs: SplatInputs<Self>, job: Arc<Job>) -> SplatOutput<Self> {
-        splat_untracked(inputs, &job)
-    }
+/// The operation on a backend, given how to read a tensor of it: as something that holds values, and those values.
+macro_rules! on_the_cpu {
+    ($backend:ty, $read:expr, $slice:expr) => {
+        #[allow(deprecated, reason = "the CPU test backend")]
+        impl SplatBackend for $backend {
+            fn splat(inputs: SplatInputs<Self>, job: Arc<Job>) -> SplatOutput<Self> {
+                splat_untracked(inputs, &job)
+            }
+        }
+
+        #[allow(deprecated, reason = "the CPU test backend")]
+        impl SplatKernels for $backend {
+            type State = Arc<State>;
+
+            fn forward(inputs: &SplatInputs<Self>, job: &Job, keep: bool) -> Forward<Self> {
+                let fields = fields(inputs).map($read);
+                let (image, state, counts) = cpu::forward(scene(fields.each_ref().map($slice)), job, keep)?;
+                let image = Self::float_from_data(image_data(image, job), &Default::default());
+                Ok((image, keep.then(|| Arc::new(state)), counts))
+            }
+
+            fn backward(
+                inputs: &SplatInputs<Self>,
+                job: &Job,
+                state: &Self::State,
+                upstream: Upstream<FloatTensor<Self>>,
+                wanted: Wanted,
+            ) -> [Option<FloatTensor<Self>>; 6] {
+                let fields = fields(inputs).map($read);
+                let scene = scene(fields.each_ref().map($slice));
+                let upstream = upstream.as_ref().map($read);
+                let gradients = cpu::backward(scene, job, state, &upstream.as_ref().map($slice), wanted);
+                gradient_data(gradients, scene.opacities.len())
+                    .map(|data| data.map(|data| Self::float_from_data(data, &Default::default())))
+            }
+        }
+    };
 }
 
-#[allow(deprecated, reason = "the CPU test backend")]
-impl SplatBackend for NdArray {
-    fn splat(inputs: SplatInputs<Self>, job: Arc<Job>) -> SplatOutput<Self> {
-        splat_untracked(inputs, &job)
-    }
-}
-
-impl SplatKernels for Flex {
-    type State = Arc<State>;
-
-    fn forward(inputs: &SplatInputs<Self>, job: &Job, keep: bool) -> Forward<Self> {
-        let fields = fields(inputs).map(FlexTensor::to_contiguous);
-        let (image, state, counts) = cpu::forward(scene(fields.each_ref().map(slice)), job, keep)?;
-        Ok((FlexTensor::from_data(image_data(image, job)), keep.then(|| Arc::new(state)), counts))
-    }
-
-    fn backward(
-        inputs: &SplatInputs<Self>,
-        job: &Job,
-        state: &Self::State,
-        upstream: Upstream<FloatTensor<Self>>,
-        wanted: Wanted,
-    ) -> [Option<FloatTensor<Self>>; 6] {
-        let fields = fields(inputs).map(FlexTensor::to_contiguous);
-        let upstream = upstream.map(|tensor| tensor.to_contiguous());
-        let scene = scene(fields.each_ref().map(slice));
-        let gradients = cpu::backward(scene, job, state, &upstream.as_ref().map(slice), wanted);
-        gradient_data(gradients, scene.opacities.len()).map(|data| data.map(FlexTensor::from_data))
-    }
-}
-
-#[allow(deprecated, reason = "the CPU test backend")]
-impl SplatKernels for NdArray {
-    type State = Arc<State>;
-
-    fn forward(inputs: &SplatInputs<Self>, job: &Job, keep: bool) -> Forward<Self> {
-        let fields = fields(inputs).map(read::<Self>);
-        let fields = fields.each_ref().map(Vec::as_slice);
-        let (image, state, counts) = cpu::forward(scene(fields), job, keep)?;
-        let image = Self::float_from_data(image_data(image, job), &Default::default());
-        Ok((image, keep.then(|| Arc::new(state)), counts))
-    }
-
-    fn backward(
-        inputs: &SplatInputs<Self>,
-        job: &Job,
-        state: &Self::State,
-        upstream: Upstream<FloatTensor<Self>>,
-        wanted: Wanted,
-    ) -> [Option<FloatTensor<Self>>; 6] {
-        let fields = fields(inputs).map(read::<Self>);
-        let scene = scene(fields.each_ref().map(Vec::as_slice));
-        let upstream = upstream.map(|tensor| read::<Self>(&tensor));
-        let gradients = cpu::backward(scene, job, state, &upstream.as_ref().map(Vec::as_slice), wanted);
-        gradient_data(gradients, scene.opacities.len())
-            .map(|data| data.map(|data| Self::float_from_data(data, &Default::default())))
-    }
-}
+on_the_cpu!(Flex, FlexTensor::to_contiguous, slice);
+on_the_cpu!(NdArray, read::<NdArray>, Vec::as_slice);
 
 fn fields<B: Backend>(inputs: &SplatInputs<B>) -> [&FloatTensor<B>; 6] {
     let SplatInputs { means, rotations, scales, opacities, colors, background } = inputs;
