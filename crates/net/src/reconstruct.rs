@@ -243,12 +243,12 @@ impl Run<'_> {
         let heads = if net.views().len() == 4 { "heads (4)" } else { "heads (2)" };
         let maps = self.timed(heads, |_| net.heads(&decoded));
         self.timed("up-sampling", |_| {
-            let on_canvas = maps.into_iter().map(|(view, map)| {
+            let pasted = maps.into_iter().map(|(view, map)| {
                 let mask = ((view as usize) < 2).then(|| masks.clone().narrow(0, view as usize, 1));
                 let map = net.finished(config, view, map, &window, mask.as_ref());
-                map.on_canvas(&config.network, view, &window, mask.as_ref())
+                map.pasted(&config.network, view, &window, mask.as_ref())
             });
-            let (points, conf): (Vec<_>, Vec<_>) = on_canvas.map(|m| (m.points, m.conf)).unzip();
+            let (points, conf): (Vec<_>, Vec<_>) = pasted.map(|m| (m.points, m.conf)).unzip();
             PointMap { points: Tensor::cat(points, 0), conf: Tensor::cat(conf, 0) }
         })
     }

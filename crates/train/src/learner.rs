@@ -115,7 +115,7 @@ impl<'a, T: Task> Learner<'a, T> {
                 Err(why) => return Ok(Err(why)),
             };
             all.extend(items.iter().map(|item| T::name(item).to_owned()));
-            let at = Moment { step, batch: batch as u64, device: 0 };
+            let at = Moment { step, batch: batch as u64, device_index: 0 };
             let how = How { precision: t.precision, scale, share: 1.0 / t.accumulate as f64 };
             let made = match on_devices(self.task, &self.networks, self.devices, items, at, how) {
                 // A scene that the rasteriser refuses costs the sample, not the run.
@@ -193,7 +193,7 @@ fn on_devices<T: Task>(
         let start = |(place, part): (usize, Vec<T::Item>)| {
             scope.spawn(move || {
                 let (device, share) = (&devices[place], how.share * part.len() as f64 / all);
-                let (at, how) = (Moment { device: place, ..at }, How { share, ..how });
+                let (at, how) = (Moment { device_index: place, ..at }, How { share, ..how });
                 on_device(task, &networks.clone().fork(device), part, at, how)
             })
         };

@@ -34,10 +34,10 @@ pub struct Prediction {
 impl Prediction {
     /// The maps on the whole canvas, as in inference. They are 0 outside the window. `masks` `[B,2,S,S]` are those of
     /// the photographs.
-    pub fn on_canvas(self, config: &NetworkConfig, masks: &Tensor<4>) -> Vec<(View, PointMap)> {
+    pub fn pasted(self, config: &NetworkConfig, masks: &Tensor<4>) -> Vec<(View, PointMap)> {
         let placed = |(view, map): (View, PointMap)| {
             let mask = mask_of(view, masks);
-            (view, map.on_canvas(config, view, &self.window, mask.as_ref()))
+            (view, map.pasted(config, view, &self.window, mask.as_ref()))
         };
         self.maps.into_iter().map(placed).collect()
     }

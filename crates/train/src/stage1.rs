@@ -66,7 +66,7 @@ impl PointTask {
     /// Predicted maps of a sample on the whole canvas.
     fn maps(&self, networks: &Networks, item: &Stage1Item) -> Vec<Map> {
         let batch = Stage1Batcher.batch(vec![item.clone()], &self.devices[0].clone().inner());
-        let maps = self.predict(networks, &batch).on_canvas(&self.networks.network, &batch.masks);
+        let maps = self.predict(networks, &batch).pasted(&self.networks.network, &batch.masks);
         let read = |(view, map): (View, PointMap)| (view as usize, host(map.points), host(map.conf));
         maps.into_iter().map(read).collect()
     }
@@ -90,7 +90,7 @@ impl Task for PointTask {
         items: Vec<Stage1Item>,
         at: Moment,
     ) -> Result<Vec<Part>, TrainError> {
-        let batch = Stage1Batcher.batch(items, &self.devices[at.device]);
+        let batch = Stage1Batcher.batch(items, &self.devices[at.device_index]);
         let losses = losses(&self.predict(networks, &batch), &batch.points, &batch.valid);
         Ok(vec![
             Part { name: "points", weight: 1.0, value: losses.regression },

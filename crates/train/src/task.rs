@@ -28,7 +28,7 @@ pub struct Moment {
     /// Number of earlier batches of this step.
     pub batch: u64,
     /// Index of the device among the training devices.
-    pub device: usize,
+    pub device_index: usize,
 }
 
 /// Result of a validation.

@@ -166,7 +166,7 @@ fn mask_aware_enlargement_never_blends_in_the_background() {
             conf: Tensor::zeros([1, 1, 3], &device),
         };
         let body = Tensor::from_data(TensorData::new(vec![1.0_f32, 1.0, 0.0], [1, 1, 1, 3]), &device);
-        let points = values(net.to_canvas(map, 2, method, Some(body)).points);
+        let points = values(net.enlarged(map, 2, method, Some(body)).points);
         points.chunks_exact(3).take(6).map(|p| p[0] / delta).collect()
     };
     let close = |got: &[f32], expected: &[f32]| got.iter().zip(expected).all(|(g, e)| (g - e).abs() < 1e-3);

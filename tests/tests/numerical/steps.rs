@@ -65,7 +65,7 @@ fn other_device() -> Option<Device> {
 fn loss<T: Task>(task: &T, networks: &Networks) -> Tensor<1> {
     let samples = task.data().pass(0);
     let items = vec![samples.get(0).expect("reads"), samples.get(1).expect("reads")];
-    let parts = task.losses(networks, items, Moment { step: 0, batch: 0, device: 0 }).expect("a loss");
+    let parts = task.losses(networks, items, Moment { step: 0, batch: 0, device_index: 0 }).expect("a loss");
     let weighted: Vec<Tensor<1>> = parts.into_iter().map(|part| part.value * part.weight).collect();
     Tensor::cat(weighted, 0).sum()
 }

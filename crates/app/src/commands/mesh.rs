@@ -45,8 +45,8 @@ pub struct SurfaceArguments {
 }
 
 impl SurfaceArguments {
-    /// Refuses options without effect.
-    pub fn refuse<T>(&self, why: &str) -> Result<Option<T>, Failure> {
+    /// `None`, unless an option is given that would have no effect.
+    pub fn must_be_unused<T>(&self, why: &str) -> Result<Option<T>, Failure> {
         let given = [("--faces", self.faces.is_some()), ("--texture", self.texture.is_some())];
         match given.iter().find(|(_, given)| *given) {
             Some((name, _)) => Err(Failure::Input(format!("{name}: {why}"))),

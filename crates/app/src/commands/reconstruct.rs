@@ -19,9 +19,9 @@ use crate::progress::Progress;
 use crate::turntable::Turntable;
 use crate::{device, dump, memory, output, say, weights};
 
-/// Bytes per pixel of a photograph while it is placed on its canvas: the decoded picture, its colours and mask, one plane of
-/// numbers, and colours and mask of the other photograph.
-const PHOTOGRAPH: u64 = 18;
+/// Bytes per pixel of a photograph while it is placed on its canvas: 4 of the decoded picture, 3 + 1 of its colours and mask,
+/// 4 of a plane of f32, 3 + 1 of the other photograph's colours and mask, and 2 to spare.
+const BYTES_PER_PIXEL: u64 = 18;
 
 #[derive(Args)]
 pub struct Arguments {
@@ -73,7 +73,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let turntable = arguments.turntable.as_deref().map(Turntable::new).transpose()?;
     let target = match &arguments.mesh {
         Some(path) => Some(Target::new(path, &arguments.surface)?),
-        None => arguments.surface.refuse("without --mesh there is no mesh to shape")?,
+        None => arguments.surface.must_be_unused("without --mesh there is no mesh to shape")?,
     };
     let config_path = check_paths(arguments, weights.path(), turntable.as_ref(), target.as_ref())?;
     let since = Instant::now();
@@ -81,12 +81,11 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     timed("finding the device", since);
     memory::check_networks(&weights, &device)?;
     if memory::is_cpu(&device) {
-        let network = config.memory_needed(weights.parameters());
         for path in [&arguments.front, &arguments.back] {
             let [width, height] = picture::size(path)?;
-            let bytes = PHOTOGRAPH * u64::from(width) * u64::from(height);
+            let bytes = BYTES_PER_PIXEL * u64::from(width) * u64::from(height);
             let what = format!("{}, {width}×{height},", path.display());
-            memory::check(&what, bytes.max(network), "make the picture smaller")?;
+            memory::check(&what, bytes, "make the picture smaller")?;
         }
     }
     let placement = match (arguments.as_is, config.mode.compat) {
@@ -119,7 +118,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     times.append(&mut result.times);
     if result.gaussians.is_empty() {
         let (file, plan) = (weights.path().display(), plan.join("\n  "));
-        bail!("{file}: no Gaussian came out, nothing was written; what happened:\n  {plan}");
+        bail!("{file}: no Gaussian came out, so nothing was written; the steps:\n  {plan}");
     }
 
     progress.stage("writing");
@@ -144,13 +143,13 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
         plan.push(mesh::describe(&target.write(&world.clone().into(), &arguments.output)?));
         times.push(("mesh", since.elapsed()));
     }
-    let say = say::beside(&arguments.output);
+    let print = say::beside(&arguments.output);
     if arguments.verbose {
         times.push(("total", start.elapsed()));
-        report(say, &plan, &times);
+        report(print, &plan, &times);
     }
     if !say::is_quiet() {
-        say(&format!("{}: {} Gaussians", arguments.output.display(), result.gaussians.len()));
+        print(&format!("{}: {} Gaussians", arguments.output.display(), result.gaussians.len()));
     }
     Ok(())
 }
@@ -186,11 +185,11 @@ fn check_paths(
     Ok(config_path)
 }
 
-fn report(say: fn(&str), plan: &[String], times: &[(&str, Duration)]) {
-    say("plan");
-    plan.iter().for_each(|line| say(&format!("  {line}")));
-    say("time, device synchronised");
+fn report(print: fn(&str), plan: &[String], times: &[(&str, Duration)]) {
+    print("steps");
+    plan.iter().for_each(|line| print(&format!("  {line}")));
+    print("time, device synchronised");
     for (name, time) in times {
-        say(&format!("  {name:<26} {:>9.1} ms", time.as_secs_f64() * 1e3));
+        print(&format!("  {name:<26} {:>9.1} ms", time.as_secs_f64() * 1e3));
     }
 }

@@ -14,20 +14,22 @@ use crate::crop::Window;
 use crate::resample::shrink;
 use snapsnap_ops::bilinear;
 
-/// Points and confidences on one view's pixel grid.
+/// Points and confidences on one view's pixel grid. [`PointPredictor::heads`] returns network units, and corrections
+/// where `network.anchor` is a ray. [`PointPredictor::finished`] returns metres in the front camera's frame, on the
+/// window; [`Self::pasted`] brings them onto the canvas.
 #[derive(Debug, Clone)]
 pub struct PointMap {
-    /// `[B, H, W, 3]` in the front camera's frame: network units, metres once multiplied by δ.
+    /// `[B, H, W, 3]`.
     pub points: Tensor<4>,
-    /// `[B, H, W]`: in (0, 1) with `sigmoid`, in (1, ∞) with `exp`.
+    /// `[B, H, W]`: in (0, 1) with `sigmoid`, in (1, ∞) with `exp`; 0 outside of the window.
     pub conf: Tensor<3>,
 }
 
 impl PointMap {
-    /// A view's map of a window on the whole canvas of `config`, 0 outside of the window. With `network.on_rays`, the points
-    /// of a photograph with the `mask` `[B, 1, S, S]` are moved onto their pixels' rays. The losses of stage 1 compare maps
-    /// before that move, so that the network still learns where the rays are.
-    pub fn on_canvas(
+    /// A view's map of a window, pasted into the whole canvas of `config`, which is 0 elsewhere. With `network.on_rays`,
+    /// the points of a photograph with the `mask` `[B, 1, S, S]` are moved onto their pixels' rays. The losses of stage 1
+    /// compare maps before that move, so that the network still learns where the rays are.
+    pub fn pasted(
         self,
         config: &NetworkConfig,
         view: View,
@@ -47,7 +49,8 @@ impl PointMap {
     }
 }
 
-/// Largest exponent whose result is in the range of f32. Such outputs are no depths, but must stay finite.
+/// Larger exponents are cut to this one, since e⁸⁸ is in the range of f32. Only untrained networks reach it, but their
+/// results too must be finite.
 const MAX_EXPONENT: f64 = 88.0;
 
 /// Raw x, y, z, confidence `[B, 4, H, W]` → point map: p = r / ‖r‖ · (e^‖r‖ − 1), or p = r with anchors
@@ -74,7 +77,7 @@ pub fn activate(raw: Tensor<4>, config: &NetworkConfig) -> PointMap {
 
 /// (e^x − 1) / x for x > 0, without the cancellation of `exp(x) − 1` near 0: a series for small x.
 fn growth(x: Tensor<4>) -> Tensor<4> {
-    /// End of the series' range: the first omitted term, x⁶/5040, is 2e-7 of the sum here.
+    /// End of the series' range: the first omitted term, x⁶/5040, is 1.2e-7 of the sum here.
     const SMALL: f64 = 0.3;
     let terms = [1.0 / 720.0, 1.0 / 120.0, 1.0 / 24.0, 1.0 / 6.0, 0.5];
     let series = terms.iter().fold(x.zeros_like(), |sum, &term| (sum + term) * x.clone()) + 1.0;
@@ -82,9 +85,9 @@ fn growth(x: Tensor<4>) -> Tensor<4> {
     direct.mask_where(x.lower_elem(SMALL), series)
 }
 
-/// The means of the maps of a batch's first half and of its second half, whose photographs are mirrored: there x is −x,
-/// and each side is the other one.
-fn means(maps: &[(View, PointMap)]) -> Vec<(View, PointMap)> {
+/// Merges both halves of a batch into one of half the size, for `network.both_ways`. The second half has the maps of the
+/// mirrored photographs. They are flipped, their x is negated, and right and left are exchanged. The result is the mean.
+fn mean_with_mirrored(maps: &[(View, PointMap)]) -> Vec<(View, PointMap)> {
     let mirrored = |view: View| match view {
         View::Right => View::Left,
         View::Left => View::Right,
@@ -109,7 +112,7 @@ fn means(maps: &[(View, PointMap)]) -> Vec<(View, PointMap)> {
 pub enum Encoded {
     /// Tokens `[2·B, N, enc_dim]` of all fronts, then all backs.
     Tokens(Tensor<3>, Grid),
-    /// Both photographs' together.
+    /// Feature images of the convolutional body, which receives both photographs at once.
     Levels(Levels),
 }
 
@@ -117,9 +120,9 @@ pub enum Encoded {
 #[derive(Debug, Clone)]
 #[allow(clippy::large_enum_variant, reason = "there is one at a time")]
 pub enum Decoded {
-    /// Both photographs' token maps.
+    /// Token maps of the front and of the back.
     Tokens([TokenMaps; 2], Grid),
-    /// Both photographs' together.
+    /// Feature images of the convolutional body.
     Levels(Levels),
 }
 
@@ -131,7 +134,7 @@ enum Body {
     Convolution(PointUNet),
 }
 
-/// A network for both photographs and global scale δ.
+/// The network that receives both photographs, and the learned global scale δ.
 #[derive(Module, Debug)]
 pub struct PointPredictor {
     /// δ `[1]`: metres per network unit.
@@ -142,7 +145,7 @@ pub struct PointPredictor {
 }
 
 impl PointPredictor {
-    /// A predictor without values for its parameters yet.
+    /// A predictor with δ from the config. Its other parameters have no values yet.
     pub fn new(config: &NetworkConfig, device: &Device) -> Self {
         let scale = Param::from_tensor(Tensor::full([1], config.delta, device));
         let body = match config.body {
@@ -193,11 +196,11 @@ impl PointPredictor {
         self.scale.val()
     }
 
-    /// Point map of one view on the canvas: enlarged `factor` times, then multiplied by δ
+    /// Enlarges a map `factor` times, from the network's pixels to those of the canvas, and multiplies its points by δ
     /// (docs/method.md, "Enlargement and delta").
     ///
-    /// `weights` `[B, 1, H, W]` ≥ 0 are the body's share of each network pixel, for `mask-aware` interpolation.
-    pub fn to_canvas(
+    /// `weights` `[B, 1, H, W]` ≥ 0 are the person's share of each network pixel, for `mask-aware` interpolation.
+    pub fn enlarged(
         &self,
         map: PointMap,
         factor: usize,
@@ -211,7 +214,7 @@ impl PointPredictor {
         let plain = up(points.clone());
         let points = match (method, weights) {
             (Upsample::MaskAware, Some(weights)) if factor > 1 => {
-                /// A canvas pixel with less body than this around it keeps the plain interpolation.
+                /// A canvas pixel with less of the person than this around it keeps the plain interpolation.
                 const MIN_WEIGHT: f64 = 1e-4;
                 let total = up(weights.clone());
                 // Points of the background may be anything, an overflow included.
@@ -228,8 +231,9 @@ impl PointPredictor {
         PointMap { points, conf }
     }
 
-    /// The map of a view on a window of the canvas, measured from the anchors in force.
-    pub fn anchored(&self, view: View, map: PointMap, window: &Window) -> PointMap {
+    /// Adds the anchors of a window to a view's map: corrections in metres become points in the front camera's frame.
+    /// Without anchors the map stays as it is.
+    pub fn add_anchors(&self, view: View, map: PointMap, window: &Window) -> PointMap {
         let config = &self.config;
         match config.anchor {
             Anchor::None => map,
@@ -240,9 +244,9 @@ impl PointPredictor {
         }
     }
 
-    /// A head's map of a view, activated, on the `window` of the canvas that the network received, in metres. `mask`
-    /// `[B, 1, S, S]` is the photograph's. Sides have none; their mask is the predicted confidence above the threshold,
-    /// without a gradient.
+    /// Enlarges a head's map to the canvas pixels of the `window` that the network received, and adds the anchors. Points
+    /// are then metres in the front camera's frame. `mask` `[B, 1, S, S]` is the photograph's. Sides have none; their mask
+    /// is the predicted confidence above the threshold, without a gradient.
     pub fn finished(
         &self,
         config: &Config,
@@ -255,14 +259,14 @@ impl PointPredictor {
         let weights = (method == Upsample::MaskAware && factor > 1).then(|| match mask {
             Some(mask) => shrink(window.cut(mask.clone()), factor, Downsample::Area),
             None => {
-                let body = map.conf.clone().detach().greater_elem(config.network.conf_threshold);
-                body.float().unsqueeze_dim(1)
+                let person = map.conf.clone().detach().greater_elem(config.network.conf_threshold);
+                person.float().unsqueeze_dim(1)
             }
         });
-        self.anchored(view, self.to_canvas(map, factor, method, weights), window)
+        self.add_anchors(view, self.enlarged(map, factor, method, weights), window)
     }
 
-    /// Features of each photograph.
+    /// The encoder: a transformer reads each photograph alone, a convolution both together.
     pub fn encode(&self, Input { images, grid }: Input) -> Encoded {
         match &self.body {
             Body::Transformer(net) => Encoded::Tokens(net.encode(images, &grid), grid),
@@ -274,7 +278,7 @@ impl PointPredictor {
         }
     }
 
-    /// Features of both photographs together.
+    /// The decoder of a transformer, which joins both photographs. Features of a convolution stay as they are.
     pub fn decode(&self, encoded: Encoded) -> Decoded {
         match encoded {
             Encoded::Tokens(tokens, grid) => {
@@ -286,7 +290,8 @@ impl PointPredictor {
         }
     }
 
-    /// Point maps of all views at network resolution and without δ.
+    /// Activated maps of all views at the network's resolution, in network units and without anchors. With
+    /// `network.both_ways`, the batch of `decoded` is twice that of the result.
     pub fn heads(&self, decoded: &Decoded) -> Vec<(View, PointMap)> {
         let raw: Vec<Tensor<4>> = match (&self.body, decoded) {
             (Body::Transformer(net), Decoded::Tokens(maps, grid)) => {
@@ -304,10 +309,10 @@ impl PointPredictor {
             (view, activate(raw, &self.config))
         };
         let maps: Vec<_> = self.views().iter().zip(raw).map(map).collect();
-        if self.config.both_ways { means(&maps) } else { maps }
+        if self.config.both_ways { mean_with_mirrored(&maps) } else { maps }
     }
 
-    /// Point maps of all views at network resolution and without δ.
+    /// `encode`, `decode` and `heads` in turn.
     pub fn forward(&self, input: Input) -> Vec<(View, PointMap)> {
         self.heads(&self.decode(self.encode(input)))
     }

@@ -1,16 +1,13 @@
 //! 1×1 convolutions for training: a matrix product per block of pixels, on images as Burn stores them. A block is small
 //! enough that its channels stay in the second-level cache between the products that read them.
 
-use pulp::Arch;
 use rayon::prelude::*;
 
 use super::elements::{add_constant, mask, rectify, total};
-use super::planes::{Planes, Transposer};
-use super::transposed::Accumulate;
 use super::{Gradients, Wanted, join};
 use crate::buffers::{give, take};
 use crate::multiply::Multiply;
-use crate::wide::{GROUP, pieces};
+use crate::wide::pieces;
 
 /// Floats of a block's inputs and outputs: 128 KiB.
 const BLOCK_FLOATS: usize = 32 * 1024;
@@ -69,20 +66,16 @@ impl Conv1x1 {
         let size = blocks.len().div_ceil(PARTS);
         let parts: Vec<_> =
             blocks.par_chunks_mut(size).map(|part| self.part(part, x, weight, dy, wanted)).collect();
-        let width = inputs.next_multiple_of(GROUP);
-        let weight = wanted.weight.then(|| {
-            let size = outputs.next_multiple_of(GROUP) * width;
-            let sums = join(parts.iter().map(|(weights, _)| &weights[..]), size);
-            sums.chunks_exact(width).take(outputs).flat_map(|row| &row[..inputs]).copied().collect()
-        });
         Gradients {
             input: dx,
-            weight,
+            weight: wanted
+                .weight
+                .then(|| join(parts.iter().map(|(weights, _)| &weights[..]), outputs * inputs)),
             bias: wanted.bias.then(|| join(parts.iter().map(|(_, biases)| &biases[..]), outputs)),
         }
     }
 
-    /// One part's gradients. Those of weight (channels in whole groups) and bias are returned, empty where not wanted.
+    /// One part's gradients. Those of weight and bias are returned, empty where not wanted.
     fn part(
         &self,
         part: &mut [Block],
@@ -92,20 +85,18 @@ impl Conv1x1 {
         wanted: Wanted,
     ) -> (Vec<f32>, Vec<f32>) {
         let Self { inputs, outputs, pixels, rectified, .. } = *self;
-        let [left, right] = [outputs, inputs].map(|channels| channels.next_multiple_of(GROUP));
-        let mut weights = vec![0.0; if wanted.weight { left * right } else { 0 }];
+        let mut weights = vec![0.0; if wanted.weight { outputs * inputs } else { 0 }];
         let mut biases = vec![0.0; if wanted.bias { outputs } else { 0 }];
         let mut add = false;
         for Block { image, first, count: n, out } in part {
             let (n, x) = (*n, &x[*image * inputs * pixels..][..inputs * pixels]);
             let dy = &dy[*image * outputs * pixels..][..outputs * pixels];
             if wanted.weight {
-                let [mut gradients, mut values] = [left, right].map(|channels| take(channels * n));
-                self.group(dy, *first, false, n, &mut gradients);
-                self.group(x, *first, rectified, n, &mut values);
-                let (left, right, out) = (&gradients, &values, &mut weights);
-                Arch::new().dispatch(Accumulate { left, right, stride: n, tiles: n, add, out });
-                [gradients, values].into_iter().for_each(give);
+                let mut read = take(if rectified { inputs * n } else { 0 });
+                let (x, [_, stride]) = self.read(&x[*first..], n, &mut read);
+                let (lhs, rhs) = ((&dy[*first..], [1, pixels]), (x, [stride, 1]));
+                Multiply { size: [outputs, inputs, n], lhs, rhs, add }.write(&mut weights, inputs);
+                give(read);
                 add = true;
             }
             if wanted.bias {
@@ -128,14 +119,6 @@ impl Conv1x1 {
             }
         }
         (weights, biases)
-    }
-
-    /// `n` pixels of an image in groups of channels, `[groups][n][16]`.
-    fn group(&self, data: &[f32], first: usize, rectified: bool, n: usize, out: &mut [f32]) {
-        let planes = Planes { data, height: 1, width: self.pixels, rectified, transposer: Transposer::new() };
-        for (group, out) in out.chunks_exact_mut(n * GROUP).enumerate() {
-            planes.read(group, Some(0), first as isize, out);
-        }
     }
 
     /// The first `n` pixels of the input as it is read: values and their (column, row) strides.

@@ -14,13 +14,13 @@ pub const MAX_SIDE: u32 = 32_768;
 pub struct Counts {
     /// Gaussians that reach at least one pixel's footprint.
     pub visible: u64,
-    /// At or before the near plane.
+    /// Depth t_z at most `near`.
     pub near: u64,
     /// No pixel within reach.
     pub outside: u64,
     /// Opacity (after antialiasing) below 1/255.
     pub transparent: u64,
-    /// A zero quaternion, or a covariance or position that f32 cannot hold once projected.
+    /// A quaternion of length 0, or a projected position or covariance beyond ±1e18.
     pub degenerate: u64,
     /// A parameter that is NaN, infinite, or beyond ±1e18.
     pub invalid: u64,

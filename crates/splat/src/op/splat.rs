@@ -1,4 +1,4 @@
-//! A Gaussian in one view: culling, the tiles that it reaches, its weight at a pixel.
+//! A Gaussian in one view: culling, the tiles that it reaches, its α at a pixel.
 //!
 //! Like [`crate::vjp`], the functions are compiled twice from this one source: as plain Rust for the CPU and, through
 //! CubeCL's `#[cube]`, into the GPU kernels.
@@ -15,11 +15,11 @@ use crate::vjp::{Footprint, View, footprint, project, span, to_camera};
 const MAX_MAGNITUDE: f32 = 1e18;
 /// Least |q|² of a quaternion that defines a rotation.
 const MIN_QUATERNION: f32 = 1e-12;
-/// Added to the squared radius inside which a splat's α can reach [`MIN_ALPHA`], so that
-/// rounding cuts off no pixel that the exact test would take, for needles of 4,000 pixels too.
+/// Margin of [`Splat::radius_squared`]. Without it, rounding would cut off pixels whose α is just above [`MIN_ALPHA`].
+/// It suffices for needles of 4,000 pixels.
 const RADIUS_MARGIN: f32 = 1e-2;
 
-/// A visible Gaussian as the pixels of one view use it.
+/// The numbers of a projected Gaussian that blending reads.
 #[derive(CubeType, Clone, Copy, Debug, Default)]
 pub struct Splat {
     /// Centre, pixels.
@@ -36,7 +36,7 @@ pub struct Splat {
     pub opacity: f32,
     /// t_z, metres.
     pub depth: f32,
-    /// Squared radius, in standard deviations, beyond which α < 1/255.
+    /// Squared radius in squared standard deviations, beyond which α < 1/255.
     pub radius_squared: f32,
 }
 
@@ -84,7 +84,7 @@ pub fn gaussian(means: &[f32], rotations: &[f32], scales: &[f32], opacities: &[f
     }
 }
 
-/// Numbers from `first` up to, but without, `end`.
+/// The numbers from `first` to `end` − 1.
 #[derive(CubeType, CubeTypeMut, Clone, Copy, Debug, Default)]
 pub struct Extent {
     pub first: u32,
@@ -108,13 +108,13 @@ pub struct Projected {
 
 /// Reaches a pixel.
 pub const VISIBLE: u32 = 0;
-/// At or before the near plane.
+/// Its depth t_z is at most `near`.
 pub const NEAR: u32 = 1;
 /// No pixel within reach.
 pub const OUTSIDE: u32 = 2;
 /// Opacity below 1/255.
 pub const TRANSPARENT: u32 = 3;
-/// No rotation, or a projection beyond f32.
+/// |q|² is below 1e-12, or a projected quantity is beyond ±1e18, or a determinant is not positive.
 pub const DEGENERATE: u32 = 4;
 /// A parameter that is not finite, or beyond ±1e18.
 pub const INVALID: u32 = 5;
@@ -173,6 +173,7 @@ pub fn splat(
     uniforms: &Uniforms,
     #[comptime] antialiased: bool,
 ) -> Projected {
+    // Everything is computed before the tests: a culled Gaussian has numbers that nobody reads, NaN among them.
     let t = to_camera(view, &gaussian.mean);
     let p = project(view, &t, &gaussian.rotation, &gaussian.scale, uniforms.blur);
     let f = footprint(view, &p);
@@ -184,6 +185,7 @@ pub fn splat(
     let radius_squared = 2.0 * (opacity / comptime!(MIN_ALPHA)).ln() + comptime!(RADIUS_MARGIN);
     let splat = Splat { u: f.u, v: f.v, l0: f.l0, k: f.k, l1: f.l1, opacity, depth: t.z, radius_squared };
 
+    // The first test that fails is the reason that is counted.
     let mut fate = comptime!(VISIBLE).runtime();
     if !is_valid(gaussian, color) {
         fate = comptime!(INVALID).runtime();
@@ -199,8 +201,8 @@ pub fn splat(
     let mut rows = Extent { first: 0u32, end: 0u32 };
     let mut tiles = 0u32;
     if fate == comptime!(VISIBLE) {
-        let extent = radius_squared.sqrt() * f.sigma_y;
-        rows = pixels_between(f.v - extent, f.v + extent, uniforms.height);
+        let half_height = radius_squared.sqrt() * f.sigma_y;
+        rows = pixels_between(f.v - half_height, f.v + half_height, uniforms.height);
         let tile_rows = tiles_of(&rows);
         for y in tile_rows.first..tile_rows.end {
             let row = tiles_in_row(&splat, y, uniforms);
@@ -259,11 +261,11 @@ pub fn offset(splat: &Splat, x: f32, y: f32) -> Offset {
 /// o·exp(−½|w|²): the splat's α before the clamp at α_max.
 #[cube]
 #[inline(always)]
-pub fn weight(splat: &Splat, w: &Offset) -> f32 {
+pub fn unclamped_alpha(splat: &Splat, w: &Offset) -> f32 {
     splat.opacity * exp((w.w0 * w.w0 + w.w1 * w.w1) * -0.5f32)
 }
 
-/// f32 of a splat in a buffer.
+/// Number of f32 that a splat takes in a buffer.
 pub const SPLAT: usize = 8;
 
 #[cube]

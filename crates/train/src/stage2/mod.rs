@@ -1,4 +1,4 @@
-//! Stage 2: the regressor is trained on rendered views from every side
+//! Stage 2: trains the regressor, and the point predictor if asked for, by comparing renders with target views
 //! (docs/method.md, "Losses of stage 2").
 
 mod frozen;
@@ -43,8 +43,8 @@ const WORST: f32 = 0.5;
 
 /// The training of the regressor on the points of a predictor, which is frozen or trained as well.
 pub struct GaussianTask {
-    networks: Config,
-    losses: Stage2Config,
+    config: Config,
+    loss_config: Stage2Config,
     /// λ of the point loss.
     confidence: f64,
     seed: u64,
@@ -55,16 +55,15 @@ pub struct GaussianTask {
     /// First step with the perceptual distance.
     lpips_from: u64,
     data: Data<Stage2Item>,
-    /// Scores of the billboard, computed once.
-    billboard: OnceLock<Scores>,
-    /// Training devices, with gradients.
+    /// Scores of the billboard baseline, computed once.
+    billboard_scores: OnceLock<Scores>,
+    /// Training devices, each with autodiff.
     devices: Vec<Device>,
 }
 
 impl GaussianTask {
-    /// A training on these data sets and devices. There must be at least one device, and devices must have gradients.
-    /// `predictor` is the frozen predictor, without gradients and on the first device, or `None` if it is trained as
-    /// well.
+    /// A training on these data sets and devices. There must be at least one device, and each must have autodiff.
+    /// `predictor` is the frozen predictor on the first device without autodiff, or `None` if it is trained as well.
     ///
     /// # Errors
     /// [`TrainError`] if a data set cannot be used with this config, or weights of LPIPS cannot be read.
@@ -85,37 +84,37 @@ impl GaussianTask {
             lpips_from = (after * config.training.steps as f64).ceil() as u64;
         }
         Ok(Self {
-            networks: config.networks(),
-            losses: config.stage2.clone(),
+            config: config.networks(),
+            loss_config: config.stage2.clone(),
             confidence: config.stage1.confidence_weight,
             seed: config.training.seed,
             frozen: predictor.map(|predictor| Frozen::new(config, predictor, devices)),
             lpips,
             lpips_from,
             data,
-            billboard: OnceLock::new(),
+            billboard_scores: OnceLock::new(),
             devices: devices.to_vec(),
         })
     }
 
-    /// Predicts the points of a sample's photographs with the trained or the frozen predictor. `place` is the index of
-    /// the training device in a step, and `None` in a validation.
+    /// Predicts the points of a sample's photographs with the trained or the frozen predictor, in a step on a training
+    /// device, or in a validation (`None`) on the first device without autodiff.
     fn predict(
         &self,
         networks: &Networks,
         item: &Stage2Item,
-        place: Option<usize>,
+        training_device: Option<usize>,
     ) -> Result<Prediction, TrainError> {
-        let device = &self.devices[place.unwrap_or(0)];
+        let device = &self.devices[training_device.unwrap_or(0)];
         let inner = device.clone().inner();
         match (&networks.predictor, &self.frozen) {
             (Some(predictor), _) => {
-                let device = if place.is_some() { device } else { &inner };
-                Ok(of_sample(predictor, &self.networks, item, device))
+                let device = if training_device.is_some() { device } else { &inner };
+                Ok(of_sample(predictor, &self.config, item, device))
             }
             (None, frozen) => {
                 let frozen = frozen.as_ref().expect("a predictor that is not trained is frozen");
-                frozen.predict(&self.networks, item, place, &inner)
+                frozen.predict(&self.config, item, training_device, &inner)
             }
         }
     }
@@ -128,10 +127,10 @@ impl GaussianTask {
         device: &Device,
     ) -> Result<Option<Gaussians>, TrainError> {
         let prediction = self.predict(networks, item, None)?;
-        Ok(gaussians(&self.networks, networks, item, prediction, &Phase::new(false, 0), None, device))
+        Ok(gaussians(&self.config, networks, item, prediction, &Phase::new(false, 0), None, device))
     }
 
-    /// Rendered pictures of all targets `[V,3,h,w]`, the background alone without Gaussians.
+    /// Renders all target views `[V,3,h,w]`. Without Gaussians the pictures show the background.
     fn shown(
         &self,
         item: &Stage2Item,
@@ -147,13 +146,15 @@ impl GaussianTask {
         }
     }
 
-    /// Scores of the billboard baseline: both photographs as flat cut-outs in the plane through the body's axis.
+    /// Scores of the billboard baseline: both photographs as flat cut-outs in the plane through the person's axis. Its
+    /// points are the ray anchors, which lie on that plane. The last layer of a regressor with a geometric start is zero,
+    /// so that random weights leave each Gaussian in its pixel's colour. Confidences of 0 leave the sides out.
     fn billboard(&self) -> Result<Scores, TrainError> {
-        if let Some(scores) = self.billboard.get() {
+        if let Some(scores) = self.billboard_scores.get() {
             return Ok(*scores);
         }
         let device = self.devices[0].clone().inner();
-        let mut config = self.networks.clone();
+        let mut config = self.config.clone();
         config.mode.compat = false;
         config.network.on_rays = false;
         config.regressor.start = Some(RegressorStart::Geometric);
@@ -171,7 +172,7 @@ impl GaussianTask {
                 gaussians(&config, &networks, &item, prediction, &Phase::new(false, 0), None, &device);
             sums.add(&item, self.shown(&item, gaussians, &device)?, &device)?;
         }
-        Ok(*self.billboard.get_or_init(|| sums.mean()))
+        Ok(*self.billboard_scores.get_or_init(|| sums.mean()))
     }
 
     /// Rendered pictures `[V,3,h,w]` and coverage `[V,h,w]`.
@@ -204,25 +205,25 @@ impl Task for GaussianTask {
         &self,
         networks: &Networks,
         items: Vec<Stage2Item>,
-        Moment { step, batch, device: place }: Moment,
+        Moment { step, batch, device_index }: Moment,
     ) -> Result<Vec<Part>, TrainError> {
-        let (phase, device) = (Phase::new(self.losses.curriculum, step), &self.devices[place]);
-        let mut random = stream(&format!("stage2/{}/{step}/{batch}/{place}", self.seed));
+        let (phase, device) = (Phase::new(self.loss_config.curriculum, step), &self.devices[device_index]);
+        let mut random = stream(&format!("stage2/{}/{step}/{batch}/{device_index}", self.seed));
         let mut sums: BTreeMap<&'static str, (f64, Vec<Tensor<1>>)> = BTreeMap::new();
-        let losses = &self.losses;
+        let config = &self.loss_config;
         for item in &items {
             let count = item.target_cameras.len();
-            // The sides are the last two views.
+            // While only the Gaussians of the sides are drawn, the target is one of the sides: the last two.
             let first = if phase.views.start == 2 { count - 2 } else { 0 };
             let chosen =
                 if phase.one_view { vec![random.random_range(first..count)] } else { (0..count).collect() };
-            let deviation = self.losses.point_noise as f32;
+            let deviation = config.point_noise as f32;
             let mut noise = || {
-                // A sum of uniform numbers is nearly normal, and bounded.
+                // The sum of three has a standard deviation of 1, is nearly normal, and 3 at most.
                 deviation * (0..3).map(|_| random.random_range(-1.0_f32..1.0)).sum::<f32>()
             };
             let noise = (deviation > 0.0).then_some(&mut noise as &mut dyn FnMut() -> f32);
-            let prediction = self.predict(networks, item, Some(place))?;
+            let prediction = self.predict(networks, item, Some(device_index))?;
             let mut add = |name, weight: f64, value: Tensor<1>| {
                 sums.entry(name).or_insert((weight, Vec::new())).1.push(value);
             };
@@ -232,29 +233,30 @@ impl Task for GaussianTask {
                 let valid = Tensor::from_data(TensorData::new(valid, [1, 4, side, side]), device);
                 let of_points = points_losses(&prediction, &points, &valid);
                 let value = of_points.regression + of_points.confidence * self.confidence;
-                add("points", losses.points_weight, value);
+                add("points", config.points_weight, value);
             }
-            let made = gaussians(&self.networks, networks, item, prediction, &phase, noise, device);
+            let made = gaussians(&self.config, networks, item, prediction, &phase, noise, device);
+            // A sample without a valid pixel counts in the points' loss alone; each part is a mean over the samples that have it.
             let Some(gaussians) = made else { continue };
             let cameras: Vec<Camera> = chosen.iter().map(|v| item.target_cameras[*v]).collect();
             let (image, coverage) = self.render(&gaussians, &cameras, item.background)?;
             let (target, mask) = targets(item, &chosen, device);
-            if let Some(lpips) = self.lpips.get(place).filter(|_| step >= self.lpips_from) {
-                let weight = losses.lpips.as_ref().map_or(0.0, |lpips| lpips.weight);
+            if let Some(lpips) = self.lpips.get(device_index).filter(|_| step >= self.lpips_from) {
+                let weight = config.lpips.as_ref().map_or(0.0, |lpips| lpips.weight);
                 add("lpips", weight, lpips.distance(image.clone(), target.clone()).mean());
             }
             let photometric = Photometric::new(image, target);
-            add("l1", losses.l1_share, photometric.l1);
-            add("dissimilarity", 1.0 - losses.l1_share, 1.0 - photometric.ssim);
-            if losses.alpha_weight > 0.0 {
-                add("alpha", losses.alpha_weight, (coverage - mask).abs().mean());
+            add("l1", config.l1_share, photometric.l1);
+            add("dissimilarity", 1.0 - config.l1_share, 1.0 - photometric.ssim);
+            if config.alpha_weight > 0.0 {
+                add("alpha", config.alpha_weight, (coverage - mask).abs().mean());
             }
-            if phase.scale > 0.0 {
-                add("scale", phase.scale, gaussians.scales.clone().mean());
+            if phase.scale_weight > 0.0 {
+                add("scale", phase.scale_weight, gaussians.scales.clone().mean());
             }
-            if losses.anisotropy_weight > 0.0 {
-                let penalty = anisotropy_penalty(&gaussians.scales, losses.anisotropy_limit);
-                add("anisotropy", losses.anisotropy_weight, penalty);
+            if config.anisotropy_weight > 0.0 {
+                let penalty = anisotropy_penalty(&gaussians.scales, config.anisotropy_limit);
+                add("anisotropy", config.anisotropy_weight, penalty);
             }
         }
         let mean = |(name, (weight, values))| Part { name, weight, value: Tensor::cat(values, 0).mean() };

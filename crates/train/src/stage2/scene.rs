@@ -28,7 +28,7 @@ pub(super) struct Phase {
     /// Views whose Gaussians are rendered.
     pub views: Range<usize>,
     /// Weight of the mean scale.
-    pub scale: f64,
+    pub scale_weight: f64,
     /// Whether a step has only one target.
     pub one_view: bool,
 }
@@ -37,10 +37,10 @@ impl Phase {
     pub fn new(curriculum: bool, step: u64) -> Self {
         let one_view = curriculum && step < ONE_VIEW;
         match step {
-            _ if !curriculum => Self { views: 0..4, scale: 0.0, one_view },
-            step if step < CURRICULUM[0] => Self { views: 2..4, scale: SCALE_PENALTY, one_view },
-            step if step < CURRICULUM[1] => Self { views: 0..2, scale: 0.0, one_view },
-            _ => Self { views: 0..4, scale: 0.0, one_view },
+            _ if !curriculum => Self { views: 0..4, scale_weight: 0.0, one_view },
+            step if step < CURRICULUM[0] => Self { views: 2..4, scale_weight: SCALE_PENALTY, one_view },
+            step if step < CURRICULUM[1] => Self { views: 0..2, scale_weight: 0.0, one_view },
+            _ => Self { views: 0..4, scale_weight: 0.0, one_view },
         }
     }
 }
@@ -61,7 +61,7 @@ pub(super) fn gaussians(
     let (mut points, mut conf, mut maps) = (Vec::new(), Vec::new(), Vec::new());
     let masks = TensorData::new(item.masks.clone(), [1, 2, side, side]);
     let masks = Tensor::from_data(masks, &prediction.maps[0].1.points.device());
-    for (_, map) in prediction.on_canvas(&config.network, &masks) {
+    for (_, map) in prediction.pasted(&config.network, &masks) {
         points.extend(host(map.points.clone()));
         conf.extend(host(map.conf));
         maps.push(map.points);
@@ -140,11 +140,11 @@ mod tests {
     #[test]
     fn the_published_curriculum_goes_from_the_sides_to_all_views() {
         let phase = |step| Phase::new(true, step);
-        assert_eq!(phase(0), Phase { views: 2..4, scale: 2.0, one_view: true });
+        assert_eq!(phase(0), Phase { views: 2..4, scale_weight: 2.0, one_view: true });
         assert_eq!(phase(1999), phase(0));
-        assert_eq!(phase(2000), Phase { views: 0..2, scale: 0.0, one_view: true });
-        assert_eq!(phase(4000), Phase { views: 0..4, scale: 0.0, one_view: true });
-        assert_eq!(phase(10_000), Phase { views: 0..4, scale: 0.0, one_view: false });
+        assert_eq!(phase(2000), Phase { views: 0..2, scale_weight: 0.0, one_view: true });
+        assert_eq!(phase(4000), Phase { views: 0..4, scale_weight: 0.0, one_view: true });
+        assert_eq!(phase(10_000), Phase { views: 0..4, scale_weight: 0.0, one_view: false });
         assert_eq!(Phase::new(false, 0), phase(10_000));
     }
 

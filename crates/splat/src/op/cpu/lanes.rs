@@ -2,7 +2,7 @@
 
 use crate::options::TILE;
 
-use super::super::splat::{Splat, offset, weight};
+use super::super::splat::{Splat, offset, unclamped_alpha};
 use super::splats::Visible;
 
 /// One value per pixel of a tile's row.
@@ -35,7 +35,7 @@ pub fn row(splat: &Splat, left: f32, y: f32) -> Row {
         let w = offset(splat, left + CENTRES[i], y);
         row.w[0][i] = w.w0;
         row.w[1][i] = w.w1;
-        row.alpha[i] = weight(splat, &w);
+        row.alpha[i] = unclamped_alpha(splat, &w);
     }
     row
 }

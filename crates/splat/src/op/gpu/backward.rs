@@ -1,6 +1,12 @@
 //! Gradients: per tile back to front into one record per intersection, then per Gaussian through its projection.
 //!
 //! No float is ever added atomically: every intersection has a place of its own, and each sum runs in a fixed order.
+//!
+//! An *intersection* is a pair of a splat and a tile that it reaches; its *slot* is its number, in the order in which
+//! `emit` writes them. An *entry* is a place in the depth-sorted lists of the tiles. A *record* has the sums of one
+//! intersection over the tile's pixels. [`pixels()`] proceeds in rounds of [`ROUND`] splats, the farthest first, in three
+//! steps: each unit computes the terms of its pixel for all splats of the round; [`SHARERS`] units per splat add up
+//! [`SHARE`] pixels each; one unit per number of a record adds up what they found.
 
 use cubecl::CubeTypeMut;
 use cubecl::prelude::*;
@@ -11,14 +17,15 @@ use super::project::{Parameters, Reach, load_view};
 use crate::linear::{Quat, Vec3, add3, dot, load3, store3};
 use crate::op::gradient::{Record, SplatGradient};
 use crate::op::job::Wanted;
-use crate::op::splat::{Offset, Splat, Uniforms, offset, weight};
+use crate::op::splat::{Offset, Splat, Uniforms, offset, unclamped_alpha};
 use crate::options::MIN_ALPHA;
 use crate::vjp::{GaussianGradient, footprint, project, project_vjp, to_camera};
 
 /// Splats that a cube visits between two barriers.
 const ROUND: usize = 8;
-/// Units that share the sums of one splat, and pixels of each.
+/// Units that sum the gradients of one splat together.
 const SHARERS: usize = UNITS / ROUND;
+/// Pixels that each of these units sums.
 const SHARE: usize = UNITS / SHARERS;
 
 /// ∂L/∂ of the outputs at a pixel.
@@ -29,41 +36,42 @@ struct Upstream {
     depth: f32,
 }
 
-/// A pixel while splats are removed from it, back to front.
+/// A pixel between two splats, while they are visited back to front.
 #[derive(CubeType, Clone, Copy)]
-struct Behind {
+struct BackToFront {
     /// Transmittance in front of the splat that was visited last.
     transmittance: f32,
     /// Σ α_j T_j e_j over the splats behind, plus the background's part (see [`crate::vjp`]).
     sum: f32,
 }
 
-/// Gradients of one splat at one pixel.
+/// What one splat adds to its sums at one pixel.
 #[derive(CubeType, CubeTypeMut, Clone, Copy)]
-struct Share {
+struct PixelTerms {
     /// α·T.
-    weight: f32,
-    /// g = ∂L/∂α·α; zero where α is clamped.
-    power: f32,
+    blend_weight: f32,
+    /// g = (∂L/∂α)·α, the gradient of the power −½|w|²; zero where α is clamped.
+    v_power: f32,
 }
 
 #[cube]
-impl Behind {
-    /// Removes a splat with unclamped α `full` from the pixel. `e` is its e_j.
-    fn take_off(&mut self, full: f32, e: f32, max_alpha: f32) -> Share {
-        let alpha = full.min(max_alpha);
+impl BackToFront {
+    /// Visits the next splat towards the camera. `e` = colour·v_colour + depth·v_depth + v_alpha (e_j in [`crate::vjp`]).
+    fn step_past(&mut self, unclamped_alpha: f32, e: f32, max_alpha: f32) -> PixelTerms {
+        let alpha = unclamped_alpha.min(max_alpha);
         let inverse = 1.0 / (1.0 - alpha);
         self.transmittance *= inverse;
-        let weight = alpha * self.transmittance;
+        let blend_weight = alpha * self.transmittance;
         let v_alpha = self.transmittance * e - self.sum * inverse;
-        self.sum += weight * e;
+        self.sum += blend_weight * e;
         // Where α is clamped it does not depend on the splat.
-        Share { weight, power: select(full < max_alpha, v_alpha * alpha, 0.0f32) }
+        PixelTerms { blend_weight, v_power: select(unclamped_alpha < max_alpha, v_alpha * alpha, 0.0f32) }
     }
 }
 
-/// Fills `records` `[intersections, record.len()]`, in the order of emission, from `upstream` `[V,H,W,C]`. `slots` has
-/// the number of each entry's intersection.
+/// Fills `records` `[intersections, record.len()]` from `upstream` `[V,H,W,C]`. `splats` `[V·N,8]`, `colors` `[N,3]`,
+/// `background` `[3]`; `slots` has the slot of each entry; `transmittance` `[V·H·W]` is that behind all splats;
+/// `list_ends` `[V·H·W]` is one more than the place, in the tile's list, of the last splat that a pixel blended.
 #[cube(launch)]
 #[allow(clippy::too_many_arguments, reason = "a kernel takes its buffers one by one")]
 pub fn pixels(
@@ -73,7 +81,7 @@ pub fn pixels(
     lists: &TileLists,
     slots: &[u32],
     transmittance: &[f32],
-    last: &[u32],
+    list_ends: &[u32],
     upstream: &[f32],
     records: &mut [f32],
     uniforms: &Uniforms,
@@ -86,42 +94,42 @@ pub fn pixels(
     let shape = comptime!(record.geometry || record.opacities);
     let unit = UNIT_POS as usize;
     let pixel = pixel_of_unit(UNIT_POS, uniforms);
-    // Per splat of a round and pixel: weight and power. Per pixel: upstream colour and depth. Per splat and sharer: sums.
-    let mut weights = Shared::<[f32]>::new_slice(comptime!(ROUND * UNITS));
-    let mut powers = Shared::<[f32]>::new_slice(comptime!(if shape { ROUND * UNITS } else { 1 }));
+    // Per splat of a round and pixel: its terms. Per pixel: upstream colour and depth. Per splat and sharer: sums.
+    let mut blend_weights = Shared::<[f32]>::new_slice(comptime!(ROUND * UNITS));
+    let mut v_powers = Shared::<[f32]>::new_slice(comptime!(if shape { ROUND * UNITS } else { 1 }));
     let mut upstreams = Shared::<[f32]>::new_slice(comptime!(4 * UNITS));
     let mut sums = Shared::<[f32]>::new_slice(comptime!(record.len() * UNITS));
 
-    let mut behind = Behind { transmittance: 1.0f32, sum: 0.0f32 };
-    let mut taken = 0u32;
+    let mut visit = BackToFront { transmittance: 1.0f32, sum: 0.0f32 };
+    let mut list_end = 0u32;
     let mut own = no_upstream();
     if pixel.inside {
         own = load_upstream(upstream, &pixel, depth);
-        taken = last[pixel.index];
-        behind.transmittance = transmittance[pixel.index];
-        behind.sum = behind.transmittance * dot(&load3(background, 0usize), &own.color);
+        list_end = list_ends[pixel.index];
+        visit.transmittance = transmittance[pixel.index];
+        visit.sum = visit.transmittance * dot(&load3(background, 0usize), &own.color);
     }
     upstreams[unit] = own.color.x;
     upstreams[comptime!(UNITS) + unit] = own.color.y;
     upstreams[comptime!(2 * UNITS) + unit] = own.color.z;
     upstreams[comptime!(3 * UNITS) + unit] = own.depth;
-    let visited = largest(taken) as usize;
+    let visited = largest(list_end) as usize;
     let start = lists.starts[CUBE_POS] as usize;
     clear(records, slots, start + visited, lists.ends[CUBE_POS] as usize, record);
 
     let mut rest = visited;
     while rest > 0 {
-        // Splats rest−1, rest−2, …: one unit per pixel.
+        // Step 1: splats rest−1, rest−2, … at the pixel of each unit.
         for j in 0..comptime!(ROUND) {
-            let mut share = Share { weight: 0.0f32, power: 0.0f32 };
+            let mut terms = PixelTerms { blend_weight: 0.0f32, v_power: 0.0f32 };
             if j < rest {
                 let index = rest - 1 - j;
-                if (index as u32) < taken {
+                if (index as u32) < list_end {
                     let entry = lists.entries[start + index] as usize;
                     let splat = Splat::load(splats, entry);
                     let w = offset(&splat, pixel.x, pixel.y);
-                    let full = weight(&splat, &w);
-                    if full.min(uniforms.max_alpha) >= comptime!(MIN_ALPHA) {
+                    let alpha = unclamped_alpha(&splat, &w);
+                    if alpha.min(uniforms.max_alpha) >= comptime!(MIN_ALPHA) {
                         let mut e = 0.0f32;
                         if comptime!(shape) {
                             let color = load3(colors, entry % uniforms.n * 3);
@@ -130,39 +138,39 @@ pub fn pixels(
                                 e += splat.depth * own.depth;
                             }
                         }
-                        share = behind.take_off(full, e, uniforms.max_alpha);
+                        terms = visit.step_past(alpha, e, uniforms.max_alpha);
                     }
                 }
             }
-            weights[j * comptime!(UNITS) + unit] = share.weight;
+            blend_weights[j * comptime!(UNITS) + unit] = terms.blend_weight;
             if comptime!(shape) {
-                powers[j * comptime!(UNITS) + unit] = share.power;
+                v_powers[j * comptime!(UNITS) + unit] = terms.v_power;
             }
         }
         sync_cube();
 
-        // The same splats: SHARERS units each, a share of the pixels per unit.
-        let visitor = unit / comptime!(SHARERS);
+        // Step 2: SHARERS units for each of the same splats, SHARE pixels for each unit.
+        let in_round = unit / comptime!(SHARERS);
         let mut gradient = SplatGradient::zero();
-        if visitor < rest {
-            let splat = Splat::load(splats, lists.entries[start + rest - 1 - visitor] as usize);
-            let first = visitor * comptime!(UNITS);
+        if in_round < rest {
+            let splat = Splat::load(splats, lists.entries[start + rest - 1 - in_round] as usize);
+            let first = in_round * comptime!(UNITS);
             for i in 0..comptime!(SHARE) {
                 let at = i * comptime!(SHARERS) + unit % comptime!(SHARERS);
-                let mut power = 0.0f32;
+                let mut v_power = 0.0f32;
                 if comptime!(shape) {
-                    power = powers[first + at];
+                    v_power = v_powers[first + at];
                 }
                 let other = pixel_of_unit(at as u32, uniforms);
                 let w = offset(&splat, other.x, other.y);
-                add_pixel(&mut gradient, weights[first + at], power, &w, &upstreams, at, record);
+                add_pixel(&mut gradient, blend_weights[first + at], v_power, &w, &upstreams, at, record);
             }
             gradient.opacity /= splat.opacity;
         }
         gradient.store(&mut sums, unit, UNITS, record);
         sync_cube();
 
-        // One unit per number of the records.
+        // Step 3: one unit per number of the records.
         let len = comptime!(record.len());
         if unit < comptime!(ROUND * record.len()) {
             let splat = unit / len;
@@ -183,26 +191,26 @@ pub fn pixels(
 #[cube]
 fn add_pixel(
     gradient: &mut SplatGradient,
-    weight: f32,
-    power: f32,
+    blend_weight: f32,
+    v_power: f32,
     w: &Offset,
     upstreams: &[f32],
     at: usize,
     #[comptime] record: Record,
 ) {
     if comptime!(record.colors) {
-        gradient.color.x += weight * upstreams[at];
-        gradient.color.y += weight * upstreams[comptime!(UNITS) + at];
-        gradient.color.z += weight * upstreams[comptime!(2 * UNITS) + at];
+        gradient.color.x += blend_weight * upstreams[at];
+        gradient.color.y += blend_weight * upstreams[comptime!(UNITS) + at];
+        gradient.color.z += blend_weight * upstreams[comptime!(2 * UNITS) + at];
     }
     if comptime!(record.depth) {
-        gradient.footprint.depth += weight * upstreams[comptime!(3 * UNITS) + at];
+        gradient.footprint.depth += blend_weight * upstreams[comptime!(3 * UNITS) + at];
     }
     if comptime!(record.opacities) {
-        gradient.opacity += power;
+        gradient.opacity += v_power;
     }
     if comptime!(record.geometry) {
-        gradient.add_shape(power, w);
+        gradient.add_shape(v_power, w);
     }
 }
 
@@ -240,7 +248,7 @@ fn largest(value: u32) -> u32 {
     workgroup_uniform_load(&values[0])
 }
 
-/// Zeros for the entries from `first` to `end`, which no pixel took.
+/// Zeros for the entries from `first` to `end`, which no pixel blended.
 #[cube]
 fn clear(records: &mut [f32], slots: &[u32], first: usize, end: usize, #[comptime] record: Record) {
     let len = comptime!(record.len());
@@ -292,15 +300,15 @@ pub fn gather(
                 sums.add(records, slot as usize * comptime!(record.len()), record);
             }
             add3(&mut v_color, &sums.color);
-            let mut v_visible = sums.opacity;
+            let mut v_opacity_here = sums.opacity;
             if comptime!(record.geometry || antialiased) {
                 let view = load_view(views, index);
                 let t = to_camera(&view, &gaussian.mean);
                 let p = project(&view, &t, &gaussian.rotation, &gaussian.scale, uniforms.blur);
                 let mut v_compensation = 0.0f32;
                 if comptime!(antialiased) {
-                    v_compensation = v_visible * gaussian.opacity;
-                    v_visible *= footprint(&view, &p).compensation;
+                    v_compensation = v_opacity_here * gaussian.opacity;
+                    v_opacity_here *= footprint(&view, &p).compensation;
                 }
                 if comptime!(record.geometry) {
                     let v = project_vjp(&view, &p, &gaussian.scale, &sums.footprint, v_compensation);
@@ -312,10 +320,11 @@ pub fn gather(
                     add3(&mut total.scale, &v.scale);
                 }
             }
-            v_opacity += v_visible;
+            v_opacity += v_opacity_here;
         }
     }
-    if comptime!(record.colors) {
+    // Records may have opacities for the geometry's sake alone.
+    if comptime!(wanted.colors) {
         store3(v_colors, 3 * g, &v_color);
     }
     if comptime!(wanted.opacities) {

@@ -4,7 +4,7 @@ use cubecl::prelude::*;
 
 use super::channels;
 use crate::linear::{Vec3, load3, store3};
-use crate::op::splat::{SPLAT, Splat, Uniforms, offset, weight};
+use crate::op::splat::{SPLAT, Splat, Uniforms, offset, unclamped_alpha};
 use crate::options::{MIN_ALPHA, MIN_TRANSMITTANCE, TILE};
 
 /// Units of a cube: the pixels of a tile.
@@ -103,7 +103,7 @@ pub fn blend(
         while i < count && open {
             let splat = Splat::load(&batch_splats, i);
             let w = offset(&splat, pixel.x, pixel.y);
-            let alpha = weight(&splat, &w).min(uniforms.max_alpha);
+            let alpha = unclamped_alpha(&splat, &w).min(uniforms.max_alpha);
             if alpha >= comptime!(MIN_ALPHA) {
                 let next = t * (1.0 - alpha);
                 if next < comptime!(MIN_TRANSMITTANCE) {
