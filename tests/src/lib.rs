@@ -36,7 +36,7 @@ decay_all = false
 rate = 1e-2
 [schedule]
 kind = "cosine"
-warm_up = 4
+warm_up = 2
 end = 0.01
 [stage2]
 alpha_weight = 0.5

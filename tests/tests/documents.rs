@@ -163,6 +163,7 @@ fn less(words: &[String]) -> Words {
         "train-stage1" | "train-stage2" => {
             for key in [
                 "training.steps=1",
+                "schedule.warm_up=0",
                 "training.validate_every=1",
                 "training.validation_samples=1",
                 "training.checkpoint_every=1",

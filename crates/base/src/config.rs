@@ -1,5 +1,6 @@
 //! TOML configs: a file, the file that it `extends`, and assignments on top.
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Display;
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
@@ -99,6 +100,37 @@ pub fn outside<T: PartialOrd + Display>(
 ) -> Option<(&'static str, String)> {
     let (key, value, range) = values.into_iter().find(|(_, value, range)| !range.contains(value))?;
     Some((key, format!("is {value}, must be {} to {}", range.start(), range.end())))
+}
+
+/// The keys of a serialisable value, dotted, each with its value as TOML.
+///
+/// # Panics
+/// For a value that is no TOML table.
+pub fn keys(value: &impl Serialize) -> BTreeMap<String, String> {
+    fn flatten(before: &str, table: &Table, keys: &mut BTreeMap<String, String>) {
+        for (key, value) in table {
+            match value {
+                Value::Table(table) => flatten(&format!("{before}{key}."), table, keys),
+                value => drop(keys.insert(format!("{before}{key}"), value.to_string())),
+            }
+        }
+    }
+    let mut keys = BTreeMap::new();
+    flatten("", &Table::try_from(value).expect("a table"), &mut keys);
+    keys
+}
+
+/// The keys that differ, each with a message that states both values.
+pub fn differences(
+    there: &BTreeMap<String, String>,
+    wanted: &BTreeMap<String, String>,
+) -> Vec<(String, String)> {
+    let value = |of: &BTreeMap<String, String>, key: &str| of.get(key).map_or("unset".into(), String::clone);
+    let all: BTreeSet<&String> = there.keys().chain(wanted.keys()).collect();
+    let differing = all.into_iter().filter(|key| there.get(*key) != wanted.get(*key));
+    let message =
+        |key: &String| format!("`{key}` is {} there, not {}", value(there, key), value(wanted, key));
+    differing.map(|key| (key.clone(), message(key))).collect()
 }
 
 fn syntax(origin: &str, message: String) -> ConfigError {

@@ -5,19 +5,33 @@ use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 
 use burn::tensor::Device;
+use serde::{Deserialize, Serialize};
 use snapsnap_base::FileError;
-use snapsnap_net::weights::{Source, WeightsError, write_tensors};
+use snapsnap_net::weights::{Source, WeightsError, not_finite, write_tensors};
 use snapsnap_ops::host;
 
+use crate::identity::Identity;
 use crate::learner::{Learner, Progress};
 use crate::networks::{Rows, row};
 use crate::task::Task;
 
-/// Metadata key of the progress, as JSON.
-const PROGRESS_KEY: &str = "snapsnap.training";
+/// Metadata key of the record, as JSON.
+const RECORD_KEY: &str = "snapsnap.training";
+
+/// The metadata of a state. One key, since the order of several keys in a file is random.
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Record {
+    progress: Progress,
+    run: Identity,
+}
 
 /// Writes the state of a run. After an error, the former file stays.
-pub(crate) fn save<T: Task>(path: &Path, learner: &Learner<T>) -> Result<(), WeightsError> {
+pub(crate) fn save<T: Task>(
+    path: &Path,
+    learner: &Learner<T>,
+    identity: &Identity,
+) -> Result<(), WeightsError> {
     let (mut rows, times) = learner.optimizer.record();
     let progress = Progress { times, ..learner.progress.clone() };
     let mut add = |kind: &str, new: Rows| {
@@ -27,8 +41,9 @@ pub(crate) fn save<T: Task>(path: &Path, learner: &Learner<T>) -> Result<(), Wei
     if let Some(average) = &learner.average {
         add("average", average.rows.clone());
     }
-    let text = serde_json::to_string(&progress).expect("plain numbers");
-    let metadata = HashMap::from([(PROGRESS_KEY.to_owned(), text)]);
+    let record = Record { progress, run: identity.clone() };
+    let text = serde_json::to_string(&record).expect("plain numbers and text");
+    let metadata = HashMap::from([(RECORD_KEY.to_owned(), text)]);
     let names = rows.iter().map(|(name, row)| (name.clone(), row.dims().to_vec())).collect();
     // One copy on the host at a time.
     let rows: Vec<_> = rows.into_values().collect();
@@ -36,21 +51,22 @@ pub(crate) fn save<T: Task>(path: &Path, learner: &Learner<T>) -> Result<(), Wei
     write_tensors(path, "the state of the training", metadata, names, values, &|_, _| ())
 }
 
-/// Restores a learner of the same config from the state of a run.
+/// Restores a learner of the same networks from the state of a run, and returns the run's identity.
 pub(crate) fn load<T: Task>(
     path: &Path,
     learner: &mut Learner<T>,
     device: &Device,
-) -> Result<(), WeightsError> {
+) -> Result<Identity, WeightsError> {
     let wrong = |message: String| WeightsError::from(FileError::unsuitable(path, message));
     let source = Source::open(path)?;
-    let text = source.metadata.get(PROGRESS_KEY).ok_or_else(|| wrong("is no state of a training".into()))?;
-    let progress: Progress = serde_json::from_str(text).map_err(|e| wrong(format!("{PROGRESS_KEY}: {e}")))?;
+    let text = source.metadata.get(RECORD_KEY).ok_or_else(|| wrong("is no state of a training".into()))?;
+    let Record { progress, run } =
+        serde_json::from_str(text).map_err(|e| wrong(format!("{RECORD_KEY}: {e}")))?;
     if progress.stage != T::STAGE {
         return Err(wrong(format!("is of stage {}, not of stage {}", progress.stage, T::STAGE)));
     }
     if progress.loss_scale.is_some_and(|scale| !scale.is_sound()) {
-        return Err(wrong(format!("{PROGRESS_KEY}: loss_scale is out of range")));
+        return Err(wrong(format!("{RECORD_KEY}: loss_scale is out of range")));
     }
     let read = |name: &String| Ok((name.clone(), source.read_f32(name)?));
     let mut rows = source.tensors().keys().map(read).collect::<Result<BTreeMap<_, _>, WeightsError>>()?;
@@ -59,6 +75,9 @@ pub(crate) fn load<T: Task>(
         let shape = key.split_once('/').and_then(|(_, name)| shapes.get(name));
         if shape.is_none_or(|shape| shape.iter().product::<usize>() != values.len()) {
             return Err(wrong(format!("{key} does not fit the configured networks")));
+        }
+        if let Some(problem) = not_finite(key, values) {
+            return Err(wrong(problem));
         }
     }
     let mut take = |kind: &str| -> Result<Rows, WeightsError> {
@@ -76,5 +95,5 @@ pub(crate) fn load<T: Task>(
     learner.networks = std::mem::take(&mut learner.networks).with_rows(&weights);
     learner.optimizer.restore(&learner.networks, &mut rows, &progress.times, device);
     learner.progress = progress;
-    Ok(())
+    Ok(run)
 }

@@ -306,7 +306,7 @@ impl TrainConfig {
         if let Some((key, message)) = self.optimizer.problem() {
             return Some((format!("optimizer.{key}"), message));
         }
-        self.schedule.problem().map(|(key, message)| (format!("schedule.{key}"), message))
+        self.schedule.problem(t.steps).map(|(key, message)| (format!("schedule.{key}"), message))
     }
 }
 

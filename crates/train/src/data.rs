@@ -13,6 +13,7 @@ use crate::config::{TrainConfig, ValidationSplit};
 
 /// The samples of a training and of its validations, from all data sets.
 pub struct Data<I> {
+    pub(crate) folders: Vec<Arc<Folder>>,
     training: Vec<Stage<I>>,
     /// Samples that are the same in every validation, from the data sets with the configured split.
     validation: ComposedDataset<Stage<I>>,
@@ -59,7 +60,7 @@ impl<I: Clone + Send + Sync + 'static> Data<I> {
         let sets = there.into_iter().map(|folder| new(folder.clone(), wanted, fixed.clone()));
         let validation = ComposedDataset::new(sets.collect::<Result<_, _>>()?);
         let count = wished.min(validation.len());
-        Ok(Self { training, validation, count })
+        Ok(Self { folders: folders.to_vec(), training, validation, count })
     }
 
     /// The samples of a pass over the data. Each pass has its own random choices.

@@ -7,6 +7,7 @@ mod ema;
 mod error;
 mod events;
 pub mod gradients;
+mod identity;
 mod learner;
 pub mod log;
 pub mod networks;

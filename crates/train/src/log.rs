@@ -11,6 +11,10 @@ use snapsnap_base::{FileError, file};
 
 use crate::events::Events;
 
+/// Name of the log's file.
+pub const NAME: &str = "log.jsonl";
+/// Name of TensorBoard's file.
+pub const EVENTS: &str = "events.out.tfevents.snapsnap";
 /// Longest log that is read, in bytes.
 const MOST_BYTES: u64 = 1 << 30;
 
@@ -42,7 +46,7 @@ impl Log {
     /// # Errors
     /// [`FileError`] if a file cannot be read or written.
     pub fn open(folder: &Path, step: u64) -> Result<Self, FileError> {
-        let path = folder.join("log.jsonl");
+        let path = folder.join(NAME);
         let (mut lines, mut kept) = (Vec::new(), String::new());
         if step > 0 && path.exists() {
             let text = file::read_text(&path, MOST_BYTES).map_err(FileError::read(&path))?;
@@ -56,7 +60,7 @@ impl Log {
         }
         file::write_whole(&path, |out| out.write_all(kept.as_bytes())).map_err(FileError::write(&path))?;
         let appended = OpenOptions::new().append(true).open(&path).map_err(FileError::write(&path))?;
-        let events_path = folder.join("events.out.tfevents.snapsnap");
+        let events_path = folder.join(EVENTS);
         let mut events = Events::create(&events_path).map_err(FileError::write(&events_path))?;
         for line in &lines {
             events.add(line.step, &line.values).map_err(FileError::write(&events_path))?;

@@ -16,8 +16,9 @@ use snapsnap_net::weights;
 use crate::TrainError;
 use crate::checkpoint;
 use crate::config::TrainConfig;
+use crate::identity::Identity;
 use crate::learner::Learner;
-use crate::log::{Line, Log};
+use crate::log::{self, Line, Log};
 use crate::networks::Networks;
 use crate::task::{Task, Validation};
 
@@ -33,6 +34,13 @@ pub const LAST: &str = "last.safetensors";
 /// Weights of the best validation.
 pub const BEST: &str = "best.safetensors";
 
+/// Curves of the loss and of the validations.
+pub const CURVES: &str = "curves.svg";
+/// Folder of previews.
+pub const PREVIEWS: &str = "previews";
+/// Files of a run besides its state.
+pub const FILES: [&str; 6] = [BEST, LAST, CONFIG, CURVES, log::NAME, log::EVENTS];
+
 /// Settings of a session.
 pub struct Options<'a> {
     /// The run's folder. It must exist.
@@ -43,6 +51,8 @@ pub struct Options<'a> {
     pub limit: Option<Duration>,
     /// Flag that ends the session.
     pub stop: &'a AtomicBool,
+    /// Continue a run although other settings, data or predictors than its own are given.
+    pub force: bool,
 }
 
 /// Receiver of a run's events.
@@ -93,6 +103,11 @@ pub fn train<T: Task>(
         session.finish()?;
     }
     let progress = &session.learner.progress;
+    // Nothing was learned.
+    if progress.step >= steps && progress.skipped == progress.step {
+        let why = session.skipped.take().unwrap_or_else(|| "of an earlier session's errors".into());
+        return Err(TrainError::Stuck { count: progress.skipped, step: progress.step - 1, why });
+    }
     Ok(Outcome {
         step: progress.step,
         finished: progress.step >= steps,
@@ -153,6 +168,9 @@ struct Session<'a, T: Task> {
     watch: &'a mut dyn Watch,
     start: Instant,
     log: Log,
+    identity: Identity,
+    /// Why the last skipped step was skipped.
+    skipped: Option<String>,
     /// Seconds of earlier sessions.
     before: f64,
     /// Time and step of the last line of the log.
@@ -169,8 +187,13 @@ impl<'a, T: Task> Session<'a, T> {
     ) -> Result<Self, TrainError> {
         let mut learner = Learner::new(task, config, networks, options.devices);
         let state = options.folder.join(STATE);
-        if state.exists() {
-            checkpoint::load(&state, &mut learner, &options.devices[0].clone().inner())?;
+        let identity = Identity::of(task, config)?;
+        let is_begun = state.exists();
+        if is_begun {
+            let there = checkpoint::load(&state, &mut learner, &options.devices[0].clone().inner())?;
+            if let Some(refusal) = identity.refusal(&there, options.force) {
+                return Err(FileError::unsuitable(&state, refusal).into());
+            }
         }
         // The config is written after the state was loaded, which proves that it fits the run.
         let path = options.folder.join(CONFIG);
@@ -179,9 +202,23 @@ impl<'a, T: Task> Session<'a, T> {
             file::write_whole(&path, |out| out.write_all(text.as_bytes()))
                 .map_err(FileError::write(&path))?;
         }
+        // From the first state on, the folder is known to be this run's.
+        if !is_begun {
+            save_state(&state, &learner, &identity)?;
+        }
         let log = Log::open(options.folder, learner.progress.step)?;
         let (before, now, step) = (log.seconds(), Instant::now(), learner.progress.step);
-        Ok(Self { learner, options, watch, start: now, log, before, logged: (now, step) })
+        Ok(Self {
+            learner,
+            options,
+            watch,
+            start: now,
+            log,
+            identity,
+            skipped: None,
+            before,
+            logged: (now, step),
+        })
     }
 
     fn is_over(&self) -> bool {
@@ -209,6 +246,7 @@ impl<'a, T: Task> Session<'a, T> {
                 if self.learner.progress.skipped_in_a_row >= MAX_FAILURES {
                     return Err(TrainError::Stuck { count: MAX_FAILURES, step, why });
                 }
+                self.skipped = Some(why);
             }
         }
         if now >= t.steps as u64 {
@@ -281,13 +319,13 @@ impl<'a, T: Task> Session<'a, T> {
 
     fn write(&self, networks: &Networks, name: &str) -> Result<(), TrainError> {
         let mut values = networks.checkpoint();
-        values.extend(self.learner.task.frozen(networks));
+        values.extend(self.learner.task.frozen());
         Ok(weights::save(&self.learner.config.networks(), &values, &self.options.folder.join(name))?)
     }
 
     fn preview(&mut self) -> Result<(), TrainError> {
         let Some(sheet) = self.learner.task.preview(&self.learner.averaged())? else { return Ok(()) };
-        let folder = self.options.folder.join("previews");
+        let folder = self.options.folder.join(PREVIEWS);
         fs::create_dir_all(&folder).map_err(FileError::write(&folder))?;
         let path = folder.join(format!("{:07}.png", self.learner.progress.step));
         Ok(preview::write_png(&path, &sheet)?)
@@ -296,13 +334,16 @@ impl<'a, T: Task> Session<'a, T> {
     /// Writes weights, state and curves. Weights are first, so that every state has its weights.
     fn save(&mut self) -> Result<(), TrainError> {
         self.write(&self.learner.averaged(), LAST)?;
-        let path = self.options.folder.join(STATE);
-        let folder = path.parent().expect("lies in a folder");
-        fs::create_dir_all(folder).map_err(FileError::write(folder))?;
-        checkpoint::save(&path, &self.learner)?;
-        let (path, svg) = (self.options.folder.join("curves.svg"), self.log.curves());
+        save_state(&self.options.folder.join(STATE), &self.learner, &self.identity)?;
+        let (path, svg) = (self.options.folder.join(CURVES), self.log.curves());
         Ok(file::write_whole(&path, |out| out.write_all(svg.as_bytes())).map_err(FileError::write(&path))?)
     }
+}
+
+fn save_state<T: Task>(path: &Path, learner: &Learner<T>, identity: &Identity) -> Result<(), TrainError> {
+    let folder = path.parent().expect("lies in a folder");
+    fs::create_dir_all(folder).map_err(FileError::write(folder))?;
+    Ok(checkpoint::save(path, learner, identity)?)
 }
 
 /// Runs `work` on the best thread for its devices. For the CPU it is one of rayon's threads, since other threads hand

@@ -38,14 +38,17 @@ impl Default for Schedule {
 }
 
 impl Schedule {
-    /// The first key that makes no sense, and why.
-    pub fn problem(&self) -> Option<(&'static str, String)> {
+    /// The first key that makes no sense in a run of `steps`, and why.
+    pub fn problem(&self, steps: usize) -> Option<(&'static str, String)> {
         match *self {
             Self::OneCycle { rise, start_divisor, end_divisor, .. } => outside([
                 ("rise", rise, 0.0..=1.0),
                 ("start_divisor", start_divisor, 1.0..=1e12),
                 ("end_divisor", end_divisor, 1.0..=1e12),
             ]),
+            Self::Cosine { warm_up, .. } if warm_up > steps => {
+                Some(("warm_up", format!("is {warm_up}, must be at most `training.steps` ({steps})")))
+            }
             Self::Cosine { end, .. } => outside([("end", end, 0.0..=1.0)]),
         }
     }

@@ -89,7 +89,7 @@ pub trait Task: Sync {
     }
 
     /// Frozen weights that are written beside the trained ones, in the layout of checkpoints.
-    fn frozen(&self, _networks: &Networks) -> BTreeMap<String, Vec<f32>> {
+    fn frozen(&self) -> BTreeMap<String, Vec<f32>> {
         BTreeMap::new()
     }
 }

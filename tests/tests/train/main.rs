@@ -63,3 +63,15 @@ fn logged(run: &Path, name: &str) -> Vec<(u64, f64)> {
     let value = |line: serde_json::Value| Some((line["step"].as_u64()?, line["values"][name].as_f64()?));
     lines.filter_map(value).collect()
 }
+
+fn copy_folder(from: &Path, to: &Path) {
+    fs::create_dir_all(to).expect("makes");
+    for entry in fs::read_dir(from).expect("lists").map(|entry| entry.expect("entry").path()) {
+        let target = to.join(entry.file_name().expect("named"));
+        if entry.is_dir() {
+            copy_folder(&entry, &target);
+        } else {
+            fs::copy(&entry, &target).expect("copies");
+        }
+    }
+}

@@ -1,10 +1,11 @@
 //! Refused settings, weights and folders.
 
 use std::fs;
+use std::path::Path;
 
 use snapsnap_tests::{refused, succeed};
 
-use super::{people, place, results, train};
+use super::{copy_folder, people, place, results, train, train_on};
 
 #[test]
 fn wrong_settings_weights_and_folders_are_refused_by_name() {
@@ -25,7 +26,10 @@ fn wrong_settings_weights_and_folders_are_refused_by_name() {
     wrong(&["--set", "network.resolution=128", "--set", "network.net_resolution=128"], &["64", "128"]);
     wrong(&["--set", "network.conf_mode=exp"], &["conf_mode", "sigmoid"]);
     wrong(&["--set", "optimizer.epsilon=0"], &["optimizer.epsilon"]);
-    wrong(&["--minutes", "0"], &["--minutes"]);
+    wrong(&["--set", "schedule.warm_up=1000000"], &["schedule.warm_up", "training.steps"]);
+    wrong(&["--set", "network.delta=1e30"], &["network.delta", "1000000"]);
+    wrong(&["--minutes", "0"], &["--minutes", "more than 0"]);
+    wrong(&["--minutes", "1e9"], &["--minutes", "at most"]);
     wrong(&["--weights", "nowhere.safetensors"], &["nowhere.safetensors"]);
     let said = refused(&mut train(2, &config, &run));
     assert!(said.contains("point predictor") && said.contains("--weights"), "{said}");
@@ -42,12 +46,6 @@ fn wrong_settings_weights_and_folders_are_refused_by_name() {
     let said = refused(train(2, &config, &run).args(["--resume"]));
     assert!(said.contains("stage 1"), "{said}");
     assert!(results(&run) == before);
-    // A folder without a state may be used again, but a run does not replace its own initial weights.
-    fs::rename(run.join("state"), run.join("elsewhere")).expect("moves");
-    let said = refused(train(2, &config, &run).arg("--weights").arg(run.join("best.safetensors")));
-    assert!(said.contains("would be replaced"), "{said}");
-    fs::rename(run.join("elsewhere"), run.join("state")).expect("moves back");
-    assert!(results(&run) == before);
     let said = refused(train(1, &config, &run.join("other")).args(["--set", "training.batch=4096"]).args([
         "--set",
         "network.resolution=4096",
@@ -55,4 +53,133 @@ fn wrong_settings_weights_and_folders_are_refused_by_name() {
         "network.net_resolution=4096",
     ]));
     assert!(said.contains("GB of memory"), "{said}");
+}
+
+/// The finished weights of a run whose state was removed, and files of the user's own.
+#[test]
+fn a_new_run_replaces_no_file() {
+    let (temporary, config) = place();
+    let run = temporary.path().join("run");
+    succeed(train(1, &config, &run).arg("--set=training.steps=2"));
+    fs::remove_dir_all(run.join("state")).expect("removes");
+    let all = || {
+        let mut files: Vec<_> =
+            fs::read_dir(&run).expect("lists").map(|e| e.expect("entry").path()).collect();
+        files.sort();
+        files.into_iter().map(|path| (fs::read(&path).unwrap_or_default(), path)).collect::<Vec<_>>()
+    };
+    let before = all();
+    for arguments in [&["--set=training.steps=2"][..], &["--resume"]] {
+        let said = refused(train(1, &config, &run).args(arguments));
+        assert!(said.contains("best.safetensors") && said.contains("would be replaced"), "{said}");
+        assert!(all() == before);
+    }
+    for name in ["log.jsonl", "curves.svg", "config.toml", "previews/1.png"] {
+        let own = temporary.path().join(name.replace('/', "-"));
+        fs::create_dir_all(own.join("previews")).expect("makes");
+        fs::write(own.join(name), "the user's own").expect("writes");
+        let said = refused(&mut train(1, &config, &own));
+        assert!(said.contains("would be replaced"), "{said}");
+        assert_eq!(fs::read_to_string(own.join(name)).expect("reads"), "the user's own");
+        assert!(!own.join("lock").exists(), "a refused start leaves nothing");
+    }
+}
+
+#[cfg(unix)]
+#[test]
+fn links_and_pipes_in_a_run_are_refused() {
+    let (temporary, config) = place();
+    let run = temporary.path().join("run");
+    succeed(train(1, &config, &run).arg("--set=training.steps=2"));
+    let other = temporary.path().join("other.txt");
+    fs::write(&other, "the user's own").expect("writes");
+    fs::remove_file(run.join("log.jsonl")).expect("removes");
+    std::os::unix::fs::symlink(&other, run.join("log.jsonl")).expect("links");
+    let said = refused(train(1, &config, &run).arg("--resume"));
+    assert!(said.contains("log.jsonl: is a link"), "{said}");
+    assert_eq!(fs::read_to_string(&other).expect("reads"), "the user's own");
+    let piped = temporary.path().join("piped");
+    fs::create_dir(&piped).expect("makes");
+    assert!(std::process::Command::new("mkfifo").arg(piped.join("lock")).status().expect("mkfifo").success());
+    let said = refused(&mut train(1, &config, &piped));
+    assert!(said.contains("lock: is no regular file"), "{said}");
+}
+
+#[test]
+fn a_refused_start_leaves_no_folder() {
+    let (temporary, config) = place();
+    let run = temporary.path().join("a/b/run");
+    let start = temporary.path().join("start.safetensors");
+    fs::write(&start, "no weights").expect("writes");
+    refused(train(1, &config, &run).arg("--weights").arg(&start));
+    assert!(!temporary.path().join("a").exists());
+}
+
+#[test]
+fn a_run_is_continued_only_as_itself() {
+    let (temporary, config) = place();
+    let run = temporary.path().join("run");
+    succeed(train(1, &config, &run).arg("--set=training.steps=2"));
+    let before = results(&run);
+    let resumed = |data: &Path, arguments: &[&str]| {
+        let mut command = train_on(data, 1, &config, &run);
+        command.args(["--resume", "--set=training.steps=3"]).args(arguments);
+        command
+    };
+    for key in ["training.seed=9", "training.batch=1", "optimizer.rate=1e-5"] {
+        let said = refused(&mut resumed(people(), &["--set", key]));
+        let name = key.split('=').next().expect("a key");
+        assert!(said.contains(name) && said.contains("--force"), "{said}");
+        assert!(results(&run) == before);
+    }
+    // A copy of the data set is the same. A copy with another picture is not.
+    let copy = temporary.path().join("copy");
+    copy_folder(people(), &copy);
+    let subject = fs::read_dir(copy.join("train/img")).expect("lists").next().expect("one").expect("entry");
+    let picture = subject.path().join("0.png");
+    let mut pixels = image::open(&picture).expect("reads").to_rgba8();
+    pixels.get_pixel_mut(30, 30).0[0] ^= 1;
+    pixels.save(&picture).expect("writes");
+    let said = refused(&mut resumed(&copy, &[]));
+    assert!(said.contains("the data sets have other content"), "{said}");
+    // Another run's state.
+    let other = temporary.path().join("other");
+    succeed(train(1, &config, &other).args(["--set=training.steps=2", "--set=training.seed=8"]));
+    fs::copy(other.join("state/state.safetensors"), run.join("state/state.safetensors")).expect("copies");
+    let said = refused(&mut resumed(people(), &[]));
+    assert!(said.contains("`training.seed` is 8 there"), "{said}");
+    succeed(&mut resumed(people(), &["--force"]));
+}
+
+#[test]
+fn stage_2_continues_with_its_own_predictor_only() {
+    let (temporary, config) = place();
+    let starts = ["one", "two"].map(|name| temporary.path().join(name));
+    for (i, start) in starts.iter().enumerate() {
+        let seed = format!("--set=training.seed={i}");
+        succeed(train(1, &config, start).args(["--set=training.steps=2", &seed]));
+    }
+    let run = temporary.path().join("run");
+    let weights = |i: usize| starts[i].join("last.safetensors");
+    succeed(train(2, &config, &run).arg("--set=training.steps=2").arg("--weights").arg(weights(0)));
+    fs::copy(weights(1), run.join("last.safetensors")).expect("copies");
+    let said = refused(train(2, &config, &run).args(["--resume", "--set=training.steps=3"]));
+    assert!(said.contains("the frozen point predictor has other weights"), "{said}");
+}
+
+/// Weights of 1e30 make every loss infinite: no step is made, and nothing is recommended.
+#[test]
+fn a_training_without_a_single_step_fails() {
+    let (temporary, config) = place();
+    let (one, start) = (temporary.path().join("one"), temporary.path().join("start.safetensors"));
+    succeed(train(1, &config, &one).arg("--set=training.steps=2"));
+    let mut file = fs::read(one.join("last.safetensors")).expect("reads");
+    let header = 8 + u64::from_le_bytes(file[..8].try_into().expect("eight bytes")) as usize;
+    file[header..].chunks_exact_mut(4).for_each(|value| value.copy_from_slice(&1e30_f32.to_le_bytes()));
+    fs::write(&start, file).expect("writes");
+    let mut command = train(2, &config, &temporary.path().join("run"));
+    let output = command.arg("--set=training.steps=3").arg("--weights").arg(&start).output().expect("runs");
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(said.contains("could not be made") && !String::from_utf8_lossy(&output.stdout).contains("next:"));
 }

@@ -1,11 +1,11 @@
 //! Samples that cannot be read or do not show a person cost steps or validations, not the run.
 
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use snapsnap_tests::{refused, succeed};
 
-use super::{logged, people, place, results, train, train_on};
+use super::{copy_folder, logged, people, place, results, train, train_on};
 
 #[test]
 fn a_broken_sample_is_skipped_and_named_and_twenty_in_a_row_end_the_run() {
@@ -68,22 +68,12 @@ fn failed_validations_cost_no_step() {
     assert_eq!(logged(&run, "loss").len(), 40);
     assert!(logged(&run, "validation/points_mm").is_empty() && !run.join("best.safetensors").exists());
     pictures.iter().zip(&sound).for_each(|(path, bytes)| fs::write(path, bytes).expect("writes"));
-    succeed(&mut train());
+    let said = refused(&mut train());
+    assert!(said.contains("the data sets have other content"), "{said}");
+    succeed(train().arg("--force"));
     assert_eq!(logged(&run, "validation/points_mm").len(), 1);
     assert!(run.join("best.safetensors").exists() && run.join("previews/0000040.png").exists());
     let before = results(&run);
     succeed(&mut train());
     assert!(results(&run) == before);
-}
-
-fn copy_folder(from: &Path, to: &Path) {
-    fs::create_dir_all(to).expect("makes");
-    for entry in fs::read_dir(from).expect("lists").map(|entry| entry.expect("entry").path()) {
-        let target = to.join(entry.file_name().expect("named"));
-        if entry.is_dir() {
-            copy_folder(&entry, &target);
-        } else {
-            fs::copy(&entry, &target).expect("copies");
-        }
-    }
 }

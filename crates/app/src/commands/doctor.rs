@@ -126,7 +126,9 @@ fn chosen(devices: &[Found]) -> (String, &'static str) {
 
 fn weights_found(arguments: &Arguments) -> Vec<Weights> {
     let open = |path: Option<&Path>, name: String| {
-        let opened = weights::open(path, &ConfigArguments::default()).map(|file| {
+        let checked = weights::open(path, &ConfigArguments::default())
+            .and_then(|file| file.check_values().map(|()| file).map_err(Failure::from));
+        let opened = checked.map(|file| {
             let (millions, side) = (file.parameters() as f64 / 1e6, file.config.network.resolution);
             format!("{millions:.1} million parameters, canvas of {side}²")
         });

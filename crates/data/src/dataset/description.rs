@@ -1,13 +1,12 @@
 //! The description of a data set, `dataset.toml`.
 
-use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
 use crate::JitterConfig;
-use snapsnap_base::config::outside;
+use snapsnap_base::config::{self, outside};
 use snapsnap_base::{FileError, file};
 
 /// Name of the description's file.
@@ -157,26 +156,6 @@ pub fn read(path: &Path) -> Result<Description, FileError> {
 
 /// Differences between two descriptions, key by key.
 pub fn differences(there: &Description, wanted: &Description) -> String {
-    let keys = |d: &Description| {
-        let table = toml::Table::try_from(d).expect("the description has only TOML types");
-        let mut keys = BTreeMap::new();
-        flatten("", &table, &mut keys);
-        keys
-    };
-    let (there, wanted) = (keys(there), keys(wanted));
-    let all: BTreeSet<&String> = there.keys().chain(wanted.keys()).collect();
-    let value = |of: &BTreeMap<String, String>, key: &str| of.get(key).map_or("unset".into(), String::clone);
-    let differing = all.into_iter().filter(|key| there.get(*key) != wanted.get(*key));
-    let messages =
-        differing.map(|key| format!("`{key}` is {} there, not {}", value(&there, key), value(&wanted, key)));
-    messages.collect::<Vec<_>>().join(", ")
-}
-
-fn flatten(before: &str, table: &toml::Table, keys: &mut BTreeMap<String, String>) {
-    for (key, value) in table {
-        match value {
-            toml::Value::Table(table) => flatten(&format!("{before}{key}."), table, keys),
-            value => drop(keys.insert(format!("{before}{key}"), value.to_string())),
-        }
-    }
+    let messages = config::differences(&config::keys(there), &config::keys(wanted));
+    messages.into_iter().map(|(_, message)| message).collect::<Vec<_>>().join(", ")
 }

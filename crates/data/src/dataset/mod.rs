@@ -18,6 +18,7 @@ mod agree;
 mod check;
 mod description;
 mod files;
+mod fingerprint;
 #[cfg(test)]
 mod tests;
 mod write;

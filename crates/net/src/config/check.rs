@@ -95,9 +95,8 @@ impl Config {
         if n.conf_threshold.is_nan() {
             return refuse("network.conf_threshold", "is not a number".into());
         }
-        if !(n.delta as f32).is_normal() {
-            let message = format!("is {}, which as f32 is zero, tiny or infinite", n.delta);
-            return refuse("network.delta", message);
+        if let Some((key, message)) = outside([("network.delta", n.delta, 1e-6..=1e6)]) {
+            return refuse(key, message);
         }
         if r.networks == 2 && !n.side_heads {
             let message = "is 2, but `network.side_heads = false` leaves the second unused";

@@ -7,6 +7,7 @@ use std::path::Path;
 use rayon::prelude::*;
 use safetensors::tensor::{Metadata, TensorInfo};
 use snapsnap_base::FileError;
+use snapsnap_base::config::{differences, keys};
 use snapsnap_base::file::write_whole;
 
 use super::WeightsError;
@@ -17,6 +18,8 @@ use crate::config::{Config, Schema};
 /// Called with the number of bytes written and their total.
 pub type Progress<'a> = &'a dyn Fn(u64, u64);
 
+/// Largest number of keys that a message names.
+const MAX_DIFFERENCES: usize = 3;
 /// Values per task: a second-level cache holds them.
 const CHUNK: usize = 1 << 16;
 
@@ -181,11 +184,34 @@ impl WeightFile {
         let names: BTreeSet<_> = expected.iter().map(|t| t.name.as_str()).collect();
         let unused = source.tensors().keys().filter(|k| !names.contains(k.as_str()));
         problems.extend(unused.map(|k| format!("not part of the configured networks: {}", k.escape_debug())));
-        let origin = path.display().to_string();
         if problems.is_empty() {
             return Ok(Self { source, config });
         }
+        // Weights of other networks say so themselves.
+        let own = source.config().map(|own| differences(&keys(&own), &keys(&config))).unwrap_or_default();
+        if !own.is_empty() {
+            let shown: Vec<String> =
+                own.into_iter().take(MAX_DIFFERENCES).map(|(_, message)| message).collect();
+            let message = format!("has weights of networks other than the config's: {}", shown.join(", "));
+            return Err(FileError::unsuitable(path, message).into());
+        }
+        let origin = path.display().to_string();
         Err(WeightsError::Tensors { origin, problems })
+    }
+
+    /// Reads every tensor, one at a time.
+    ///
+    /// # Errors
+    /// [`WeightsError`] if a read fails or a value is not finite.
+    pub fn check_values(&self) -> Result<(), WeightsError> {
+        let mut problems = Vec::new();
+        for name in self.source.tensors().keys() {
+            problems.extend(not_finite(name, &self.source.read_f32(name)?));
+        }
+        match problems.is_empty() {
+            true => Ok(()),
+            false => Err(WeightsError::Tensors { origin: self.path().display().to_string(), problems }),
+        }
     }
 
     /// The file.

@@ -22,6 +22,17 @@ pub use init::{SideHeads, init};
 pub use load::{random_predictor, random_regressors};
 pub use source::{CONFIG_KEY, Entry, Float, Source};
 
+/// The first problems, a line each, and the number of the others.
+fn listed(problems: &[String]) -> String {
+    /// Lines that are shown.
+    const SHOWN: usize = 12;
+    let shown = problems[..problems.len().min(SHOWN)].join("\n  ");
+    match problems.len().saturating_sub(SHOWN) {
+        0 => shown,
+        more => format!("{shown}\n  … and {more} more"),
+    }
+}
+
 /// Errors of weight files.
 #[derive(Debug, thiserror::Error)]
 pub enum WeightsError {
@@ -29,7 +40,7 @@ pub enum WeightsError {
     #[error(transparent)]
     File(#[from] FileError),
     /// Tensors are missing, unused, mis-shaped, of the wrong type, not finite or given twice.
-    #[error("{origin}: {} problem(s) with the weights:\n  {}", .problems.len(), .problems.join("\n  "))]
+    #[error("{origin}: {} problem(s) with the weights:\n  {}", .problems.len(), listed(.problems))]
     Tensors {
         /// File or files.
         origin: String,

@@ -74,7 +74,7 @@ fn trained<T: Task>(
 ) -> Result<(Outcome, bool), TrainError> {
     let folder = temporary()?;
     let stop = AtomicBool::new(false);
-    let options = Options { folder: folder.path(), devices, limit: None, stop: &stop };
+    let options = Options { folder: folder.path(), devices, limit: None, stop: &stop, force: false };
     let mut watch = Silent { finite: true };
     let outcome = on_best_thread(devices, || train(task, config, networks, &options, &mut watch))?;
     let weights = Source::open(&folder.path().join("last.safetensors"))?;

@@ -322,10 +322,7 @@ impl Task for GaussianTask {
         Ok(grid(&rows))
     }
 
-    fn frozen(&self, networks: &Networks) -> BTreeMap<String, Vec<f32>> {
-        match (&networks.predictor, &self.frozen) {
-            (None, Some(frozen)) => frozen.networks.checkpoint(),
-            _ => BTreeMap::new(),
-        }
+    fn frozen(&self) -> BTreeMap<String, Vec<f32>> {
+        self.frozen.as_ref().map_or_else(BTreeMap::new, |frozen| frozen.networks.checkpoint())
     }
 }

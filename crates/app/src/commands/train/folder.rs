@@ -1,18 +1,21 @@
 //! The folder of a run: its lock and its config.
 
-use std::fs::{File, TryLockError};
+use std::fs::{self, File, TryLockError};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use snapsnap_base::config::Schema;
 use snapsnap_data::dataset::Folder;
 use snapsnap_train::config::TrainConfig;
-use snapsnap_train::run::{BEST, CONFIG, LAST, STATE};
+use snapsnap_train::run::{CONFIG, FILES, PREVIEWS, STATE};
 
-use super::super::{is_same_file, outside_data};
+use super::super::outside_data;
 use super::Arguments;
 use crate::failure::Failure;
 use crate::output::make_folder;
+
+/// The file that a training process locks.
+const LOCK: &str = "lock";
 
 /// The config of --config or of the continued run, with the options of the command line.
 pub fn config(arguments: &Arguments) -> Result<TrainConfig, Failure> {
@@ -40,13 +43,17 @@ pub fn config(arguments: &Arguments) -> Result<TrainConfig, Failure> {
 /// The locked folder of a run.
 pub struct RunFolder {
     pub path: PathBuf,
+    /// Folders that were made for it, the innermost first.
+    made: Vec<PathBuf>,
+    /// Whether the file of the lock was made for it.
+    has_new_lock: bool,
     /// Locked until it is dropped.
     _lock: File,
 }
 
 impl RunFolder {
-    /// Makes or opens the folder, and locks it. Refuses runs of other networks or of other processes, and existing runs without
-    /// --resume.
+    /// Makes or opens the folder, and locks it. Refuses runs of other networks or of other processes, existing runs without
+    /// --resume, and folders in which the run would replace something.
     pub fn open(
         path: &Path,
         arguments: &Arguments,
@@ -55,39 +62,71 @@ impl RunFolder {
     ) -> Result<Self, Failure> {
         let wrong = |message: &str| Failure::file(path, message);
         outside_data(path, data.iter().map(|folder| folder.root()))?;
+        for name in FILES.iter().chain(&[LOCK, STATE]) {
+            check_kind(&path.join(name))?;
+        }
+        let missing =
+            path.ancestors().take_while(|folder| !folder.as_os_str().is_empty() && !folder.exists());
+        let made = missing.map(Path::to_owned).collect();
         make_folder(path)?;
-        let lock = path.join("lock");
+        let lock = path.join(LOCK);
+        let is_new = !lock.exists();
         let file = File::options().create(true).truncate(false).write(true).open(&lock);
         let file = file.map_err(|e| Failure::cannot_write(&lock, &e))?;
         // Some file systems have no locks. The run goes on without one.
         if matches!(file.try_lock(), Err(TryLockError::WouldBlock)) {
             return Err(wrong("is being trained by another process"));
         }
-        let own = path.join(CONFIG);
+        let folder = Self { path: path.to_owned(), made, has_new_lock: is_new, _lock: file };
         if path.join(STATE).exists() {
             if !arguments.resume {
                 return Err(wrong("contains a run: add --resume to continue it, or give another folder"));
             }
-            if TrainConfig::from_file(&own, &[])?.networks() != config.networks() {
+            if TrainConfig::from_file(&path.join(CONFIG), &[])?.networks() != config.networks() {
                 return Err(wrong(
                     "was begun with other [network], [regressor] or [mode] sections (its config.toml): give \
                      another folder",
                 ));
             }
-        } else {
-            // A run without a checkpoint may be replaced, unless the new run begins with one of its files.
-            if own.exists() {
-                TrainConfig::from_file(&own, &[])?;
-            }
-            let start = config.training.weights.as_deref().into_iter();
-            let lpips = config.stage2.lpips.iter().flat_map(|lpips| &lpips.files).map(PathBuf::as_path);
-            let outputs = [BEST, LAST, CONFIG].map(|name| path.join(name));
-            for input in start.chain(arguments.config.as_deref()).chain(lpips) {
-                if outputs.iter().any(|output| is_same_file(input, output)) {
-                    return Err(Failure::file(input, "would be replaced by the run: give another folder"));
-                }
+        } else if let Some(replaced) = replaced(path, config) {
+            let message = "would be replaced by a new run, and the folder has no state to continue from: give another \
+                           folder, or move it away";
+            return Err(Failure::file(&replaced, message));
+        }
+        Ok(folder)
+    }
+}
+
+impl Drop for RunFolder {
+    /// A run that could not begin leaves nothing.
+    fn drop(&mut self) {
+        if self.has_new_lock && !self.path.join(STATE).exists() {
+            let _ = fs::remove_file(self.path.join(LOCK));
+            for folder in &self.made {
+                let _ = fs::remove_dir(folder);
             }
         }
-        Ok(Self { path: path.to_owned(), _lock: file })
     }
+}
+
+/// Refuses a link, a pipe or a folder in place of a file of the run: a run writes only its own files.
+fn check_kind(path: &Path) -> Result<(), Failure> {
+    match fs::symlink_metadata(path) {
+        Ok(there) if there.is_symlink() => {
+            Err(Failure::file(path, "is a link; a run writes only its own files"))
+        }
+        Ok(there) if !there.is_file() => Err(Failure::file(path, "is no regular file")),
+        _ => Ok(()),
+    }
+}
+
+/// The first file of the folder that a new run would replace. Its config may be there already.
+fn replaced(folder: &Path, config: &TrainConfig) -> Option<PathBuf> {
+    let is_own = |path: &Path| fs::read(path).is_ok_and(|bytes| bytes == config.to_toml().as_bytes());
+    let mut files = FILES.map(|name| folder.join(name)).into_iter();
+    let file = files.find(|path| path.exists() && !(path.ends_with(CONFIG) && is_own(path)));
+    let previews = folder.join(PREVIEWS);
+    file.or_else(|| {
+        fs::read_dir(&previews).is_ok_and(|mut entries| entries.next().is_some()).then_some(previews)
+    })
 }

@@ -50,6 +50,9 @@ pub struct Arguments {
     /// Continue the run in this folder, or begin it.
     #[arg(long)]
     resume: bool,
+    /// With --resume: continue the run even if settings, data sets or the frozen predictor are no longer those of its state.
+    #[arg(long, requires = "resume")]
+    force: bool,
     /// Check config and data, make a few steps without writing anything, and print how long the run will take.
     #[arg(long)]
     dry_run: bool,
@@ -93,8 +96,8 @@ pub fn stage1(arguments: &Arguments) -> Result<(), Failure> {
 
 pub fn stage2(arguments: &Arguments) -> Result<(), Failure> {
     let plan = Plan::new(arguments)?;
-    // The latest weights of a continued run contain its point predictor.
-    let latest = arguments.begun().map(|run| run.join(LAST));
+    // The latest weights of a continued run contain its point predictor. Before the first checkpoint there are none.
+    let latest = arguments.begun().map(|run| run.join(LAST)).filter(|latest| latest.exists());
     let Some(start) = latest.or_else(|| plan.config.training.weights.clone()) else {
         bail!(
             "stage 2 needs a trained point predictor: give --weights FILE, as train-stage1 writes it, or \
@@ -128,8 +131,8 @@ fn open(path: &Path, config: &TrainConfig) -> Result<WeightFile, Failure> {
 
 impl<'a> Plan<'a> {
     fn new(arguments: &'a Arguments) -> Result<Self, Failure> {
-        if let Some(minutes) = arguments.minutes.filter(|minutes| !(*minutes > 0.0 && *minutes < 1e6)) {
-            bail!("--minutes {minutes}: must be more than 0");
+        if let Some(minutes) = arguments.minutes.filter(|minutes| !(*minutes > 0.0 && *minutes <= 1e6)) {
+            bail!("--minutes {minutes}: must be more than 0 and at most a million");
         }
         let mut config = folder::config(arguments)?;
         if arguments.dry_run {
@@ -189,7 +192,13 @@ impl<'a> Plan<'a> {
         let folder = RunFolder::open(path, self.arguments, &self.config, &self.folders)?;
         let limit = self.arguments.minutes.map(|minutes| Duration::from_secs_f64(60.0 * minutes));
         let stop = interrupt::patiently();
-        let options = Options { folder: &folder.path, devices: &self.devices, limit, stop };
+        let options = Options {
+            folder: &folder.path,
+            devices: &self.devices,
+            limit,
+            stop,
+            force: self.arguments.force,
+        };
         let mut reporter = Reporter::new(&self.config, limit);
         let start = Instant::now();
         let outcome = run::on_best_thread(&self.devices, || {

@@ -1,0 +1,78 @@
+//! The fingerprint of a data set, by which a continued training notices other pictures.
+
+use std::fs::{self, File};
+use std::io::{self, Read, Seek, SeekFrom};
+use std::path::{Path, PathBuf};
+
+use rayon::prelude::*;
+use sha2::{Digest, Sha256};
+use snapsnap_base::{FileError, file};
+
+use super::{Folder, Split};
+
+/// Bytes that are read at the beginning and at the end of a file. A PNG and a compressed array end with checksums of their
+/// content.
+const ENDS: u64 = 4096;
+/// Largest depth of files below a split: `img/S/v.png`.
+const MAX_DEPTH: usize = 3;
+
+impl Folder {
+    /// A hash of the description and of the people to train on and to validate with: of the names, lengths, beginnings and ends of
+    /// their files.
+    ///
+    /// # Errors
+    /// [`FileError::Read`] for a file or folder that cannot be read.
+    pub fn fingerprint(&self) -> Result<String, FileError> {
+        let mut files = Vec::new();
+        for split in [Split::Train, Split::Val] {
+            let folder = self.split_path(Some(split));
+            if folder.is_dir() {
+                list(&folder, MAX_DEPTH, &mut files).map_err(FileError::read(&folder))?;
+            }
+        }
+        files.sort_unstable();
+        let hashes: Vec<_> = files
+            .par_iter()
+            .map(|path| hash(path).map_err(FileError::read(path)))
+            .collect::<Result<_, _>>()?;
+        let mut whole = Sha256::new();
+        whole.update(toml::to_string(&self.description).expect("the description has only TOML types"));
+        for (path, hash) in files.iter().zip(hashes) {
+            let name = path.strip_prefix(&self.root).unwrap_or(path);
+            whole.update(name.to_string_lossy().as_bytes());
+            whole.update(hash);
+        }
+        Ok(format!("{:x}", whole.finalize()))
+    }
+}
+
+/// Adds the files below a folder. Hidden ones, which are unfinished, are left out.
+fn list(folder: &Path, depth: usize, files: &mut Vec<PathBuf>) -> io::Result<()> {
+    for entry in fs::read_dir(folder)? {
+        let entry = entry?;
+        if entry.file_name().to_string_lossy().starts_with('.') {
+            continue;
+        }
+        // Links are followed, as the reader of views does.
+        let path = entry.path();
+        match fs::metadata(&path)? {
+            metadata if metadata.is_file() => files.push(path),
+            metadata if metadata.is_dir() && depth > 1 => list(&path, depth - 1, files)?,
+            _ => {}
+        }
+    }
+    Ok(())
+}
+
+fn hash(path: &Path) -> io::Result<[u8; 32]> {
+    let mut file: File = file::open(path)?;
+    let length = file.metadata()?.len();
+    let mut bytes = Vec::new();
+    (&mut file).take(ENDS).read_to_end(&mut bytes)?;
+    file.seek(SeekFrom::Start(length.saturating_sub(ENDS).max(ENDS)))?;
+    file.take(ENDS).read_to_end(&mut bytes)?;
+    let mut hash = Sha256::new();
+    hash.update(length.to_le_bytes());
+    hash.update(bytes);
+    Ok(hash.finalize().into())
+}

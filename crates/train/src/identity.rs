@@ -1,0 +1,86 @@
+//! The identity of a run: what its state belongs to. A run that is continued with something else is refused.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+use snapsnap_base::config::{differences, keys};
+
+use crate::TrainError;
+use crate::config::TrainConfig;
+use crate::task::Task;
+
+/// Keys that may change between the sessions of a run: its length, its reports, the speed of its loader, and paths. The files
+/// behind the paths have hashes of their own, or are no longer read.
+const FREE: [&str; 12] = [
+    "data.folders",
+    "stage2.lpips.files",
+    "stage2.point_map_cache",
+    "training.checkpoint_every",
+    "training.gradient_checkpointing",
+    "training.log_every",
+    "training.prefetch",
+    "training.preview_every",
+    "training.steps",
+    "training.validate_every",
+    "training.weights",
+    "training.workers",
+];
+/// Sections of the networks. A state of other networks cannot be used.
+const NETWORKS: [&str; 3] = ["network.", "regressor.", "mode."];
+
+/// What a run trains on what.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub(crate) struct Identity {
+    /// The config's keys with their values, without the keys that may change.
+    config: BTreeMap<String, String>,
+    /// Fingerprints of the data sets.
+    data: Vec<String>,
+    /// Hash of the frozen point predictor.
+    predictor: Option<String>,
+}
+
+impl Identity {
+    /// The identity of a run of `task`.
+    ///
+    /// # Errors
+    /// [`TrainError::File`] if a file of a data set cannot be read.
+    pub fn of<T: Task>(task: &T, config: &TrainConfig) -> Result<Self, TrainError> {
+        let mut config = keys(config);
+        config.retain(|key, _| !FREE.contains(&key.as_str()));
+        let data = task.data().folders.iter().map(|folder| folder.fingerprint());
+        let frozen = task.frozen();
+        let predictor = (!frozen.is_empty()).then(|| {
+            let mut hash = Sha256::new();
+            for (name, values) in frozen {
+                hash.update(name);
+                values.into_iter().for_each(|value| hash.update(value.to_le_bytes()));
+            }
+            format!("{:x}", hash.finalize())
+        });
+        Ok(Self { config, data: data.collect::<Result<_, _>>()?, predictor })
+    }
+
+    /// Why a run with the identity `there` cannot be continued as this one, or not without `force`.
+    pub fn refusal(&self, there: &Self, force: bool) -> Option<String> {
+        let mut harmful = Vec::new();
+        let mut harmless = Vec::new();
+        for (key, message) in differences(&there.config, &self.config) {
+            let is_network = NETWORKS.iter().any(|section| key.starts_with(section));
+            if is_network { &mut harmful } else { &mut harmless }.push(message);
+        }
+        if there.data != self.data {
+            harmless.push("the data sets have other content".to_owned());
+        }
+        if there.predictor != self.predictor {
+            harmless.push("the frozen point predictor has other weights".to_owned());
+        }
+        let message =
+            |differences: &[String]| format!("is the state of another run: {}", differences.join("; "));
+        match (harmful.is_empty(), harmless.is_empty() || force) {
+            (true, true) => None,
+            (true, false) => Some(format!("{}. --force continues it all the same", message(&harmless))),
+            (false, _) => Some(message(&harmful)),
+        }
+    }
+}
