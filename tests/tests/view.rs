@@ -1,8 +1,9 @@
 //! `snapsnap view`, as a browser and as somebody else would ask it.
 
 use std::fs;
-use std::io::Write;
+use std::io::{Read, Write};
 use std::net::TcpStream;
+use std::time::{Duration, Instant};
 
 use burn::tensor::Device;
 use snapsnap_splat::scene;
@@ -85,6 +86,82 @@ fn the_page_and_its_file_are_served_to_this_machine_alone() {
     assert_eq!(server.ask("GET /", None).0, 200);
     fs::remove_file(&file).expect("removed");
     assert_eq!(server.ask("GET /scene.ply", None).0, 422);
+}
+
+#[test]
+fn pages_of_other_sites_start_no_work() {
+    let server = Server::new(&data("spz/v3_degree0.spz"));
+    let ask =
+        |path: &str, header: &str| server.ask(&format!("GET {path} HTTP/1.1\r\n{header}\r\nX: y"), None).0;
+    let own = format!("Origin: http://127.0.0.1:{}", server.port);
+    for header in [
+        "Origin: https://evil.example",
+        "Origin: null",
+        "Sec-Fetch-Site: cross-site",
+        "Sec-Fetch-Site: same-site",
+    ] {
+        for path in ["/scene.ply", "/scene.spz", "/scene.glb", "/viewer.js"] {
+            assert_eq!(ask(path, header), 403, "{header} {path}");
+        }
+    }
+    for header in [own.as_str(), "Sec-Fetch-Site: same-origin", "Sec-Fetch-Site: none"] {
+        assert_eq!(ask("/scene.ply", header), 200, "{header}");
+    }
+    // A link on another page leads here.
+    assert_eq!(ask("/", "Sec-Fetch-Site: cross-site"), 200);
+}
+
+/// A file of Gaussians that are all alike, but for their position.
+#[cfg(target_os = "linux")]
+fn large(count: usize) -> Vec<u8> {
+    let names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2"];
+    let names = names.into_iter().chain(["rot_0", "rot_1", "rot_2", "rot_3"]);
+    let properties: String = names.map(|name| format!("property float {name}\n")).collect();
+    let header =
+        format!("ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}end_header\n");
+    let mut bytes = header.into_bytes();
+    for i in 0..count {
+        let mut values = [0.0_f32, 0.0, 0.0, 0.0, 0.0, 0.0, 2.0, -6.0, -6.0, -6.0, 1.0, 0.0, 0.0, 0.0];
+        values[0] = i as f32 * 1e-5;
+        bytes.extend(values.iter().flat_map(|value| value.to_le_bytes()));
+    }
+    bytes
+}
+
+/// Clients that do not read share one copy of the file, and lose their connection to clients that do.
+#[cfg(target_os = "linux")]
+#[test]
+fn clients_that_do_not_read_cost_neither_memory_nor_places() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let file = temporary.path().join("large.ply");
+    fs::write(&file, large(800_000)).expect("written");
+    let server = Server::new(&file);
+    let size = server.ask("GET /scene.ply", None).2.len() as u64;
+    let before = server.memory();
+    // All connections but one, so that the server still answers while they are begun.
+    let unread: Vec<TcpStream> = (0..64)
+        .map(|_| {
+            let mut stream = TcpStream::connect(("127.0.0.1", server.port)).expect("connected");
+            write!(stream, "GET /scene.ply HTTP/1.1\r\nHost: 127.0.0.1:{}\r\n\r\n", server.port)
+                .expect("asked");
+            stream
+        })
+        .collect();
+    std::thread::sleep(Duration::from_secs(2));
+    let after = server.memory();
+    assert!(after < before + size, "{before} and {after} bytes for a file of {size}");
+    let start = Instant::now();
+    let is_served = || {
+        let mut stream = TcpStream::connect(("127.0.0.1", server.port)).expect("connected");
+        let asked = write!(stream, "GET / HTTP/1.1\r\nHost: 127.0.0.1:{}\r\n\r\n", server.port);
+        let mut answer = Vec::new();
+        asked.and_then(|()| stream.read_to_end(&mut answer)).is_ok() && answer.starts_with(b"HTTP/1.1 200")
+    };
+    while !is_served() {
+        assert!(start.elapsed() < Duration::from_secs(60), "nobody else is served");
+        std::thread::sleep(Duration::from_millis(500));
+    }
+    drop(unread);
 }
 
 #[test]

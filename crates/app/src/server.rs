@@ -1,8 +1,9 @@
-//! A small web server for local clients, with one request per connection. Time and memory of a connection are bounded.
+//! A small web server for local clients, with one request per connection. The time of a connection is bounded. Contents are
+//! shared by all connections.
 
-use std::borrow::Cow;
 use std::io::{self, Read, Write};
 use std::net::{Shutdown, TcpListener, TcpStream};
+use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
@@ -17,8 +18,14 @@ const LONGEST: usize = 16 << 10;
 const HEADERS: usize = 64;
 /// Time limit of a request.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// Time limit of each write.
-const STALLED: Duration = Duration::from_secs(20);
+/// Time limit of an answer.
+const LONGEST_ANSWER: Duration = Duration::from_secs(600);
+/// Time that every answer may take, and bytes per second that it must reach beyond that time. A client behind an SSH tunnel is
+/// faster.
+const ALLOWANCE: Duration = Duration::from_secs(10);
+const SLOWEST: u64 = 512 << 10;
+/// Bytes of one write.
+const PART: usize = 256 << 10;
 
 /// A request.
 pub struct Request {
@@ -28,13 +35,20 @@ pub struct Request {
     pub host: Option<String>,
     /// The method, for example GET.
     pub method: String,
+    /// The `Origin` header.
+    pub origin: Option<String>,
+    /// The `Sec-Fetch-Site` header, by which a browser names the requesting page's relation to the server.
+    pub fetch_site: Option<String>,
 }
+
+/// Content of an answer.
+pub type Content = Arc<dyn AsRef<[u8]> + Send + Sync>;
 
 /// An answer.
 pub struct Answer {
     pub status: StatusCode,
     pub headers: Vec<(&'static str, String)>,
-    pub content: Cow<'static, [u8]>,
+    pub content: Content,
 }
 
 /// Answers requests until the program ends.
@@ -65,27 +79,51 @@ pub fn serve(listener: &TcpListener, answer: &(dyn Fn(&Request) -> Answer + Sync
 }
 
 fn converse(mut stream: TcpStream, answer: &dyn Fn(&Request) -> Answer) -> io::Result<()> {
-    stream.set_write_timeout(Some(STALLED))?;
     let (is_head, answered) = match request(&mut stream)? {
         Ok(request) => (request.method == "HEAD", answer(&request)),
-        Err((status, why)) => (false, Answer { status, headers: Vec::new(), content: why.as_bytes().into() }),
+        Err((status, why)) => (false, Answer { status, headers: Vec::new(), content: Arc::new(why) }),
     };
     let Answer { status, headers, content } = answered;
+    let content: &[u8] = (*content).as_ref();
     let length = content.len();
     let mut head = format!("HTTP/1.1 {status}\r\nConnection: close\r\nContent-Length: {length}\r\n");
     headers.iter().for_each(|(name, value)| head += &format!("{name}: {value}\r\n"));
     head += "\r\n";
-    stream.write_all(head.as_bytes())?;
+    let start = Instant::now();
+    send(&mut stream, head.as_bytes(), start, 0)?;
     if !is_head {
-        stream.write_all(&content)?;
+        for (i, part) in content.chunks(PART).enumerate() {
+            send(&mut stream, part, start, (i * PART) as u64)?;
+        }
     }
-    drop(content);
     // After an immediate close the client might lose the answer. Hence the rest of the request is read first.
     stream.shutdown(Shutdown::Write)?;
     stream.set_read_timeout(Some(Duration::from_millis(500)))?;
     let end = Instant::now() + Duration::from_secs(2);
     let mut rest = [0; 4096];
     while Instant::now() < end && stream.read(&mut rest)? > 0 {}
+    Ok(())
+}
+
+/// Sends a part of an answer that began at `start`, after `sent` other bytes. A client that reads too slowly is left.
+fn send(stream: &mut TcpStream, mut part: &[u8], start: Instant, mut sent: u64) -> io::Result<()> {
+    while !part.is_empty() {
+        let end = (ALLOWANCE + Duration::from_secs(sent / SLOWEST)).min(LONGEST_ANSWER);
+        let left = end.saturating_sub(start.elapsed());
+        if left.is_zero() {
+            return Err(io::ErrorKind::TimedOut.into());
+        }
+        stream.set_write_timeout(Some(left))?;
+        match stream.write(part) {
+            Ok(0) => return Err(io::ErrorKind::WriteZero.into()),
+            Ok(n) => {
+                part = &part[n..];
+                sent += n as u64;
+            }
+            Err(e) if e.kind() == io::ErrorKind::Interrupted => {}
+            Err(e) => return Err(e),
+        }
+    }
     Ok(())
 }
 
@@ -132,5 +170,10 @@ fn checked(parsed: &httparse::Request) -> Result<Request, Refusal> {
     let path =
         target.strip_prefix("http://").map_or(target, |rest| rest.find('/').map_or("/", |at| &rest[at..]));
     let path = path.split(['?', '#']).next().unwrap_or_default().to_owned();
-    Ok(Request { path, host, method: parsed.method.unwrap_or_default().to_owned() })
+    let header = |name: &str| {
+        let found = parsed.headers.iter().find(|header| header.name.eq_ignore_ascii_case(name))?;
+        Some(String::from_utf8_lossy(found.value).into_owned())
+    };
+    let (origin, fetch_site) = (header("origin"), header("sec-fetch-site"));
+    Ok(Request { path, host, method: parsed.method.unwrap_or_default().to_owned(), origin, fetch_site })
 }
