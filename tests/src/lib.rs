@@ -128,6 +128,14 @@ pub fn snapsnap() -> Command {
     command
 }
 
+/// Sets every value of a weight file in f32.
+pub fn fill_weights(path: &Path, value: f32) {
+    let mut file = std::fs::read(path).expect("reads");
+    let header = 8 + u64::from_le_bytes(file[..8].try_into().expect("eight bytes")) as usize;
+    file[header..].chunks_exact_mut(4).for_each(|bytes| bytes.copy_from_slice(&value.to_le_bytes()));
+    std::fs::write(path, file).expect("writes");
+}
+
 /// Runs a command that must succeed. Returns its output.
 pub fn succeed(command: &mut Command) -> String {
     let output = command.output().expect("the program starts");

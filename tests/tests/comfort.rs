@@ -3,7 +3,12 @@
 use std::fs;
 
 use serde_json::Value;
-use snapsnap_tests::{refused, snapsnap, succeed};
+use snapsnap_tests::{fill_weights, refused, root, snapsnap, succeed};
+
+/// A config of the repository.
+fn config(name: &str) -> String {
+    root().join("configs").join(name).display().to_string()
+}
 
 #[test]
 fn the_doctor_names_devices_weights_and_what_mends() {
@@ -37,12 +42,89 @@ fn the_doctor_names_devices_weights_and_what_mends() {
 #[test]
 #[cfg(target_os = "linux")]
 fn a_report_that_the_disk_does_not_take_is_a_failure() {
-    for arguments in [&["doctor"][..], &["doctor", "--json"], &["completions", "bash"]] {
+    const COMMANDS: [&[&str]; 6] = [
+        &["doctor"],
+        &["doctor", "--json"],
+        &["completions", "bash"],
+        &["--help"],
+        &["--version"],
+        &["fetch-weights", "--list"],
+    ];
+    for arguments in COMMANDS {
         let full = fs::File::options().write(true).open("/dev/full").expect("a device");
         let done = snapsnap().args(arguments).stdout(full).output().expect("runs");
         assert_eq!(done.status.code(), Some(2), "{arguments:?}");
         let said = String::from_utf8(done.stderr).expect("text");
         assert!(said.contains("stdout: cannot write"), "{arguments:?}: {said}");
+    }
+}
+
+#[test]
+fn values_that_are_not_finite_are_no_sound_weights() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let path = temporary.path().join("w.safetensors");
+    succeed(
+        snapsnap().args(["init-weights", "--config", &config("tiny.toml"), "--seed", "1", "-o"]).arg(&path),
+    );
+    fill_weights(&path, f32::NAN);
+    let said = refused(snapsnap().arg("doctor").arg("--weights").arg(&path));
+    assert!(said.contains("not finite"), "{said}");
+}
+
+#[test]
+fn weights_of_another_size_are_refused_in_a_few_lines() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let path = temporary.path().join("w.safetensors");
+    succeed(
+        snapsnap().args(["init-weights", "--config", &config("tiny.toml"), "--seed", "1", "-o"]).arg(&path),
+    );
+    let mut command = snapsnap();
+    command.args(["reconstruct", "a.png", "b.png", "--config", &config("full.toml"), "--weights"]).arg(&path);
+    let said = refused(&mut command);
+    assert!(
+        said.contains("not the weights of the configured networks") && said.contains("`network."),
+        "{said}"
+    );
+    assert!(said.lines().count() < 4, "{said}");
+    // Weights of an import have no config to compare.
+    let said = refused(
+        snapsnap()
+            .args(["import-weights", "-o", "x.safetensors"])
+            .arg(&path)
+            .args(["--config", &config("full.toml")]),
+    );
+    assert!(said.contains("more") && said.lines().count() < 20, "{said}");
+}
+
+#[test]
+fn a_senseless_number_of_threads_is_refused() {
+    let said = refused(snapsnap().arg("doctor").env("RAYON_NUM_THREADS", "100000"));
+    assert!(said.contains("RAYON_NUM_THREADS=100000") && said.contains("at most 1024"), "{said}");
+}
+
+#[test]
+#[cfg(target_os = "linux")]
+fn loaders_of_drivers_print_nothing() {
+    let output = snapsnap().arg("doctor").env_remove("XDG_RUNTIME_DIR").output().expect("runs");
+    assert!(
+        output.status.success() && output.stderr.is_empty(),
+        "{}",
+        String::from_utf8_lossy(&output.stderr)
+    );
+}
+
+/// A software adapter that is opened with so little memory ends the process that opens it.
+#[test]
+#[cfg(target_os = "linux")]
+fn drivers_crash_no_command() {
+    for limit in ["1000000", "1500000"] {
+        let output = std::process::Command::new("sh")
+            .args(["-c", &format!("ulimit -v {limit}; exec \"$@\""), "sh"])
+            .arg(snapsnap().get_program())
+            .arg("doctor")
+            .output()
+            .expect("runs");
+        assert_eq!(output.status.code(), Some(0), "{limit}: {}", String::from_utf8_lossy(&output.stderr));
     }
 }
 

@@ -157,6 +157,7 @@ fn a_server_that_refuses_or_stays_short_is_told() {
     let (code, said) = run(&mut fetch(&address, temporary.path()));
     assert!(code == Some(1) && said.contains("404"), "{code:?}: {said}");
     assert_eq!(asked.lock().expect("unharmed").len(), 1, "what is refused is not asked for again");
+    assert_eq!(fs::read_dir(temporary.path()).expect("lists").count(), 0, "nothing is left");
     // Never more than half: what came is kept for the next time.
     let body = published();
     let (address, _) = server(move |number, first| ranged(&body, first, if number == 0 { 3000 } else { 0 }));

@@ -1,8 +1,11 @@
 //! `--device`: the devices of this build and this machine, and their names.
 
 use std::panic;
+use std::process::{Command, Stdio};
+use std::sync::OnceLock;
 
 use burn::tensor::{Device, DeviceKind, DeviceType};
+use serde::{Deserialize, Serialize};
 use snapsnap_splat::adapter;
 
 use crate::failure::Failure;
@@ -25,7 +28,11 @@ pub fn choose(name: &str) -> Result<Device, Failure> {
     }
     match kind {
         "auto" => {
-            let card = gpus().into_iter().flat_map(|(_, kind)| devices(kind)).find(is_card);
+            let Some(card) = adapters().iter().find(|adapter| adapter.is_card) else {
+                return Ok(Device::flex());
+            };
+            let kind = gpus().into_iter().find(|(name, _)| *name == card.kind);
+            let card = kind.and_then(|(_, kind)| devices(kind).into_iter().nth(card.index));
             return Ok(card.unwrap_or_else(Device::flex));
         }
         "cpu" | "flex" => return Ok(Device::flex()),
@@ -74,26 +81,70 @@ pub fn found() -> Vec<Found> {
         memory: Some(memory::there()),
     };
     let mut found = vec![processor("cpu", "Burn's flex"), processor("ndarray", "Burn's ndarray")];
-    for (kind, device_type) in gpus() {
-        for (i, device) in devices(device_type).iter().enumerate() {
-            let identity = device.identity();
-            found.push(Found {
-                name: format!("{kind}:{i}"),
-                adapter: identity.as_ref().map_or_else(|| "?".into(), |identity| identity.name.clone()),
-                backend: match kind {
-                    "wgpu" => "wgpu, WGSL",
-                    "vulkan" => "wgpu, SPIR-V",
-                    "metal" => "wgpu, MSL",
-                    _ => "CUDA",
-                },
-                software: !is_card(device),
-                card: is_card(device),
-                // The graphics layer has no function for the memory of cards.
-                memory: (!is_card(device)).then(memory::there),
-            });
-        }
-    }
+    found.extend(adapters().iter().map(|adapter| Found {
+        name: adapter.device(),
+        adapter: adapter.name.clone(),
+        backend: match adapter.kind.as_str() {
+            "wgpu" => "wgpu, WGSL",
+            "vulkan" => "wgpu, SPIR-V",
+            "metal" => "wgpu, MSL",
+            _ => "CUDA",
+        },
+        software: !adapter.is_card,
+        card: adapter.is_card,
+        // The graphics layer has no function for the memory of cards.
+        memory: (!adapter.is_card).then(memory::there),
+    }));
     found
+}
+
+/// A graphics adapter that answers.
+#[derive(Debug, Serialize, Deserialize)]
+struct Adapter {
+    /// Its kind for `--device`.
+    kind: String,
+    /// Its place among the adapters of the kind.
+    index: usize,
+    name: String,
+    /// Whether it is no software.
+    is_card: bool,
+}
+
+impl Adapter {
+    /// Its name for `--device`.
+    fn device(&self) -> String {
+        format!("{}:{}", self.kind, self.index)
+    }
+}
+
+/// Name of the hidden command that prints [`probe`]'s text.
+pub const PROBE: &str = "probe-adapters";
+
+/// All adapters of the compiled kinds, as JSON.
+pub fn probe() -> String {
+    let of_kind = |(kind, device_type): (&str, DeviceType)| {
+        let adapter = |(index, device): (usize, Device)| Adapter {
+            kind: kind.to_owned(),
+            index,
+            name: device.identity().map_or_else(|| "?".into(), |identity| identity.name),
+            is_card: is_card(&device),
+        };
+        devices(device_type).into_iter().enumerate().map(adapter).collect::<Vec<_>>()
+    };
+    let adapters: Vec<Adapter> = gpus().into_iter().flat_map(of_kind).collect();
+    serde_json::to_string(&adapters).expect("plain text and numbers")
+}
+
+/// All adapters of the compiled kinds, listed by another process: drivers may crash, for example when memory is short.
+fn adapters() -> &'static [Adapter] {
+    static ADAPTERS: OnceLock<Vec<Adapter>> = OnceLock::new();
+    ADAPTERS.get_or_init(|| {
+        let probed = std::env::current_exe().and_then(|program| {
+            Command::new(program).arg(PROBE).stdin(Stdio::null()).stderr(Stdio::null()).output()
+        });
+        let probed = probed.ok().filter(|output| output.status.success());
+        probed.and_then(|output| serde_json::from_slice(&output.stdout).ok()).unwrap_or_default()
+    })
 }
 
 /// Kinds of devices of this build.
@@ -149,7 +200,9 @@ fn devices(kind: DeviceType) -> Vec<Device> {
 }
 
 fn nth(name: &str, kind: DeviceType, index: Option<usize>) -> Result<Device, Failure> {
-    let devices = devices(kind);
+    let kind_name = name.split(':').next().unwrap_or(name);
+    let is_there = adapters().iter().any(|adapter| adapter.kind == kind_name);
+    let devices = if is_there { devices(kind) } else { Vec::new() };
     let found = devices.len();
     if found == 0 {
         let message =
@@ -177,9 +230,9 @@ fn is_card(device: &Device) -> bool {
 
 fn unknown(name: &str, why: &str) -> Failure {
     let mut there = vec!["auto".to_owned(), "cpu (= flex)".into(), "ndarray".into()];
-    for (kind, device_type) in gpus() {
-        let devices = devices(device_type).into_iter().enumerate();
-        there.extend(devices.map(|(i, device)| format!("{kind}:{i} ({})", describe(&device))));
-    }
+    there.extend(adapters().iter().map(|adapter| {
+        let software = if adapter.is_card { "" } else { ", software" };
+        format!("{} ({}{software})", adapter.device(), adapter.name)
+    }));
     Failure::Input(format!("--device {name}: {why}. Here there are: {}", there.join(", ")))
 }

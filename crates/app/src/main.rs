@@ -26,6 +26,7 @@ mod weights;
 use std::process::ExitCode;
 
 use clap::{CommandFactory, Parser, Subcommand};
+use failure::bail;
 
 /// Every operation allocates and frees large tensors. mimalloc keeps their pages, while the system allocator returns them to the
 /// kernel and causes page faults.
@@ -125,6 +126,9 @@ enum Command {
     /// List devices, features, weights and missing parts, each with its remedy.
     #[command(after_help = "Example: snapsnap doctor --json")]
     Doctor(commands::doctor::Arguments),
+    /// List the graphics adapters as JSON.
+    #[command(name = device::PROBE, hide = true)]
+    ProbeAdapters,
     /// Print completions for a shell.
     #[command(
         after_help = "Example: snapsnap completions bash > ~/.local/share/bash-completion/completions/snapsnap"
@@ -136,6 +140,8 @@ enum Command {
 }
 
 fn main() -> ExitCode {
+    #[cfg(unix)]
+    set_runtime_folder();
     // Panics of libraries on damaged files become errors, which are reported without this hook.
     let hook = std::panic::take_hook();
     std::panic::set_hook(Box::new(move |panic| {
@@ -149,15 +155,22 @@ fn main() -> ExitCode {
         Err(e) => {
             // clap prints usage errors and help with exit codes 2 and 0, but does not escape control characters.
             let mut arguments = std::env::args_os().map(|argument| argument.to_string_lossy().into_owned());
-            if arguments.all(|argument| say::printable(&argument) == argument) {
+            let is_printable = arguments.all(|argument| say::printable(&argument) == argument);
+            if is_printable && e.use_stderr() {
                 e.exit();
             }
-            let say = if e.use_stderr() { say::err } else { say::out };
-            say(e.to_string().trim_end());
+            if !e.use_stderr() {
+                // Help and version are the result of the command.
+                return ended(say::written(e.print()).and_then(|()| say::result(b"")));
+            }
+            say::err(e.to_string().trim_end());
             return ExitCode::from(e.exit_code() as u8);
         }
     };
     say::set_quiet(quiet);
+    if let Err(failure) = check_threads() {
+        return ended(Err(failure));
+    }
     let result = match command {
         Command::Demo(arguments) => commands::demo::run(&arguments),
         Command::Reconstruct(arguments) => commands::reconstruct::run(&arguments),
@@ -177,9 +190,42 @@ fn main() -> ExitCode {
         Command::InitWeights(arguments) => commands::weight_files::init(&arguments),
         Command::ExportWeights(arguments) => commands::weight_files::export(&arguments),
         Command::Doctor(arguments) => commands::doctor::run(&arguments),
+        Command::ProbeAdapters => say::json(&device::probe()),
         Command::Completions(arguments) => commands::manuals::completions(&arguments, Arguments::command()),
         Command::Man(arguments) => commands::manuals::pages(&arguments, Arguments::command()),
     };
+    ended(result)
+}
+
+/// Sets `XDG_RUNTIME_DIR` where it is missing, by starting the program anew: loaders of Vulkan would print several lines about
+/// it in every command.
+#[cfg(unix)]
+fn set_runtime_folder() {
+    use std::os::unix::process::CommandExt;
+    const FOLDER: &str = "XDG_RUNTIME_DIR";
+    if std::env::var_os(FOLDER).is_none()
+        && let Ok(program) = std::env::current_exe()
+    {
+        // It returns only after a failure, and then the program goes on.
+        let _ = std::process::Command::new(program)
+            .args(std::env::args_os().skip(1))
+            .env(FOLDER, std::env::temp_dir())
+            .exec();
+    }
+}
+
+/// Refuses a number of threads at whose start the program would hang.
+fn check_threads() -> Result<(), failure::Failure> {
+    const VARIABLE: &str = "RAYON_NUM_THREADS";
+    const MAX_THREADS: usize = 1024;
+    let threads = std::env::var(VARIABLE).ok().and_then(|text| text.parse::<usize>().ok());
+    match threads.filter(|threads| *threads > MAX_THREADS) {
+        Some(threads) => bail!("{VARIABLE}={threads}: must be at most {MAX_THREADS}"),
+        None => Ok(()),
+    }
+}
+
+fn ended(result: Result<(), failure::Failure>) -> ExitCode {
     match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {

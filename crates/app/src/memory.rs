@@ -16,7 +16,8 @@ pub fn check(what: &str, needed: u64, mend: &str) -> Result<(), Failure> {
         return Ok(());
     }
     let [needed, there] = [needed, there].map(|bytes| bytes as f64 / 1e9);
-    let message = format!("{what} needs {needed:.1} GB of memory, this machine has {there:.1} GB: {mend}");
+    let message =
+        format!("{what} needs {needed:.1} GB of memory, this process can have {there:.1} GB: {mend}");
     Err(Failure::Input(message))
 }
 
@@ -61,9 +62,11 @@ fn status(key: &str) -> Option<u64> {
     Some(line.split_whitespace().next()?.parse::<u64>().ok()? * 1024)
 }
 
-/// The limit that `ulimit -v` sets, in bytes.
+/// The limit that `ulimit -v` sets, in bytes, without addresses that this process has reserved and does not use.
 fn address_space() -> Option<u64> {
     let limits = fs::read_to_string("/proc/self/limits").ok()?;
     let line = limits.lines().find_map(|line| line.strip_prefix("Max address space"))?;
-    line.split_whitespace().next()?.parse().ok()
+    let limit: u64 = line.split_whitespace().next()?.parse().ok()?;
+    let reserved = status("VmSize")?.saturating_sub(used()?);
+    Some(limit.saturating_sub(reserved))
 }

@@ -64,10 +64,15 @@ pub fn json(text: &str) -> Result<(), Failure> {
     result(text.chars().map(escaped).chain(["\n".into()]).collect::<String>().as_bytes())
 }
 
-/// Writes the result of a command, unchanged, to stdout. A full disk is an error, a closed pipe is not.
+/// Writes the result of a command, unchanged, to stdout.
 pub fn result(text: &[u8]) -> Result<(), Failure> {
     let mut stdout = std::io::stdout();
-    match stdout.write_all(text).and_then(|()| stdout.flush()) {
+    written(stdout.write_all(text).and_then(|()| stdout.flush()))
+}
+
+/// The outcome of writing to stdout. A full disk is an error, a closed pipe is not.
+pub fn written(outcome: std::io::Result<()>) -> Result<(), Failure> {
+    match outcome {
         Err(e) if e.kind() != ErrorKind::BrokenPipe => {
             Err(Failure::Input(format!("stdout: cannot write: {e}")))
         }

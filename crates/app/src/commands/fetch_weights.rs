@@ -99,10 +99,10 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
         .filter(|item| arguments.what.is_empty() || arguments.what.contains(&item.name))
         .map(|item| (item, origin(arguments, item)))
         .collect();
-    for (item, origin) in &wanted {
-        say::out(&format!("{}\n  {origin}", item.file));
-        say::out(&format!("  {} bytes, SHA-256 {}\n  licence: {}", item.bytes, item.sha256, item.licence));
-    }
+    let lines = wanted.iter().map(|(Item { file, bytes, sha256, licence, .. }, origin)| {
+        format!("{file}\n  {origin}\n  {bytes} bytes, SHA-256 {sha256}\n  licence: {licence}")
+    });
+    say::lines(&lines.collect::<Vec<_>>().join("\n"))?;
     if arguments.list {
         return Ok(());
     }
@@ -187,7 +187,12 @@ fn download(item: &Item, address: &str, path: &Path) -> Result<(), Failure> {
     if matches!(file.try_lock(), Err(TryLockError::WouldBlock)) {
         return Err(Failure::file(&part, "is being fetched by another process"));
     }
-    fill(&mut file, item, address, &Progress::bytes(), &part)?;
+    let filled = fill(&mut file, item, address, &Progress::bytes(), &part);
+    // A later attempt continues from what has arrived.
+    if filled.is_err() && file.metadata().is_ok_and(|there| there.len() == 0) {
+        let _ = fs::remove_file(&part);
+    }
+    filled?;
     match check_sum(item, address, &mut file) {
         Ok(()) => {}
         Err(Broken::Write(e)) => return Err(cannot_write(e)),

@@ -189,10 +189,12 @@ impl WeightFile {
         }
         // Weights of other networks say so themselves.
         let own = source.config().map(|own| differences(&keys(&own), &keys(&config))).unwrap_or_default();
+        // `mode` changes no tensor.
+        let own: Vec<_> = own.into_iter().filter(|(key, _)| !key.starts_with("mode.")).collect();
         if !own.is_empty() {
             let shown: Vec<String> =
                 own.into_iter().take(MAX_DIFFERENCES).map(|(_, message)| message).collect();
-            let message = format!("has weights of networks other than the config's: {}", shown.join(", "));
+            let message = format!("not the weights of the configured networks: {}", shown.join(", "));
             return Err(FileError::unsuitable(path, message).into());
         }
         let origin = path.display().to_string();
