@@ -81,3 +81,19 @@ pub fn ply_bytes(rows: &[Row], format: Format, before: &str, prefix: &[u8]) -> V
     }
     bytes
 }
+
+/// A PLY of opaque grey balls of radius `e^scale` at these places.
+pub fn balls(places: impl ExactSizeIterator<Item = [f32; 3]>, scale: f32) -> Vec<u8> {
+    let names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2"];
+    let names = names.into_iter().chain(["rot_0", "rot_1", "rot_2", "rot_3"]);
+    let properties: String = names.map(|name| format!("property float {name}\n")).collect();
+    let count = places.len();
+    let header =
+        format!("ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}end_header\n");
+    let mut bytes = header.into_bytes();
+    for [x, y, z] in places {
+        let values = [x, y, z, 0.0, 0.0, 0.0, 2.0, scale, scale, scale, 1.0, 0.0, 0.0, 0.0];
+        bytes.extend(values.iter().flat_map(|value| value.to_le_bytes()));
+    }
+    bytes
+}

@@ -7,6 +7,7 @@ use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 use image::{Rgba, RgbaImage};
+use snapsnap_tests::ply::balls;
 use snapsnap_tests::{refused, root, snapsnap, succeed};
 
 /// A temporary folder with tiny random weights `w`, a picture `i.png`, and a PLY that was made of it.
@@ -290,5 +291,32 @@ fn escapes_in_files_and_names_stay_text() {
         let message = place.refusal(command);
         let is_text = message.contains("[31m") || message.contains("no-command");
         assert!(!message.contains('\x1b') && is_text, "{what}: {message:?}");
+    }
+}
+
+/// Half a million Gaussians of a metre in one place, as a PLY and as an SPZ of ten kilobytes.
+#[test]
+fn small_files_that_take_minutes_are_refused_at_once() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let path = |name: &str| temporary.path().join(name);
+    fs::write(path("many.ply"), balls((0..500_000).map(|_| [0.0; 3]), 0.0)).expect("written");
+    succeed(snapsnap().arg("convert").arg(path("many.ply")).arg(path("many.spz")));
+    for (name, expected) in [("many.ply", "--force"), ("many.spz", "no real scene")] {
+        let mut mesh = snapsnap();
+        mesh.arg("mesh").arg(path(name)).args(["--device", "cpu", "-o"]).arg(path("mesh.glb"));
+        let mut render = snapsnap();
+        render
+            .arg("render")
+            .arg(path(name))
+            .args(["--device", "cpu", "--orbit", "8", "-o"])
+            .arg(path("views"));
+        for command in [&mut mesh, &mut render] {
+            let start = Instant::now();
+            let said = refused(command);
+            assert!(said.contains(name) && said.contains(expected), "{said}");
+            // A second on a quiet machine.
+            assert!(start.elapsed() < Duration::from_secs(10), "{:?}: {said}", start.elapsed());
+        }
+        assert!(!path("mesh.glb").exists() && !path("views/cameras.json").exists());
     }
 }

@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 
 use burn::tensor::Device;
 use snapsnap_splat::scene;
+use snapsnap_tests::ply::balls;
 use snapsnap_tests::server::Server;
 use snapsnap_tests::{data, refused, snapsnap};
 
@@ -111,30 +112,13 @@ fn pages_of_other_sites_start_no_work() {
     assert_eq!(ask("/", "Sec-Fetch-Site: cross-site"), 200);
 }
 
-/// A file of Gaussians that are all alike, but for their position.
-#[cfg(target_os = "linux")]
-fn large(count: usize) -> Vec<u8> {
-    let names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2"];
-    let names = names.into_iter().chain(["rot_0", "rot_1", "rot_2", "rot_3"]);
-    let properties: String = names.map(|name| format!("property float {name}\n")).collect();
-    let header =
-        format!("ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}end_header\n");
-    let mut bytes = header.into_bytes();
-    for i in 0..count {
-        let mut values = [0.0_f32, 0.0, 0.0, 0.0, 0.0, 0.0, 2.0, -6.0, -6.0, -6.0, 1.0, 0.0, 0.0, 0.0];
-        values[0] = i as f32 * 1e-5;
-        bytes.extend(values.iter().flat_map(|value| value.to_le_bytes()));
-    }
-    bytes
-}
-
 /// Clients that do not read share one copy of the file, and lose their connection to clients that do.
 #[cfg(target_os = "linux")]
 #[test]
 fn clients_that_do_not_read_cost_neither_memory_nor_places() {
     let temporary = tempfile::tempdir().expect("temporary folder");
     let file = temporary.path().join("large.ply");
-    fs::write(&file, large(800_000)).expect("written");
+    fs::write(&file, balls((0..800_000_i32).map(|i| [i as f32 * 1e-5, 0.0, 0.0]), -6.0)).expect("written");
     let server = Server::new(&file);
     let size = server.ask("GET /scene.ply", None).2.len() as u64;
     let before = server.memory();

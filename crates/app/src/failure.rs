@@ -91,6 +91,7 @@ impl From<FuseError> for Failure {
         match e {
             FuseError::Splat(e) => e.into(),
             FuseError::Reduce(_) => Self::Internal(e.to_string()),
+            FuseError::Long(_) => Self::Input(format!("{e}; --force makes it all the same")),
             FuseError::Nothing(_) | FuseError::Hollow | FuseError::Texture(_) => Self::Input(e.to_string()),
         }
     }

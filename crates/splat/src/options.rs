@@ -26,12 +26,23 @@ pub struct RenderOptions {
     pub depth: bool,
     /// Colour `[3]` behind the Gaussians; differentiable. `None` is black and costs nothing.
     pub background: Option<Tensor<1>>,
+    /// Largest number of pairs of a splat and a 16×16 tile in one view, on which the time of a render depends. More are refused
+    /// before any of them is drawn.
+    pub max_intersections: u64,
 }
 
 impl RenderOptions {
     /// Constants of the original 3D Gaussian splatting rasteriser, with which the published weights were trained.
     pub fn inria() -> Self {
-        Self { max_alpha: 0.99, blur: 0.3, near: 0.2, antialiased: false, depth: false, background: None }
+        Self {
+            max_alpha: 0.99,
+            blur: 0.3,
+            near: 0.2,
+            antialiased: false,
+            depth: false,
+            background: None,
+            max_intersections: u64::MAX,
+        }
     }
 
     /// Constants of gsplat 1.5.

@@ -48,9 +48,10 @@ impl Stored {
         let mut start = Vec::new();
         (&mut file).take(2).read_to_end(&mut start).map_err(&cannot)?;
         let magic = <[u8; 2]>::try_from(&start[..]).unwrap_or_default();
+        let length = file.metadata().map_err(&cannot)?.len();
         let whole = start.as_slice().chain(file);
         let read = match magic {
-            spz::GZIP => spz::read(whole),
+            spz::GZIP => spz::read(whole, length),
             spz::BARE => Err("SPZ of version 4 or later; 1 to 3 are read".to_owned().into()),
             _ => ply::read(whole),
         };

@@ -23,6 +23,10 @@ const VERSION: u32 = 3;
 /// Number of Gaussians of the largest file that Niantic's library reads. It limits the memory for a hostile file, whose
 /// content may be a thousand times its size.
 const MAX_POINTS: usize = 10_000_000;
+/// Content in bytes, and its ratio to the file, beyond which a file is refused: a few kilobytes of equal Gaussians keep a
+/// rasteriser busy for minutes. The content of real files is up to 5 times as large.
+const MAX_CONTENT: u64 = 1 << 20;
+const MAX_RATIO: u64 = 100;
 /// Fractional bits of coordinates, if they fit: steps of a quarter of a millimetre up to 2 km.
 const FRACTIONAL_BITS: u8 = 12;
 /// Largest coordinate in 24 bits.
@@ -34,8 +38,8 @@ const SH_STEPS: [i32; 2] = [8, 16];
 /// Values per channel of SH degrees 0 to 4.
 const COEFFICIENTS: [usize; 5] = [1, 4, 9, 16, 25];
 
-/// Reads a gzip stream.
-pub(crate) fn read(input: impl Read) -> Result<Stored, Problem> {
+/// Reads a gzip stream of `length` bytes.
+pub(crate) fn read(input: impl Read, length: u64) -> Result<Stored, Problem> {
     let mut input = Bytes { input: GzDecoder::new(input) };
     let header = input.take(16, "the header")?;
     let word = |at: usize| u32::from_le_bytes([header[at], header[at + 1], header[at + 2], header[at + 3]]);
@@ -56,6 +60,16 @@ pub(crate) fn read(input: impl Read) -> Result<Stored, Problem> {
     };
     if bits > 24 {
         return Err(format!("coordinates with {bits} bits behind the point, which have 24 in all").into());
+    }
+    let size = if version == VERSION { 4 } else { 3 };
+    let centre = if version == 1 { 6 } else { 9 };
+    let content = (n * (centre + 7 + size + 3 * (there - 1))) as u64;
+    if content > MAX_CONTENT && content / MAX_RATIO > length {
+        let ratio = content / length.max(1);
+        let message = format!(
+            "{n} Gaussians in {length} bytes: the content is {ratio} times as large as the file, as of no real scene"
+        );
+        return Err(message.into());
     }
     let coefficients = there.min(COEFFICIENTS[3]);
     let mut columns = Vec::with_capacity(Stored::COLUMNS.len() + 3 * (coefficients - 1));
@@ -81,7 +95,6 @@ pub(crate) fn read(input: impl Read) -> Result<Stored, Problem> {
     let opacities: Vec<f32> = input.take(n, "opacities")?.iter().map(|&a| logit(a)).collect();
     let colors = input.take(3 * n, "colours")?;
     let scales = input.take(3 * n, "scales")?;
-    let size = if version == VERSION { 4 } else { 3 };
     let rotations = input.take(size * n, "rotations")?;
     let mut quaternions = [(); 4].map(|()| Vec::with_capacity(n));
     for packed in rotations.chunks_exact(size) {

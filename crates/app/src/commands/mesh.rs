@@ -25,6 +25,9 @@ pub struct Arguments {
     output: PathBuf,
     #[command(flatten)]
     surface: SurfaceArguments,
+    /// Also make meshes that take far longer than a person's.
+    #[arg(long)]
+    force: bool,
     /// auto, cpu, ndarray, wgpu, vulkan, cuda or metal; wgpu:1 is the second adapter.
     #[arg(long, default_value = "auto")]
     device: String,
@@ -57,7 +60,8 @@ impl SurfaceArguments {
 
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let since = Instant::now();
-    let target = Target::new(&arguments.output, &arguments.surface)?;
+    let mut target = Target::new(&arguments.output, &arguments.surface)?;
+    target.options.force = arguments.force;
     check_outputs(&target.files(), &[&arguments.input])?;
     let device = device::choose(&arguments.device)?;
     let loaded = scene::read(&arguments.input, &device)?;
@@ -97,7 +101,11 @@ impl Target {
         }
         let bytes = TEXEL * (texture as u64).pow(2);
         memory::check(&format!("--texture {texture}"), bytes, "choose a smaller one")?;
-        let options = Options { faces: surface.faces.unwrap_or(Options::default().faces), texture };
+        let options = Options {
+            faces: surface.faces.unwrap_or(Options::default().faces),
+            texture,
+            ..Options::default()
+        };
         Ok(Self { path: path.to_owned(), companions: export::companions(path, texture > 0), options })
     }
 

@@ -44,6 +44,11 @@ const FLYING: f32 = 0.002;
 const SEEN: f32 = 2.0;
 /// Number of times that neighbouring distances are averaged, against steps between views and the grain of Gaussians.
 const SMOOTHED: usize = 2;
+/// Seconds on two cores that a scene may take without [`Options::force`]. A person takes half as long.
+const LONG: u32 = 20;
+/// Pairs of a splat and a tile in one of the views, and triangles before the reduction, that take about that time.
+const MAX_INTERSECTIONS: u64 = 20_000_000;
+const MAX_TRIANGLES: usize = 4_000_000;
 /// Fewest Gaussians of a body.
 const FEWEST: usize = 50;
 
@@ -56,6 +61,9 @@ pub enum FuseError {
     /// Gaussians without a body.
     #[error("no surface: nothing that the Gaussians show is solid from any side")]
     Hollow,
+    /// Too much work.
+    #[error("{0}: this would take longer than {LONG} s on a few cores")]
+    Long(String),
     /// A texture that is too small.
     #[error("{0}: choose a larger one, or fewer triangles")]
     Texture(String),
@@ -74,11 +82,13 @@ pub struct Options {
     pub faces: usize,
     /// Side of a texture in pixels; 0 for colours of positions instead.
     pub texture: usize,
+    /// Whether scenes are accepted that take far longer than a person.
+    pub force: bool,
 }
 
 impl Default for Options {
     fn default() -> Self {
-        Self { faces: 100_000, texture: 0 }
+        Self { faces: 100_000, texture: 0, force: false }
     }
 }
 
@@ -124,8 +134,16 @@ pub fn fuse(scene: &Loaded, options: Options, stage: &dyn Fn(&str)) -> Result<Fu
     stage("views from all around");
     let (centre, radius) = ((0.5 * (low + high)).as_dvec3(), f64::from(0.5 * size.length()));
     let cameras = views::cameras(centre, radius, SIDE).into_iter();
-    let views: Vec<View> =
-        cameras.map(|camera| View::new(&scene, camera, radius)).collect::<Result<_, SplatError>>()?;
+    let most = if options.force { u64::MAX } else { MAX_INTERSECTIONS };
+    let views: Result<Vec<View>, SplatError> =
+        cameras.map(|camera| View::new(&scene, camera, radius, most)).collect();
+    let views = views.map_err(|e| match e {
+        SplatError::TooManyIntersections { found, limit } if limit == most => {
+            let millions = found / 1_000_000;
+            FuseError::Long(format!("a view of it has {millions} million pairs of a splat and a tile"))
+        }
+        e => e.into(),
+    })?;
 
     stage("distance field");
     let mut grid = Grid { origin: low - margin, cell, counts, values: Vec::new() };
@@ -146,6 +164,12 @@ pub fn fuse(scene: &Loaded, options: Options, stage: &dyn Fn(&str)) -> Result<Fu
         return Err(FuseError::Hollow);
     }
     let faces = triangles.len();
+    if faces > MAX_TRIANGLES && !options.force {
+        let millions = faces as f64 / 1e6;
+        return Err(FuseError::Long(format!(
+            "its surface has {millions:.1} million triangles, far more than a person's"
+        )));
+    }
     let mut mesh = Mesh::colored(positions, Vec::new(), triangles);
     stage("colours");
     mesh.colors = color::colors(&mesh, &views, cell);
@@ -172,7 +196,7 @@ fn textured(
     let atlas = atlas::atlas(mesh, side).map_err(FuseError::Texture)?;
     let mut means = vec![Mean::default(); atlas.texels.len()];
     for camera in views::cameras(centre, radius, TEXTURE_SIDE) {
-        let view = View::new(scene, camera, radius)?;
+        let view = View::new(scene, camera, radius, u64::MAX)?;
         means.par_iter_mut().zip(&atlas.texels).for_each(|(mean, texel)| {
             mean.add(&view, texel.place, texel.normal, color::REACH * cell);
         });

@@ -57,14 +57,19 @@ pub fn cameras(centre: DVec3, radius: f64, side: u32) -> Vec<Camera> {
 }
 
 impl View {
-    /// Renders Gaussians from one of the [`cameras`] around a ball of this radius.
+    /// Renders Gaussians from one of the [`cameras`] around a ball of this radius. More than `max_intersections` pairs of a splat and a tile are refused.
     ///
     /// # Errors
     /// The errors of [`render`].
-    pub fn new(scene: &Loaded, camera: Camera, radius: f64) -> Result<Self, SplatError> {
+    pub fn new(
+        scene: &Loaded,
+        camera: Camera,
+        radius: f64,
+        max_intersections: u64,
+    ) -> Result<Self, SplatError> {
         // Gaussians between the camera and the ball are left out.
         let near = ((DISTANCE - 1.0) * radius) as f32;
-        let options = RenderOptions { depth: true, near, ..RenderOptions::inria() };
+        let options = RenderOptions { depth: true, near, max_intersections, ..RenderOptions::inria() };
         let rendered = render(&scene.seen_by(&camera)?, std::slice::from_ref(&camera), &options)?;
         let (alpha, color) = (host(rendered.alpha), host(rendered.color));
         let depth = host(rendered.depth.expect("depth was requested"));

@@ -47,6 +47,7 @@ pub struct Job {
     pub(super) near: f32,
     pub(super) antialiased: bool,
     pub(super) depth: bool,
+    pub(super) max_intersections: u64,
 }
 
 impl Job {
@@ -62,7 +63,7 @@ impl Job {
                 return Err(SplatError::Camera { index, problem });
             }
         }
-        let RenderOptions { max_alpha, blur, near, antialiased, depth, .. } = *options;
+        let RenderOptions { max_alpha, blur, near, antialiased, depth, max_intersections, .. } = *options;
         let check = |field, holds: bool, allowed| {
             if holds { Ok(()) } else { Err(SplatError::Option { field, allowed }) }
         };
@@ -80,6 +81,7 @@ impl Job {
             near,
             antialiased,
             depth,
+            max_intersections,
         })
     }
 

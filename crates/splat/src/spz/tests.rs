@@ -48,7 +48,7 @@ fn niantics_files_are_read_as_niantics_library_reads_them() {
         let (bytes, values) = reference(name);
         let degree = values["degree"].as_u64().expect("a degree");
         let expected = stored(&values["output"], degree);
-        let found = read(&bytes[..]).unwrap_or_else(|_| panic!("{name}"));
+        let found = read(&bytes[..], bytes.len() as u64).unwrap_or_else(|_| panic!("{name}"));
         assert_eq!(found.degree() as u64, degree);
         assert_eq!(found.columns.len(), expected.columns.len());
         for (row, (found, expected)) in found.columns.iter().zip(&expected.columns).enumerate() {
@@ -76,7 +76,7 @@ fn what_is_written_is_what_niantics_library_writes() {
 
 #[test]
 fn what_is_no_spz_or_a_damaged_one_is_refused() {
-    let problem = |bytes: &[u8]| match read(bytes) {
+    let problem = |bytes: &[u8]| match read(bytes, bytes.len() as u64) {
         Ok(_) => panic!("was read"),
         Err(Problem::Content(problem)) => problem,
         Err(Problem::Io(e)) => panic!("{e}"),
@@ -104,10 +104,13 @@ fn what_is_no_spz_or_a_damaged_one_is_refused() {
     let at = sum.len() - 6;
     sum[at] ^= 1;
     assert!(problem(&sum).contains("damaged"));
-    // No memory is allocated for the promises of a header.
+    // Neither memory nor time goes to the promises of a header, or to Gaussians that are all alike.
     let mut header = content(&good)[..16].to_vec();
     header[8..12].copy_from_slice(&10_000_000_u32.to_le_bytes());
-    assert!(problem(&packed(&header)).contains("0 of 90000000 bytes"));
+    assert!(problem(&packed(&header)).contains("10000000 Gaussians in"));
+    header[8..12].copy_from_slice(&500_000_u32.to_le_bytes());
+    header.resize(16 + 500_000 * 64, 0);
+    assert!(problem(&packed(&header)).contains("as of no real scene"));
 }
 
 #[test]
@@ -127,7 +130,7 @@ fn far_away_places_get_coarser_steps_and_that_is_told() {
     values.columns[0][0] = -70_000.0;
     let mut bytes = Vec::new();
     write(&values, &mut bytes).expect("written");
-    let Ok(found) = read(&bytes[..]) else { panic!("was written just now") };
+    let Ok(found) = read(&bytes[..], bytes.len() as u64) else { panic!("was written just now") };
     assert!((found.columns[0][0] + 70_000.0).abs() < 0.01);
     assert!((found.columns[1][0] - values.columns[1][0]).abs() <= 0.5 / 64.0);
     let told = losses(&values);
@@ -161,7 +164,7 @@ fn what_lies_beyond_the_range_is_counted() {
     // And it is kept at the border.
     let mut bytes = Vec::new();
     write(&values, &mut bytes).expect("written");
-    let Ok(found) = read(&bytes[..]) else { panic!("was written just now") };
+    let Ok(found) = read(&bytes[..], bytes.len() as u64) else { panic!("was written just now") };
     assert_eq!(found.columns[7][0], 255.0 / 16.0 - 10.0);
     assert_eq!(losses(&found), Vec::<String>::new());
 }

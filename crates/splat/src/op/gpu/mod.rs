@@ -288,6 +288,7 @@ fn lists(
     let s: Vec<u32> = into_data_sync(statistics).try_into_vec().expect("u32 as allocated");
     let [low, middle, high] = [0, 1, 2].map(|limb| u64::from(s[FATES + limb]));
     let found = low + (middle << 10) + (high << 20);
+    let limit = limit.min(job.max_intersections.saturating_mul(job.views.len() as u64));
     if found > limit {
         return Err(SplatError::TooManyIntersections { found, limit });
     }
