@@ -4,8 +4,9 @@ use std::fs;
 use std::path::Path;
 
 use burn::tensor::Device;
-use snapsnap_splat::Gaussians;
+use glam::{DMat3, DVec3};
 use snapsnap_splat::scene::{self, Stored};
+use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
 use snapsnap_tests::ply::{Format, cloud, ply_bytes};
 use snapsnap_tests::{data, refused, snapsnap, succeed, values};
 
@@ -104,6 +105,42 @@ fn what_is_written_is_read_again() {
 }
 
 /// A colour that is no number is not black.
+/// A turned file looks as before from a turned camera, spherical harmonics included, and reads as before.
+#[test]
+fn a_ply_with_y_down_is_turned_and_turned_back() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let path = |name: &str| temporary.path().join(name);
+    fs::write(path("any.ply"), ply_bytes(&cloud(200, 3), Format::Little, "", b"")).expect("written");
+    let convert = |from: &str, to: &str, more: &[&str]| {
+        let mut command = snapsnap();
+        command.arg("convert").arg(path(from)).arg(path(to)).args(more);
+        command
+    };
+    succeed(&mut convert("any.ply", "up.ply", &[]));
+    succeed(&mut convert("up.ply", "down.ply", &["--y-down"]));
+    succeed(&mut convert("down.ply", "again.ply", &[]));
+    let bytes = |name: &str| fs::read(path(name)).expect("reads");
+    assert!(bytes("up.ply") == bytes("again.ply"));
+    // As a viewer that does not know the comment.
+    let mut raw = bytes("down.ply");
+    let at = raw.windows(12).position(|text| text == b"axes: y down").expect("the comment");
+    raw[at..at + 12].copy_from_slice(b"no comment..");
+    fs::write(path("raw.ply"), raw).expect("written");
+    let look = |name: &str, camera: &Camera| {
+        let loaded = scene::read(&path(name), &Device::flex()).expect("reads");
+        let seen = loaded.seen_by(camera).expect("colours");
+        values(render(&seen, std::slice::from_ref(camera), &RenderOptions::inria()).expect("renders").color)
+    };
+    for camera in Camera::orbit(3, 64, 64) {
+        let mut turned = camera.clone();
+        turned.world_to_camera.rotation *= DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
+        let (up, down) = (look("up.ply", &camera), look("raw.ply", &turned));
+        let largest = up.iter().zip(&down).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        assert!(largest < 1e-4 && up.iter().any(|value| *value > 0.1), "{largest}");
+    }
+    assert!(refused(&mut convert("up.ply", "down.spz", &["--y-down"])).contains("y up by definition"));
+}
+
 #[test]
 fn colours_that_are_not_finite_are_kept() {
     let temporary = tempfile::tempdir().expect("temporary folder");

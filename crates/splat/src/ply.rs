@@ -19,8 +19,11 @@ pub const PROPERTIES: [&str; 17] = [
 /// How many of them come before `f_rest_0`.
 const BEFORE_REST: usize = 9;
 
-/// Writes a binary PLY.
-pub(crate) fn write(stored: &Stored, out: &mut impl Write) -> io::Result<()> {
+/// Comment of files whose world has y down, as the scenes of INRIA's datasets. Their readers turn them back.
+pub(crate) const Y_DOWN: &str = "axes: y down";
+
+/// Writes a binary PLY with this comment.
+pub(crate) fn write(stored: &Stored, comment: Option<&str>, out: &mut impl Write) -> io::Result<()> {
     let rest = stored.columns.len() - Stored::COLUMNS.len();
     let of = |name: &&str| {
         let at = Stored::COLUMNS.iter().position(|column| column == name);
@@ -32,7 +35,11 @@ pub(crate) fn write(stored: &Stored, out: &mut impl Write) -> io::Result<()> {
         (0..rest).map(|i| (format!("f_rest_{i}"), Some(&stored.columns[Stored::COLUMNS.len() + i][..])));
     properties.splice(BEFORE_REST..BEFORE_REST, bands);
 
-    writeln!(out, "ply\nformat binary_little_endian 1.0\nelement vertex {}", stored.len())?;
+    writeln!(out, "ply\nformat binary_little_endian 1.0")?;
+    if let Some(comment) = comment {
+        writeln!(out, "comment {comment}")?;
+    }
+    writeln!(out, "element vertex {}", stored.len())?;
     for (name, _) in &properties {
         writeln!(out, "property float {name}")?;
     }

@@ -73,6 +73,19 @@ impl Stored {
         Ok(file::write_whole(path, |out| self.encode(kind, out)).map_err(FileError::write(path))?)
     }
 
+    /// Writes a PLY whose world has y down, whole or not at all, for viewers that expect the axes of INRIA's scenes. Readers of this
+    /// crate turn it back, by a comment in the header.
+    ///
+    /// # Errors
+    /// As [`Self::write`].
+    pub fn write_y_down(&self, path: &Path) -> Result<(), SplatError> {
+        self.check(Kind::Ply, path)?;
+        let mut turned = self.clone();
+        turned.turn(false);
+        let written = file::write_whole(path, |out| ply::write(&turned, Some(ply::Y_DOWN), out));
+        Ok(written.map_err(FileError::write(path))?)
+    }
+
     /// The bytes of a file of this kind.
     ///
     /// # Errors
@@ -95,7 +108,7 @@ impl Stored {
 
     fn encode(&self, kind: Kind, out: &mut impl Write) -> io::Result<()> {
         match kind {
-            Kind::Ply => ply::write(self, out),
+            Kind::Ply => ply::write(self, None, out),
             Kind::Spz => spz::write(self, out),
         }
     }

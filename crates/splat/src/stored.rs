@@ -96,6 +96,28 @@ impl Stored {
         }
     }
 
+    /// Turns the Gaussians by 180° about the x axis, from y up to y down, or `back` in the opposite sense. Nothing is
+    /// rounded.
+    pub(crate) fn turn(&mut self, back: bool) {
+        // Monomials of each SH basis function up to degree 3: whether its powers of y and z have an odd sum, which reverses it.
+        const REVERSED: [bool; 16] = [
+            false, true, true, false, true, false, false, true, false, true, false, true, true, false, true,
+            false,
+        ];
+        let negate = |column: &mut Vec<f32>| column.iter_mut().for_each(|value| *value = -*value);
+        self.columns[1..3].iter_mut().for_each(negate);
+        // The quaternion of the turn, i, times (w, x, y, z) is (−x, w, −z, y); −i gives (x, −w, z, −y).
+        self.columns.swap(3, 4);
+        self.columns.swap(5, 6);
+        [3, 5].into_iter().for_each(|column| negate(&mut self.columns[column + usize::from(back)]));
+        let rest = self.coefficients - 1;
+        for (at, column) in self.columns[Self::COLUMNS.len()..].iter_mut().enumerate() {
+            if REVERSED[1 + at % rest.max(1)] {
+                negate(column);
+            }
+        }
+    }
+
     /// Drops every Gaussian that has a value that is not finite; returns how many there were.
     pub fn drop_not_finite(&mut self) -> usize {
         let whole = |i: usize| self.columns.iter().all(|column| column[i].is_finite());

@@ -15,14 +15,43 @@ pub struct Arguments {
     input: PathBuf,
     /// Output file: .ply or .spz.
     output: PathBuf,
+    #[command(flatten)]
+    axes: AxesArguments,
+}
+
+/// Axes of an output file of Gaussians.
+#[derive(Args)]
+pub struct AxesArguments {
+    /// Write a PLY with y down, as SuperSplat and other viewers of INRIA's scenes expect it; every command of this program
+    /// turns it back.
+    #[arg(long)]
+    y_down: bool,
+}
+
+impl AxesArguments {
+    /// Refuses y down for a kind of file that has y up by definition.
+    pub fn check(&self, output: &Path) -> Result<(), Failure> {
+        match self.y_down && Kind::of(output) == Kind::Spz {
+            true => {
+                Err(Failure::file(output, "--y-down: an SPZ has y up by definition, and viewers know it"))
+            }
+            false => Ok(()),
+        }
+    }
+
+    /// Writes the file, whole or not at all.
+    pub fn write(&self, stored: &Stored, output: &Path) -> Result<(), Failure> {
+        Ok(if self.y_down { stored.write_y_down(output) } else { stored.write(output) }?)
+    }
 }
 
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
-    let Arguments { input, output } = arguments;
+    let Arguments { input, output, axes } = arguments;
     check_kind(output)?;
+    axes.check(output)?;
     check_outputs(&[output], &[input])?;
     let (stored, dropped) = finite(input)?;
-    stored.write(output)?;
+    axes.write(&stored, output)?;
     if say::is_quiet() {
         return Ok(());
     }

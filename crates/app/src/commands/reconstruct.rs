@@ -10,8 +10,9 @@ use snapsnap_data::photo::{self, Canvas, Placement};
 use snapsnap_mesh::picture;
 use snapsnap_net::weights::schema::Part;
 use snapsnap_net::{Photograph, Reconstructor};
-use snapsnap_splat::scene;
+use snapsnap_splat::scene::Stored;
 
+use super::convert::AxesArguments;
 use super::mesh::{self, SurfaceArguments, Target};
 use super::{ConfigArguments, check_kind, check_outputs, is_same_file};
 use crate::failure::{Failure, bail};
@@ -46,6 +47,8 @@ pub struct Arguments {
     /// File of Gaussians to write, .ply or .spz. The resolved config is written beside it.
     #[arg(short, long, default_value = "human.ply")]
     output: PathBuf,
+    #[command(flatten)]
+    axes: AxesArguments,
     /// Also render the result all around: an animation, a sheet of eight views, or a folder of pictures.
     #[arg(long, value_name = "OUT.gif|OUT.png|DIR")]
     turntable: Option<PathBuf>,
@@ -124,7 +127,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     progress.stage("writing");
     let since = Instant::now();
     let world = result.in_world(&config);
-    scene::write(&world, &arguments.output)?;
+    arguments.axes.write(&Stored::of(&world)?, &arguments.output)?;
     if let Some(path) = &config_path {
         output::write(path, config.resolved().to_toml().as_bytes())?;
     }
@@ -182,6 +185,7 @@ fn check_paths(
     outputs.extend(pictures.iter().map(PathBuf::as_path));
     check_outputs(&outputs, &inputs)?;
     check_kind(&arguments.output)?;
+    arguments.axes.check(&arguments.output)?;
     Ok(config_path)
 }
 

@@ -3,6 +3,7 @@
 
 use std::io::{self, BufRead, BufReader, Cursor, Read};
 
+use super::Y_DOWN;
 use super::header::{Element, Format, Header, MAX_HEADER, Property, parse};
 use crate::stored::{Problem, Stored};
 use snapsnap_base::quoted;
@@ -16,7 +17,11 @@ pub(crate) fn read(mut input: impl Read) -> Result<Stored, Problem> {
     (&mut input).take(MAX_HEADER as u64 + 1).read_to_end(&mut start)?;
     let header = parse(&start)?;
     let mut body = BufReader::new(Cursor::new(start.split_off(header.len)).chain(input));
-    table(&header, &mut body)
+    let mut stored = table(&header, &mut body)?;
+    if header.comments.iter().any(|comment| comment == Y_DOWN) {
+        stored.turn(true);
+    }
+    Ok(stored)
 }
 
 fn table(header: &Header, body: &mut impl BufRead) -> Result<Stored, Problem> {
