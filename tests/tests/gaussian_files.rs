@@ -132,7 +132,7 @@ fn a_ply_with_y_down_is_turned_and_turned_back() {
         values(render(&seen, std::slice::from_ref(camera), &RenderOptions::inria()).expect("renders").color)
     };
     for camera in Camera::orbit(3, 64, 64) {
-        let mut turned = camera.clone();
+        let mut turned = camera;
         turned.world_to_camera.rotation *= DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
         let (up, down) = (look("up.ply", &camera), look("raw.ply", &turned));
         let largest = up.iter().zip(&down).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
