@@ -1,5 +1,6 @@
 //! A photograph and its mask → a square canvas, with the person at the networks' place and size.
 
+mod doubts;
 mod placing;
 #[cfg(test)]
 mod tests;
@@ -56,6 +57,16 @@ pub struct Canvas {
     pub report: String,
 }
 
+/// The photographs of front and back.
+#[derive(Debug, Clone)]
+pub struct Pair {
+    /// Front and back on their canvases.
+    pub canvases: [Canvas; 2],
+    /// Signs that they are not photographs as the networks need them, a sentence each: a mask that touches three borders, a
+    /// person who is wider than high, equal pictures, silhouettes that do not fit one another.
+    pub doubts: Vec<String>,
+}
+
 /// Loads the photographs of front and back and places each on a canvas of `side` pixels. The mask of the person is the
 /// file in `masks` (white: person) or, without one, the picture's alpha channel. With [`Placement::Training`],
 /// photographs whose sizes and boxes agree are taken for photographs from one place. They get the same scale and
@@ -69,18 +80,21 @@ pub fn load(
     masks: [Option<&Path>; 2],
     side: usize,
     placement: Placement,
-) -> Result<[Canvas; 2], FileError> {
+) -> Result<Pair, FileError> {
     let front = Cutout::read(paths[0], masks[0], side, placement)?;
     let back = Cutout::read(paths[1], masks[1], side, placement)?;
+    let doubts = doubts::doubts(&front, &back);
     let common = match placement {
         Placement::Training { .. } => together([&front.mask, &back.mask], [front.person, back.person]),
         _ => None,
     };
-    Ok([front.canvas(common, side, placement)?, back.canvas(common, side, placement)?])
+    let canvases = [front.canvas(common, side, placement)?, back.canvas(common, side, placement)?];
+    Ok(Pair { canvases, doubts })
 }
 
 /// A photograph without its background.
 struct Cutout<'a> {
+    path: &'a Path,
     /// File of the mask.
     mask_path: &'a Path,
     rgb: RgbImage,
@@ -131,7 +145,7 @@ impl<'a> Cutout<'a> {
             "{width}×{height}, person's box {}×{} at ({}, {})",
             person.width, person.height, person.x, person.y
         );
-        Ok(Self { mask_path, rgb, mask, person, source })
+        Ok(Self { path, mask_path, rgb, mask, person, source })
     }
 
     /// Places the photograph by the person's box, or by the common box of both photographs.
@@ -141,7 +155,7 @@ impl<'a> Cutout<'a> {
         side: usize,
         placement: Placement,
     ) -> Result<Canvas, FileError> {
-        let Self { mask_path, rgb, mask, person, source } = self;
+        let Self { mask_path, rgb, mask, person, source, .. } = self;
         let canvas = match placement {
             Placement::AsIs => on_canvas(&rgb, &mask, source + ", used as it is"),
             Placement::Training { height } => {

@@ -254,14 +254,9 @@ fn missing_and_damaged_parts_are_named_and_the_rest_evaluated() {
 fn a_prediction_that_is_not_finite_is_counted() {
     let temporary = tempfile::tempdir().expect("a folder");
     let report = temporary.path().join("report");
-    // With this δ, in metres per unit, products overflow f32.
     let huge = ["--set", "network.anchor=none", "--set", "network.conf_threshold=0.0"];
     let config = temporary.path().join("networks.toml");
-    let networks = snapsnap_tests::TRAINING
-        .split("[samples]")
-        .next()
-        .expect("sections")
-        .replace("delta = 0.2", "delta = 3e38");
+    let networks = snapsnap_tests::TRAINING.split("[samples]").next().expect("sections");
     fs::write(&config, networks).expect("writes");
     let file = temporary.path().join("huge.safetensors");
     succeed(
@@ -272,6 +267,8 @@ fn a_prediction_that_is_not_finite_is_counted() {
             .arg("-o")
             .arg(&file),
     );
+    // Products overflow f32.
+    snapsnap_tests::fill_weights(&file, 1e30);
     let file = file.display().to_string();
     let arguments = ["--set", "metrics.geometry=false", "--weights", file.as_str()];
     let (code, said) = ended(&mut evaluate(people(), &report, &arguments));

@@ -75,7 +75,8 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let since = Instant::now();
     // The sample pair fills its canvas. Hence its cameras are known, and other views can be compared.
     let [front, back] = PHOTOGRAPHS.map(|(name, _)| folder.path.join(name));
-    let canvases = photo::load([&front, &back], [None; 2], config.network.resolution, Placement::AsIs)?;
+    let canvases =
+        photo::load([&front, &back], [None; 2], config.network.resolution, Placement::AsIs)?.canvases;
     let [front, back] = canvases.map(|Canvas { rgb, mask, valid, .. }| Photograph { rgb, mask, valid });
     let reconstructor = Reconstructor::load(&weights, &device)?;
     let made = reconstructor.reconstruct(&front, &back, &|name| progress.stage(name));

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use clap::Args;
 use snapsnap_base::config::Schema;
 use snapsnap_base::file;
-use snapsnap_data::photo::{self, Canvas, Placement};
+use snapsnap_data::photo::{self, Canvas, Pair, Placement};
 use snapsnap_mesh::picture;
 use snapsnap_net::weights::schema::Part;
 use snapsnap_net::{Photograph, Reconstructor};
@@ -36,6 +36,9 @@ pub struct Arguments {
     /// Use the pictures as the canvas, without cropping, scaling and centring.
     #[arg(long)]
     as_is: bool,
+    /// Refuse photographs that seem to be wrong, instead of a warning.
+    #[arg(long)]
+    strict: bool,
     /// Weight file, or a folder that contains `weights.safetensors` [default: the program's own].
     #[arg(long, value_name = "FILE|DIR")]
     weights: Option<PathBuf>,
@@ -100,7 +103,11 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let since = Instant::now();
     let masks = [0, 1].map(|i| masks.get(i).map(PathBuf::as_path));
     let paths = [arguments.front.as_path(), &arguments.back];
-    let canvases = photo::load(paths, masks, config.network.resolution, placement)?;
+    let Pair { canvases, doubts } = photo::load(paths, masks, config.network.resolution, placement)?;
+    if arguments.strict && !doubts.is_empty() {
+        bail!("{} (--strict)", doubts.join("\n"));
+    }
+    doubts.iter().for_each(|doubt| say::note(&format!("warning: {doubt}")));
     timed("photographs", since);
 
     let progress = Progress::stages();

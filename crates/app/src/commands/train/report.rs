@@ -29,7 +29,8 @@ impl Reporter {
     pub fn new(config: &TrainConfig, limit: Option<Duration>) -> Self {
         let bar = (!say::is_quiet() && std::io::stderr().is_terminal()).then(|| {
             let bar = ProgressBar::new(config.training.steps as u64);
-            let style = ProgressStyle::with_template("{bar:30} {pos}/{len} {msg}").expect("a valid template");
+            let style =
+                ProgressStyle::with_template("{bar:20} {pos}/{len} {wide_msg}").expect("a valid template");
             bar.set_style(style);
             bar
         });
@@ -71,15 +72,16 @@ impl Watch for Reporter {
             .collect();
         let memory = memory::used().map_or(String::new(), |bytes| format!(", {:.1} GB", bytes as f64 / 1e9));
         let skipped = if skipped > 0 { format!(", {skipped} skipped") } else { String::new() };
+        // A narrow terminal cuts off the end.
         let message = format!(
-            "loss {:.4} ({}), {:.2} it/s, {:.1} samples/s, rate {:.1e}, norm {:.2}{memory}{skipped}, {}",
+            "loss {:.4}, {}, {:.2} it/s{skipped}, {}, {:.1} samples/s, rate {:.1e}, norm {:.2}{memory}",
             value("loss"),
-            parts.join(", "),
+            self.left(line, steps),
             value("steps_per_second"),
+            parts.join(", "),
             value("samples_per_second"),
             value("rate"),
             value("norm"),
-            self.left(line, steps),
         );
         let first = *self.first.get_or_insert(line.step);
         if let Some(bar) = &self.bar {

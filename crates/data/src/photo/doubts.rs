@@ -1,0 +1,114 @@
+//! Signs that two photographs are not those of the front and the back of one person who stands upright.
+
+use image::{GrayImage, RgbImage};
+
+use super::{Cutout, Rect};
+
+/// Mask value from which a pixel belongs to the person.
+const PERSON: u8 = 128;
+/// Share of a border from which the mask touches it, and number of borders that no person touches.
+const TOUCHED: f32 = 0.05;
+const BORDERS: usize = 3;
+/// Largest width of a person as a share of the height. Outstretched arms reach about 1.
+const WIDEST: f32 = 1.2;
+/// Least overlap (intersection over union) of the front's silhouette and the mirrored back's, each scaled to its own box. Photographs
+/// of one pose have 0.8 and more.
+const OVERLAP: f32 = 0.55;
+/// Side of the grid on which silhouettes and colours are compared.
+const GRID: u32 = 64;
+/// Largest mean difference of colours, of 255, between two files of one picture.
+const EQUAL: f32 = 2.0;
+
+/// The doubts about both photographs, a sentence each.
+pub(super) fn doubts(front: &Cutout, back: &Cutout) -> Vec<String> {
+    let mut doubts = Vec::new();
+    for one in [front, back] {
+        let mut add = |message: String| doubts.push(format!("{}: {message}", one.path.display()));
+        let touched = borders(&one.mask);
+        if touched >= BORDERS {
+            add(format!(
+                "the mask touches {touched} borders of the picture: is it inverted? The person must be white"
+            ));
+        }
+        let Rect { width, height, .. } = one.person;
+        if width as f32 > WIDEST * height as f32 {
+            add(format!(
+                "the person is wider than high ({width}×{height} pixels): the person should stand upright"
+            ));
+        }
+    }
+    let pair = |message: &str| format!("{} and {}: {message}", front.path.display(), back.path.display());
+    if are_equal(front, back, false) {
+        doubts.push(pair("this is the same picture twice"));
+    } else if are_equal(front, back, true) {
+        doubts.push(pair("one is the mirror image of the other"));
+    } else {
+        let overlap = overlap(front, back);
+        if overlap < OVERLAP {
+            let share = (100.0 * overlap).round();
+            doubts.push(pair(&format!(
+                "the silhouettes of the front and of the mirrored back overlap by {share} % only: are they one person in one pose?"
+            )));
+        }
+    }
+    doubts
+}
+
+/// Number of borders that the person touches.
+fn borders(mask: &GrayImage) -> usize {
+    let (width, height) = mask.dimensions();
+    let rows = [0, height - 1].map(|y| share(width, |x| mask.get_pixel(x, y)[0]));
+    let columns = [0, width - 1].map(|x| share(height, |y| mask.get_pixel(x, y)[0]));
+    rows.into_iter().chain(columns).filter(|share| *share > TOUCHED).count()
+}
+
+/// Share of the places along a border that belong to the person.
+fn share(length: u32, value: impl Fn(u32) -> u8) -> f32 {
+    (0..length).filter(|at| value(*at) >= PERSON).count() as f32 / length as f32
+}
+
+/// The pixel at a place of the grid over the person's box, mirrored or not.
+fn place(person: Rect, x: u32, y: u32, mirrored: bool) -> (u32, u32) {
+    let x = if mirrored { GRID - 1 - x } else { x };
+    let at = |first: u32, length: u32, i: u32| first + (2 * i + 1) * length / (2 * GRID);
+    (at(person.x, person.width, x), at(person.y, person.height, y))
+}
+
+/// All places of the grid.
+fn grid() -> impl Iterator<Item = (u32, u32)> {
+    (0..GRID).flat_map(|y| (0..GRID).map(move |x| (x, y)))
+}
+
+fn overlap(front: &Cutout, back: &Cutout) -> f32 {
+    let inside = |one: &Cutout, x: u32, y: u32, mirrored: bool| {
+        let (x, y) = place(one.person, x, y, mirrored);
+        one.mask.get_pixel(x, y)[0] >= PERSON
+    };
+    let (mut both, mut any) = (0_u32, 0_u32);
+    for (x, y) in grid() {
+        let (a, b) = (inside(front, x, y, false), inside(back, x, y, true));
+        both += u32::from(a && b);
+        any += u32::from(a || b);
+    }
+    both as f32 / any.max(1) as f32
+}
+
+/// Whether the person has the same colours in both pictures, or in one and the mirror image of the other.
+fn are_equal(front: &Cutout, back: &Cutout, mirrored: bool) -> bool {
+    let (mut sum, mut count) = (0.0, 0);
+    for (x, y) in grid() {
+        let [a, b] = [(front, false), (back, mirrored)].map(|(one, mirrored)| {
+            let at = place(one.person, x, y, mirrored);
+            (color(&one.rgb, at), one.mask.get_pixel(at.0, at.1)[0] >= PERSON)
+        });
+        if a.1 || b.1 {
+            sum += a.0.iter().zip(b.0).map(|(a, b)| (a - b).abs()).sum::<f32>() / 3.0;
+            count += 1;
+        }
+    }
+    count > 0 && sum / count as f32 <= EQUAL
+}
+
+fn color(picture: &RgbImage, (x, y): (u32, u32)) -> [f32; 3] {
+    picture.get_pixel(x, y).0.map(f32::from)
+}

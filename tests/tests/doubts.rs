@@ -1,0 +1,101 @@
+//! Photographs that are not those of the front and the back of one person who stands upright.
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use image::{DynamicImage, GrayImage, Luma, RgbaImage};
+use snapsnap_tests::{refused, root, snapsnap, succeed};
+
+/// The sample's picture of one side.
+fn sample(side: &str) -> RgbaImage {
+    image::open(root().join(format!("assets/sample/{side}.png"))).expect("the sample").to_rgba8()
+}
+
+/// The sample with each picture changed.
+fn pair(folder: &Path, change: impl Fn(RgbaImage) -> RgbaImage) -> [PathBuf; 2] {
+    ["front", "back"].map(|side| {
+        let path = folder.join(format!("{side}.png"));
+        change(sample(side)).save(&path).expect("written");
+        path
+    })
+}
+
+fn reconstruct(folder: &Path, [front, back]: &[PathBuf; 2]) -> Command {
+    let mut command = snapsnap();
+    command.args(["reconstruct", "--device", "cpu", "-o"]).arg(folder.join("human.ply")).arg(front).arg(back);
+    command
+}
+
+/// The message of --strict, which writes nothing.
+fn strict(folder: &Path, photographs: &[PathBuf; 2], more: &[PathBuf]) -> String {
+    let said = refused(reconstruct(folder, photographs).arg("--strict").args(more));
+    assert!(said.contains("--strict") && !folder.join("human.ply").exists(), "{said}");
+    said
+}
+
+#[test]
+fn the_sample_raises_no_doubt() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let photographs = pair(temporary.path(), |picture| picture);
+    let output = reconstruct(temporary.path(), &photographs).arg("--strict").output().expect("runs");
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success() && !said.contains("warning"), "{said}");
+}
+
+#[test]
+fn an_inverted_mask_is_noticed() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let photographs = pair(temporary.path(), |picture| picture);
+    let masks = ["front", "back"].map(|side| {
+        let picture = sample(side);
+        let inverted = |x, y| Luma([255 - picture.get_pixel(x, y)[3]]);
+        let path = temporary.path().join(format!("{side}_mask.png"));
+        GrayImage::from_fn(picture.width(), picture.height(), inverted).save(&path).expect("written");
+        path
+    });
+    let more: Vec<PathBuf> = ["--masks".into()].into_iter().chain(masks).collect();
+    let said = strict(temporary.path(), &photographs, &more);
+    assert!(said.contains("touches 4 borders") && said.contains("is it inverted?"), "{said}");
+}
+
+#[test]
+fn somebody_who_lies_is_noticed() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let photographs = pair(temporary.path(), |picture| DynamicImage::from(picture).rotate90().to_rgba8());
+    let said = strict(temporary.path(), &photographs, &[]);
+    assert!(said.contains("wider than high"), "{said}");
+}
+
+#[test]
+fn one_picture_in_place_of_two_is_noticed_and_taken() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let [front, _] = pair(temporary.path(), |picture| picture);
+    let twice = [front.clone(), front.clone()];
+    assert!(strict(temporary.path(), &twice, &[]).contains("the same picture twice"));
+    let flipped = temporary.path().join("flipped.png");
+    image::imageops::flip_horizontal(&sample("front")).save(&flipped).expect("written");
+    assert!(strict(temporary.path(), &[front, flipped], &[]).contains("mirror image"));
+    let output = reconstruct(temporary.path(), &twice).output().expect("runs");
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success() && said.matches("warning: ").count() == 1, "{said}");
+    assert!(!succeed(reconstruct(temporary.path(), &twice).arg("--quiet")).contains("warning"));
+}
+
+#[test]
+fn silhouettes_that_do_not_fit_are_noticed() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let [front, back] = pair(temporary.path(), |picture| picture);
+    let mut other = sample("back");
+    let (width, height) = other.dimensions();
+    // A cross from corner to corner.
+    for (x, y, pixel) in other.enumerate_pixels_mut() {
+        let (u, v) = (x as f32 / width as f32, y as f32 / height as f32);
+        let inside = (0.3..0.7).contains(&u) && (0.1..0.9).contains(&v);
+        let along = (u - 0.3) / 0.4 - (v - 0.1) / 0.8;
+        let across = (u - 0.3) / 0.4 + (v - 0.1) / 0.8 - 1.0;
+        pixel.0 = [x as u8, y as u8, 90, if inside && along.abs().min(across.abs()) < 0.1 { 255 } else { 0 }];
+    }
+    other.save(&back).expect("written");
+    let said = strict(temporary.path(), &[front, back], &[]);
+    assert!(said.contains("silhouettes"), "{said}");
+}
