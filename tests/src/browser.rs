@@ -55,6 +55,15 @@ impl Page {
     /// An empty page of so many pixels, drawn by a software GPU; `None`, said aloud, where there is no browser. That is an error
     /// where `SNAPSNAP_REQUIRE_CHROMIUM` is set.
     pub fn new(width: u32, height: u32) -> Option<Self> {
+        Self::with_options(
+            width,
+            height,
+            &["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage"],
+        )
+    }
+
+    /// As [`Self::new`], in a browser with these options.
+    pub fn with_options(width: u32, height: u32, options: &[&str]) -> Option<Self> {
         let Some(program) = program() else {
             assert!(env::var_os("SNAPSNAP_REQUIRE_CHROMIUM").is_none(), "no Chromium, but it is required");
             println!("SKIPPED: no Chromium on this machine");
@@ -68,7 +77,7 @@ impl Page {
         command.args(["-c", script, "sh"]).args(&pipes).arg(program);
         // Its own sandbox needs rights that containers do not give; the page is ours.
         command.args(["--headless", "--no-sandbox", "--remote-debugging-pipe", "--no-first-run"]);
-        command.args(["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage"]);
+        command.args(options);
         command.arg(format!("--user-data-dir={}", folder.path().join("profile").display()));
         command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
         let process = command.process_group(0).spawn().expect("a shell");
@@ -155,6 +164,14 @@ impl Page {
         while self.value(expression) != json!(true) {
             assert!(Instant::now() < end, "never true: {expression}; errors: {:?}", self.errors);
             thread::sleep(Duration::from_millis(50));
+        }
+    }
+
+    /// Presses a key, named as in the browser's events, with Shift or without.
+    pub fn press(&mut self, key: &str, shift: bool) {
+        for kind in ["keyDown", "keyUp"] {
+            let event = json!({ "type": kind, "key": key, "modifiers": if shift { 8 } else { 0 } });
+            self.ask("Input.dispatchKeyEvent", event);
         }
     }
 

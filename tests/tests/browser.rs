@@ -130,6 +130,20 @@ fn a_browser_shows_the_person_and_turns_it() {
     assert_eq!(page.value("document.getElementById('message').textContent"), "");
     assert_eq!(page.value("document.getElementById('name').textContent"), "human.ply");
 
+    // A grey gradient surrounds the person, lighter above. Our own render has a black background.
+    let shot = folder.join("gradient.png");
+    screenshot(&mut page, &shot);
+    let shot = image::open(&shot).expect("a picture").into_rgb8();
+    let [above, below] = [1, SIDE - 2].map(|y| shot.get_pixel(1, y).0);
+    assert!(above.iter().zip(below).all(|(a, b)| *a > b + 40 && *a < 180 && b > 60), "{above:?} {below:?}");
+    let choose = |value: &str| {
+        format!(
+            "{{ const chosen = document.getElementById('surround'); chosen.value = '{value}'; \
+             chosen.dispatchEvent(new Event('input')); }}"
+        )
+    };
+    page.value(&choose("#000000"));
+
     // From the front, and turned by a drag, once it has come to rest.
     let front = agreement(&mut page, &file, folder);
     check_rest(&mut page, folder);
@@ -163,7 +177,60 @@ fn a_browser_shows_the_person_and_turns_it() {
     );
     assert!(front.min(turned).min(back) >= ALIKE, "{front} {turned} {back}");
 
+    // Arrows turn, with Shift they shift. Digits are sides. A double click moves the centre of turning to the body's surface.
+    let close = |a: f64, b: f64| (a - b).abs() < 0.1;
+    page.press("1", false);
+    page.press("ArrowRight", false);
+    page.press("ArrowUp", false);
+    let [yaw, pitch, away] = place(&mut page);
+    assert!(close(yaw, 5.0) && close(pitch, 13.0) && close(away, 2.0), "{yaw} {pitch} {away}");
+    page.press("1", false);
+    let centre = |page: &mut Page| page.value("snapsnap.target()");
+    let before = centre(&mut page);
+    page.press("ArrowLeft", true);
+    let after = centre(&mut page);
+    let x = |value: &Value| value[0].as_f64().expect("a number");
+    assert!((-0.2..-0.05).contains(&(x(&after) - x(&before))), "{before} {after}");
+    page.press("1", false);
+    for count in [1, 2] {
+        for kind in ["mousePressed", "mouseReleased"] {
+            let event = json!({ "type": kind, "x": 384, "y": 384, "button": "left", "clickCount": count });
+            page.ask("Input.dispatchMouseEvent", event);
+        }
+    }
+    let after = centre(&mut page);
+    let z = after[2].as_f64().expect("a number");
+    assert!((0.05..0.3).contains(&z), "{after}");
+    // Rotation goes on until it is switched off.
+    page.press("1", false);
+    page.press("r", false);
+    page.wait("(() => { const m = snapsnap.camera().world_to_camera; return Math.abs(m[0][0]) < 0.9; })()");
+    page.value("document.getElementById('rotate').click()");
+    check_rest(&mut page, folder);
+    assert_eq!(page.value("getComputedStyle(document.getElementById('keys')).display"), "none");
+    page.press("?", false);
+    assert_eq!(page.value("getComputedStyle(document.getElementById('keys')).display"), "block");
+    page.press("?", false);
+
+    // A mesh says what is being done.
+    page.value(
+        "{ window.said = new Set(); window.saved = []; const message = document.getElementById('message'); \
+         new MutationObserver(() => window.said.add(message.textContent)).observe(message, { childList: true }); \
+         HTMLAnchorElement.prototype.click = function () { window.saved.push(this.download); }; }",
+    );
+    page.value(
+        "document.getElementById('mesh').dispatchEvent(new MouseEvent('click', { cancelable: true, bubbles: true }))",
+    );
+    page.wait("window.saved.length === 1");
+    assert_eq!(page.value("window.saved[0]"), "human.glb");
+    let said = page.value("[...window.said].join('|')").to_string();
+    assert!(
+        said.contains("Making the mesh: views from all around … ") && said.contains("texture … "),
+        "{said}"
+    );
+
     // The background is the colour that was chosen.
+    page.value(&choose("chosen"));
     page.value(
         "{ const chosen = document.getElementById('background'); chosen.value = '#806040'; \
          chosen.dispatchEvent(new Event('input')); }",
@@ -194,4 +261,37 @@ fn a_browser_shows_the_person_and_turns_it() {
         |address: &&String| !["blob:", "data:", url.as_str()].iter().any(|own| address.starts_with(own));
     let asked: Vec<&String> = page.requests.iter().filter(elsewhere).collect();
     assert!(asked.is_empty() && page.requests.len() > 3, "{asked:?} of {:?}", page.requests);
+}
+
+/// Without WebGL the page says so, and its downloads work.
+#[test]
+fn a_browser_without_webgl_is_told_so() {
+    let options = ["--disable-gpu", "--disable-webgl", "--disable-3d-apis", "--disable-dev-shm-usage"];
+    let Some(mut page) = Page::with_options(400, 700, &options) else { return };
+    let server = Server::new(&data("spz/v3_degree0.spz"));
+    page.ask("Page.navigate", json!({ "url": format!("http://127.0.0.1:{}/", server.port) }));
+    page.wait("document.getElementById('message')?.textContent.includes('WebGL 2')");
+    let link = "document.querySelector('a[href=\"./scene.spz\"]')";
+    assert_eq!(page.value(&format!("fetch({link}.href).then(answer => answer.status)")), 200);
+}
+
+/// Fingers hit buttons of at least 40 pixels.
+#[test]
+fn buttons_are_large_on_touch_screens() {
+    let Some(mut page) = Page::new(390, 800) else { return };
+    page.ask("Emulation.setTouchEmulationEnabled", json!({ "enabled": true }));
+    let features = json!({ "features": [{ "name": "pointer", "value": "coarse" }] });
+    page.ask("Emulation.setEmulatedMedia", features);
+    let server = Server::new(&data("spz/v3_degree0.spz"));
+    page.ask("Page.navigate", json!({ "url": format!("http://127.0.0.1:{}/", server.port) }));
+    page.wait("window.snapsnap !== undefined");
+    let smallest = page.value(
+        "Math.min(...[...document.querySelectorAll('button, .button')].flatMap(b => [b.offsetWidth, b.offsetHeight]))",
+    );
+    assert!(smallest.as_f64() >= Some(40.0), "{smallest}");
+    // All of them are on the screen.
+    let right = page.value(
+        "Math.max(...[...document.querySelectorAll('button, .button')].map(b => b.getBoundingClientRect().right))",
+    );
+    assert!(right.as_f64() <= Some(390.0), "{right}");
 }

@@ -301,7 +301,8 @@ fn small_files_that_take_minutes_are_refused_at_once() {
     let path = |name: &str| temporary.path().join(name);
     fs::write(path("many.ply"), balls((0..500_000).map(|_| [0.0; 3]), 0.0)).expect("written");
     succeed(snapsnap().arg("convert").arg(path("many.ply")).arg(path("many.spz")));
-    for (name, expected) in [("many.ply", "--force"), ("many.spz", "no real scene")] {
+    let large = "the Gaussians are too large";
+    for (name, expected) in [("many.ply", [large, "--force"]), ("many.spz", ["no real scene"; 2])] {
         let mut mesh = snapsnap();
         mesh.arg("mesh").arg(path(name)).args(["--device", "cpu", "-o"]).arg(path("mesh.glb"));
         let mut render = snapsnap();
@@ -310,7 +311,7 @@ fn small_files_that_take_minutes_are_refused_at_once() {
             .arg(path(name))
             .args(["--device", "cpu", "--orbit", "8", "-o"])
             .arg(path("views"));
-        for command in [&mut mesh, &mut render] {
+        for (command, expected) in [&mut mesh, &mut render].into_iter().zip(expected) {
             let start = Instant::now();
             let said = refused(command);
             assert!(said.contains(name) && said.contains(expected), "{said}");
@@ -319,4 +320,30 @@ fn small_files_that_take_minutes_are_refused_at_once() {
         }
         assert!(!path("mesh.glb").exists() && !path("views/cameras.json").exists());
     }
+}
+
+/// Gaussians all over a cube have far more surface than a person. The refusal is bounded in memory.
+#[test]
+#[cfg(target_os = "linux")]
+fn scattered_gaussians_are_refused_within_two_gigabytes() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let path = |name: &str| temporary.path().join(name);
+    let mut random = snapsnap_tests::scenes::Random(5);
+    let mut place = || [0; 3].map(|_| random.between(-1.0, 1.0));
+    let places: Vec<[f32; 3]> = (0..13_000).map(|_| place()).collect();
+    fs::write(path("cube.ply"), balls(places.into_iter(), 0.02_f32.ln())).expect("written");
+    let program = snapsnap().get_program().to_owned();
+    let limited = Command::new("sh")
+        .args(["-c", "ulimit -v 2500000; exec \"$@\"", "sh"])
+        .arg(program)
+        .args(["mesh", "--device", "cpu", "-o"])
+        .args([path("mesh.glb"), path("cube.ply")])
+        .output()
+        .expect("starts");
+    let said = String::from_utf8_lossy(&limited.stderr);
+    assert_eq!(limited.status.code(), Some(2), "{said}");
+    assert!(
+        said.contains("million triangles, far more than a person's") && said.contains("--force"),
+        "{said}"
+    );
 }

@@ -92,7 +92,9 @@ impl From<FuseError> for Failure {
             FuseError::Splat(e) => e.into(),
             FuseError::Reduce(_) => Self::Internal(e.to_string()),
             FuseError::Long(_) => Self::Input(format!("{e}; --force makes it all the same")),
-            FuseError::Nothing(_) | FuseError::Hollow | FuseError::Texture(_) => Self::Input(e.to_string()),
+            FuseError::Nothing(_) | FuseError::Hollow | FuseError::Coarse | FuseError::Texture(_) => {
+                Self::Input(e.to_string())
+            }
         }
     }
 }

@@ -31,7 +31,8 @@ pub fn read_back<const D: usize>(tensor: Tensor<D>) -> Result<Vec<f32>, Failure>
 
 /// Writes a PNG, whole or not at all.
 pub fn write_png(path: &Path, picture: &RgbImage) -> Result<(), Failure> {
-    Ok(preview::write_png(path, picture)?)
+    preview::write_png(path, picture)?;
+    Ok(())
 }
 
 /// Writes an endless animation, whole or not at all.

@@ -1,5 +1,7 @@
 //! Curves as SVG.
 
+use std::ops::Range;
+
 use plotters::coord::Shift;
 use plotters::prelude::*;
 
@@ -74,12 +76,7 @@ fn draw(area: &Area, axes: &Axes, series: &[Series]) -> Drawn {
         let values = drawable(axes, series).map(of);
         let (low, high) = values.fold((f64::MAX, f64::MIN), |(low, high), v| (low.min(v), high.max(v)));
         let room = 0.05 * (high - low).max(1e-3 * high.abs()).max(1e-9);
-        // Ticks are powers of ten: within one of them there is none.
-        if log && high >= 10.0 * low {
-            (0.8 * low..1.2 * high, true)
-        } else {
-            (low - room..high + room, false)
-        }
+        if log { (0.9 * low..1.1 * high, true) } else { (low - room..high + room, false) }
     };
     if drawable(axes, series).next().is_none() {
         return Ok(());
@@ -92,7 +89,13 @@ fn draw(area: &Area, axes: &Axes, series: &[Series]) -> Drawn {
     macro_rules! chart {
         ($x:expr, $y:expr) => {{
             let mut chart = builder.build_cartesian_2d($x, $y)?;
-            chart.configure_mesh().x_desc(axes.x).y_desc(axes.y).draw()?;
+            chart
+                .configure_mesh()
+                .x_desc(axes.x)
+                .y_desc(axes.y)
+                .x_label_formatter(&|v| number(*v))
+                .y_label_formatter(&|v| number(*v))
+                .draw()?;
             for (i, s) in series.iter().enumerate() {
                 let color = Palette99::pick(i).to_rgba();
                 let points = || s.points.iter().copied().filter(|point| is_drawable(axes, *point));
@@ -108,13 +111,44 @@ fn draw(area: &Area, axes: &Axes, series: &[Series]) -> Drawn {
             }
         }};
     }
+    let log = |range: Range<f64>| {
+        let ticks = ticks(&range);
+        range.log_scale().with_key_points(ticks)
+    };
     match (log_x, log_y) {
         (false, false) => chart!(x, y),
-        (true, false) => chart!(x.log_scale(), y),
-        (false, true) => chart!(x, y.log_scale()),
-        (true, true) => chart!(x.log_scale(), y.log_scale()),
+        (true, false) => chart!(log(x), y),
+        (false, true) => chart!(x, log(y)),
+        (true, true) => chart!(log(x), log(y)),
     }
     Ok(())
+}
+
+/// Ticks of a logarithmic axis: powers of ten, their multiples where the range has few, and finer steps within a factor of two.
+fn ticks(range: &Range<f64>) -> Vec<f64> {
+    let decades = (range.end / range.start).log10();
+    let steps: &[f64] = match decades {
+        d if d < 0.5 => &[1.0, 1.2, 1.4, 1.6, 1.8, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5, 5.0, 6.0, 7.0, 8.0, 9.0],
+        d if d < 1.0 => &[1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0],
+        d if d < 4.0 => &[1.0, 2.0, 5.0],
+        _ => &[1.0],
+    };
+    let exponents = range.start.log10().floor() as i32..=range.end.log10().ceil() as i32;
+    let all = exponents.flat_map(|e| steps.iter().map(move |step| step * 10_f64.powi(e)));
+    all.filter(|tick| range.contains(tick)).collect()
+}
+
+/// A number with at most four digits, or all those of an integer.
+fn number(value: f64) -> String {
+    if value == 0.0 {
+        return "0".into();
+    }
+    let digits = 3 - value.abs().log10().floor() as i32;
+    if !(-9..=9).contains(&digits) {
+        return format!("{value:.2e}");
+    }
+    let text = format!("{value:.*}", digits.max(0) as usize);
+    if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.').into() } else { text }
 }
 
 #[cfg(test)]
@@ -144,7 +178,25 @@ mod tests {
                 vec![Series { name: "n".into(), points: vec![(3000.0, 1.0), (last, 2.0)], line: true }],
             )])
         };
-        assert!(drawn(4800.0).contains("3600.0"), "{}", drawn(4800.0));
-        assert!(!drawn(90_000.0).contains("3600.0") && drawn(90_000.0).contains("10000.0"));
+        for (last, ticks) in [(4800.0, [3000, 3500, 4500]), (90_000.0, [5000, 20_000, 50_000])] {
+            let drawn = drawn(last);
+            // Labels stand on lines of their own.
+            assert!(ticks.iter().all(|tick| drawn.contains(&format!("\n{tick}\n"))), "{drawn}");
+        }
+    }
+
+    #[test]
+    fn numbers_are_short() {
+        let cases = [
+            (0.0, "0"),
+            (20_000.0, "20000"),
+            (0.05, "0.05"),
+            (-1.5, "-1.5"),
+            (1234.5, "1234"),
+            (3e-12, "3.00e-12"),
+        ];
+        for (value, expected) in cases {
+            assert_eq!(number(value), expected);
+        }
     }
 }

@@ -2,6 +2,7 @@
 
 mod doubts;
 mod placing;
+mod specks;
 #[cfg(test)]
 mod tests;
 
@@ -122,7 +123,7 @@ impl<'a> Cutout<'a> {
             let message = format!("is {width}×{height}; both sides must have at least {MIN_SIDE} pixels");
             return Err(FileError::unsuitable(path, message));
         }
-        let (mask, mask_path) = match mask {
+        let (mut mask, mask_path) = match mask {
             Some(mask_path) => (grey(&picture::decode(mask_path, MAX_BYTES)?), mask_path),
             None => (alpha(&picture).map_err(|message| FileError::unsuitable(path, message))?, path),
         };
@@ -136,15 +137,24 @@ impl<'a> Cutout<'a> {
         let rgb = picture.into_rgb8();
         // The demo includes every pixel that is not 0. Lossy masks have many such pixels outside the person.
         let least = if matches!(placement, Placement::Demo { .. }) { 1 } else { u8::MAX.div_ceil(2) };
+        // The demo has no such step.
+        let specks = if matches!(placement, Placement::Training { .. }) {
+            specks::remove(&mut mask, least)
+        } else {
+            0
+        };
         let person = Rect::around(&mask, least).ok_or_else(|| nobody(mask_path, placement))?;
         if is_single_colour(&rgb, &mask) {
             let message = "the person is of a single colour: this is no photograph";
             return Err(FileError::unsuitable(path, message));
         }
-        let source = format!(
+        let mut source = format!(
             "{width}×{height}, person's box {}×{} at ({}, {})",
             person.width, person.height, person.x, person.y
         );
+        if specks > 0 {
+            source += &format!(", {specks} specks of the mask left out");
+        }
         Ok(Self { path, mask_path, rgb, mask, person, source })
     }
 

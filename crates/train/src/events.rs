@@ -23,20 +23,41 @@ impl Events {
 
     /// Adds the values of a step.
     pub fn add(&mut self, step: u64, values: &BTreeMap<String, f64>) -> io::Result<()> {
+        self.summary(step, |summary| {
+            for (name, value) in values {
+                let mut entry = Vec::new();
+                text(&mut entry, 1, name.as_bytes());
+                // Field 2, four bytes.
+                entry.push(2 << 3 | 5);
+                entry.extend((*value as f32).to_le_bytes());
+                text(summary, 1, &entry);
+            }
+        })
+    }
+
+    fn summary(&mut self, step: u64, fill: impl FnOnce(&mut Vec<u8>)) -> io::Result<()> {
         let mut summary = Vec::new();
-        for (name, value) in values {
-            let mut entry = Vec::new();
-            text(&mut entry, 1, name.as_bytes());
-            // Field 2, four bytes.
-            entry.push(2 << 3 | 5);
-            entry.extend((*value as f32).to_le_bytes());
-            text(&mut summary, 1, &entry);
-        }
+        fill(&mut summary);
         let mut event = now();
         event.push(2 << 3);
         varint(&mut event, step);
         text(&mut event, 5, &summary);
         self.record(&event)
+    }
+
+    /// Adds a PNG of `size` (width, height) to a step.
+    pub fn add_picture(&mut self, step: u64, name: &str, size: (u32, u32), png: &[u8]) -> io::Result<()> {
+        // Height, width, number of channels, bytes.
+        let mut picture = Vec::new();
+        for (field, value) in [(1, size.1), (2, size.0), (3, 3)] {
+            picture.push(field << 3);
+            varint(&mut picture, value.into());
+        }
+        text(&mut picture, 4, png);
+        let mut entry = Vec::new();
+        text(&mut entry, 1, name.as_bytes());
+        text(&mut entry, 4, &picture);
+        self.summary(step, |summary| text(summary, 1, &entry))
     }
 
     fn record(&mut self, data: &[u8]) -> io::Result<()> {

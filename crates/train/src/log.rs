@@ -18,6 +18,11 @@ pub const EVENTS: &str = "events.out.tfevents.snapsnap";
 /// Longest log that is read, in bytes.
 const MOST_BYTES: u64 = 1 << 30;
 
+/// Folder of previews, named by their steps.
+pub const PREVIEWS: &str = "previews";
+/// Name of previews in TensorBoard.
+const PREVIEW: &str = "preview";
+
 /// One line of `log.jsonl`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Line {
@@ -65,6 +70,12 @@ impl Log {
         for line in &lines {
             events.add(line.step, &line.values).map_err(FileError::write(&events_path))?;
         }
+        for (at, path) in previews(&folder.join(PREVIEWS), step) {
+            // Whoever removed or damaged one does not stop the run.
+            if let (Ok(size), Ok(png)) = (image::image_dimensions(&path), std::fs::read(&path)) {
+                events.add_picture(at, PREVIEW, size, &png).map_err(FileError::write(&events_path))?;
+            }
+        }
         Ok(Self { path, file: appended, events, lines })
     }
 
@@ -73,16 +84,36 @@ impl Log {
         self.lines.last().map_or(0.0, |line| line.seconds)
     }
 
-    /// An SVG of the loss over the steps and, below it, of the validations' score. Empty without values.
+    /// An SVG of the loss over the steps and, below it, of the figure by which validations choose the best weights. Empty without
+    /// values.
     pub fn curves(&self) -> String {
-        let chart = |caption: &'static str, y: &'static str, name: &str| {
+        let chart = |caption: &'static str, y: &'static str, name: &str, log_y: bool| {
             let values =
                 self.lines.iter().filter_map(|line| Some((line.step as f64, *line.values.get(name)?)));
-            let series = Series { name: name.into(), points: values.collect(), line: true };
-            (Axes { caption, x: "step", y, log_x: false, log_y: true }, vec![series])
+            let points: Vec<_> = values.collect();
+            let axes = Axes { caption, x: "step", y, log_x: false, log_y };
+            (!points.is_empty()).then(|| (axes, vec![Series { name: name.into(), points, line: true }]))
         };
-        let scores = chart("validation (less is better)", "score", "validation/score");
-        svg(&[chart("loss", "loss", "loss"), scores])
+        let charts = [
+            chart("training: loss (less is better)", "loss, without unit", "loss", true),
+            chart("held-out people: error of points (less is better)", "mm", "validation/points_mm", true),
+            chart(
+                "held-out people: PSNR of the person (more is better)",
+                "dB",
+                "validation/psnr_masked",
+                false,
+            ),
+        ];
+        svg(&charts.into_iter().flatten().collect::<Vec<_>>())
+    }
+
+    /// Adds a preview to TensorBoard's events.
+    ///
+    /// # Errors
+    /// [`FileError`] if the file cannot be written.
+    pub fn add_preview(&mut self, step: u64, size: (u32, u32), png: &[u8]) -> Result<(), FileError> {
+        let path = self.path.with_file_name(EVENTS);
+        self.events.add_picture(step, PREVIEW, size, png).map_err(FileError::write(&path))
     }
 
     /// Adds a line.
@@ -97,4 +128,14 @@ impl Log {
         self.lines.push(line);
         Ok(())
     }
+}
+
+/// Previews of a run up to a step, in order.
+fn previews(folder: &Path, last: u64) -> Vec<(u64, PathBuf)> {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
+    let step = |path: &PathBuf| path.file_stem()?.to_str()?.parse::<u64>().ok().filter(|step| *step <= last);
+    let pictures = entries.filter(|path| path.extension().is_some_and(|end| end == "png") && path.is_file());
+    let mut found: Vec<_> = pictures.filter_map(|path| Some((step(&path)?, path))).collect();
+    found.sort();
+    found
 }

@@ -18,7 +18,7 @@ use crate::checkpoint;
 use crate::config::TrainConfig;
 use crate::identity::Identity;
 use crate::learner::Learner;
-use crate::log::{self, Line, Log};
+use crate::log::{self, Line, Log, PREVIEWS};
 use crate::networks::Networks;
 use crate::task::{Task, Validation};
 
@@ -36,8 +36,6 @@ pub const BEST: &str = "best.safetensors";
 
 /// Curves of the loss and of the validations.
 pub const CURVES: &str = "curves.svg";
-/// Folder of previews.
-pub const PREVIEWS: &str = "previews";
 /// Files of a run besides its state.
 pub const FILES: [&str; 6] = [BEST, LAST, CONFIG, CURVES, log::NAME, log::EVENTS];
 
@@ -328,7 +326,8 @@ impl<'a, T: Task> Session<'a, T> {
         let folder = self.options.folder.join(PREVIEWS);
         fs::create_dir_all(&folder).map_err(FileError::write(&folder))?;
         let path = folder.join(format!("{:07}.png", self.learner.progress.step));
-        Ok(preview::write_png(&path, &sheet)?)
+        let png = preview::write_png(&path, &sheet)?;
+        Ok(self.log.add_preview(self.learner.progress.step, sheet.dimensions(), &png)?)
     }
 
     /// Writes weights, state and curves. Weights are first, so that every state has its weights.

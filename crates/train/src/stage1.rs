@@ -138,7 +138,8 @@ impl Task for PointTask {
                 ]);
             }
         }
-        Ok(grid(&rows))
+        let note = format!("rows: front, back, right, left; white errors: {:.0} cm or more", 100.0 * WORST);
+        Ok(grid(&rows, &["photo", "points", "truth", "error"], &note))
     }
 }
 

@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
+use burn::tensor::Device;
 use clap::Args;
 use snapsnap_mesh::export::{self, Kind};
 use snapsnap_mesh::fuse::{Fused, Options, fuse};
@@ -13,8 +14,18 @@ use crate::failure::Failure;
 use crate::progress::Progress;
 use crate::{device, memory, say};
 
+/// Bytes of the views and the field, and of each Gaussian besides its harmonics, as measured.
+const FIELD: u64 = 700_000_000;
+const GAUSSIAN: u64 = 220;
+/// Seconds per Gaussian on two cores of an AMD EPYC, and seconds from which they are announced.
+const SECONDS: f64 = 1e-5;
+const LONG: f64 = 20.0;
 /// Bytes per texel: position, normal, colour, and sums over views.
 const TEXEL: u64 = 60;
+/// Side of the texture of a GLB in pixels unless `--texture` is given.
+const GLB_TEXTURE: u32 = 2048;
+/// Volume of a dropped piece, as a share of the body's, from which on it may be another person.
+const COMPARABLE: f64 = 0.1;
 
 #[derive(Args)]
 pub struct Arguments {
@@ -42,8 +53,8 @@ pub struct SurfaceArguments {
     /// Approximate number of triangles of the mesh; 0 keeps all [default: 100000].
     #[arg(long, value_name = "N")]
     faces: Option<usize>,
-    /// Side in pixels of a texture, which replaces the colours of vertices (not in a .ply).
-    #[arg(long, value_name = "SIZE", value_parser = clap::value_parser!(u32).range(64..=16384))]
+    /// Side in pixels of a texture, 64 to 16384, or 0 for colours of vertices. A .ply has no texture [default: 2048 for .glb, else 0].
+    #[arg(long, value_name = "SIZE", value_parser = texture_side)]
     texture: Option<u32>,
 }
 
@@ -58,6 +69,16 @@ impl SurfaceArguments {
     }
 }
 
+fn texture_side(text: &str) -> Result<u32, String> {
+    let side = text.parse().ok().filter(|side| *side == 0 || (64..=16384).contains(side));
+    side.ok_or_else(|| "expected 64 to 16384, or 0 for colours of vertices".to_owned())
+}
+
+/// Options for a kind of file.
+pub fn options(kind: Kind) -> Options {
+    Options { texture: if kind == Kind::Glb { GLB_TEXTURE as usize } else { 0 }, ..Options::default() }
+}
+
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let since = Instant::now();
     let mut target = Target::new(&arguments.output, &arguments.surface)?;
@@ -65,6 +86,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     check_outputs(&target.files(), &[&arguments.input])?;
     let device = device::choose(&arguments.device)?;
     let loaded = scene::read(&arguments.input, &device)?;
+    check_size(&loaded, &device).map_err(|e| e.about(&arguments.input))?;
     let fused = target.write(&loaded, &arguments.input)?;
     if arguments.verbose {
         say::out(&describe(&fused));
@@ -72,6 +94,21 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     }
     let (file, faces) = (arguments.output.display(), fused.mesh.faces.len());
     say::info(&format!("{file}: {faces} triangles, {} positions", fused.mesh.positions.len()));
+    Ok(())
+}
+
+/// Refuses a mesh that memory cannot hold, and says how long one of very many Gaussians takes.
+fn check_size(scene: &Loaded, device: &Device) -> Result<(), Failure> {
+    let count = scene.gaussians.len() as u64;
+    let harmonics = scene.harmonics.as_ref().map_or(0, |h| 4 * h.dims()[1] as u64 * 3);
+    if memory::is_cpu(device) {
+        let bytes = FIELD + count * (GAUSSIAN + 2 * harmonics);
+        memory::check(&format!("a mesh of {count} Gaussians"), bytes, "leave out some of them")?;
+    }
+    let seconds = count as f64 * SECONDS;
+    if seconds > LONG {
+        say::note(&format!("a mesh of {count} Gaussians takes about {seconds:.0} s on two cores"));
+    }
     Ok(())
 }
 
@@ -94,18 +131,15 @@ impl Target {
             let message = "an OBJ names its materials' file, so its own name must be plain text (UTF-8)";
             return Err(Failure::file(path, message));
         }
-        let texture = surface.texture.unwrap_or(0) as usize;
+        let defaults = options(kind);
+        let texture = surface.texture.map_or(defaults.texture, |side| side as usize);
         if texture > 0 && kind == Kind::Ply {
             let message = "a PLY has no texture: leave out --texture, or write a .glb or .obj";
             return Err(Failure::file(path, message));
         }
         let bytes = TEXEL * (texture as u64).pow(2);
         memory::check(&format!("--texture {texture}"), bytes, "choose a smaller one")?;
-        let options = Options {
-            faces: surface.faces.unwrap_or(Options::default().faces),
-            texture,
-            ..Options::default()
-        };
+        let options = Options { faces: surface.faces.unwrap_or(defaults.faces), texture, ..defaults };
         Ok(Self { path: path.to_owned(), companions: export::companions(path, texture > 0), options })
     }
 
@@ -121,19 +155,48 @@ impl Target {
         let fused = fuse(scene, self.options, &|name| progress.stage(name));
         let fused = fused.map_err(|e| Failure::from(e).about(name))?;
         progress.stage("writing");
-        export::write(&fused.mesh, &self.path)?;
+        export::write(&fused.mesh, fused.offset, &self.path)?;
+        drop(progress);
+        self.warn(&fused, name);
         Ok(fused)
     }
+}
+
+impl Target {
+    /// Says what a user may not expect.
+    fn warn(&self, fused: &Fused, name: &Path) {
+        let name = name.display();
+        if fused.largest_dropped >= COMPARABLE {
+            let share = 100.0 * fused.largest_dropped;
+            say::err(&format!(
+                "warning: {name}: a separate piece with {share:.0} % of the body's volume was dropped; a mesh shows one body"
+            ));
+        }
+        let (faces, wanted) = (fused.mesh.faces.len(), self.options.faces);
+        if wanted > 0 && faces > wanted + wanted / 10 {
+            say::err(&format!(
+                "warning: {name}: {faces} triangles instead of {wanted}: fewer would tear thin parts off"
+            ));
+        }
+    }
+}
+
+/// A length in millimetres, or in metres far from those.
+fn length(metres: f32) -> String {
+    if (1e-4..1.0).contains(&metres) { format!("{:.1} mm", 1e3 * metres) } else { format!("{metres:.1e} m") }
 }
 
 /// A description of the fusion.
 pub fn describe(fused: &Fused) -> String {
     format!(
-        "surface from a field of {:.1} mm: gaps between the shells closed: {}, hollows filled: {}, \
-         parts joined with the body: {}, flying pieces dropped: {}; {} triangles reduced to {}",
-        1e3 * fused.cell,
+        "surface from a field of {}: gaps between the shells closed: {}, hollows filled: {}, \
+         narrow tunnels closed: {}, handles left: {}, parts joined with the body: {}, flying pieces dropped: {}; \
+         {} triangles reduced to {}",
+        length(fused.cell),
         fused.closed,
         fused.filled,
+        fused.walls,
+        fused.handles,
         fused.joined,
         fused.dropped,
         fused.faces,

@@ -11,12 +11,13 @@ use std::time::SystemTime;
 use burn::tensor::Device;
 use clap::Args;
 use snapsnap_base::FileError;
-use snapsnap_mesh::export;
-use snapsnap_mesh::fuse::{Options, fuse};
+use snapsnap_mesh::export::{self, Kind as MeshKind};
+use snapsnap_mesh::fuse::fuse;
 use snapsnap_splat::scene::{Kind, Stored};
 use ureq::http::StatusCode;
 
 use super::convert::finite;
+use super::mesh;
 use crate::failure::Failure;
 use crate::server::{Answer, Content, Request, serve};
 use crate::{interrupt, say};
@@ -64,6 +65,8 @@ struct Made {
 static MADE: LazyLock<Mutex<Made>> = LazyLock::new(Mutex::default);
 /// Locked while a mesh is made. A mesh takes all cores and a gigabyte.
 static MESH: Mutex<()> = Mutex::new(());
+/// The step of the mesh that is being made.
+static STAGE: Mutex<String> = Mutex::new(String::new());
 
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let input = arguments.input.as_path();
@@ -116,10 +119,13 @@ fn respond(request: &Request, input: &Path, port: u16) -> Answer {
     let made = match path {
         "/scene.ply" => shared(input, "ply", || Ok(finite(input)?.0.to_bytes(Kind::Ply)?)),
         "/scene.spz" => shared(input, "spz", || Ok(finite(input)?.0.to_bytes(Kind::Spz)?)),
+        "/progress" => {
+            return text(StatusCode::OK, &STAGE.lock().unwrap_or_else(PoisonError::into_inner));
+        }
         "/scene.glb" if is_head => finite(input).map(|_| Some(Arc::default())),
         "/scene.glb" => match MESH.try_lock() {
             Err(TryLockError::WouldBlock) => Ok(None),
-            _one => shared(input, "glb", || mesh(input)),
+            _one => shared(input, "glb", || made_mesh(input)),
         },
         _ => return text(StatusCode::NOT_FOUND, "no such page"),
     };
@@ -174,9 +180,12 @@ fn shared(
 }
 
 /// The mesh that `snapsnap mesh` makes.
-fn mesh(input: &Path) -> Result<Vec<u8>, Failure> {
-    let fused = fuse(&Stored::read(input)?.load(&Device::flex()), Options::default(), &|_| {})?;
-    export::glb_bytes(&fused.mesh).map_err(|e| Failure::Internal(e.to_string()))
+fn made_mesh(input: &Path) -> Result<Vec<u8>, Failure> {
+    let stage = |name: &str| name.clone_into(&mut STAGE.lock().unwrap_or_else(PoisonError::into_inner));
+    let fused = fuse(&Stored::read(input)?.load(&Device::flex()), mesh::options(MeshKind::Glb), &stage);
+    stage("");
+    let fused = fused?;
+    export::glb_bytes(&fused.mesh, fused.offset).map_err(|e| Failure::Internal(e.to_string()))
 }
 
 fn text(status: StatusCode, message: &str) -> Answer {

@@ -4,12 +4,31 @@ import { SparkRenderer, SplatFileType, SplatMesh } from "@sparkjsdev/spark";
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { inBatches } from "./batches.js";
+import { bounds, nearestTo } from "./gaussians.js";
+import { listen } from "./keys.js";
+import { save, saveMesh } from "./saving.js";
 import "./style.css";
 
 const element = (id) => document.getElementById(id);
 const canvas = element("canvas");
 
-const renderer = new THREE.WebGLRenderer({ canvas, antialias: false });
+function say(text) {
+  element("message").textContent = text;
+}
+
+function newRenderer() {
+  try {
+    return new THREE.WebGLRenderer({ canvas, antialias: false });
+  } catch (error) {
+    say(
+      "This browser does not offer WebGL 2, which the viewer needs. Allow hardware acceleration in its settings or use " +
+        "another browser. The downloads below work without it.",
+    );
+    throw error;
+  }
+}
+
+const renderer = newRenderer();
 const scene = new THREE.Scene();
 // The page draws only after changes.
 let changed = true;
@@ -39,7 +58,6 @@ const FIELD = (2 * Math.atan(0.5 / 0.8) * 180) / Math.PI;
 const camera = new THREE.PerspectiveCamera(FIELD, 1, 0.01, 100);
 const controls = new OrbitControls(camera, canvas);
 controls.enableDamping = true;
-controls.listenToKeyEvents(canvas);
 
 /** Frames without a visible move after which the camera stops. Damping alone does not stop it. */
 const REST = 60;
@@ -78,27 +96,6 @@ function lookFrom(yawDegrees) {
   controls.update();
 }
 
-/** The bounding box of opaque Gaussians, without the outermost 0.2 % at each end, which may be outliers. */
-function bounds(mesh) {
-  const along = { x: [], y: [], z: [] };
-  mesh.forEachSplat((_, centre, __, ___, opacity) => {
-    if (opacity >= 0.1 && [centre.x, centre.y, centre.z].every(Number.isFinite)) {
-      Object.keys(along).forEach((axis) => along[axis].push(centre[axis]));
-    }
-  });
-  const box = new THREE.Box3();
-  const count = along.x.length;
-  if (count > 0) {
-    const skipped = Math.floor(0.002 * count);
-    for (const [axis, values] of Object.entries(along)) {
-      const sorted = Float64Array.from(values).sort();
-      box.min[axis] = sorted[skipped];
-      box.max[axis] = sorted[count - 1 - skipped];
-    }
-  }
-  return box;
-}
-
 function frame(box) {
   const size = box.getSize(new THREE.Vector3());
   const centre = box.getCenter(new THREE.Vector3());
@@ -115,6 +112,14 @@ function frame(box) {
   camera.updateProjectionMatrix();
 }
 
+/** Looks at a scene from the front. */
+function lookAt(mesh) {
+  mesh.updateMatrixWorld();
+  frame(bounds(mesh));
+  lookFrom(0);
+  redraw();
+}
+
 function resize() {
   renderer.setPixelRatio(window.devicePixelRatio);
   renderer.setSize(window.innerWidth, window.innerHeight, false);
@@ -129,10 +134,6 @@ canvas.addEventListener("webglcontextrestored", () => {
   redraw();
 });
 resize();
-
-function say(text) {
-  element("message").textContent = text;
-}
 
 let shown = null;
 let asked = 0;
@@ -164,9 +165,7 @@ async function show(what, read) {
   }
   shown = mesh;
   scene.add(mesh);
-  frame(bounds(mesh));
-  lookFrom(0);
-  redraw();
+  lookAt(mesh);
   element("name").textContent = name;
   const count = (mesh.extSplats ?? mesh.packedSplats).numSplats;
   element("count").textContent = `${count.toLocaleString("en")} Gaussians`;
@@ -199,19 +198,31 @@ for (const button of document.querySelectorAll("button[data-yaw]")) {
   button.addEventListener("click", () => lookFrom(Number(button.dataset.yaw)));
 }
 
+/** Mid-grey, lighter at the top: dark and light people stand out against it. */
+function gradient() {
+  const picture = document.createElement("canvas");
+  [picture.width, picture.height] = [1, 256];
+  const context = picture.getContext("2d");
+  const colors = context.createLinearGradient(0, 0, 0, picture.height);
+  colors.addColorStop(0, "#a0a0a0");
+  colors.addColorStop(1, "#585858");
+  context.fillStyle = colors;
+  context.fillRect(0, 0, picture.width, picture.height);
+  const texture = new THREE.CanvasTexture(picture);
+  texture.colorSpace = THREE.SRGBColorSpace;
+  return texture;
+}
+const GRADIENT = gradient();
+
 function background() {
-  scene.background = new THREE.Color(element("background").value);
+  const wanted = element("surround").value;
+  const own = wanted === "chosen";
+  element("background").classList.toggle("hidden", !own);
+  scene.background = wanted === "gradient" ? GRADIENT : new THREE.Color(own ? element("background").value : wanted);
   redraw();
 }
+element("surround").addEventListener("input", background);
 element("background").addEventListener("input", background);
-
-function save(blob, name) {
-  const link = document.createElement("a");
-  link.href = URL.createObjectURL(blob);
-  link.download = name;
-  link.click();
-  setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
-}
 
 const stem = () => element("name").textContent.replace(/\.[^.]*$/, "") || "scene";
 
@@ -220,7 +231,6 @@ function screenshot() {
   renderer.render(scene, camera);
   return new Promise((done) => canvas.toBlob(done));
 }
-element("screenshot").addEventListener("click", async () => save(await screenshot(), `${stem()}.png`));
 
 /** The current camera as an entry of `cameras.json`: OpenCV axes, pixels of the canvas. */
 function cameraEntry() {
@@ -240,9 +250,79 @@ function cameraEntry() {
     world_to_camera: [row(0, 1), row(1, -1), row(2, -1), [0, 0, 0, 1]],
   };
 }
-element("camera").addEventListener("click", () => {
+function saveCamera() {
   save(new Blob([JSON.stringify([cameraEntry()], null, 1)], { type: "application/json" }), "cameras.json");
+}
+element("camera").addEventListener("click", saveCamera);
+
+element("mesh").addEventListener("click", (event) => {
+  event.preventDefault();
+  saveMesh(event.currentTarget, `${stem()}.glb`, say);
 });
+
+function rotate() {
+  controls.autoRotate = !controls.autoRotate;
+  element("rotate").setAttribute("aria-pressed", controls.autoRotate);
+  hold();
+}
+element("rotate").addEventListener("click", rotate);
+
+function help() {
+  const hidden = element("keys").classList.toggle("hidden");
+  element("help").setAttribute("aria-expanded", !hidden);
+}
+element("help").addEventListener("click", help);
+
+/** Turns the scene by 180° about x, for files with y down. */
+function turnOver() {
+  if (shown) {
+    shown.rotation.x = shown.rotation.x === 0 ? Math.PI : 0;
+    lookAt(shown);
+  }
+}
+
+/** Moves the centre of turning to the Gaussian below the pointer. */
+canvas.addEventListener("dblclick", (event) => {
+  const at = new THREE.Vector2(event.clientX, window.innerHeight - event.clientY);
+  const place = shown && nearestTo(shown, camera, at.divide(new THREE.Vector2(window.innerWidth, window.innerHeight)));
+  if (place) {
+    hold();
+    camera.position.add(place).sub(controls.target);
+    controls.target.copy(place);
+    controls.update();
+  }
+});
+
+/** Turns the camera around its target, radians. */
+function turn(yaw, pitch) {
+  const away = camera.position.clone().sub(controls.target);
+  const place = new THREE.Spherical().setFromVector3(away);
+  place.theta += yaw;
+  place.phi -= pitch;
+  hold();
+  camera.position.copy(controls.target).add(away.setFromSpherical(place.makeSafe()));
+  controls.update();
+}
+
+/** Moves the camera and its target by shares of the picture's height. */
+function shift(x, y) {
+  const size = 2 * camera.position.distanceTo(controls.target) * Math.tan((0.5 * camera.fov * Math.PI) / 180);
+  const move = new THREE.Vector3(x * size, y * size, 0).applyQuaternion(camera.quaternion);
+  hold();
+  camera.position.add(move);
+  controls.target.add(move);
+  controls.update();
+}
+
+function zoom(factor) {
+  hold();
+  camera.position.sub(controls.target).multiplyScalar(factor).add(controls.target);
+  controls.update();
+}
+
+const saveScreenshot = async () => save(await screenshot(), `${stem()}.png`);
+element("screenshot").addEventListener("click", saveScreenshot);
+listen({ turn, shift, zoom, lookFrom, rotate, turnOver, saveScreenshot, saveCamera, help });
 
 // Number of consecutive frames, and their time in milliseconds.
 let drawn = 0;
@@ -250,7 +330,7 @@ let busy = 0;
 let last = null;
 renderer.setAnimationLoop((now) => {
   controls.update();
-  still += pressed ? 0 : 1;
+  still += pressed || controls.autoRotate ? 0 : 1;
   if (still === REST) {
     hold();
     redraw();
@@ -277,4 +357,4 @@ background();
 lookFrom(0);
 const ready = show("Cannot show the file", served);
 // For tests and the browser's console.
-window.snapsnap = { ready, camera: cameraEntry, screenshot, lookFrom, renderer, spark };
+window.snapsnap = { ready, camera: cameraEntry, target: () => controls.target.toArray(), screenshot, lookFrom, renderer, spark };

@@ -228,6 +228,15 @@ impl Folder {
         Ok((picture.into_rgb8(), mask))
     }
 
+    /// Path of a view's picture.
+    pub fn picture_path(&self, split: Option<Split>, subject: &str, view: usize) -> PathBuf {
+        self.picture_named(split, subject, view)
+    }
+
+    fn picture_named(&self, split: Option<Split>, subject: &str, view: impl Display) -> PathBuf {
+        self.path(split, "img", subject).join(self.file_name("img", view))
+    }
+
     /// The picture file of a view. In the exact layout it contains the mask as well.
     fn file(
         &self,
@@ -237,8 +246,7 @@ impl Folder {
         high_resolution: bool,
     ) -> Result<DynamicImage, FileError> {
         let (suffix, times) = if high_resolution { ("_hr", 2) } else { ("", 1) };
-        let name = self.file_name("img", format_args!("{view}{suffix}"));
-        let path = self.path(split, "img", subject).join(name);
+        let path = self.picture_named(split, subject, format_args!("{view}{suffix}"));
         let picture = decode(&path, MAX_BYTES)?;
         self.check_size(&path, (picture.width(), picture.height()), times * self.description.resolution)?;
         Ok(picture)

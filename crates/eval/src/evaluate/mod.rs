@@ -334,6 +334,9 @@ pub fn rendered(
     Picture::rendered(&snapsnap_ops::host(color), [large, large], views.supersampling)
 }
 
+/// Mean absolute difference of channels that is white in the sheet.
+const WORST: f32 = 0.5;
+
 /// A sheet of some people (rows of the outcome's): both photographs and, for each view of the config, the model's
 /// picture, the ground truth and the error. Also the people whose pictures failed.
 pub fn sheet(
@@ -351,7 +354,14 @@ pub fn sheet(
             Err(e) => left_out.push(LeftOut::new(format!("{}, pictures", name_of(sets, people, row)), e)),
         }
     }
-    (grid(&rows), left_out)
+    let degrees = config
+        .report
+        .degrees
+        .iter()
+        .flat_map(|degrees| [format!("{degrees} deg. render"), "truth".into(), "error".into()]);
+    let captions: Vec<String> = ["front".into(), "back".into()].into_iter().chain(degrees).collect();
+    let captions: Vec<&str> = captions.iter().map(String::as_str).collect();
+    (grid(&rows, &captions, &format!("white errors: {WORST} of 1 or more")), left_out)
 }
 
 /// A row of the sheet.
@@ -361,8 +371,6 @@ fn pictures(
     row: usize,
     contestant: &Contestant,
 ) -> Result<Vec<RgbImage>, EvalError> {
-    /// Mean absolute difference of channels that is white in the sheet.
-    const WORST: f32 = 0.5;
     let inputs = people.inputs(&config.views, config.views.turns[0]);
     let item = people.item(row, &inputs, &Handling::default())?;
     let side = people.side(&config.views);

@@ -143,7 +143,7 @@ impl Surface {
     /// [`EvalError`] if no mesh can be made of them.
     pub fn of_mesh(gaussians: &Gaussians, truth: &Truth) -> Result<Self, EvalError> {
         let fused = fuse(&gaussians.clone().into(), Options::default(), &|_| {});
-        let mesh = fused.map_err(|e| EvalError::Empty(e.to_string()))?.mesh;
+        let mesh = fused.map_err(|e| EvalError::Empty(e.to_string()))?.into_world();
         let drawn = sampled(&mesh, MOST, SEED)?;
         Ok(Self { chamfer: chamfer(&drawn, &truth.points)?, normals: truth.agreement_of_mesh(&mesh)? })
     }

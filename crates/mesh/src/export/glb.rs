@@ -4,7 +4,7 @@ use std::collections::HashMap;
 use std::io::{self, Write};
 use std::path::Path;
 
-use glam::{Vec2, Vec3};
+use glam::{DVec3, Vec2, Vec3};
 use gltf::binary::{Glb, Header};
 use serde_json::{Value, json};
 use snapsnap_base::FileError;
@@ -21,17 +21,18 @@ const F32: u32 = 5126;
 const ATTRIBUTES: u32 = 34962;
 const INDICES: u32 = 34963;
 
-pub fn write(mesh: &Mesh, path: &Path) -> Result<(), FileError> {
-    let bytes = glb_bytes(mesh).map_err(FileError::write(path))?;
+pub fn write(mesh: &Mesh, offset: DVec3, path: &Path) -> Result<(), FileError> {
+    let bytes = glb_bytes(mesh, offset).map_err(FileError::write(path))?;
     write_whole(path, |out| out.write_all(&bytes)).map_err(FileError::write(path))
 }
 
 /// The bytes of a binary glTF with one node and one primitive for each material. Colours contain the light of the photographs,
-/// so that materials are unlit (KHR_materials_unlit), and rough for viewers without that extension.
+/// so that materials are unlit (KHR_materials_unlit), and rough for viewers without that extension. The
+/// node moves the mesh by `offset`, metres.
 ///
 /// # Errors
 /// If a texture cannot be encoded.
-pub fn glb_bytes(mesh: &Mesh) -> io::Result<Vec<u8>> {
+pub fn glb_bytes(mesh: &Mesh, offset: DVec3) -> io::Result<Vec<u8>> {
     let mut file = Content::default();
     let (rows, faces) = vertices(mesh);
     let normals = mesh.normals();
@@ -92,12 +93,16 @@ pub fn glb_bytes(mesh: &Mesh) -> io::Result<Vec<u8>> {
             primitives.push(json!({ "attributes": attributes, "indices": indices, "material": row }));
         }
     }
+    let mut node = json!({ "mesh": 0, "name": "person" });
+    if offset != DVec3::ZERO {
+        node["translation"] = json!(offset.to_array());
+    }
     let mut document = json!({
         "asset": { "version": "2.0", "generator": "snapsnap" },
         "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
         "scenes": [{ "nodes": [0] }],
-        "nodes": [{ "mesh": 0, "name": "person" }],
+        "nodes": [node],
         "meshes": [{ "primitives": primitives }],
         "materials": materials,
         "accessors": file.accessors,

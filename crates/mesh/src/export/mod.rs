@@ -8,6 +8,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use glam::DVec3;
 use image::{ImageFormat, RgbImage};
 use snapsnap_base::FileError;
 
@@ -41,25 +42,25 @@ impl Kind {
 }
 
 /// Writes `mesh` to `path` as the kind that its extension names, or else as GLB. Each file is written as a whole or not at
-/// all. An OBJ comes after its pictures and materials.
+/// all. An OBJ comes after its pictures and materials. `offset` is the place of the mesh's origin in the world, metres. Far from the
+/// world's origin f32 is too coarse for positions, so that an OBJ and a PLY then contain f64, and a GLB moves its node.
 ///
 /// # Errors
 /// [`FileError::Write`]; [`FileError::Unsuitable`] for a texture in a PLY.
-pub fn write(mesh: &Mesh, path: &Path) -> Result<(), FileError> {
+pub fn write(mesh: &Mesh, offset: DVec3, path: &Path) -> Result<(), FileError> {
     match Kind::named(path) {
-        Some(Kind::Obj) => write_obj(mesh, path),
-        Some(Kind::Ply) => ply::write(mesh, path),
-        Some(Kind::Glb) | None => glb::write(mesh, path),
+        Some(Kind::Obj) => obj::write(mesh, offset, path),
+        Some(Kind::Ply) => ply::write(mesh, offset, path),
+        Some(Kind::Glb) | None => glb::write(mesh, offset, path),
     }
 }
 
-/// The files that [`write()`] writes beside `path` for a mesh of one material.
+/// The files that [`write()`] writes beside `path` for a mesh with one texture, or with colours of positions.
 pub fn companions(path: &Path, textured: bool) -> Vec<PathBuf> {
-    if Kind::named(path) != Some(Kind::Obj) {
-        return Vec::new();
+    match Kind::named(path) {
+        Some(Kind::Obj) if textured => vec![path.with_extension("mtl"), obj::texture_beside(path, 0)],
+        _ => Vec::new(),
     }
-    let texture = textured.then(|| obj::texture_beside(path, 0));
-    [Some(path.with_extension("mtl")), texture].into_iter().flatten().collect()
 }
 
 fn png(texture: &Arc<RgbImage>) -> io::Result<Vec<u8>> {

@@ -6,20 +6,28 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use glam::{DVec3, Vec3};
 use snapsnap_base::FileError;
 use snapsnap_base::file::write_whole;
 
 use super::png;
 use crate::mesh::Mesh;
 
-/// Writes `mesh` to `path`, with its materials and textures beside it under the same name; the OBJ is written last.
+/// Writes `mesh` to `path`, with its materials and textures beside it under the same name; the OBJ is written last. Colours of
+/// positions need no material. A white one would hide them in many programs.
 ///
 /// # Errors
 /// [`FileError::Write`].
 pub fn write_obj(mesh: &Mesh, path: &Path) -> Result<(), FileError> {
+    write(mesh, DVec3::ZERO, path)
+}
+
+pub fn write(mesh: &Mesh, offset: DVec3, path: &Path) -> Result<(), FileError> {
     let folder = path.parent().unwrap_or(Path::new("."));
     fs::create_dir_all(folder).map_err(FileError::write(folder))?;
     let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+    let has_texture = mesh.materials.iter().any(|material| material.texture.is_some());
+    let is_plain = !mesh.colors.is_empty() && !has_texture;
     let mut materials = String::new();
     let mut textures = HashMap::new();
     for (row, material) in mesh.materials.iter().enumerate() {
@@ -35,28 +43,44 @@ pub fn write_obj(mesh: &Mesh, path: &Path) -> Result<(), FileError> {
         }
     }
     let file = path.with_extension("mtl");
-    write_whole(&file, |out| out.write_all(materials.as_bytes())).map_err(FileError::write(&file))?;
+    if !is_plain {
+        write_whole(&file, |out| out.write_all(materials.as_bytes())).map_err(FileError::write(&file))?;
+    }
+    let normals = mesh.normals();
     write_whole(path, |out| {
-        writeln!(out, "mtllib {stem}.mtl")?;
+        if !is_plain {
+            writeln!(out, "mtllib {stem}.mtl")?;
+        }
         for (row, p) in mesh.positions.iter().enumerate() {
-            match mesh.colors.get(row) {
-                Some(c) => writeln!(out, "v {} {} {} {} {} {}", p.x, p.y, p.z, c.x, c.y, c.z)?,
-                None => writeln!(out, "v {} {} {}", p.x, p.y, p.z)?,
+            if offset == DVec3::ZERO {
+                write!(out, "v {} {} {}", p.x, p.y, p.z)?;
+            } else {
+                let p = p.as_dvec3() + offset;
+                write!(out, "v {} {} {}", p.x, p.y, p.z)?;
             }
+            match mesh.colors.get(row) {
+                Some(c) => writeln!(out, " {} {} {}", c.x, c.y, c.z)?,
+                None => writeln!(out)?,
+            }
+        }
+        for n in &normals {
+            // A position without area has no normal.
+            let n = if *n == Vec3::ZERO { Vec3::Y } else { *n };
+            writeln!(out, "vn {} {} {}", n.x, n.y, n.z)?;
         }
         for t in &mesh.texcoords {
             writeln!(out, "vt {} {}", t.x, t.y)?;
         }
         let mut material = u32::MAX;
         for face in &mesh.faces {
-            if face.material != material {
+            if face.material != material && !is_plain {
                 material = face.material;
                 writeln!(out, "usemtl m{material}")?;
             }
             let [a, b, c] = face.positions.map(|row| row + 1);
             match face.texcoords.map(|t| t.map(|row| row + 1)) {
-                Some([s, t, u]) => writeln!(out, "f {a}/{s} {b}/{t} {c}/{u}")?,
-                None => writeln!(out, "f {a} {b} {c}")?,
+                Some([s, t, u]) => writeln!(out, "f {a}/{s}/{a} {b}/{t}/{b} {c}/{u}/{c}")?,
+                None => writeln!(out, "f {a}//{a} {b}//{b} {c}//{c}")?,
             }
         }
         Ok(())

@@ -3,19 +3,21 @@
 use std::io::{self, Write};
 use std::path::Path;
 
+use glam::DVec3;
 use snapsnap_base::FileError;
 use snapsnap_base::file::write_whole;
 
 use crate::mesh::Mesh;
 
-pub fn write(mesh: &Mesh, path: &Path) -> Result<(), FileError> {
+pub fn write(mesh: &Mesh, offset: DVec3, path: &Path) -> Result<(), FileError> {
     if mesh.materials.iter().any(|material| material.texture.is_some()) {
         let message = "a PLY has vertex colours and no texture: write a .glb or .obj";
         return Err(FileError::unsuitable(path, message));
     }
     write_whole(path, |out| {
         writeln!(out, "ply\nformat binary_little_endian 1.0\nelement vertex {}", mesh.positions.len())?;
-        write!(out, "property float x\nproperty float y\nproperty float z\n")?;
+        let (is_far, kind) = if offset == DVec3::ZERO { (false, "float") } else { (true, "double") };
+        ["x", "y", "z"].iter().try_for_each(|axis| writeln!(out, "property {kind} {axis}"))?;
         if !mesh.colors.is_empty() {
             write!(out, "property uchar red\nproperty uchar green\nproperty uchar blue\n")?;
         }
@@ -25,7 +27,14 @@ pub fn write(mesh: &Mesh, path: &Path) -> Result<(), FileError> {
             mesh.faces.len()
         )?;
         for (row, p) in mesh.positions.iter().enumerate() {
-            p.to_array().iter().try_for_each(|v| out.write_all(&v.to_le_bytes()))?;
+            if is_far {
+                (p.as_dvec3() + offset)
+                    .to_array()
+                    .iter()
+                    .try_for_each(|v| out.write_all(&v.to_le_bytes()))?;
+            } else {
+                p.to_array().iter().try_for_each(|v| out.write_all(&v.to_le_bytes()))?;
+            }
             if let Some(color) = mesh.colors.get(row) {
                 out.write_all(&color.to_array().map(|c| (c * 255.0).round() as u8))?;
             }

@@ -20,7 +20,8 @@ pub struct Grid {
 
 /// Steps from a corner to half of those that share an edge with it. The steps to the others have the opposite sign. Every
 /// cube consists of six tetrahedra around its diagonal (Kuhn's subdivision).
-const STEPS: [[usize; 3]; 7] = [[1, 0, 0], [0, 1, 0], [1, 1, 0], [0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 1, 1]];
+pub const STEPS: [[usize; 3]; 7] =
+    [[1, 0, 0], [0, 1, 0], [1, 1, 0], [0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 1, 1]];
 /// Each tetrahedron's order of axes on the way from a cube's first corner to its last, and whether it is left-handed.
 const TETRAHEDRA: [([usize; 3], bool); 6] = [
     ([0, 1, 2], false),
@@ -44,6 +45,17 @@ pub struct Pieces {
     pub inside: Vec<bool>,
 }
 
+/// Counts of [`Grid::keep_one_body`].
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Kept {
+    /// Dropped pieces of the inside.
+    pub dropped: usize,
+    /// Corners of the largest dropped piece, as a share of the body's.
+    pub largest_dropped: f64,
+    /// Filled pieces of the outside.
+    pub filled: usize,
+}
+
 impl Pieces {
     /// The largest piece inside, if there is one.
     pub fn body(&self) -> Option<usize> {
@@ -58,7 +70,7 @@ impl Pieces {
 
 impl Grid {
     /// Number of a corner along each axis.
-    fn at(&self, row: usize) -> USizeVec3 {
+    pub fn at(&self, row: usize) -> USizeVec3 {
         let USizeVec3 { x: nx, y: ny, .. } = self.counts;
         USizeVec3::new(row % nx, row / nx % ny, row / (nx * ny))
     }
@@ -122,16 +134,18 @@ impl Grid {
     }
 
     /// Keeps only the largest piece inside and fills the outside that it encloses, which leaves one closed surface.
-    /// Returns the number of dropped and of filled pieces.
-    pub fn keep_one_body(&mut self) -> (usize, usize) {
+    pub fn keep_one_body(&mut self) -> Kept {
         for row in 0..self.values.len() {
             if self.on_border(row) {
                 self.values[row] = self.values[row].abs().max(f32::MIN_POSITIVE);
             }
         }
         let mut pieces = self.pieces();
-        let Some(body) = pieces.body() else { return (0, 0) };
+        let Some(body) = pieces.body() else { return Kept::default() };
         let dropped = pieces.bodies() - 1;
+        let others = (0..pieces.sizes.len()).filter(|i| pieces.inside[*i] && *i != body);
+        let largest = others.map(|i| pieces.sizes[i]).max().unwrap_or(0);
+        let largest_dropped = largest as f64 / pieces.sizes[body] as f64;
         if dropped > 0 {
             for (piece, value) in pieces.of.iter().zip(&mut self.values) {
                 if *value < 0.0 && *piece as usize != body {
@@ -148,7 +162,21 @@ impl Grid {
             }
         }
         // All pieces but the body and the outside around it.
-        (dropped, pieces.sizes.len() - 2)
+        Kept { dropped, largest_dropped, filled: pieces.sizes.len() - 2 }
+    }
+
+    /// Number of positions of the [`Self::surface`].
+    pub fn crossings(&self) -> usize {
+        let steps = self.steps();
+        let inside = |row: usize| self.values[row] < 0.0;
+        let count = |row: usize| {
+            let at = self.at(row);
+            let edges = STEPS.iter().zip(steps);
+            let there =
+                edges.filter(|(step, _)| (at + USizeVec3::from_array(**step)).cmplt(self.counts).all());
+            there.filter(|(_, step)| inside(row) != inside(row + step)).count()
+        };
+        (0..self.values.len()).into_par_iter().map(count).sum()
     }
 
     /// Replaces each value by a weighted mean with its six neighbours. Values on the border stay.
@@ -287,11 +315,11 @@ pub(super) mod tests {
     fn noise_is_closed_and_one_piece_once_one_body_is_kept() {
         let noise = |p: Vec3| (p * 977.0).dot(Vec3::new(12.9898, 78.233, 37.719)).sin();
         // Small pieces inside, then small pieces outside.
-        let (dropped, _) = grid(24, |p| noise(p) + 0.95).keep_one_body();
+        let Kept { dropped, .. } = grid(24, |p| noise(p) + 0.95).keep_one_body();
         let mut grid = grid(24, |p| noise(p) - 0.95);
-        let (_, filled) = grid.keep_one_body();
+        let Kept { filled, .. } = grid.keep_one_body();
         assert!(dropped > 10 && filled > 10, "{dropped} {filled}");
-        assert_eq!(grid.keep_one_body(), (0, 0));
+        assert_eq!(grid.keep_one_body(), Kept::default());
         assert_eq!(grid.pieces().sizes.len(), 2);
         grid.values.iter_mut().for_each(|value| *value += 0.95);
         grid.keep_one_body();
@@ -305,7 +333,10 @@ pub(super) mod tests {
         let hollow = |p: Vec3| (p.length() - 0.6).abs() - 0.15;
         let speck = |p: Vec3| (p - Vec3::splat(0.85)).length() - 0.09;
         let mut grid = grid(41, |p| hollow(p).min(speck(p)));
-        assert_eq!(grid.keep_one_body(), (1, 1));
+        let kept = grid.keep_one_body();
+        assert_eq!((kept.dropped, kept.filled), (1, 1));
+        // (0.09/0.75)³ without the hollow.
+        assert!((0.0005..0.005).contains(&kept.largest_dropped), "{kept:?}");
         let (positions, faces) = grid.surface();
         let expected = 4.0 / 3.0 * std::f64::consts::PI * 0.75_f64.powi(3);
         assert!(is_closed(&faces) && (volume(&positions, &faces) / expected - 1.0).abs() < 0.01);
@@ -314,8 +345,9 @@ pub(super) mod tests {
     #[test]
     fn bodies_that_reach_the_border_are_closed_there() {
         let mut grid = grid(9, |_| -1.0);
-        assert_eq!(grid.keep_one_body(), (0, 0));
-        let (_, faces) = grid.surface();
+        assert_eq!(grid.keep_one_body(), Kept::default());
+        let (positions, faces) = grid.surface();
         assert!(!faces.is_empty() && is_closed(&faces));
+        assert_eq!(grid.crossings(), positions.len());
     }
 }

@@ -8,6 +8,7 @@ mod grid;
 mod join;
 mod manifold;
 mod simplify;
+mod tunnels;
 mod views;
 
 use std::collections::HashMap;
@@ -22,11 +23,13 @@ use snapsnap_splat::{Gaussians, SplatError};
 
 use crate::mesh::Mesh;
 use color::Mean;
-use grid::Grid;
+use grid::{Grid, Kept};
 use views::{View, host};
 
-/// Cubes along the longest side of the body's box without its margins.
+/// Cubes along the longest side of the body's box, unless the field would have more corners than [`MAX_CORNERS`].
 const CUBES: f32 = 320.0;
+/// Most corners of the field. A person with level arms has eight million; a cube-shaped scene gets larger cubes.
+const MAX_CORNERS: f32 = 12e6;
 /// Side in pixels of the pictures for distances.
 const SIDE: u32 = 640;
 /// Side in pixels of the pictures for a texture, of which one at a time is in memory.
@@ -48,9 +51,15 @@ const SMOOTHED: usize = 2;
 const LONG: u32 = 20;
 /// Pairs of a splat and a tile in one of the views, and triangles before the reduction, that take about that time.
 const MAX_INTERSECTIONS: u64 = 20_000_000;
-const MAX_TRIANGLES: usize = 4_000_000;
+const MAX_TRIANGLES: usize = 3_000_000;
 /// Fewest Gaussians of a body.
 const FEWEST: usize = 50;
+/// Least size of the box of the centres, as a share of the box of the Gaussians. Pictures of depth show the centres of Gaussians, so
+/// that a few large ones have no surface.
+const RESOLVED: f32 = 0.5;
+/// Distance of a body from the origin, in lengths of its box, beyond which its positions are measured from its middle: in f32 they would
+/// fall together.
+const FAR: f64 = 100.0;
 
 /// Errors of [`fuse`].
 #[derive(Debug, thiserror::Error)]
@@ -61,6 +70,9 @@ pub enum FuseError {
     /// Gaussians without a body.
     #[error("no surface: nothing that the Gaussians show is solid from any side")]
     Hollow,
+    /// Too few Gaussians for the size of the body, or too large ones.
+    #[error("no surface: the Gaussians are too large for the shape that their centres have")]
+    Coarse,
     /// Too much work.
     #[error("{0}: this would take longer than {LONG} s on a few cores")]
     Long(String),
@@ -95,20 +107,37 @@ impl Default for Options {
 /// A surface and counts of the steps that lead to it.
 #[derive(Debug, Clone)]
 pub struct Fused {
-    /// One closed piece, with a texture or a colour at each position; in the Gaussians' world, metres.
+    /// One closed piece, with a texture or a colour at each position; metres, measured from `offset`.
     pub mesh: Mesh,
+    /// Place of the mesh's origin in the Gaussians' world, metres. Zero unless the body is far from the world's origin.
+    pub offset: DVec3,
     /// Connected gaps between the shells that were closed because too few views pass through them.
     pub closed: usize,
     /// Hollows inside that were filled.
     pub filled: usize,
+    /// Walls across narrow tunnels through the body.
+    pub walls: usize,
+    /// Handles of the surface before the reduction, such as the ring of an arm whose hand is on the hip.
+    pub handles: usize,
     /// Parts apart from the body that were joined with it.
     pub joined: usize,
     /// Pieces beside the body that were dropped.
     pub dropped: usize,
+    /// Volume of the largest dropped piece, as a share of the body's.
+    pub largest_dropped: f64,
     /// Triangles before the reduction.
     pub faces: usize,
     /// Edge of the field's cubes, metres.
     pub cell: f32,
+}
+
+impl Fused {
+    /// The mesh in the Gaussians' world, rounded to f32.
+    pub fn into_world(self) -> Mesh {
+        let Self { mut mesh, offset, .. } = self;
+        mesh.positions.iter_mut().for_each(|place| *place = (place.as_dvec3() + offset).as_vec3());
+        mesh
+    }
 }
 
 /// Makes a mesh of Gaussians. `stage` receives the name of each step.
@@ -116,24 +145,18 @@ pub struct Fused {
 /// # Errors
 /// [`FuseError`].
 pub fn fuse(scene: &Loaded, options: Options, stage: &dyn Fn(&str)) -> Result<Fused, FuseError> {
-    let (low, high) = bounds(&scene.gaussians)?;
-    // f32 is finest around the origin, from which people in the coordinates of a survey are far away.
-    let away = (0.5 * low + 0.5 * high).round();
-    let (low, high) = (low - away, high - away);
-    let mut scene = scene.clone();
-    let means = scene.gaussians.means;
-    let by = Tensor::<1>::from_floats((-away).to_array(), &means.device()).unsqueeze::<2>();
-    scene.gaussians.means = means + by;
-
-    let size = high - low;
-    let cell = size.max_element() / CUBES;
+    let body = Placing::of(&scene.gaussians)?;
+    let scene = body.scene(scene);
+    let size = body.size;
+    let roomy = (size.element_product() / MAX_CORNERS).cbrt();
+    let cell = (size.max_element() / CUBES).max(roomy);
     // The border stays outside.
     let margin = cell * (TRUNCATION + 2.0);
     let counts = ((size + 2.0 * margin) / cell).ceil().as_usizevec3() + 1;
 
     stage("views from all around");
-    let (centre, radius) = ((0.5 * (low + high)).as_dvec3(), f64::from(0.5 * size.length()));
-    let cameras = views::cameras(centre, radius, SIDE).into_iter();
+    let radius = f64::from(0.5 * size.length());
+    let cameras = views::cameras(radius, SIDE).into_iter();
     let most = if options.force { u64::MAX } else { MAX_INTERSECTIONS };
     let views: Result<Vec<View>, SplatError> =
         cameras.map(|camera| View::new(&scene, camera, radius, most)).collect();
@@ -146,7 +169,7 @@ pub fn fuse(scene: &Loaded, options: Options, stage: &dyn Fn(&str)) -> Result<Fu
     })?;
 
     stage("distance field");
-    let mut grid = Grid { origin: low - margin, cell, counts, values: Vec::new() };
+    let mut grid = Grid { origin: -0.5 * size - margin, cell, counts, values: Vec::new() };
     let rows = (0..counts.y * counts.z).into_par_iter();
     let (values, gaps): (Vec<f32>, Vec<bool>) =
         rows.flat_map_iter(|row| distances(&grid, row * counts.x, &views)).unzip();
@@ -154,8 +177,17 @@ pub fn fuse(scene: &Loaded, options: Options, stage: &dyn Fn(&str)) -> Result<Fu
     let closed = grid.pieces().bodies();
     grid.values = values;
     (0..SMOOTHED).for_each(|_| grid.smooth());
+    // A surface has about twice as many triangles as positions.
+    let faces = 2 * grid.crossings();
+    if faces > MAX_TRIANGLES && !options.force {
+        let millions = faces as f64 / 1e6;
+        return Err(FuseError::Long(format!(
+            "its surface has some {millions:.1} million triangles, far more than a person's"
+        )));
+    }
     let joined = grid.join_parts();
-    let (dropped, filled) = grid.keep_one_body();
+    let walls = grid.close_tunnels();
+    let Kept { dropped, filled, largest_dropped } = grid.keep_one_body();
 
     stage("surface");
     let (positions, triangles) = grid.surface();
@@ -164,12 +196,8 @@ pub fn fuse(scene: &Loaded, options: Options, stage: &dyn Fn(&str)) -> Result<Fu
         return Err(FuseError::Hollow);
     }
     let faces = triangles.len();
-    if faces > MAX_TRIANGLES && !options.force {
-        let millions = faces as f64 / 1e6;
-        return Err(FuseError::Long(format!(
-            "its surface has {millions:.1} million triangles, far more than a person's"
-        )));
-    }
+    // Euler's formula for a closed surface of one piece.
+    let handles = (faces / 2 + 2).saturating_sub(positions.len()) / 2;
     let mut mesh = Mesh::colored(positions, Vec::new(), triangles);
     stage("colours");
     mesh.colors = color::colors(&mesh, &views, cell);
@@ -178,24 +206,68 @@ pub fn fuse(scene: &Loaded, options: Options, stage: &dyn Fn(&str)) -> Result<Fu
     if options.texture > 0 {
         drop(views);
         stage("texture");
-        textured(&mut mesh, &scene, (centre, radius), options.texture, cell)?;
+        textured(&mut mesh, &scene, radius, options.texture, cell)?;
     }
-    mesh.positions.iter_mut().for_each(|place| *place += away);
-    Ok(Fused { mesh, closed, filled, joined, dropped, faces, cell })
+    let offset = body.offset();
+    mesh.positions.iter_mut().for_each(|place| *place = (body.world(*place) - offset).as_vec3());
+    let cell = (f64::from(cell) / body.scale) as f32;
+    Ok(Fused { mesh, offset, closed, filled, walls, handles, joined, dropped, largest_dropped, faces, cell })
+}
+
+/// Place and size of a body. The surface is made around the origin, of a body one to two units long: f32 is finest there, and neither a
+/// figure of a micrometre nor one in the coordinates of a survey is lost.
+struct Placing {
+    /// Middle of the body's box, world metres.
+    centre: DVec3,
+    /// Units per metre, a power of two.
+    scale: f64,
+    /// Sides of the box, units.
+    size: Vec3,
+}
+
+impl Placing {
+    fn of(gaussians: &Gaussians) -> Result<Self, FuseError> {
+        let (low, high) = bounds(gaussians)?;
+        let size = high - low;
+        if !(size.max_element() > 0.0 && size.is_finite()) {
+            return Err(FuseError::Hollow);
+        }
+        // The powers of two in both directions that f32 contains.
+        let scale = (-size.max_element().log2().floor()).clamp(-126.0, 126.0).exp2();
+        // Exact in f32, as the means are.
+        let centre = (0.5 * (low + high)).as_vec3().as_dvec3();
+        Ok(Self { centre, scale, size: (size * scale).as_vec3() })
+    }
+
+    /// The Gaussians in units around the origin.
+    fn scene(&self, scene: &Loaded) -> Loaded {
+        let Gaussians { means, scales, .. } = scene.gaussians.clone();
+        let centre = Tensor::<1>::from_floats(self.centre.as_vec3().to_array(), &means.device());
+        let means = (means - centre.unsqueeze::<2>()).mul_scalar(self.scale);
+        let scales = scales.mul_scalar(self.scale);
+        let mut scene = scene.clone();
+        scene.gaussians = Gaussians { means, scales, ..scene.gaussians };
+        scene
+    }
+
+    /// A place in the Gaussians' world, metres.
+    fn world(&self, place: Vec3) -> DVec3 {
+        place.as_dvec3() / self.scale + self.centre
+    }
+
+    /// The origin of the finished mesh in the Gaussians' world.
+    fn offset(&self) -> DVec3 {
+        let length = f64::from(self.size.max_element()) / self.scale;
+        if self.centre.length() > FAR * length { self.centre } else { DVec3::ZERO }
+    }
 }
 
 /// Replaces the colours of a mesh's positions by a texture, in which they remain at places that no view shows. The body is in
-/// the ball with this centre and radius.
-fn textured(
-    mesh: &mut Mesh,
-    scene: &Loaded,
-    (centre, radius): (DVec3, f64),
-    side: usize,
-    cell: f32,
-) -> Result<(), FuseError> {
+/// the ball of this radius around the origin.
+fn textured(mesh: &mut Mesh, scene: &Loaded, radius: f64, side: usize, cell: f32) -> Result<(), FuseError> {
     let atlas = atlas::atlas(mesh, side).map_err(FuseError::Texture)?;
     let mut means = vec![Mean::default(); atlas.texels.len()];
-    for camera in views::cameras(centre, radius, TEXTURE_SIDE) {
+    for camera in views::cameras(radius, TEXTURE_SIDE) {
         let view = View::new(scene, camera, radius, u64::MAX)?;
         means.par_iter_mut().zip(&atlas.texels).for_each(|(mean, texel)| {
             mean.add(&view, texel.place, texel.normal, color::REACH * cell);
@@ -276,8 +348,8 @@ fn distances(grid: &Grid, first: usize, views: &[View]) -> impl Iterator<Item = 
     distances.into_iter().map(move |distance| distance.finish(reach))
 }
 
-/// The box of the body's Gaussians.
-fn bounds(gaussians: &Gaussians) -> Result<(Vec3, Vec3), FuseError> {
+/// The box of the body's Gaussians, world metres.
+fn bounds(gaussians: &Gaussians) -> Result<(DVec3, DVec3), FuseError> {
     let opacities = host(gaussians.opacities.clone());
     let (means, scales) = (host(gaussians.means.clone()), host(gaussians.scales.clone()));
     let rows = means.as_chunks::<3>().0.iter().zip(scales.as_chunks::<3>().0);
@@ -290,16 +362,23 @@ fn bounds(gaussians: &Gaussians) -> Result<(Vec3, Vec3), FuseError> {
     if there.len() < FEWEST {
         return Err(FuseError::Nothing(FEWEST));
     }
-    let (mut low, mut high) = (Vec3::ZERO, Vec3::ZERO);
+    let mut along = vec![0.0; there.len()];
+    let skipped = along.len() - 1 - (FLYING * along.len() as f32) as usize;
+    let mut end = |place: &dyn Fn(&(Vec3, f32)) -> f32| {
+        along.iter_mut().zip(&there).for_each(|(along, row)| *along = place(row));
+        f64::from(*along.select_nth_unstable_by(skipped, f32::total_cmp).1)
+    };
+    let (mut low, mut high, mut centres) = (DVec3::ZERO, DVec3::ZERO, DVec3::ZERO);
     for axis in 0..3 {
-        let end = |sign: f32| {
-            let mut along: Vec<f32> = there.iter().map(|(p, reach)| sign * p[axis] + reach).collect();
-            let skipped = along.len() - 1 - (FLYING * along.len() as f32) as usize;
-            sign * *along.select_nth_unstable_by(skipped, f32::total_cmp).1
-        };
-        (low[axis], high[axis]) = (end(-1.0), end(1.0));
+        low[axis] = -end(&|(p, reach)| reach - p[axis]);
+        high[axis] = end(&|(p, reach)| p[axis] + reach);
+        centres[axis] = end(&|(p, _)| p[axis]) + end(&|(p, _)| -p[axis]);
+    }
+    let size = (high - low).max_element();
+    if centres.max_element() < f64::from(RESOLVED) * size {
+        return Err(FuseError::Coarse);
     }
     // The Gaussians that were left out may be those of a hand.
-    let margin = 0.06 * (high - low).max_element().max(1e-3);
+    let margin = 0.06 * size;
     Ok((low - margin, high + margin))
 }

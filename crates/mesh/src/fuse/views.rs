@@ -31,8 +31,8 @@ pub struct View {
     color: Vec<Vec3>,
 }
 
-/// Cameras around a ball, the whole of which is in each picture of `side`² pixels.
-pub fn cameras(centre: DVec3, radius: f64, side: u32) -> Vec<Camera> {
+/// Cameras around the ball of this radius around the origin, the whole of which is in each picture of `side`² pixels.
+pub fn cameras(radius: f64, side: u32) -> Vec<Camera> {
     let distance = DISTANCE * radius;
     let focal = (distance * distance / (radius * radius) - 1.0).sqrt() * 0.5 * 0.98;
     let ring = |(row, (pitch, count)): (usize, (f64, usize))| {
@@ -43,7 +43,7 @@ pub fn cameras(centre: DVec3, radius: f64, side: u32) -> Vec<Camera> {
             let right = DVec3::new(yaw.cos(), 0.0, -yaw.sin());
             let forward = -backward;
             let rotation = DMat3::from_cols(right, forward.cross(right), forward).transpose();
-            let translation = -(rotation * (centre + distance * backward));
+            let translation = -(rotation * (distance * backward));
             Camera {
                 width: side,
                 height: side,

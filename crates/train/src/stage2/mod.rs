@@ -319,7 +319,9 @@ impl Task for GaussianTask {
             }
             rows.push(row);
         }
-        Ok(grid(&rows))
+        let captions = ["front", "back", "render", "truth", "error", "render", "truth", "error"];
+        let note = format!("two views; white errors: {WORST} of 1 or more");
+        Ok(grid(&rows, &captions, &note))
     }
 
     fn frozen(&self) -> BTreeMap<String, Vec<f32>> {

@@ -46,7 +46,7 @@ struct Generate {
     /// Split of the people. Different splits have different people.
     #[arg(long, value_parser = one_of(SPLITS), default_value = "train")]
     split: Split,
-    /// Also write each person as a scan, OBJ with texture, to scans/SPLIT/ID in the data set.
+    /// Also write each person as a scan, OBJ with texture, to scans/SPLIT/ID in the data set, standing as its views show it.
     #[arg(long)]
     save_scans: bool,
 }
@@ -88,12 +88,17 @@ impl Generate {
         };
         // A scan that exists may have been edited.
         let is_due = |work: &Work| self.save_scans && !scan(work).exists();
-        let made = make(common, &source, inputs, &works, |_, work| {
+        // Where the cameras of the data set see it.
+        let placed = |work: &Work| {
             let mut mesh = person(&work.identity)?;
+            place(&mut mesh, work, Collection::Other, &common.output)?;
+            Ok(mesh)
+        };
+        let made = make(common, &source, inputs, &works, |_, work| {
+            let mesh = placed(work)?;
             if is_due(work) {
                 export::write_obj(&mesh, &scan(work))?;
             }
-            place(&mut mesh, work, Collection::Other, &common.output)?;
             Ok(Person { mesh, yaw_degrees: 0.0, origin: common.output.clone() })
         });
         // Older subjects without scans.
@@ -101,7 +106,7 @@ impl Generate {
         let mut due = common.mine(&works);
         due.retain(|(_, work)| is_due(work) && has(work));
         for (_, work) in Progress::over(due.iter(), "scans") {
-            export::write_obj(&person(&work.identity)?, &scan(work))?;
+            export::write_obj(&placed(work)?, &scan(work))?;
         }
         made
     }

@@ -7,7 +7,8 @@ use std::sync::Arc;
 use snapsnap_base::config::Schema;
 use snapsnap_data::dataset::Folder;
 use snapsnap_train::config::TrainConfig;
-use snapsnap_train::run::{CONFIG, FILES, PREVIEWS, STATE};
+use snapsnap_train::log::PREVIEWS;
+use snapsnap_train::run::{CONFIG, FILES, STATE};
 
 use super::super::outside_data;
 use super::Arguments;

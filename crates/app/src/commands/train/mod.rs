@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use burn::tensor::Device;
 use clap::Args;
-use snapsnap_data::dataset::Folder;
+use snapsnap_data::dataset::{Folder, Layout};
 use snapsnap_net::weights::schema::{self, Part};
 use snapsnap_net::weights::{WeightFile, random_predictor, random_regressors};
 use snapsnap_train::config::TrainConfig;
@@ -205,9 +205,97 @@ impl<'a> Plan<'a> {
             Ok::<_, Failure>(run::train(task, &self.config, networks(tracked)?, &options, &mut reporter)?)
         })?;
         drop(reporter);
-        summarise(T::STAGE, &folder.path, &outcome, start.elapsed());
+        self.summarise(T::STAGE, &folder.path, &outcome, start.elapsed());
         Ok(())
     }
+
+    /// Prints the outcome of a session and the next commands.
+    fn summarise(&self, stage: u32, folder: &Path, outcome: &Outcome, session: Duration) {
+        let run = folder.display();
+        let state = if outcome.finished { "finished" } else { "interrupted" };
+        let [total, session] = [outcome.seconds, session.as_secs_f64()].map(|seconds| seconds / 60.0);
+        let step = outcome.step;
+        say::info(&format!(
+            "{run}: {state} after {step} steps, {total:.1} minutes of training, {session:.1} of them in this session"
+        ));
+        if outcome.skipped > 0 {
+            say::info(&format!("{} steps were skipped", outcome.skipped));
+        }
+        let weights = match outcome.best {
+            Some((step, score)) => {
+                let score = match stage {
+                    1 => format!("{score:.2} mm from the true points"),
+                    _ => format!("{:.2} dB PSNR of the person", -score),
+                };
+                say::info(&format!("best validation: {score} after step {step}, {run}/{BEST}"));
+                BEST
+            }
+            None => LAST,
+        };
+        let run = quoted(folder);
+        say::info(&format!("curves: {run}/curves.svg; TensorBoard: tensorboard --logdir {run}"));
+        if !outcome.finished {
+            say::info(&format!("resume:  snapsnap train-stage{stage} --resume -o {run}"));
+        }
+        let weights = quoted(&folder.join(weights));
+        let next = match stage {
+            1 => {
+                let config = self.arguments.config.as_deref().and_then(stage2_config);
+                let config = config.map_or("configs/default/stage2.toml".into(), |path| quoted(&path));
+                let data: Vec<String> = self.folders.iter().map(|folder| quoted(folder.root())).collect();
+                let data = data.join(" ");
+                let out = quoted(&folder.with_file_name(format!("{}-stage2", name(folder))));
+                format!("snapsnap train-stage2 --config {config} --data {data} --weights {weights} -o {out}")
+            }
+            _ => {
+                let pictures = self.folders.iter().find_map(|folder| example(folder));
+                let pictures = pictures.map_or("FRONT BACK".into(), |two| two.map(|p| quoted(&p)).join(" "));
+                format!(
+                    "snapsnap reconstruct {pictures} --weights {weights} -o human.ply --turntable turn.png"
+                )
+            }
+        };
+        say::info(&format!("next:    {next}"));
+    }
+}
+
+/// A run's name.
+fn name(folder: &Path) -> String {
+    folder.file_name().unwrap_or_default().to_string_lossy().into_owned()
+}
+
+/// A path as a shell takes it.
+fn quoted(path: &Path) -> String {
+    let text = path.display().to_string();
+    let is_plain = |c: char| c.is_alphanumeric() || "/._-+:=@%,".contains(c);
+    if !text.is_empty() && text.chars().all(is_plain) {
+        text
+    } else {
+        format!("'{}'", text.replace('\'', r"'\''"))
+    }
+}
+
+/// The config of stage 2 beside one of stage 1, if there is one.
+fn stage2_config(stage1: &Path) -> Option<PathBuf> {
+    let name = stage1.file_name()?.to_str()?.replace("stage1", "stage2");
+    let path = stage1.with_file_name(name);
+    (path != stage1 && path.is_file()).then_some(path)
+}
+
+/// Front and back of somebody in a data set whose pictures are cut out, preferably a held-out person.
+fn example(folder: &Folder) -> Option<[PathBuf; 2]> {
+    let description = folder.description();
+    if description.layout != Layout::Exact {
+        return None;
+    }
+    let split = folder
+        .splits()
+        .into_iter()
+        .rev()
+        .find(|split| folder.subjects(*split).is_ok_and(|subjects| !subjects.is_empty()))?;
+    let subject = folder.subjects(split).ok()?.into_iter().next()?;
+    let [front, back, ..] = description.arrangement.four(0, description.views);
+    Some([front, back].map(|view| folder.picture_path(split, &subject, view)))
 }
 
 /// Lower bound of a training's memory in bytes: weights, gradients, two moments and averages, samples, and the last
@@ -221,34 +309,4 @@ fn least_memory(config: &TrainConfig) -> u64 {
     let share = if n.window { 10 } else { 1 };
     let heads = 4 * (2 * n.last_dim + n.feature_dim) as u64 * n.net_resolution.pow(2) as u64 / share;
     4 * (5 * parameters + batch * (sample + heads))
-}
-
-/// Prints the outcome of a session and the next commands.
-fn summarise(stage: u32, folder: &Path, outcome: &Outcome, session: Duration) {
-    let run = folder.display();
-    let state = if outcome.finished { "finished" } else { "interrupted" };
-    let [total, session] = [outcome.seconds, session.as_secs_f64()].map(|seconds| seconds / 60.0);
-    let step = outcome.step;
-    say::info(&format!(
-        "{run}: {state} after {step} steps, {total:.1} minutes of training, {session:.1} of them in this session"
-    ));
-    if outcome.skipped > 0 {
-        say::info(&format!("{} steps were skipped", outcome.skipped));
-    }
-    let weights = match outcome.best {
-        Some((step, score)) => {
-            say::info(&format!("best validation: {score:.3} after step {step}, {run}/{BEST}"));
-            BEST
-        }
-        None => LAST,
-    };
-    say::info(&format!("curves: {run}/curves.svg; TensorBoard: tensorboard --logdir {run}"));
-    if !outcome.finished {
-        say::info(&format!("resume:  snapsnap train-stage{stage} --resume -o {run}"));
-    }
-    let next = match stage {
-        1 => format!("snapsnap train-stage2 --config CONFIG --weights {run}/{weights} -o RUN2"),
-        _ => format!("snapsnap reconstruct FRONT BACK --weights {run}/{weights} --turntable turn.png"),
-    };
-    say::info(&format!("next:    {next}"));
 }

@@ -1,0 +1,211 @@
+//! Tunnels through a body, such as a hole between the shells of a shoulder. Narrow ones are closed: the body grows and shrinks
+//! again (a morphological closing), and of what that adds only the walls across tunnels are kept.
+
+use std::collections::VecDeque;
+use std::sync::LazyLock;
+
+use glam::I64Vec3;
+
+use super::grid::{Grid, STEPS};
+
+/// Width of the widest closed tunnel in cubes, 3 cm for a person of 1.7 m.
+const WIDEST: f32 = 5.0;
+/// Thickness that walls get on either side, in cubes.
+const THICKER: usize = 1;
+
+/// Bits of the 14 corners that share an edge with a corner, and the rows of their neighbours among themselves. The edges are those of
+/// Kuhn's subdivision, in which any corners that are neighbours in pairs form a simplex.
+static AROUND: LazyLock<[(I64Vec3, u16); 14]> = LazyLock::new(|| {
+    let steps = STEPS.map(|step| I64Vec3::from_array(step.map(|s| s as i64)));
+    let offsets: Vec<I64Vec3> = steps.into_iter().flat_map(|step| [step, -step]).collect();
+    std::array::from_fn(|i| {
+        let is_neighbour = |other: &I64Vec3| {
+            steps.contains(&(offsets[i] - *other)) || steps.contains(&(*other - offsets[i]))
+        };
+        let bits = (0..14).filter(|j| is_neighbour(&offsets[*j])).map(|j| 1 << j).sum();
+        (offsets[i], bits)
+    })
+});
+
+/// Number of connected parts of some of the 14 corners.
+fn parts(mut corners: u16) -> u32 {
+    let mut parts = 0;
+    while corners != 0 {
+        parts += 1;
+        let mut reached = corners & corners.wrapping_neg();
+        loop {
+            corners &= !reached;
+            let next = AROUND.iter().enumerate().filter(|(i, _)| reached >> i & 1 == 1);
+            reached = next.fold(0, |all, (_, (_, neighbours))| all | neighbours) & corners;
+            if reached == 0 {
+                break;
+            }
+        }
+    }
+    parts
+}
+
+/// For each set of the 14 corners whether it is connected.
+static CONNECTED: LazyLock<Vec<bool>> =
+    LazyLock::new(|| (0..1_u16 << 14).map(|corners| parts(corners) == 1).collect());
+
+impl Grid {
+    /// Closes the tunnels through the inside that are narrower than [`WIDEST`]. Returns the number of walls.
+    pub fn close_tunnels(&mut self) -> usize {
+        let inside: Vec<bool> = self.values.iter().map(|value| *value < 0.0).collect();
+        let outside: Vec<bool> = self.spread(&inside).into_iter().map(|grown| !grown).collect();
+        let outside = self.spread(&outside);
+        let is_added = |row: usize| !outside[row] && !inside[row] && !self.on_border(row);
+
+        // What the closing added is taken away again from its surface, unless two parts of the outside would meet.
+        let steps = AROUND.map(|(offset, _)| self.step(offset));
+        let near = |row: usize| steps.map(|step| row.wrapping_add_signed(step));
+        let link = |kept: &[bool], row: usize| {
+            near(row).iter().enumerate().fold(0_u16, |bits, (i, at)| bits | u16::from(kept[*at]) << i)
+        };
+        let all = (1 << 14) - 1;
+        let added: Vec<usize> = (0..inside.len()).filter(|row| is_added(*row)).collect();
+        let mut kept = inside.clone();
+        added.iter().for_each(|row| kept[*row] = true);
+        let mut waiting: VecDeque<usize> = added.iter().copied().collect();
+        while let Some(row) = waiting.pop_front() {
+            if kept[row] && CONNECTED[usize::from(!link(&kept, row) & all)] {
+                kept[row] = false;
+                waiting.extend(near(row).into_iter().filter(|at| kept[*at] && is_added(*at)));
+            }
+        }
+        let walls: Vec<usize> = added.iter().copied().filter(|row| kept[*row]).collect();
+
+        // Walls of one cube would be lost when the surface is reduced.
+        let mut front = walls.clone();
+        for _ in 0..THICKER {
+            let around: Vec<usize> = front.iter().flat_map(|row| near(*row)).collect();
+            front.clear();
+            for row in around.into_iter().filter(|row| is_added(*row)) {
+                let bits = link(&kept, row);
+                if !kept[row] && CONNECTED[usize::from(bits)] && CONNECTED[usize::from(!bits & all)] {
+                    kept[row] = true;
+                    front.push(row);
+                }
+            }
+        }
+        let mut is_wall = vec![false; kept.len()];
+        for row in added.into_iter().filter(|row| kept[*row]) {
+            is_wall[row] = true;
+            self.values[row] = -0.5 * self.cell;
+        }
+        self.count(&walls, &mut is_wall)
+    }
+
+    /// Rows between a corner and another one at this offset.
+    fn step(&self, offset: I64Vec3) -> isize {
+        let strides = self.strides().map(|stride| stride as i64);
+        offset.dot(I64Vec3::from_array(strides)) as isize
+    }
+
+    /// Marks all corners within half of [`WIDEST`] of a marked one, by balls around those with an unmarked neighbour.
+    fn spread(&self, marked: &[bool]) -> Vec<bool> {
+        let reach = 0.5 * WIDEST;
+        let side = reach as i64;
+        let cube = (-side..=side).flat_map(|z| {
+            (-side..=side).flat_map(move |y| (-side..=side).map(move |x| I64Vec3::new(x, y, z)))
+        });
+        let ball: Vec<I64Vec3> = cube.filter(|offset| offset.as_vec3().length() <= reach).collect();
+        let steps: Vec<isize> = ball.iter().map(|offset| self.step(*offset)).collect();
+        let strides = self.strides();
+        let counts = self.counts.as_i64vec3();
+        let mut spread = marked.to_vec();
+        for row in (0..marked.len()).filter(|row| marked[*row]) {
+            if !self.on_border(row) && strides.iter().all(|step| marked[row - step] && marked[row + step]) {
+                continue;
+            }
+            let at = self.at(row).as_i64vec3();
+            let within = (at - side).min_element() >= 0 && (at + side).cmplt(counts).all();
+            for (offset, step) in ball.iter().zip(&steps) {
+                let to = at + *offset;
+                if within || (to.min_element() >= 0 && to.cmplt(counts).all()) {
+                    spread[row.wrapping_add_signed(*step)] = true;
+                }
+            }
+        }
+        spread
+    }
+
+    /// Number of connected sets of marked corners that contain one of `rows`. Unmarks them.
+    fn count(&self, rows: &[usize], marked: &mut [bool]) -> usize {
+        let steps = AROUND.map(|(offset, _)| self.step(offset));
+        let (mut sets, mut waiting) = (0, Vec::new());
+        for row in rows {
+            if !std::mem::take(&mut marked[*row]) {
+                continue;
+            }
+            sets += 1;
+            waiting.push(*row);
+            while let Some(row) = waiting.pop() {
+                let near = steps.map(|step| row.wrapping_add_signed(step));
+                waiting.extend(near.into_iter().filter(|at| std::mem::take(&mut marked[*at])));
+            }
+        }
+        sets
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::{Vec2, Vec3};
+
+    use super::*;
+    use crate::fuse::grid::tests::{grid, is_closed, volume};
+
+    /// Number of handles of the surface, and its volume.
+    fn handles(grid: &Grid) -> (i64, f64) {
+        let (positions, faces) = grid.surface();
+        assert!(is_closed(&faces));
+        (1 - (positions.len() as i64 - faces.len() as i64 / 2) / 2, volume(&positions, &faces))
+    }
+
+    #[test]
+    fn narrow_tunnels_are_closed_by_walls_and_wide_ones_stay() {
+        let cell = 2.0 / 80.0;
+        // A plate with round holes of these radii in cubes.
+        let plate = |radii: &[f32]| {
+            grid(81, |p| {
+                let plate = ((p.abs() - Vec3::new(0.8, 0.8, 0.2)) / cell).max_element();
+                let holes = radii.iter().enumerate().map(|(i, radius)| {
+                    let middle = Vec2::new(-0.5 + 0.5 * i as f32, 0.1);
+                    radius - p.truncate().distance(middle) / cell
+                });
+                cell * holes.fold(plate, f32::max)
+            })
+        };
+        let mut narrow = plate(&[1.2, 2.0]);
+        let before = handles(&narrow);
+        assert_eq!((before.0, narrow.close_tunnels(), handles(&narrow).0), (2, 2, 0));
+        // Walls are thin.
+        let whole = handles(&plate(&[])).1;
+        assert!(handles(&narrow).1 < before.1 + 0.5 * (whole - before.1));
+        let mut wide = plate(&[4.0, 6.0]);
+        let values = wide.values.clone();
+        assert_eq!((wide.close_tunnels(), handles(&wide).0), (0, 2));
+        assert_eq!(wide.values, values);
+        let mut both = plate(&[4.0, 2.0]);
+        assert_eq!((both.close_tunnels(), handles(&both).0), (1, 1));
+    }
+
+    #[test]
+    fn gaps_between_limbs_stay_open() {
+        // Two limbs that come close to each other at two places, and a body that joins them above.
+        let mut scene = grid(81, |p| {
+            let limb = |side: f32| {
+                let middle = side * (0.2 + 0.05 * (9.0 * p.y).cos());
+                Vec2::new(p.x - middle, p.z).length() - 0.13
+            };
+            let body = (p - Vec3::new(0.0, 0.7, 0.0)).length() - 0.25;
+            limb(-1.0).min(limb(1.0)).min(body).max(p.y.abs() - 0.8)
+        });
+        let values = scene.values.clone();
+        assert_eq!(handles(&scene).0, 0);
+        assert_eq!((scene.close_tunnels(), handles(&scene).0), (0, 0));
+        assert_eq!(scene.values, values);
+    }
+}
