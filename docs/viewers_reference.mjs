@@ -18,7 +18,13 @@ const SETTINGS = {
   tonemapping: "none",
   highPrecisionRendering: false,
   background: { color: [0.4, 0.4, 0.4] },
-  postEffectSettings: {},
+  postEffectSettings: {
+    sharpness: { enabled: false, amount: 0 },
+    bloom: { enabled: false, intensity: 1, blurLevel: 2 },
+    grading: { enabled: false, brightness: 1, contrast: 1, saturation: 1, tint: [1, 1, 1] },
+    vignette: { enabled: false, intensity: 0.5, inner: 0.3, outer: 0.75, curvature: 1 },
+    fringing: { enabled: false, intensity: 0.5 },
+  },
   animTracks: [],
   cameras: [{ initial: { position: [0, 0.9, 3], target: [0, 0.9, 0], fov: 50 } }],
   annotations: [],
@@ -28,7 +34,7 @@ const SETTINGS = {
 const below = structuredClone(SETTINGS);
 Object.assign(below.cameras[0].initial, { position: [0, -0.9, 3], target: [0, -0.9, 0] });
 
-const SPARK = `<!doctype html><style>body{margin:0}</style><script type="importmap">{"imports":{"three":"/m/three/build/three.module.js",
+const SPARK = `<!doctype html><style>body{margin:0}</style><script type="importmap">{"imports":{"three":"/m/three/build/three.module.js","three/addons/":"/m/three/examples/jsm/",
 "@sparkjsdev/spark":"/m/@sparkjsdev/spark/dist/spark.module.js"}}</script><script type="module">
 import * as THREE from "three"; import { SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
 const renderer = new THREE.WebGLRenderer({ preserveDrawingBuffer: true }); renderer.setSize(innerWidth, innerHeight);

@@ -162,7 +162,7 @@ fn a_person_of_few_triangles_is_one_closed_surface() {
     };
     let pictures = ["front.png", "back.png"].map(|name| root().join("assets/sample").join(name));
     let mut command = here();
-    command.arg("reconstruct").args(pictures).args(["--set", "network.resolution=512", "--device", "cpu"]);
+    command.arg("reconstruct").args(pictures).args(["--device", "cpu"]);
     succeed(command.args(["--mesh", "few.ply", "--faces", "20000"]));
     succeed(here().args(["mesh", "human.ply", "-o", "all.ply", "--faces", "0", "--device", "cpu"]));
     let [few, all] = ["few.ply", "all.ply"].map(|name| {
@@ -170,7 +170,7 @@ fn a_person_of_few_triangles_is_one_closed_surface() {
         check_closed(&mesh);
         // Euler's formula: before narrow tunnels were closed there were 33.
         let handles = 1 - (mesh.positions.len() as i64 - mesh.faces.len() as i64 / 2) / 2;
-        assert!((0..=1).contains(&handles), "{name}: {handles} handles");
+        assert_eq!(handles, 0, "{name}");
         mesh
     });
     assert!((15_000..25_000).contains(&few.faces.len()), "{}", few.faces.len());
