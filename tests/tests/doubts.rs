@@ -99,3 +99,26 @@ fn silhouettes_that_do_not_fit_are_noticed() {
     let said = strict(temporary.path(), &[front, back], &[]);
     assert!(said.contains("silhouettes"), "{said}");
 }
+
+/// The person's box decides the scale. A few pixels in a corner do not widen it.
+#[test]
+fn a_distant_speck_of_the_mask_changes_nothing() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let gaussians = |name: &str, speck: bool| {
+        let folder = temporary.path().join(name);
+        std::fs::create_dir(&folder).expect("a folder");
+        let photographs = pair(&folder, |mut picture| {
+            if speck {
+                let opaque = |(x, y): (u32, u32)| (x + 3, y + 3, image::Rgba([200, 10, 10, 255]));
+                let all = (0..20).flat_map(|y| (0..20).map(move |x| (x, y))).map(opaque);
+                all.for_each(|(x, y, pixel)| picture.put_pixel(x, y, pixel));
+            }
+            picture
+        });
+        let mut command = reconstruct(&folder, &photographs);
+        let said = succeed(command.args(["--set", "network.resolution=256", "-v"]));
+        assert_eq!(said.contains("1 specks of the mask left out"), speck, "{said}");
+        std::fs::read(folder.join("human.ply")).expect("a PLY")
+    };
+    assert!(gaussians("clean", false) == gaussians("speck", true));
+}

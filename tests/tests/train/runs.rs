@@ -21,13 +21,38 @@ fn both_stages_learn_and_write_weights_for_reconstructions() {
     for file in ["config.toml", "curves.svg", "previews/0000020.png", "previews/0000040.png"] {
         assert!(one.join(file).is_file(), "{file}");
     }
-    assert!(fs::read(one.join("events.out.tfevents.snapsnap")).expect("events").len() > 1000);
+    // TensorBoard gets the previews.
+    let events = fs::read(one.join("events.out.tfevents.snapsnap")).expect("events");
+    let has = |part: &[u8]| events.windows(part.len()).any(|window| window == part);
+    for preview in ["previews/0000020.png", "previews/0000040.png"] {
+        assert!(has(&fs::read(one.join(preview)).expect("a preview")), "{preview}");
+    }
+    // Captions stand above the pictures and a note below: 14 rows each.
+    let (width, height) = image::image_dimensions(one.join("previews/0000040.png")).expect("a picture");
+    assert_eq!((height - 28) % 4, 0);
+    assert_eq!(width % (4 * (height - 28) / 4), 0);
     let svg = fs::read_to_string(one.join("curves.svg")).expect("curves");
-    assert!(svg.contains("<polyline"), "{svg}");
+    for part in ["<polyline", "held-out people: error of points", "\nmm\n", "\nstep\n"] {
+        assert!(svg.contains(part), "{part}: {svg}");
+    }
 
+    // The printed commands run as they are.
     let weights = one.join("best.safetensors");
+    let next = |said: &str| {
+        said.lines().find_map(|line| line.strip_prefix("next:")).expect("a command").trim().to_owned()
+    };
+    let command = next(&said);
+    for part in [weights.display().to_string(), people().display().to_string()] {
+        assert!(command.contains(&part), "{command}");
+    }
     let said = succeed(train(2, &config, &two).arg("--weights").arg(&weights));
-    assert!(said.contains("reconstruct"), "{said}");
+    let command = next(&said);
+    assert!(!command.contains("FRONT"), "{command}");
+    let program = snapsnap().get_program().to_owned();
+    let mut shell = std::process::Command::new("sh");
+    shell.current_dir(temporary.path()).arg("-c");
+    succeed(shell.arg(command.replacen("snapsnap", &program.to_string_lossy(), 1)));
+    assert!(temporary.path().join("turn.png").is_file());
     assert_eq!(logged(&two, "validation/psnr_masked").len(), 4);
 
     // The file of stage 2 contains both networks.

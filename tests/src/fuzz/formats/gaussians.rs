@@ -5,12 +5,14 @@ use std::path::Path;
 
 use burn::tensor::{Device, Tensor};
 use snapsnap_base::config::Schema;
+use snapsnap_mesh::import;
 use snapsnap_net::config::Config;
 use snapsnap_splat::{Camera, Gaussians, cameras, ply, scene};
 
 use super::super::Format;
 use super::put;
 use crate::data;
+use crate::ply::balls;
 
 /// What all have in common.
 const RENDER: Format = Format {
@@ -35,6 +37,19 @@ pub const FORMATS: &[Format] = &[
     Format {
         name: "gaussians-big-endian",
         sample: |folder| put(folder, "h.ply", file("binary_big_endian", 2)),
+        ..RENDER
+    },
+    // A mesh takes seconds, hence few cases.
+    Format {
+        name: "gaussians-mesh",
+        sample: |folder| put(folder, "h.ply", balls(globe(400), 0.12_f32.ln())),
+        command: "mesh in/h.ply --faces 500 --device cpu -o out.ply",
+        file: Some("out.ply"),
+        whole: |folder| match import::read(&folder.join("out.ply")) {
+            Ok(mesh) => mesh.check().map_err(|e| e.to_string()),
+            Err(e) => Err(e.to_string()),
+        },
+        share: 2,
         ..RENDER
     },
     Format {
@@ -70,6 +85,16 @@ pub const FORMATS: &[Format] = &[
         ..RENDER
     },
 ];
+
+/// Places on a ball of one metre.
+fn globe(n: u16) -> impl ExactSizeIterator<Item = [f32; 3]> {
+    (0..n).map(move |i| {
+        let y = 1.0 - 2.0 * (f32::from(i) + 0.5) / f32::from(n);
+        let (sin, cos) = (2.4 * f32::from(i)).sin_cos();
+        let radius = (1.0 - y * y).sqrt();
+        [radius * cos, y, radius * sin]
+    })
+}
 
 fn three() -> Gaussians {
     let device = Device::flex();
