@@ -1,4 +1,4 @@
-"""Commands against six faults of their surroundings: python docs/faults.py target/release/snapsnap > docs/faults.md
+"""Commands against six faults of their surroundings: python docs/faults.py target/release/snapsnap [COMMAND …] > docs/faults.md
 
 Needs root on Linux, since it mounts small and read-only file systems. Each cell is a run in a fresh folder. It names the exit code (or the
 signal) and is wrong, in capitals, if an input changed, an earlier output was lost, or something half-written was left.
@@ -17,7 +17,7 @@ from pathlib import Path
 PROGRAM = str(Path(sys.argv[1]).resolve())
 ROOT = Path(__file__).resolve().parent.parent
 SAMPLE = [str(ROOT / f"assets/sample/{side}.png") for side in ("front", "back")]
-SMALL = ["--set", "views.count=4", "--set", "views.resolution=128", "--set", "views.samples_per_axis=1"]
+SMALL = ["--set", "views.count=4", "--set", "views.resolution=256", "--set", "views.samples_per_axis=1"]
 TRAIN = str(ROOT / "configs/tiny/stage1.toml")
 
 work = Path(tempfile.mkdtemp())
@@ -179,6 +179,8 @@ print("| command | " + " | ".join(FAULTS) + " |")
 print("|---|" + "---|" * len(FAULTS))
 wrong = 0
 for command, (begin, name, given) in COMMANDS.items():
+    if sys.argv[2:] and command not in sys.argv[2:]:
+        continue
     cells = []
     for fault in FAULTS.values():
         folder = Path(tempfile.mkdtemp(dir=work))
