@@ -122,3 +122,23 @@ fn a_distant_speck_of_the_mask_changes_nothing() {
     };
     assert!(gaussians("clean", false) == gaussians("speck", true));
 }
+
+/// Skin tells the face from hair that is not brown.
+#[test]
+fn swapped_pictures_are_noticed_by_the_face() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let [front, back] = pair(temporary.path(), |picture| picture);
+    let mut dark = sample("back");
+    let top = dark.enumerate_pixels().find(|(.., pixel)| pixel[3] > 127).expect("a person").1;
+    let head = top + dark.height() / 9;
+    for (_, y, pixel) in dark.enumerate_pixels_mut() {
+        if y < head {
+            pixel.0 = [30, 30, 40, pixel[3]];
+        }
+    }
+    dark.save(&back).expect("written");
+    let said = strict(temporary.path(), &[back.clone(), front.clone()], &[]);
+    assert!(said.contains("are front and back swapped?"), "{said}");
+    let said = reconstruct(temporary.path(), &[front, back]).output().expect("runs");
+    assert!(said.status.success() && !String::from_utf8_lossy(&said.stderr).contains("warning"));
+}

@@ -14,6 +14,11 @@ const WIDEST: f32 = 1.2;
 /// Least overlap (intersection over union) of the front's silhouette and the mirrored back's, each scaled to its own box. Photographs
 /// of one pose have 0.8 and more.
 const OVERLAP: f32 = 0.55;
+/// Rows of the face below the top of the person's box, and columns on either side of the head's middle, as shares of the height.
+const FACE: [f32; 2] = [0.03, 0.11];
+const HALF_FACE: f32 = 0.03;
+/// Difference of the shares of skin-coloured pixels from which the pictures may be swapped.
+const SWAPPED: f32 = 0.5;
 /// Side of the grid on which silhouettes and colours are compared.
 const GRID: u32 = 64;
 /// Largest mean difference of colours, of 255, between two files of one picture.
@@ -43,6 +48,11 @@ pub(super) fn doubts(front: &Cutout, back: &Cutout) -> Vec<String> {
     } else if are_equal(front, back, true) {
         doubts.push(pair("one is the mirror image of the other"));
     } else {
+        if skin(front) + SWAPPED < skin(back) {
+            doubts.push(pair(
+                "the head has the colour of skin in the second picture only: are front and back swapped?",
+            ));
+        }
         let overlap = overlap(front, back);
         if overlap < OVERLAP {
             let share = (100.0 * overlap).round();
@@ -107,6 +117,34 @@ fn are_equal(front: &Cutout, back: &Cutout, mirrored: bool) -> bool {
         }
     }
     count > 0 && sum / count as f32 <= EQUAL
+}
+
+/// Share of the pixels at the place of the face that have the colour of skin. Its hue hardly depends on its brightness (Chai and Ngan, "Face
+/// segmentation using skin-color map in videophone applications", 1999). Brown hair has it as well.
+fn skin(one: &Cutout) -> f32 {
+    let Rect { x, y, width, height } = one.person;
+    let at = |share: f32| (share * height as f32) as u32;
+    let rows = y + at(FACE[0])..(y + at(FACE[1])).max(y + at(FACE[0]) + 1);
+    let inside = |x: u32, y: u32| one.mask.get_pixel(x, y)[0] >= PERSON;
+    let columns: Vec<u32> =
+        rows.clone().flat_map(|y| (x..x + width).filter(move |x| inside(*x, y))).collect();
+    if columns.is_empty() {
+        return 0.0;
+    }
+    let middle = (columns.iter().map(|x| u64::from(*x)).sum::<u64>() / columns.len() as u64) as u32;
+    let half = at(HALF_FACE);
+    let (mut count, mut all) = (0_u32, 0_u32);
+    for y in rows {
+        for x in (middle.saturating_sub(half).max(x)..=(middle + half).min(x + width - 1))
+            .filter(|x| inside(*x, y))
+        {
+            let [r, g, b] = color(&one.rgb, (x, y));
+            let [blue, red] = [-0.1687 * r - 0.3313 * g + 0.5 * b, 0.5 * r - 0.4187 * g - 0.0813 * b];
+            all += 1;
+            count += u32::from((-51.0..=-1.0).contains(&blue) && (5.0..=45.0).contains(&red));
+        }
+    }
+    count as f32 / all.max(1) as f32
 }
 
 fn color(picture: &RgbImage, (x, y): (u32, u32)) -> [f32; 3] {
