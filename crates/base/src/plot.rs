@@ -124,7 +124,7 @@ fn draw(area: &Area, axes: &Axes, series: &[Series]) -> Drawn {
     Ok(())
 }
 
-/// Ticks of a logarithmic axis: powers of ten, their multiples where the range has few, and finer steps within a factor of two.
+/// Ticks of a logarithmic axis: powers of ten, with their multiples where the range contains few of them.
 fn ticks(range: &Range<f64>) -> Vec<f64> {
     let decades = (range.end / range.start).log10();
     let steps: &[f64] = match decades {

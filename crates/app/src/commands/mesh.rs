@@ -160,9 +160,7 @@ impl Target {
         self.warn(&fused, name);
         Ok(fused)
     }
-}
 
-impl Target {
     /// Says what a user may not expect.
     fn warn(&self, fused: &Fused, name: &Path) {
         let name = name.display();

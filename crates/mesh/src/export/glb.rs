@@ -27,8 +27,8 @@ pub fn write(mesh: &Mesh, offset: DVec3, path: &Path) -> Result<(), FileError> {
 }
 
 /// The bytes of a binary glTF with one node and one primitive for each material. Colours contain the light of the photographs,
-/// so that materials are unlit (KHR_materials_unlit), and rough for viewers without that extension. The
-/// node moves the mesh by `offset`, metres.
+/// so that materials are unlit (KHR_materials_unlit), and rough for viewers without that extension.
+/// The node moves the mesh by `offset`, metres.
 ///
 /// # Errors
 /// If a texture cannot be encoded.

@@ -14,7 +14,7 @@ use super::png;
 use crate::mesh::Mesh;
 
 /// Writes `mesh` to `path`, with its materials and textures beside it under the same name; the OBJ is written last. Colours of
-/// positions need no material. A white one would hide them in many programs.
+/// positions need no material unless it has a colour of its own. A white one would hide them in many programs.
 ///
 /// # Errors
 /// [`FileError::Write`].
@@ -26,8 +26,8 @@ pub fn write(mesh: &Mesh, offset: DVec3, path: &Path) -> Result<(), FileError> {
     let folder = path.parent().unwrap_or(Path::new("."));
     fs::create_dir_all(folder).map_err(FileError::write(folder))?;
     let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-    let has_texture = mesh.materials.iter().any(|material| material.texture.is_some());
-    let is_plain = !mesh.colors.is_empty() && !has_texture;
+    let is_white = mesh.materials.iter().all(|m| m.texture.is_none() && m.color == Vec3::ONE);
+    let is_plain = !mesh.colors.is_empty() && is_white;
     let mut materials = String::new();
     let mut textures = HashMap::new();
     for (row, material) in mesh.materials.iter().enumerate() {
