@@ -1,11 +1,13 @@
-"""A training step in PyTorch beside ours, on the same cores: the small predictor and the regressor.
+"""A training step in PyTorch beside ours, on the same cores: a predictor and the regressor, in f32 and in bf16.
 
     pip install torch
     cargo bench --workspace --bench step --no-run       # prints the program's path
     python docs/step_pytorch.py PROGRAM [--threads 2] [--seconds 20] [--side 256] [--batch 2] [--network tiny]
+    python docs/step_pytorch.py PROGRAM --network default --side 128 --batch 4 [--wide]
     python docs/step_pytorch.py PROGRAM --memory [...]  # each network alone, and the most memory of its process
 
-Both networks are written in their plainest form with PyTorch's own operators: docs/method.md, "Point predictor" and
+PyTorch's bf16 is torch.autocast("cpu", torch.bfloat16) with images and weights in channels-last order. --wide doubles all
+widths of the default predictor. All networks are written in their plainest form with PyTorch's own operators: docs/method.md, "Point predictor" and
 docs/method.md, "Gaussian regressor". The loss is the mean square of the output. Forward and backward, the fastest of all
 repetitions; programs take turns.
 """
@@ -21,9 +23,11 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-PATCH = 16
+PATCH, CHANNELS = 16, 3
 # Width, heads, blocks of the encoder and of each decoder, the four layers that the heads read; the heads' widths.
+# The default's attention is that of its coarsest level: 6 blocks for the photographs, 4 for the sides.
 NETWORKS = {
+    "default": (128, 4, 6, 4, (), (32, 64, 96, 128), 0, 32),
     "small": (192, 3, 6, 4, (0, 2, 3, 4), (32, 64, 96, 128), 64, 32),
     "tiny": (128, 4, 4, 3, (0, 1, 2, 3), (16, 32, 48, 64), 32, 16),
 }
@@ -90,14 +94,14 @@ def conv(inputs, outputs, side=3, stride=1, bias=True):
     return nn.Conv2d(inputs, outputs, side, stride, side // 2, bias=bias)
 
 
-def double(x):
-    return functional.interpolate(x, scale_factor=2, mode="bilinear", align_corners=True)
+def double(x, align=True):
+    return functional.interpolate(x, scale_factor=2, mode="bilinear", align_corners=align)
 
 
 class Unit(nn.Module):
-    def __init__(self):
+    def __init__(self, width):
         super().__init__()
-        self.conv1, self.conv2 = conv(FEATURES, FEATURES), conv(FEATURES, FEATURES)
+        self.conv1, self.conv2 = conv(width, width), conv(width, width)
 
     def forward(self, x):
         return x + self.conv2(functional.relu(self.conv1(functional.relu(x))))
@@ -115,8 +119,8 @@ class Head(nn.Module):
         ]
         self.sizes = nn.ModuleList(sizes)
         self.common = nn.ModuleList(conv(width, FEATURES, bias=False) for width in BRANCHES)
-        self.fine = nn.ModuleList(Unit() for _ in range(3))
-        self.joined = nn.ModuleList(Unit() for _ in range(4))
+        self.fine = nn.ModuleList(Unit(FEATURES) for _ in range(3))
+        self.joined = nn.ModuleList(Unit(FEATURES) for _ in range(4))
         self.out = nn.ModuleList(conv(FEATURES, FEATURES, 1) for _ in range(4))
         self.head0, self.head2 = conv(FEATURES, FEATURES // 2), conv(FEATURES // 2, LAST)
         self.head4 = conv(LAST, 4, 1)
@@ -159,6 +163,68 @@ class Predictor(nn.Module):
             head([maps[i] for i in HOOKS], self.grid)
             for head, maps in zip(self.heads, (*sides, fused, fused))
         ]
+
+
+class Tokens(nn.Module):
+    """Attention at the coarsest level of the convolutional body."""
+
+    def __init__(self, inputs, depth):
+        super().__init__()
+        self.embed = nn.Linear(inputs, WIDTH)
+        self.blocks = nn.ModuleList(Block(False) for _ in range(depth))
+        self.norm, self.proj = nn.LayerNorm(WIDTH, eps=1e-6), nn.Linear(WIDTH, BRANCHES[3])
+
+    def forward(self, tokens, table):
+        tokens = self.embed(tokens)
+        for block in self.blocks:
+            tokens = block(tokens, None, table)
+        return self.norm(tokens)
+
+    def image(self, tokens, grid):
+        return self.proj(tokens).transpose(1, 2).reshape(-1, BRANCHES[3], *grid)
+
+
+class Decoder(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.units = nn.ModuleList(Unit(width) for width in BRANCHES)
+        self.up = nn.ModuleList(conv(b, a, 1) for a, b in zip(BRANCHES, BRANCHES[1:]))
+        self.middle, self.out = conv(BRANCHES[0], LAST), conv(LAST, 8, 1)
+
+    def forward(self, coarsest, images):
+        x = self.units[3](coarsest + images[3])
+        for level in (2, 1, 0):
+            x = double(self.up[level](x), False) + images[level]
+            x = self.units[level](x)
+        return self.out(functional.relu(self.middle(functional.relu(x))))
+
+
+class Convolutions(nn.Module):
+    """The convolutional body, which reads both photographs together."""
+
+    def __init__(self, side):
+        super().__init__()
+        self.grid = (side // PATCH, side // PATCH)
+        self.table = tables(*self.grid, WIDTH // HEADS)
+        self.first = conv(2 * CHANNELS, BRANCHES[0])
+        self.units = nn.ModuleList(Unit(width) for width in BRANCHES)
+        self.down = nn.ModuleList(conv(a, b, 3, 2) for a, b in zip(BRANCHES, BRANCHES[1:]))
+        self.tokens, self.side_tokens = Tokens(BRANCHES[3], ENCODER), Tokens(WIDTH, DECODER)
+        self.decoder, self.side_decoder = Decoder(), Decoder()
+
+    def forward(self, images):
+        x = self.first(torch.cat(images.chunk(2), 1))
+        levels = []
+        for level, unit in enumerate(self.units):
+            if level > 0:
+                x = self.down[level - 1](functional.relu(x))
+            x = unit(x)
+            levels.append(x)
+        tokens = self.tokens(x.flatten(2).transpose(1, 2), self.table)
+        rows = [level.mean(3, keepdim=True) for level in levels]
+        front = self.decoder(self.tokens.image(tokens, self.grid), levels)
+        side = self.side_tokens.image(self.side_tokens(tokens, self.table), self.grid)
+        return [*front.chunk(2, 1), *self.side_decoder(side, rows).chunk(2, 1)]
 
 
 class Residual(nn.Module):
@@ -205,15 +271,16 @@ class Regressor(nn.Module):
         return [self.last(self.conv_out(functional.silu(self.norm(x))))]
 
 
-def measure(network, images, seconds):
+def measure(network, images, seconds, half):
     """Fastest forward and backward in milliseconds, and how many there were."""
     best, count, end = (float("inf"), 0.0), 0, None
     while end is None or time.perf_counter() < end or count < 3:
         network.zero_grad()
         start = time.perf_counter()
-        out = network(images)
+        with torch.autocast("cpu", torch.bfloat16, enabled=half):
+            out = network(images)
         middle = time.perf_counter()
-        sum(o.square().mean() for o in out).backward()
+        sum(o.float().square().mean() for o in out).backward()
         times = (middle - start, time.perf_counter() - middle)
         if end is None:
             end = time.perf_counter() + seconds
@@ -231,22 +298,29 @@ def main():
     parser.add_argument("--side", type=int, default=256)
     parser.add_argument("--batch", type=int, default=2)
     parser.add_argument("--network", choices=NETWORKS, default="small")
+    parser.add_argument("--wide", action="store_true", help="twice the widths; the default predictor alone")
     parser.add_argument("--memory", action="store_true")
     parser.add_argument("--only", choices=("predictor", "regressor"), help=argparse.SUPPRESS)
     a = parser.parse_args()
-    global WIDTH, HEADS, ENCODER, DECODER, HOOKS, BRANCHES, FEATURES, LAST
+    global WIDTH, HEADS, ENCODER, DECODER, HOOKS, BRANCHES, FEATURES, LAST, PATCH, CHANNELS
     WIDTH, HEADS, ENCODER, DECODER, HOOKS, BRANCHES, FEATURES, LAST = NETWORKS[a.network]
+    if a.wide:
+        WIDTH, BRANCHES, LAST = 2 * WIDTH, tuple(2 * width for width in BRANCHES), 2 * LAST
+    if a.network == "default":
+        PATCH, CHANNELS = 8, 6
     torch.set_num_threads(a.threads)
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: a.threads])
-    predictor, images = Predictor(a.side), torch.rand(2 * a.batch, 3, a.side, a.side)
+    body = Convolutions if a.network == "default" else Predictor
+    predictor, images = body(a.side), torch.rand(2 * a.batch, CHANNELS, a.side, a.side)
     regressor, views = Regressor(), torch.rand(2, 6, a.side, a.side)
     networks = (("predictor", predictor, images), ("regressor", regressor, views))
     ours = [a.program, str(a.seconds), str(a.side), str(a.batch), "whole", a.network]
+    ours += ["wide"] if a.wide else []
     if a.only:
         [(network, x)] = [(network, x) for name, network, x in networks if name == a.only]
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
-        measure(network, x, a.seconds)
+        measure(network, x, a.seconds, False)
         after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
         print(f"{a.only}, PyTorch: {after} MB at most, {before} MB of it before the first step")
         return
@@ -258,14 +332,18 @@ def main():
     print(f"PyTorch {torch.__version__}, {a.threads} threads")
     print(f"predictor: {sum(p.numel() for p in predictor.parameters()):,} parameters")
     for turn in range(2):
-        print(subprocess.run(ours, capture_output=True, text=True, check=True).stdout.rstrip())
+        for words in ((), ("bf16",)):
+            print(subprocess.run([*ours, *words], capture_output=True, text=True, check=True).stdout.rstrip())
         for name, network, x in networks:
-            (forward, backward), count = measure(network, x, a.seconds)
-            total = forward + backward
-            print(
-                f"{name}, PyTorch: forward {forward:.0f} + backward {backward:.0f} = {total:.0f} ms, {count} runs",
-                flush=True,
-            )
+            for half in (False, True):
+                order = torch.channels_last if half else torch.contiguous_format
+                network, x = network.to(memory_format=order), x.contiguous(memory_format=order)
+                (forward, backward), count = measure(network, x, a.seconds, half)
+                print(
+                    f"{name}, PyTorch, {'bf16' if half else 'f32'}: forward {forward:.0f} + backward {backward:.0f} = "
+                    f"{forward + backward:.0f} ms, {count} runs",
+                    flush=True,
+                )
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ use burn::module::{Module, Param, ParamGroup, ParamId};
 use burn::optim::GradientsParams;
 use burn::tensor::{Device, Distribution, Tensor};
 use snapsnap_base::config::Schema;
-use snapsnap_net::network::{PointPredictor, View};
+use snapsnap_net::network::{Grid, Input, PointPredictor};
 use snapsnap_net::regressor::Statistics;
 use snapsnap_net::weights::{NamedVisitor, Path, random_predictor, random_regressors, visit_named};
 use snapsnap_train::config::TrainConfig;
@@ -79,14 +79,15 @@ fn peak() -> String {
 
 fn run(seconds: f64, side: usize, batch: usize) {
     let device = Device::flex().autodiff();
-    let network = ["tiny", "full"].into_iter().find(|word| asked_for(word)).unwrap_or("small");
+    let network = ["tiny", "full", "default"].into_iter().find(|word| asked_for(word)).unwrap_or("small");
     let path = format!("{}/../../configs/{network}/stage1.toml", env!("CARGO_MANIFEST_DIR"));
     let config = TrainConfig::from_file(path.as_ref(), &[]).expect("a config").networks();
     let predictor = random_predictor(&config, 1, &device);
     let regressor = random_regressors(&config, 1, &device).remove(0);
     let threads = rayon::current_num_threads();
 
-    let images = Tensor::<4>::random([2 * batch, 3, side, side], Distribution::Uniform(-1.0, 1.0), &device);
+    let channels = config.network.input_channels();
+    let images = Tensor::<4>::random([2 * batch, channels, side, side], Distribution::Uniform(-1.0, 1.0), &device);
     // Layers before the first trained one have no backward pass.
     for (what, trained) in [
         ("all trained", ""),
@@ -99,14 +100,12 @@ fn run(seconds: f64, side: usize, batch: usize) {
             continue;
         }
         let predictor = frozen(predictor.clone(), &trained.split(',').collect::<Vec<_>>());
-        let net = predictor.transformer();
-        let grid = net.grid([side, side]);
+        let grid = Grid::whole([side / config.network.patch; 2]);
         let time = measure(seconds, || {
             let start = Instant::now();
-            let tokens = net.encode(images.clone(), &grid);
-            let maps = net.decode(tokens.clone().narrow(0, 0, batch), tokens.narrow(0, batch, batch), &grid);
-            let raw = View::ALL.map(|view| net.raw_points(view, &maps, &grid).square().mean());
-            let loss = Tensor::cat(raw.to_vec(), 0).sum();
+            let input = Input { images: images.clone(), grid: grid.clone() };
+            let raw = predictor.raw(&predictor.decode(predictor.encode(input)));
+            let loss = Tensor::cat(raw.into_iter().map(|raw| raw.square().mean()).collect(), 0).sum();
             let forward = start.elapsed();
             if trained != "nothing" {
                 black_box(GradientsParams::from_grads(loss.backward(), &predictor));

@@ -290,10 +290,9 @@ impl PointPredictor {
         }
     }
 
-    /// Activated maps of all views at the network's resolution, in network units and without anchors. With
-    /// `network.both_ways`, the batch of `decoded` is twice that of the result.
-    pub fn heads(&self, decoded: &Decoded) -> Vec<(View, PointMap)> {
-        let raw: Vec<Tensor<4>> = match (&self.body, decoded) {
+    /// Raw x, y, z, confidence `[B, 4, h, w]` of [`Self::views`], before their activation.
+    pub fn raw(&self, decoded: &Decoded) -> Vec<Tensor<4>> {
+        match (&self.body, decoded) {
             (Body::Transformer(net), Decoded::Tokens(maps, grid)) => {
                 self.views().iter().map(|view| net.raw_points(*view, maps, grid)).collect()
             }
@@ -302,7 +301,13 @@ impl PointPredictor {
                 net.photographed(levels).into_iter().chain(sides.into_iter().flatten()).collect()
             }
             _ => panic!("decoded by another network"),
-        };
+        }
+    }
+
+    /// Activated maps of all views at the network's resolution, in network units and without anchors. With
+    /// `network.both_ways`, the batch of `decoded` is twice that of the result.
+    pub fn heads(&self, decoded: &Decoded) -> Vec<(View, PointMap)> {
+        let raw = self.raw(decoded);
         let map = |(&view, raw): (&View, Tensor<4>)| {
             // The map of a mirrored photograph is mirrored.
             let raw = if self.config.mirror && view == View::Back { raw.flip([3]) } else { raw };
