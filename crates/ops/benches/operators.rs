@@ -50,7 +50,7 @@ fn lengths(name: &str, s: &[usize]) -> Vec<usize> {
 }
 
 /// Forward and backward pass.
-fn build<'a>(name: &str, s: &[usize], x: &'a [Vec<f32>]) -> [Run<'a>; 2] {
+fn build<'a>(name: &str, half: bool, s: &[usize], x: &'a [Vec<f32>]) -> [Run<'a>; 2] {
     let dy = &x[x.len() - 1];
     // All inputs but the first two and the last one.
     let bias = x.get(2..x.len() - 1).and_then(|rest| Some(&rest.first()?[..]));
@@ -68,10 +68,10 @@ fn build<'a>(name: &str, s: &[usize], x: &'a [Vec<f32>]) -> [Run<'a>; 2] {
     let [outputs, height] = [2, 3].map(|i| s.get(i).copied().unwrap_or(0));
     let width = height;
     match name {
-        "conv3x3" => passes!(Conv3x3 { batch, inputs, outputs, height, width, rectified }),
-        "conv1x1" => passes!(Conv1x1 { batch, inputs, outputs, pixels: height * width, rectified }),
+        "conv3x3" => passes!(Conv3x3 { batch, inputs, outputs, height, width, rectified, half }),
+        "conv1x1" => passes!(Conv1x1 { batch, inputs, outputs, pixels: height * width, rectified, half }),
         "halve" => {
-            passes!(Unfolded { batch, inputs, outputs, height, width, stride: 2, rectified: false })
+            passes!(Unfolded { batch, inputs, outputs, height, width, stride: 2, rectified: false, half })
         }
         "resize" => {
             let size = [s[2]; 2];
@@ -82,7 +82,7 @@ fn build<'a>(name: &str, s: &[usize], x: &'a [Vec<f32>]) -> [Run<'a>; 2] {
             ]
         }
         "linear" => {
-            let layer = Linear { rows: s[0], inputs: s[1], outputs: s[2], transposed: false };
+            let layer = Linear { rows: s[0], inputs: s[1], outputs: s[2], transposed: false, half };
             let gelu = move || layer.forward_gelu(&x[0], &x[1], bias);
             let before = (s[3] == 1).then(|| gelu()[1].clone());
             let activated = s[3] == 1;
@@ -109,7 +109,7 @@ fn build<'a>(name: &str, s: &[usize], x: &'a [Vec<f32>]) -> [Run<'a>; 2] {
         }
         "attention" => {
             let n = s[1] * s[2];
-            let attention = Attention { batch: s[0], queries: n, keys: n, heads: s[3], head_dim: s[4] };
+            let attention = Attention { batch: s[0], queries: n, keys: n, heads: s[3], head_dim: s[4], half };
             let (rope, copy) = (tables(s[1], s[2], s[4]), tables(s[1], s[2], s[4]));
             let qkv = Tokens::apart([&x[0], &x[1], &x[2]], s[3] * s[4]);
             let logarithms = attention.forward(qkv, [&rope[0], &rope[1]]).1;
@@ -161,6 +161,8 @@ fn serve() {
         let line = line.expect("a readable line");
         let words: Vec<&str> = line.split_whitespace().collect();
         let (mode, argument, name) = (words[0], words[1], words[2]);
+        // A name with 16 behind it: products in bf16.
+        let (name, half) = name.strip_suffix("16").map_or((name, false), |name| (name, true));
         let sizes: Vec<usize> = words[3..].iter().map(|word| word.parse().expect("a size")).collect();
         let lengths = lengths(name, &sizes);
         let input = |(i, &len): (usize, &usize)| match mode {
@@ -168,7 +170,7 @@ fn serve() {
             _ => read(&format!("{argument}/in{i}"), len),
         };
         let inputs: Vec<Vec<f32>> = lengths.iter().enumerate().map(input).collect();
-        let [forward, backward] = build(name, &sizes, &inputs);
+        let [forward, backward] = build(name, half, &sizes, &inputs);
         if mode == "time" {
             let seconds = Duration::from_secs_f64(argument.parse().expect("a number of seconds"));
             let (mut best, mut count, begin) = ([f64::INFINITY; 2], 0, Instant::now());

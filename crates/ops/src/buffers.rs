@@ -3,42 +3,54 @@
 
 use std::sync::{Mutex, PoisonError};
 
-/// Largest number of unused floats: 2 GiB.
+/// Largest number of unused values: 2 GiB of each type.
 const MOST: usize = 1 << 29;
 
 /// The unused memory of all operators.
-static POOL: Pool = Pool { free: Mutex::new(Vec::new()) };
+static FLOATS: Pool<f32> = Pool { free: Mutex::new(Vec::new()) };
+/// That of the factors of products in bf16, whose pairs are words.
+static WORDS: Pool<u32> = Pool { free: Mutex::new(Vec::new()) };
 
 /// `len` floats of any value.
 pub fn take(len: usize) -> Vec<f32> {
-    POOL.take(len)
+    FLOATS.take(len)
 }
 
 /// Memory for later calls of [`take`].
 pub fn give(buffer: Vec<f32>) {
-    POOL.give(buffer);
+    FLOATS.give(buffer);
 }
 
-/// Unused blocks of floats.
+/// `len` words of any value.
+pub fn take_words(len: usize) -> Vec<u32> {
+    WORDS.take(len)
+}
+
+/// Memory for later calls of [`take_words`].
+pub fn give_words(buffer: Vec<u32>) {
+    WORDS.give(buffer);
+}
+
+/// Unused blocks of values.
 #[derive(Default)]
-struct Pool {
-    free: Mutex<Vec<Vec<f32>>>,
+struct Pool<T> {
+    free: Mutex<Vec<Vec<T>>>,
 }
 
-impl Pool {
-    fn take(&self, len: usize) -> Vec<f32> {
+impl<T: Copy + Default> Pool<T> {
+    fn take(&self, len: usize) -> Vec<T> {
         let mut free = self.free.lock().unwrap_or_else(PoisonError::into_inner);
         // Much larger blocks stay for larger requests.
         let fitting = (0..free.len()).filter(|&i| (len..=2 * len).contains(&free[i].capacity()));
         let best = fitting.min_by_key(|&i| free[i].capacity()).map(|i| free.swap_remove(i));
         drop(free);
-        let Some(mut buffer) = best else { return vec![0.0; len] };
-        buffer.resize(len, 0.0);
+        let Some(mut buffer) = best else { return vec![T::default(); len] };
+        buffer.resize(len, T::default());
         buffer
     }
 
     /// Beyond [`MOST`], the oldest blocks are freed.
-    fn give(&self, buffer: Vec<f32>) {
+    fn give(&self, buffer: Vec<T>) {
         let mut free = self.free.lock().unwrap_or_else(PoisonError::into_inner);
         free.push(buffer);
         let mut sum: usize = free.iter().map(Vec::capacity).sum();
@@ -54,7 +66,7 @@ mod tests {
 
     #[test]
     fn returned_memory_is_used_again_unless_it_is_far_too_large() {
-        let buffers = Pool::default();
+        let buffers = Pool::<f32>::default();
         let buffer = buffers.take(1000);
         let address = buffer.as_ptr();
         buffers.give(buffer);

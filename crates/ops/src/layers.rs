@@ -4,32 +4,32 @@
 use burn::module::Param;
 use burn::nn;
 use burn::nn::conv::{Conv2d, ConvTranspose2d};
-use burn::tensor::Tensor;
+use burn::tensor::{FloatDType, Tensor};
 use burn::tensor::activation::relu;
 
 use crate::buffers::give;
 use crate::op::{self, Kept, Kernel};
 use crate::train::{Conv1x1, Conv3x3, Gradients, LayerNorm, Linear, Statistics, Unfolded, Wanted};
-use crate::{in_f32, is_fast, is_trained_fast};
+use crate::{has_kernels, in_f32, is_half, is_trained_fast};
 
 /// `[B, N, inputs]` → `[B, N, outputs]`.
 pub fn linear(layer: &nn::Linear, x: Tensor<3>) -> Tensor<3> {
-    if !is_trained_fast(&x) {
+    if !has_kernels(&x) {
         return layer.forward(x);
     }
     let (sizes, shape) = linear_sizes(layer, &x);
     run(sizes, shape, x, layer.weight.val(), bias(&layer.bias))
 }
 
-/// GELU (erf form) of a linear layer, in training on `flex`.
-pub(crate) fn trained_linear_gelu(layer: &nn::Linear, x: Tensor<3>) -> Tensor<3> {
+/// GELU (erf form) of a linear layer, on `flex`.
+pub(crate) fn linear_gelu(layer: &nn::Linear, x: Tensor<3>) -> Tensor<3> {
     let (sizes, shape) = linear_sizes(layer, &x);
     run(Gelu(sizes), shape, x, layer.weight.val(), bias(&layer.bias))
 }
 
 fn linear_sizes(layer: &nn::Linear, x: &Tensor<3>) -> (Linear, [usize; 3]) {
-    let ([b, n, _], [inputs, outputs]) = (x.dims(), layer.weight.dims());
-    (Linear { rows: b * n, inputs, outputs, transposed: false }, [b, n, outputs])
+    let ([b, n, _], [inputs, outputs], half) = (x.dims(), layer.weight.dims(), is_half(&layer.weight));
+    (Linear { rows: b * n, inputs, outputs, transposed: false, half }, [b, n, outputs])
 }
 
 /// Layer normalisation of tokens `[B, N, C]`. `epsilon` is that of the layer, whose field is private.
@@ -46,21 +46,25 @@ pub fn layer_norm(layer: &nn::LayerNorm, epsilon: f64, x: Tensor<3>) -> Tensor<3
 pub fn conv2d(layer: &Conv2d, x: Tensor<4>, rectified: bool) -> Tensor<4> {
     let ([batch, inputs, height, width], [outputs, _, rows, columns]) = (x.dims(), layer.weight.dims());
     let (weight, bias) = (layer.weight.val(), bias(&layer.bias));
-    let plain = layer.groups == 1 && layer.dilation == [1, 1] && (is_trained_fast(&x) || is_fast(&x));
+    let half = is_half(&layer.weight);
+    let plain = layer.groups == 1 && layer.dilation == [1, 1] && has_kernels(&x);
     match (plain, [rows, columns], layer.stride) {
         (true, [3, 3], [1, 1]) => {
-            let sizes = Conv3x3 { batch, inputs, outputs, height, width, rectified };
+            let sizes = Conv3x3 { batch, inputs, outputs, height, width, rectified, half };
             run(sizes, [batch, outputs, height, width], x, weight, bias)
         }
         (true, [3, 3], [2, 2]) => {
-            let sizes = Unfolded { batch, inputs, outputs, height, width, stride: 2, rectified };
+            let sizes = Unfolded { batch, inputs, outputs, height, width, stride: 2, rectified, half };
             run(sizes, [batch, outputs, height.div_ceil(2), width.div_ceil(2)], x, weight, bias)
         }
         (true, [1, 1], [1, 1]) => {
-            let sizes = Conv1x1 { batch, inputs, outputs, pixels: height * width, rectified };
+            let sizes = Conv1x1 { batch, inputs, outputs, pixels: height * width, rectified, half };
             run(sizes, [batch, outputs, height, width], x, weight, bias)
         }
-        _ => layer.forward(if rectified { relu(x) } else { x }),
+        _ => {
+            let dtype = x.dtype();
+            layer.forward(if rectified { relu(x) } else { x }.cast(layer.weight.val().dtype())).cast(dtype)
+        }
     }
 }
 
@@ -68,7 +72,7 @@ pub fn conv2d(layer: &Conv2d, x: Tensor<4>, rectified: bool) -> Tensor<4> {
 /// pixel becomes a square of its own, so that it is a 1×1 convolution to `[B, D · stride · stride, H, W]` and a
 /// rearrangement.
 pub fn enlarge(layer: &ConvTranspose2d, x: Tensor<4>) -> Tensor<4> {
-    if !is_trained_fast(&x) && !is_fast(&x) {
+    if !has_kernels(&x) {
         return layer.forward(x);
     }
     let ([batch, inputs, height, width], [_, outputs, s, _]) = (x.dims(), layer.weight.dims());
@@ -77,7 +81,8 @@ pub fn enlarge(layer: &ConvTranspose2d, x: Tensor<4>) -> Tensor<4> {
     let weight: Tensor<2> = layer.weight.val().reshape([inputs, squares]).transpose();
     let bias =
         layer.bias.as_ref().map(|bias| bias.val().reshape([outputs, 1]).repeat_dim(1, s * s).flatten(0, 1));
-    let sizes = Conv1x1 { batch, inputs, outputs: squares, pixels: height * width, rectified: false };
+    let (pixels, half) = (height * width, is_half(&layer.weight));
+    let sizes = Conv1x1 { batch, inputs, outputs: squares, pixels, rectified: false, half };
     run(sizes, [batch, outputs, s, s, height, width], x, weight, bias).permute([0, 1, 4, 2, 5, 3]).reshape([
         batch,
         outputs,
@@ -89,14 +94,15 @@ pub fn enlarge(layer: &ConvTranspose2d, x: Tensor<4>) -> Tensor<4> {
 /// A convolution whose kernel is as large as its stride, from images `[B, C, H, W]` to tokens
 /// `[B, H/side · W/side, D]`, row-major.
 pub fn patches(layer: &Conv2d, x: Tensor<4>) -> Tensor<3> {
-    if !is_trained_fast(&x) {
+    if !has_kernels(&x) {
         return layer.forward(x).flatten::<3>(2, 3).swap_dims(1, 2);
     }
     let ([batch, channels, height, width], [outputs, _, side, _]) = (x.dims(), layer.weight.dims());
     assert_eq!(layer.stride, [side; 2], "the kernel is as large as the stride");
     let (rows, columns, inputs) = (height / side, width / side, channels * side * side);
     let patches = x.reshape([batch, channels, rows, side, columns, side]).permute([0, 2, 4, 1, 3, 5]);
-    let sizes = Linear { rows: batch * rows * columns, inputs, outputs, transposed: true };
+    let half = is_half(&layer.weight);
+    let sizes = Linear { rows: batch * rows * columns, inputs, outputs, transposed: true, half };
     let x: Tensor<2> = patches.reshape([sizes.rows, inputs]);
     run(sizes, [batch, rows * columns, outputs], x, layer.weight.val(), bias(&layer.bias))
 }
@@ -223,6 +229,8 @@ fn run<const A: usize, const W: usize, const D: usize>(
     weight: Tensor<W>,
     bias: Option<Tensor<1>>,
 ) -> Tensor<D> {
+    // Kernels read f32 and round it themselves.
+    let (weight, bias) = (weight.cast(FloatDType::F32), bias.map(|bias| bias.cast(FloatDType::F32)));
     let operator = Operator { layer, shape: shape.to_vec(), has_bias: bias.is_some() };
     op::run(operator, x, Some(weight), bias)
 }

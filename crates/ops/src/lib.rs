@@ -3,7 +3,7 @@
 
 pub mod buffers;
 pub mod conv;
-mod gelu;
+pub mod half;
 pub mod layers;
 mod math;
 mod multiply;
@@ -44,9 +44,19 @@ pub fn is_trained_fast<const D: usize>(x: &Tensor<D>) -> bool {
     x.dtype() == DType::F32 && device.is_autodiff() && device.inner() == Device::flex()
 }
 
-/// `x` in the float type of a layer's weight.
+/// Whether this crate's kernels apply to `x`, with gradients or without.
+pub fn has_kernels<const D: usize>(x: &Tensor<D>) -> bool {
+    is_fast(x) || is_trained_fast(x)
+}
+
+/// `x` in the float type of a layer's weight. On `flex` all tensors between layers are f32: kernels round what they multiply.
 pub fn as_weight<const D: usize, const W: usize>(x: Tensor<D>, weight: &Param<Tensor<W>>) -> Tensor<D> {
-    x.cast(weight.val().dtype())
+    if has_kernels(&x) { x } else { x.cast(weight.val().dtype()) }
+}
+
+/// Whether a layer's weight is bf16: its products are, too.
+pub fn is_half<const D: usize>(weight: &Param<Tensor<D>>) -> bool {
+    weight.val().dtype() == DType::BF16
 }
 
 /// Runs `compute` in f32 for tensors of 16 bits: norms, rotations.
@@ -58,29 +68,29 @@ pub fn in_f32<const D: usize>(x: Tensor<D>, compute: impl FnOnce(Tensor<D>) -> T
 
 /// softmax(rope(q) · rope(k)ᵀ / √head_dim) · v, heads side by side in the channels: `q` `[B, N, C]`, `k` and `v`
 /// `[B, M, C]` → `[B, N, C]`; both sides share one grid, hence one table.
-pub fn rotary_attention(q: Tensor<3>, k: Tensor<3>, v: Tensor<3>, rope: &Rope, heads: usize) -> Tensor<3> {
+pub fn rotary_attention(q: Tensor<3>, k: Tensor<3>, v: Tensor<3>, rope: &Rope, heads: usize, half: bool) -> Tensor<3> {
     if is_trained_fast(&q) {
-        return tracked::apart(q, k, v, rope, heads);
+        return tracked::apart([q, k, v], rope, heads, half);
     }
     if !is_fast(&q) {
         return plain_attention(q, k, v, [rope, rope], heads);
     }
     let ([b, n, c], m, device) = (q.dims(), k.dims()[1], q.device());
     let (cos, sin) = (host(rope.cos.clone()), host(rope.sin.clone()));
-    let attention = Attention { batch: b, queries: n, keys: m, heads, head_dim: c / heads };
+    let attention = Attention { batch: b, queries: n, keys: m, heads, head_dim: c / heads, half };
     let [q, k, v] = [q, k, v].map(host);
     let (out, _) = attention.forward(Tokens::apart([&q, &k, &v], c), [&cos, &sin]);
     Tensor::from_data(TensorData::new(out, [b, n, c]), &device)
 }
 
 /// The same for queries, keys and values side by side in one tensor: `[B, N, 3·C]` → `[B, N, C]`.
-pub fn rotary_self_attention(qkv: Tensor<3>, rope: &Rope, heads: usize) -> Tensor<3> {
+pub fn rotary_self_attention(qkv: Tensor<3>, rope: &Rope, heads: usize, half: bool) -> Tensor<3> {
     if is_trained_fast(&qkv) {
-        return tracked::together(qkv, rope, heads);
+        return tracked::together(qkv, rope, heads, half);
     }
     let c = qkv.dims()[2] / 3;
     let part = |i: usize| qkv.clone().narrow(2, i * c, c);
-    rotary_attention(part(0), part(1), part(2), rope, heads)
+    rotary_attention(part(0), part(1), part(2), rope, heads, half)
 }
 
 fn plain_attention(q: Tensor<3>, k: Tensor<3>, v: Tensor<3>, ropes: [&Rope; 2], heads: usize) -> Tensor<3> {
@@ -96,24 +106,16 @@ fn plain_attention(q: Tensor<3>, k: Tensor<3>, v: Tensor<3>, ropes: [&Rope; 2], 
 
 /// GELU (erf form) of a linear layer: `[B, N, C]` → `[B, N, D]`.
 pub fn linear_gelu(layer: &Linear, x: Tensor<3>) -> Tensor<3> {
-    if is_trained_fast(&x) {
-        return layers::trained_linear_gelu(layer, x);
+    if has_kernels(&x) {
+        return layers::linear_gelu(layer, x);
     }
-    if x.device().is_autodiff() {
+    let has_gradient = x.device().is_autodiff();
+    let x = layer.forward(x);
+    if has_gradient {
         // The gradient of Burn's own operator is that of the approximation by tanh on all backends but flex: 4e-4 off.
-        let x = layer.forward(x);
         return x.clone() * ((x * FRAC_1_SQRT_2).erf() + 1.0) * 0.5;
     }
-    if !is_fast(&x) {
-        return gelu(layer.forward(x));
-    }
-    let ([b, n, c], device) = (x.dims(), x.device());
-    let weight = layer.weight.val();
-    let width = weight.dims()[1];
-    let mut values = host(x.reshape([b * n, c]).matmul(weight));
-    let bias = layer.bias.as_ref().map_or_else(|| vec![0.0; width], |bias| host(bias.val()));
-    gelu::bias_gelu(&mut values, &bias);
-    Tensor::from_data(TensorData::new(values, [b, n, width]), &device)
+    gelu(x)
 }
 
 /// Bilinear resize of `[B, C, H, W]` to `size` (rows, columns).

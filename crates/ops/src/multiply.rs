@@ -1,14 +1,68 @@
-//! Matrix products by the gemm crate on one thread; what is shared out among threads is decided by its callers, by sizes
-//! alone, so that every element is one sum in one order.
+//! Matrix products on one thread, in f32 by the gemm crate or in bf16 by [`crate::half`]; what is shared out among threads
+//! is decided by its callers, by sizes alone, so that every element is one sum in one order.
+
+use rayon::prelude::*;
+
+use crate::buffers::{give_words, take_words};
+use crate::half::{self, Left, PANEL, SLACK, Source, Target, Unit};
+
+/// A matrix in f32: values, and their (column, row) strides in elements.
+pub type Matrix<'a> = (&'a [f32], [usize; 2]);
+
+/// Right factor of products `[k, n]`.
+pub enum Right<'a> {
+    /// As it is.
+    Plain(Matrix<'a>),
+    /// In bf16.
+    Packed(Unit, Vec<u32>),
+}
+
+impl<'a> Right<'a> {
+    /// The factor for products in f32, or, if `half` and the processor can, in bf16.
+    pub fn new(half: bool, [k, n]: [usize; 2], matrix: Matrix<'a>) -> Self {
+        match half::unit().filter(|_| half) {
+            None => Self::Plain(matrix),
+            Some(unit) => Self::packed(unit, [k, n], matrix),
+        }
+    }
+
+    pub(crate) fn packed(unit: Unit, [depth, columns]: [usize; 2], (values, [stride, inner]): Matrix) -> Self {
+        /// Words per task.
+        const PIECE: usize = 32 * 1024;
+        let source = Source { values, stride, inner, count: columns, depth };
+        let panel = source.blocks() * half::PAIRS * PANEL;
+        let mut words = take_words(source.words_right());
+        let pack = |(i, out): (usize, &mut [u32])| {
+            let first = i * PANEL;
+            let values = &values[first * stride..];
+            let part = Source { values, count: (columns - first).min(out.len() / panel * PANEL), ..source };
+            part.pack_right(out.as_chunks_mut().0);
+        };
+        if words.len() <= PIECE {
+            pack((0, &mut words));
+        } else {
+            words.par_chunks_exact_mut(panel).with_min_len(PIECE.div_ceil(panel)).enumerate().for_each(pack);
+        }
+        Self::Packed(unit, words)
+    }
+}
+
+impl Drop for Right<'_> {
+    fn drop(&mut self) {
+        if let Self::Packed(_, words) = self {
+            give_words(std::mem::take(words));
+        }
+    }
+}
 
 /// lhs `[m, k]` · rhs `[k, n]`.
 pub struct Multiply<'a> {
     /// m, n, k.
     pub size: [usize; 3],
-    /// Values, and their (column, row) strides in elements.
-    pub lhs: (&'a [f32], [usize; 2]),
-    /// The same of the right factor.
-    pub rhs: (&'a [f32], [usize; 2]),
+    /// Left factor.
+    pub lhs: Matrix<'a>,
+    /// Right factor.
+    pub rhs: &'a Right<'a>,
     /// Adds to the present values.
     pub add: bool,
 }
@@ -16,7 +70,35 @@ pub struct Multiply<'a> {
 impl Multiply<'_> {
     /// Writes the product's rows, which begin `stride` floats after one another.
     pub fn write(self, out: &mut [f32], stride: usize) {
-        let Self { size: [m, n, k], lhs: (lhs, ls), rhs: (rhs, rs), add } = self;
+        match self.rhs {
+            Right::Plain(rhs) => self.in_f32(*rhs, out, stride),
+            Right::Packed(unit, words) => self.in_bf16(*unit, words, out, stride),
+        }
+    }
+
+    fn in_bf16(&self, unit: Unit, rhs: &[u32], out: &mut [f32], stride: usize) {
+        /// Words of the left factor at once: 128 KiB, which leaves a core's second-level cache room for a panel.
+        const WORDS: usize = 32 * 1024;
+        let Self { size: [m, columns, depth], lhs: (values, [inner, row]), add, .. } = *self;
+        let blocks = depth.div_ceil(half::BLOCK);
+        let most = (WORDS / (blocks * half::PAIRS)).next_multiple_of(4 * half::PAIRS);
+        for first in (0..m).step_by(most) {
+            let values = &values[first * row..];
+            let source = Source { values, stride: row, inner, count: most.min(m - first), depth };
+            let packed = source.packed_rows();
+            let mut words = take_words((blocks * packed + SLACK) * half::PAIRS);
+            let (rows, _) = words.as_chunks_mut();
+            source.pack_left(&mut rows[..blocks * packed]);
+            let starts: Vec<_> = (0..blocks).map(|block| block * packed).collect();
+            let left = Left { values: rows, starts: &starts, rows: source.count };
+            let values = &mut out[first * stride..];
+            half::product(unit, left, rhs.as_chunks().0, &mut Target { values, stride, columns, add });
+            give_words(words);
+        }
+    }
+
+    fn in_f32(&self, (rhs, rs): Matrix, out: &mut [f32], stride: usize) {
+        let Self { size: [m, n, k], lhs: (lhs, ls), add, .. } = *self;
         let last = |rows: usize, columns: usize, [column, row]: [usize; 2]| {
             (rows - 1) * row + (columns - 1) * column
         };

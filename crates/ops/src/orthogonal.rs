@@ -1,6 +1,6 @@
 //! An approximation of the nearest matrix with orthonormal rows, as Muon uses it for directions (Jordan et al., "Muon").
 
-use crate::multiply::Multiply;
+use crate::multiply::{Multiply, Right};
 
 /// Coefficients of a step, of x, x³ and x⁵: those of Muon's authors, which bring singular values to between 0.7 and 1.2.
 pub const COEFFICIENTS: [f32; 3] = [3.4445, -4.775, 2.0315];
@@ -27,17 +27,17 @@ pub fn orthogonalised(matrix: Vec<f32>, [rows, columns]: [usize; 2]) -> Vec<f32>
     for _ in 0..STEPS {
         // x·xᵀ, and b·G + c·G².
         let transposed = [strides[1], strides[0]];
-        Multiply { size: [m, m, n], lhs: (&x, strides), rhs: (&x, transposed), add: false }
+        Multiply { size: [m, m, n], lhs: (&x, strides), rhs: &Right::Plain((&x, transposed)), add: false }
             .write(&mut gram, m);
-        Multiply { size: [m, m, m], lhs: (&gram, [1, m]), rhs: (&gram, [1, m]), add: false }
+        Multiply { size: [m, m, m], lhs: (&gram, [1, m]), rhs: &Right::Plain((&gram, [1, m])), add: false }
             .write(&mut square, m);
         square.iter_mut().zip(&gram).for_each(|(s, g)| *s = b * g + c * *s);
         if is_tall {
             // The transpose of (square · x), since square is symmetric: xᵀ · square, row by row as it is stored.
-            Multiply { size: [n, m, m], lhs: (&x, [1, m]), rhs: (&square, [1, m]), add: false }
+            Multiply { size: [n, m, m], lhs: (&x, [1, m]), rhs: &Right::Plain((&square, [1, m])), add: false }
                 .write(&mut next, m);
         } else {
-            Multiply { size: [m, n, m], lhs: (&square, [1, m]), rhs: (&x, [1, n]), add: false }
+            Multiply { size: [m, n, m], lhs: (&square, [1, m]), rhs: &Right::Plain((&x, [1, n])), add: false }
                 .write(&mut next, n);
         }
         x.iter_mut().zip(&next).for_each(|(x, next)| *x = a * *x + next);

@@ -34,7 +34,7 @@ fn rotary_attention_equals_its_composition() {
         let rope = Rope::new(rows, columns, head_dim, 100.0, &Device::flex());
         let [q, k, v] = [1, 2, 3].map(|seed| random([2, n, dim], seed));
         let expected = super::plain_attention(q.clone(), k.clone(), v.clone(), [&rope, &rope], heads);
-        assert_equal(&format!("{n} tokens"), super::rotary_attention(q, k, v, &rope, heads), expected);
+        assert_equal(&format!("{n} tokens"), super::rotary_attention(q, k, v, &rope, heads, false), expected);
     }
 }
 

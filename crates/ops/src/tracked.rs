@@ -58,16 +58,16 @@ impl Kernel for Attend {
 }
 
 /// As [`crate::rotary_attention`].
-pub fn apart(q: Tensor<3>, k: Tensor<3>, v: Tensor<3>, rope: &Rope, heads: usize) -> Tensor<3> {
+pub fn apart([q, k, v]: [Tensor<3>; 3], rope: &Rope, heads: usize, half: bool) -> Tensor<3> {
     let ([batch, queries, c], keys) = (q.dims(), k.dims()[1]);
-    let sizes = Attention { batch, queries, keys, heads, head_dim: c / heads };
+    let sizes = Attention { batch, queries, keys, heads, head_dim: c / heads, half };
     op::run(Attend { sizes, tables: tables(rope), apart: true }, q, Some(k), Some(v))
 }
 
 /// As [`crate::rotary_self_attention`].
-pub fn together(qkv: Tensor<3>, rope: &Rope, heads: usize) -> Tensor<3> {
+pub fn together(qkv: Tensor<3>, rope: &Rope, heads: usize, half: bool) -> Tensor<3> {
     let [batch, tokens, c] = qkv.dims();
-    let sizes = Attention { batch, queries: tokens, keys: tokens, heads, head_dim: c / 3 / heads };
+    let sizes = Attention { batch, queries: tokens, keys: tokens, heads, head_dim: c / 3 / heads, half };
     let none: Option<Tensor<1>> = None;
     op::run(Attend { sizes, tables: tables(rope), apart: false }, qkv, none.clone(), none)
 }

@@ -1,8 +1,8 @@
 //! A training step, forward and backward, of the small predictor (`configs/small`, 256², batch 2) and of the regressor
 //! (two views of 256²): `cargo bench --workspace --bench step`. `docs/step_pytorch.py` measures PyTorch.
 //!
-//! Arguments: seconds per measurement (20), side (256), batch (2); `tiny` or `full` for that folder of `configs`;
-//! `whole` for no partly frozen networks; `predictor` or `regressor` for one network alone, so that the printed memory
+//! Arguments: seconds per measurement (20), side (256), batch (2); `tiny`, `default` or `full` for that folder of `configs`;
+//! `wide` for twice its widths; `bf16`; `whole` for no partly frozen networks; `predictor` or `regressor` for one network alone, so that the printed memory
 //! is its own.
 
 use std::hint::black_box;
@@ -12,6 +12,7 @@ use burn::module::{Module, Param, ParamGroup, ParamId};
 use burn::optim::GradientsParams;
 use burn::tensor::{Device, Distribution, Tensor};
 use snapsnap_base::config::Schema;
+use snapsnap_net::precision::Precision;
 use snapsnap_net::network::{Grid, Input, PointPredictor};
 use snapsnap_net::regressor::Statistics;
 use snapsnap_net::weights::{NamedVisitor, Path, random_predictor, random_regressors, visit_named};
@@ -81,8 +82,14 @@ fn run(seconds: f64, side: usize, batch: usize) {
     let device = Device::flex().autodiff();
     let network = ["tiny", "full", "default"].into_iter().find(|word| asked_for(word)).unwrap_or("small");
     let path = format!("{}/../../configs/{network}/stage1.toml", env!("CARGO_MANIFEST_DIR"));
-    let config = TrainConfig::from_file(path.as_ref(), &[]).expect("a config").networks();
-    let predictor = random_predictor(&config, 1, &device);
+    let mut config = TrainConfig::from_file(path.as_ref(), &[]).expect("a config").networks();
+    if asked_for("wide") {
+        let n = &mut config.network;
+        n.layer_dims = n.layer_dims.map(|width| 2 * width);
+        [n.enc_dim, n.dec_dim, n.last_dim] = [n.enc_dim, n.dec_dim, n.last_dim].map(|width| 2 * width);
+    }
+    let precision = if asked_for("bf16") { Precision::Bf16 } else { Precision::F32 };
+    let masters = random_predictor(&config, 1, &device);
     let regressor = random_regressors(&config, 1, &device).remove(0);
     let threads = rayon::current_num_threads();
 
@@ -99,20 +106,21 @@ fn run(seconds: f64, side: usize, batch: usize) {
         if asked_for("regressor") || (!trained.is_empty() && asked_for("whole")) {
             continue;
         }
-        let predictor = frozen(predictor.clone(), &trained.split(',').collect::<Vec<_>>());
+        let masters = frozen(masters.clone(), &trained.split(',').collect::<Vec<_>>());
         let grid = Grid::whole([side / config.network.patch; 2]);
         let time = measure(seconds, || {
             let start = Instant::now();
+            let predictor = precision.lower(masters.clone());
             let input = Input { images: images.clone(), grid: grid.clone() };
             let raw = predictor.raw(&predictor.decode(predictor.encode(input)));
             let loss = Tensor::cat(raw.into_iter().map(|raw| raw.square().mean()).collect(), 0).sum();
             let forward = start.elapsed();
             if trained != "nothing" {
-                black_box(GradientsParams::from_grads(loss.backward(), &predictor));
+                black_box(GradientsParams::from_grads(loss.backward(), &masters));
             }
             (forward, start.elapsed() - forward)
         });
-        println!("predictor, {what}, batch {batch}, {side}², {threads} threads: {time}{}", peak());
+        println!("predictor, {}, {what}, batch {batch}, {side}², {threads} threads: {time}{}", precision.name(), peak());
     }
 
     if asked_for("predictor") {

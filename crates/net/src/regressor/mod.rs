@@ -50,7 +50,7 @@ impl Regressor {
         let [_, channels, h, w] = input.dims();
         assert_eq!(channels, INPUT_CHANNELS, "regressor input must be [B, {INPUT_CHANNELS}, H, W]");
         assert!(h % 4 == 0 && w % 4 == 0, "regressor input {h}×{w}: both sides must be multiples of 4");
-        let has_kernel = snapsnap_ops::is_fast(&input) || snapsnap_ops::is_trained_fast(&input);
+        let has_kernel = snapsnap_ops::has_kernels(&input);
         if has_kernel && self.pred_unet.suits_cpu_kernel() {
             return kernel::regress(&self.pred_unet, &self.gs_conv, input, statistics);
         }

@@ -9,7 +9,7 @@ use rayon::prelude::*;
 
 use crate::buffers::{give, take};
 use crate::math::exp;
-use crate::multiply::Multiply;
+use crate::multiply::{Matrix, Multiply, Right};
 
 /// Queries per block of the forward pass: 128 × 1024 scores of 4 bytes fit a second-level cache.
 const FORWARD_BLOCK: usize = 128;
@@ -30,6 +30,8 @@ pub struct Attention {
     pub heads: usize,
     /// Channels of a head, a multiple of 4.
     pub head_dim: usize,
+    /// Products in bf16, if the processor has them.
+    pub half: bool,
 }
 
 /// Rotation tables cos and ±sin, `[tokens, head_dim]` each, as [`crate::Rope`] holds them.
@@ -67,19 +69,21 @@ impl Attention {
         heads.enumerate().for_each(|(i, (out, logarithms))| {
             let [packed_q, packed_k] = [(q, queries, self.scale()), (k, keys, 1.0)]
                 .map(|(x, tokens, factor)| self.pack(x, tokens, i, rope, factor));
-            let values = self.head(v, keys, i);
+            let across = self.right([d, keys], (&packed_k, [d, 1]));
+            let values = self.right([keys, d], (self.head(v, keys, i), [1, v.width]));
             let mut scores = take(FORWARD_BLOCK.min(queries) * keys);
             let blocks = packed_q.chunks(FORWARD_BLOCK * d).zip(out.chunks_mut(FORWARD_BLOCK * d));
             for ((block, out), logarithms) in blocks.zip(logarithms.chunks_mut(FORWARD_BLOCK)) {
                 let rows = logarithms.len();
                 let scores = &mut scores[..rows * keys];
-                product([rows, keys, d], (block, [1, d]), (&packed_k, [d, 1]), scores, false);
+                product([rows, keys, d], (block, [1, d]), &across, scores, false);
                 let sums = arch.dispatch(Exponentials { scores, keys, logarithms });
-                product([rows, d, keys], (scores, [1, keys]), (values, [1, v.width]), out, false);
+                product([rows, d, keys], (scores, [1, keys]), &values, out, false);
                 for (row, sum) in out.chunks_exact_mut(d).zip(sums) {
                     row.iter_mut().for_each(|x| *x /= sum);
                 }
             }
+            drop(across);
             [packed_q, packed_k, scores].into_iter().for_each(give);
         });
         let out = self.by_token([&by_head], queries);
@@ -117,25 +121,33 @@ impl Attention {
             let [packed_q, packed_k] = [(q, queries, self.scale()), (k, keys, 1.0)]
                 .map(|(x, tokens, factor)| self.pack(x, tokens, i, rope, factor));
             let (values, dy) = (self.head(v, keys, i), self.head(Tokens { values: dy, width }, queries, i));
+            let across = [(&packed_k[..], [d, 1]), (values, [v.width, 1])].map(|x| self.right([d, keys], x));
+            let along = self.right([keys, d], (&packed_k, [1, d]));
             let [mut scores, mut gradients] = [(); 2].map(|()| take(BLOCK.min(queries) * keys));
             let blocks = packed_q.chunks(BLOCK * d).zip(dq.chunks_mut(BLOCK * d));
             let logarithms = logarithms[i * queries..][..queries].chunks(BLOCK);
             for (b, ((block, dq), logarithms)) in blocks.zip(logarithms).enumerate() {
                 let (rows, add) = (logarithms.len(), b > 0);
                 let dy = (&dy[b * BLOCK * width..], [1, width]);
+                let of_block = [(block, [1, d]), dy].map(|x| self.right([rows, d], x));
                 let (scores, gradients) = (&mut scores[..rows * keys], &mut gradients[..rows * keys]);
-                product([rows, keys, d], (block, [1, d]), (&packed_k, [d, 1]), scores, false);
-                product([rows, keys, d], dy, (values, [v.width, 1]), gradients, false);
+                product([rows, keys, d], (block, [1, d]), &across[0], scores, false);
+                product([rows, keys, d], dy, &across[1], gradients, false);
                 arch.dispatch(Backward { scores, gradients, keys, logarithms });
-                product([rows, d, keys], (gradients, [1, keys]), (&packed_k, [1, d]), dq, false);
-                product([keys, d, rows], (gradients, [keys, 1]), (block, [1, d]), dk, add);
-                product([keys, d, rows], (scores, [keys, 1]), (dy.0, [1, width]), dv, add);
+                product([rows, d, keys], (gradients, [1, keys]), &along, dq, false);
+                product([keys, d, rows], (gradients, [keys, 1]), &of_block[0], dk, add);
+                product([keys, d, rows], (scores, [keys, 1]), &of_block[1], dv, add);
             }
+            drop((across, along));
             arch.dispatch(Unrotate { x: dq, d, rope, factor: self.scale() });
             arch.dispatch(Unrotate { x: dk, d, rope, factor: 1.0 });
             [packed_q, packed_k, scores, gradients].into_iter().for_each(give);
         });
         by_head
+    }
+
+    fn right<'a>(&self, size: [usize; 2], matrix: Matrix<'a>) -> Right<'a> {
+        Right::new(self.half, size, matrix)
     }
 
     fn scale(&self) -> f32 {
@@ -176,11 +188,8 @@ impl Attention {
     }
 }
 
-/// A matrix and its (column, row) strides.
-type Strided<'a> = (&'a [f32], [usize; 2]);
-
 /// Into contiguous rows.
-fn product(size: [usize; 3], lhs: Strided, rhs: Strided, out: &mut [f32], add: bool) {
+fn product(size: [usize; 3], lhs: Matrix, rhs: &Right, out: &mut [f32], add: bool) {
     Multiply { size, lhs, rhs, add }.write(out, size[1]);
 }
 

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 use super::elements::{add_constant, mask, rectify, total};
 use super::{Gradients, Wanted, join};
 use crate::buffers::{give, take};
-use crate::multiply::Multiply;
+use crate::multiply::{Multiply, Right};
 use crate::wide::pieces;
 
 /// Floats of a block's inputs and outputs: 128 KiB.
@@ -27,6 +27,8 @@ pub struct Conv1x1 {
     pub pixels: usize,
     /// Reads max(x, 0).
     pub rectified: bool,
+    /// Products in bf16, if the processor has them.
+    pub half: bool,
 }
 
 /// Some pixels of one image, and where their results belong, channel by channel.
@@ -46,9 +48,10 @@ impl Conv1x1 {
             let (n, x) = (block.count, &x[block.image * inputs * pixels + block.first..]);
             let mut read = take(if self.rectified { inputs * n } else { 0 });
             let mut results = take(outputs * n);
-            let x = self.read(x, n, &mut read);
-            Multiply { size: [outputs, n, inputs], lhs: (weight, [1, inputs]), rhs: x, add: false }
+            let x = Right::new(self.half, [inputs, n], self.read(x, n, &mut read));
+            Multiply { size: [outputs, n, inputs], lhs: (weight, [1, inputs]), rhs: &x, add: false }
                 .write(&mut results, n);
+            drop(x);
             for (c, (out, results)) in block.out.into_iter().zip(results.chunks_exact(n)).enumerate() {
                 let bias = bias.map_or(0.0, |bias| bias[c]);
                 add_constant(results, bias, out);
@@ -84,7 +87,7 @@ impl Conv1x1 {
         dy: &[f32],
         wanted: Wanted,
     ) -> (Vec<f32>, Vec<f32>) {
-        let Self { inputs, outputs, pixels, rectified, .. } = *self;
+        let Self { inputs, outputs, pixels, rectified, half, .. } = *self;
         let mut weights = vec![0.0; if wanted.weight { outputs * inputs } else { 0 }];
         let mut biases = vec![0.0; if wanted.bias { outputs } else { 0 }];
         let mut add = false;
@@ -94,8 +97,9 @@ impl Conv1x1 {
             if wanted.weight {
                 let mut read = take(if rectified { inputs * n } else { 0 });
                 let (x, [_, stride]) = self.read(&x[*first..], n, &mut read);
-                let (lhs, rhs) = ((&dy[*first..], [1, pixels]), (x, [stride, 1]));
-                Multiply { size: [outputs, inputs, n], lhs, rhs, add }.write(&mut weights, inputs);
+                let (lhs, rhs) = ((&dy[*first..], [1, pixels]), Right::new(half, [n, inputs], (x, [stride, 1])));
+                Multiply { size: [outputs, inputs, n], lhs, rhs: &rhs, add }.write(&mut weights, inputs);
+                drop(rhs);
                 give(read);
                 add = true;
             }
@@ -106,8 +110,9 @@ impl Conv1x1 {
             }
             if wanted.input {
                 let mut results = take(inputs * n);
-                let (lhs, rhs) = ((weight, [inputs, 1]), (&dy[*first..], [1, pixels]));
-                Multiply { size: [inputs, n, outputs], lhs, rhs, add: false }.write(&mut results, n);
+                let rhs = &Right::new(half, [outputs, n], (&dy[*first..], [1, pixels]));
+                Multiply { size: [inputs, n, outputs], lhs: (weight, [inputs, 1]), rhs, add: false }
+                    .write(&mut results, n);
                 let channels = out.iter_mut().zip(results.chunks_exact(n)).zip(x.chunks_exact(pixels));
                 for ((out, results), x) in channels {
                     out.copy_from_slice(results);

@@ -39,6 +39,8 @@ pub struct Conv3x3 {
     pub width: usize,
     /// Reads max(x, 0).
     pub rectified: bool,
+    /// Products in bf16, if the processor has them.
+    pub half: bool,
 }
 
 impl Conv3x3 {
@@ -56,8 +58,8 @@ impl Conv3x3 {
             back.run(dy, false, filters, None, self.rectified.then_some(x))
         });
         if wanted.weight && self.batch * self.height * self.width <= FEW_PIXELS {
-            let Self { batch, inputs, outputs, height, width, rectified } = *self;
-            let direct = Unfolded { batch, inputs, outputs, height, width, stride: 1, rectified };
+            let Self { batch, inputs, outputs, height, width, rectified, half } = *self;
+            let direct = Unfolded { batch, inputs, outputs, height, width, stride: 1, rectified, half };
             let gradients = direct.backward(x, weight, dy, Wanted { input: false, ..wanted });
             Gradients { input, ..gradients }
         } else if wanted.weight {

@@ -8,7 +8,7 @@ use super::elements::{add_rows, add_to_rows};
 use super::{Gradients, Wanted, join, parts};
 use crate::buffers::{give, take};
 use crate::math::{gelu, gelu_derivative};
-use crate::multiply::Multiply;
+use crate::multiply::{Multiply, Right};
 
 /// Rows per task of the products over rows.
 const ROWS: usize = 128;
@@ -28,24 +28,27 @@ pub struct Linear {
     pub outputs: usize,
     /// The weight is `[outputs, inputs]`, as a convolution's, instead of `[inputs, outputs]`.
     pub transposed: bool,
+    /// Products in bf16, if the processor has them.
+    pub half: bool,
 }
 
 impl Linear {
     /// x · weight + bias: `x` `[rows, inputs]` → `[rows, outputs]`.
     pub fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>) -> Vec<f32> {
         let mut out = take(self.rows * self.outputs);
+        let weight = self.factor(weight);
         let tasks = out.par_chunks_mut(ROWS * self.outputs).zip(x.par_chunks(ROWS * self.inputs));
-        tasks.for_each(|(out, x)| self.product(x, weight, bias, out));
+        tasks.for_each(|(out, x)| self.product(x, &weight, bias, out));
         out
     }
 
     /// gelu(z) and z = x · weight + bias, which [`Linear::backward`] needs: `[rows, outputs]` each.
     pub fn forward_gelu(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>) -> [Vec<f32>; 2] {
         let [mut out, mut before] = [(); 2].map(|()| take(self.rows * self.outputs));
-        let arch = Arch::new();
+        let (arch, weight) = (Arch::new(), self.factor(weight));
         let tasks = out.par_chunks_mut(ROWS * self.outputs).zip(before.par_chunks_mut(ROWS * self.outputs));
         tasks.zip(x.par_chunks(ROWS * self.inputs)).for_each(|((out, before), x)| {
-            self.product(x, weight, bias, before);
+            self.product(x, &weight, bias, before);
             arch.dispatch(
                 #[inline(always)]
                 || out.iter_mut().zip(before).for_each(|(out, z)| *out = gelu(*z)),
@@ -69,6 +72,8 @@ impl Linear {
         let mut dx = wanted.input.then(|| take(rows * inputs));
         let mut dz = before.map(|_| take(rows * outputs));
         let mut sums = vec![0.0; if wanted.bias { blocks * outputs } else { 0 }];
+        let [column, row] = self.strides();
+        let transposed = wanted.input.then(|| Right::new(self.half, [outputs, inputs], (weight, [row, column])));
         let results = parts(dx.as_deref_mut(), ROWS * inputs, blocks).into_par_iter();
         let changed = parts(dz.as_deref_mut(), ROWS * outputs, blocks);
         let totals = parts(wanted.bias.then_some(&mut sums), outputs, blocks);
@@ -85,11 +90,9 @@ impl Linear {
             if let Some(sums) = sums {
                 add_rows(dz, sums);
             }
-            if let Some(dx) = dx {
-                let [column, row] = self.strides();
+            if let Some((dx, rhs)) = dx.zip(transposed.as_ref()) {
                 let size = [dz.len() / outputs, inputs, outputs];
-                Multiply { size, lhs: (dz, [1, outputs]), rhs: (weight, [row, column]), add: false }
-                    .write(dx, inputs);
+                Multiply { size, lhs: (dz, [1, outputs]), rhs, add: false }.write(dx, inputs);
             }
         });
         let weight = wanted.weight.then(|| self.weight_gradient(x, dz.as_deref().unwrap_or(dy)));
@@ -105,11 +108,12 @@ impl Linear {
         let ((left, rows), (right, columns)) =
             if self.transposed { (outputs, inputs) } else { (inputs, outputs) };
         let mut out = take(rows * columns);
+        let rhs = &Right::new(self.half, [self.rows, columns], (right, [1, columns]));
         let block = rows.div_ceil(WEIGHT_TASKS).clamp(WEIGHT_ROWS[0], WEIGHT_ROWS[1]);
         out.par_chunks_mut(block * columns).enumerate().for_each(|(i, out)| {
             let size = [out.len() / columns, columns, self.rows];
             let lhs = (&left[i * block..], [rows, 1]);
-            Multiply { size, lhs, rhs: (right, [1, columns]), add: false }.write(out, columns);
+            Multiply { size, lhs, rhs, add: false }.write(out, columns);
         });
         out
     }
@@ -119,9 +123,14 @@ impl Linear {
         if self.transposed { [self.inputs, 1] } else { [1, self.outputs] }
     }
 
-    fn product(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>, out: &mut [f32]) {
+    /// The weight as the right factor.
+    fn factor<'a>(&self, weight: &'a [f32]) -> Right<'a> {
+        Right::new(self.half, [self.inputs, self.outputs], (weight, self.strides()))
+    }
+
+    fn product(&self, x: &[f32], rhs: &Right, bias: Option<&[f32]>, out: &mut [f32]) {
         let (size, lhs) = ([x.len() / self.inputs, self.outputs, self.inputs], (x, [1, self.inputs]));
-        Multiply { size, lhs, rhs: (weight, self.strides()), add: false }.write(out, self.outputs);
+        Multiply { size, lhs, rhs, add: false }.write(out, self.outputs);
         if let Some(bias) = bias {
             add_to_rows(bias, out);
         }

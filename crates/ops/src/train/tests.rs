@@ -105,7 +105,7 @@ fn convolutions_of_three_taps_equal_burns() {
 /// A channel that is positive in one corner only: eight taps never meet it together with a gradient.
 #[test]
 fn taps_that_see_nothing_have_no_gradient() {
-    let conv = Conv3x3 { batch: 1, inputs: 1, outputs: 1, height: 32, width: 32, rectified: true };
+    let conv = Conv3x3 { batch: 1, inputs: 1, outputs: 1, height: 32, width: 32, rectified: true, half: false };
     let mut x = vec![-1.0; 1024];
     x[0] = 0.7;
     let mut dy = vec![0.0; 1024];
@@ -190,7 +190,7 @@ fn rotary_attention_equals_burns() {
         let run = |pairs: &Pairs, q: Tensor<3>| {
             let (k, v) = (pairs.keys.val(), pairs.values.val());
             if crate::is_trained_fast(&q) {
-                return rotary_attention(q, k, v, &ropes[0], heads);
+                return rotary_attention(q, k, v, &ropes[0], heads, false);
             }
             let [rope_q, rope_k] = ropes.clone().map(|Rope { cos, sin }| Rope {
                 cos: cos.cast(FloatDType::F64),
@@ -205,7 +205,7 @@ fn rotary_attention_equals_burns() {
 
 #[test]
 fn attention_of_parts_equals_that_of_tensors() {
-    let attention = Attention { batch: 2, queries: 67, keys: 67, heads: 2, head_dim: 8 };
+    let attention = Attention { batch: 2, queries: 67, keys: 67, heads: 2, head_dim: 8, half: false };
     let (channels, tokens) = (16, 2 * 67);
     let (qkv, dy) = (random(tokens * 3 * channels, 1), random(tokens * channels, 2));
     let part = |i: usize| -> Vec<f32> {
@@ -243,13 +243,13 @@ fn everything() -> Vec<Vec<f32>> {
     let keep = |all: &mut Vec<_>, g: Gradients| all.extend([g.input, g.weight, g.bias].into_iter().flatten());
     let (x, dy) = (random(2 * 40 * 30 * 50, 1), random(2 * 72 * 30 * 50, 2));
     let (weight, bias) = (random(72 * 40 * 9, 3), random(72, 4));
-    let conv = Conv3x3 { batch: 2, inputs: 40, outputs: 72, height: 30, width: 50, rectified: true };
+    let conv = Conv3x3 { batch: 2, inputs: 40, outputs: 72, height: 30, width: 50, rectified: true, half: false };
     all.push(conv.forward(&x, &weight, Some(&bias)));
     keep(&mut all, conv.backward(&x, &weight, &dy, Wanted::ALL));
-    let conv = Conv1x1 { batch: 2, inputs: 40, outputs: 72, pixels: 1500, rectified: true };
+    let conv = Conv1x1 { batch: 2, inputs: 40, outputs: 72, pixels: 1500, rectified: true, half: false };
     all.push(conv.forward(&x, &weight, Some(&bias)));
     keep(&mut all, conv.backward(&x, &weight, &dy, Wanted::ALL));
-    let linear = Linear { rows: 1500, inputs: 80, outputs: 72, transposed: false };
+    let linear = Linear { rows: 1500, inputs: 80, outputs: 72, transposed: false, half: false };
     let [result, before] = linear.forward_gelu(&x, &weight, Some(&bias));
     all.push(result);
     keep(&mut all, linear.backward(&x, &weight, Some(&before), &dy, Wanted::ALL));
@@ -272,7 +272,7 @@ fn the_number_of_threads_changes_no_bit() {
 
 #[test]
 fn only_wanted_gradients_are_found_and_they_are_the_same() {
-    let conv = Conv3x3 { batch: 1, inputs: 3, outputs: 5, height: 6, width: 7, rectified: false };
+    let conv = Conv3x3 { batch: 1, inputs: 3, outputs: 5, height: 6, width: 7, rectified: false, half: false };
     let (x, weight, dy) = (random(3 * 42, 1), random(135, 2), random(5 * 42, 3));
     let all = conv.backward(&x, &weight, &dy, Wanted::ALL);
     for bits in 0..8 {

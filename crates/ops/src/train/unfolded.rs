@@ -7,7 +7,7 @@ use rayon::prelude::*;
 use super::elements::{add_constant, channel_sums, mask, rectify};
 use super::{Gradients, Wanted};
 use crate::buffers::{give, take};
-use crate::multiply::Multiply;
+use crate::multiply::{Multiply, Right};
 use crate::wide::pieces;
 
 /// Taps of a filter.
@@ -35,6 +35,8 @@ pub struct Unfolded {
     pub stride: usize,
     /// Reads max(x, 0).
     pub rectified: bool,
+    /// Products in bf16, if the processor has them.
+    pub half: bool,
 }
 
 impl Unfolded {
@@ -60,8 +62,9 @@ impl Unfolded {
             self.unfold(&x[image * inputs * plane..][..inputs * plane], row, &mut taps);
             let mut results = take(outputs * n);
             let lhs = (weight, [1, inputs * TAPS]);
-            Multiply { size: [outputs, n, inputs * TAPS], lhs, rhs: (&taps, [1, n]), add: false }
-                .write(&mut results, n);
+            let rhs = Right::new(self.half, [inputs * TAPS, n], (&taps, [1, n]));
+            Multiply { size: [outputs, n, inputs * TAPS], lhs, rhs: &rhs, add: false }.write(&mut results, n);
+            drop(rhs);
             for (c, (out, results)) in out.into_iter().zip(results.chunks_exact(n)).enumerate() {
                 add_constant(results, bias.map_or(0.0, |bias| bias[c]), out);
             }
@@ -92,13 +95,14 @@ impl Unfolded {
                 let dy = &dy[image * outputs * n..][..outputs * n];
                 if wanted.weight {
                     self.unfold(x, 0, &mut taps);
-                    let (lhs, rhs) = ((dy, [1, n]), (&taps[..], [n, 1]));
-                    Multiply { size: [outputs, width, n], lhs, rhs, add: image > 0 }.write(&mut sums, width);
+                    let rhs = &Right::new(self.half, [n, width], (&taps, [n, 1]));
+                    Multiply { size: [outputs, width, n], lhs: (dy, [1, n]), rhs, add: image > 0 }
+                        .write(&mut sums, width);
                 }
                 if let Some(dx) = dx.get_mut(image) {
                     let lhs = (&weight[first * TAPS..], [inputs * TAPS, 1]);
-                    Multiply { size: [width, n, outputs], lhs, rhs: (dy, [1, n]), add: false }
-                        .write(&mut taps, n);
+                    let rhs = &Right::new(self.half, [outputs, n], (dy, [1, n]));
+                    Multiply { size: [width, n, outputs], lhs, rhs, add: false }.write(&mut taps, n);
                     self.fold(&taps, dx);
                     if self.rectified {
                         mask(x, dx);

@@ -1,0 +1,247 @@
+//! Packing and the kernel of AVX-512 with its instructions for bf16.
+
+#![allow(unsafe_code, reason = "functions for processors that have these instructions, and loads of vectors")]
+
+use std::arch::x86_64::{
+    __m512, __m512bh, __m512i, _mm512_cvtepu16_epi32, _mm512_cvtne2ps_pbh, _mm512_cvtneps_pbh, _mm512_dpbf16_ps,
+    _mm512_loadu_ps, _mm512_loadu_si512, _mm512_or_si512, _mm512_set1_epi32, _mm512_setzero_ps, _mm512_shuffle_i32x4,
+    _mm512_slli_epi32, _mm512_storeu_ps, _mm512_storeu_si512, _mm512_unpackhi_epi32, _mm512_unpackhi_epi64,
+    _mm512_unpacklo_epi32, _mm512_unpacklo_epi64,
+};
+use std::mem::transmute;
+
+use super::{BLOCK, Columns, Left, PAIRS, PANEL, Row, Source, Sums};
+
+/// Whether this processor has the instructions of all functions here.
+pub fn is_there() -> bool {
+    is_x86_feature_detected!("avx512f")
+        && is_x86_feature_detected!("avx512bw")
+        && is_x86_feature_detected!("avx512vl")
+        && is_x86_feature_detected!("avx512bf16")
+}
+
+fn check() {
+    assert!(is_there(), "this processor computes in bf16");
+}
+
+/// Sums of `rows` (12 or at most 4) rows from `row` on.
+pub fn block(left: &Left, row: usize, rows: usize, columns: usize, panel: &[Columns], sums: &mut Sums) {
+    check();
+    // SAFETY: the processor has the instructions.
+    unsafe {
+        match (rows > 4, columns > PAIRS) {
+            (true, true) => kernel::<12, 2>(left, row, panel, sums),
+            (true, false) => kernel::<12, 1>(left, row, panel, sums),
+            (false, true) => kernel::<4, 2>(left, row, panel, sums),
+            (false, false) => kernel::<4, 1>(left, row, panel, sums),
+        }
+    }
+}
+
+/// Writes a block's sums, or adds them.
+pub fn store(sums: &[[f32; PANEL]], columns: usize, out: &mut [f32], stride: usize, add: bool) {
+    check();
+    // SAFETY: the processor has the instructions.
+    unsafe {
+        if add {
+            write::<true>(sums, columns, out, stride);
+        } else {
+            write::<false>(sums, columns, out, stride);
+        }
+    }
+}
+
+/// As [`Source::pack_left`].
+pub fn pack_left(source: &Source, out: &mut [Row]) {
+    check();
+    // SAFETY: the processor has the instructions.
+    unsafe { left(source, out) }
+}
+
+/// As [`Source::pack_right`].
+pub fn pack_right(source: &Source, out: &mut [Columns]) {
+    check();
+    // SAFETY: the processor has the instructions.
+    unsafe { right(source, out) }
+}
+
+#[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
+fn kernel<const ROWS: usize, const VECTORS: usize>(left: &Left, row: usize, panel: &[Columns], out: &mut Sums) {
+    let mut sums = [[_mm512_setzero_ps(); VECTORS]; ROWS];
+    for (start, panel) in left.starts.iter().zip(panel.as_chunks::<PAIRS>().0) {
+        let rows: &[Row; ROWS] = left.values[start + row..].first_chunk().expect("the block lies inside");
+        for pair in 0..PAIRS {
+            let mut right = [as_halves(_mm512_setzero_si()); VECTORS];
+            for (v, right) in right.iter_mut().enumerate() {
+                *right = as_halves(words(&panel[pair].as_chunks().0[v]));
+            }
+            for (sums, row) in sums.iter_mut().zip(rows) {
+                let value = as_halves(_mm512_set1_epi32(row[pair].cast_signed()));
+                for (sum, right) in sums.iter_mut().zip(right) {
+                    *sum = _mm512_dpbf16_ps(*sum, value, right);
+                }
+            }
+        }
+    }
+    for (out, sums) in out.iter_mut().zip(sums) {
+        for (out, sum) in out.as_chunks_mut().0.iter_mut().zip(sums) {
+            put(sum, out);
+        }
+    }
+}
+
+#[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
+fn write<const ADD: bool>(sums: &[[f32; PANEL]], columns: usize, out: &mut [f32], stride: usize) {
+    for (i, sums) in sums.iter().enumerate() {
+        let out = &mut out[i * stride..][..columns];
+        if let Some(out) = out.first_chunk_mut::<PANEL>() {
+            out.iter_mut().zip(sums).for_each(|(out, sum)| *out = if ADD { *out + sum } else { *sum });
+        } else {
+            out.iter_mut().zip(sums).for_each(|(out, sum)| *out = if ADD { *out + sum } else { *sum });
+        }
+    }
+}
+
+#[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
+fn left(source: &Source, out: &mut [Row]) {
+    let rows = source.packed_rows();
+    for (block, out) in out.chunks_exact_mut(rows).enumerate() {
+        for (i, out) in out.as_chunks_mut::<PAIRS>().0.iter_mut().enumerate() {
+            let square = square(source, i * PAIRS, block * BLOCK, true);
+            out.iter_mut().zip(square).for_each(|(out, row)| put_words(row, out));
+        }
+    }
+}
+
+#[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
+fn right(source: &Source, out: &mut [Columns]) {
+    let blocks = source.blocks();
+    for (i, out) in out.as_chunks_mut::<PAIRS>().0.iter_mut().enumerate() {
+        let (panel, block) = (i / blocks, i % blocks);
+        for half in 0..PANEL / PAIRS {
+            let square = square(source, panel * PANEL + half * PAIRS, block * BLOCK, false);
+            for (out, row) in out.iter_mut().zip(square) {
+                put_words(row, &mut out.as_chunks_mut().0[half]);
+            }
+        }
+    }
+}
+
+/// 16 rows (or columns) from `first` on by 16 pairs of k from `k` on: `[row][pair]` or `[pair][row]`. Outside of the
+/// source, everything is 0.
+#[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
+fn square(source: &Source, first: usize, k: usize, by_row: bool) -> [__m512i; PAIRS] {
+    let Source { stride, inner, count, depth, .. } = *source;
+    let (count, depth) = (count.saturating_sub(first).min(PAIRS), depth - k);
+    let values = &source.values[(first * stride + k * inner).min(source.values.len())..];
+    let mut square = [_mm512_setzero_si(); PAIRS];
+    // Whichever is contiguous is read in vectors.
+    let along_rows = inner != 1 && stride == 1;
+    for (i, out) in square.iter_mut().enumerate() {
+        if along_rows {
+            let line = |k: usize| line(values, k * inner, 1, if k < depth { count } else { 0 });
+            *out = interleaved(line(2 * i), line(2 * i + 1));
+        } else if i < count {
+            let line = |k: usize| line(values, i * stride + k * inner, inner, depth.saturating_sub(k).min(PAIRS));
+            *out = consecutive(line(0), line(PAIRS));
+        }
+    }
+    if along_rows == by_row {
+        transpose(&mut square);
+    }
+    square
+}
+
+/// The first `count` of 16 values `step` apart, then zeros.
+#[inline]
+#[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
+fn line(values: &[f32], start: usize, step: usize, count: usize) -> __m512 {
+    if step == 1 && count == PAIRS {
+        let values: &[f32; PAIRS] = values[start..].first_chunk().expect("the line lies inside");
+        // SAFETY: sixteen floats are there.
+        return unsafe { _mm512_loadu_ps(values.as_ptr()) };
+    }
+    let mut line = [0.0; PAIRS];
+    if count > 0 {
+        let values = values[start..].iter().step_by(step);
+        line[..count].iter_mut().zip(values).for_each(|(line, x)| *line = *x);
+    }
+    // SAFETY: sixteen floats are there.
+    unsafe { _mm512_loadu_ps(line.as_ptr()) }
+}
+
+/// Pairs (a₀, b₀), (a₁, b₁) …
+#[inline]
+#[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
+fn interleaved(a: __m512, b: __m512) -> __m512i {
+    // SAFETY: sixteen halves are sixteen integers.
+    let [a, b] = [a, b].map(|x| unsafe { transmute(_mm512_cvtneps_pbh(x)) });
+    let [a, b] = [_mm512_cvtepu16_epi32(a), _mm512_cvtepu16_epi32(b)];
+    _mm512_or_si512(a, _mm512_slli_epi32::<16>(b))
+}
+
+/// Pairs (a₀, a₁), … (b₀, b₁), …
+#[inline]
+#[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
+fn consecutive(a: __m512, b: __m512) -> __m512i {
+    // SAFETY: 32 halves are sixteen pairs.
+    unsafe { transmute(_mm512_cvtne2ps_pbh(b, a)) }
+}
+
+/// Four rounds of shuffles: of words, of pairs of words, of quarters and of halves.
+#[inline]
+#[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
+fn transpose(rows: &mut [__m512i; PAIRS]) {
+    for i in (0..PAIRS).step_by(2) {
+        let (a, b) = (rows[i], rows[i + 1]);
+        (rows[i], rows[i + 1]) = (_mm512_unpacklo_epi32(a, b), _mm512_unpackhi_epi32(a, b));
+    }
+    for i in (0..PAIRS).step_by(4) {
+        let [a, b, c, d] = [rows[i], rows[i + 1], rows[i + 2], rows[i + 3]];
+        (rows[i], rows[i + 1]) = (_mm512_unpacklo_epi64(a, c), _mm512_unpackhi_epi64(a, c));
+        (rows[i + 2], rows[i + 3]) = (_mm512_unpacklo_epi64(b, d), _mm512_unpackhi_epi64(b, d));
+    }
+    for distance in [4, 8] {
+        for i in 0..PAIRS {
+            if i & distance == 0 {
+                let (a, b) = (rows[i], rows[i + distance]);
+                rows[i] = _mm512_shuffle_i32x4::<0x88>(a, b);
+                rows[i + distance] = _mm512_shuffle_i32x4::<0xdd>(a, b);
+            }
+        }
+    }
+}
+
+#[inline]
+#[target_feature(enable = "avx512f")]
+fn _mm512_setzero_si() -> __m512i {
+    _mm512_set1_epi32(0)
+}
+
+#[inline]
+#[target_feature(enable = "avx512f")]
+fn words(words: &Row) -> __m512i {
+    // SAFETY: sixteen words are there.
+    unsafe { _mm512_loadu_si512(words.as_ptr().cast()) }
+}
+
+#[inline]
+#[target_feature(enable = "avx512f")]
+fn put_words(words: __m512i, out: &mut Row) {
+    // SAFETY: there is room for sixteen words.
+    unsafe { _mm512_storeu_si512(out.as_mut_ptr().cast(), words) }
+}
+
+#[inline]
+#[target_feature(enable = "avx512f")]
+fn put(values: __m512, out: &mut [f32; PAIRS]) {
+    // SAFETY: there is room for sixteen floats.
+    unsafe { _mm512_storeu_ps(out.as_mut_ptr(), values) }
+}
+
+#[inline]
+#[target_feature(enable = "avx512f")]
+fn as_halves(words: __m512i) -> __m512bh {
+    // SAFETY: sixteen pairs are 32 halves.
+    unsafe { transmute(words) }
+}

@@ -1,0 +1,200 @@
+//! Matrix products of factors in bf16 with sums in f32, on processors that have instructions for them: tiles of AMX, else
+//! `vdpbf16ps` of AVX-512.
+//!
+//! Both kernels read the same layout. Values are rounded to bf16 to the nearest, ties to even, and stored in pairs that
+//! follow one another in the inner dimension k, which is filled up with zeros to blocks of 32:
+//!
+//! * the left factor as `[blocks][rows][16 pairs]`, where each block may begin anywhere, so that the windows of a
+//!   convolution need no copies of their own;
+//! * the right factor as `[panels of 32 columns][pairs][32 columns]`.
+//!
+//! Every element is one sum in one order, for any number of threads. The two kernels add in different orders. Both take
+//! subnormal numbers for 0.
+//!
+//! `unsafe` is needed to call functions for which the processor was asked, to read vectors and for the instructions of
+//! AMX, which are inline assembly. It is in this module's files only.
+
+#[cfg(target_arch = "x86_64")]
+mod amx;
+#[cfg(target_arch = "x86_64")]
+mod avx512;
+#[cfg(test)]
+mod tests;
+
+use std::sync::OnceLock;
+
+/// Pairs of k in a block.
+pub const PAIRS: usize = 16;
+/// Values of k in a block.
+pub const BLOCK: usize = 2 * PAIRS;
+/// Columns of a panel.
+pub const PANEL: usize = 32;
+/// A kernel reads up to so many rows of the left factor beyond its last one.
+pub const SLACK: usize = 32;
+
+/// One row of the left factor in one block of k.
+pub type Row = [u32; PAIRS];
+/// One pair of k of the right factor in one panel.
+pub type Columns = [u32; PANEL];
+/// A block of sums. A kernel fills its first rows.
+type Sums = [[f32; PANEL]; SLACK];
+
+/// What computes products.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Unit {
+    /// `tdpbf16ps`.
+    Amx,
+    /// `vdpbf16ps`.
+    Avx512,
+    /// The tiles of AMX in plain loops, for tests.
+    #[cfg(test)]
+    Emulated,
+}
+
+impl Unit {
+    /// Name for messages.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Amx => "AMX",
+            Self::Avx512 => "AVX-512",
+            #[cfg(test)]
+            Self::Emulated => "emulated AMX",
+        }
+    }
+
+    /// Rows of the kernel's block of sums, if `left` rows remain.
+    fn rows(self, left: usize) -> usize {
+        match self {
+            Self::Avx512 if left <= 4 => 4,
+            Self::Avx512 => 12,
+            _ => 32,
+        }
+    }
+}
+
+/// The fastest unit of this processor, if it has one.
+pub fn unit() -> Option<Unit> {
+    #[cfg(target_arch = "x86_64")]
+    {
+        static UNIT: OnceLock<Option<Unit>> = OnceLock::new();
+        *UNIT.get_or_init(|| {
+            let packs = avx512::is_there();
+            let tiles = packs && amx::permitted();
+            if tiles { Some(Unit::Amx) } else { packs.then_some(Unit::Avx512) }
+        })
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    None
+}
+
+/// The left factor of a product.
+#[derive(Clone, Copy)]
+pub struct Left<'a> {
+    /// Rows of all blocks, and [`SLACK`] more.
+    pub values: &'a [Row],
+    /// The first row of each block.
+    pub starts: &'a [usize],
+    /// How many rows.
+    pub rows: usize,
+}
+
+/// Values in f32 that become a factor: rows of the left one, or columns of the right one.
+#[derive(Clone, Copy)]
+pub struct Source<'a> {
+    /// Values.
+    pub values: &'a [f32],
+    /// From one row or column to the next, in values.
+    pub stride: usize,
+    /// From one k to the next.
+    pub inner: usize,
+    /// Rows or columns.
+    pub count: usize,
+    /// Values of k.
+    pub depth: usize,
+}
+
+impl Source<'_> {
+    /// Blocks of k.
+    pub fn blocks(&self) -> usize {
+        self.depth.div_ceil(BLOCK)
+    }
+
+    fn check(&self) {
+        let last = (self.count - 1) * self.stride + (self.depth - 1) * self.inner;
+        assert!(last < self.values.len(), "the strides stay inside");
+    }
+
+    /// Rows between the blocks of a packed left factor.
+    pub fn packed_rows(&self) -> usize {
+        self.count.next_multiple_of(PAIRS)
+    }
+
+    /// Packs rows `[blocks][packed_rows][16]`.
+    pub fn pack_left(&self, out: &mut [Row]) {
+        self.check();
+        assert_eq!(out.len(), self.blocks() * self.packed_rows());
+        #[cfg(target_arch = "x86_64")]
+        avx512::pack_left(self, out);
+    }
+
+    /// Words of the packed right factor.
+    pub fn words_right(&self) -> usize {
+        self.count.div_ceil(PANEL) * PANEL * self.blocks() * PAIRS
+    }
+
+    /// Packs columns `[panels][blocks · 16][32]`.
+    pub fn pack_right(&self, out: &mut [Columns]) {
+        self.check();
+        assert_eq!(out.len() * PANEL, self.words_right());
+        #[cfg(target_arch = "x86_64")]
+        avx512::pack_right(self, out);
+    }
+}
+
+/// Where the sums belong.
+pub struct Target<'a> {
+    /// `[rows][columns]`.
+    pub values: &'a mut [f32],
+    /// From one row to the next.
+    pub stride: usize,
+    /// How many columns.
+    pub columns: usize,
+    /// Adds to the present values.
+    pub add: bool,
+}
+
+/// Writes `left` · `right`.
+///
+/// # Panics
+/// If a factor is smaller than the sizes say, or if the processor lacks the unit.
+pub fn product(unit: Unit, left: Left, right: &[Columns], target: &mut Target) {
+    let (pairs, panels) = (left.starts.len() * PAIRS, target.columns.div_ceil(PANEL));
+    assert!(left.rows > 0 && panels > 0 && right.len() >= pairs * panels);
+    let reach = left.starts.iter().max().map_or(0, |start| start + left.rows + SLACK);
+    assert!(reach <= left.values.len(), "blocks lie inside, with slack");
+    assert!((left.rows - 1) * target.stride + target.columns <= target.values.len());
+    #[cfg(target_arch = "x86_64")]
+    {
+        let _tiles = (unit == Unit::Amx).then(amx::Tiles::configured);
+        let mut sums: Sums = [[0.0; PANEL]; SLACK];
+        for (p, panel) in right.chunks_exact(pairs).take(panels).enumerate() {
+            let columns = (target.columns - p * PANEL).min(PANEL);
+            let mut row = 0;
+            while row < left.rows {
+                let rows = unit.rows(left.rows - row);
+                match unit {
+                    Unit::Avx512 => avx512::block(&left, row, rows, columns, panel, &mut sums),
+                    Unit::Amx => amx::block(&left, row, panel, &mut sums),
+                    #[cfg(test)]
+                    Unit::Emulated => tests::block(&left, row, panel, &mut sums),
+                }
+                let out = &mut target.values[row * target.stride + p * PANEL..];
+                let sums = &sums[..rows.min(left.rows - row)];
+                avx512::store(sums, columns, out, target.stride, target.add);
+                row += rows;
+            }
+        }
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    unreachable!("{} is of other processors", unit.name());
+}

@@ -1,0 +1,89 @@
+//! Products against f64, with every unit, and the tiles of AMX in plain loops.
+
+use super::*;
+use crate::tests::uniform;
+
+fn rounded(bits: u32) -> f32 {
+    f32::from_bits(bits << 16)
+}
+
+/// As `amx::block`: one row and one column at a time, pair by pair.
+pub fn block(left: &Left, row: usize, panel: &[Columns], sums: &mut Sums) {
+    for (r, sums) in sums.iter_mut().enumerate() {
+        *sums = [0.0; PANEL];
+        for (start, panel) in left.starts.iter().zip(panel.as_chunks::<PAIRS>().0) {
+            for (pair, columns) in left.values[start + row + r].iter().zip(panel) {
+                for (sum, column) in sums.iter_mut().zip(columns) {
+                    *sum += rounded(pair & 0xffff) * rounded(column & 0xffff);
+                    *sum += rounded(pair >> 16) * rounded(column >> 16);
+                }
+            }
+        }
+    }
+}
+
+/// Nearest bf16, ties to even.
+fn nearest(x: f32) -> f32 {
+    let bits = x.to_bits();
+    f32::from_bits((bits + 0x7fff + (bits >> 16 & 1)) & 0xffff_0000)
+}
+
+/// The units that can be tried here.
+fn units() -> Vec<Unit> {
+    let Some(best) = unit() else {
+        println!("skipped: this processor has no instructions for bf16 (AVX512-BF16)");
+        return Vec::new();
+    };
+    if best != Unit::Amx {
+        println!("skipped: this processor has no tiles (AMX); its kernel is not run, only emulated");
+    }
+    let tiles = (best == Unit::Amx).then_some(Unit::Amx);
+    [Unit::Avx512, Unit::Emulated].into_iter().chain(tiles).collect()
+}
+
+#[test]
+fn products_equal_those_of_rounded_factors() {
+    for [m, n, k] in [[1, 1, 1], [12, 32, 32], [13, 33, 33], [5, 70, 31], [150, 16, 64], [40, 100, 300], [3, 9, 1000]] {
+        // All four orders of storage, and one with gaps.
+        for (i, (ls, rs)) in [([1, k], [1, n]), ([m, 1], [1, n]), ([1, k], [k, 1]), ([m, 1], [k, 1]), ([2, 2 * k], [2 * k, 2])]
+            .into_iter()
+            .enumerate()
+        {
+            let (lhs, rhs) = (uniform(2 * m * k, 1), uniform(2 * k * n, 2));
+            for unit in units() {
+                let right = crate::multiply::Right::packed(unit, [k, n], (&rhs, rs));
+                for add in [false, true] {
+                    let stride = n + 3;
+                    let mut out = vec![0.5; m * stride];
+                    crate::multiply::Multiply { size: [m, n, k], lhs: (&lhs, ls), rhs: &right, add }.write(&mut out, stride);
+                    for (row, out) in out.chunks_exact(stride).enumerate() {
+                        for (column, got) in out.iter().enumerate() {
+                            let inside = column < n;
+                            let terms = (0..if inside { k } else { 0 }).map(|i| {
+                                let (a, b) = (lhs[row * ls[1] + i * ls[0]], rhs[i * rs[1] + column * rs[0]]);
+                                f64::from(nearest(a)) * f64::from(nearest(b))
+                            });
+                            let expected = terms.sum::<f64>() + if add || !inside { 0.5 } else { 0.0 };
+                            let error = (f64::from(*got) - expected).abs();
+                            assert!(error < 2e-5, "{unit:?}, {m}×{n}×{k}, order {i}, {row}, {column}: {got}, {expected}");
+                        }
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// Infinities stay, and what is no number stays so, whatever its bits.
+#[test]
+fn rounding_keeps_what_is_not_finite() {
+    let values = [f32::INFINITY, f32::NEG_INFINITY, f32::from_bits(0x7f80_0001), f32::from_bits(0xffff_ffff), f32::MAX];
+    for unit in units() {
+        let right = crate::multiply::Right::packed(unit, [1, 5], (&values, [1, 5]));
+        let mut out = [0.0; 5];
+        crate::multiply::Multiply { size: [1, 5, 1], lhs: (&[1.0], [1, 1]), rhs: &right, add: false }.write(&mut out, 5);
+        assert!(out[0] == f32::INFINITY && out[1] == f32::NEG_INFINITY && out[2].is_nan() && out[3].is_nan(), "{out:?}");
+        // The largest float is nearer to infinity than to the largest bf16.
+        assert_eq!(out[4], f32::INFINITY);
+    }
+}
