@@ -37,14 +37,14 @@ struct Pool<T> {
     free: Mutex<Vec<Vec<T>>>,
 }
 
-impl<T: Copy + Default> Pool<T> {
+impl<T: Bits> Pool<T> {
     fn take(&self, len: usize) -> Vec<T> {
         let mut free = self.free.lock().unwrap_or_else(PoisonError::into_inner);
         // Much larger blocks stay for larger requests.
         let fitting = (0..free.len()).filter(|&i| (len..=2 * len).contains(&free[i].capacity()));
         let best = fitting.min_by_key(|&i| free[i].capacity()).map(|i| free.swap_remove(i));
         drop(free);
-        let Some(mut buffer) = best else { return vec![T::default(); len] };
+        let Some(mut buffer) = best else { return arbitrary(len) };
         buffer.resize(len, T::default());
         buffer
     }
@@ -59,6 +59,31 @@ impl<T: Copy + Default> Pool<T> {
         }
     }
 }
+
+/// `len` values of any bits, as they come from the allocator: zeros would take as long as some operators do.
+#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
+#[allow(unsafe_code, reason = "memory that is not filled")]
+fn arbitrary<T: Bits>(len: usize) -> Vec<T> {
+    let mut buffer = Vec::<T>::with_capacity(len);
+    // SAFETY: the assembly may write all of the memory, for all that the compiler knows, so it has values; and `Bits` says
+    // that all of them are valid.
+    unsafe {
+        std::arch::asm!("/* {0} */", in(reg) buffer.as_mut_ptr(), options(nostack, preserves_flags));
+        buffer.set_len(len);
+    }
+    buffer
+}
+
+/// The same for other processors, filled.
+#[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
+fn arbitrary<T: Bits>(len: usize) -> Vec<T> {
+    vec![T::default(); len]
+}
+
+/// Types whose values are all patterns of bits.
+trait Bits: Copy + Default {}
+impl Bits for f32 {}
+impl Bits for u32 {}
 
 #[cfg(test)]
 mod tests {

@@ -4,7 +4,7 @@
 use rayon::prelude::*;
 
 use crate::buffers::{give_words, take_words};
-use crate::half::{self, Left, PANEL, SLACK, Source, Target, Unit};
+use crate::half::{self, Edge, Left, PANEL, SLACK, Source, Unit};
 
 /// A matrix in f32: values, and their (column, row) strides in elements.
 pub type Matrix<'a> = (&'a [f32], [usize; 2]);
@@ -91,8 +91,13 @@ impl Multiply<'_> {
             source.pack_left(&mut rows[..blocks * packed]);
             let starts: Vec<_> = (0..blocks).map(|block| block * packed).collect();
             let left = Left { values: rows, starts: &starts, rows: source.count };
-            let values = &mut out[first * stride..];
-            half::product(unit, left, rhs.as_chunks().0, &mut Target { values, stride, columns, add });
+            let firsts: Vec<_> = (0..blocks).map(|block| block * half::PAIRS * PANEL).collect();
+            let panel = blocks * half::PAIRS * PANEL;
+            let right = half::Right { values: rhs, starts: &firsts, pair: PANEL, panel };
+            let edge = if add { Edge::Add } else { Edge::Write };
+            half::product(unit, left, right, columns, |row, column, sums| {
+                edge.write(sums, &mut out[(first + row) * stride + column..][..sums.len()]);
+            });
             give_words(words);
         }
     }

@@ -5,7 +5,7 @@
 use std::arch::asm;
 use std::arch::x86_64::__cpuid_count;
 
-use super::{Columns, Left, PAIRS, SLACK, Sums};
+use super::{Left, PAIRS, PANEL, Right, SLACK, Sums};
 
 /// Whether the processor has tiles for bf16, and Linux lets this process use them. Linux keeps the registers of tiles,
 /// 8 KiB per thread, only for processes that asked.
@@ -72,11 +72,13 @@ impl Drop for Tiles {
 }
 
 /// Sums of 32 rows from `row` on, in four tiles. The tiles must be configured.
-pub fn block(left: &Left, row: usize, panel: &[Columns], sums: &mut Sums) {
+pub fn block(left: &Left, row: usize, panel: &Right, sums: &mut Sums) {
     let blocks = left.starts.len();
-    assert!(blocks > 0 && panel.len() >= blocks * PAIRS);
+    assert!(blocks > 0 && panel.starts.len() == blocks);
     let last = left.starts.iter().max().map_or(0, |start| start + row + SLACK);
     assert!(last <= left.values.len(), "blocks lie inside");
+    let last = panel.starts.iter().max().map_or(0, |start| start + (PAIRS - 1) * panel.pair + PANEL);
+    assert!(last <= panel.values.len(), "the panel lies inside");
     // SAFETY: every block reads 32 rows of 64 bytes of the left factor, and 16 pairs of 128 bytes of the panel; 32 rows of
     // 128 bytes are written. The assertions, and the type of `sums`, say that all of it is there.
     unsafe {
@@ -91,15 +93,18 @@ pub fn block(left: &Left, row: usize, panel: &[Columns], sums: &mut Sums) {
             "shl {rows}, 6",
             "add {rows}, {left}",
             "tileloadd tmm4, [{rows} + {row}*1]",
-            "tileloadd tmm6, [{panel} + {line}*1]",
-            "tdpbf16ps tmm0, tmm4, tmm6",
-            "tileloadd tmm7, [{panel} + {line}*1 + 64]",
-            "tdpbf16ps tmm1, tmm4, tmm7",
             "tileloadd tmm5, [{rows} + {row}*1 + 1024]",
+            // The block's first pair.
+            "mov {rows}, qword ptr [{firsts}]",
+            "lea {rows}, [{panel} + {rows}*4]",
+            "tileloadd tmm6, [{rows} + {pair}*1]",
+            "tileloadd tmm7, [{rows} + {pair}*1 + 64]",
+            "tdpbf16ps tmm0, tmm4, tmm6",
+            "tdpbf16ps tmm1, tmm4, tmm7",
             "tdpbf16ps tmm2, tmm5, tmm6",
             "tdpbf16ps tmm3, tmm5, tmm7",
             "add {starts}, 8",
-            "add {panel}, 2048",
+            "add {firsts}, 8",
             "dec {blocks}",
             "jnz 2b",
             "tilestored [{sums} + {line}*1], tmm0",
@@ -108,12 +113,14 @@ pub fn block(left: &Left, row: usize, panel: &[Columns], sums: &mut Sums) {
             "tilestored [{sums} + {line}*1 + 2112], tmm3",
             rows = out(reg) _,
             starts = inout(reg) left.starts.as_ptr() => _,
-            panel = inout(reg) panel.as_ptr() => _,
+            firsts = inout(reg) panel.starts.as_ptr() => _,
+            panel = in(reg) panel.values.as_ptr(),
             blocks = inout(reg) blocks => _,
             left = in(reg) left.values[row..].as_ptr(),
             sums = in(reg) sums.as_mut_ptr(),
             row = in(reg) 64_usize,
             line = in(reg) 128_usize,
+            pair = in(reg) 4 * panel.pair,
             options(nostack),
         );
     }

@@ -4,13 +4,13 @@
 
 use std::arch::x86_64::{
     __m512, __m512bh, __m512i, _mm512_cvtepu16_epi32, _mm512_cvtne2ps_pbh, _mm512_cvtneps_pbh, _mm512_dpbf16_ps,
-    _mm512_loadu_ps, _mm512_loadu_si512, _mm512_or_si512, _mm512_set1_epi32, _mm512_setzero_ps, _mm512_shuffle_i32x4,
+    _mm512_loadu_ps, _mm512_loadu_si512, _mm512_max_ps, _mm512_or_si512, _mm512_set1_epi32, _mm512_setzero_ps, _mm512_shuffle_i32x4,
     _mm512_slli_epi32, _mm512_storeu_ps, _mm512_storeu_si512, _mm512_unpackhi_epi32, _mm512_unpackhi_epi64,
     _mm512_unpacklo_epi32, _mm512_unpacklo_epi64,
 };
 use std::mem::transmute;
 
-use super::{BLOCK, Columns, Left, PAIRS, PANEL, Row, Source, Sums};
+use super::{BLOCK, Columns, Edge, Left, PAIRS, PANEL, Right, Row, Source, Sums};
 
 /// Whether this processor has the instructions of all functions here.
 pub fn is_there() -> bool {
@@ -24,31 +24,34 @@ fn check() {
     assert!(is_there(), "this processor computes in bf16");
 }
 
-/// Sums of `rows` (12 or at most 4) rows from `row` on.
-pub fn block(left: &Left, row: usize, rows: usize, columns: usize, panel: &[Columns], sums: &mut Sums) {
+/// Sums of `rows` (4, 8 or 12) rows from `row` on.
+pub fn block(left: &Left, row: usize, rows: usize, columns: usize, panel: &Right, sums: &mut Sums) {
     check();
     // SAFETY: the processor has the instructions.
     unsafe {
-        match (rows > 4, columns > PAIRS) {
-            (true, true) => kernel::<12, 2>(left, row, panel, sums),
-            (true, false) => kernel::<12, 1>(left, row, panel, sums),
-            (false, true) => kernel::<4, 2>(left, row, panel, sums),
-            (false, false) => kernel::<4, 1>(left, row, panel, sums),
+        match (rows, columns > PAIRS) {
+            (12, true) => kernel::<12, 2>(left, row, panel, sums),
+            (12, false) => kernel::<12, 1>(left, row, panel, sums),
+            (8, true) => kernel::<8, 2>(left, row, panel, sums),
+            (8, false) => kernel::<8, 1>(left, row, panel, sums),
+            (_, true) => kernel::<4, 2>(left, row, panel, sums),
+            (_, false) => kernel::<4, 1>(left, row, panel, sums),
         }
     }
 }
 
-/// Writes a block's sums, or adds them.
-pub fn store(sums: &[[f32; PANEL]], columns: usize, out: &mut [f32], stride: usize, add: bool) {
+/// As [`Edge::write`].
+pub fn write(edge: Edge, sums: &[f32], out: &mut [f32]) {
     check();
     // SAFETY: the processor has the instructions.
-    unsafe {
-        if add {
-            write::<true>(sums, columns, out, stride);
-        } else {
-            write::<false>(sums, columns, out, stride);
-        }
-    }
+    unsafe { finish(edge, sums, out) }
+}
+
+/// As [`super::pack_pairs`].
+pub fn pack_pairs(lines: [Option<&[f32]>; 2], rectified: bool, out: &mut [u32]) {
+    check();
+    // SAFETY: the processor has the instructions.
+    unsafe { pairs(lines, rectified, out) }
 }
 
 /// As [`Source::pack_left`].
@@ -66,14 +69,16 @@ pub fn pack_right(source: &Source, out: &mut [Columns]) {
 }
 
 #[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
-fn kernel<const ROWS: usize, const VECTORS: usize>(left: &Left, row: usize, panel: &[Columns], out: &mut Sums) {
+fn kernel<const ROWS: usize, const VECTORS: usize>(left: &Left, row: usize, panel: &Right, out: &mut Sums) {
     let mut sums = [[_mm512_setzero_ps(); VECTORS]; ROWS];
-    for (start, panel) in left.starts.iter().zip(panel.as_chunks::<PAIRS>().0) {
+    for (start, first) in left.starts.iter().zip(panel.starts) {
         let rows: &[Row; ROWS] = left.values[start + row..].first_chunk().expect("the block lies inside");
         for pair in 0..PAIRS {
+            let columns: &Columns =
+                panel.values[first + pair * panel.pair..].first_chunk().expect("the panel lies inside");
             let mut right = [as_halves(_mm512_setzero_si()); VECTORS];
             for (v, right) in right.iter_mut().enumerate() {
-                *right = as_halves(words(&panel[pair].as_chunks().0[v]));
+                *right = as_halves(words(&columns.as_chunks().0[v]));
             }
             for (sums, row) in sums.iter_mut().zip(rows) {
                 let value = as_halves(_mm512_set1_epi32(row[pair].cast_signed()));
@@ -91,13 +96,36 @@ fn kernel<const ROWS: usize, const VECTORS: usize>(left: &Left, row: usize, pane
 }
 
 #[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
-fn write<const ADD: bool>(sums: &[[f32; PANEL]], columns: usize, out: &mut [f32], stride: usize) {
-    for (i, sums) in sums.iter().enumerate() {
-        let out = &mut out[i * stride..][..columns];
-        if let Some(out) = out.first_chunk_mut::<PANEL>() {
-            out.iter_mut().zip(sums).for_each(|(out, sum)| *out = if ADD { *out + sum } else { *sum });
+fn finish(edge: Edge, sums: &[f32], out: &mut [f32]) {
+    let pairs = out.iter_mut().zip(sums);
+    match edge {
+        Edge::Write => pairs.for_each(|(out, sum)| *out = *sum),
+        Edge::Add => pairs.for_each(|(out, sum)| *out += sum),
+        Edge::Bias(bias) => pairs.for_each(|(out, sum)| *out = sum + bias),
+        Edge::Mask(mask) => {
+            pairs.zip(mask).for_each(|((out, sum), mask)| *out = if *mask > 0.0 { *sum } else { 0.0 });
+        }
+    }
+}
+
+#[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
+fn pairs(lines: [Option<&[f32]>; 2], rectified: bool, out: &mut [u32]) {
+    let zero = _mm512_setzero_ps();
+    let length = out.len();
+    for (i, out) in out.chunks_mut(PAIRS).enumerate() {
+        let count = (length - i * PAIRS).min(PAIRS);
+        let read = |values: Option<&[f32]>| {
+            let values = values.map_or(zero, |values| line(values, i * PAIRS, 1, count));
+            // The second argument is the result where one is no number.
+            if rectified { _mm512_max_ps(values, zero) } else { values }
+        };
+        let words = interleaved(read(lines[0]), read(lines[1]));
+        if let Some(out) = out.first_chunk_mut() {
+            put_words(words, out);
         } else {
-            out.iter_mut().zip(sums).for_each(|(out, sum)| *out = if ADD { *out + sum } else { *sum });
+            let mut all = [0; PAIRS];
+            put_words(words, &mut all);
+            out.copy_from_slice(&all[..out.len()]);
         }
     }
 }

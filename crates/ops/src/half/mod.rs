@@ -6,7 +6,7 @@
 //!
 //! * the left factor as `[blocks][rows][16 pairs]`, where each block may begin anywhere, so that the windows of a
 //!   convolution need no copies of their own;
-//! * the right factor as `[panels of 32 columns][pairs][32 columns]`.
+//! * the right factor as pairs of 32 columns, where blocks, pairs and panels of columns may lie anywhere, too.
 //!
 //! Every element is one sum in one order, for any number of threads. The two kernels add in different orders. Both take
 //! subnormal numbers for 0.
@@ -34,7 +34,7 @@ pub const SLACK: usize = 32;
 
 /// One row of the left factor in one block of k.
 pub type Row = [u32; PAIRS];
-/// One pair of k of the right factor in one panel.
+/// One pair of k of a packed right factor in one panel.
 pub type Columns = [u32; PANEL];
 /// A block of sums. A kernel fills its first rows.
 type Sums = [[f32; PANEL]; SLACK];
@@ -65,8 +65,7 @@ impl Unit {
     /// Rows of the kernel's block of sums, if `left` rows remain.
     fn rows(self, left: usize) -> usize {
         match self {
-            Self::Avx512 if left <= 4 => 4,
-            Self::Avx512 => 12,
+            Self::Avx512 => left.next_multiple_of(4).min(12),
             _ => 32,
         }
     }
@@ -96,6 +95,19 @@ pub struct Left<'a> {
     pub starts: &'a [usize],
     /// How many rows.
     pub rows: usize,
+}
+
+/// The right factor of a product, in panels of 32 columns.
+#[derive(Clone, Copy)]
+pub struct Right<'a> {
+    /// Pairs of k.
+    pub values: &'a [u32],
+    /// Where each block of k begins, in the first panel.
+    pub starts: &'a [usize],
+    /// From one pair to the next.
+    pub pair: usize,
+    /// From one panel to the next.
+    pub panel: usize,
 }
 
 /// Values in f32 that become a factor: rows of the left one, or columns of the right one.
@@ -151,46 +163,65 @@ impl Source<'_> {
     }
 }
 
-/// Where the sums belong.
-pub struct Target<'a> {
-    /// `[rows][columns]`.
-    pub values: &'a mut [f32],
-    /// From one row to the next.
-    pub stride: usize,
-    /// How many columns.
-    pub columns: usize,
-    /// Adds to the present values.
-    pub add: bool,
+/// Rounds pairs (a₀, b₀), (a₁, b₁) … of max(a, 0) or a, and so on. An absent line is zeros.
+pub fn pack_pairs(a: Option<&[f32]>, b: Option<&[f32]>, rectified: bool, out: &mut [u32]) {
+    assert!([a, b].into_iter().flatten().all(|line| line.len() == out.len()));
+    #[cfg(target_arch = "x86_64")]
+    avx512::pack_pairs([a, b], rectified, out);
 }
 
-/// Writes `left` · `right`.
+/// What happens to sums on their way out.
+#[derive(Clone, Copy)]
+pub enum Edge<'a> {
+    /// Nothing.
+    Write,
+    /// They are added to the present values.
+    Add,
+    /// A number is added to them.
+    Bias(f32),
+    /// Those become 0 where these values are not positive.
+    Mask(&'a [f32]),
+}
+
+impl Edge<'_> {
+    /// Writes a row of sums.
+    pub fn write(self, sums: &[f32], out: &mut [f32]) {
+        assert_eq!(sums.len(), out.len());
+        #[cfg(target_arch = "x86_64")]
+        avx512::write(self, sums, out);
+    }
+}
+
+/// Calls `each` with row, column and the sums from there on, up to 32 of a row, of `left` · `right`.
 ///
 /// # Panics
 /// If a factor is smaller than the sizes say, or if the processor lacks the unit.
-pub fn product(unit: Unit, left: Left, right: &[Columns], target: &mut Target) {
-    let (pairs, panels) = (left.starts.len() * PAIRS, target.columns.div_ceil(PANEL));
-    assert!(left.rows > 0 && panels > 0 && right.len() >= pairs * panels);
+pub fn product(unit: Unit, left: Left, right: Right, columns: usize, mut each: impl FnMut(usize, usize, &[f32])) {
+    let panels = columns.div_ceil(PANEL);
+    assert!(left.rows > 0 && panels > 0 && left.starts.len() == right.starts.len());
     let reach = left.starts.iter().max().map_or(0, |start| start + left.rows + SLACK);
     assert!(reach <= left.values.len(), "blocks lie inside, with slack");
-    assert!((left.rows - 1) * target.stride + target.columns <= target.values.len());
+    let reach = (panels - 1) * right.panel + (PAIRS - 1) * right.pair + PANEL;
+    assert!(right.starts.iter().all(|start| start + reach <= right.values.len()), "panels lie inside");
     #[cfg(target_arch = "x86_64")]
     {
         let _tiles = (unit == Unit::Amx).then(amx::Tiles::configured);
         let mut sums: Sums = [[0.0; PANEL]; SLACK];
-        for (p, panel) in right.chunks_exact(pairs).take(panels).enumerate() {
-            let columns = (target.columns - p * PANEL).min(PANEL);
+        for p in 0..panels {
+            let count = (columns - p * PANEL).min(PANEL);
+            let panel = Right { values: &right.values[p * right.panel..], ..right };
             let mut row = 0;
             while row < left.rows {
                 let rows = unit.rows(left.rows - row);
                 match unit {
-                    Unit::Avx512 => avx512::block(&left, row, rows, columns, panel, &mut sums),
-                    Unit::Amx => amx::block(&left, row, panel, &mut sums),
+                    Unit::Avx512 => avx512::block(&left, row, rows, count, &panel, &mut sums),
+                    Unit::Amx => amx::block(&left, row, &panel, &mut sums),
                     #[cfg(test)]
-                    Unit::Emulated => tests::block(&left, row, panel, &mut sums),
+                    Unit::Emulated => tests::block(&left, row, &panel, &mut sums),
                 }
-                let out = &mut target.values[row * target.stride + p * PANEL..];
-                let sums = &sums[..rows.min(left.rows - row)];
-                avx512::store(sums, columns, out, target.stride, target.add);
+                for (i, sums) in sums[..rows.min(left.rows - row)].iter().enumerate() {
+                    each(row + i, p * PANEL, &sums[..count]);
+                }
                 row += rows;
             }
         }

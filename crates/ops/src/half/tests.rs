@@ -8,12 +8,12 @@ fn rounded(bits: u32) -> f32 {
 }
 
 /// As `amx::block`: one row and one column at a time, pair by pair.
-pub fn block(left: &Left, row: usize, panel: &[Columns], sums: &mut Sums) {
+pub fn block(left: &Left, row: usize, panel: &Right, sums: &mut Sums) {
     for (r, sums) in sums.iter_mut().enumerate() {
         *sums = [0.0; PANEL];
-        for (start, panel) in left.starts.iter().zip(panel.as_chunks::<PAIRS>().0) {
-            for (pair, columns) in left.values[start + row + r].iter().zip(panel) {
-                for (sum, column) in sums.iter_mut().zip(columns) {
+        for (start, first) in left.starts.iter().zip(panel.starts) {
+            for (i, pair) in left.values[start + row + r].iter().enumerate() {
+                for (sum, column) in sums.iter_mut().zip(&panel.values[first + i * panel.pair..][..PANEL]) {
                     *sum += rounded(pair & 0xffff) * rounded(column & 0xffff);
                     *sum += rounded(pair >> 16) * rounded(column >> 16);
                 }

@@ -15,6 +15,7 @@ mod planes;
 mod transposed;
 mod unfolded;
 mod weights3x3;
+mod windows;
 
 #[cfg(test)]
 mod tests;

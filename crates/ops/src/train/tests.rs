@@ -53,16 +53,17 @@ impl ModuleVisitor for Collect<'_> {
     }
 }
 
-/// Compares the result of `run`, and its gradients by the input and by the module's parameters, in f32 and in f64. Only
-/// tensors in f32 reach the operators of this crate.
+/// Compares the result of `run`, and its gradients by the input and by the module's parameters, in f32 and with
+/// parameters in bf16 with those in f64. Only an input in f32 reaches the operators of this crate.
 fn check<M: Module, const A: usize, const D: usize>(
     what: &str,
     module: M,
     shape: [usize; A],
     run: impl Fn(&M, Tensor<A>) -> Tensor<D>,
 ) {
-    let [got, expected] = [FloatDType::F32, FloatDType::F64].map(|float| {
-        let module = module.clone().map(&mut Filled { float, seed: 10 });
+    use FloatDType::{BF16, F32, F64};
+    let [got, half, expected] = [(F32, F32), (BF16, F32), (F64, F64)].map(|(of_module, float)| {
+        let module = module.clone().map(&mut Filled { float: of_module, seed: 10 });
         let x = tensor(shape, 1, float).require_grad();
         let y = run(&module, x.clone());
         let all = (y.clone() * tensor(y.dims(), 2, float)).sum().backward();
@@ -71,9 +72,22 @@ fn check<M: Module, const A: usize, const D: usize>(
         module.visit(&mut collect);
         collect.1
     });
-    for (i, (got, expected)) in got.iter().zip(&expected).enumerate() {
+    for (i, ((got, half), expected)) in got.iter().zip(&half).zip(&expected).enumerate() {
         assert_equal(&format!("{what}, tensor {i}"), got, expected);
+        assert_close(&format!("{what}, tensor {i} in bf16"), half, expected);
     }
+}
+
+/// Relative L2 error and cosine in bf16, whose rounding is 2⁻⁹ at most.
+fn assert_close(what: &str, got: &[f64], expected: &[f64]) {
+    assert_eq!(got.len(), expected.len(), "{what}");
+    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+    let (one, other) = (dot(got, got), dot(expected, expected));
+    let difference: Vec<f64> = got.iter().zip(expected).map(|(got, expected)| got - expected).collect();
+    let error = (dot(&difference, &difference) / other.max(1e-30)).sqrt();
+    let cosine = if one + other > 0.0 { dot(got, expected) / (one * other).sqrt() } else { 1.0 };
+    println!("{what}: {error:e}, cosine {cosine}");
+    assert!(error < 1e-2 && cosine > 0.9999, "{what}: {error:e}, cosine {cosine}");
 }
 
 #[test]
@@ -190,7 +204,9 @@ fn rotary_attention_equals_burns() {
         let run = |pairs: &Pairs, q: Tensor<3>| {
             let (k, v) = (pairs.keys.val(), pairs.values.val());
             if crate::is_trained_fast(&q) {
-                return rotary_attention(q, k, v, &ropes[0], heads, false);
+                let half = crate::is_half(&pairs.keys);
+                let [k, v] = [k, v].map(|x| x.cast(FloatDType::F32));
+                return rotary_attention(q, k, v, &ropes[0], heads, half);
             }
             let [rope_q, rope_k] = ropes.clone().map(|Rope { cos, sin }| Rope {
                 cos: cos.cast(FloatDType::F64),

@@ -5,8 +5,10 @@
 use rayon::prelude::*;
 
 use super::elements::{add_constant, channel_sums, mask, rectify};
+use super::windows::Windows;
 use super::{Gradients, Wanted};
 use crate::buffers::{give, take};
+use crate::half::unit;
 use crate::multiply::{Multiply, Right};
 use crate::wide::pieces;
 
@@ -43,6 +45,9 @@ impl Unfolded {
     /// `x` `[B, inputs, H, W]`, `weight` `[outputs, inputs, 3, 3]`, `bias` `[outputs]` →
     /// `[B, outputs, ⌈H/stride⌉, ⌈W/stride⌉]`.
     pub fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>) -> Vec<f32> {
+        if let Some(windows) = self.windows() {
+            return windows.forward(x, weight, bias);
+        }
         let Self { inputs, outputs, .. } = *self;
         let [rows, columns] = self.size();
         let plane = self.height * self.width;
@@ -62,7 +67,7 @@ impl Unfolded {
             self.unfold(&x[image * inputs * plane..][..inputs * plane], row, &mut taps);
             let mut results = take(outputs * n);
             let lhs = (weight, [1, inputs * TAPS]);
-            let rhs = Right::new(self.half, [inputs * TAPS, n], (&taps, [1, n]));
+            let rhs = Right::Plain((&taps, [1, n]));
             Multiply { size: [outputs, n, inputs * TAPS], lhs, rhs: &rhs, add: false }.write(&mut results, n);
             drop(rhs);
             for (c, (out, results)) in out.into_iter().zip(results.chunks_exact(n)).enumerate() {
@@ -75,6 +80,9 @@ impl Unfolded {
 
     /// Gradients from that of the output, `dy` `[B, outputs, ⌈H/stride⌉, ⌈W/stride⌉]`.
     pub fn backward(&self, x: &[f32], weight: &[f32], dy: &[f32], wanted: Wanted) -> Gradients {
+        if let Some(windows) = self.windows() {
+            return windows.backward(x, weight, dy, wanted);
+        }
         let Self { batch, inputs, outputs, .. } = *self;
         let [rows, columns] = self.size();
         let (plane, n) = (self.height * self.width, rows * columns);
@@ -95,13 +103,13 @@ impl Unfolded {
                 let dy = &dy[image * outputs * n..][..outputs * n];
                 if wanted.weight {
                     self.unfold(x, 0, &mut taps);
-                    let rhs = &Right::new(self.half, [n, width], (&taps, [n, 1]));
+                    let rhs = &Right::Plain((&taps, [n, 1]));
                     Multiply { size: [outputs, width, n], lhs: (dy, [1, n]), rhs, add: image > 0 }
                         .write(&mut sums, width);
                 }
                 if let Some(dx) = dx.get_mut(image) {
                     let lhs = (&weight[first * TAPS..], [inputs * TAPS, 1]);
-                    let rhs = &Right::new(self.half, [outputs, n], (dy, [1, n]));
+                    let rhs = &Right::Plain((dy, [1, n]));
                     Multiply { size: [width, n, outputs], lhs, rhs, add: false }.write(&mut taps, n);
                     self.fold(&taps, dx);
                     if self.rectified {
@@ -125,6 +133,13 @@ impl Unfolded {
         sums.into_iter().for_each(give);
         let bias = wanted.bias.then(|| channel_sums(dy, batch, outputs));
         Gradients { input: dx, weight, bias }
+    }
+
+    /// The same in bf16, if it is wanted and the processor can.
+    fn windows(&self) -> Option<Windows> {
+        let Self { batch, inputs, outputs, height, width, stride, rectified, half } = *self;
+        let unit = unit().filter(|_| half)?;
+        Some(Windows { batch, inputs, outputs, height, width, stride, rectified, unit })
     }
 
     /// Rows and columns of the output.
