@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value, json};
 use snapsnap_data::sample::Handling;
-use snapsnap_net::precision::Precision;
+use snapsnap_net::config::PrecisionChoice;
 use snapsnap_splat::Preset;
 
 /// A section `[ablations.NAME]` of an evaluation, and `[model]` or `[settings.NAME]` of a benchmark. Unset keys are
@@ -21,8 +21,8 @@ pub struct Variant {
     pub set: Vec<String>,
     /// Device, as in `--device`.
     pub device: Option<String>,
-    /// Precision of the point predictor.
-    pub precision: Option<Precision>,
+    /// Precision of the point predictor. Unset: `auto`.
+    pub precision: Option<PrecisionChoice>,
     /// Whether the unseen sides are predicted. Unset: only with two photographs.
     pub sides: Option<bool>,
     /// Whether pixels of the unseen sides get the colours of the nearest photographed points.

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 pub use snapsnap_base::config::{ConfigError, Schema};
 
 pub use modes::{
-    Anchor, Body, ConfMode, Downsample, Fusion, HeadKind, RegressorColor, RegressorStart, RotationFrame,
+    Anchor, Body, ConfMode, Downsample, Fusion, HeadKind, Precision, PrecisionChoice, RegressorColor, RegressorStart, RotationFrame,
     Upsample, WorldFrame,
 };
 
@@ -96,6 +96,9 @@ pub struct NetworkConfig {
     pub ray_channels: bool,
     /// Whether the back photograph is mirrored, so that both show a limb at the same place.
     pub mirror: bool,
+    /// Precision in which the weights were trained. A training writes it, and a reconstruction uses the same.
+    #[serde(skip_serializing_if = "Precision::is_f32")]
+    pub precision: Precision,
     /// Whether maps are the means of the predictions for the photographs and for their mirror images.
     pub both_ways: bool,
     /// Whether the photographs' points are moved onto the rays of their pixels.
@@ -143,6 +146,7 @@ impl Default for NetworkConfig {
             mask_channel: false,
             ray_channels: false,
             mirror: false,
+            precision: Precision::F32,
             both_ways: false,
             on_rays: false,
             hull_margin: None,

@@ -1,45 +1,18 @@
 //! The point predictor in 16 bits: its matrix products and convolutions. Norms, activations, the rasteriser and the
 //! regressor, whose input is coordinates, stay in f32.
+//!
+//! On a GPU the layers' tensors are of 16 bits. On the CPU they are f32, and kernels round the factors of products
+//! ([`snapsnap_ops::half`]).
 
 use burn::module::Param;
-use burn::tensor::{FloatDType, Tensor};
-use serde::{Deserialize, Serialize};
+use burn::tensor::{Device, FloatDType, Tensor};
 
+pub use crate::config::{Precision, PrecisionChoice};
+use crate::config::Config;
 use crate::names::{NamedMapper, Path, map_named};
 use crate::network::PointPredictor;
 
-/// Float type of the point predictor's layers.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Precision {
-    /// 24 bits of mantissa.
-    #[default]
-    F32,
-    /// 8 bits of mantissa, the range of f32.
-    Bf16,
-    /// 11 bits of mantissa, up to 65,504: the loss is scaled, so that small gradients do not vanish.
-    F16,
-}
-
 impl Precision {
-    /// Name in configs.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::F32 => "f32",
-            Self::Bf16 => "bf16",
-            Self::F16 => "f16",
-        }
-    }
-
-    /// Burn's name.
-    pub fn dtype(self) -> FloatDType {
-        match self {
-            Self::F32 => FloatDType::F32,
-            Self::Bf16 => FloatDType::BF16,
-            Self::F16 => FloatDType::F16,
-        }
-    }
-
     /// The predictor in this precision. Gradients reach the given predictor. Norms, δ and the last layers of the heads stay
     /// in f32.
     pub fn lower(self, predictor: PointPredictor) -> PointPredictor {
@@ -48,6 +21,32 @@ impl Precision {
         }
         let is_last = predictor.is_last_layer();
         map_named(predictor, "", &mut Lower { dtype: self.dtype(), is_last })
+    }
+}
+
+/// What computes products in bf16 on this processor, by name.
+pub fn unit_of_cpu() -> Option<&'static str> {
+    snapsnap_ops::half::unit().map(snapsnap_ops::half::Unit::name)
+}
+
+/// Whether products in bf16 are faster on this device: on the CPU, if its processor has them. GPUs were not measured.
+fn is_fast_in_bf16(device: &Device) -> bool {
+    let device = device.clone();
+    let device = if device.is_autodiff() { device.inner() } else { device };
+    device == Device::flex() && unit_of_cpu().is_some()
+}
+
+impl PrecisionChoice {
+    /// The precision of a training: with `auto`, bf16 where the device is faster in it.
+    pub fn of_training(self, device: &Device) -> Precision {
+        self.fixed().unwrap_or(if is_fast_in_bf16(device) { Precision::Bf16 } else { Precision::F32 })
+    }
+
+    /// The precision of a reconstruction: with `auto`, that of the weights' training where the device is faster in it.
+    pub fn of_weights(self, config: &Config, device: &Device) -> Precision {
+        let trained = config.network.precision;
+        let auto = if is_fast_in_bf16(device) { trained } else { Precision::F32 };
+        self.fixed().unwrap_or(auto)
     }
 }
 

@@ -43,6 +43,11 @@ fn measure(seconds: f64, mut step: impl FnMut() -> (Duration, Duration)) -> Stri
 }
 
 fn main() {
+    // As the program does.
+    #[allow(unsafe_code, reason = "a function of C")]
+    unsafe {
+        libmimalloc_sys::mi_option_set(15, 10_000);
+    }
     let arguments: Vec<f64> = std::env::args().filter_map(|argument| argument.parse().ok()).collect();
     let argument = |i: usize, default: f64| arguments.get(i).copied().unwrap_or(default);
     let (seconds, side, batch) = (argument(0, 20.0), argument(1, 256.0) as usize, argument(2, 2.0) as usize);

@@ -6,10 +6,9 @@ use serde::{Deserialize, Serialize};
 use snapsnap_base::config::outside;
 use snapsnap_data::sample::SampleConfig;
 use snapsnap_eval::lpips::MIN_SIDE;
-use snapsnap_net::config::{ConfMode, Config, ModeConfig, NetworkConfig, RegressorConfig, Schema};
+use snapsnap_net::config::{ConfMode, Config, ModeConfig, NetworkConfig, Precision, PrecisionChoice, RegressorConfig, Schema};
 
 use crate::optimizer::OptimizerConfig;
-use crate::precision::Precision;
 use crate::schedule::Schedule;
 
 /// All settings of a training. The default is the published training.
@@ -85,8 +84,9 @@ pub struct TrainingConfig {
     pub checkpoint_every: usize,
     /// Steps between two previews; 0: only at the end.
     pub preview_every: usize,
-    /// Number format of the point predictor's layers. The device must support it.
-    pub precision: Precision,
+    /// Number format of the point predictor's layers. The device must support it. A program that trains replaces `auto` by
+    /// the device's before it begins.
+    pub precision: PrecisionChoice,
     /// Whether the backward pass computes cheap intermediate results again instead of keeping them. Operators with a
     /// backward pass of their own ignore it.
     pub gradient_checkpointing: bool,
@@ -175,7 +175,7 @@ impl Default for TrainingConfig {
             validate_on: ValidationSplit::Val,
             checkpoint_every: 1000,
             preview_every: 2000,
-            precision: Precision::F32,
+            precision: PrecisionChoice::F32,
             gradient_checkpointing: false,
         }
     }
@@ -229,7 +229,13 @@ impl Schema for TrainConfig {
 impl TrainConfig {
     /// The part of the config that a weight file contains.
     pub fn networks(&self) -> Config {
-        Config { network: self.network.clone(), regressor: self.regressor.clone(), mode: self.mode.clone() }
+        let network = NetworkConfig { precision: self.precision(), ..self.network.clone() };
+        Config { network, regressor: self.regressor.clone(), mode: self.mode.clone() }
+    }
+
+    /// The precision of the point predictor. `auto` that was not replaced is f32.
+    pub fn precision(&self) -> Precision {
+        self.training.precision.fixed().unwrap_or(Precision::F32)
     }
 
     /// The samples' config, with the height of people from the section `[mode]`.

@@ -103,7 +103,7 @@ impl<'a, T: Task> Learner<'a, T> {
     fn update(&mut self, step: u64) -> Result<Result<BTreeMap<String, f64>, Skipped>, TrainError> {
         let t = &self.config.training;
         let scale = &mut self.progress.loss_scale;
-        *scale = (t.precision == Precision::F16).then(|| scale.unwrap_or_default());
+        *scale = (self.config.precision() == Precision::F16).then(|| scale.unwrap_or_default());
         let scale = scale.map_or(1.0, |scale| scale.factor);
         let (mut sum, mut values) = (Rows::new(), BTreeMap::<String, f64>::new());
         let mut all: Vec<String> = Vec::new();
@@ -116,7 +116,7 @@ impl<'a, T: Task> Learner<'a, T> {
             };
             all.extend(items.iter().map(|item| T::name(item).to_owned()));
             let at = Moment { step, batch: batch as u64, device_index: 0 };
-            let how = How { precision: t.precision, scale, share: 1.0 / t.accumulate as f64 };
+            let how = How { precision: self.config.precision(), scale, share: 1.0 / t.accumulate as f64 };
             let made = match on_devices(self.task, &self.networks, self.devices, items, at, how) {
                 // A scene that the rasteriser refuses costs the sample, not the run.
                 Err(TrainError::Splat(e)) => return skipped(&e.to_string(), &all),

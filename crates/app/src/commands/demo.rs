@@ -11,6 +11,7 @@ use snapsnap_data::photo::{self, Canvas, Placement};
 use snapsnap_eval::pictures::Picture;
 use snapsnap_eval::region::{Region, margin};
 use snapsnap_eval::similarity::psnr;
+use snapsnap_net::config::PrecisionChoice;
 use snapsnap_net::{Photograph, Reconstructor};
 use snapsnap_splat::{Camera, Gaussians, RenderOptions, render, scene};
 
@@ -78,7 +79,8 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let canvases =
         photo::load([&front, &back], [None; 2], config.network.resolution, Placement::AsIs)?.canvases;
     let [front, back] = canvases.map(|Canvas { rgb, mask, valid, .. }| Photograph { rgb, mask, valid });
-    let reconstructor = Reconstructor::load(&weights, &device)?;
+    let precision = PrecisionChoice::Auto.of_weights(&config, &device);
+    let reconstructor = Reconstructor::load(&weights, &device)?.in_precision(precision);
     let made = reconstructor.reconstruct(&front, &back, &|name| progress.stage(name));
     let seconds = since.elapsed().as_secs_f64();
     let world = made.in_world(&config);

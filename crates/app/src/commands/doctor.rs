@@ -6,6 +6,7 @@ use burn::tensor::Device;
 use clap::Args;
 use serde_json::{Value, json};
 use snapsnap_eval::lpips::Lpips;
+use snapsnap_net::precision::unit_of_cpu;
 
 use super::ConfigArguments;
 use crate::device::{self, Found};
@@ -65,6 +66,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
             "commit": env!("SNAPSNAP_COMMIT"),
             "compiled_in": device::compiled_in(),
             "threads": threads(),
+            "bf16": unit_of_cpu(),
             "memory_bytes": memory,
             "devices": devices.iter().map(device).collect::<Vec<Value>>(),
             "chosen": chosen,
@@ -79,6 +81,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
         format!("snapsnap {}, commit {}", env!("CARGO_PKG_VERSION"), env!("SNAPSNAP_COMMIT")),
         format!("compiled in  {}", device::compiled_in().join(", ")),
         format!("threads      {}", threads()),
+        format!("bf16         {}", unit_of_cpu().unwrap_or("no instructions for it in this processor")),
         format!("memory       {}", gigabytes(memory)),
         "devices".into(),
     ];

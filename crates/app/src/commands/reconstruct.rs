@@ -3,11 +3,13 @@
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
+use burn::tensor::Device;
 use clap::Args;
 use snapsnap_base::config::Schema;
 use snapsnap_base::file;
 use snapsnap_data::photo::{self, Canvas, Pair, Placement};
 use snapsnap_mesh::picture;
+use snapsnap_net::precision::{Precision, PrecisionChoice, unit_of_cpu};
 use snapsnap_net::weights::schema::Part;
 use snapsnap_net::{Photograph, Reconstructor};
 use snapsnap_splat::scene::Stored;
@@ -47,6 +49,10 @@ pub struct Arguments {
     /// auto, cpu, ndarray, wgpu, vulkan, cuda or metal; wgpu:1 is the second adapter.
     #[arg(long, default_value = "auto")]
     device: String,
+    /// Products of the point predictor: f32, bf16, or auto: bf16 on a CPU with instructions for it, if the weights were
+    /// trained so.
+    #[arg(long, value_name = "auto|f32|bf16", default_value = "auto", value_parser = precision)]
+    precision: PrecisionChoice,
     /// File of Gaussians to write, .ply or .spz. The resolved config is written beside it.
     #[arg(short, long, default_value = "human.ply")]
     output: PathBuf,
@@ -66,6 +72,24 @@ pub struct Arguments {
     /// Print the modules that ran, the omitted ones with the reasons, and the time of each.
     #[arg(short, long)]
     verbose: bool,
+}
+
+fn precision(text: &str) -> Result<PrecisionChoice, &'static str> {
+    match text {
+        "auto" => Ok(PrecisionChoice::Auto),
+        "f32" => Ok(PrecisionChoice::F32),
+        "bf16" => Ok(PrecisionChoice::Bf16),
+        _ => Err("auto, f32 or bf16"),
+    }
+}
+
+/// The precision, and what computes it on the CPU.
+fn in_words(precision: Precision, device: &Device) -> String {
+    let name = precision.name();
+    if precision != Precision::Bf16 || !memory::is_cpu(device) {
+        return name.into();
+    }
+    format!("{name}, by {}", unit_of_cpu().unwrap_or("products in f32 of rounded weights: this processor has no others"))
 }
 
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
@@ -113,11 +137,16 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let progress = Progress::stages();
     progress.stage("loading weights");
     let since = Instant::now();
-    let reconstructor = Reconstructor::load(&weights, &device)?;
+    let precision = arguments.precision.of_weights(&config, &device);
+    if !device.supports_dtype(precision.dtype()) {
+        bail!("--device {}: does not compute in {}", arguments.device, precision.name());
+    }
+    let reconstructor = Reconstructor::load(&weights, &device)?.in_precision(precision);
     timed("loading weights", since);
     let mut plan = vec![
         format!("device: {}", device::describe(&device)),
         format!("weights: {}", weights.path().display()),
+        format!("precision: {}", in_words(precision, &device)),
     ];
     for (name, canvas) in ["front", "back"].into_iter().zip(&canvases) {
         plan.push(format!("{name}: {}", canvas.report));

@@ -6,6 +6,7 @@ use burn::tensor::{Device, Int, Tensor, TensorData};
 use snapsnap_data::photo::Mapping;
 use snapsnap_data::sample::{Handling, TestItem};
 use snapsnap_net::gaussians::placed;
+use snapsnap_net::config::PrecisionChoice;
 use snapsnap_net::weights::{WeightFile, WeightsError};
 use snapsnap_net::{Reconstruction, Reconstructor};
 use snapsnap_ops::host;
@@ -47,8 +48,8 @@ impl Model {
     /// # Errors
     /// [`WeightsError`] if a part is absent or a value is not finite.
     pub fn load(weights: &WeightFile, device: &Device, variant: &Variant) -> Result<Self, WeightsError> {
-        let mut reconstructor =
-            Reconstructor::load(weights, device)?.in_precision(variant.precision.unwrap_or_default());
+        let precision = variant.precision.unwrap_or(PrecisionChoice::Auto).of_weights(&weights.config, device);
+        let mut reconstructor = Reconstructor::load(weights, device)?.in_precision(precision);
         // Scenes of more than two photographs have no unseen sides.
         let is_pair = variant.inputs.as_ref().is_none_or(|inputs| inputs.len() <= 2);
         if !variant.sides.unwrap_or(is_pair) {

@@ -1,5 +1,6 @@
 //! The choices of a config. Their names in a config are those of the variants, in kebab case.
 
+use burn::tensor::FloatDType;
 use serde::{Deserialize, Serialize};
 
 macro_rules! choices {
@@ -103,5 +104,74 @@ choices! {
         Upright,
         /// The published demo's diag(−1, −1, −1) about (0, 0, 2): a mirror image.
         Mirrored,
+    }
+
+    /// Float type of the point predictor's layers.
+    Precision {
+        /// 24 bits of mantissa.
+        F32,
+        /// 8 bits of mantissa, the range of f32.
+        Bf16,
+        /// 11 bits of mantissa, up to 65,504: the loss is scaled, so that small gradients do not vanish.
+        F16,
+    }
+
+    /// What is asked for: a precision, or the fastest that fits.
+    PrecisionChoice {
+        /// As `Precision::F32`.
+        F32,
+        /// As `Precision::Bf16`.
+        Bf16,
+        /// As `Precision::F16`.
+        F16,
+        /// In training, bf16 on a CPU with instructions for it, else f32.
+        Auto,
+    }
+}
+
+impl Precision {
+    /// Name in configs.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::F32 => "f32",
+            Self::Bf16 => "bf16",
+            Self::F16 => "f16",
+        }
+    }
+
+    /// Burn's name.
+    pub fn dtype(self) -> FloatDType {
+        match self {
+            Self::F32 => FloatDType::F32,
+            Self::Bf16 => FloatDType::BF16,
+            Self::F16 => FloatDType::F16,
+        }
+    }
+
+    /// Whether it is f32.
+    pub fn is_f32(&self) -> bool {
+        *self == Self::F32
+    }
+}
+
+impl PrecisionChoice {
+    /// The precision, if it depends on nothing.
+    pub fn fixed(self) -> Option<Precision> {
+        match self {
+            Self::F32 => Some(Precision::F32),
+            Self::Bf16 => Some(Precision::Bf16),
+            Self::F16 => Some(Precision::F16),
+            Self::Auto => None,
+        }
+    }
+}
+
+impl From<Precision> for PrecisionChoice {
+    fn from(precision: Precision) -> Self {
+        match precision {
+            Precision::F32 => Self::F32,
+            Precision::Bf16 => Self::Bf16,
+            Precision::F16 => Self::F16,
+        }
     }
 }

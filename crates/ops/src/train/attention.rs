@@ -214,10 +214,11 @@ impl WithSimd for Rotate<'_> {
             let (cos, sin) = (&self.rope[0][token * d..][..d], &self.rope[1][token * d..][..d]);
             // Two halves (row, column), each of two quarters whose members pair up.
             for half in [0, 2 * quarter] {
+                let [x, cos, sin] = [x, cos, sin].map(|values| values[half..half + 2 * quarter].split_at(quarter));
+                let (first, second) = out[half..half + 2 * quarter].split_at_mut(quarter);
                 for k in 0..quarter {
-                    let (i, j) = (half + k, half + quarter + k);
-                    out[i] = (x[i] * cos[i] + x[j] * sin[i]) * self.factor;
-                    out[j] = (x[j] * cos[j] + x[i] * sin[j]) * self.factor;
+                    first[k] = (x.0[k] * cos.0[k] + x.1[k] * sin.0[k]) * self.factor;
+                    second[k] = (x.1[k] * cos.1[k] + x.0[k] * sin.1[k]) * self.factor;
                 }
             }
         }
@@ -241,11 +242,12 @@ impl WithSimd for Unrotate<'_> {
         let tables = self.rope[0].chunks_exact(d).zip(self.rope[1].chunks_exact(d));
         for (x, (cos, sin)) in self.x.chunks_exact_mut(d).zip(tables) {
             for half in [0, 2 * quarter] {
+                let [cos, sin] = [cos, sin].map(|values| values[half..half + 2 * quarter].split_at(quarter));
+                let (first, second) = x[half..half + 2 * quarter].split_at_mut(quarter);
                 for k in 0..quarter {
-                    let (i, j) = (half + k, half + quarter + k);
-                    let (a, b) = (x[i] * self.factor, x[j] * self.factor);
-                    x[i] = a * cos[i] + b * sin[j];
-                    x[j] = b * cos[j] + a * sin[i];
+                    let (a, b) = (first[k] * self.factor, second[k] * self.factor);
+                    first[k] = a * cos.0[k] + b * sin.1[k];
+                    second[k] = b * cos.1[k] + a * sin.0[k];
                 }
             }
         }
@@ -267,7 +269,9 @@ impl WithSimd for Exponentials<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, _simd: S) -> Vec<f32> {
-        let row = |(row, logarithm): (&mut [f32], &mut f32)| {
+        // Loops, since closures do not inherit the target's features.
+        let mut all = Vec::with_capacity(self.logarithms.len());
+        for (row, logarithm) in self.scores.chunks_exact_mut(self.keys).zip(self.logarithms) {
             let mut most = [f32::NEG_INFINITY; LANES];
             let (chunks, rest) = row.as_chunks::<LANES>();
             for chunk in chunks {
@@ -290,9 +294,9 @@ impl WithSimd for Exponentials<'_> {
                 sum += *x;
             }
             *logarithm = most + sum.ln();
-            sum
-        };
-        self.scores.chunks_exact_mut(self.keys).zip(self.logarithms).map(row).collect()
+            all.push(sum);
+        }
+        all
     }
 }
 

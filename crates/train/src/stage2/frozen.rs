@@ -41,7 +41,7 @@ impl Frozen {
     pub fn new(config: &TrainConfig, predictor: PointPredictor, devices: &[Device]) -> Self {
         let maps = config.stage2.point_map_cache.as_ref();
         let maps = maps.map(|folder| Maps::new(folder, &config.networks(), &predictor));
-        let precision = config.training.precision;
+        let precision = config.precision();
         let networks = Networks { predictor: Some(predictor), regressors: Vec::new() };
         let lowered = lower(precision, &networks).predictor.expect("there is one");
         let lowered = devices.iter().map(|device| lowered.clone().fork(&device.clone().inner())).collect();
