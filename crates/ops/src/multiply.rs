@@ -36,7 +36,7 @@ impl<'a> Right<'a> {
             let first = i * PANEL;
             let values = &values[first * stride..];
             let part = Source { values, count: (columns - first).min(out.len() / panel * PANEL), ..source };
-            part.pack_right(0, out.as_chunks_mut().0);
+            part.pack_right(out.as_chunks_mut().0);
         };
         if words.len() <= PIECE {
             pack((0, &mut words));

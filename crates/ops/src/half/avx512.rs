@@ -11,9 +11,10 @@ use std::arch::x86_64::{
 use std::mem::transmute;
 use std::sync::OnceLock;
 
-use super::{BLOCK, Columns, Edge, Groups, Left, PAIRS, PANEL, Right, Row, Source, Sums};
+use super::{BLOCK, Columns, Edge, Left, PAIRS, PANEL, Right, Row, Source, Sums};
 
 /// Whether this processor has the instructions of all functions here.
+#[inline]
 pub fn is_there() -> bool {
     static THERE: OnceLock<bool> = OnceLock::new();
     *THERE.get_or_init(|| {
@@ -24,6 +25,7 @@ pub fn is_there() -> bool {
     })
 }
 
+#[inline]
 fn check() {
     assert!(is_there(), "this processor computes in bf16");
 }
@@ -58,25 +60,18 @@ pub fn pack_pairs(lines: [Option<&[f32]>; 2], rectified: bool, out: &mut [u32]) 
     unsafe { pairs(lines, rectified, out) }
 }
 
-/// As [`Source::pack_left`], for rows from `first` on of `rows`.
-pub fn pack_left(source: &Source, first: usize, rows: usize, out: &mut [Row]) {
+/// As [`Source::pack_left`].
+pub fn pack_left(source: &Source, out: &mut [Row]) {
     check();
     // SAFETY: the processor has the instructions.
-    unsafe { left(source, first, rows, out) }
+    unsafe { left(source, out) }
 }
 
-/// As [`Source::pack_right`], for columns from `first` on.
-pub fn pack_right(source: &Source, first: usize, out: &mut [Columns]) {
+/// As [`Source::pack_right`].
+pub fn pack_right(source: &Source, out: &mut [Columns]) {
     check();
     // SAFETY: the processor has the instructions.
-    unsafe { right(source, first, out) }
-}
-
-/// As [`Groups::pack_rows`].
-pub fn pack_rows(groups: &Groups, out: &mut [Row]) {
-    check();
-    // SAFETY: the processor has the instructions.
-    unsafe { rows(groups, out) }
+    unsafe { right(source, out) }
 }
 
 #[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
@@ -108,12 +103,28 @@ fn kernel<const ROWS: usize, const VECTORS: usize>(left: &Left, row: usize, pane
 
 #[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
 fn finish(edge: Edge, sums: &[f32], out: &mut [f32]) {
+    // Whole vectors first: for loops over few values the preparations take longer than the values.
+    let (vectors, rest) = out.as_chunks_mut::<PAIRS>();
+    let whole = vectors.len() * PAIRS;
+    for (i, (out, sums)) in vectors.iter_mut().zip(sums.as_chunks::<PAIRS>().0).enumerate() {
+        apply(edge, i * PAIRS, sums, out);
+    }
+    if !rest.is_empty() {
+        apply(edge, whole, &sums[whole..], rest);
+    }
+}
+
+/// The edge from value `first` of a row on.
+#[inline]
+#[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
+fn apply(edge: Edge, first: usize, sums: &[f32], out: &mut [f32]) {
     let pairs = out.iter_mut().zip(sums);
     match edge {
         Edge::Write => pairs.for_each(|(out, sum)| *out = *sum),
         Edge::Add => pairs.for_each(|(out, sum)| *out += sum),
         Edge::Bias(bias) => pairs.for_each(|(out, sum)| *out = sum + bias),
         Edge::Mask(mask) => {
+            let mask = &mask[first..];
             pairs.zip(mask).for_each(|((out, sum), mask)| *out = if *mask > 0.0 { *sum } else { 0.0 });
         }
     }
@@ -142,10 +153,9 @@ fn pairs(lines: [Option<&[f32]>; 2], rectified: bool, out: &mut [u32]) {
 }
 
 #[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
-fn left(source: &Source, first: usize, rows: usize, out: &mut [Row]) {
-    let count = source.packed_rows();
-    for (block, out) in out.chunks_exact_mut(rows).enumerate() {
-        for (i, out) in out[first..first + count].as_chunks_mut::<PAIRS>().0.iter_mut().enumerate() {
+fn left(source: &Source, out: &mut [Row]) {
+    for (block, out) in out.chunks_exact_mut(source.packed_rows()).enumerate() {
+        for (i, out) in out.as_chunks_mut::<PAIRS>().0.iter_mut().enumerate() {
             let square = square(source, i * PAIRS, block * BLOCK, true);
             out.iter_mut().zip(square).for_each(|(out, row)| put_words(row, out));
         }
@@ -153,28 +163,15 @@ fn left(source: &Source, first: usize, rows: usize, out: &mut [Row]) {
 }
 
 #[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
-fn right(source: &Source, first: usize, out: &mut [Columns]) {
+fn right(source: &Source, out: &mut [Columns]) {
     let blocks = source.blocks();
-    let (panels, _) = out.as_chunks_mut::<PAIRS>();
-    for column in (0..source.count).step_by(PAIRS) {
-        let (panel, half) = ((first + column) / PANEL, (first + column) % PANEL / PAIRS);
-        for (block, out) in panels[panel * blocks..][..blocks].iter_mut().enumerate() {
-            let square = square(source, column, block * BLOCK, false);
+    for (i, out) in out.as_chunks_mut::<PAIRS>().0.iter_mut().enumerate() {
+        let (panel, block) = (i / blocks, i % blocks);
+        for half in 0..PANEL / PAIRS {
+            let square = square(source, panel * PANEL + half * PAIRS, block * BLOCK, false);
             for (out, row) in out.iter_mut().zip(square) {
                 put_words(row, &mut out.as_chunks_mut().0[half]);
             }
-        }
-    }
-}
-
-#[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
-fn rows(groups: &Groups, out: &mut [Row]) {
-    let zero = [0.0; PAIRS];
-    for (block, out) in out.chunks_exact_mut(groups.rows).enumerate() {
-        let [a, b] = [2 * block, 2 * block + 1].map(|group| groups.group(group));
-        for (i, out) in out.iter_mut().enumerate() {
-            let [a, b] = [a, b].map(|group| line(group.map_or(&zero, |group| &group[i]), 0, 1, PAIRS));
-            put_words(consecutive(a, b), out);
         }
     }
 }

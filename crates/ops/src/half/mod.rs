@@ -19,7 +19,7 @@ mod amx;
 #[cfg(target_arch = "x86_64")]
 mod avx512;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 
 use std::sync::OnceLock;
 
@@ -143,15 +143,10 @@ impl Source<'_> {
 
     /// Packs rows `[blocks][packed_rows][16]`.
     pub fn pack_left(&self, out: &mut [Row]) {
-        self.pack_rows(0, self.packed_rows(), out);
-    }
-
-    /// Packs rows from `first` on of a left factor of `rows` rows, `[blocks][rows][16]`.
-    pub fn pack_rows(&self, first: usize, rows: usize, out: &mut [Row]) {
         self.check();
-        assert!(out.len() == self.blocks() * rows && first + self.packed_rows() <= rows);
+        assert_eq!(out.len(), self.blocks() * self.packed_rows());
         #[cfg(target_arch = "x86_64")]
-        avx512::pack_left(self, first, rows, out);
+        avx512::pack_left(self, out);
     }
 
     /// Words of the packed right factor.
@@ -159,62 +154,12 @@ impl Source<'_> {
         self.count.div_ceil(PANEL) * PANEL * self.blocks() * PAIRS
     }
 
-    /// Packs columns `[panels][blocks · 16][32]`, those from `first` on, which is a multiple of 16. Columns of the last panel
-    /// beyond the next multiple of 16 stay as they are.
-    pub fn pack_right(&self, first: usize, out: &mut [Columns]) {
-        self.check();
-        assert!(first.is_multiple_of(PAIRS));
-        assert!(out.len() >= (first + self.count).div_ceil(PANEL) * self.blocks() * PAIRS);
-        #[cfg(target_arch = "x86_64")]
-        avx512::pack_right(self, first, out);
-    }
-}
-
-/// A matrix `[rows][groups of 16 columns]` in f32 that is stored group after group, `[groups][stride][16]`.
-#[derive(Clone, Copy)]
-pub struct Groups<'a> {
-    /// Values.
-    pub values: &'a [[f32; PAIRS]],
-    /// Rows from one group to the next.
-    pub stride: usize,
-    /// How many rows.
-    pub rows: usize,
-}
-
-impl Groups<'_> {
-    fn count(&self) -> usize {
-        self.values.len() / self.stride
-    }
-
-    fn group(&self, i: usize) -> Option<&[[f32; PAIRS]]> {
-        (i < self.count()).then(|| &self.values[i * self.stride..][..self.rows])
-    }
-
-    /// Blocks of k where the rows are k.
-    pub fn blocks_of_rows(&self) -> usize {
-        self.rows.div_ceil(BLOCK)
-    }
-
-    /// The left factor `[blocks of columns][rows][16]`.
-    pub fn pack_rows(&self, out: &mut [Row]) {
-        assert_eq!(out.len(), self.count().div_ceil(2) * self.rows);
-        #[cfg(target_arch = "x86_64")]
-        avx512::pack_rows(self, out);
-    }
-
-    fn source(&self, group: usize) -> Source<'_> {
-        let values = self.values[group * self.stride..].as_flattened();
-        Source { values, stride: 1, inner: PAIRS, count: PAIRS, depth: self.rows }
-    }
-
-    /// The transpose as the left factor `[blocks of rows][columns][16]`.
-    pub fn pack_transposed(&self, out: &mut [Row]) {
-        (0..self.count()).for_each(|i| self.source(i).pack_rows(i * PAIRS, self.count() * PAIRS, out));
-    }
-
-    /// The right factor whose k are the rows, `[panels][blocks of rows · 16][32]`.
+    /// Packs columns `[panels][blocks · 16][32]`.
     pub fn pack_right(&self, out: &mut [Columns]) {
-        (0..self.count()).for_each(|i| self.source(i).pack_right(i * PAIRS, out));
+        self.check();
+        assert_eq!(out.len() * PANEL, self.words_right());
+        #[cfg(target_arch = "x86_64")]
+        avx512::pack_right(self, out);
     }
 }
 

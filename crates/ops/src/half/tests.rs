@@ -29,7 +29,7 @@ fn nearest(x: f32) -> f32 {
 }
 
 /// The units that can be tried here.
-fn units() -> Vec<Unit> {
+pub fn units() -> Vec<Unit> {
     let Some(best) = unit() else {
         println!("skipped: this processor has no instructions for bf16 (AVX512-BF16)");
         return Vec::new();

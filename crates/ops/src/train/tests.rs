@@ -1,7 +1,9 @@
 //! The operators against Burn's in f64, forward and backward, at sizes that reach the corners: channels that fill no
 //! group, tiles and blocks that overhang, single rows.
 
+use super::windows::Windows;
 use super::*;
+use crate::half::tests::units;
 use crate::tests::uniform as random;
 use crate::{Rope, bilinear, host, layers, linear_gelu, plain_attention, rotary_attention};
 use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
@@ -112,6 +114,47 @@ fn convolutions_of_three_taps_equal_burns() {
                 format!("{batch}×{inputs}→{outputs} at {height}×{width}, stride {stride}, {rectified}");
             let layer = layer.init(&Device::flex().autodiff());
             check(&what, layer, [batch, inputs, height, width], |l, x| layers::conv2d(l, x, rectified));
+        }
+    }
+}
+
+/// Processors with tiles take windows for stride 1, too. Here every unit does, forward and backward.
+#[test]
+fn windows_equal_burns_with_every_unit() {
+    let sizes = [[1, 1, 1, 1, 1], [2, 5, 7, 2, 3], [1, 33, 48, 9, 13], [2, 20, 40, 18, 70]];
+    for ([batch, inputs, outputs, height, width], stride) in
+        sizes.into_iter().flat_map(|size| [1, 2].map(|stride| (size, stride)))
+    {
+        for (unit, rectified) in units().into_iter().flat_map(|unit| [false, true].map(|rectified| (unit, rectified))) {
+            let what = format!("{unit:?}: {batch}×{inputs}→{outputs} at {height}×{width}, {stride}, {rectified}");
+            let windows = Windows { batch, inputs, outputs, height, width, stride, rectified, unit };
+            let pixels = height.div_ceil(stride) * width.div_ceil(stride);
+            let x = random(batch * inputs * height * width, 1);
+            let (weight, bias) = (random(outputs * inputs * 9, 2), random(outputs, 3));
+            let dy = random(batch * outputs * pixels, 4);
+            let gradients = windows.backward(&x, &weight, &dy, Wanted::ALL);
+            let got = [windows.forward(&x, &weight, Some(&bias))]
+                .into_iter()
+                .chain([gradients.input, gradients.weight, gradients.bias].into_iter().flatten());
+
+            let exact = |values: &[f32], shape| -> Tensor<4> {
+                let data = TensorData::new(values.to_vec(), shape);
+                Tensor::<4>::from_data(data, &Device::flex().autodiff()).cast(FloatDType::F64).require_grad()
+            };
+            let image = exact(&x, [batch, inputs, height, width]);
+            let filters = exact(&weight, [outputs, inputs, 3, 3]);
+            let added = exact(&bias, [1, 1, 1, outputs]);
+            let read = if rectified { burn::tensor::activation::relu(image.clone()) } else { image.clone() };
+            let options = burn::tensor::ops::ConvOptions::new([stride; 2], [1, 1], [1, 1], 1);
+            let y = burn::tensor::module::conv2d(read, filters.clone(), Some(added.clone().reshape([outputs])), options);
+            let shape = y.dims();
+            let all = (y.clone() * exact(&dy, shape)).sum().backward();
+            let of = |x: &Tensor<4>| values(x.grad(&all).expect("tracked"));
+            let expected = [values(y), of(&image), of(&filters), of(&added)];
+            for (i, (got, expected)) in got.zip(expected).enumerate() {
+                let got: Vec<f64> = got.into_iter().map(f64::from).collect();
+                assert_close(&format!("{what}, tensor {i}"), &got, &expected);
+            }
         }
     }
 }

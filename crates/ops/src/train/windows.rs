@@ -209,7 +209,7 @@ impl Windows {
             for (row, words) in right.chunks_exact_mut(size).take(count).enumerate() {
                 let values = &dy[(image * outputs * rows + first + row) * columns..];
                 let source = Source { values, stride: rows * columns, inner: 1, count: outputs, depth: columns };
-                source.pack_right(0, words.as_chunks_mut().0);
+                source.pack_right(words.as_chunks_mut().0);
             }
             let firsts: Vec<_> = (0..count)
                 .flat_map(|row| (0..blocks).map(move |block| row * size + block * PAIRS * PANEL))
