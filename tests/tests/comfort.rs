@@ -24,12 +24,19 @@ fn the_doctor_names_devices_weights_and_what_mends() {
         report["threads"].as_u64() > Some(0)
             && report["compiled_in"].as_array().is_some_and(|all| all.len() > 2)
     );
+    assert!(report["bf16"].is_null() || report["bf16"] == "AMX" || report["bf16"] == "AVX-512", "{report}");
     assert_eq!(report["weights"][0]["sound"], true);
     let missing = report["missing"].as_array().expect("a list");
     assert!(missing.iter().any(|m| m["mend"].as_str().is_some_and(|mend| mend.contains("fetch-weights"))));
 
     let said = succeed(snapsnap().current_dir(temporary.path()).arg("doctor"));
-    for part in ["compiled in", "--device auto takes", "the default weights: sound", "what could be better"] {
+    for part in [
+        "compiled in",
+        "\nbf16 ",
+        "--device auto takes",
+        "the default weights: sound",
+        "what could be better",
+    ] {
         assert!(said.contains(part), "{part}: {said}");
     }
     fs::write(temporary.path().join("bad.safetensors"), "no weights").expect("written");

@@ -9,8 +9,8 @@ use serde::{Deserialize, Serialize};
 pub use snapsnap_base::config::{ConfigError, Schema};
 
 pub use modes::{
-    Anchor, Body, ConfMode, Downsample, Fusion, HeadKind, Precision, PrecisionChoice, RegressorColor, RegressorStart, RotationFrame,
-    Upsample, WorldFrame,
+    Anchor, Body, ConfMode, Downsample, Fusion, HeadKind, Precision, PrecisionChoice, RegressorColor,
+    RegressorStart, RotationFrame, Upsample, WorldFrame,
 };
 
 /// Largest distance, in pixels, of an input pixel that influences an output pixel of the regressor, statistics aside. It is

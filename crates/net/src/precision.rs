@@ -7,8 +7,8 @@
 use burn::module::Param;
 use burn::tensor::{Device, FloatDType, Tensor};
 
-pub use crate::config::{Precision, PrecisionChoice};
 use crate::config::Config;
+pub use crate::config::{Precision, PrecisionChoice};
 use crate::names::{NamedMapper, Path, map_named};
 use crate::network::PointPredictor;
 

@@ -4,8 +4,8 @@
 use burn::module::Param;
 use burn::nn;
 use burn::nn::conv::{Conv2d, ConvTranspose2d};
-use burn::tensor::{FloatDType, Tensor};
 use burn::tensor::activation::relu;
+use burn::tensor::{FloatDType, Tensor};
 
 use crate::buffers::give;
 use crate::op::{self, Kept, Kernel};

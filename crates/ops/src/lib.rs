@@ -68,7 +68,14 @@ pub fn in_f32<const D: usize>(x: Tensor<D>, compute: impl FnOnce(Tensor<D>) -> T
 
 /// softmax(rope(q) · rope(k)ᵀ / √head_dim) · v, heads side by side in the channels: `q` `[B, N, C]`, `k` and `v`
 /// `[B, M, C]` → `[B, N, C]`; both sides share one grid, hence one table.
-pub fn rotary_attention(q: Tensor<3>, k: Tensor<3>, v: Tensor<3>, rope: &Rope, heads: usize, half: bool) -> Tensor<3> {
+pub fn rotary_attention(
+    q: Tensor<3>,
+    k: Tensor<3>,
+    v: Tensor<3>,
+    rope: &Rope,
+    heads: usize,
+    half: bool,
+) -> Tensor<3> {
     if is_trained_fast(&q) {
         return tracked::apart([q, k, v], rope, heads, half);
     }

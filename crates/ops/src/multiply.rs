@@ -26,7 +26,11 @@ impl<'a> Right<'a> {
         }
     }
 
-    pub(crate) fn packed(unit: Unit, [depth, columns]: [usize; 2], (values, [stride, inner]): Matrix) -> Self {
+    pub(crate) fn packed(
+        unit: Unit,
+        [depth, columns]: [usize; 2],
+        (values, [stride, inner]): Matrix,
+    ) -> Self {
         /// Words per task.
         const PIECE: usize = 32 * 1024;
         let source = Source { values, stride, inner, count: columns, depth };

@@ -34,11 +34,21 @@ pub fn orthogonalised(matrix: Vec<f32>, [rows, columns]: [usize; 2]) -> Vec<f32>
         square.iter_mut().zip(&gram).for_each(|(s, g)| *s = b * g + c * *s);
         if is_tall {
             // The transpose of (square · x), since square is symmetric: xᵀ · square, row by row as it is stored.
-            Multiply { size: [n, m, m], lhs: (&x, [1, m]), rhs: &Right::Plain((&square, [1, m])), add: false }
-                .write(&mut next, m);
+            Multiply {
+                size: [n, m, m],
+                lhs: (&x, [1, m]),
+                rhs: &Right::Plain((&square, [1, m])),
+                add: false,
+            }
+            .write(&mut next, m);
         } else {
-            Multiply { size: [m, n, m], lhs: (&square, [1, m]), rhs: &Right::Plain((&x, [1, n])), add: false }
-                .write(&mut next, n);
+            Multiply {
+                size: [m, n, m],
+                lhs: (&square, [1, m]),
+                rhs: &Right::Plain((&x, [1, n])),
+                add: false,
+            }
+            .write(&mut next, n);
         }
         x.iter_mut().zip(&next).for_each(|(x, next)| *x = a * *x + next);
     }

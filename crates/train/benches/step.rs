@@ -12,8 +12,8 @@ use burn::module::{Module, Param, ParamGroup, ParamId};
 use burn::optim::GradientsParams;
 use burn::tensor::{Device, Distribution, Tensor};
 use snapsnap_base::config::Schema;
-use snapsnap_net::precision::Precision;
 use snapsnap_net::network::{Grid, Input, PointPredictor};
+use snapsnap_net::precision::Precision;
 use snapsnap_net::regressor::Statistics;
 use snapsnap_net::weights::{NamedVisitor, Path, random_predictor, random_regressors, visit_named};
 use snapsnap_train::config::TrainConfig;
@@ -99,7 +99,8 @@ fn run(seconds: f64, side: usize, batch: usize) {
     let threads = rayon::current_num_threads();
 
     let channels = config.network.input_channels();
-    let images = Tensor::<4>::random([2 * batch, channels, side, side], Distribution::Uniform(-1.0, 1.0), &device);
+    let images =
+        Tensor::<4>::random([2 * batch, channels, side, side], Distribution::Uniform(-1.0, 1.0), &device);
     // Layers before the first trained one have no backward pass.
     for (what, trained) in [
         ("all trained", ""),
@@ -125,7 +126,11 @@ fn run(seconds: f64, side: usize, batch: usize) {
             }
             (forward, start.elapsed() - forward)
         });
-        println!("predictor, {}, {what}, batch {batch}, {side}², {threads} threads: {time}{}", precision.name(), peak());
+        println!(
+            "predictor, {}, {what}, batch {batch}, {side}², {threads} threads: {time}{}",
+            precision.name(),
+            peak()
+        );
     }
 
     if asked_for("predictor") {

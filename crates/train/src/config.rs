@@ -6,7 +6,9 @@ use serde::{Deserialize, Serialize};
 use snapsnap_base::config::outside;
 use snapsnap_data::sample::SampleConfig;
 use snapsnap_eval::lpips::MIN_SIDE;
-use snapsnap_net::config::{ConfMode, Config, ModeConfig, NetworkConfig, Precision, PrecisionChoice, RegressorConfig, Schema};
+use snapsnap_net::config::{
+    ConfMode, Config, ModeConfig, NetworkConfig, Precision, PrecisionChoice, RegressorConfig, Schema,
+};
 
 use crate::optimizer::OptimizerConfig;
 use crate::schedule::Schedule;

@@ -130,6 +130,32 @@ fn perceptual_distance_is_part_of_the_last_steps() {
     assert!(said.contains("stage2.lpips"), "{said}");
 }
 
+/// `auto` is bf16 where the processor has it. The run's config and its weights say so, and `reconstruct` does the same.
+#[test]
+fn automatic_precision_is_that_of_the_processor() {
+    let (temporary, config) = place();
+    let report = succeed(snapsnap().current_dir(temporary.path()).args(["doctor", "--json"]));
+    let report: serde_json::Value = serde_json::from_str(&report).expect("JSON");
+    let name = if report["bf16"].is_null() { "f32" } else { "bf16" };
+    println!("{name}");
+    let [one, two] = ["one", "two"].map(|run| temporary.path().join(run));
+    succeed(train(1, &config, &one).args(["--set=training.precision=auto", "--set=training.steps=3"]));
+    let written = fs::read_to_string(one.join("config.toml")).expect("a config");
+    assert!(written.contains(&format!("\nprecision = \"{name}\"")), "{written}");
+    let mut second = train(2, &config, &two);
+    second.args(["--set=training.precision=auto", "--set=training.steps=2"]).arg("--weights");
+    succeed(second.arg(one.join("last.safetensors")));
+    let view = |view: u32| people().join(format!("val/img/0000/{view}.png"));
+    let said = |precision: &str| {
+        let mut command = snapsnap();
+        command.current_dir(temporary.path()).arg("reconstruct").arg(view(0)).arg(view(2));
+        command.args(["--as-is", "--device=cpu", "-v", "--precision", precision, "--weights"]);
+        succeed(command.arg(two.join("last.safetensors")))
+    };
+    assert!(said("auto").contains(&format!("precision: {name}")));
+    assert!(said("f32").contains("precision: f32\n") && said("bf16").contains("precision: bf16, by "));
+}
+
 /// The loss scale of f16 is reduced within a few steps, which are skipped.
 #[test]
 fn validations_of_sixteen_bits_are_close_to_thirty_two() {

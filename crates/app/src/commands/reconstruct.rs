@@ -89,7 +89,10 @@ fn in_words(precision: Precision, device: &Device) -> String {
     if precision != Precision::Bf16 || !memory::is_cpu(device) {
         return name.into();
     }
-    format!("{name}, by {}", unit_of_cpu().unwrap_or("products in f32 of rounded weights: this processor has no others"))
+    format!(
+        "{name}, by {}",
+        unit_of_cpu().unwrap_or("products in f32 of rounded weights: this processor has no others")
+    )
 }
 
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {

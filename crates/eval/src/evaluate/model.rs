@@ -5,8 +5,8 @@ use std::time::{Duration, Instant};
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use snapsnap_data::photo::Mapping;
 use snapsnap_data::sample::{Handling, TestItem};
-use snapsnap_net::gaussians::placed;
 use snapsnap_net::config::PrecisionChoice;
+use snapsnap_net::gaussians::placed;
 use snapsnap_net::weights::{WeightFile, WeightsError};
 use snapsnap_net::{Reconstruction, Reconstructor};
 use snapsnap_ops::host;
@@ -48,7 +48,8 @@ impl Model {
     /// # Errors
     /// [`WeightsError`] if a part is absent or a value is not finite.
     pub fn load(weights: &WeightFile, device: &Device, variant: &Variant) -> Result<Self, WeightsError> {
-        let precision = variant.precision.unwrap_or(PrecisionChoice::Auto).of_weights(&weights.config, device);
+        let precision =
+            variant.precision.unwrap_or(PrecisionChoice::Auto).of_weights(&weights.config, device);
         let mut reconstructor = Reconstructor::load(weights, device)?.in_precision(precision);
         // Scenes of more than two photographs have no unseen sides.
         let is_pair = variant.inputs.as_ref().is_none_or(|inputs| inputs.len() <= 2);

@@ -27,7 +27,10 @@ impl SelfAttention {
 
     /// `[B, N, dim]` → `[B, N, dim]`.
     pub(crate) fn forward(&self, x: Tensor<3>, rope: &Rope) -> Tensor<3> {
-        linear(&self.proj, rotary_self_attention(linear(&self.qkv, x), rope, self.heads, is_half(&self.proj.weight)))
+        linear(
+            &self.proj,
+            rotary_self_attention(linear(&self.qkv, x), rope, self.heads, is_half(&self.proj.weight)),
+        )
     }
 }
 

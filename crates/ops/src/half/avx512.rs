@@ -3,10 +3,10 @@
 #![allow(unsafe_code, reason = "functions for processors that have these instructions, and loads of vectors")]
 
 use std::arch::x86_64::{
-    __m512, __m512bh, __m512i, _mm512_cvtepu16_epi32, _mm512_cvtne2ps_pbh, _mm512_cvtneps_pbh, _mm512_dpbf16_ps,
-    _mm512_loadu_ps, _mm512_loadu_si512, _mm512_max_ps, _mm512_or_si512, _mm512_set1_epi32, _mm512_setzero_ps, _mm512_shuffle_i32x4,
-    _mm512_slli_epi32, _mm512_storeu_ps, _mm512_storeu_si512, _mm512_unpackhi_epi32, _mm512_unpackhi_epi64,
-    _mm512_unpacklo_epi32, _mm512_unpacklo_epi64,
+    __m512, __m512bh, __m512i, _mm512_cvtepu16_epi32, _mm512_cvtne2ps_pbh, _mm512_cvtneps_pbh,
+    _mm512_dpbf16_ps, _mm512_loadu_ps, _mm512_loadu_si512, _mm512_max_ps, _mm512_or_si512, _mm512_set1_epi32,
+    _mm512_setzero_ps, _mm512_shuffle_i32x4, _mm512_slli_epi32, _mm512_storeu_ps, _mm512_storeu_si512,
+    _mm512_unpackhi_epi32, _mm512_unpackhi_epi64, _mm512_unpacklo_epi32, _mm512_unpacklo_epi64,
 };
 use std::mem::transmute;
 use std::sync::OnceLock;
@@ -191,7 +191,8 @@ fn square(source: &Source, first: usize, k: usize, by_row: bool) -> [__m512i; PA
             let line = |k: usize| line(values, k * inner, 1, if k < depth { count } else { 0 });
             *out = interleaved(line(2 * i), line(2 * i + 1));
         } else if i < count {
-            let line = |k: usize| line(values, i * stride + k * inner, inner, depth.saturating_sub(k).min(PAIRS));
+            let line =
+                |k: usize| line(values, i * stride + k * inner, inner, depth.saturating_sub(k).min(PAIRS));
             *out = consecutive(line(0), line(PAIRS));
         }
     }

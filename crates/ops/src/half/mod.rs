@@ -196,7 +196,13 @@ impl Edge<'_> {
 ///
 /// # Panics
 /// If a factor is smaller than the sizes say, or if the processor lacks the unit.
-pub fn product(unit: Unit, left: Left, right: Right, columns: usize, mut each: impl FnMut(usize, usize, &[f32])) {
+pub fn product(
+    unit: Unit,
+    left: Left,
+    right: Right,
+    columns: usize,
+    mut each: impl FnMut(usize, usize, &[f32]),
+) {
     let panels = columns.div_ceil(PANEL);
     assert!(left.rows > 0 && panels > 0 && left.starts.len() == right.starts.len());
     let reach = left.starts.iter().max().map_or(0, |start| start + left.rows + SLACK);

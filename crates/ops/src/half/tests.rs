@@ -43,11 +43,14 @@ pub fn units() -> Vec<Unit> {
 
 #[test]
 fn products_equal_those_of_rounded_factors() {
-    for [m, n, k] in [[1, 1, 1], [12, 32, 32], [13, 33, 33], [5, 70, 31], [150, 16, 64], [40, 100, 300], [3, 9, 1000]] {
+    for [m, n, k] in
+        [[1, 1, 1], [12, 32, 32], [13, 33, 33], [5, 70, 31], [150, 16, 64], [40, 100, 300], [3, 9, 1000]]
+    {
         // All four orders of storage, and one with gaps.
-        for (i, (ls, rs)) in [([1, k], [1, n]), ([m, 1], [1, n]), ([1, k], [k, 1]), ([m, 1], [k, 1]), ([2, 2 * k], [2 * k, 2])]
-            .into_iter()
-            .enumerate()
+        for (i, (ls, rs)) in
+            [([1, k], [1, n]), ([m, 1], [1, n]), ([1, k], [k, 1]), ([m, 1], [k, 1]), ([2, 2 * k], [2 * k, 2])]
+                .into_iter()
+                .enumerate()
         {
             let (lhs, rhs) = (uniform(2 * m * k, 1), uniform(2 * k * n, 2));
             for unit in units() {
@@ -55,7 +58,8 @@ fn products_equal_those_of_rounded_factors() {
                 for add in [false, true] {
                     let stride = n + 3;
                     let mut out = vec![0.5; m * stride];
-                    crate::multiply::Multiply { size: [m, n, k], lhs: (&lhs, ls), rhs: &right, add }.write(&mut out, stride);
+                    crate::multiply::Multiply { size: [m, n, k], lhs: (&lhs, ls), rhs: &right, add }
+                        .write(&mut out, stride);
                     for (row, out) in out.chunks_exact(stride).enumerate() {
                         for (column, got) in out.iter().enumerate() {
                             let inside = column < n;
@@ -65,7 +69,10 @@ fn products_equal_those_of_rounded_factors() {
                             });
                             let expected = terms.sum::<f64>() + if add || !inside { 0.5 } else { 0.0 };
                             let error = (f64::from(*got) - expected).abs();
-                            assert!(error < 2e-5, "{unit:?}, {m}×{n}×{k}, order {i}, {row}, {column}: {got}, {expected}");
+                            assert!(
+                                error < 2e-5,
+                                "{unit:?}, {m}×{n}×{k}, order {i}, {row}, {column}: {got}, {expected}"
+                            );
                         }
                     }
                 }
@@ -77,12 +84,22 @@ fn products_equal_those_of_rounded_factors() {
 /// Infinities stay, and what is no number stays so, whatever its bits.
 #[test]
 fn rounding_keeps_what_is_not_finite() {
-    let values = [f32::INFINITY, f32::NEG_INFINITY, f32::from_bits(0x7f80_0001), f32::from_bits(0xffff_ffff), f32::MAX];
+    let values = [
+        f32::INFINITY,
+        f32::NEG_INFINITY,
+        f32::from_bits(0x7f80_0001),
+        f32::from_bits(0xffff_ffff),
+        f32::MAX,
+    ];
     for unit in units() {
         let right = crate::multiply::Right::packed(unit, [1, 5], (&values, [1, 5]));
         let mut out = [0.0; 5];
-        crate::multiply::Multiply { size: [1, 5, 1], lhs: (&[1.0], [1, 1]), rhs: &right, add: false }.write(&mut out, 5);
-        assert!(out[0] == f32::INFINITY && out[1] == f32::NEG_INFINITY && out[2].is_nan() && out[3].is_nan(), "{out:?}");
+        crate::multiply::Multiply { size: [1, 5, 1], lhs: (&[1.0], [1, 1]), rhs: &right, add: false }
+            .write(&mut out, 5);
+        assert!(
+            out[0] == f32::INFINITY && out[1] == f32::NEG_INFINITY && out[2].is_nan() && out[3].is_nan(),
+            "{out:?}"
+        );
         // The largest float is nearer to infinity than to the largest bf16.
         assert_eq!(out[4], f32::INFINITY);
     }

@@ -214,7 +214,8 @@ impl WithSimd for Rotate<'_> {
             let (cos, sin) = (&self.rope[0][token * d..][..d], &self.rope[1][token * d..][..d]);
             // Two halves (row, column), each of two quarters whose members pair up.
             for half in [0, 2 * quarter] {
-                let [x, cos, sin] = [x, cos, sin].map(|values| values[half..half + 2 * quarter].split_at(quarter));
+                let [x, cos, sin] =
+                    [x, cos, sin].map(|values| values[half..half + 2 * quarter].split_at(quarter));
                 let (first, second) = out[half..half + 2 * quarter].split_at_mut(quarter);
                 for k in 0..quarter {
                     first[k] = (x.0[k] * cos.0[k] + x.1[k] * sin.0[k]) * self.factor;

@@ -97,7 +97,8 @@ impl Conv1x1 {
             if wanted.weight {
                 let mut read = take(if rectified { inputs * n } else { 0 });
                 let (x, [_, stride]) = self.read(&x[*first..], n, &mut read);
-                let (lhs, rhs) = ((&dy[*first..], [1, pixels]), Right::new(half, [n, inputs], (x, [stride, 1])));
+                let (lhs, rhs) =
+                    ((&dy[*first..], [1, pixels]), Right::new(half, [n, inputs], (x, [stride, 1])));
                 Multiply { size: [outputs, inputs, n], lhs, rhs: &rhs, add }.write(&mut weights, inputs);
                 drop(rhs);
                 give(read);

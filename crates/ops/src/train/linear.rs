@@ -73,7 +73,8 @@ impl Linear {
         let mut dz = before.map(|_| take(rows * outputs));
         let mut sums = vec![0.0; if wanted.bias { blocks * outputs } else { 0 }];
         let [column, row] = self.strides();
-        let transposed = wanted.input.then(|| Right::new(self.half, [outputs, inputs], (weight, [row, column])));
+        let transposed =
+            wanted.input.then(|| Right::new(self.half, [outputs, inputs], (weight, [row, column])));
         let results = parts(dx.as_deref_mut(), ROWS * inputs, blocks).into_par_iter();
         let changed = parts(dz.as_deref_mut(), ROWS * outputs, blocks);
         let totals = parts(wanted.bias.then_some(&mut sums), outputs, blocks);

@@ -125,8 +125,11 @@ fn windows_equal_burns_with_every_unit() {
     for ([batch, inputs, outputs, height, width], stride) in
         sizes.into_iter().flat_map(|size| [1, 2].map(|stride| (size, stride)))
     {
-        for (unit, rectified) in units().into_iter().flat_map(|unit| [false, true].map(|rectified| (unit, rectified))) {
-            let what = format!("{unit:?}: {batch}×{inputs}→{outputs} at {height}×{width}, {stride}, {rectified}");
+        for (unit, rectified) in
+            units().into_iter().flat_map(|unit| [false, true].map(|rectified| (unit, rectified)))
+        {
+            let what =
+                format!("{unit:?}: {batch}×{inputs}→{outputs} at {height}×{width}, {stride}, {rectified}");
             let windows = Windows { batch, inputs, outputs, height, width, stride, rectified, unit };
             let pixels = height.div_ceil(stride) * width.div_ceil(stride);
             let x = random(batch * inputs * height * width, 1);
@@ -146,7 +149,12 @@ fn windows_equal_burns_with_every_unit() {
             let added = exact(&bias, [1, 1, 1, outputs]);
             let read = if rectified { burn::tensor::activation::relu(image.clone()) } else { image.clone() };
             let options = burn::tensor::ops::ConvOptions::new([stride; 2], [1, 1], [1, 1], 1);
-            let y = burn::tensor::module::conv2d(read, filters.clone(), Some(added.clone().reshape([outputs])), options);
+            let y = burn::tensor::module::conv2d(
+                read,
+                filters.clone(),
+                Some(added.clone().reshape([outputs])),
+                options,
+            );
             let shape = y.dims();
             let all = (y.clone() * exact(&dy, shape)).sum().backward();
             let of = |x: &Tensor<4>| values(x.grad(&all).expect("tracked"));
@@ -162,7 +170,8 @@ fn windows_equal_burns_with_every_unit() {
 /// A channel that is positive in one corner only: eight taps never meet it together with a gradient.
 #[test]
 fn taps_that_see_nothing_have_no_gradient() {
-    let conv = Conv3x3 { batch: 1, inputs: 1, outputs: 1, height: 32, width: 32, rectified: true, half: false };
+    let conv =
+        Conv3x3 { batch: 1, inputs: 1, outputs: 1, height: 32, width: 32, rectified: true, half: false };
     let mut x = vec![-1.0; 1024];
     x[0] = 0.7;
     let mut dy = vec![0.0; 1024];
@@ -297,21 +306,31 @@ fn resizing_equals_burns() {
 }
 
 /// Results and gradients of all operators, at sizes of several tasks.
-fn everything() -> Vec<Vec<f32>> {
+fn everything(half: bool) -> Vec<Vec<f32>> {
     let mut all = Vec::new();
     let keep = |all: &mut Vec<_>, g: Gradients| all.extend([g.input, g.weight, g.bias].into_iter().flatten());
     let (x, dy) = (random(2 * 40 * 30 * 50, 1), random(2 * 72 * 30 * 50, 2));
     let (weight, bias) = (random(72 * 40 * 9, 3), random(72, 4));
-    let conv = Conv3x3 { batch: 2, inputs: 40, outputs: 72, height: 30, width: 50, rectified: true, half: false };
+    let conv = Conv3x3 { batch: 2, inputs: 40, outputs: 72, height: 30, width: 50, rectified: true, half };
     all.push(conv.forward(&x, &weight, Some(&bias)));
     keep(&mut all, conv.backward(&x, &weight, &dy, Wanted::ALL));
-    let conv = Conv1x1 { batch: 2, inputs: 40, outputs: 72, pixels: 1500, rectified: true, half: false };
+    let (batch, inputs, outputs, height, width) = (2, 40, 72, 30, 50);
+    let conv = Unfolded { batch, inputs, outputs, height, width, stride: 2, rectified: true, half };
+    all.push(conv.forward(&x, &weight, Some(&bias)));
+    keep(&mut all, conv.backward(&x, &weight, &dy[..2 * 72 * 15 * 25], Wanted::ALL));
+    let conv = Conv1x1 { batch: 2, inputs: 40, outputs: 72, pixels: 1500, rectified: true, half };
     all.push(conv.forward(&x, &weight, Some(&bias)));
     keep(&mut all, conv.backward(&x, &weight, &dy, Wanted::ALL));
-    let linear = Linear { rows: 1500, inputs: 80, outputs: 72, transposed: false, half: false };
+    let linear = Linear { rows: 1500, inputs: 80, outputs: 72, transposed: false, half };
     let [result, before] = linear.forward_gelu(&x, &weight, Some(&bias));
     all.push(result);
     keep(&mut all, linear.backward(&x, &weight, Some(&before), &dy, Wanted::ALL));
+    let attention = Attention { batch: 2, queries: 150, keys: 150, heads: 2, head_dim: 8, half };
+    let tables = [&dy[..150 * 8], &dy[150 * 8..][..150 * 8]];
+    let tokens = Tokens::parts(&x, 16);
+    let (result, logarithms) = attention.forward(tokens, tables);
+    all.push(result);
+    all.push(attention.backward_parts(tokens, tables, &logarithms, &dy[..2 * 150 * 16]));
     let norm = LayerNorm { channels: 80, epsilon: 1e-6 };
     let (result, statistics) = norm.forward(&x, &weight[..80], &weight[..80]);
     all.push(result);
@@ -321,17 +340,20 @@ fn everything() -> Vec<Vec<f32>> {
 
 #[test]
 fn the_number_of_threads_changes_no_bit() {
-    let run = |threads: usize| {
+    let run = |threads: usize, half: bool| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads");
         let bits = |values: Vec<f32>| values.into_iter().map(f32::to_bits).collect::<Vec<_>>();
-        pool.install(everything).into_iter().map(bits).collect::<Vec<_>>()
+        pool.install(|| everything(half)).into_iter().map(bits).collect::<Vec<_>>()
     };
-    assert!(run(1) == run(3));
+    for half in [false, true] {
+        assert!(run(1, half) == run(3, half), "{half}");
+    }
 }
 
 #[test]
 fn only_wanted_gradients_are_found_and_they_are_the_same() {
-    let conv = Conv3x3 { batch: 1, inputs: 3, outputs: 5, height: 6, width: 7, rectified: false, half: false };
+    let conv =
+        Conv3x3 { batch: 1, inputs: 3, outputs: 5, height: 6, width: 7, rectified: false, half: false };
     let (x, weight, dy) = (random(3 * 42, 1), random(135, 2), random(5 * 42, 3));
     let all = conv.backward(&x, &weight, &dy, Wanted::ALL);
     for bits in 0..8 {

@@ -125,7 +125,8 @@ impl Windows {
             (0..3).map(read).filter(|(row, _)| row.is_multiple_of(stride)).map(|(row, t)| (row / stride, t))
         };
         let kind = |[i, j]: [usize; 2]| {
-            let taps = along(i).flat_map(|(row, ky)| along(j).map(move |(column, kx)| (3 * ky + kx, row, column)));
+            let taps =
+                along(i).flat_map(|(row, ky)| along(j).map(move |(column, kx)| (3 * ky + kx, row, column)));
             ([i, j], taps.collect())
         };
         let kinds = (0..stride).flat_map(|i| (0..stride).map(move |j| [i, j])).map(kind).collect();
@@ -156,7 +157,9 @@ impl Windows {
         let band = (BAND_WORDS / row).clamp(1, rows);
         let band = band.min((batch * rows).div_ceil(TASKS)).max(1);
         let bands: Vec<_> = (0..batch)
-            .flat_map(|image| (0..rows).step_by(band).map(move |first| (image, first, band.min(rows - first))))
+            .flat_map(|image| {
+                (0..rows).step_by(band).map(move |first| (image, first, band.min(rows - first)))
+            })
             .collect();
         let parts: Vec<_> =
             bands.par_chunks(bands.len().div_ceil(PARTS)).map(|bands| self.part(x, dy, bands)).collect();
@@ -208,7 +211,8 @@ impl Windows {
             let size = panels * blocks * PAIRS * PANEL;
             for (row, words) in right.chunks_exact_mut(size).take(count).enumerate() {
                 let values = &dy[(image * outputs * rows + first + row) * columns..];
-                let source = Source { values, stride: rows * columns, inner: 1, count: outputs, depth: columns };
+                let source =
+                    Source { values, stride: rows * columns, inner: 1, count: outputs, depth: columns };
                 source.pack_right(words.as_chunks_mut().0);
             }
             let firsts: Vec<_> = (0..count)
@@ -218,7 +222,9 @@ impl Windows {
             for (tap, sums) in sums.chunks_exact_mut(inputs * outputs).enumerate() {
                 let first = tap % 3 * read(count) + tap / 3;
                 let starts: Vec<_> = (0..count)
-                    .flat_map(|row| (0..blocks).map(move |block| ((first + stride * row) * blocks + block) * packed))
+                    .flat_map(|row| {
+                        (0..blocks).map(move |block| ((first + stride * row) * blocks + block) * packed)
+                    })
                     .collect();
                 let left = Left { values: left.as_chunks().0, starts: &starts, rows: inputs };
                 let edge = if i > 0 { Edge::Add } else { Edge::Write };
@@ -321,9 +327,9 @@ impl Pass<'_> {
                 } else {
                     let out = out.iter_mut().step_by(self.spread).zip(sums);
                     match self.mask {
-                        Some(mask) => out.zip(beside(mask).iter().step_by(self.spread)).for_each(
-                            |((out, sum), mask)| *out = if *mask > 0.0 { *sum } else { 0.0 },
-                        ),
+                        Some(mask) => out
+                            .zip(beside(mask).iter().step_by(self.spread))
+                            .for_each(|((out, sum), mask)| *out = if *mask > 0.0 { *sum } else { 0.0 }),
                         None => out.for_each(|(out, sum)| *out = *sum),
                     }
                 }
@@ -353,7 +359,10 @@ impl Pass<'_> {
                 half::pack_pairs(plane(2 * i), plane(2 * i + 1), self.rectified, &mut out[1..=width]);
                 if self.stride == 2 {
                     for (k, words) in words.chunks_exact_mut(half).enumerate() {
-                        words.iter_mut().zip(whole[k..].iter().step_by(2)).for_each(|(out, pair)| *out = *pair);
+                        words
+                            .iter_mut()
+                            .zip(whole[k..].iter().step_by(2))
+                            .for_each(|(out, pair)| *out = *pair);
                     }
                 }
             }
