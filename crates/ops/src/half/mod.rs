@@ -11,8 +11,10 @@
 //! Every element is one sum in one order, for any number of threads. The two kernels add in different orders. Both take
 //! subnormal numbers for 0.
 //!
-//! `unsafe` is needed to call functions for which the processor was asked, to read vectors and for the instructions of
-//! AMX, which are inline assembly. It is in this module's files only.
+//! `unsafe` is needed to call functions that use instructions which not every processor has, to read and write vectors, and
+//! for the instructions of AMX, which are inline assembly.
+
+#![cfg_attr(not(target_arch = "x86_64"), allow(unused, reason = "there is no unit"))]
 
 #[cfg(target_arch = "x86_64")]
 mod amx;
