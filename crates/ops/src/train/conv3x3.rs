@@ -66,8 +66,7 @@ impl Conv3x3 {
             back.run(dy, false, filters, None, self.rectified.then_some(x))
         });
         if wanted.weight && self.batch * self.height * self.width <= FEW_PIXELS {
-            let Self { batch, inputs, outputs, height, width, rectified, half } = *self;
-            let direct = Unfolded { batch, inputs, outputs, height, width, stride: 1, rectified, half };
+            let direct = self.unfolded();
             let gradients = direct.backward(x, weight, dy, Wanted { input: false, ..wanted });
             Gradients { input, ..gradients }
         } else if wanted.weight {
@@ -82,9 +81,13 @@ impl Conv3x3 {
 
     /// The same by tiles in bf16, which are faster than Winograd's method.
     fn windows(&self) -> Option<Windows> {
+        let unit = unit().filter(|unit| self.half && *unit == Unit::Amx)?;
+        Some(Windows { sizes: self.unfolded(), unit })
+    }
+
+    fn unfolded(&self) -> Unfolded {
         let Self { batch, inputs, outputs, height, width, rectified, half } = *self;
-        let unit = unit().filter(|unit| half && *unit == Unit::Amx)?;
-        Some(Windows { batch, inputs, outputs, height, width, stride: 1, rectified, unit })
+        Unfolded { batch, inputs, outputs, height, width, stride: 1, rectified, half }
     }
 
     /// Winograd's method with any filters; where `mask` is given and not positive, the result is 0.

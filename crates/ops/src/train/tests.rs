@@ -130,7 +130,8 @@ fn windows_equal_burns_with_every_unit() {
         {
             let what =
                 format!("{unit:?}: {batch}×{inputs}→{outputs} at {height}×{width}, {stride}, {rectified}");
-            let windows = Windows { batch, inputs, outputs, height, width, stride, rectified, unit };
+            let sizes = Unfolded { batch, inputs, outputs, height, width, stride, rectified, half: true };
+            let windows = Windows { sizes, unit };
             let pixels = height.div_ceil(stride) * width.div_ceil(stride);
             let x = random(batch * inputs * height * width, 1);
             let (weight, bias) = (random(outputs * inputs * 9, 2), random(outputs, 3));

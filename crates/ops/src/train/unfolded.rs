@@ -137,13 +137,11 @@ impl Unfolded {
 
     /// The same in bf16, if it is wanted and the processor can.
     fn windows(&self) -> Option<Windows> {
-        let Self { batch, inputs, outputs, height, width, stride, rectified, half } = *self;
-        let unit = unit().filter(|_| half)?;
-        Some(Windows { batch, inputs, outputs, height, width, stride, rectified, unit })
+        unit().filter(|_| self.half).map(|unit| Windows { sizes: *self, unit })
     }
 
     /// Rows and columns of the output.
-    fn size(&self) -> [usize; 2] {
+    pub(super) fn size(&self) -> [usize; 2] {
         [self.height.div_ceil(self.stride), self.width.div_ceil(self.stride)]
     }
 

@@ -8,7 +8,7 @@
 use rayon::prelude::*;
 
 use super::elements::{channel_sums, rectify};
-use super::{Gradients, Wanted, join};
+use super::{Gradients, Unfolded, Wanted, join};
 use crate::buffers::{give, give_words, take, take_words};
 use crate::half::{self, BLOCK, Edge, Left, PAIRS, PANEL, Right, SLACK, Source, Unit};
 use crate::wide::pieces;
@@ -22,23 +22,11 @@ const TASKS: usize = 8;
 /// Parts that the weight's gradient is summed in at most.
 const PARTS: usize = 16;
 
-/// Sizes of a convolution.
+/// A convolution and what computes it.
 #[derive(Debug, Clone, Copy)]
 pub struct Windows {
-    /// Images.
-    pub batch: usize,
-    /// Channels of the input.
-    pub inputs: usize,
-    /// Channels of the output.
-    pub outputs: usize,
-    /// Rows of the input.
-    pub height: usize,
-    /// Columns of the input.
-    pub width: usize,
-    /// Rows and columns of the input per row and column of the output: 1 or 2.
-    pub stride: usize,
-    /// Reads max(x, 0).
-    pub rectified: bool,
+    /// Sizes; the stride is 1 or 2.
+    pub sizes: Unfolded,
     /// What computes.
     pub unit: Unit,
 }
@@ -81,19 +69,19 @@ impl Windows {
     /// `x` `[B, inputs, H, W]`, `weight` `[outputs, inputs, 3, 3]`, `bias` `[outputs]` →
     /// `[B, outputs, ⌈H/stride⌉, ⌈W/stride⌉]`.
     pub fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>) -> Vec<f32> {
-        let Self { inputs, outputs, stride, .. } = *self;
+        let Unfolded { inputs, outputs, width, height, rectified, stride, .. } = self.sizes;
         let filters = Filters::new(weight, [outputs, inputs], [TAPS * inputs, TAPS]);
         // Column c of a line, which has a border of one, is the c/2-th of its half.
-        let half = (self.width + 2).div_ceil(2);
+        let half = (width + 2).div_ceil(2);
         let place = |c: usize| if stride == 2 { c % 2 * half + c / 2 } else { c };
         let taps = (0..TAPS).map(|tap| (tap, tap / 3, place(tap % 3))).collect();
-        let [rows, columns] = self.size();
+        let [rows, columns] = self.sizes.size();
         let pass = Pass {
             unit: self.unit,
             source: x,
             channels: inputs,
-            size: [self.height, self.width],
-            rectified: self.rectified,
+            size: [height, width],
+            rectified,
             stride,
             filters: &filters,
             kinds: vec![([0, 0], taps)],
@@ -112,12 +100,12 @@ impl Windows {
         Gradients {
             input: wanted.input.then(|| self.input_gradient(x, weight, dy)),
             weight: wanted.weight.then(|| self.weight_gradient(x, dy)),
-            bias: wanted.bias.then(|| channel_sums(dy, self.batch, self.outputs)),
+            bias: wanted.bias.then(|| channel_sums(dy, self.sizes.batch, self.sizes.outputs)),
         }
     }
 
     fn input_gradient(&self, x: &[f32], weight: &[f32], dy: &[f32]) -> Vec<f32> {
-        let Self { inputs, outputs, height, width, stride, .. } = *self;
+        let Unfolded { inputs, outputs, height, width, stride, rectified, .. } = self.sizes;
         let filters = Filters::new(weight, [inputs, outputs], [TAPS, TAPS * inputs]);
         // Tap t of pixel i reads row (i + 1 − t) / stride of dy, which is one later with its border.
         let along = |i: usize| {
@@ -134,7 +122,7 @@ impl Windows {
             unit: self.unit,
             source: dy,
             channels: outputs,
-            size: self.size(),
+            size: self.sizes.size(),
             rectified: false,
             stride: 1,
             filters: &filters,
@@ -142,7 +130,7 @@ impl Windows {
             spread: stride,
             result: [inputs, height, width],
             bias: None,
-            mask: self.rectified.then_some(x),
+            mask: rectified.then_some(x),
         };
         let out = pass.run();
         give_words(filters.words);
@@ -151,9 +139,9 @@ impl Windows {
 
     /// The images are cut into a fixed number of parts, whose sums are joined in their order.
     fn weight_gradient(&self, x: &[f32], dy: &[f32]) -> Vec<f32> {
-        let Self { batch, inputs, outputs, .. } = *self;
-        let [rows, columns] = self.size();
-        let row = columns.next_multiple_of(BLOCK) * (3 * inputs * self.stride + outputs) / 2;
+        let Unfolded { batch, inputs, outputs, stride, .. } = self.sizes;
+        let [rows, columns] = self.sizes.size();
+        let row = columns.next_multiple_of(BLOCK) * (3 * inputs * stride + outputs) / 2;
         let band = (BAND_WORDS / row).clamp(1, rows);
         let band = band.min((batch * rows).div_ceil(TASKS)).max(1);
         let bands: Vec<_> = (0..batch)
@@ -176,8 +164,8 @@ impl Windows {
 
     /// Sums `[9][inputs][outputs]` over bands of rows (image, first row, rows).
     fn part(&self, x: &[f32], dy: &[f32], bands: &[(usize, usize, usize)]) -> Vec<f32> {
-        let Self { inputs, outputs, height, width, stride, .. } = *self;
-        let [rows, columns] = self.size();
+        let Unfolded { inputs, outputs, height, width, stride, rectified, .. } = self.sizes;
+        let [rows, columns] = self.sizes.size();
         let blocks = columns.div_ceil(BLOCK);
         let (packed, panels) = (inputs.next_multiple_of(PAIRS), outputs.div_ceil(PANEL));
         let most = bands.iter().map(|(_, _, rows)| *rows).max().unwrap_or(0);
@@ -197,7 +185,7 @@ impl Windows {
                     if let Some(y) = y {
                         let x = &x[((image * inputs + c) * height + y) * width..][..width];
                         let line = &mut line[1..=width];
-                        if self.rectified { rectify(x, line) } else { line.copy_from_slice(x) }
+                        if rectified { rectify(x, line) } else { line.copy_from_slice(x) }
                     }
                 }
                 for kx in 0..3 {
@@ -236,11 +224,6 @@ impl Windows {
         give(lines);
         [left, right].into_iter().for_each(give_words);
         sums
-    }
-
-    /// Rows and columns of the output.
-    fn size(&self) -> [usize; 2] {
-        [self.height.div_ceil(self.stride), self.width.div_ceil(self.stride)]
     }
 }
 
