@@ -33,8 +33,8 @@ use failure::bail;
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
-/// Keeps free pages for ten seconds instead of ten milliseconds, after which they would be fetched and cleared again: a
-/// quarter of a training step's time.
+/// Keeps free pages for ten seconds instead of ten milliseconds. A training step needs them again, and the system
+/// would clear them first.
 fn keep_pages() {
     /// `mi_option_purge_delay` of mimalloc 2 and 3.
     const PURGE_DELAY: libmimalloc_sys::mi_option_t = 15;

@@ -83,14 +83,14 @@ fn build<'a>(name: &str, half: bool, s: &[usize], x: &'a [Vec<f32>]) -> [Run<'a>
         }
         "linear" => {
             let layer = Linear { rows: s[0], inputs: s[1], outputs: s[2], transposed: false, half };
-            let gelu = move || layer.forward_gelu(&x[0], &x[1], bias);
-            let before = (s[3] == 1).then(|| gelu()[1].clone());
+            let gelu = move || layer.forward_gelu(&x[0], &x[1], bias, true);
+            let before = (s[3] == 1).then(|| gelu().1).flatten();
             let activated = s[3] == 1;
             [
                 Box::new(move || {
                     if activated {
-                        let [y, before] = gelu();
-                        give(before);
+                        let (y, before) = gelu();
+                        before.into_iter().for_each(give);
                         vec![y]
                     } else {
                         vec![layer.forward(&x[0], &x[1], bias)]

@@ -116,7 +116,8 @@ trait Layer: std::fmt::Debug + Send + Sync + 'static {
     /// Values that the backward pass needs beside the input and the weight.
     type Kept: Send + 'static;
 
-    fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>) -> (Vec<f32>, Self::Kept);
+    /// `keep`: for a backward pass.
+    fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>, keep: bool) -> (Vec<f32>, Self::Kept);
 
     fn backward(&self, x: &[f32], weight: &[f32], kept: Self::Kept, dy: &[f32], wanted: Wanted) -> Gradients;
 }
@@ -126,7 +127,7 @@ macro_rules! keeps_nothing {
         $(impl Layer for $layer {
             type Kept = ();
 
-            fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>) -> (Vec<f32>, ()) {
+            fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>, _keep: bool) -> (Vec<f32>, ()) {
                 (<$layer>::forward(self, x, weight, bias), ())
             }
 
@@ -142,7 +143,7 @@ keeps_nothing!(Conv1x1, Conv3x3, Unfolded);
 impl Layer for Linear {
     type Kept = ();
 
-    fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>) -> (Vec<f32>, ()) {
+    fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>, _keep: bool) -> (Vec<f32>, ()) {
         (Self::forward(self, x, weight, bias), ())
     }
 
@@ -156,14 +157,28 @@ impl Layer for Linear {
 struct Gelu(Linear);
 
 impl Layer for Gelu {
-    type Kept = Vec<f32>;
+    /// The values before GELU, if kept.
+    type Kept = Option<Vec<f32>>;
 
-    fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>) -> (Vec<f32>, Vec<f32>) {
-        let [out, before] = self.0.forward_gelu(x, weight, bias);
-        (out, before)
+    fn forward(
+        &self,
+        x: &[f32],
+        weight: &[f32],
+        bias: Option<&[f32]>,
+        keep: bool,
+    ) -> (Vec<f32>, Option<Vec<f32>>) {
+        self.0.forward_gelu(x, weight, bias, keep)
     }
 
-    fn backward(&self, x: &[f32], weight: &[f32], before: Vec<f32>, dy: &[f32], wanted: Wanted) -> Gradients {
+    fn backward(
+        &self,
+        x: &[f32],
+        weight: &[f32],
+        before: Option<Vec<f32>>,
+        dy: &[f32],
+        wanted: Wanted,
+    ) -> Gradients {
+        let before = before.expect("kept by the forward pass");
         let gradients = self.0.backward(x, weight, Some(&before), dy, wanted);
         give(before);
         gradients
@@ -173,7 +188,13 @@ impl Layer for Gelu {
 impl Layer for LayerNorm {
     type Kept = Vec<Statistics>;
 
-    fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>) -> (Vec<f32>, Vec<Statistics>) {
+    fn forward(
+        &self,
+        x: &[f32],
+        weight: &[f32],
+        bias: Option<&[f32]>,
+        _keep: bool,
+    ) -> (Vec<f32>, Vec<Statistics>) {
         Self::forward(self, x, weight, bias.expect("the published norms have biases"))
     }
 
@@ -203,7 +224,7 @@ impl<L: Layer> Kernel for Operator<L> {
     }
 
     fn forward(&self, [x, weight, bias]: [&[f32]; 3], keep: bool) -> (Vec<f32>, Kept) {
-        let (out, kept) = self.layer.forward(x, weight, self.has_bias.then_some(bias));
+        let (out, kept) = self.layer.forward(x, weight, self.has_bias.then_some(bias), keep);
         let kept: Kept = if keep { Some(Box::new(kept)) } else { None };
         (out, kept)
     }

@@ -2,8 +2,8 @@
 //! (two views of 256²): `cargo bench --workspace --bench step`. `docs/step_pytorch.py` measures PyTorch.
 //!
 //! Arguments: seconds per measurement (20), side (256), batch (2); `tiny`, `default` or `full` for that folder of `configs`;
-//! `wide` for twice its widths; `bf16`; `whole` for no partly frozen networks; `predictor` or `regressor` for one network alone, so that the printed memory
-//! is its own.
+//! `wide` for twice the default's widths; `bf16`; `whole` for no partly frozen networks; `predictor` or `regressor` for
+//! one network alone, so that the printed memory is its own.
 
 use std::hint::black_box;
 use std::time::{Duration, Instant};
@@ -43,7 +43,7 @@ fn measure(seconds: f64, mut step: impl FnMut() -> (Duration, Duration)) -> Stri
 }
 
 fn main() {
-    // As the program does.
+    // Free pages are kept, as the program keeps them.
     #[allow(unsafe_code, reason = "a function of C")]
     unsafe {
         libmimalloc_sys::mi_option_set(15, 10_000);

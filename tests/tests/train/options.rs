@@ -138,6 +138,14 @@ fn automatic_precision_is_that_of_the_processor() {
     let report: serde_json::Value = serde_json::from_str(&report).expect("JSON");
     let name = if report["bf16"].is_null() { "f32" } else { "bf16" };
     println!("{name}");
+    // A device without bf16 keeps the others from it.
+    let both = temporary.path().join("both");
+    let mut command = snapsnap();
+    command.args(["train-stage1", "--device=cpu,ndarray", "--set=training.precision=auto"]);
+    command.args(["--set=training.steps=1", "--set=training.batch=2", "--config"]).arg(&config);
+    succeed(command.arg("--data").arg(people()).arg("-o").arg(&both));
+    let written = fs::read_to_string(both.join("config.toml")).expect("a config");
+    assert!(written.contains("\nprecision = \"f32\""), "{written}");
     let [one, two] = ["one", "two"].map(|run| temporary.path().join(run));
     succeed(train(1, &config, &one).args(["--set=training.precision=auto", "--set=training.steps=3"]));
     let written = fs::read_to_string(one.join("config.toml")).expect("a config");

@@ -5,7 +5,7 @@
 use std::arch::asm;
 use std::arch::x86_64::__cpuid_count;
 
-use super::{Left, PAIRS, PANEL, Right, SLACK, Sums};
+use super::{Left, PAIRS, PANEL, Right, SLACK, Sums, Unit, unit};
 
 /// Whether the processor has tiles for bf16, and Linux lets this process use them. Linux keeps the registers of tiles,
 /// 8 KiB per thread, only for processes that asked.
@@ -48,7 +48,11 @@ pub struct Tiles(());
 
 impl Tiles {
     /// Configures the tiles.
+    ///
+    /// # Panics
+    /// If there are none for this process.
     pub fn configured() -> Self {
+        assert_eq!(unit(), Some(Unit::Amx), "this processor has tiles");
         #[repr(align(64))]
         struct Config([u8; 64]);
         let mut config = Config([0; 64]);
@@ -58,7 +62,7 @@ impl Tiles {
             config.0[16 + 2 * tile] = 64;
             config.0[48 + tile] = 16;
         }
-        // SAFETY: only a processor with tiles has this unit, and the process has the permission.
+        // SAFETY: the processor has tiles, and the process has the permission.
         unsafe { asm!("ldtilecfg [{}]", in(reg) &raw const config, options(nostack, preserves_flags)) };
         Self(())
     }
@@ -71,8 +75,8 @@ impl Drop for Tiles {
     }
 }
 
-/// Sums of 32 rows from `row` on, in four tiles. The tiles must be configured.
-pub fn block(left: &Left, row: usize, panel: &Right, sums: &mut Sums) {
+/// Sums of 32 rows from `row` on, in four tiles, which are configured.
+pub fn block(_tiles: &Tiles, left: &Left, row: usize, panel: &Right, sums: &mut Sums) {
     let blocks = left.starts.len();
     assert!(blocks > 0 && panel.starts.len() == blocks);
     let last = left.starts.iter().max().map_or(0, |start| start + row + SLACK);

@@ -5,8 +5,9 @@
 use std::arch::x86_64::{
     __m512, __m512bh, __m512i, _mm512_cvtepu16_epi32, _mm512_cvtne2ps_pbh, _mm512_cvtneps_pbh,
     _mm512_dpbf16_ps, _mm512_loadu_ps, _mm512_loadu_si512, _mm512_max_ps, _mm512_or_si512, _mm512_set1_epi32,
-    _mm512_setzero_ps, _mm512_shuffle_i32x4, _mm512_slli_epi32, _mm512_storeu_ps, _mm512_storeu_si512,
-    _mm512_unpackhi_epi32, _mm512_unpackhi_epi64, _mm512_unpacklo_epi32, _mm512_unpacklo_epi64,
+    _mm512_setzero_ps, _mm512_setzero_si512, _mm512_shuffle_i32x4, _mm512_slli_epi32, _mm512_storeu_ps,
+    _mm512_storeu_si512, _mm512_unpackhi_epi32, _mm512_unpackhi_epi64, _mm512_unpacklo_epi32,
+    _mm512_unpacklo_epi64,
 };
 use std::mem::transmute;
 use std::sync::OnceLock;
@@ -82,7 +83,7 @@ fn kernel<const ROWS: usize, const VECTORS: usize>(left: &Left, row: usize, pane
         for pair in 0..PAIRS {
             let columns: &Columns =
                 panel.values[first + pair * panel.pair..].first_chunk().expect("the panel lies inside");
-            let mut right = [as_halves(_mm512_setzero_si()); VECTORS];
+            let mut right = [as_halves(_mm512_setzero_si512()); VECTORS];
             for (v, right) in right.iter_mut().enumerate() {
                 *right = as_halves(words(&columns.as_chunks().0[v]));
             }
@@ -183,7 +184,7 @@ fn square(source: &Source, first: usize, k: usize, by_row: bool) -> [__m512i; PA
     let Source { stride, inner, count, depth, .. } = *source;
     let (count, depth) = (count.saturating_sub(first).min(PAIRS), depth - k);
     let values = &source.values[(first * stride + k * inner).min(source.values.len())..];
-    let mut square = [_mm512_setzero_si(); PAIRS];
+    let mut square = [_mm512_setzero_si512(); PAIRS];
     // Whichever is contiguous is read in vectors.
     let along_rows = inner != 1 && stride == 1;
     for (i, out) in square.iter_mut().enumerate() {
@@ -260,12 +261,6 @@ fn transpose(rows: &mut [__m512i; PAIRS]) {
             }
         }
     }
-}
-
-#[inline]
-#[target_feature(enable = "avx512f")]
-fn _mm512_setzero_si() -> __m512i {
-    _mm512_set1_epi32(0)
 }
 
 #[inline]

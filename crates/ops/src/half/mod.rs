@@ -213,7 +213,7 @@ pub fn product(
     assert!(right.starts.iter().all(|start| start + reach <= right.values.len()), "panels lie inside");
     #[cfg(target_arch = "x86_64")]
     {
-        let _tiles = (unit == Unit::Amx).then(amx::Tiles::configured);
+        let tiles = (unit == Unit::Amx).then(amx::Tiles::configured);
         let mut sums: Sums = [[0.0; PANEL]; SLACK];
         for p in 0..panels {
             let count = (columns - p * PANEL).min(PANEL);
@@ -221,11 +221,11 @@ pub fn product(
             let mut row = 0;
             while row < left.rows {
                 let rows = unit.rows(left.rows - row);
-                match unit {
-                    Unit::Avx512 => avx512::block(&left, row, rows, count, &panel, &mut sums),
-                    Unit::Amx => amx::block(&left, row, &panel, &mut sums),
+                match (unit, &tiles) {
+                    (_, Some(tiles)) => amx::block(tiles, &left, row, &panel, &mut sums),
                     #[cfg(test)]
-                    Unit::Emulated => tests::block(&left, row, &panel, &mut sums),
+                    (Unit::Emulated, _) => tests::block(&left, row, &panel, &mut sums),
+                    _ => avx512::block(&left, row, rows, count, &panel, &mut sums),
                 }
                 for (i, sums) in sums[..rows.min(left.rows - row)].iter().enumerate() {
                     each(row + i, p * PANEL, &sums[..count]);

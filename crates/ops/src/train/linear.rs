@@ -42,19 +42,36 @@ impl Linear {
         out
     }
 
-    /// gelu(z) and z = x · weight + bias, which [`Linear::backward`] needs: `[rows, outputs]` each.
-    pub fn forward_gelu(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>) -> [Vec<f32>; 2] {
-        let [mut out, mut before] = [(); 2].map(|()| take(self.rows * self.outputs));
+    /// gelu(z), and, with `keep`, z = x · weight + bias, which [`Linear::backward`] needs: `[rows, outputs]` each.
+    pub fn forward_gelu(
+        &self,
+        x: &[f32],
+        weight: &[f32],
+        bias: Option<&[f32]>,
+        keep: bool,
+    ) -> (Vec<f32>, Option<Vec<f32>>) {
+        let (size, piece) = (self.rows * self.outputs, ROWS * self.outputs);
+        let (mut out, mut before) = (take(size), keep.then(|| take(size)));
         let (arch, weight) = (Arch::new(), self.factor(weight));
-        let tasks = out.par_chunks_mut(ROWS * self.outputs).zip(before.par_chunks_mut(ROWS * self.outputs));
-        tasks.zip(x.par_chunks(ROWS * self.inputs)).for_each(|((out, before), x)| {
-            self.product(x, &weight, bias, before);
-            arch.dispatch(
-                #[inline(always)]
-                || out.iter_mut().zip(before).for_each(|(out, z)| *out = gelu(*z)),
-            );
+        let kept = parts(before.as_deref_mut(), piece, self.rows.div_ceil(ROWS));
+        let tasks = out.par_chunks_mut(piece).zip(x.par_chunks(ROWS * self.inputs));
+        tasks.zip(kept).for_each(|((out, x), before)| match before {
+            Some(before) => {
+                self.product(x, &weight, bias, before);
+                arch.dispatch(
+                    #[inline(always)]
+                    || out.iter_mut().zip(before).for_each(|(out, z)| *out = gelu(*z)),
+                );
+            }
+            None => {
+                self.product(x, &weight, bias, out);
+                arch.dispatch(
+                    #[inline(always)]
+                    || out.iter_mut().for_each(|out| *out = gelu(*out)),
+                );
+            }
         });
-        [out, before]
+        (out, before)
     }
 
     /// Gradients from that of the output, `dy` `[rows, outputs]`. `before` has the values before GELU from

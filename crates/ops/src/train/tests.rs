@@ -323,9 +323,10 @@ fn everything(half: bool) -> Vec<Vec<f32>> {
     all.push(conv.forward(&x, &weight, Some(&bias)));
     keep(&mut all, conv.backward(&x, &weight, &dy, Wanted::ALL));
     let linear = Linear { rows: 1500, inputs: 80, outputs: 72, transposed: false, half };
-    let [result, before] = linear.forward_gelu(&x, &weight, Some(&bias));
+    let (result, before) = linear.forward_gelu(&x, &weight, Some(&bias), true);
+    assert_eq!(linear.forward_gelu(&x, &weight, Some(&bias), false), (result.clone(), None));
     all.push(result);
-    keep(&mut all, linear.backward(&x, &weight, Some(&before), &dy, Wanted::ALL));
+    keep(&mut all, linear.backward(&x, &weight, before.as_deref(), &dy, Wanted::ALL));
     let attention = Attention { batch: 2, queries: 150, keys: 150, heads: 2, head_dim: 8, half };
     let tables = [&dy[..150 * 8], &dy[150 * 8..][..150 * 8]];
     let tokens = Tokens::parts(&x, 16);

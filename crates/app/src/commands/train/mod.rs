@@ -151,7 +151,7 @@ impl<'a> Plan<'a> {
         if memory::is_cpu(&devices[0]) {
             memory::check("this training", least_memory(&config), "a smaller network or batch needs less")?;
         }
-        let precision = config.training.precision.of_training(&devices[0]);
+        let precision = config.training.precision.of_training(&devices);
         config.training.precision = precision.into();
         for (name, device) in arguments.device.split(',').zip(&devices) {
             if !device.supports_dtype(precision.dtype()) {
