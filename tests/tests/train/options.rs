@@ -142,7 +142,7 @@ fn automatic_precision_is_that_of_the_processor() {
     let both = temporary.path().join("both");
     let mut command = snapsnap();
     command.args(["train-stage1", "--device=cpu,ndarray", "--set=training.precision=auto"]);
-    command.args(["--set=training.steps=1", "--set=training.batch=2", "--config"]).arg(&config);
+    command.args(["--set=training.steps=3", "--set=training.batch=2", "--config"]).arg(&config);
     succeed(command.arg("--data").arg(people()).arg("-o").arg(&both));
     let written = fs::read_to_string(both.join("config.toml")).expect("a config");
     assert!(written.contains("\nprecision = \"f32\""), "{written}");
