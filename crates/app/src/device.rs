@@ -3,6 +3,7 @@
 use std::panic;
 use std::process::{Command, Stdio};
 use std::sync::OnceLock;
+use std::thread;
 
 use burn::tensor::{Device, DeviceKind, DeviceType};
 use serde::{Deserialize, Serialize};
@@ -45,6 +46,13 @@ pub fn choose(name: &str) -> Result<Device, Failure> {
             Err(unknown(name, &format!("not compiled in: build with --features {kind}")))
         }
         None => Err(unknown(name, "no such kind of device")),
+    }
+}
+
+/// Lists the adapters on another thread if [`choose`] will need them for `name`; it takes a tenth of a second.
+pub fn begin_search(name: &str) {
+    if name == "auto" {
+        thread::spawn(adapters);
     }
 }
 

@@ -3,7 +3,8 @@
 use std::time::{Duration, Instant};
 
 use burn::tensor::{Device, Tensor, TensorData};
-use snapsnap_ops::host;
+use rayon::prelude::*;
+use snapsnap_ops::{has_kernels, host};
 use snapsnap_splat::{Camera, Gaussians, RigidTransform};
 
 use crate::config::{Config, Downsample, WorldFrame};
@@ -243,12 +244,17 @@ impl Run<'_> {
         let heads = if net.views().len() == 4 { "heads (4)" } else { "heads (2)" };
         let maps = self.timed(heads, |_| net.heads(&decoded));
         self.timed("up-sampling", |_| {
-            let pasted = maps.into_iter().map(|(view, map)| {
+            let enlarge = |(view, map): (View, PointMap)| {
                 let mask = ((view as usize) < 2).then(|| masks.clone().narrow(0, view as usize, 1));
                 let map = net.finished(config, view, map, &window, mask.as_ref());
-                map.pasted(&config.network, view, &window, mask.as_ref())
-            });
-            let (points, conf): (Vec<_>, Vec<_>) = pasted.map(|m| (m.points, m.conf)).unzip();
+                let map = map.pasted(&config.network, view, &window, mask.as_ref());
+                (map.points, map.conf)
+            };
+            // On a CPU, each of these operations runs on one thread.
+            let (points, conf): (Vec<_>, Vec<_>) = match has_kernels(&masks) {
+                true => maps.into_par_iter().map(enlarge).unzip(),
+                false => maps.into_iter().map(enlarge).unzip(),
+            };
             PointMap { points: Tensor::cat(points, 0), conf: Tensor::cat(conf, 0) }
         })
     }

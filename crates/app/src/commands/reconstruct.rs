@@ -109,17 +109,12 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
         None => arguments.surface.must_be_unused("without --mesh there is no mesh to shape")?,
     };
     let config_path = check_paths(arguments, weights.path(), turntable.as_ref(), target.as_ref())?;
-    let since = Instant::now();
-    let device = device::choose(&arguments.device)?;
-    timed("finding the device", since);
-    memory::check_networks(&weights, &device)?;
-    if memory::is_cpu(&device) {
-        for path in [&arguments.front, &arguments.back] {
-            let [width, height] = picture::size(path)?;
-            let bytes = BYTES_PER_PIXEL * u64::from(width) * u64::from(height);
-            let what = format!("{}, {width}×{height},", path.display());
-            memory::check(&what, bytes, "make the picture smaller")?;
-        }
+    device::begin_search(&arguments.device);
+    for path in [&arguments.front, &arguments.back] {
+        let [width, height] = picture::size(path)?;
+        let bytes = BYTES_PER_PIXEL * u64::from(width) * u64::from(height);
+        let what = format!("{}, {width}×{height},", path.display());
+        memory::check(&what, bytes, "make the picture smaller")?;
     }
     let placement = match (arguments.as_is, config.mode.compat) {
         (true, _) => Placement::AsIs,
@@ -136,6 +131,10 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     }
     doubts.iter().for_each(|doubt| say::note(&format!("warning: {doubt}")));
     timed("photographs", since);
+    let since = Instant::now();
+    let device = device::choose(&arguments.device)?;
+    timed("finding the device", since);
+    memory::check_networks(&weights, &device)?;
 
     let progress = Progress::stages();
     progress.stage("loading weights");
