@@ -58,6 +58,7 @@ def rotate(x, cos, sin):
 class Attention(nn.Module):
     def __init__(self, crossed):
         super().__init__()
+        self.heads = HEADS
         widths = (WIDTH,) * 3 if crossed else (3 * WIDTH,)
         self.inputs = nn.ModuleList(nn.Linear(WIDTH, width) for width in widths)
         self.output = nn.Linear(WIDTH, WIDTH)
@@ -68,9 +69,9 @@ class Attention(nn.Module):
         else:
             q, k, v = (layer(t) for layer, t in zip(self.inputs, (x, y, y)))
         b, n, _ = x.shape
-        q, k, v = (t.view(b, n, HEADS, -1).transpose(1, 2) for t in (q, k, v))
+        q, k, v = (t.view(b, n, self.heads, -1).transpose(1, 2) for t in (q, k, v))
         out = functional.scaled_dot_product_attention(rotate(q, *table), rotate(k, *table), v)
-        return self.output(out.transpose(1, 2).reshape(b, n, WIDTH))
+        return self.output(out.transpose(1, 2).flatten(2))
 
 
 class Block(nn.Module):

@@ -1,10 +1,11 @@
-"""Time of the four DPT heads at full size in PyTorch, to compare with the line "heads (4)" of `snapsnap reconstruct -v`.
+"""Time of the point predictor of the published size in PyTorch, to compare with `snapsnap reconstruct -v`.
 
-Random weights, float32, inference mode, one image (batch 1): 512x512 pixels, 32x32 tokens of 1024, 768, 768 and 768
-channels, layer_dims 96/192/384/768, feature_dim 256, last_dim 128. The order of the 1x1 convolution and the enlargement
-in a fusion block is the published one (enlarge first); --commute swaps them as snapsnap does.
+Random weights, inference mode, two photographs of 512x512 pixels. Encoder: 24 blocks of width 1024. Decoders: 2 x 12 blocks of
+width 768. Heads: four, layer_dims 96/192/384/768, feature_dim 256, last_dim 128. --bf16 means torch.autocast("cpu",
+torch.bfloat16) with images in channels-last order. The order of the 1x1 convolution and the enlargement in a fusion block is
+the published one (enlarge first); --commute swaps them as snapsnap does.
 
-    taskset -c 2,3 python heads_pytorch.py --threads 2 --runs 5 [--commute]
+    python docs/published_pytorch.py --threads 2 --runs 5 [--bf16] [--commute]
 """
 
 import argparse
@@ -13,6 +14,8 @@ import time
 import torch
 from torch import nn
 from torch.nn.functional import interpolate, relu
+
+import step_pytorch
 
 
 def double(x):
@@ -69,22 +72,52 @@ class Head(nn.Module):
         return self.out4(relu(self.out2(double(self.out0(path)))))
 
 
+def blocks(width, crossed, count):
+    step_pytorch.WIDTH, step_pytorch.HEADS = width, width // 64
+    return nn.ModuleList(step_pytorch.Block(crossed) for _ in range(count))
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument("--bf16", action="store_true")
     parser.add_argument("--commute", action="store_true")
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
     torch.manual_seed(1)
-    with torch.inference_mode():
-        heads = [Head(arguments.commute).eval() for _ in range(4)]
-        maps = [torch.randn(1, c, 32, 32) for c in (1024, 768, 768, 768)]
+    order = torch.channels_last if arguments.bf16 else torch.contiguous_format
+    grid = (32, 32)
+    table = step_pytorch.tables(*grid, 64)
+    with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=arguments.bf16):
+        patches = nn.Conv2d(3, 1024, 16, 16)
+        encoder, embed = blocks(1024, False, 24), nn.Linear(1024, 768)
+        norm, last = nn.LayerNorm(1024, eps=1e-6), nn.LayerNorm(768, eps=1e-6)
+        decoders = [blocks(768, True, 12) for _ in range(2)]
+        heads = [Head(arguments.commute).eval().to(memory_format=order) for _ in range(4)]
+        images = torch.randn(2, 3, 512, 512).contiguous(memory_format=order)
         for run in range(arguments.runs):
-            begin = time.perf_counter()
-            for head in heads:
-                head(maps)
-            print(f"run {run}: heads (4) {1e3 * (time.perf_counter() - begin):.0f} ms", flush=True)
+            times = [time.perf_counter()]
+            x = patches(images).flatten(2).transpose(1, 2)
+            for block in encoder:
+                x = block(x, None, table)
+            x = norm(x)
+            times.append(time.perf_counter())
+            pairs = [x.chunk(2)]
+            pairs.append(tuple(embed(x) for x in pairs[0]))
+            for first, second in zip(*decoders):
+                x, y = pairs[-1]
+                pairs.append((first(x, y, table), second(y, x, table)))
+            pairs.append(tuple(last(x) for x in pairs.pop()))
+            times.append(time.perf_counter())
+            sides = [[pairs[i][side] for i in (0, 7, 10, 13)] for side in (0, 1)]
+            fused = [(a + b) * 0.5 for a, b in zip(*sides)]
+            for head, maps in zip(heads, (*sides, fused, fused)):
+                head([m.transpose(1, 2).unflatten(2, grid) for m in maps])
+            times.append(time.perf_counter())
+            parts = [1e3 * (b - a) for a, b in zip(times, times[1:])]
+            names = ("encoder", "decoders", "heads (4)")
+            print(f"run {run}:", ", ".join(f"{n} {t:.0f}" for n, t in zip(names, parts)) + f", all {sum(parts):.0f} ms", flush=True)
 
 
 if __name__ == "__main__":
