@@ -3,6 +3,7 @@
 // These modules use interfaces of Linux.
 #[cfg(target_os = "linux")]
 pub mod browser;
+pub mod character;
 #[cfg(target_os = "linux")]
 pub mod fuzz;
 pub mod ply;

@@ -2,6 +2,7 @@
 
 pub mod dataset;
 mod jitter;
+mod light;
 pub mod photo;
 pub mod prepare;
 mod resize;
@@ -12,3 +13,4 @@ pub mod smplx;
 mod testing;
 
 pub use jitter::{Jitter, JitterConfig};
+pub use light::LightConfig;

@@ -11,12 +11,13 @@ use crate::JitterConfig;
 use crate::dataset::{
     Arrangement, Description, Drawn, Folder, Layout, MAX_RESOLUTION, MAX_VIEWS, Made, Split,
 };
+use crate::light::LightConfig;
 use snapsnap_base::FileError;
 use snapsnap_base::config::Schema;
 use snapsnap_base::config::outside;
 use snapsnap_base::random::stream;
 use snapsnap_mesh::mesh::Mesh;
-use snapsnap_mesh::view::{Lights, Renderer, ViewOptions};
+use snapsnap_mesh::view::{Renderer, ViewOptions};
 
 /// Config of a data set: `configs/data/*.toml`.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -26,6 +27,8 @@ pub struct DataConfig {
     pub views: ViewsConfig,
     /// Deviations of cameras from the training orbit.
     pub jitter: JitterConfig,
+    /// Light.
+    pub light: LightConfig,
 }
 
 /// The section `[views]`.
@@ -93,6 +96,9 @@ impl Schema for DataConfig {
             let message = "is \"groups\", which the authors' layout does not support".into();
             return Some(("views.arrangement".into(), message));
         }
+        if let Some((key, message)) = self.light.problem() {
+            return Some((format!("light.{key}"), message));
+        }
         self.jitter.problem().map(|(key, message)| (format!("jitter.{key}"), message))
     }
 }
@@ -109,7 +115,11 @@ impl DataConfig {
             high_resolution,
             pixel_centre: if layout == Layout::Authors { 0.0 } else { 0.5 },
             source: source.to_owned(),
-            drawn: Some(Drawn { samples: self.views.samples_per_axis, jitter: self.jitter.clone() }),
+            drawn: Some(Drawn {
+                samples: self.views.samples_per_axis,
+                jitter: self.jitter.clone(),
+                light: self.light.clone(),
+            }),
         }
     }
 
@@ -163,9 +173,14 @@ impl DataConfig {
     pub fn add(&self, folder: &Folder, subject: &Subject, mesh: &Mesh) -> Result<Made, FileError> {
         let Subject { split, name, identity, yaw_degrees, origin } = *subject;
         let renderer = Renderer::new(mesh).map_err(|e| FileError::unsuitable(origin, e))?;
-        let options = ViewOptions { samples: self.views.samples_per_axis, lights: Lights::default() };
         let cameras = self.cameras(yaw_degrees, identity);
-        folder.write_subject(split, name, origin, &cameras, |camera| renderer.draw(camera, &options))
+        let light = self.light.draw(identity);
+        let around = |camera: &Camera| camera.centre().x.atan2(camera.centre().z).to_degrees();
+        let first = around(&cameras[0]);
+        folder.write_subject(split, name, origin, &cameras, |camera| {
+            let light = self.light.seen_from(&light, around(camera), first);
+            renderer.draw(camera, &ViewOptions { samples: self.views.samples_per_axis, light })
+        })
     }
 }
 

@@ -120,8 +120,8 @@ impl Mesh {
     }
 
     /// Merges positions that are equal in place and colour. Files repeat positions along the seams of textures, where
-    /// shading would show an edge.
-    pub fn weld(&mut self) {
+    /// shading would show an edge. Returns the former row of each position.
+    pub fn weld(&mut self) -> Vec<usize> {
         let bits = |v: Vec3| v.to_array().map(|x| if x == 0.0 { 0 } else { x.to_bits() });
         let mut rows = HashMap::with_capacity(self.positions.len());
         let mut kept = Vec::new();
@@ -139,6 +139,7 @@ impl Mesh {
             self.colors = kept.iter().map(|row| self.colors[*row]).collect();
         }
         self.faces.iter_mut().for_each(|f| f.positions = f.positions.map(|row| places[row as usize]));
+        kept
     }
 
     /// Smallest and largest coordinates of the positions.

@@ -7,10 +7,12 @@
 //!   pixel, at the middle of its samples, with textures filtered to the pixel's size.
 //! * Depth is exact: the ray through the pixel's centre (at +½) meets the plane of the nearest triangle there.
 
+mod light;
+mod occlusion;
 mod shade;
 
 use std::collections::HashMap;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use glam::{DVec2, DVec3, Vec3};
 use image::RgbImage;
@@ -18,8 +20,9 @@ use rayon::prelude::*;
 use snapsnap_splat::Camera;
 
 use crate::mesh::{Mesh, MeshError};
-pub use shade::Lights;
-use shade::{Pyramid, Shader};
+pub use light::{Lamp, Light, Lights, Surroundings};
+use occlusion::Occlusion;
+use shade::{Lit, Pyramid, Shader};
 
 /// Steps per pixel to which vertices are rounded. Samples of grids of 1 to 6 per axis lie on whole steps.
 const SUBPIXELS: i64 = 240;
@@ -37,13 +40,13 @@ const NONE: u32 = u32::MAX;
 pub struct ViewOptions {
     /// Samples per pixel along each axis, 1 to 6.
     pub samples: usize,
-    /// Lights of the scene.
-    pub lights: Lights,
+    /// Light of the scene.
+    pub light: Light,
 }
 
 impl Default for ViewOptions {
     fn default() -> Self {
-        Self { samples: 3, lights: Lights::default() }
+        Self { samples: 3, light: Light::default() }
     }
 }
 
@@ -80,6 +83,8 @@ pub struct Renderer<'a> {
     normals: Vec<Vec3>,
     /// One per material.
     textures: Vec<Option<Arc<Pyramid>>>,
+    /// Computed by the first view with shadows.
+    occlusion: OnceLock<Occlusion>,
 }
 
 impl<'a> Renderer<'a> {
@@ -96,7 +101,14 @@ impl<'a> Renderer<'a> {
             pyramid.or_insert_with(|| Arc::new(Pyramid::new(texture))).clone()
         };
         let textures = mesh.materials.iter().map(|m| m.texture.as_ref().map(&mut pyramid)).collect();
-        Ok(Self { mesh, normals: mesh.normals(), textures })
+        Ok(Self { mesh, normals: mesh.normals(), textures, occlusion: OnceLock::new() })
+    }
+
+    fn occlusion(&self) -> &Occlusion {
+        self.occlusion.get_or_init(|| {
+            let faces: Vec<[u32; 3]> = self.mesh.faces.iter().map(|face| face.positions).collect();
+            Occlusion::new(&self.mesh.positions, &self.normals, &faces)
+        })
     }
 
     /// Draws the mesh from `camera`. Both sides of a surface are visible.
@@ -119,7 +131,11 @@ impl<'a> Renderer<'a> {
         }
 
         let places = places(options.samples);
-        let shader = Shader { renderer: self, camera, corners: &corners, lights: &options.lights };
+        let light = match &options.light {
+            Light::Plain(lights) => Lit::Plain(lights),
+            Light::Around(surroundings) => Lit::Vertices(self.occlusion().light(surroundings, &self.normals)),
+        };
+        let shader = Shader { renderer: self, camera, corners: &corners, light };
         let pixels = width * height;
         let mut view = View {
             width,

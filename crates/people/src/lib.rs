@@ -1,6 +1,9 @@
-//! Synthetic people for training, built of simple shapes ([`synth`]) or from MakeHuman's data ([`makehuman`]).
+//! People for training: synthetic ones of simple shapes ([`synth`]) or of MakeHuman's data ([`makehuman`]), and rigged
+//! characters from files ([`avatars`]).
 
+pub mod avatars;
 pub mod makehuman;
 mod math;
 mod pattern;
+mod skeleton;
 pub mod synth;

@@ -6,6 +6,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use crate::JitterConfig;
+use crate::light::LightConfig;
 use snapsnap_base::config::{self, outside};
 use snapsnap_base::{FileError, file};
 
@@ -121,6 +122,13 @@ pub struct Drawn {
     pub samples: usize,
     /// Deviations of the cameras.
     pub jitter: JitterConfig,
+    /// Light.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub light: LightConfig,
+}
+
+fn is_default(light: &LightConfig) -> bool {
+    *light == LightConfig::default()
 }
 
 impl Description {

@@ -1,4 +1,5 @@
-//! Binary glTF 2.0: every triangle of the default scene, in its node's place, with its base colour.
+//! Binary glTF 2.0: every triangle of the default scene, in its node's place or where its joints put it, with its base
+//! colour.
 
 use std::collections::HashSet;
 use std::fmt::Display;
@@ -13,6 +14,7 @@ use gltf::{Accessor, Document, Node, Primitive, image::Source};
 use image::RgbImage;
 use snapsnap_base::{FileError, file};
 
+use super::skin::{Bone, Rigged, Skins, Weights, moved};
 use super::{MAX_BYTES, Textures, add_colors};
 use crate::mesh::{Face, Material, Mesh};
 use crate::picture::decode_bytes;
@@ -20,10 +22,14 @@ use crate::picture::decode_bytes;
 /// Deepest nesting of nodes.
 const MAX_DEPTH: usize = 256;
 
-/// Most positions and corners of faces that nodes may add by a further use of a mesh.
-const MAX_ELEMENTS: usize = 10_000_000;
+/// Most positions and corners of faces that nodes and primitives may add by a further use of the same data.
+const MAX_ELEMENTS: usize = 4_000_000;
 
 pub fn read(path: &Path) -> Result<Mesh, FileError> {
+    Ok(read_rigged(path)?.mesh)
+}
+
+pub fn read_rigged(path: &Path) -> Result<Rigged, FileError> {
     let bytes = file::read(path, MAX_BYTES).map_err(FileError::read(path))?;
     let invalid = |e: &dyn Display| FileError::unsuitable(path, format!("is no valid GLB: {e}"));
     let parsed = gltf::Gltf::from_slice_without_validation(&bytes);
@@ -41,9 +47,14 @@ pub fn read(path: &Path) -> Result<Mesh, FileError> {
         places: Vec::new(),
         shown: HashSet::new(),
         elements: 0,
+        bones: Vec::new(),
+        worlds: Vec::new(),
+        weights: Vec::new(),
     };
     file.add(&document)?;
-    Ok(file.mesh)
+    let has_targets = document.meshes().flat_map(|m| m.primitives()).any(|p| p.morph_targets().len() > 0);
+    let has_animations = has_targets || document.animations().len() > 0;
+    Ok(Rigged { mesh: file.mesh, bones: file.bones, weights: file.weights, has_animations })
 }
 
 /// Refuses references that are missing or out of range, on which the validation would panic.
@@ -65,25 +76,37 @@ fn check_references(root: &Root) -> Result<(), String> {
     Ok(())
 }
 
-struct File<'a> {
+/// A primitive that a node shows.
+pub struct Place {
+    mesh: usize,
+    primitive: usize,
+    /// Row of the node in the bones.
+    node: usize,
+    pub skin: Option<usize>,
+}
+
+pub struct File<'a> {
     path: &'a Path,
     /// The binary part.
-    blob: Vec<u8>,
+    pub blob: Vec<u8>,
     mesh: Mesh,
     /// By the row of the image.
     textures: Textures<usize>,
     /// Nodes that may still be visited: each node of a tree is visited once, but a damaged file may contain loops.
     nodes_left: usize,
-    /// Mesh, primitive and place in the world of every primitive that a node shows.
-    places: Vec<(usize, usize, Mat4)>,
-    /// Mesh and primitive of each entry of `places`.
-    shown: HashSet<(usize, usize)>,
-    /// Positions and corners of the primitives at their second and further places.
+    pub places: Vec<Place>,
+    /// Accessors of the positions and corners of all entries of `places`.
+    shown: HashSet<usize>,
+    /// Positions and corners of data at their second and further places.
     elements: usize,
+    bones: Vec<Bone>,
+    /// Index of the node of each bone, and its place in the world.
+    pub worlds: Vec<(usize, Mat4)>,
+    weights: Vec<Weights>,
 }
 
 impl File<'_> {
-    fn wrong(&self, problem: impl ToString) -> FileError {
+    pub fn wrong(&self, problem: impl ToString) -> FileError {
         FileError::unsuitable(self.path, problem)
     }
 
@@ -97,13 +120,14 @@ impl File<'_> {
         let scene = document.default_scene().or_else(|| document.scenes().next());
         let scene = scene.ok_or_else(|| self.wrong("it has no scene"))?;
         for node in scene.nodes() {
-            self.node(&node, Mat4::IDENTITY, 0)?;
+            self.node(&node, None, 0)?;
         }
         // The size of the whole is checked by now.
         let meshes = document.meshes().map(|mesh| mesh.primitives().collect());
         let primitives: Vec<Vec<Primitive>> = meshes.collect();
-        for (mesh, primitive, to_world) in std::mem::take(&mut self.places) {
-            self.primitive(&primitives[mesh][primitive], to_world)?;
+        let skins = self.skins(document)?;
+        for place in std::mem::take(&mut self.places) {
+            self.primitive(&primitives[place.mesh][place.primitive], &place, &skins)?;
         }
         Ok(())
     }
@@ -127,46 +151,67 @@ impl File<'_> {
         self.textures.load(image.index(), |most| decode_bytes(self.path, bytes, most))
     }
 
-    fn node(&mut self, node: &Node, parent: Mat4, depth: usize) -> Result<(), FileError> {
+    fn node(&mut self, node: &Node, parent: Option<usize>, depth: usize) -> Result<(), FileError> {
         if depth > MAX_DEPTH || self.nodes_left == 0 {
             return Err(self.wrong(format!("its nodes form a loop, or nest deeper than {MAX_DEPTH}")));
         }
         self.nodes_left -= 1;
-        let to_world = parent * Mat4::from_cols_array_2d(&node.transform().matrix());
+        let from = parent.map_or(Mat4::IDENTITY, |row| self.worlds[row].1);
+        let to_world = from * Mat4::from_cols_array_2d(&node.transform().matrix());
+        let own = self.bones.len();
+        let name = node.name().unwrap_or_default().to_owned();
+        self.bones.push(Bone { name, parent, place: to_world.transform_point3(Vec3::ZERO) });
+        self.worlds.push((node.index(), to_world));
         if let Some(mesh) = node.mesh() {
             for (row, primitive) in mesh.primitives().enumerate() {
-                let size = self.checked_size(&primitive)?;
-                if !self.shown.insert((mesh.index(), row)) {
-                    self.elements = self.elements.saturating_add(size);
+                self.check_accessors(&primitive)?;
+                let data = [primitive.get(&gltf::Semantic::Positions), primitive.indices()];
+                for accessor in data.into_iter().flatten() {
+                    if !self.shown.insert(accessor.index()) {
+                        self.elements = self.elements.saturating_add(accessor.count());
+                    }
                 }
+                // Corners that no accessor lists, and empty primitives.
+                self.elements += 1;
                 if self.elements > MAX_ELEMENTS {
                     let message =
                         format!("its nodes unfold to more than {MAX_ELEMENTS} positions and corners");
                     return Err(self.wrong(message));
                 }
-                self.places.push((mesh.index(), row, to_world));
+                let skin = node.skin().map(|skin| skin.index());
+                self.places.push(Place { mesh: mesh.index(), primitive: row, node: own, skin });
             }
         }
         for child in node.children() {
-            self.node(&child, to_world, depth + 1)?;
+            self.node(&child, Some(own), depth + 1)?;
         }
         Ok(())
     }
 
-    fn primitive(&mut self, primitive: &Primitive, to_world: Mat4) -> Result<(), FileError> {
+    fn primitive(&mut self, primitive: &Primitive, place: &Place, skins: &Skins) -> Result<(), FileError> {
         let mode = primitive.mode();
         if !matches!(mode, Mode::Triangles | Mode::TriangleStrip | Mode::TriangleFan) {
             return Ok(());
         }
         let set = texture_set(primitive);
         let count = primitive.get(&gltf::Semantic::Positions).as_ref().map_or(0, Accessor::count);
+        let joints = place.skin.map(|skin| &skins[skin][..]);
+        let mut weights = match joints {
+            Some(joints) => self.weights(primitive, count, joints)?,
+            None if skins.is_empty() => Vec::new(),
+            None => vec![[(place.node as u32, 1.0), (0, 0.0), (0, 0.0), (0, 0.0)]; count],
+        };
+        // A skin replaces the place of its node.
+        let to_world = joints.map_or(self.worlds[place.node].1, |_| Mat4::IDENTITY);
         let reader = primitive.reader(|_| Some(&self.blob));
-        let positions: Vec<Vec3> = reader
-            .read_positions()
-            .into_iter()
-            .flatten()
-            .map(|p| to_world.transform_point3(Vec3::from_array(p)))
-            .collect();
+        let read = reader.read_positions().into_iter().flatten().map(Vec3::from_array);
+        let positions: Vec<Vec3> = match joints {
+            Some(joints) => read.zip(&weights).map(|(p, weights)| moved(p, weights, joints)).collect(),
+            None => read.map(|p| to_world.transform_point3(p)).collect(),
+        };
+        for (row, _) in weights.iter_mut().flatten().filter(|(_, share)| *share > 0.0) {
+            *row = joints.map_or(*row, |joints| joints[*row as usize].0);
+        }
         let texcoords: Vec<Vec2> = reader
             .read_tex_coords(set)
             .into_iter()
@@ -213,34 +258,31 @@ impl File<'_> {
             });
         }
         self.mesh.positions.extend(positions);
+        self.weights.extend(weights);
         self.mesh.texcoords.extend(texcoords);
         add_colors(&mut self.mesh, first as usize, colors.into_iter());
         Ok(())
     }
 
-    /// Number of positions and corners of a primitive, at least 1.
-    ///
-    /// # Errors
-    /// The errors of [`File::check`] for its accessors.
-    fn checked_size(&self, primitive: &Primitive) -> Result<usize, FileError> {
+    /// Refuses the accessors of a primitive as [`File::check`] does.
+    fn check_accessors(&self, primitive: &Primitive) -> Result<(), FileError> {
         let shares: &[DataType] = &[DataType::U8, DataType::U16, DataType::F32];
         let texcoords = gltf::Semantic::TexCoords(texture_set(primitive));
-        let positions = primitive.get(&gltf::Semantic::Positions);
-        let corners = primitive.indices();
-        let size = |accessor: &Option<Accessor>| accessor.as_ref().map(Accessor::count);
-        let count = size(&positions).unwrap_or(0);
-        let count = count.saturating_add(size(&corners).unwrap_or(count)).max(1);
-        self.check("positions", positions, &[DataType::F32], &[Dimensions::Vec3])?;
+        self.check(
+            "positions",
+            primitive.get(&gltf::Semantic::Positions),
+            &[DataType::F32],
+            &[Dimensions::Vec3],
+        )?;
         self.check("texture coordinates", primitive.get(&texcoords), shares, &[Dimensions::Vec2])?;
         let colors = primitive.get(&gltf::Semantic::Colors(0));
         self.check("colours", colors, shares, &[Dimensions::Vec3, Dimensions::Vec4])?;
         let rows = [DataType::U8, DataType::U16, DataType::U32];
-        self.check("indices", corners, &rows, &[Dimensions::Scalar])?;
-        Ok(count)
+        self.check("indices", primitive.indices(), &rows, &[Dimensions::Scalar])
     }
 
     /// Refuses an accessor of a wrong type or outside the file: the reader does not check it.
-    fn check(
+    pub fn check(
         &self,
         name: &str,
         accessor: Option<Accessor>,

@@ -3,6 +3,7 @@
 mod glb;
 mod obj;
 mod ply;
+mod skin;
 #[cfg(test)]
 mod tests;
 
@@ -17,6 +18,7 @@ use snapsnap_base::{FileError, guarded, quoted};
 
 use crate::mesh::Mesh;
 use crate::picture::decode;
+pub use skin::{Bone, Rigged, Weights};
 
 /// Endings of the files that [`read`] accepts, in lower case.
 pub const EXTENSIONS: [&str; 3] = ["obj", "ply", "glb"];
@@ -44,14 +46,30 @@ pub fn read(path: &Path) -> Result<Mesh, FileError> {
         _ => return Err(FileError::unsuitable(path, "is no scan: expected a file .obj, .ply or .glb")),
     };
     let mut mesh = guarded(path, || reader(path))?;
+    finish(&mut mesh, path)?;
+    Ok(mesh)
+}
+
+/// Reads a GLB with its skeleton, as [`read`] reads its mesh.
+///
+/// # Errors
+/// As [`read`]; for joints and weights that are missing or damaged, naming the position.
+pub fn read_rigged(path: &Path) -> Result<Rigged, FileError> {
+    let mut rigged = guarded(path, || glb::read_rigged(path))?;
+    let kept = finish(&mut rigged.mesh, path)?;
+    rigged.weights = kept.iter().filter_map(|row| rigged.weights.get(*row).copied()).collect();
+    Ok(rigged)
+}
+
+/// Checks a mesh, brings its colours into [0, 1], and merges equal positions. Returns the former rows of the positions.
+fn finish(mesh: &mut Mesh, path: &Path) -> Result<Vec<usize>, FileError> {
     mesh.check().map_err(|e| FileError::unsuitable(path, e))?;
     // The brightest value of a colour is 1 in some files and 255 in others.
     if mesh.colors.iter().any(|c| c.max_element() > 2.0) {
         mesh.colors.iter_mut().for_each(|c| *c /= 255.0);
     }
     mesh.colors.iter_mut().for_each(|c| *c = c.clamp(Vec3::ZERO, Vec3::ONE));
-    mesh.weld();
-    Ok(mesh)
+    Ok(mesh.weld())
 }
 
 /// Adds the colours of the positions from row `first` on. Positions without a colour become white if others have one.

@@ -299,8 +299,8 @@ fn glb_that_unfolds_to_too_many_elements_is_refused() {
     let folder = Folder::new();
     assert_eq!(read(&folder.file("a.glb", nodes(30))).expect("reads").faces.len(), 900);
     // Three positions and three corners each.
-    let error = read(&folder.file("a.glb", nodes(1300))).map(|_| ()).expect_err("refuses").to_string();
-    assert!(error.contains("its nodes unfold to more than 10000000 positions and corners"), "{error}");
+    let error = read(&folder.file("a.glb", nodes(900))).map(|_| ()).expect_err("refuses").to_string();
+    assert!(error.contains("its nodes unfold to more than 4000000 positions and corners"), "{error}");
 }
 
 #[test]

@@ -1,6 +1,5 @@
-//! Light and textures.
+//! Textures, and colours of surfaces in their light.
 
-use std::f32::consts::TAU;
 use std::sync::Arc;
 
 use glam::{DVec2, DVec3, Vec2, Vec3};
@@ -8,67 +7,7 @@ use image::RgbImage;
 use snapsnap_splat::Camera;
 
 use super::Renderer;
-
-/// Soft directional lights. Together they are so strong that the brightest direction reflects exactly the surface's own
-/// colour, and none is clipped.
-#[derive(Debug, Clone)]
-pub struct Lights {
-    /// Unit vectors towards the lights, world axes, and their strengths.
-    directional: Vec<(Vec3, f32)>,
-    /// Light from everywhere.
-    ambient: f32,
-}
-
-impl Lights {
-    /// Scales these directions with strengths, and the light from everywhere, as a whole.
-    pub fn new(directional: &[(Vec3, f32)], ambient: f32) -> Self {
-        let directional = directional.iter().map(|(d, s)| (d.normalize_or_zero(), *s)).collect();
-        let mut lights = Self { directional, ambient };
-        // The brightest of many directions, evenly spread over the sphere.
-        let count = 4000;
-        let golden = TAU * (1.0 - 1.0 / 1.618_034);
-        let brightest = (0..count)
-            .map(|i| {
-                let y = 1.0 - (2 * i + 1) as f32 / count as f32;
-                let (sin, cos) = (golden * i as f32).sin_cos();
-                let r = (1.0 - y * y).sqrt();
-                lights.sum(Vec3::new(r * cos, y, r * sin))
-            })
-            .fold(f32::MIN_POSITIVE, f32::max);
-        lights.ambient /= brightest;
-        lights.directional.iter_mut().for_each(|(_, strength)| *strength /= brightest);
-        lights
-    }
-
-    /// Light that a surface with this unit normal reflects, 0 to 1.
-    pub fn strength(&self, normal: Vec3) -> f32 {
-        // A direction between the sampled ones may be brighter, by less than a shade of 8 bits.
-        self.sum(normal).min(1.0)
-    }
-
-    fn sum(&self, normal: Vec3) -> f32 {
-        let soft = |(direction, strength): &(Vec3, f32)| {
-            // Light from an area reaches a little beyond the terminator.
-            let cosine = (normal.dot(*direction) + 0.3) / 1.3;
-            strength * cosine.max(0.0)
-        };
-        self.ambient + self.directional.iter().map(soft).sum::<f32>()
-    }
-}
-
-impl Default for Lights {
-    /// Six weak lights all around, from above, and one stronger.
-    fn default() -> Self {
-        let mut directional: Vec<(Vec3, f32)> = (0..6)
-            .map(|i| {
-                let (sin, cos) = (TAU * i as f32 / 6.0).sin_cos();
-                (Vec3::new(sin, 0.6, cos), 0.25)
-            })
-            .collect();
-        directional.push((Vec3::new(0.4, 0.8, 0.9), 0.35));
-        Self::new(&directional, 0.5)
-    }
-}
+use super::light::Lights;
 
 /// Step in pixels for the derivative of texture coordinates.
 const STEP: f64 = 0.01;
@@ -131,31 +70,46 @@ fn bilinear(texture: &RgbImage, at: Vec2) -> Vec3 {
     texel(0, 0).lerp(texel(1, 0), fx).lerp(texel(0, 1).lerp(texel(1, 1), fx), fy)
 }
 
+/// The light on a mesh's surfaces in one view.
+pub enum Lit<'a> {
+    /// By the direction of the surface.
+    Plain(&'a Lights),
+    /// Linear light on the front and the back of each vertex.
+    Vertices(Vec<[Vec3; 2]>),
+}
+
 /// Colours of a mesh's surfaces in the view of one camera.
 pub struct Shader<'a> {
     pub renderer: &'a Renderer<'a>,
     pub camera: &'a Camera,
     /// Positions in the camera's frame.
     pub corners: &'a [DVec3],
-    pub lights: &'a Lights,
+    pub light: Lit<'a>,
 }
 
 impl Shader<'_> {
     /// Colour of `face` at pixel coordinates `at`; `plane` gives 1/z there.
     pub fn color(&self, face: usize, at: DVec2, plane: DVec3) -> Vec3 {
-        let Renderer { mesh, normals, textures } = self.renderer;
+        let Renderer { mesh, normals, textures, .. } = self.renderer;
         let face = &mesh.faces[face];
         let weights = self.weights(face.positions, at, plane).as_vec3();
         let mix = |values: [Vec3; 3]| values[0] * weights.x + values[1] * weights.y + values[2] * weights.z;
-        let mut normal = mix(face.positions.map(|row| normals[row as usize])).normalize_or_zero();
         // The visible side of the surface is lit.
         let corners = face.positions.map(|row| self.corners[row as usize]);
-        let towards = (corners[1] - corners[0]).cross(corners[2] - corners[0]).dot(corners[0]);
-        if towards > 0.0 {
-            normal = -normal;
-        }
+        let is_back = (corners[1] - corners[0]).cross(corners[2] - corners[0]).dot(corners[0]) > 0.0;
+        let light = match &self.light {
+            Lit::Plain(lights) => {
+                let normal = mix(face.positions.map(|row| normals[row as usize])).normalize_or_zero();
+                Vec3::splat(lights.strength(if is_back { -normal } else { normal }))
+            }
+            Lit::Vertices(light) => {
+                let linear = mix(face.positions.map(|row| light[row as usize][usize::from(is_back)]));
+                // Colours are sRGB, about the 2.2nd root of linear light.
+                linear.min(Vec3::ONE).map(|light| libm::powf(light, 1.0 / 2.2))
+            }
+        };
         let material = &mesh.materials[face.material as usize];
-        let mut color = material.color * self.lights.strength(normal);
+        let mut color = material.color * light;
         if !mesh.colors.is_empty() {
             color *= mix(face.positions.map(|row| mesh.colors[row as usize]));
         }

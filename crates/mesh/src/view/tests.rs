@@ -6,7 +6,7 @@ use snapsnap_splat::{Camera, RigidTransform};
 
 use super::{Renderer, View, ViewOptions};
 use crate::mesh::{Face, Material, Mesh};
-use crate::view::Lights;
+use crate::view::{Lamp, Light, Lights, Surroundings};
 
 /// At the origin, looking along z.
 fn camera(width: u32, height: u32) -> Camera {
@@ -25,7 +25,7 @@ fn draw(mesh: &Mesh, camera: &Camera, options: &ViewOptions) -> View {
 
 /// Light of strength 1 from everywhere.
 fn flat(samples: usize) -> ViewOptions {
-    ViewOptions { samples, lights: Lights::new(&[], 1.0) }
+    ViewOptions { samples, light: Light::Plain(Lights::new(&[], 1.0)) }
 }
 
 fn mesh(positions: Vec<Vec3>, faces: &[[u32; 3]]) -> Mesh {
@@ -301,4 +301,62 @@ fn light_is_never_clipped_and_the_nearer_surface_is_visible_from_both_sides() {
     // A triangle behind the camera is invisible.
     let nothing = draw(&triangle(-2.0), &camera(32, 32), &flat(2));
     assert!(nothing.alpha.iter().all(|a| *a == 0.0) && nothing.depth.iter().all(|d| *d == 0.0));
+}
+
+/// A floor of 2 m under a ball of radius 0.3 m, whose middle is 0.6 m above it.
+fn ball_over_a_floor() -> Mesh {
+    let side = 80_u32;
+    let at = |i: u32| 2.0 * i as f32 / side as f32 - 1.0;
+    let rows = 0..=side;
+    let positions: Vec<Vec3> =
+        rows.clone().flat_map(|z| rows.clone().map(move |x| Vec3::new(at(x), 0.0, at(z)))).collect();
+    let cells = (0..side).flat_map(|z| (0..side).map(move |x| z * (side + 1) + x));
+    let triangles = cells.flat_map(|a| [[a, a + side + 1, a + 1], [a + 1, a + side + 1, a + side + 2]]);
+    let mut mesh = Mesh::colored(positions, Vec::new(), triangles.collect());
+    let ball = sphere(Vec3::new(0.0, 0.6, 0.0), 0.3, 4);
+    let first = mesh.positions.len() as u32;
+    mesh.positions.extend(&ball.positions);
+    mesh.faces.extend(ball.faces.iter().map(|f| Face { positions: f.positions.map(|r| r + first), ..*f }));
+    mesh
+}
+
+#[test]
+fn a_ball_shades_the_floor_on_the_side_away_from_the_lamp() {
+    let mesh = ball_over_a_floor();
+    let renderer = Renderer::new(&mesh).expect("a mesh");
+    let lamp = Lamp { direction: Vec3::new(-1.0, 1.0, 0.0), color: Vec3::ONE, radius: 0.2 };
+    let surroundings = Surroundings::new(vec![lamp], [Vec3::ONE; 2], 6.0);
+    let light = renderer.occlusion().light(&surroundings, &renderer.normals);
+    let near = |x: f32, z: f32| {
+        let places = mesh.positions.iter().zip(&light);
+        let found = places.filter(|(p, _)| p.y == 0.0 && (p.x - x).abs() < 0.02 && (p.z - z).abs() < 0.02);
+        let found: Vec<f32> = found.map(|(_, light)| light[0].x.powf(1.0 / 2.2)).collect();
+        found.iter().sum::<f32>() / found.len() as f32
+    };
+    // The ball is 0.6 m above the floor, and the lamp's light falls at 45° towards +x.
+    let (shadow, mirrored, open) = (near(0.6, 0.0), near(-0.6, 0.0), near(0.6, 0.85));
+    assert!(shadow < 0.75 * mirrored && shadow < 0.75 * open, "{shadow} {mirrored} {open}");
+    assert!((mirrored - open).abs() < 0.05, "{mirrored} {open}");
+    // Turned by half a turn, the shadow falls to the other side.
+    let turned = renderer.occlusion().light(&surroundings.turned(180.0), &renderer.normals);
+    let row = mesh.positions.iter().position(|p| (*p - Vec3::new(-0.6, 0.0, 0.0)).length() < 0.02);
+    assert!(turned[row.expect("a vertex")][0].x.powf(1.0 / 2.2) < 0.75 * mirrored);
+}
+
+/// Nothing hides a convex surface from the directions before it.
+#[test]
+fn a_ball_alone_has_the_light_of_its_normals_with_the_given_contrast() {
+    let mesh = sphere(Vec3::new(0.0, 1.0, 0.0), 0.9, 5);
+    let renderer = Renderer::new(&mesh).expect("a mesh");
+    for contrast in [1.2_f32, 3.0, 6.0] {
+        let lamp = Lamp { direction: Vec3::new(0.3, 0.6, 1.0), color: Vec3::ONE, radius: 0.4 };
+        let surroundings = Surroundings::new(vec![lamp], [Vec3::ONE; 2], contrast);
+        let light = renderer.occlusion().light(&surroundings, &renderer.normals);
+        let linear = |light: &[Vec3; 2]| light[0].x;
+        let (low, high) = light.iter().map(linear).fold((9.0_f32, 0.0_f32), |(l, h), v| (l.min(v), h.max(v)));
+        assert!((high - 1.0).abs() < 0.03, "{contrast}: {high}");
+        assert!((high / low / contrast - 1.0).abs() < 0.08, "{contrast}: {low} {high}");
+        // Inside of a closed surface it is dark.
+        assert!(light.iter().all(|light| light[1].x < 0.1), "{contrast}");
+    }
 }

@@ -5,9 +5,10 @@ use std::num::NonZeroUsize;
 use glam::{Vec2, Vec3};
 use kiddo::SquaredEuclidean;
 
-use super::net::{Net, PARTS, Vertex, coordinates, tree};
+use super::net::{Net, PARTS, Vertex};
 use super::{HEAD, ORDER, Person, Piece, Place};
 use crate::math::{noise, smoothstep};
+use crate::skeleton::{coordinates, tree};
 use crate::synth::body::Body;
 use crate::synth::outfit::Lower;
 use crate::synth::part::Kind;

@@ -3,7 +3,6 @@
 use std::collections::HashMap;
 
 use glam::Vec3;
-use kiddo::ImmutableKdTree;
 
 /// Parts of the body that a vertex may belong to.
 pub const PARTS: usize = 10;
@@ -32,16 +31,6 @@ impl Vertex {
     pub fn part(&self) -> usize {
         (1..PARTS).fold(0, |best, part| if self.parts[part] > self.parts[best] { part } else { best })
     }
-}
-
-/// Points in the form that [`tree`] is searched with.
-pub fn coordinates(points: impl IntoIterator<Item = Vec3>) -> Vec<[f32; 3]> {
-    points.into_iter().map(|p| p.to_array()).collect()
-}
-
-/// A tree for searches of the nearest of many points.
-pub fn tree(points: impl IntoIterator<Item = Vec3>) -> ImmutableKdTree<f32, 3> {
-    ImmutableKdTree::new_from_slice(&coordinates(points)).expect("fewer points than u32 can number")
 }
 
 /// A piece of surface; faces have three or four corners.

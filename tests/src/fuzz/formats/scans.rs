@@ -12,6 +12,7 @@ use snapsnap_mesh::mesh::{Face, Material, Mesh};
 
 use super::super::Format;
 use super::put;
+use crate::character::character;
 
 /// What `prepare` may leave of a data set for which no subject could be made.
 pub const DESCRIPTIONS: &[&str] = &["out/dataset.toml", "out/prepare.config.toml"];
@@ -126,6 +127,19 @@ pub const FORMATS: &[Format] = &[
         changed: &[".glb"],
         command: scan!("in/a.glb"),
         share: 96,
+        ..SCAN
+    },
+    Format {
+        name: "avatars",
+        sample: |folder| {
+            // The first person is for test.
+            for name in ["a_suit.glb", "b_suit.glb"] {
+                put(folder, name, character(1.0, |_| {}));
+            }
+        },
+        changed: &["b_suit.glb"],
+        command: "prepare avatars in --subjects 1 -o out --set views.count=2 --set views.resolution=16 --set views.samples_per_axis=1",
+        share: 24,
         ..SCAN
     },
     with_body!(

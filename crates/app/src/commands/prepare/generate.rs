@@ -1,5 +1,6 @@
-//! `snapsnap prepare synth` and `snapsnap prepare makehuman`.
+//! `snapsnap prepare synth`, `snapsnap prepare makehuman` and `snapsnap prepare avatars`.
 
+use std::cell::Cell;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
@@ -8,6 +9,7 @@ use snapsnap_data::dataset::Split;
 use snapsnap_data::scan::Collection;
 use snapsnap_mesh::export;
 use snapsnap_mesh::mesh::Mesh;
+use snapsnap_people::avatars::{Avatars, Character};
 use snapsnap_people::makehuman::{self, Library};
 use snapsnap_people::synth;
 
@@ -15,6 +17,7 @@ use super::super::one_of;
 use super::{Common, Person, SPLITS, Work, make, place};
 use crate::failure::{Failure, bail};
 use crate::progress::Progress;
+use crate::say;
 
 /// Largest number of people of one command.
 const MAX_SUBJECTS: usize = 1_000_000;
@@ -30,6 +33,17 @@ pub struct SynthArguments {
 #[derive(Args)]
 pub struct MakehumanArguments {
     /// MakeHuman's folder `data`, or a checkout that contains it.
+    folder: PathBuf,
+    #[command(flatten)]
+    common: Common,
+    #[command(flatten)]
+    generate: Generate,
+}
+
+#[derive(Args)]
+pub struct AvatarsArguments {
+    /// Folder of rigged characters, GLB, with the joint names of Mixamo or MakeHuman. Files whose names are equal up to the
+    /// last `_` show one person. Of nine people, one is for test and one for val.
     folder: PathBuf,
     #[command(flatten)]
     common: Common,
@@ -59,6 +73,29 @@ pub fn makehuman(arguments: &MakehumanArguments) -> Result<(), Failure> {
     let library = Library::open(&arguments.folder)?;
     let person = |name: &str| makehuman::person(&library, name);
     arguments.generate.run(&arguments.common, "makehuman", &[library.root()], person)
+}
+
+pub fn avatars(arguments: &AvatarsArguments) -> Result<(), Failure> {
+    let AvatarsArguments { folder, common, generate } = arguments;
+    let avatars = Avatars::open(folder, |person| match person % 9 {
+        0 => generate.split == Split::Test,
+        4 => generate.split == Split::Val,
+        _ => generate.split == Split::Train,
+    })?;
+    let animated = Cell::new(0);
+    let person = |name: &str| {
+        let Character { mesh, has_animations } = avatars.person(name)?;
+        animated.set(animated.get() + usize::from(has_animations));
+        Ok(mesh)
+    };
+    let made = generate.run(common, "avatars", &[folder], person);
+    if animated.get() > 0 {
+        say::note(&format!(
+            "{} subjects come from files with morph targets or animations, which were ignored",
+            animated.get()
+        ));
+    }
+    made
 }
 
 impl Generate {

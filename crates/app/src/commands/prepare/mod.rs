@@ -50,6 +50,11 @@ enum Kind {
         after_help = "Example: snapsnap prepare makehuman path/to/makehuman/data --subjects 300 --seed 2 -o people/makehuman"
     )]
     Makehuman(generate::MakehumanArguments),
+    /// Make people from rigged characters.
+    #[command(
+        after_help = "Example: snapsnap prepare avatars path/to/characters --subjects 300 --seed 3 -o people/avatars"
+    )]
+    Avatars(generate::AvatarsArguments),
     /// List the faults of a data set.
     #[command(after_help = "Example: snapsnap prepare check people/synth")]
     Check(check::Arguments),
@@ -60,6 +65,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
         Kind::Scan(arguments) => scan::run(arguments),
         Kind::Synth(arguments) => generate::synth(arguments),
         Kind::Makehuman(arguments) => generate::makehuman(arguments),
+        Kind::Avatars(arguments) => generate::avatars(arguments),
         Kind::Check(arguments) => check::run(arguments),
     }
 }

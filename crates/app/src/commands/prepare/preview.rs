@@ -20,10 +20,11 @@ const BACKGROUND: [u8; 3] = [235; 3];
 
 /// Writes a sheet of the first of these subjects. There must be at least one.
 pub fn write(path: &Path, folder: &Folder, subjects: &[&Work]) -> Result<(), Failure> {
-    let views = folder.description().views;
+    let (views, arrangement) = (folder.description().views, folder.description().arrangement);
+    let [front, back, side, _] = arrangement.four(0, views);
     let mut pictures = Vec::new();
     for work in subjects.iter().take(MOST) {
-        for view in [0, views / 2, views / 4] {
+        for view in [front, back, side] {
             let (color, mask) = folder.picture(Some(work.split), &work.subject, view, false)?;
             pictures.push(shrink(&color, &mask));
         }

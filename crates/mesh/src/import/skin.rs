@@ -1,0 +1,152 @@
+//! Skins of binary glTF: positions moved by the joints, and the skeleton for other poses.
+
+use std::collections::HashMap;
+
+use glam::{Mat4, Vec3};
+use gltf::accessor::{DataType, Dimensions};
+use gltf::{Document, Primitive, Semantic};
+use snapsnap_base::FileError;
+
+use super::glb::File;
+use crate::mesh::Mesh;
+
+/// Largest deviation of the sum of a position's weights from 1.
+const LARGEST_ERROR: f32 = 0.02;
+/// Bones of a position.
+const BONES: usize = 4;
+
+/// Bones that move a position, with shares that add up to 1.
+pub type Weights = [(u32, f32); BONES];
+
+/// A node of the skeleton, as the file's nodes place it.
+#[derive(Debug, Clone)]
+pub struct Bone {
+    /// Its name; empty without one.
+    pub name: String,
+    /// Row of its parent, which comes before it.
+    pub parent: Option<usize>,
+    /// Its origin, in the positions' space.
+    pub place: Vec3,
+}
+
+/// A mesh and what moves it.
+#[derive(Debug, Clone, Default)]
+pub struct Rigged {
+    /// The mesh in the pose of the file's nodes.
+    pub mesh: Mesh,
+    /// All nodes of the scene, parents before children.
+    pub bones: Vec<Bone>,
+    /// By position. A mesh without a skin follows its node. Empty if the file has no skin.
+    pub weights: Vec<Weights>,
+    /// Whether the file has morph targets or animations, which are ignored.
+    pub has_animations: bool,
+}
+
+/// The joints of all skins: row of the bone, and the matrix from the mesh's space to the world.
+pub type Skins = Vec<Vec<(u32, Mat4)>>;
+
+impl File<'_> {
+    /// The joints of all skins, from the places of their nodes in the world.
+    ///
+    /// # Errors
+    /// A joint outside of the scene, or inverse bind matrices that are missing or damaged.
+    pub(super) fn skins(&self, document: &Document) -> Result<Skins, FileError> {
+        let rows: HashMap<usize, usize> =
+            self.worlds.iter().enumerate().map(|(row, (node, _))| (*node, row)).collect();
+        let used: Vec<usize> = self.places.iter().filter_map(|place| place.skin).collect();
+        let skins = document.skins().map(|skin| {
+            let index = skin.index();
+            if !used.contains(&index) {
+                return Ok(Vec::new());
+            }
+            let accessor = skin.inverse_bind_matrices();
+            let count = accessor.as_ref().map(gltf::Accessor::count);
+            self.check("inverse bind matrices", accessor, &[DataType::F32], &[Dimensions::Mat4])?;
+            let reader = skin.reader(|_| Some(&self.blob));
+            let inverse: Vec<Mat4> = reader
+                .read_inverse_bind_matrices()
+                .into_iter()
+                .flatten()
+                .map(|matrix| Mat4::from_cols_array_2d(&matrix))
+                .collect();
+            let joints = skin.joints().enumerate().map(|(place, joint)| {
+                let row = *rows.get(&joint.index()).ok_or_else(|| {
+                    self.wrong(format!("joint {place} of skin {index} is not in the scene"))
+                })?;
+                let inverse = match inverse.get(place) {
+                    Some(inverse) => *inverse,
+                    None if count.is_none() => Mat4::IDENTITY,
+                    None => {
+                        let message = format!("skin {index} has no inverse bind matrix for joint {place}");
+                        return Err(self.wrong(message));
+                    }
+                };
+                let matrix = self.worlds[row].1 * inverse;
+                if !matrix.is_finite() {
+                    return Err(self.wrong(format!("joint {place} of skin {index} is not finite")));
+                }
+                Ok((row as u32, matrix))
+            });
+            joints.collect()
+        });
+        skins.collect()
+    }
+
+    /// Weights of a primitive's positions; bones are rows of `joints`.
+    ///
+    /// # Errors
+    /// Missing or damaged weights, naming the position.
+    pub(super) fn weights(
+        &self,
+        primitive: &Primitive,
+        positions: usize,
+        joints: &[(u32, Mat4)],
+    ) -> Result<Vec<Weights>, FileError> {
+        let [found, shares] = [Semantic::Joints(0), Semantic::Weights(0)].map(|name| primitive.get(&name));
+        if primitive.get(&Semantic::Joints(1)).is_some() {
+            return Err(self.wrong(format!("a primitive has more than {BONES} joints for a position")));
+        }
+        for (accessor, what) in [(&found, "joints"), (&shares, "weights")] {
+            let count = accessor.as_ref().map_or(0, gltf::Accessor::count);
+            if count != positions {
+                let message = format!("a primitive with a skin has {count} {what} for {positions} positions");
+                return Err(self.wrong(message));
+            }
+        }
+        self.check("joints", found, &[DataType::U8, DataType::U16], &[Dimensions::Vec4])?;
+        self.check("weights", shares, &[DataType::U8, DataType::U16, DataType::F32], &[Dimensions::Vec4])?;
+        let reader = primitive.reader(|_| Some(&self.blob));
+        let rows = reader.read_joints(0).into_iter().flat_map(|joints| joints.into_u16());
+        let shares = reader.read_weights(0).into_iter().flat_map(|weights| weights.into_f32());
+        let weights = rows.zip(shares).enumerate().map(|(position, (rows, shares))| {
+            let sum: f32 = shares.iter().sum();
+            if shares.iter().any(|share| !(*share >= 0.0)) || !((sum - 1.0).abs() <= LARGEST_ERROR) {
+                let message =
+                    format!("position {position} of a skin has the weights {shares:?}, which are not shares");
+                return Err(self.wrong(message));
+            }
+            let mut weights = [(0, 0.0); BONES];
+            for ((to, row), share) in
+                weights.iter_mut().zip(rows).zip(shares).filter(|(_, share)| *share > 0.0)
+            {
+                if usize::from(row) >= joints.len() {
+                    let message =
+                        format!("position {position} refers to joint {row} of a skin of {}", joints.len());
+                    return Err(self.wrong(message));
+                }
+                *to = (u32::from(row), share / sum);
+            }
+            Ok(weights)
+        });
+        weights.collect()
+    }
+}
+
+/// The position that the joints give.
+pub fn moved(p: Vec3, weights: &Weights, joints: &[(u32, Mat4)]) -> Vec3 {
+    weights
+        .iter()
+        .filter(|(_, share)| *share > 0.0)
+        .map(|(row, share)| *share * joints[*row as usize].1.transform_point3(p))
+        .sum()
+}

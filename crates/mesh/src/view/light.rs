@@ -1,0 +1,164 @@
+//! Lights: soft ones without shadows, and surroundings whose light is partly hidden by the mesh itself.
+
+use std::f32::consts::{PI, TAU};
+
+use glam::{Mat3, Vec3};
+
+use super::occlusion::{SHARE, ways};
+
+/// The light in a view.
+#[derive(Debug, Clone)]
+pub enum Light {
+    /// Soft lights that cast no shadows.
+    Plain(Lights),
+    /// Light from all around, with shadows and ambient occlusion.
+    Around(Surroundings),
+}
+
+impl Default for Light {
+    fn default() -> Self {
+        Self::Plain(Lights::default())
+    }
+}
+
+/// Soft directional lights. Together they are so strong that the brightest direction reflects exactly the surface's own
+/// colour, and none is clipped.
+#[derive(Debug, Clone)]
+pub struct Lights {
+    /// Unit vectors towards the lights, world axes, and their strengths.
+    directional: Vec<(Vec3, f32)>,
+    /// Light from everywhere.
+    ambient: f32,
+}
+
+impl Lights {
+    /// Scales these directions with strengths, and the light from everywhere, as a whole.
+    pub fn new(directional: &[(Vec3, f32)], ambient: f32) -> Self {
+        let directional = directional.iter().map(|(d, s)| (d.normalize_or_zero(), *s)).collect();
+        let mut lights = Self { directional, ambient };
+        let brightest = directions(4000).map(|d| lights.sum(d)).fold(f32::MIN_POSITIVE, f32::max);
+        lights.ambient /= brightest;
+        lights.directional.iter_mut().for_each(|(_, strength)| *strength /= brightest);
+        lights
+    }
+
+    /// Light that a surface with this unit normal reflects, 0 to 1.
+    pub fn strength(&self, normal: Vec3) -> f32 {
+        // A direction between the sampled ones may be brighter, by less than a shade of 8 bits.
+        self.sum(normal).min(1.0)
+    }
+
+    fn sum(&self, normal: Vec3) -> f32 {
+        let soft = |(direction, strength): &(Vec3, f32)| {
+            // Light from an area reaches a little beyond the terminator.
+            let cosine = (normal.dot(*direction) + 0.3) / 1.3;
+            strength * cosine.max(0.0)
+        };
+        self.ambient + self.directional.iter().map(soft).sum::<f32>()
+    }
+}
+
+impl Default for Lights {
+    /// Six weak lights all around, from above, and one stronger.
+    fn default() -> Self {
+        let mut directional: Vec<(Vec3, f32)> = (0..6)
+            .map(|i| {
+                let (sin, cos) = (TAU * i as f32 / 6.0).sin_cos();
+                (Vec3::new(sin, 0.6, cos), 0.25)
+            })
+            .collect();
+        directional.push((Vec3::new(0.4, 0.8, 0.9), 0.35));
+        Self::new(&directional, 0.5)
+    }
+}
+
+/// Unit vectors, evenly spread over the sphere, from the top down.
+pub(super) fn directions(count: usize) -> impl Iterator<Item = Vec3> {
+    let golden = TAU * (1.0 - 1.0 / 1.618_034);
+    (0..count).map(move |i| {
+        let y = 1.0 - (2 * i + 1) as f32 / count as f32;
+        let (sin, cos) = libm::sincosf(golden * i as f32);
+        let r = (1.0 - y * y).sqrt();
+        Vec3::new(r * cos, y, r * sin)
+    })
+}
+
+/// An area that shines, far away.
+#[derive(Debug, Clone, Copy)]
+pub struct Lamp {
+    /// Unit vector towards it.
+    pub direction: Vec3,
+    /// Its light, linear.
+    pub color: Vec3,
+    /// Half of its width as an angle: its light falls to 1/e there, radians.
+    pub radius: f32,
+}
+
+/// Light from all around: lamps, and a sky that is brighter above than below. The brightest direction of a surface
+/// without shadows reflects exactly the surface's own colour.
+#[derive(Debug, Clone)]
+pub struct Surroundings {
+    lamps: Vec<Lamp>,
+    /// Linear light from straight above and straight below.
+    sky: [Vec3; 2],
+}
+
+impl Surroundings {
+    /// Scales the light so that the brightest direction without shadows has a luminance of 1, and the sky so that this is
+    /// `contrast` times the luminance of the darkest direction. A contrast that the lamps alone do not reach is not
+    /// reached.
+    pub fn new(mut lamps: Vec<Lamp>, sky: [Vec3; 2], contrast: f32) -> Self {
+        for lamp in &mut lamps {
+            lamp.direction = lamp.direction.normalize_or(Vec3::Y);
+            // All lamps of a colour are equally bright, whatever their size.
+            lamp.color *= 1.0 / (PI * lamp.radius * lamp.radius).min(TAU);
+        }
+        let ways = ways();
+        let reflected = |surroundings: &Self| {
+            let light = ways.iter().map(|d| surroundings.from(*d)).collect::<Vec<_>>();
+            let sum = |normal: &Vec3| {
+                let parts = ways.iter().zip(&light).map(|(d, light)| normal.dot(*d).max(0.0) * *light);
+                luminance(parts.sum::<Vec3>() * SHARE)
+            };
+            let all = ways.iter().map(sum);
+            all.fold((f32::INFINITY, f32::MIN_POSITIVE), |(low, high), v| (low.min(v), high.max(v)))
+        };
+        let mut found = Self { lamps, sky };
+        // The contrast falls with the strength of the sky.
+        let (mut weak, mut strong) = (0.0_f32, 64.0_f32);
+        for _ in 0..24 {
+            let middle = 0.5 * (weak + strong);
+            found.sky = sky.map(|s| s * middle);
+            let (darkest, brightest) = reflected(&found);
+            if brightest > contrast * darkest { weak = middle } else { strong = middle }
+        }
+        let (_, brightest) = reflected(&found);
+        found.sky = found.sky.map(|s| s / brightest);
+        found.lamps.iter_mut().for_each(|lamp| lamp.color /= brightest);
+        found
+    }
+
+    /// The surroundings turned around the vertical axis, as a camera that moves by this angle around the person.
+    #[must_use]
+    pub fn turned(&self, degrees: f32) -> Self {
+        let (sin, cos) = libm::sincosf(degrees.to_radians());
+        let turn = Mat3::from_cols(Vec3::new(cos, 0.0, -sin), Vec3::Y, Vec3::new(sin, 0.0, cos));
+        let lamps =
+            self.lamps.iter().map(|lamp| Lamp { direction: turn * lamp.direction, ..*lamp }).collect();
+        Self { lamps, sky: self.sky }
+    }
+
+    /// Linear light from a direction.
+    pub(super) fn from(&self, direction: Vec3) -> Vec3 {
+        let lamps = self.lamps.iter().map(|lamp| {
+            let away = (1.0 - lamp.direction.dot(direction)).max(0.0);
+            lamp.color * libm::expf(-2.0 * away / (lamp.radius * lamp.radius))
+        });
+        let up = 0.5 + 0.5 * direction.y;
+        self.sky[1].lerp(self.sky[0], up) + lamps.sum::<Vec3>()
+    }
+}
+
+fn luminance(linear: Vec3) -> f32 {
+    linear.dot(Vec3::new(0.2126, 0.7152, 0.0722))
+}

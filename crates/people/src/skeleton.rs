@@ -1,0 +1,183 @@
+//! Bones of any rig and their places in a pose, and hands that sink into the body.
+
+use glam::{Mat3, Vec3};
+use kiddo::{ImmutableKdTree, SquaredEuclidean};
+
+use crate::math::{rotate_x, rotate_y, rotate_z};
+use crate::synth::figure::{Bone as Limb, Figure, Pose, sign};
+
+/// What a bone follows. Sides are 0 for the left (towards +x) and 1 for the right.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Joint {
+    /// The trunk, from the pelvis (0) to the shoulders (1).
+    Trunk(f32),
+    /// Neck and head, from the shoulders (0) to the skull (1).
+    Head(f32),
+    Clavicle(usize),
+    /// The upper arm, after so many halvings of the way from its parent.
+    UpperArm(usize, u8),
+    Forearm(usize),
+    /// A joint of a finger, but not of the thumb, with the axis of its bend towards the palm.
+    Finger(Vec3),
+    /// The thigh, after so many halvings of the way from its parent.
+    Thigh(usize, u8),
+    Calf(usize),
+    Foot(usize),
+    /// Its parent.
+    Parent,
+}
+
+/// A bone at rest.
+#[derive(Debug, Clone)]
+pub struct Bone {
+    pub joint: Joint,
+    /// Row of its parent, which comes before it.
+    pub parent: Option<usize>,
+    /// Its start.
+    pub head: Vec3,
+    /// Scales of what it moves, along its own axes at rest.
+    pub scale: Mat3,
+}
+
+/// Axes of the limbs at rest, by side, and the height of the arms.
+#[derive(Debug, Clone)]
+pub struct Rest {
+    pub upper_arms: [Mat3; 2],
+    pub forearms: [Mat3; 2],
+    pub thighs: [Mat3; 2],
+    pub calves: [Mat3; 2],
+    pub feet: [Mat3; 2],
+    /// Degrees by which the shoulders are raised at rest, as [`Pose::lift`].
+    pub lift: f32,
+}
+
+impl Rest {
+    /// The axes of a figure whose toes point outwards by 9°, as those of [`Figure::new`].
+    pub fn of(figure: &Figure) -> Self {
+        let frames = |limbs: &[Limb; 2]| [limbs[0].frame, limbs[1].frame];
+        Self {
+            upper_arms: frames(&figure.upper_arms),
+            forearms: frames(&figure.forearms),
+            thighs: frames(&figure.thighs),
+            calves: frames(&figure.calves),
+            feet: [0, 1].map(|side| rotate_y(sign(side) * 9.0)),
+            lift: 0.0,
+        }
+    }
+}
+
+/// Place of a bone in a pose.
+#[derive(Debug, Clone, Copy)]
+pub struct Placed {
+    /// Rotation.
+    pub turn: Mat3,
+    /// Rotation and scale.
+    matrix: Mat3,
+    /// Its start at rest and in the pose.
+    rest: Vec3,
+    head: Vec3,
+}
+
+impl Placed {
+    /// The place of a resting point that moves with the bone alone.
+    pub fn apply(&self, p: Vec3) -> Vec3 {
+        self.matrix * (p - self.rest) + self.head
+    }
+}
+
+/// Places of all bones in `pose`. `goal` is a figure in that pose; only its axes matter.
+pub fn placed(bones: &[Bone], rest: &Rest, pose: &Pose, goal: &Figure) -> Vec<Placed> {
+    let turned = |goal: &[Limb; 2], rest: &[Mat3; 2], side: usize| goal[side].frame * rest[side].transpose();
+    let mut placed: Vec<Placed> = Vec::with_capacity(bones.len());
+    for bone in bones {
+        let parent = bone.parent.map(|parent| placed[parent]);
+        let parent_turn = parent.map_or(pose.trunk_frame(0.0), |parent| parent.turn);
+        let halved = |turn: Mat3, times: u8| (0..times).fold(turn, |turn, _| halfway(parent_turn, turn));
+        let turn = match bone.joint {
+            Joint::Trunk(share) => pose.trunk_frame(share),
+            Joint::Head(share) => pose.head_frame(share),
+            // Shoulders rise with raised arms.
+            Joint::Clavicle(side) => {
+                parent_turn * rotate_z(sign(side) * (pose.lift(side) - rest.lift) * 0.35)
+            }
+            Joint::UpperArm(side, times) => halved(turned(&goal.upper_arms, &rest.upper_arms, side), times),
+            Joint::Forearm(side) => turned(&goal.forearms, &rest.forearms, side),
+            Joint::Finger(axis) => parent_turn * around(axis, 0.6 * pose.fingers),
+            Joint::Thigh(side, times) => halved(turned(&goal.thighs, &rest.thighs, side), times),
+            Joint::Calf(side) => turned(&goal.calves, &rest.calves, side),
+            Joint::Foot(side) => turned(&goal.feet, &rest.feet, side),
+            Joint::Parent => parent_turn,
+        };
+        let head = parent.map_or(bone.head, |parent| parent.apply(bone.head));
+        placed.push(Placed { turn, matrix: turn * bone.scale, rest: bone.head, head });
+    }
+    placed
+}
+
+/// Rotation by degrees around a unit vector; the identity for axis 0.
+fn around(axis: Vec3, degrees: f32) -> Mat3 {
+    if axis == Vec3::ZERO {
+        return Mat3::IDENTITY;
+    }
+    let up = axis.any_orthonormal_vector();
+    let frame = Mat3::from_cols(axis, up, axis.cross(up));
+    frame * rotate_x(degrees) * frame.transpose()
+}
+
+/// The rotation between two rotations: their mean, made orthonormal.
+fn halfway(a: Mat3, b: Mat3) -> Mat3 {
+    let mean = (a + b) * 0.5;
+    let x = mean.x_axis.normalize_or(a.x_axis);
+    let y = (mean.y_axis - mean.y_axis.dot(x) * x).normalize_or(a.y_axis);
+    Mat3::from_cols(x, y, x.cross(y))
+}
+
+/// Axes of a limb that hangs along `down` and bends around `hinge`.
+pub fn hanging(down: Vec3, hinge: Vec3) -> Mat3 {
+    let up = -down.normalize_or_zero();
+    let right = (hinge - hinge.dot(up) * up).normalize_or(up.any_orthonormal_vector());
+    Mat3::from_cols(right, up, right.cross(up))
+}
+
+/// A part of the body for [`sunk_hands`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Owner {
+    /// Trunk or legs.
+    Solid,
+    /// A hand, by its side.
+    Hand(usize),
+    Other,
+}
+
+/// Whether the left and the right hand lie in trunk or legs, or nearer to them than `gap` metres.
+pub fn sunk_hands(places: &[Vec3], normals: &[Vec3], owners: &[Owner], gap: f32) -> [bool; 2] {
+    /// One in so many vertices of a hand is checked.
+    const STEP: usize = 4;
+    /// Largest distance of a place inside the body from the nearest skin, metres.
+    const REACH: f32 = 0.07;
+    let of = |owner: Owner| (0..places.len()).filter(move |row| owners[*row] == owner);
+    let solid: Vec<usize> = of(Owner::Solid).collect();
+    if solid.is_empty() {
+        return [false; 2];
+    }
+    let tree = tree(solid.iter().map(|row| places[*row]));
+    [0, 1].map(|side| {
+        let hand = coordinates(of(Owner::Hand(side)).step_by(STEP).map(|row| places[row]));
+        let found = tree.query_batch(&hand).nearest_one::<SquaredEuclidean<f32>>().execute();
+        hand.iter().zip(&found).any(|(place, found)| {
+            let nearest = solid[found.item as usize];
+            let out = (Vec3::from(*place) - places[nearest]).dot(normals[nearest]);
+            found.distance < REACH * REACH && out < gap
+        })
+    })
+}
+
+/// Points in the form that [`tree`] is searched with.
+pub fn coordinates(points: impl IntoIterator<Item = Vec3>) -> Vec<[f32; 3]> {
+    points.into_iter().map(|p| p.to_array()).collect()
+}
+
+/// A tree for searches of the nearest of many points.
+pub fn tree(points: impl IntoIterator<Item = Vec3>) -> ImmutableKdTree<f32, 3> {
+    ImmutableKdTree::new_from_slice(&coordinates(points)).expect("fewer points than u32 can number")
+}
