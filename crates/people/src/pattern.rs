@@ -36,6 +36,8 @@ const KINDS: [Kind; 12] = [
     Kind::Denim,
     Kind::Knit,
 ];
+/// Kinds of most tops.
+const COMMON: [Kind; 5] = [Kind::Plain, Kind::Plain, Kind::Plain, Kind::Knit, Kind::Denim];
 /// Kinds of most trousers and shoes.
 const QUIET: [Kind; 6] = [Kind::Plain, Kind::Denim, Kind::Plain, Kind::Knit, Kind::Checks, Kind::Stripes];
 
@@ -60,9 +62,10 @@ pub fn hue(hue: f32, saturation: f32, value: f32) -> Vec3 {
 }
 
 impl Pattern {
-    /// Any cloth.
+    /// Any cloth, mostly plain.
     pub fn draw(random: &mut impl Rng) -> Self {
-        Self::of(KINDS[random.random_range(0..KINDS.len())], random, 1.0)
+        let kinds = if random.random_range(0.0..1.0_f32) < 0.6 { &COMMON[..] } else { &KINDS };
+        Self::of(kinds[random.random_range(0..kinds.len())], random, 1.0)
     }
 
     /// A cloth for trousers and shoes.
@@ -77,7 +80,7 @@ impl Pattern {
         let is_grey = random.random_range(0.0..1.0_f64) < 0.3;
         let mut between = |low: f32, high: f32| random.random_range(low..high);
         let saturation = if is_grey { 0.06 } else { between(0.25, 0.85) * strength };
-        let value = between(0.15, 0.95);
+        let value = between(0.05, 0.97);
         let contrast = if value > 0.5 { -0.45 } else { 0.45 };
         let second = hue(base + between(-0.15, 0.5), saturation * 0.9, (value + contrast).clamp(0.05, 1.0));
         let third = hue(base + between(0.2, 0.8), (saturation + 0.2).min(0.9), between(0.3, 0.95));

@@ -67,7 +67,10 @@ impl Person<'_> {
     }
 
     pub fn skin(&self) -> Piece {
-        let net = self.group("body").subdivide();
+        let body = &self.library.groups["body"];
+        let shown: Vec<[u32; 4]> =
+            body.iter().copied().filter(|face| !face.iter().all(|row| self.worn.hides(*row))).collect();
+        let net = Net::of(&self.vertices, &shown).subdivide();
         let parts = net.vertices.iter().map(|vertex| self.rows[vertex.part()] as u8).collect();
         Piece { net, parts }
     }
@@ -103,7 +106,7 @@ impl Person<'_> {
         Piece { net, parts }
     }
 
-    fn folds(&self, vertex: &Vertex) -> f32 {
+    pub fn folds(&self, vertex: &Vertex) -> f32 {
         let p = vertex.rest;
         self.outfit.folds * noise(Vec3::new(p.x * 24.0, p.y * 30.0, p.z * 24.0), self.outfit.seed)
     }
@@ -205,8 +208,8 @@ impl Person<'_> {
         let row = self.body.parts.iter().position(|part| part.kind == Kind::Hair)?;
         let hair = Body { parts: vec![self.body.parts[row].clone()] };
         let Surface { positions, faces, .. } = surface::mesh(&hair, HAIR_CELL);
-        let (turn, shift) = self.head;
-        let vertex = |p: &Vec3| Vertex { rest: *p, posed: turn * *p + shift, parts: [0.0; PARTS] };
+        let head = self.placed[self.head];
+        let vertex = |p: &Vec3| Vertex { rest: *p, posed: head.apply(*p), parts: [0.0; PARTS] };
         let vertices: Vec<Vertex> = positions.iter().map(vertex).collect();
         let mut net = Net { vertices, faces: faces.into_iter().map(|f| f.to_vec()).collect() };
         push_out(&mut net, &skin.net, false, |_| 0.006);

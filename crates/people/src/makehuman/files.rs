@@ -10,8 +10,10 @@ use serde::Deserialize;
 use serde::de::DeserializeOwned;
 use snapsnap_base::{FileError, file, quoted};
 
+use super::proxy::{Proxy, Wardrobe};
+
 /// Metres per unit of MakeHuman's files, a decimetre.
-const METRES: f32 = 0.1;
+pub const METRES: f32 = 0.1;
 /// Size limit of a file. The largest of MakeHuman's files has a few megabytes.
 const MAX_BYTES: u64 = 256 << 20;
 
@@ -50,6 +52,9 @@ pub struct Library {
     /// Bones that move each vertex, with shares that add up to 1.
     pub weights: Vec<Vec<(u32, f32)>>,
     targets: Mutex<HashMap<PathBuf, Target>>,
+    /// Clothes and hair.
+    pub wardrobe: Wardrobe,
+    proxies: Mutex<HashMap<PathBuf, Arc<Proxy>>>,
 }
 
 impl Library {
@@ -80,7 +85,9 @@ impl Library {
             let path = root.join("rigs/default.mhskel");
             return Err(FileError::unsuitable(&path, format!("has no bone `{bone}`")));
         }
-        Ok(Self { root, positions, groups, bones, weights, targets: Mutex::default() })
+        let wardrobe = Wardrobe::open(&root)?;
+        let (targets, proxies) = Default::default();
+        Ok(Self { root, positions, groups, bones, weights, targets, wardrobe, proxies })
     }
 
     /// The morph target at the path `name` below `targets`, without its ending. Each file is read once.
@@ -89,13 +96,15 @@ impl Library {
     /// [`FileError`] if it is missing or damaged.
     pub fn target(&self, name: &str) -> Result<Target, FileError> {
         let path = self.root.join("targets").join(format!("{name}.target"));
-        let locked = || self.targets.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(target) = locked().get(&path) {
-            return Ok(target.clone());
-        }
-        let target = Arc::new(read_target(&path, self.positions.len())?);
-        locked().insert(path, target.clone());
-        Ok(target)
+        once(&self.targets, &path, || read_target(&path, self.positions.len()))
+    }
+
+    /// A proxy of the wardrobe. Each file is read once.
+    ///
+    /// # Errors
+    /// [`FileError`] if it is damaged.
+    pub fn proxy(&self, path: &Path) -> Result<Arc<Proxy>, FileError> {
+        once(&self.proxies, path, || Proxy::read(path, self.positions.len()))
     }
 
     /// Names of the targets in a folder below `targets`, in order.
@@ -114,7 +123,22 @@ impl Library {
     }
 }
 
-fn read_text(path: &Path) -> Result<String, FileError> {
+/// The value of a file that was read before, or what `read` returns.
+fn once<T>(
+    cache: &Mutex<HashMap<PathBuf, Arc<T>>>,
+    path: &Path,
+    read: impl FnOnce() -> Result<T, FileError>,
+) -> Result<Arc<T>, FileError> {
+    let locked = || cache.lock().unwrap_or_else(PoisonError::into_inner);
+    if let Some(value) = locked().get(path) {
+        return Ok(value.clone());
+    }
+    let value = Arc::new(read()?);
+    locked().insert(path.to_owned(), value.clone());
+    Ok(value)
+}
+
+pub fn read_text(path: &Path) -> Result<String, FileError> {
     file::read_text(path, MAX_BYTES).map_err(FileError::read(path))
 }
 
@@ -122,12 +146,12 @@ fn read_json<T: DeserializeOwned>(path: &Path) -> Result<T, FileError> {
     serde_json::from_str(&read_text(path)?).map_err(|e| FileError::unsuitable(path, e))
 }
 
-fn wrong(path: &Path, line: usize, text: &str) -> FileError {
+pub fn wrong(path: &Path, line: usize, text: &str) -> FileError {
     FileError::unsuitable(path, format!("line {}, `{}`: not understood", line + 1, quoted(text)))
 }
 
 /// Three numbers within ±`LARGEST`, converted to metres.
-fn vector<'a>(mut words: impl Iterator<Item = &'a str>) -> Option<Vec3> {
+pub fn vector<'a>(mut words: impl Iterator<Item = &'a str>) -> Option<Vec3> {
     let mut next = || words.next()?.parse().ok().filter(|v: &f32| v.abs() < LARGEST);
     Some(METRES * Vec3::new(next()?, next()?, next()?))
 }

@@ -1,5 +1,5 @@
-//! People of MakeHuman's data: bodies mixed from morph targets, posed by skinning, and dressed in layers. The layers are cut
-//! from the helper surfaces of the base mesh; clothes and colours are those of [`synth`](crate::synth).
+//! People of MakeHuman's data: bodies mixed from morph targets, posed by skinning, and dressed. Clothes are layers that are
+//! cut from the helper surfaces of the base mesh, in colours of [`synth`](crate::synth), or meshes of the asset collection.
 //!
 //! The place on the resting body alone determines a colour, so that all layers at a place have the same one. Skin under
 //! cloth is pressed in, so that it does not come through.
@@ -7,14 +7,17 @@
 mod dress;
 mod files;
 mod net;
+mod proxy;
 mod rig;
 mod shape;
 #[cfg(test)]
 mod tests;
+mod wear;
 
-use glam::{Mat3, Vec3};
+use glam::Vec3;
 
 use crate::math::bounds;
+use crate::skeleton::Placed;
 use crate::synth::atlas;
 use crate::synth::body::Body;
 use crate::synth::figure::{Build, Figure, Pose};
@@ -27,6 +30,7 @@ pub use files::Library;
 use net::{Net, PARTS, Vertex};
 use rig::Joints;
 use shape::{Mix, morph};
+use wear::Worn;
 use snapsnap_base::FileError;
 use snapsnap_base::random::stream;
 use snapsnap_mesh::mesh::{Face, Material, Mesh};
@@ -71,8 +75,11 @@ struct Person<'a> {
     vertices: Vec<Vertex>,
     /// The surface that clothes are cut from.
     tights: Net,
-    /// Rotation and translation from the resting head to the posed one.
-    head: (Mat3, Vec3),
+    /// Places of the bones.
+    placed: Vec<Placed>,
+    /// Row of the head in `placed`.
+    head: usize,
+    worn: Worn,
     face: Landmarks,
 }
 
@@ -115,6 +122,9 @@ impl<'a> Person<'a> {
             // The base mesh's skirt begins below the waist.
             outfit.top_length = outfit.top_length.max(0.5);
         }
+        let is_draped = matches!(outfit.lower, Lower::Skirt { .. }) || outfit.top_length > 1.0;
+        let wardrobe = &mut stream(&format!("makehuman/wardrobe/{name}"));
+        let worn = Worn::draw(library, &outfit, mix.sex, is_draped, wardrobe)?;
         pose.spread_arms(0.5 * outfit.breadth());
 
         let joints = Joints::of(library, &rest);
@@ -125,15 +135,15 @@ impl<'a> Person<'a> {
         let figure = joints.figure(build, high.y, middle);
         let shares = shares(library);
         let posed = |pose: &Pose| {
-            let (positions, head) = joints.pose(&rest, &figure, pose);
+            let (positions, placed) = joints.pose(&rest, &figure, pose);
             let places = rest.iter().zip(positions).zip(&shares);
             let vertices = places.map(|((rest, posed), parts)| Vertex { rest: *rest, posed, parts: *parts });
-            (vertices.collect::<Vec<_>>(), head)
+            (vertices.collect::<Vec<_>>(), placed)
         };
         let cloth = 0.01 + outfit.top_thickness + if outfit.breadth() > 0.0 { 0.03 } else { 0.0 };
         let sunk =
-            |(vertices, _): &(Vec<Vertex>, _)| rig::sunk_hands(&group(library, vertices, "body"), cloth);
-        let (vertices, head) = pose.free_hands(posed, sunk);
+            |(vertices, _): &(Vec<Vertex>, Vec<Placed>)| rig::sunk_hands(&group(library, vertices, "body"), cloth);
+        let (vertices, placed) = pose.free_hands(posed, sunk);
 
         let body = Body::new(&figure, &outfit);
         let row = |kind: Kind, side: usize| {
@@ -145,7 +155,9 @@ impl<'a> Person<'a> {
             marks: Marks::of(&figure, &outfit),
             rows,
             tights: group(library, &vertices, "helper-tights").subdivide().subdivide(),
-            head,
+            placed,
+            head: joints.row("head").unwrap_or(0),
+            worn,
             face: landmarks(&body.parts[rows[HEAD]], &joints),
             figure,
             outfit,
@@ -172,8 +184,14 @@ impl<'a> Person<'a> {
 
     fn mesh(&self) -> Mesh {
         let skin = self.skin();
-        let hair = self.hair(&skin);
-        let garments = vec![self.bottom(), self.top(), self.shoes()];
+        let hair = self.hair(&skin).filter(|_| self.worn.hair.is_none());
+        let mut garments = Vec::new();
+        if self.worn.suit.is_none() {
+            garments.extend([self.bottom(), self.top()]);
+        }
+        if self.worn.shoes.is_none() {
+            garments.push(self.shoes());
+        }
         let skirts: Vec<Piece> = self
             .drapes()
             .map(|row| {
@@ -196,9 +214,11 @@ impl<'a> Person<'a> {
             surface.parts.extend(parts);
             surface.faces.extend(net.triangles().map(|face| face.map(|row| row + first)));
         }
-        let painter = Painter::new(&self.figure, &self.outfit, &self.face);
+        let bare = [self.worn.suit.is_some(), self.worn.shoes.is_some()];
+        let painter = Painter::new(&self.figure, &self.outfit, &self.face).bare(bare);
         let mut mesh = atlas::paint(&self.body, &surface, &painter);
         mesh.positions = positions;
+        self.add_worn(&mut mesh);
         self.add_eyes(&mut mesh);
         stand(&mut mesh);
         mesh

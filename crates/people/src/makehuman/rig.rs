@@ -6,7 +6,7 @@ use super::ORDER;
 use super::files::Library;
 use super::net::Net;
 use crate::math::bounds;
-use crate::skeleton::{self, Joint, Owner, Rest, hanging};
+use crate::skeleton::{self, Joint, Owner, Placed, Rest, hanging};
 use crate::synth::figure::{Bone, Build, Figure, Pose};
 use crate::synth::part::Kind;
 
@@ -27,7 +27,8 @@ impl<'a> Joints<'a> {
         Self { library, heads, tails }
     }
 
-    fn row(&self, name: &str) -> Option<usize> {
+    /// Row of a bone.
+    pub fn row(&self, name: &str) -> Option<usize> {
         self.library.bones.iter().position(|bone| bone.name == name)
     }
 
@@ -91,8 +92,8 @@ impl<'a> Joints<'a> {
         }
     }
 
-    /// `positions` in `pose`, and the rotation and translation of the head. `rest` is the figure of the resting body.
-    pub fn pose(&self, positions: &[Vec3], rest: &Figure, pose: &Pose) -> (Vec<Vec3>, (Mat3, Vec3)) {
+    /// `positions` in `pose`, and the places of the bones. `rest` is the figure of the resting body.
+    pub fn pose(&self, positions: &[Vec3], rest: &Figure, pose: &Pose) -> (Vec<Vec3>, Vec<Placed>) {
         let bones = self.library.bones.iter().enumerate().map(|(row, bone)| skeleton::Bone {
             joint: self.joint(&bone.name),
             parent: bone.parent,
@@ -106,8 +107,7 @@ impl<'a> Joints<'a> {
             let weights = self.library.weights[row].iter();
             weights.map(|(bone, share)| *share * placed[*bone as usize].apply(positions[row])).sum()
         };
-        let head = placed[self.row("head").unwrap_or(0)];
-        ((0..positions.len()).map(moved).collect(), (head.turn, head.apply(Vec3::ZERO)))
+        ((0..positions.len()).map(moved).collect(), placed)
     }
 
     /// What a bone of the default rig follows.

@@ -59,7 +59,8 @@ impl Mix {
             ages,
             descent: shares.map(|share| share / sum),
             muscle: between(0.2, 0.85),
-            weight: between(0.2, 0.85),
+            // One in five is very thin or very heavy.
+            weight: if between(0.0, 1.0) < 0.2 { between(0.0, 1.0) } else { between(0.25, 0.8) },
             height: between(0.25, 0.75),
             proportions: between(0.3, 0.9),
         }

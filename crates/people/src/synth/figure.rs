@@ -28,7 +28,9 @@ impl Build {
     pub fn draw(random: &mut impl Rng) -> Self {
         let sex: f32 = random.random_range(0.0..1.0);
         let stature = random.random_range(1.52..1.78) + 0.14 * sex;
-        let girth = random.random_range(0.86..1.2);
+        // One in five is heavy.
+        let heavy: f32 = random.random_range(0.0..1.0);
+        let girth = random.random_range(0.84..1.2) + 0.9 * (heavy - 0.8).max(0.0);
         Self {
             stature,
             sex,
@@ -57,6 +59,9 @@ pub struct Pose {
     pub fingers: f32,
 }
 
+/// Share of people who walk.
+const WALKING: f32 = 0.17;
+
 impl Pose {
     pub fn draw(random: &mut impl Rng) -> Self {
         let mut between = |low: f32, high: f32| random.random_range(low..high);
@@ -66,44 +71,57 @@ impl Pose {
             fingers: between(5.0, 35.0),
             ..Self::default()
         };
-        let stance = between(2.0, 10.0);
+        let stance = between(0.0, 12.0);
         for leg in &mut pose.legs {
             *leg = [between(-3.0, 6.0), stance + between(-1.0, 1.0), between(0.0, 8.0)];
         }
-        let kind = between(0.0, 1.0);
-        // Arms down, a little away, about horizontal; walking; hands on the hips; any other pose.
+        // The weight on one leg, the other a little forwards and bent.
+        if between(0.0, 1.0) < 0.3 {
+            let free = usize::from(between(0.0, 1.0) < 0.5);
+            pose.legs[free] = [between(6.0, 20.0), between(2.0, 14.0), between(8.0, 30.0)];
+            pose.legs[1 - free] = [between(-4.0, 1.0), between(-2.0, 3.0), between(0.0, 3.0)];
+            pose.trunk[2] = sign(free) * between(0.0, 6.0);
+        }
         let swing = if between(0.0, 1.0) < 0.5 { 1.0 } else { -1.0 };
-        for side in 0..2 {
-            let across = if side == 0 { swing } else { -swing };
-            pose.arms[side] = match kind {
-                k if k < 0.3 => {
-                    [between(9.0, 22.0), between(-8.0, 12.0), between(-5.0, 25.0), between(3.0, 25.0)]
+        let kind = between(0.0, 1.0);
+        if kind < WALKING {
+            for side in 0..2 {
+                let across = if side == 0 { swing } else { -swing };
+                let stride = between(14.0, 28.0);
+                pose.legs[side] = if across > 0.0 {
+                    [stride, between(1.0, 4.0), between(2.0, 12.0)]
+                } else {
+                    [-stride * 0.7, between(1.0, 4.0), between(10.0, 28.0)]
+                };
+                let raise = -across * between(15.0, 32.0);
+                pose.arms[side] = [between(9.0, 14.0), raise, between(0.0, 15.0), between(10.0, 40.0)];
+            }
+            return pose;
+        }
+        // Both arms do the same, or each what it likes.
+        let kind = between(0.0, 1.0);
+        let alike = between(0.0, 1.0) < 0.6;
+        for arm in &mut pose.arms {
+            let kind = if alike { kind } else { between(0.0, 1.0) };
+            *arm = match kind {
+                // Close to the body; a little away; farther away; about level; on the hip; in the pocket; anywhere.
+                k if k < 0.2 => {
+                    [between(4.0, 12.0), between(-8.0, 10.0), between(-5.0, 25.0), between(3.0, 22.0)]
                 }
-                k if k < 0.45 => {
-                    [between(25.0, 50.0), between(-8.0, 8.0), between(-10.0, 20.0), between(2.0, 20.0)]
+                k if k < 0.4 => {
+                    [between(10.0, 25.0), between(-8.0, 12.0), between(-5.0, 25.0), between(3.0, 30.0)]
                 }
-                k if k < 0.55 => {
-                    [between(75.0, 92.0), between(-8.0, 8.0), between(-10.0, 20.0), between(0.0, 12.0)]
+                k if k < 0.53 => {
+                    [between(25.0, 55.0), between(-8.0, 8.0), between(-10.0, 20.0), between(2.0, 20.0)]
                 }
-                k if k < 0.75 => {
-                    let stride = between(14.0, 28.0);
-                    pose.legs[side] = if across > 0.0 {
-                        [stride, between(1.0, 4.0), between(2.0, 12.0)]
-                    } else {
-                        [-stride * 0.7, between(1.0, 4.0), between(10.0, 28.0)]
-                    };
-                    [
-                        between(9.0, 14.0),
-                        -across * between(15.0, 32.0),
-                        between(0.0, 15.0),
-                        between(10.0, 40.0),
-                    ]
+                k if k < 0.62 => {
+                    [between(70.0, 95.0), between(-8.0, 8.0), between(-10.0, 20.0), between(0.0, 12.0)]
                 }
-                k if k < 0.88 && (side == 0 || k < 0.82) => {
+                k if k < 0.76 => {
                     [between(42.0, 52.0), between(-22.0, -12.0), between(78.0, 95.0), between(88.0, 102.0)]
                 }
-                k if k < 0.88 => {
-                    [between(10.0, 20.0), between(-5.0, 10.0), between(0.0, 20.0), between(5.0, 20.0)]
+                k if k < 0.86 => {
+                    [between(14.0, 24.0), between(-26.0, -12.0), between(15.0, 40.0), between(30.0, 52.0)]
                 }
                 _ => [between(12.0, 110.0), between(-15.0, 60.0), between(-10.0, 60.0), between(5.0, 95.0)],
             };
@@ -132,7 +150,7 @@ impl Pose {
     /// Moves hanging arms out of the way of clothes. `share` is the width of the clothes beyond the hips, in hip widths.
     pub fn spread_arms(&mut self, share: f32) {
         for arm in &mut self.arms {
-            arm[0] = arm[0].max((10.0 + 32.0 * share).min(30.0));
+            arm[0] = arm[0].max((6.0 + 36.0 * share).min(30.0));
         }
     }
 

@@ -32,18 +32,29 @@ pub struct Painter<'a> {
     /// Centre of prints, metres along the trunk.
     chest: f32,
     face: &'a Face,
+    /// Whether trunk, arms and legs have the colour of skin, and whether feet have.
+    bare: [bool; 2],
 }
 
 impl<'a> Painter<'a> {
     pub fn new(figure: &Figure, outfit: &'a Outfit, face: &'a Face) -> Self {
         let chest = 1.7 * figure.pelvis.length() + 0.55 * figure.chest.length();
-        Self { outfit, marks: Marks::of(figure, outfit), chest, face }
+        Self { outfit, marks: Marks::of(figure, outfit), chest, face, bare: [false; 2] }
+    }
+
+    /// The same without colours of cloth on trunk, arms and legs, and on the feet.
+    #[must_use]
+    pub fn bare(self, bare: [bool; 2]) -> Self {
+        Self { bare, ..self }
     }
 
     /// Colour at a place of a part's chart: angle around the axis (0 in front, positive towards +x) and metres along it.
     pub fn color(&self, part: &Part, angle: f32, along: f32) -> Vec3 {
         let cloth = Vec2::new(angle * part.radius, along);
+        let [body, feet] = self.bare;
         match part.kind {
+            Kind::Trunk | Kind::Arm | Kind::Leg if body => self.skin(cloth, 1),
+            Kind::Foot if feet => self.skin(cloth, 3),
             Kind::Trunk => self.trunk(angle, along, cloth),
             Kind::Arm => self.arm(part, along, cloth),
             Kind::Hand => self.skin(cloth, 3),

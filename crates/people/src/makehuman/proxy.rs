@@ -1,0 +1,327 @@
+//! Clothes, hair, hats and shoes of MakeHuman's asset collection: meshes bound to the base mesh (`.mhclo` and `.obj`).
+
+use std::collections::HashMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+
+use glam::{Vec2, Vec3};
+use rand::Rng;
+use snapsnap_base::FileError;
+
+use super::files::{METRES, read_text, vector, wrong};
+use super::net::{Net, Vertex};
+
+/// Purpose of a proxy.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Kind {
+    /// Top and bottom.
+    Suit,
+    Shoes,
+    Hat,
+    Hair,
+}
+
+/// Largest scale of offsets. Larger bodies come from damaged files.
+const MAX_SCALE: f32 = 10.0;
+
+/// A vertex: a mixture of vertices of the base mesh, and an offset in metres before it is scaled.
+#[derive(Debug, Clone, Copy)]
+struct Binding {
+    rows: [u32; 3],
+    shares: [f32; 3],
+    offset: Vec3,
+}
+
+/// Two vertices of the base mesh, and their distance along an axis for which offsets are made, metres.
+type Scale = ([u32; 2], f32);
+
+/// A proxy.
+#[derive(Debug, Clone)]
+pub struct Proxy {
+    bindings: Vec<Binding>,
+    /// For x, y and z.
+    scales: [Option<Scale>; 3],
+    /// Whether a vertex of the base mesh lies below it and is left out.
+    pub hides: Vec<bool>,
+    /// Corners of three or four, and their texture coordinates.
+    faces: Vec<(Vec<u32>, Vec<Vec2>)>,
+}
+
+/// A proxy on a body, in pieces that hang together.
+pub struct Fitted {
+    pub net: Net,
+    /// Texture coordinates of the faces' corners.
+    pub texcoords: Vec<Vec<Vec2>>,
+    /// By face: its piece. The largest piece is 0.
+    pub pieces: Vec<usize>,
+}
+
+/// Names of the proxies of each kind and sex that a folder has.
+#[derive(Debug, Default)]
+pub struct Wardrobe {
+    files: Vec<(Kind, PathBuf)>,
+}
+
+impl Wardrobe {
+    /// The proxies in the folders `clothes` and `hair` of MakeHuman's `data`. Without these, it is empty.
+    ///
+    /// # Errors
+    /// [`FileError`] for a file that cannot be read.
+    pub fn open(root: &Path) -> Result<Self, FileError> {
+        let mut files = Vec::new();
+        for folder in ["clothes", "hair"] {
+            for asset in entries(&root.join(folder))? {
+                let found = entries(&asset)?;
+                let found = found.into_iter().filter(|path| path.extension().is_some_and(|e| e == "mhclo"));
+                for path in found {
+                    let kind = if folder == "hair" { Kind::Hair } else { kind(&read_text(&path)?) };
+                    files.push((kind, path));
+                }
+            }
+        }
+        Ok(Self { files })
+    }
+
+    /// One of this kind for this sex, 0 female and 1 male.
+    pub fn choose(&self, kind: Kind, sex: f32, random: &mut impl Rng) -> Option<&Path> {
+        let word = if sex < 0.5 { "male_" } else { "female_" };
+        let fits = |path: &Path| {
+            let name = path.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
+            !name.starts_with(word)
+        };
+        let files: Vec<&PathBuf> =
+            self.files.iter().filter(|(own, path)| *own == kind && fits(path)).map(|(_, path)| path).collect();
+        let draw: f32 = random.random_range(0.0..1.0);
+        files.get((draw * files.len() as f32) as usize).map(|path| path.as_path())
+    }
+}
+
+/// Entries of a folder in order; none if it does not exist.
+fn entries(folder: &Path) -> Result<Vec<PathBuf>, FileError> {
+    if !folder.is_dir() {
+        return Ok(Vec::new());
+    }
+    let entries = fs::read_dir(folder).and_then(Iterator::collect::<Result<Vec<_>, _>>);
+    let mut paths: Vec<PathBuf> =
+        entries.map_err(FileError::read(folder))?.into_iter().map(|entry| entry.path()).collect();
+    paths.sort_unstable();
+    Ok(paths)
+}
+
+/// The kind of clothes, by their tags.
+fn kind(text: &str) -> Kind {
+    let has = |tag: &str| text.lines().any(|line| line.trim().eq_ignore_ascii_case(&format!("tag {tag}")));
+    match () {
+        () if has("Shoes") => Kind::Shoes,
+        () if has("Hats") => Kind::Hat,
+        () => Kind::Suit,
+    }
+}
+
+/// `count` numbers.
+fn numbers<'a, T: FromStr, const N: usize>(words: &mut impl Iterator<Item = &'a str>) -> Option<[T; N]> {
+    let values: Option<Vec<T>> = (0..N).map(|_| words.next()?.parse().ok()).collect();
+    values?.try_into().ok()
+}
+
+impl Proxy {
+    /// Reads a proxy of a base mesh of so many vertices.
+    ///
+    /// # Errors
+    /// [`FileError`] naming the file and the line.
+    pub fn read(path: &Path, vertices: usize) -> Result<Self, FileError> {
+        let text = read_text(path)?;
+        let mut proxy = Self {
+            bindings: Vec::new(),
+            scales: [None; 3],
+            hides: vec![false; vertices],
+            faces: Vec::new(),
+        };
+        let mut mesh = None;
+        let (mut is_list, mut is_hidden) = (false, false);
+        let inside = |row: &u32| (*row as usize) < vertices;
+        for (number, line) in text.lines().enumerate() {
+            let mut words = line.split_ascii_whitespace();
+            let Some(first) = words.clone().next().filter(|word| !word.starts_with('#')) else { continue };
+            let bad = || wrong(path, number, line);
+            if first.starts_with(|c: char| c.is_ascii_digit()) && is_hidden {
+                hide(line, &mut proxy.hides).ok_or_else(bad)?;
+                continue;
+            }
+            if first.starts_with(|c: char| c.is_ascii_digit()) && is_list {
+                proxy.bindings.push(binding(line, vertices).ok_or_else(bad)?);
+                continue;
+            }
+            words.next();
+            match first {
+                "obj_file" => mesh = words.next(),
+                "verts" => (is_list, is_hidden) = (true, false),
+                "delete_verts" => (is_list, is_hidden) = (false, true),
+                "x_scale" | "y_scale" | "z_scale" => {
+                    let rows: [u32; 2] = numbers(&mut words).filter(|rows| rows.iter().all(inside)).ok_or_else(bad)?;
+                    let [length]: [f32; 1] = numbers(&mut words).ok_or_else(bad)?;
+                    if !(length > 0.0 && length.is_finite()) {
+                        return Err(bad());
+                    }
+                    let axis = usize::from(first.as_bytes()[0] - b'x');
+                    proxy.scales[axis] = Some((rows, METRES * length));
+                }
+                _ => {}
+            }
+        }
+        let name = mesh.and_then(|name| Path::new(name).file_name());
+        let name = name.ok_or_else(|| FileError::unsuitable(path, "names no `obj_file`"))?;
+        proxy.faces = read_faces(&path.with_file_name(name), proxy.bindings.len())?;
+        Ok(proxy)
+    }
+
+    /// The proxy on a body. `bones` moves a resting point as the weights of the base mesh's vertices say.
+    pub fn fit(&self, body: &[Vertex], bones: impl Fn(&[(u32, f32)], Vec3) -> Vec3) -> Fitted {
+        let scale = |axis: usize| {
+            self.scales[axis].map_or(1.0, |([a, b], length)| {
+                let apart = body[a as usize].rest[axis] - body[b as usize].rest[axis];
+                (apart.abs() / length).min(MAX_SCALE)
+            })
+        };
+        let scale = Vec3::new(scale(0), scale(1), scale(2));
+        let vertex = |binding: &Binding| {
+            let shares: Vec<(u32, f32)> = binding.rows.into_iter().zip(binding.shares).collect();
+            let at = |(row, share): &(u32, f32)| *share * body[*row as usize].rest;
+            let rest = shares.iter().map(at).sum::<Vec3>() + binding.offset * scale;
+            // Shares below 0 lie beyond the triangle; bones follow its corners.
+            let kept: Vec<(u32, f32)> = shares.iter().map(|(row, share)| (*row, share.max(0.0))).collect();
+            let sum: f32 = kept.iter().map(|(_, share)| share).sum();
+            let kept: Vec<(u32, f32)> = if sum > 0.0 {
+                kept.into_iter().map(|(row, share)| (row, share / sum)).collect()
+            } else {
+                vec![(binding.rows[0], 1.0)]
+            };
+            let parts = std::array::from_fn(|part| {
+                kept.iter().map(|(row, share)| share * body[*row as usize].parts[part]).sum()
+            });
+            Vertex { rest, posed: bones(&kept, rest), parts }
+        };
+        let vertices: Vec<Vertex> = self.bindings.iter().map(vertex).collect();
+        let net = Net { vertices, faces: self.faces.iter().map(|(rows, _)| rows.clone()).collect() };
+        let pieces = pieces(&net);
+        let texcoords = self.faces.iter().map(|(_, texcoords)| texcoords.clone()).collect();
+        Fitted { net, texcoords, pieces }
+    }
+}
+
+impl Fitted {
+    /// One step of [`Net::subdivide`].
+    pub fn subdivide(&self) -> Self {
+        let net = self.net.subdivide();
+        let mut texcoords = Vec::with_capacity(net.faces.len());
+        let mut pieces = Vec::with_capacity(net.faces.len());
+        for (corners, piece) in self.texcoords.iter().zip(&self.pieces) {
+            let count = corners.len();
+            let middle = corners.iter().sum::<Vec2>() / count as f32;
+            for (i, corner) in corners.iter().enumerate() {
+                let (before, after) = (corners[(i + count - 1) % count], corners[(i + 1) % count]);
+                texcoords.push(vec![*corner, 0.5 * (*corner + after), middle, 0.5 * (before + *corner)]);
+                pieces.push(*piece);
+            }
+        }
+        Self { net, texcoords, pieces }
+    }
+}
+
+/// A line of the list of vertices: one vertex of the base mesh, or three with their shares and an offset.
+fn binding(line: &str, vertices: usize) -> Option<Binding> {
+    let mut words = line.split_ascii_whitespace();
+    let inside = |row: &u32| (*row as usize) < vertices;
+    if words.clone().count() == 1 {
+        let [row] = numbers(&mut words).filter(|rows: &[u32; 1]| rows.iter().all(inside))?;
+        return Some(Binding { rows: [row; 3], shares: [1.0, 0.0, 0.0], offset: Vec3::ZERO });
+    }
+    let rows = numbers(&mut words).filter(|rows: &[u32; 3]| rows.iter().all(inside))?;
+    let shares: [f32; 3] = numbers(&mut words)?;
+    if shares.iter().any(|share| !(share.abs() < 100.0)) {
+        return None;
+    }
+    Some(Binding { rows, shares, offset: vector(words)? })
+}
+
+/// Marks the vertices of a line such as `1355 - 1388 1393`.
+fn hide(line: &str, hides: &mut [bool]) -> Option<()> {
+    let mut last: Option<usize> = None;
+    let mut is_range = false;
+    for word in line.split_ascii_whitespace() {
+        if word == "-" {
+            is_range = true;
+            continue;
+        }
+        let row: usize = word.parse().ok()?;
+        let first = if is_range { last? } else { row };
+        hides.get_mut(first..=row)?.fill(true);
+        (last, is_range) = (Some(row), false);
+    }
+    Some(())
+}
+
+/// Faces of an OBJ of so many vertices, with texture coordinates, 0 without.
+fn read_faces(path: &Path, vertices: usize) -> Result<Vec<(Vec<u32>, Vec<Vec2>)>, FileError> {
+    let text = read_text(path)?;
+    let (mut count, mut texcoords, mut faces) = (0, Vec::new(), Vec::new());
+    for (number, line) in text.lines().enumerate() {
+        let mut words = line.split_ascii_whitespace();
+        match words.next() {
+            Some("v") => count += 1,
+            Some("vt") => {
+                let at = numbers(&mut words).filter(|at: &[f32; 2]| at.iter().all(|v| v.abs() < 1000.0));
+                texcoords.push(Vec2::from(at.ok_or_else(|| wrong(path, number, line))?));
+            }
+            Some("f") => {
+                let corner = |word: &str| {
+                    let mut parts = word.split('/');
+                    let row: usize = parts.next()?.parse().ok()?;
+                    let row = (1..=vertices).contains(&row).then(|| row as u32 - 1)?;
+                    let place = match parts.next().filter(|part| !part.is_empty()) {
+                        Some(part) => *texcoords.get(part.parse::<usize>().ok()?.checked_sub(1)?)?,
+                        None => Vec2::ZERO,
+                    };
+                    Some((row, place))
+                };
+                let face: Option<Vec<(u32, Vec2)>> = words.map(corner).collect();
+                let face = face.filter(|face| (3..=4).contains(&face.len()));
+                faces.push(face.ok_or_else(|| wrong(path, number, line))?.into_iter().unzip());
+            }
+            _ => {}
+        }
+    }
+    if count != vertices || faces.is_empty() {
+        let message = format!("has {count} vertices and {} faces for {vertices} bindings", faces.len());
+        return Err(FileError::unsuitable(path, message));
+    }
+    Ok(faces)
+}
+
+/// The pieces that hang together, largest first, by face.
+fn pieces(net: &Net) -> Vec<usize> {
+    let mut roots: Vec<usize> = (0..net.vertices.len()).collect();
+    fn root(roots: &mut [usize], mut row: usize) -> usize {
+        while roots[row] != row {
+            roots[row] = roots[roots[row]];
+            row = roots[row];
+        }
+        row
+    }
+    for face in &net.faces {
+        let first = root(&mut roots, face[0] as usize);
+        for corner in &face[1..] {
+            let other = root(&mut roots, *corner as usize);
+            roots[other] = first;
+        }
+    }
+    let owners: Vec<usize> = net.faces.iter().map(|face| root(&mut roots, face[0] as usize)).collect();
+    let mut sizes: HashMap<usize, usize> = HashMap::new();
+    owners.iter().for_each(|owner| *sizes.entry(*owner).or_default() += 1);
+    let mut order: Vec<usize> = sizes.keys().copied().collect();
+    order.sort_unstable_by_key(|owner| (std::cmp::Reverse(sizes[owner]), *owner));
+    let places: HashMap<usize, usize> = order.into_iter().enumerate().map(|(place, owner)| (owner, place)).collect();
+    owners.iter().map(|owner| places[owner]).collect()
+}
+
