@@ -66,7 +66,7 @@ fn data_set(root: &Path, resolution: usize) -> Result<Arc<Folder>, FileError> {
     for (split, count) in PEOPLE {
         for index in 0..count {
             let name = format!("{}-{index}", split.name());
-            config.add(&folder, &Subject::plain(split, &name), &synth::person(&name))?;
+            config.add(&folder, &Subject::plain(split, &name), &synth::person(&name, None))?;
         }
     }
     Ok(Arc::new(folder))

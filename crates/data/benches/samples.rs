@@ -24,7 +24,7 @@ fn data_set(root: &std::path::Path, layout: Layout, resolution: u32) -> Arc<Fold
         Folder::create(&root.join(format!("{layout:?}_{resolution}_24")), config.description("bench"));
     let folder = folder.expect("makes the folder");
     for index in 0..SUBJECTS {
-        let (subject, mesh) = (format!("{index:04}"), synth::person(&format!("bench/{index}")));
+        let (subject, mesh) = (format!("{index:04}"), synth::person(&format!("bench/{index}"), None));
         config.add(&folder, &Subject::plain(Split::Train, &subject), &mesh).expect("adds a subject");
     }
     Arc::new(folder)

@@ -1,11 +1,14 @@
 //! Random deviations of cameras from the training orbit.
 
-use glam::DVec3;
+use glam::{DVec2, DVec3};
 use rand::Rng;
 use serde::{Deserialize, Serialize};
-use snapsnap_splat::Orbit;
+use snapsnap_splat::{Camera, Orbit};
 
 use snapsnap_base::config::outside;
+
+/// Least distance of a camera from its target point, metres.
+const NEAREST: f64 = 1.3;
 
 /// Uniform deviations of cameras within ± each value.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -33,35 +36,38 @@ pub struct Jitter {
     pub focal: f64,
     /// Position of the target point in metres, per axis.
     pub look_at: f64,
+    /// Place of the optical axis in the picture, as a share of its side, across and up: a picture that was cropped.
+    pub shift: f64,
 }
 
 impl JitterConfig {
-    /// The first key that makes no sense, and why.
-    pub(crate) fn problem(&self) -> Option<(String, String)> {
+    /// The first key that makes no sense for cameras at `radius` metres, and why.
+    pub(crate) fn problem(&self, radius: f64) -> Option<(String, String)> {
         let Self { rig, view } = self;
         let sections = [("rig", rig), ("view", view), ("rig + jitter.view", &rig.plus(view))];
         sections.into_iter().find_map(|(section, jitter)| {
-            jitter.problem().map(|(key, message)| (format!("{section}.{key}"), message))
+            jitter.problem(radius).map(|(key, message)| (format!("{section}.{key}"), message))
         })
     }
 }
 
 impl Jitter {
-    fn problem(&self) -> Option<(&'static str, String)> {
-        let Self { yaw, pitch, roll, distance, focal, look_at } = *self;
+    fn problem(&self, radius: f64) -> Option<(&'static str, String)> {
+        let Self { yaw, pitch, roll, distance, focal, look_at, shift } = *self;
         outside([
             ("yaw", yaw, 0.0..=180.0),
             ("pitch", pitch, 0.0..=80.0),
             ("roll", roll, 0.0..=180.0),
             // Larger deviations would put the camera into the subject, or the subject out of view.
-            ("distance", distance, 0.0..=0.7),
+            ("distance", distance, 0.0..=(radius - NEAREST).max(0.0)),
             ("focal", focal, 0.0..=0.5),
             ("look_at", look_at, 0.0..=0.5),
+            ("shift", shift, 0.0..=0.25),
         ])
     }
 
     /// Sum of both deviations.
-    fn plus(&self, other: &Self) -> Self {
+    pub(crate) fn plus(&self, other: &Self) -> Self {
         Self {
             yaw: 0.0,
             pitch: self.pitch + other.pitch,
@@ -69,7 +75,15 @@ impl Jitter {
             distance: self.distance + other.distance,
             focal: self.focal + other.focal,
             look_at: self.look_at + other.look_at,
+            shift: self.shift + other.shift,
         }
+    }
+
+    /// Moves the optical axis of a camera at random in its picture.
+    pub(crate) fn shifted(&self, camera: Camera, random: &mut impl Rng) -> Camera {
+        let mut stray = || self.shift * f64::from(camera.width) * random.random_range(-1.0..1.0);
+        let principal_point = camera.principal_point + DVec2::new(stray(), stray());
+        Camera { principal_point, ..camera }
     }
 
     /// Moves a camera at random.

@@ -45,12 +45,16 @@ pub struct ViewsConfig {
     pub pitch: f64,
     /// Factor of the published cameras' distance.
     pub distance: f64,
+    /// Whether the focal length grows with the distance, so that a person is as large in a picture from afar.
+    pub framed: bool,
     /// Side in pixels.
     pub resolution: u32,
     /// Whether each view is rendered at twice the side as well, for stage 2's targets.
     pub high_resolution: bool,
     /// Samples per pixel along each axis, 1 to 6.
     pub samples_per_axis: usize,
+    /// Whether the depth of the second surface that faces the camera is stored as well.
+    pub second_depth: bool,
     /// Layout of the stored views.
     pub layout: Layout,
 }
@@ -64,9 +68,11 @@ impl Default for ViewsConfig {
             front_within_degrees: 30.0,
             pitch: 0.0,
             distance: 1.0,
+            framed: false,
             resolution: 1024,
             high_resolution: false,
             samples_per_axis: 3,
+            second_depth: false,
             layout: Layout::Exact,
         }
     }
@@ -92,6 +98,10 @@ impl Schema for DataConfig {
         if arrangement == Arrangement::Groups && !count.is_multiple_of(4) {
             return Some(("views.count".into(), format!("is {count}, must be a multiple of 4 in groups")));
         }
+        if self.views.second_depth && layout == Layout::Authors {
+            let message = "is true, which the authors' layout does not support".into();
+            return Some(("views.second_depth".into(), message));
+        }
         if arrangement == Arrangement::Groups && layout == Layout::Authors {
             let message = "is \"groups\", which the authors' layout does not support".into();
             return Some(("views.arrangement".into(), message));
@@ -99,20 +109,22 @@ impl Schema for DataConfig {
         if let Some((key, message)) = self.light.problem() {
             return Some((format!("light.{key}"), message));
         }
-        self.jitter.problem().map(|(key, message)| (format!("jitter.{key}"), message))
+        self.jitter.problem(self.orbit(0.0).radius).map(|(key, message)| (format!("jitter.{key}"), message))
     }
 }
 
 impl DataConfig {
     /// Description of a data set with this config.
     pub fn description(&self, source: &str) -> Description {
-        let ViewsConfig { count, arrangement, resolution, high_resolution, layout, .. } = self.views;
+        let ViewsConfig { count, arrangement, resolution, high_resolution, second_depth, layout, .. } =
+            self.views;
         Description {
             layout,
             views: count,
             arrangement,
             resolution,
             high_resolution,
+            second_depth,
             pixel_centre: if layout == Layout::Authors { 0.0 } else { 0.5 },
             source: source.to_owned(),
             drawn: Some(Drawn {
@@ -127,8 +139,11 @@ impl DataConfig {
     /// deviations.
     pub fn cameras(&self, yaw_degrees: f64, name: &str) -> Vec<Camera> {
         let mut random = stream(&format!("cameras/{name}"));
+        let mut shifts = stream(&format!("shifts/{name}"));
         if self.views.arrangement == Arrangement::Groups {
-            return (0..self.views.count / 4).flat_map(|_| self.group(yaw_degrees, &mut random)).collect();
+            return (0..self.views.count / 4)
+                .flat_map(|_| self.group(yaw_degrees, &mut random, &mut shifts))
+                .collect();
         }
         let mut rig = self.orbit(yaw_degrees);
         self.jitter.rig.apply(&mut rig, &mut random);
@@ -137,7 +152,7 @@ impl DataConfig {
                 let mut orbit = rig;
                 orbit.yaw_degrees += view as f64 * 360.0 / self.views.count as f64;
                 self.jitter.view.apply(&mut orbit, &mut random);
-                orbit.camera(self.views.resolution)
+                self.jitter.rig.plus(&self.jitter.view).shifted(self.camera(orbit), &mut shifts)
             })
             .collect()
     }
@@ -153,16 +168,23 @@ impl DataConfig {
         }
     }
 
+    fn camera(&self, orbit: Orbit) -> Camera {
+        let nominal = Orbit::default().radius;
+        let zoom = if self.views.framed { orbit.radius / nominal } else { 1.0 };
+        Orbit { focal: zoom * orbit.focal, ..orbit }.camera(self.views.resolution)
+    }
+
     /// Cameras of a group. The sides' cameras are exact quarter turns of the front camera.
-    fn group(&self, yaw_degrees: f64, random: &mut impl Rng) -> [Camera; 4] {
-        let ViewsConfig { front_within_degrees, resolution, .. } = self.views;
+    fn group(&self, yaw_degrees: f64, random: &mut impl Rng, shifts: &mut impl Rng) -> [Camera; 4] {
+        let front_within_degrees = self.views.front_within_degrees;
         let mut front = self.orbit(yaw_degrees);
         front.yaw_degrees += front_within_degrees * random.random_range(-1.0..1.0);
         self.jitter.rig.apply(&mut front, random);
         let mut back = Orbit { yaw_degrees: front.yaw_degrees + 180.0, ..front };
         self.jitter.view.apply(&mut back, random);
-        let front = front.camera(resolution);
-        [front, back.camera(resolution), front.turned(90.0), front.turned(270.0)]
+        let front = self.jitter.rig.shifted(self.camera(front), shifts);
+        let back = self.jitter.rig.plus(&self.jitter.view).shifted(self.camera(back), shifts);
+        [front, back, front.turned(90.0), front.turned(270.0)]
     }
 
     /// Renders a subject and adds it to the data set. `mesh` stands on the floor at the origin.
@@ -179,7 +201,8 @@ impl DataConfig {
         let first = around(&cameras[0]);
         folder.write_subject(split, name, origin, &cameras, |camera| {
             let light = self.light.seen_from(&light, around(camera), first);
-            renderer.draw(camera, &ViewOptions { samples: self.views.samples_per_axis, light })
+            let ViewsConfig { samples_per_axis: samples, second_depth: second, .. } = self.views;
+            renderer.draw(camera, &ViewOptions { samples, light, second })
         })
     }
 }
@@ -294,7 +317,15 @@ mod tests {
 
     #[test]
     fn jitter_stays_in_its_ranges_and_follows_the_name() {
-        let jitter = Jitter { yaw: 5.0, pitch: 4.0, roll: 3.0, distance: 0.2, focal: 0.1, look_at: 0.05 };
+        let jitter = Jitter {
+            yaw: 5.0,
+            pitch: 4.0,
+            roll: 3.0,
+            distance: 0.2,
+            focal: 0.1,
+            look_at: 0.05,
+            ..Jitter::default()
+        };
         let mut config = DataConfig::default();
         config.jitter.view = jitter;
         let cameras = |name: &str| config.cameras(0.0, name);
@@ -312,6 +343,41 @@ mod tests {
         assert_eq!(config.refusal(), None);
         config.jitter.rig.focal = 0.6;
         assert_eq!(config.refusal(), Some(("jitter.rig.focal".into(), "is 0.6, must be 0 to 0.5".into())));
+    }
+
+    /// From 1.6 to 4 metres a person is about as large in all pictures, and somewhere near their middles.
+    #[test]
+    fn framed_cameras_see_persons_of_one_size_from_any_distance() {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/data/phone.toml");
+        let config = DataConfig::from_file(&path, &[]).expect("reads");
+        let (mut distances, mut pitches, mut sizes, mut places) =
+            (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+        for name in 0..200 {
+            for camera in config.cameras(0.0, &name.to_string()).chunks(4).flat_map(|four| [four[0], four[1]])
+            {
+                let away = camera.centre() - Orbit::default().centre;
+                distances.push(away.length());
+                pitches.push((away.y / away.length()).asin().to_degrees());
+                let seen = |y: f64| {
+                    let p = camera.world_to_camera.apply(glam::DVec3::new(0.0, y, 0.0));
+                    (camera.focal * p.truncate() / p.z + camera.principal_point) / f64::from(camera.width)
+                };
+                sizes.push((seen(1.8) - seen(0.0)).length());
+                places.push((seen(0.9) - 0.5).abs().max_element());
+            }
+        }
+        let range = |values: &mut Vec<f64>| {
+            values.sort_by(f64::total_cmp);
+            (values[0], values[values.len() - 1])
+        };
+        let (nearest, farthest) = range(&mut distances);
+        assert!((1.55..1.8).contains(&nearest) && (3.8..4.05).contains(&farthest), "{nearest} {farthest}");
+        let (lowest, highest) = range(&mut pitches);
+        assert!((-6.5..-3.0).contains(&lowest) && (18.0..21.5).contains(&highest), "{lowest} {highest}");
+        let (smallest, largest) = range(&mut sizes);
+        assert!(smallest > 0.55 && largest < 0.9, "{smallest} {largest}");
+        let (_, farthest) = range(&mut places);
+        assert!((0.05..0.2).contains(&farthest), "{farthest}");
     }
 
     #[test]

@@ -32,6 +32,8 @@ const BAND: usize = 8;
 const NEAR: f64 = 1e-3;
 /// Largest pixel coordinate of a vertex. Triangles with a larger one are left out.
 const FAR_OUTSIDE: f64 = 1e6;
+/// Least distance between two surfaces along a ray, metres, for the second one to be another.
+const LEAST_GAP: f64 = 0.004;
 /// No triangle.
 const NONE: u32 = u32::MAX;
 
@@ -42,11 +44,13 @@ pub struct ViewOptions {
     pub samples: usize,
     /// Light of the scene.
     pub light: Light,
+    /// Whether [`View::second`] is made.
+    pub second: bool,
 }
 
 impl Default for ViewOptions {
     fn default() -> Self {
-        Self { samples: 3, light: Light::default() }
+        Self { samples: 3, light: Light::default(), second: false }
     }
 }
 
@@ -63,6 +67,9 @@ pub struct View {
     pub alpha: Vec<f32>,
     /// `[H,W]` metres along the optical axis at the pixel's centre; 0 without a surface there.
     pub depth: Vec<f32>,
+    /// `[H,W]` depth of the second surface that faces the camera: the first one behind the place where the pixel's ray
+    /// leaves the body, as a flank behind an arm. 0 without one, and empty unless [`ViewOptions::second`].
+    pub second: Vec<f32>,
 }
 
 /// A triangle on the screen.
@@ -75,6 +82,8 @@ struct Triangle {
     columns: [usize; 2],
     rows: [usize; 2],
     face: u32,
+    /// Whether its outer side is visible.
+    is_front: bool,
 }
 
 /// A mesh with the normals and textures that drawing needs, for any number of views.
@@ -143,12 +152,19 @@ impl<'a> Renderer<'a> {
             color: vec![[0.0; 3]; pixels],
             alpha: vec![0.0; pixels],
             depth: vec![0.0; pixels],
+            second: vec![0.0; if options.second { pixels } else { 0 }],
         };
         let colors = view.color.par_chunks_mut(BAND * width);
         let coverages = view.alpha.par_chunks_mut(BAND * width);
         let depths = view.depth.par_chunks_mut(BAND * width);
-        let bands = lists.par_iter().enumerate().zip((colors, coverages, depths).into_par_iter());
-        bands.for_each(|((number, list), (color, alpha, depth))| {
+        // Rows of no pixels, if the second surface is not wanted.
+        let mut seconds: Vec<&mut [f32]> = match options.second {
+            true => view.second.chunks_mut(BAND * width).collect(),
+            false => lists.iter().map(|_| Default::default()).collect(),
+        };
+        let outputs = (colors, coverages, depths, seconds.par_iter_mut()).into_par_iter();
+        let bands = lists.par_iter().enumerate().zip(outputs);
+        bands.for_each(|((number, list), (color, alpha, depth, second))| {
             let rows = [number * BAND, height.min((number + 1) * BAND)];
             let Some(band) = Band::new(list, &triangles, rows, &places) else { return };
             for (pixel, seen) in band.nearest.chunks_exact(places.len()).enumerate() {
@@ -160,6 +176,9 @@ impl<'a> Renderer<'a> {
                 }
                 let corner = DVec2::new(x as f64, (rows[0] + y) as f64);
                 (color[at], alpha[at]) = shade(samples, &places, corner, &triangles, &shader);
+            }
+            if options.second {
+                band.second(list, &triangles, rows, width, second);
             }
         });
         view
@@ -203,7 +222,7 @@ fn triangle(corners: [DVec3; 3], face: usize, camera: &Camera) -> Option<Triangl
     let (f, c) = (camera.focal, camera.principal_point);
     let (x, y) = (n.x / f.x, n.y / f.y);
     let plane = DVec3::new(x, y, n.z - x * c.x - y * c.y) / distance;
-    Some(Triangle { corners: rounded, plane, columns, rows, face: face as u32 })
+    Some(Triangle { corners: rounded, plane, columns, rows, face: face as u32, is_front: distance < 0.0 })
 }
 
 /// Places of the samples within a pixel, in 1/[`SUBPIXELS`]. The last is the centre, which counts only for depth.
@@ -236,27 +255,67 @@ impl Band {
 
     /// Marks the samples inside the triangle to which it is the nearest so far.
     fn add(&mut self, index: u32, t: &Triangle, rows: [usize; 2], places: &[[i64; 2]]) {
+        let (left, columns) = (self.left, self.columns);
+        t.samples(rows, places, |x, y, place, inverse_depth| {
+            let pixel = (y - rows[0]) * columns + x - left;
+            let nearest = &mut self.nearest[pixel * places.len() + place];
+            if inverse_depth > nearest.0 {
+                *nearest = (inverse_depth, index);
+            }
+        });
+    }
+
+    /// Writes the depths of [`View::second`] in the rows of the band, pictures of this width.
+    fn second(&self, list: &[u32], triangles: &[Triangle], rows: [usize; 2], width: usize, to: &mut [f32]) {
+        let per_pixel = self.nearest.len() / ((rows[1] - rows[0]) * self.columns);
+        let centres = self.nearest.iter().skip(per_pixel - 1).step_by(per_pixel);
+        // The nearest triangle of one side that lies behind the given depths (their inverses).
+        let behind = |limits: &[f64], is_front: bool| {
+            let mut found = vec![0.0_f64; limits.len()];
+            for t in list.iter().map(|index| &triangles[*index as usize]).filter(|t| t.is_front == is_front) {
+                t.samples(rows, &[[SUBPIXELS / 2; 2]], |x, y, _, inverse_depth| {
+                    let pixel = (y - rows[0]) * self.columns + x - self.left;
+                    // A depth of 0 has no inverse: there is nothing to lie behind.
+                    let is_behind =
+                        limits[pixel] > 0.0 && 1.0 / inverse_depth > 1.0 / limits[pixel] + LEAST_GAP;
+                    if is_behind && inverse_depth > found[pixel] {
+                        found[pixel] = inverse_depth;
+                    }
+                });
+            }
+            found
+        };
+        let first: Vec<f64> = centres.map(|(inverse_depth, _)| *inverse_depth).collect();
+        let exits = behind(&first, false);
+        for (pixel, inverse_depth) in behind(&exits, true).into_iter().enumerate() {
+            if inverse_depth > 0.0 {
+                to[pixel / self.columns * width + self.left + pixel % self.columns] =
+                    (1.0 / inverse_depth) as f32;
+            }
+        }
+    }
+}
+
+impl Triangle {
+    /// Calls `each` for the samples inside the triangle in the rows from `rows[0]` to before `rows[1]`: column, row, place
+    /// in the pixel, and 1/z.
+    fn samples(&self, rows: [usize; 2], places: &[[i64; 2]], mut each: impl FnMut(usize, usize, usize, f64)) {
         // Edge function of edge i at (x, y), minus one where points on the edge belong to the neighbour: inside is ≥ 0.
         let edges: [[i64; 3]; 3] = std::array::from_fn(|i| {
-            let (from, to) = (t.corners[i], t.corners[(i + 1) % 3]);
+            let (from, to) = (self.corners[i], self.corners[(i + 1) % 3]);
             let [dx, dy] = [to[0] - from[0], to[1] - from[1]];
             // With y down and positive area, top edges run right and left edges run up.
             let owned = (dy == 0 && dx > 0) || dy < 0;
             [-dy, dx, dy * from[0] - dx * from[1] - i64::from(!owned)]
         });
-        for y in t.rows[0].max(rows[0])..=t.rows[1].min(rows[1] - 1) {
-            for x in t.columns[0]..=t.columns[1] {
-                let pixel = (y - rows[0]) * self.columns + x - self.left;
+        for y in self.rows[0].max(rows[0])..=self.rows[1].min(rows[1] - 1) {
+            for x in self.columns[0]..=self.columns[1] {
                 let (px, py) = (x as i64 * SUBPIXELS, y as i64 * SUBPIXELS);
-                let seen = &mut self.nearest[pixel * places.len()..(pixel + 1) * places.len()];
-                for (place, nearest) in places.iter().zip(seen) {
-                    let (sx, sy) = (px + place[0], py + place[1]);
+                for (place, [dx, dy]) in places.iter().enumerate() {
+                    let (sx, sy) = (px + dx, py + dy);
                     if edges.iter().all(|[a, b, c]| a * sx + b * sy + c >= 0) {
                         let (u, v) = (sx as f64 / SUBPIXELS as f64, sy as f64 / SUBPIXELS as f64);
-                        let inverse_depth = t.plane.dot(DVec3::new(u, v, 1.0));
-                        if inverse_depth > nearest.0 {
-                            *nearest = (inverse_depth, index);
-                        }
+                        each(x, y, place, self.plane.dot(DVec3::new(u, v, 1.0)));
                     }
                 }
             }

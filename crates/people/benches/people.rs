@@ -23,12 +23,12 @@ fn measure(kind: &str, make: impl Fn(&str) -> Mesh) {
 
 fn main() {
     println!("| people | each | per minute | triangles |\n|---|---:|---:|---:|");
-    measure("synthetic", synth::person);
+    measure("synthetic", |name| synth::person(name, None));
     // Cargo adds flags.
     match std::env::args().skip(1).find(|argument| !argument.starts_with('-')) {
         Some(folder) => {
             let library = Library::open(Path::new(&folder)).expect("MakeHuman's data");
-            measure("MakeHuman", |name| makehuman::person(&library, name).expect("made"));
+            measure("MakeHuman", |name| makehuman::person(&library, name, None).expect("made"));
         }
         None => println!("SKIPPED: MakeHuman people, no folder of its data was given"),
     }

@@ -5,5 +5,6 @@ pub mod avatars;
 pub mod makehuman;
 mod math;
 mod pattern;
+pub mod poses;
 mod skeleton;
 pub mod synth;

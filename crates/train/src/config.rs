@@ -304,7 +304,7 @@ impl TrainConfig {
             return refuse("stage2.point_map_cache", message);
         }
         if two.point_map_cache.is_some() && self.samples.augment.changes_photographs() {
-            let message = "needs photographs that do not change: exposure, white_balance, mask_erosion, mask_dilation \
+            let message = "needs photographs that do not change: exposure, white_balance, blur, noise, mask_erosion, mask_dilation \
                            and jpeg_quality of `samples.augment` must be 0, and background false";
             return refuse("stage2.point_map_cache", message);
         }

@@ -9,6 +9,7 @@ use burn::tensor::Device;
 use clap::Args;
 use serde_json::Value;
 use snapsnap_base::config::Schema;
+use snapsnap_data::sample::Handling;
 use snapsnap_eval::baselines::MeanPictures;
 use snapsnap_eval::evaluate::config::EvalConfig;
 use snapsnap_eval::evaluate::meshes::{Align, evaluate_meshes};
@@ -44,6 +45,10 @@ pub struct Arguments {
     /// Other weights, which are compared with the model person by person.
     #[arg(long, value_name = "FILE|DIR")]
     against: Option<PathBuf>,
+    /// Also evaluate the model on other photographs: grey gives every pixel of the person their mean colour, so that only
+    /// the outline is left.
+    #[arg(long, value_parser = one_of(INPUTS), value_name = "KIND", conflicts_with = "mesh_dir")]
+    inputs: Option<Handling>,
     /// Evaluate the meshes NAME.obj, .ply or .glb in this folder instead of weights.
     #[arg(long, value_name = "DIR", conflicts_with_all = ["weights", "against"])]
     mesh_dir: Option<PathBuf>,
@@ -61,6 +66,8 @@ pub struct Arguments {
 }
 
 const ICP: [(&str, &str, Align); 2] = [("rigid", "", Align::Rigidly), ("similarity", "", Align::Similarly)];
+const INPUTS: [(&str, &str, Handling); 1] =
+    [("grey", "", Handling { grey: true, place: 0, exposure: 0.0, mask: 0.0, cut: 0.0 })];
 /// The end of the message about failed parts.
 const REST: &str = "the rest, if there is any, was evaluated";
 
@@ -207,6 +214,10 @@ fn config_of(arguments: &Arguments) -> Result<EvalConfig, Failure> {
     if let Some(against) = &arguments.against {
         let other = Variant { weights: Some(against.clone()), ..Variant::default() };
         config.ablations.insert("against".into(), other);
+    }
+    if let Some(Handling { grey, .. }) = arguments.inputs {
+        let photographs = Some(Handling { grey, ..config.photographs });
+        config.ablations.insert("grey".into(), Variant { photographs, ..Variant::default() });
     }
     Ok(config)
 }

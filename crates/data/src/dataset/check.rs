@@ -112,7 +112,7 @@ fn unexpected(folder: &Folder, split: Option<Split>, subject: &str) -> Vec<Strin
 fn faults(folder: &Folder, split: Option<Split>, subject: &str, view: usize) -> (Vec<String>, Option<Seen>) {
     let mut problems = Vec::new();
     let mut keep = |e: FileError| problems.push(e.to_string());
-    let Description { layout, high_resolution, .. } = *folder.description();
+    let Description { layout, high_resolution, second_depth, .. } = *folder.description();
     if high_resolution {
         folder.file(split, subject, view, true).map_err(&mut keep).ok();
     }
@@ -122,6 +122,7 @@ fn faults(folder: &Folder, split: Option<Split>, subject: &str, view: usize) -> 
         Layout::Authors => folder.mask(split, subject, view).map_err(&mut keep).ok(),
     };
     let depth = folder.depth_map(split, subject, view).map_err(&mut keep).ok();
+    let second = second_depth.then(|| folder.second_depth(split, subject, view).map_err(&mut keep).ok());
     let camera = folder.camera(split, subject, view).map_err(&mut keep).ok();
 
     let at = folder.path(split, "img", subject).join(view.to_string());
@@ -144,6 +145,14 @@ fn faults(folder: &Folder, split: Option<Split>, subject: &str, view: usize) -> 
         .count();
     if missing > 4 && missing as f64 > HOLES * person.unwrap_or(0) as f64 {
         report(format!("{missing} pixels of the person have no depth"));
+    }
+    if let Some(second) = second.flatten() {
+        let before = depth.iter().zip(&second).filter(|(first, second)| **second > 0.0 && second <= first);
+        let bare = depth.iter().zip(&second).filter(|(first, second)| **second > 0.0 && **first <= 0.0);
+        let wrong = before.count() + bare.count();
+        if wrong > 0 {
+            report(format!("{wrong} pixels have a second surface that is not behind a first one"));
+        }
     }
     // Empty and tiny views cannot be compared.
     let camera = camera.filter(|_| person != Some(0) && width >= LEAST_SIDE);

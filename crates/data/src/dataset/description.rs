@@ -104,6 +104,9 @@ pub struct Description {
     pub resolution: u32,
     /// Whether each view is stored at twice the side as well.
     pub high_resolution: bool,
+    /// Whether the depth of the second surface that faces the camera is stored as well.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub second_depth: bool,
     /// Camera coordinates of the first pixel's sample: 0 in the authors' sets, ½ in the exact layout. Points from depth
     /// are half a pixel off without this correction.
     pub pixel_centre: f64,

@@ -133,8 +133,8 @@ pub fn read_inverse_depth(path: &Path) -> Result<Depth, FileError> {
 }
 
 /// Writes f32 metres, compressed without loss. NumPy's `load` reads the file.
-pub fn write_depth(path: &Path, view: &View) -> Result<(), FileError> {
-    let array = ArrayView2::from_shape((view.height, view.width), &view.depth).expect("one depth per pixel");
+pub fn write_depth(path: &Path, [height, width]: [usize; 2], depth: &[f32]) -> Result<(), FileError> {
+    let array = ArrayView2::from_shape((height, width), depth).expect("one depth per pixel");
     let mut npy = Vec::new();
     array.write_npy(&mut npy).map_err(|e| FileError::unsuitable(path, e))?;
     let mut archive = ZipWriter::new(Cursor::new(Vec::new()));

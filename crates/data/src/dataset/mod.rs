@@ -8,7 +8,7 @@
 //!   ├ img/S/v.jpg, v_hr.jpg                  ├ img/S/v.png, v_hr.png   RGBA, straight alpha
 //!   ├ mask/S/v.png          0 or 255         ├ depth/S/v.npz           `depth`, f32 metres, 0: background
 //!   ├ depth/S/v.png         ⌊2¹⁵/z⌋          └ cameras/S.json          one camera per view
-//!   └ parm/S/v_intrinsic.npy, v_extrinsic.npy
+//!   └ parm/S/v_intrinsic.npy, v_extrinsic.npy  └ depth2/S/v.npz       optional: the second surface, as depth
 //! ```
 //!
 //! A subject is added whole or not at all: it is written under another name, and its `img` folder, which marks a
@@ -83,6 +83,7 @@ impl Folder {
                 arrangement: Arrangement::Ring,
                 resolution: 1,
                 high_resolution: false,
+                second_depth: false,
                 pixel_centre: 0.0,
                 source: "written by the authors' tools".into(),
                 drawn: None,
@@ -189,8 +190,31 @@ impl Folder {
         Ok(StoredView { color: RgbImage::default(), mask: GrayImage::default(), depth, camera })
     }
 
+    /// Reads the depth of the second surface that faces the camera: `[H,W]` metres, 0 without one.
+    ///
+    /// # Errors
+    /// As [`Self::view`]. Without [`Description::second_depth`] the files are missing.
+    pub fn second_depth(
+        &self,
+        split: Option<Split>,
+        subject: &str,
+        view: usize,
+    ) -> Result<Vec<f32>, FileError> {
+        self.map_of("depth2", split, subject, view)
+    }
+
     fn depth_map(&self, split: Option<Split>, subject: &str, view: usize) -> Result<Vec<f32>, FileError> {
-        let path = self.path(split, "depth", subject).join(self.file_name("depth", view));
+        self.map_of("depth", split, subject, view)
+    }
+
+    fn map_of(
+        &self,
+        kind: &str,
+        split: Option<Split>,
+        subject: &str,
+        view: usize,
+    ) -> Result<Vec<f32>, FileError> {
+        let path = self.path(split, kind, subject).join(self.file_name(kind, view));
         let read = match self.description.layout {
             Layout::Authors => files::read_inverse_depth,
             Layout::Exact => files::read_depth,
@@ -308,7 +332,7 @@ impl Folder {
     /// File name of a view's picture, mask or depth, by the name of its folder.
     fn file_name(&self, kind: &str, view: impl Display) -> String {
         let ending = match (kind, self.description.layout) {
-            ("depth", Layout::Exact) => "npz",
+            ("depth" | "depth2", Layout::Exact) => "npz",
             ("img", Layout::Authors) => "jpg",
             _ => "png",
         };

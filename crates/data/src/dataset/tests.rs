@@ -1,6 +1,8 @@
 use super::*;
 use crate::prepare::{DataConfig, Subject};
-use crate::testing::{data_set, rectangle};
+use crate::testing::{block, data_set, rectangle};
+use glam::Vec3;
+use snapsnap_mesh::mesh::Face;
 
 const TRAIN: Option<Split> = Some(Split::Train);
 
@@ -29,6 +31,45 @@ fn what_was_written_is_read_again() {
         let checked = check(folder.root(), |_, _| {}).expect("checks");
         assert_eq!((checked.subjects, checked.views, checked.problems), (2, 8, Vec::<String>::new()));
     }
+}
+
+/// Two views of a block behind a rectangle, from the front and the back.
+#[test]
+fn second_surfaces_are_stored_and_checked() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let mut config = DataConfig::default();
+    config.views =
+        crate::prepare::ViewsConfig { count: 2, resolution: 64, second_depth: true, ..config.views };
+    let folder = Folder::create(temporary.path(), config.description("a test")).expect("creates");
+    let mut mesh = block();
+    let first = mesh.positions.len() as u32;
+    // A thin slab in front of the block.
+    let slab = block();
+    mesh.positions.extend(slab.positions.iter().map(|p| *p * Vec3::new(0.5, 1.0, 0.2) + 0.4 * Vec3::Z));
+    mesh.faces.extend(slab.faces.iter().map(|f| Face { positions: f.positions.map(|r| r + first), ..*f }));
+    config.add(&folder, &Subject::plain(Split::Train, "0000"), &mesh).expect("adds");
+    let of = |view: usize| {
+        let first = folder.depth(TRAIN, "0000", view).expect("reads").depth;
+        (first, folder.second_depth(TRAIN, "0000", view).expect("reads"))
+    };
+    // The slab hides a part of the block from the front, and the block all of the slab from behind.
+    let (front, back) = (of(0), of(1));
+    let count = |depths: &[f32]| depths.iter().filter(|z| **z > 0.0).count();
+    assert!(count(&front.1) > 100 && count(&front.1) < count(&front.0), "{}", count(&front.1));
+    assert!(count(&back.1) > 100 && count(&back.1) < count(&back.0), "{}", count(&back.1));
+    let middle = 37 * 64 + 32;
+    let gap = front.1[middle] - front.0[middle];
+    assert!((0.2..0.5).contains(&gap), "{gap}");
+    let problems = || check(folder.root(), |_, _| {}).expect("checks").problems;
+    assert_eq!(problems(), Vec::<String>::new());
+    let path = folder.root().join("train/depth2/0000/0.npz");
+    files::write_depth(&path, [64, 64], &vec![0.5; 64 * 64]).expect("writes");
+    assert!(problems()[0].contains("4096 pixels have a second surface that is not behind a first one"));
+    fs::remove_file(&path).expect("removes");
+    assert!(problems()[0].contains("depth2/0000/0.npz"), "{:?}", problems());
+    config.views.layout = Layout::Authors;
+    use snapsnap_base::config::Schema;
+    assert_eq!(config.refusal().expect("a problem").0, "views.second_depth");
 }
 
 /// The authors' folders have no description, and their test sets no splits.
@@ -123,9 +164,7 @@ fn a_check_lists_everything_that_is_wrong() {
     let write_depth = |view: usize, change: fn(&mut Vec<f32>)| {
         let mut depth = folder.depth(TRAIN, "0001", view).expect("reads").depth;
         change(&mut depth);
-        let view_file =
-            snapsnap_mesh::view::View { width: 64, height: 64, color: vec![], alpha: vec![], depth };
-        files::write_depth(&at(&format!("depth/0001/{view}.npz")), &view_file).expect("writes");
+        files::write_depth(&at(&format!("depth/0001/{view}.npz")), [64, 64], &depth).expect("writes");
     };
     write_depth(1, |depth| depth[0] = f32::NAN);
     write_depth(2, |depth| depth.fill(0.0));
@@ -177,7 +216,7 @@ fn a_check_lists_everything_that_is_wrong() {
 /// 16 bits of inverse depth cannot store depths below half a metre.
 #[test]
 fn depths_that_the_authors_layout_cannot_store_are_refused() {
-    let mut wall = crate::testing::block();
+    let mut wall = block();
     // Every camera, 2 m from the middle, stands before a wall 40 cm away.
     wall.positions.iter_mut().for_each(|p| {
         p.x = 1.6 * p.x.signum();

@@ -152,7 +152,14 @@ impl Folder {
                     files::write_inverse_depth(&at("depth"), &drawn)?;
                     files::write_camera(&folder.join("parm"), view, camera)
                 }
-                Layout::Exact => files::write_depth(&at("depth"), &drawn),
+                Layout::Exact => {
+                    let size = [drawn.height, drawn.width];
+                    files::write_depth(&at("depth"), size, &drawn.depth)?;
+                    if self.description.second_depth {
+                        files::write_depth(&at("depth2"), size, &drawn.second)?;
+                    }
+                    Ok(())
+                }
             }
         });
         // The error of the first failed view, in any order of the threads.
@@ -182,6 +189,7 @@ impl Folder {
     pub(super) fn kinds(&self) -> &'static [&'static str] {
         match self.description.layout {
             Layout::Authors => &["img", "mask", "depth", "parm"],
+            Layout::Exact if self.description.second_depth => &["img", "depth", "depth2", "cameras"],
             Layout::Exact => &["img", "depth", "cameras"],
         }
     }

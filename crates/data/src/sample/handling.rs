@@ -27,6 +27,8 @@ pub struct Handling {
     /// Share of the person's width that the frame cuts off, on the left of the first photograph and on the right of the
     /// others.
     pub cut: f32,
+    /// Whether all of the person's pixels have their mean colour, so that only the outline is left.
+    pub grey: bool,
 }
 
 impl Handling {
@@ -49,6 +51,9 @@ impl Handling {
         mut color: RgbImage,
         mut mask: GrayImage,
     ) -> (RgbImage, GrayImage) {
+        if self.grey {
+            flatten(&mut color, &mask);
+        }
         if self.exposure != 0.0 {
             let gain = (if place == 0 { 0.5 } else { -0.5 } * self.exposure).exp2();
             color.iter_mut().for_each(|v| *v = (f32::from(*v) * gain).round().min(255.0) as u8);
@@ -85,5 +90,38 @@ impl Handling {
             (ray, scale * DVec3::from(point))
         });
         (scale, RigidTransform { translation: shift(seen), ..RigidTransform::IDENTITY })
+    }
+}
+
+/// Gives all pixels the mean colour of those in the mask.
+fn flatten(color: &mut RgbImage, mask: &GrayImage) {
+    let (mut sum, mut weight) = ([0.0_f64; 3], 0.0);
+    for (pixel, share) in color.pixels().zip(mask.pixels()) {
+        let share = f64::from(share.0[0]);
+        (0..3).for_each(|c| sum[c] += share * f64::from(pixel.0[c]));
+        weight += share;
+    }
+    if weight > 0.0 {
+        let mean = sum.map(|sum| (sum / weight).round() as u8);
+        color.pixels_mut().for_each(|pixel| pixel.0 = mean);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use image::{Luma, Rgb};
+
+    use super::*;
+
+    #[test]
+    fn a_grey_person_has_the_mean_colour_of_its_pixels_alone() {
+        let color = RgbImage::from_fn(4, 1, |x, _| {
+            Rgb([[100, 0, 40], [200, 0, 80], [255, 255, 255], [9, 9, 9]][x as usize])
+        });
+        let mask = GrayImage::from_fn(4, 1, |x, _| Luma([if x < 2 { 255 } else { 0 }]));
+        let grey = Handling { grey: true, ..Handling::default() };
+        let (flat, same) = grey.apply(0, color, mask.clone());
+        assert_eq!(same, mask);
+        assert!(flat.pixels().all(|pixel| pixel.0 == [150, 0, 60]), "{flat:?}");
     }
 }

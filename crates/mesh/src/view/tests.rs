@@ -25,7 +25,7 @@ fn draw(mesh: &Mesh, camera: &Camera, options: &ViewOptions) -> View {
 
 /// Light of strength 1 from everywhere.
 fn flat(samples: usize) -> ViewOptions {
-    ViewOptions { samples, light: Light::Plain(Lights::new(&[], 1.0)) }
+    ViewOptions { samples, light: Light::Plain(Lights::new(&[], 1.0)), second: false }
 }
 
 fn mesh(positions: Vec<Vec3>, faces: &[[u32; 3]]) -> Mesh {
@@ -359,4 +359,27 @@ fn a_ball_alone_has_the_light_of_its_normals_with_the_given_contrast() {
         // Inside of a closed surface it is dark.
         assert!(light.iter().all(|light| light[1].x < 0.1), "{contrast}");
     }
+}
+
+/// Two balls one behind the other: the second surface is the front of the farther one, where the nearer hides it.
+#[test]
+fn the_second_surface_is_the_next_that_faces_the_camera_behind_the_first_body() {
+    let (near, far) = (sphere(Vec3::new(0.0, 0.0, 2.0), 0.2, 4), sphere(Vec3::new(0.05, 0.0, 3.0), 0.5, 4));
+    let mut mesh = near.clone();
+    let first = mesh.positions.len() as u32;
+    mesh.positions.extend(&far.positions);
+    mesh.faces.extend(far.faces.iter().map(|f| Face { positions: f.positions.map(|r| r + first), ..*f }));
+    let camera = camera(64, 64);
+    let options = ViewOptions { second: true, ..flat(1) };
+    let [both, near, far] = [&mesh, &near, &far].map(|mesh| draw(mesh, &camera, &options));
+    let mut hidden = 0;
+    for i in 0..64 * 64 {
+        let expected = if near.depth[i] > 0.0 { far.depth[i] } else { 0.0 };
+        assert_eq!(both.second[i], expected, "pixel {i}");
+        hidden += usize::from(expected > 0.0);
+    }
+    assert!(hidden > 50, "{hidden}");
+    // One ball has no second surface: its far side faces away.
+    assert!(near.second.iter().all(|z| *z == 0.0) && near.depth.iter().any(|z| *z > 0.0));
+    assert!(draw(&mesh, &camera, &flat(1)).second.is_empty());
 }

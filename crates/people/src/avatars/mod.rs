@@ -17,6 +17,7 @@ use snapsnap_mesh::import::{self, Rigged};
 use snapsnap_mesh::mesh::Mesh;
 
 use crate::math::rotate_y;
+use crate::poses::Poses;
 use crate::skeleton::{self, Owner};
 use crate::synth::figure::{Build, Figure, Pose};
 use crate::synth::stand;
@@ -73,14 +74,15 @@ impl Avatars {
         Ok(Self { files })
     }
 
-    /// The person of this name: one of the characters, life-size in metres, standing on y = 0 and facing +z.
+    /// The person of this name: one of the characters, life-size in metres, standing on y = 0 and facing +z. Often in one of
+    /// `poses`.
     ///
     /// # Errors
     /// [`FileError`] naming a file that is damaged or no character, and why.
-    pub fn person(&self, name: &str) -> Result<Character, FileError> {
+    pub fn person(&self, name: &str, poses: Option<&Poses>) -> Result<Character, FileError> {
         let mut random = stream(&format!("avatars/{name}"));
         let path = &self.files[random.random_range(0..self.files.len())];
-        character(path, &mut random)
+        character(path, poses, &mut random)
     }
 }
 
@@ -90,7 +92,7 @@ fn person_of(path: &Path) -> String {
     stem.rsplit_once('_').map_or(&*stem, |(person, _)| person).to_owned()
 }
 
-fn character(path: &Path, random: &mut ChaCha8Rng) -> Result<Character, FileError> {
+fn character(path: &Path, poses: Option<&Poses>, random: &mut ChaCha8Rng) -> Result<Character, FileError> {
     let wrong = |message: String| FileError::unsuitable(path, message);
     let Rigged { mut mesh, mut bones, weights, has_animations } = import::read_rigged(path)?;
     if weights.is_empty() {
@@ -133,7 +135,7 @@ fn character(path: &Path, random: &mut ChaCha8Rng) -> Result<Character, FileErro
     });
     let owners: Vec<Owner> = owners.collect();
     let build = Build { stature: height, ..Build::draw(random) };
-    let mut pose = Pose::draw(random);
+    let mut pose = Poses::any(poses, random);
     pose.spread_arms(0.0);
     let rest = mesh.positions.clone();
     let posed = |pose: &Pose| {

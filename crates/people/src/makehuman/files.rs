@@ -11,6 +11,7 @@ use serde::de::DeserializeOwned;
 use snapsnap_base::{FileError, file, quoted};
 
 use super::proxy::{Proxy, Wardrobe};
+use crate::poses::Poses;
 
 /// Metres per unit of MakeHuman's files, a decimetre.
 pub const METRES: f32 = 0.1;
@@ -52,6 +53,8 @@ pub struct Library {
     /// Bones that move each vertex, with shares that add up to 1.
     pub weights: Vec<Vec<(u32, f32)>>,
     targets: Mutex<HashMap<PathBuf, Target>>,
+    /// Poses of the folder `poses`, if there is one.
+    pub poses: Option<Poses>,
     /// Clothes and hair.
     pub wardrobe: Wardrobe,
     proxies: Mutex<HashMap<PathBuf, Arc<Proxy>>>,
@@ -86,8 +89,10 @@ impl Library {
             return Err(FileError::unsuitable(&path, format!("has no bone `{bone}`")));
         }
         let wardrobe = Wardrobe::open(&root)?;
+        let poses = Some(root.join("poses")).filter(|folder| folder.is_dir());
+        let poses = poses.map(|folder| Poses::open(&folder)).transpose()?;
         let (targets, proxies) = Default::default();
-        Ok(Self { root, positions, groups, bones, weights, targets, wardrobe, proxies })
+        Ok(Self { root, positions, groups, bones, weights, targets, poses, wardrobe, proxies })
     }
 
     /// The morph target at the path `name` below `targets`, without its ending. Each file is read once.

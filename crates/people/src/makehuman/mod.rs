@@ -17,6 +17,7 @@ mod wear;
 use glam::Vec3;
 
 use crate::math::bounds;
+use crate::poses::Poses;
 use crate::skeleton::Placed;
 use crate::synth::atlas;
 use crate::synth::body::Body;
@@ -30,10 +31,10 @@ pub use files::Library;
 use net::{Net, PARTS, Vertex};
 use rig::Joints;
 use shape::{Mix, morph};
-use wear::Worn;
 use snapsnap_base::FileError;
 use snapsnap_base::random::stream;
 use snapsnap_mesh::mesh::{Face, Material, Mesh};
+use wear::Worn;
 
 /// Kinds and sides of the parts of [`Vertex::parts`].
 const ORDER: [(Kind, usize); PARTS] = [
@@ -55,12 +56,13 @@ const HEAD: usize = 1;
 /// Longest side of the box around a person, metres. A larger one would not fit in memory as a mesh.
 const LARGEST: f32 = 5.0;
 
-/// The person of this name: life-size in metres, standing on y = 0 and facing +z.
+/// The person of this name: life-size in metres, standing on y = 0 and facing +z. Often in one of `poses`, or else in one of
+/// the data's own.
 ///
 /// # Errors
 /// [`FileError`] naming a file that is missing or damaged.
-pub fn person(library: &Library, name: &str) -> Result<Mesh, FileError> {
-    Ok(Person::of(library, name)?.mesh())
+pub fn person(library: &Library, name: &str, poses: Option<&Poses>) -> Result<Mesh, FileError> {
+    Ok(Person::of(library, name, poses)?.mesh())
 }
 
 /// A person in a pose, before it becomes a mesh.
@@ -100,11 +102,11 @@ struct Place {
 }
 
 impl<'a> Person<'a> {
-    fn of(library: &'a Library, name: &str) -> Result<Self, FileError> {
+    fn of(library: &'a Library, name: &str, poses: Option<&Poses>) -> Result<Self, FileError> {
         let mut random = stream(&format!("makehuman/{name}"));
         let mix = Mix::draw(&mut random);
         let mut build = Build::draw(&mut random);
-        let mut pose = Pose::draw(&mut random);
+        let mut pose = Poses::any(poses.or(library.poses.as_ref()), &mut random);
         let rest = morph(library, &mix, &mut random)?;
         let (low, high) = bounds(rest.iter().copied());
         let reach = (high - low).max_element();
@@ -141,8 +143,9 @@ impl<'a> Person<'a> {
             (vertices.collect::<Vec<_>>(), placed)
         };
         let cloth = 0.01 + outfit.top_thickness + if outfit.breadth() > 0.0 { 0.03 } else { 0.0 };
-        let sunk =
-            |(vertices, _): &(Vec<Vertex>, Vec<Placed>)| rig::sunk_hands(&group(library, vertices, "body"), cloth);
+        let sunk = |(vertices, _): &(Vec<Vertex>, Vec<Placed>)| {
+            rig::sunk_hands(&group(library, vertices, "body"), cloth)
+        };
         let (vertices, placed) = pose.free_hands(posed, sunk);
 
         let body = Body::new(&figure, &outfit);
@@ -187,7 +190,9 @@ impl<'a> Person<'a> {
         let hair = self.hair(&skin).filter(|_| self.worn.hair.is_none());
         let mut garments = Vec::new();
         if self.worn.suit.is_none() {
-            garments.extend([self.bottom(), self.top()]);
+            let bottom = self.bottom();
+            let top = self.top(&bottom);
+            garments.extend([bottom, top]);
         }
         if self.worn.shoes.is_none() {
             garments.push(self.shoes());

@@ -90,8 +90,12 @@ impl Wardrobe {
             let name = path.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
             !name.starts_with(word)
         };
-        let files: Vec<&PathBuf> =
-            self.files.iter().filter(|(own, path)| *own == kind && fits(path)).map(|(_, path)| path).collect();
+        let files: Vec<&PathBuf> = self
+            .files
+            .iter()
+            .filter(|(own, path)| *own == kind && fits(path))
+            .map(|(_, path)| path)
+            .collect();
         let draw: f32 = random.random_range(0.0..1.0);
         files.get((draw * files.len() as f32) as usize).map(|path| path.as_path())
     }
@@ -132,12 +136,8 @@ impl Proxy {
     /// [`FileError`] naming the file and the line.
     pub fn read(path: &Path, vertices: usize) -> Result<Self, FileError> {
         let text = read_text(path)?;
-        let mut proxy = Self {
-            bindings: Vec::new(),
-            scales: [None; 3],
-            hides: vec![false; vertices],
-            faces: Vec::new(),
-        };
+        let mut proxy =
+            Self { bindings: Vec::new(), scales: [None; 3], hides: vec![false; vertices], faces: Vec::new() };
         let mut mesh = None;
         let (mut is_list, mut is_hidden) = (false, false);
         let inside = |row: &u32| (*row as usize) < vertices;
@@ -159,7 +159,8 @@ impl Proxy {
                 "verts" => (is_list, is_hidden) = (true, false),
                 "delete_verts" => (is_list, is_hidden) = (false, true),
                 "x_scale" | "y_scale" | "z_scale" => {
-                    let rows: [u32; 2] = numbers(&mut words).filter(|rows| rows.iter().all(inside)).ok_or_else(bad)?;
+                    let rows: [u32; 2] =
+                        numbers(&mut words).filter(|rows| rows.iter().all(inside)).ok_or_else(bad)?;
                     let [length]: [f32; 1] = numbers(&mut words).ok_or_else(bad)?;
                     if !(length > 0.0 && length.is_finite()) {
                         return Err(bad());
@@ -321,7 +322,7 @@ fn pieces(net: &Net) -> Vec<usize> {
     owners.iter().for_each(|owner| *sizes.entry(*owner).or_default() += 1);
     let mut order: Vec<usize> = sizes.keys().copied().collect();
     order.sort_unstable_by_key(|owner| (std::cmp::Reverse(sizes[owner]), *owner));
-    let places: HashMap<usize, usize> = order.into_iter().enumerate().map(|(place, owner)| (owner, place)).collect();
+    let places: HashMap<usize, usize> =
+        order.into_iter().enumerate().map(|(place, owner)| (owner, place)).collect();
     owners.iter().map(|owner| places[owner]).collect()
 }
-

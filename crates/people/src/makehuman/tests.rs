@@ -21,7 +21,7 @@ fn library() -> Option<Library> {
 #[test]
 fn people_stand_upright_and_follow_their_names() {
     let Some(library) = library() else { return };
-    let mesh = |name: &str| person(&library, name).expect("made");
+    let mesh = |name: &str| person(&library, name, None).expect("made");
     let mut counts = HashSet::new();
     for index in 0..8 {
         let mesh = mesh(&format!("test/{index}"));
@@ -42,7 +42,7 @@ fn people_stand_upright_and_follow_their_names() {
     // near, machines may press skin against either.
     let texture = one.materials[0].texture.as_ref().expect("has a texture");
     let light: u64 = texture.as_raw().iter().map(|b| u64::from(*b)).sum();
-    assert_eq!((one.positions.len(), one.faces.len(), light), (100_479, 199_159, 316_772_622));
+    assert_eq!((one.positions.len(), one.faces.len(), light), (104_789, 203_260, 312_716_998));
     let mean = one.positions.iter().map(|p| p.as_dvec3()).sum::<glam::DVec3>() / one.positions.len() as f64;
     let expected = glam::DVec3::new(-0.061_584, 0.964_124, 0.058_625);
     assert!((mean - expected).length() < 1e-5, "{mean}");
@@ -72,10 +72,12 @@ fn through(inner: &Net, cloth: &Net, inside: impl Fn(&Vertex) -> f32) -> (usize,
 fn nothing_comes_through_cloth() {
     let Some(library) = library() else { return };
     let mut found = [(0, 0); 2];
-    for index in 0..10 {
-        let person = Person::of(&library, &format!("test/cloth/{index}")).expect("made");
+    let people = (0..).map(|index| Person::of(&library, &format!("test/cloth/{index}"), None).expect("made"));
+    for person in people.filter(|person| person.worn.suit.is_none() && person.worn.shoes.is_none()).take(10) {
         let whole = person.group("body").subdivide();
-        let garments = [person.bottom(), person.top(), person.shoes()];
+        let bottom = person.bottom();
+        let top = person.top(&bottom);
+        let garments = [bottom, top, person.shoes()];
         let skin = person.pressed_skin(person.skin(), &garments).net;
         assert_eq!(skin.faces.len(), whole.faces.len());
         let [bottom, top, shoes] = garments.map(|piece| piece.net);
@@ -97,12 +99,82 @@ fn nothing_comes_through_cloth() {
     }
 }
 
+/// Skin that a suit leaves in place does not come through it, in any pose, and most of a clothed body is left out.
+#[test]
+fn suits_cover_what_is_below_them() {
+    let Some(library) = library() else { return };
+    let (mut out, mut all, mut suits) = (0, 0, HashSet::new());
+    let people = (0..).map(|index| Person::of(&library, &format!("test/suit/{index}"), None).expect("made"));
+    for person in people.filter(|person| person.worn.suit.is_some()).take(12) {
+        let suit = person.worn.suit.as_ref().expect("is worn");
+        suits.insert(std::sync::Arc::as_ptr(suit));
+        let (skin, whole) = (person.skin().net, person.group("body").subdivide());
+        // Arms, waist or calves may be bare.
+        assert!(
+            4 * skin.faces.len() < 3 * whole.faces.len(),
+            "{} of {}",
+            skin.faces.len(),
+            whole.faces.len()
+        );
+        let suit = person.fit(suit).subdivide().net;
+        let hidden = |v: &Vertex| if v.parts[0] + v.parts[2] + v.parts[3] > 0.9 { 1.0 } else { 0.0 };
+        let (through, under) = through(&skin, &suit, hidden);
+        (out, all) = (out + through, all + under);
+        // The suit lies on the body, not far from it and not inside.
+        let tree = crate::skeleton::tree(whole.vertices.iter().map(|v| v.posed));
+        let places = crate::skeleton::coordinates(suit.vertices.iter().map(|v| v.posed));
+        let found = tree.query_batch(&places).nearest_one::<kiddo::SquaredEuclidean<f32>>().execute();
+        let far = found.iter().map(|found| found.distance.sqrt()).fold(0.0, f32::max);
+        assert!(far < 0.2, "{far} m from the body");
+    }
+    assert!(suits.len() > 4, "{} suits", suits.len());
+    println!("{out} of {all} vertices of skin near suits lie outside of them");
+    assert!(all > 100 && out * 4 < all, "{out} of {all}");
+}
+
+#[test]
+fn damaged_proxies_are_named() {
+    let folder = tempfile::tempdir().expect("temporary folder");
+    let (clothes, mesh) = (folder.path().join("a.mhclo"), folder.path().join("a.obj"));
+    let sound = "obj_file a.obj\nx_scale 0 1 1.0\nverts 0\n0 1 2 0.5 0.25 0.25 0 0 0.1\n1\n2\n\ndelete_verts\n0 - 2 4\n";
+    let faces = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n";
+    let read = |text: &str, obj: &str| {
+        fs::write(&clothes, text).expect("write");
+        fs::write(&mesh, obj).expect("write");
+        proxy::Proxy::read(&clothes, 5).map_err(|e| e.to_string())
+    };
+    let proxy = read(sound, faces).expect("reads");
+    assert_eq!(proxy.hides, [true, true, true, false, true]);
+    let at = |p: Vec3| Vertex { rest: p, posed: p, parts: [0.0; PARTS] };
+    let body = [Vec3::ZERO, Vec3::X, Vec3::Y, Vec3::Z, Vec3::ONE].map(at);
+    let fitted = proxy.fit(&body, |_, p| p + Vec3::Y);
+    // Offsets of decimetres, not scaled along z; the scale along x is 1 m of 0.1 m.
+    let first = fitted.net.vertices[0];
+    assert!((first.rest - Vec3::new(0.25, 0.25, 0.01)).length() < 1e-6, "{}", first.rest);
+    assert_eq!(first.posed, first.rest + Vec3::Y);
+    assert_eq!(fitted.subdivide().texcoords[0][2], glam::Vec2::splat(1.0 / 3.0));
+    for (text, obj, expected) in [
+        (sound.replace("1 2 0.5", "9 2 0.5"), faces.to_owned(), "line 4"),
+        (sound.replace("0.25", "nan"), faces.into(), "line 4"),
+        (sound.replace("0.1\n", "\n"), faces.into(), "line 4"),
+        (sound.replace("1.0", "0"), faces.into(), "line 2"),
+        (sound.replace("- 2", "- 7"), faces.into(), "line 9"),
+        (sound.replace("obj_file a.obj", ""), faces.into(), "names no `obj_file`"),
+        (sound.replace("a.obj", "../b.obj"), faces.into(), "b.obj: cannot read"),
+        (sound.into(), faces.replace("3/3", "4/3"), "a.obj: line 7"),
+        (sound.into(), faces.replace("v 0 1 0\n", ""), "has 2 vertices and 1 faces for 3 bindings"),
+    ] {
+        let error = read(&text, &obj).expect_err(expected);
+        assert!(error.contains(expected), "{expected}: {error}");
+    }
+}
+
 /// No pose leaves a hand in the trunk.
 #[test]
 fn hands_do_not_sink_into_the_body() {
     let Some(library) = library() else { return };
     for index in 0..30 {
-        let person = Person::of(&library, &format!("test/hands/{index}")).expect("made");
+        let person = Person::of(&library, &format!("test/hands/{index}"), None).expect("made");
         assert_eq!(rig::sunk_hands(&person.group("body"), 0.005), [false; 2], "person {index}");
     }
 }
@@ -121,7 +193,7 @@ fn missing_and_damaged_files_are_named() {
         fs::write(copy.path().join(name), bytes).expect("write");
     }
     let library = Library::open(copy.path()).expect("complete");
-    let error = person(&library, "a").map(drop).expect_err("no targets").to_string();
+    let error = person(&library, "a", None).map(drop).expect_err("no targets").to_string();
     assert!(error.contains("targets") && error.contains("cannot read"), "{error}");
     let damage = |name: &str, text: &str| {
         let path = copy.path().join(name);

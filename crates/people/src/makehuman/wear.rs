@@ -107,7 +107,8 @@ impl Person<'_> {
         }
     }
 
-    fn fit(&self, proxy: &Proxy) -> Fitted {
+    /// A proxy on the posed body.
+    pub fn fit(&self, proxy: &Proxy) -> Fitted {
         proxy.fit(&self.vertices, |shares, p| {
             let bones = shares.iter().flat_map(|(row, share)| {
                 self.library.weights[*row as usize].iter().map(move |(bone, weight)| (*bone, share * weight))

@@ -48,13 +48,13 @@ impl Build {
 #[derive(Debug, Clone, Default)]
 pub struct Pose {
     /// Trunk: lean forwards, turn, lean aside.
-    trunk: [f32; 3],
+    pub trunk: [f32; 3],
     /// Head: nod, turn, tilt.
-    head: [f32; 3],
+    pub head: [f32; 3],
     /// Arms: raised aside, raised forwards, turned inwards; bend of the elbow.
-    arms: [[f32; 4]; 2],
+    pub arms: [[f32; 4]; 2],
     /// Legs: raised forwards, raised aside; bend of the knee.
-    legs: [[f32; 3]; 2],
+    pub legs: [[f32; 3]; 2],
     /// Curl of the fingers.
     pub fingers: f32,
 }

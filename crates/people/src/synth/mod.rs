@@ -15,6 +15,8 @@ mod tests;
 
 use body::Body;
 use figure::{Build, Figure, Pose};
+
+use crate::poses::Poses;
 use outfit::Outfit;
 use paint::{FACE, Painter};
 use snapsnap_base::random::stream;
@@ -24,8 +26,9 @@ use snapsnap_mesh::mesh::Mesh;
 const CELL: f32 = 0.005;
 
 /// The person of this name: life-size in metres, standing on y = 0 and facing +z.
-pub fn person(name: &str) -> Mesh {
-    let (figure, outfit, body) = dressed(name);
+/// Often in one of `poses`.
+pub fn person(name: &str, poses: Option<&Poses>) -> Mesh {
+    let (figure, outfit, body) = dressed(name, poses);
     let surface = surface::mesh(&body, CELL);
     let mut mesh = atlas::paint(&body, &surface, &Painter::new(&figure, &outfit, &FACE));
     mesh.positions = surface.positions;
@@ -40,10 +43,10 @@ pub(crate) fn stand(mesh: &mut Mesh) {
 }
 
 /// The posed and dressed person. Hands lie outside of the trunk.
-fn dressed(name: &str) -> (Figure, Outfit, Body) {
+fn dressed(name: &str, poses: Option<&Poses>) -> (Figure, Outfit, Body) {
     let mut random = stream(&format!("synth/{name}"));
     let build = Build::draw(&mut random);
-    let mut pose = Pose::draw(&mut random);
+    let mut pose = Poses::any(poses, &mut random);
     let outfit = Outfit::draw(&mut random, &build);
     pose.spread_arms(outfit.breadth());
     let posed = |pose: &Pose| {

@@ -89,7 +89,7 @@ fn extreme_people(root: &Path) -> Result<Arc<Folder>, TrainError> {
     let mut data = DataConfig::default();
     (data.views.count, data.views.resolution) = (4, 64);
     let folder = Folder::create(&root.join("people"), data.description("stability"))?;
-    let person = synth::person("stability");
+    let person = synth::person("stability", None);
     let lit = |factor: f32| {
         let mut mesh = person.clone();
         mesh.materials.iter_mut().for_each(|material| material.color *= factor);

@@ -11,6 +11,7 @@ use snapsnap_mesh::export;
 use snapsnap_mesh::mesh::Mesh;
 use snapsnap_people::avatars::{Avatars, Character};
 use snapsnap_people::makehuman::{self, Library};
+use snapsnap_people::poses::Poses;
 use snapsnap_people::synth;
 
 use super::super::one_of;
@@ -60,18 +61,22 @@ struct Generate {
     /// Split of the people. Different splits have different people.
     #[arg(long, value_parser = one_of(SPLITS), default_value = "train")]
     split: Split,
+    /// Folder of motion files (BVH) with the joint names of Mixamo or MakeHuman; three in ten people take one of their
+    /// standing poses [default of makehuman: its own folder].
+    #[arg(long, value_name = "DIR")]
+    poses: Option<PathBuf>,
     /// Also write each person as a scan, OBJ with texture, to scans/SPLIT/ID in the data set, standing as its views show it.
     #[arg(long)]
     save_scans: bool,
 }
 
 pub fn synth(SynthArguments { common, generate }: &SynthArguments) -> Result<(), Failure> {
-    generate.run(common, "synth", &[], |name| Ok(synth::person(name)))
+    generate.run(common, "synth", &[], |name, poses| Ok(synth::person(name, poses)))
 }
 
 pub fn makehuman(arguments: &MakehumanArguments) -> Result<(), Failure> {
     let library = Library::open(&arguments.folder)?;
-    let person = |name: &str| makehuman::person(&library, name);
+    let person = |name: &str, poses: Option<&Poses>| makehuman::person(&library, name, poses);
     arguments.generate.run(&arguments.common, "makehuman", &[library.root()], person)
 }
 
@@ -83,8 +88,8 @@ pub fn avatars(arguments: &AvatarsArguments) -> Result<(), Failure> {
         _ => generate.split == Split::Train,
     })?;
     let animated = Cell::new(0);
-    let person = |name: &str| {
-        let Character { mesh, has_animations } = avatars.person(name)?;
+    let person = |name: &str, poses: Option<&Poses>| {
+        let Character { mesh, has_animations } = avatars.person(name, poses)?;
         animated.set(animated.get() + usize::from(has_animations));
         Ok(mesh)
     };
@@ -105,11 +110,14 @@ impl Generate {
         common: &Common,
         kind: &str,
         inputs: &[&Path],
-        person: impl Fn(&str) -> Result<Mesh, FileError>,
+        person: impl Fn(&str, Option<&Poses>) -> Result<Mesh, FileError>,
     ) -> Result<(), Failure> {
         if self.subjects == 0 || self.subjects > MAX_SUBJECTS {
             bail!("--subjects is {}, must be 1 to {MAX_SUBJECTS}", self.subjects);
         }
+        let poses = self.poses.as_deref().map(Poses::open).transpose()?;
+        let mut inputs = inputs.to_vec();
+        inputs.extend(self.poses.as_deref());
         let split = self.split;
         let works: Vec<Work> = (0..self.subjects)
             .map(|index| Work {
@@ -118,7 +126,8 @@ impl Generate {
                 identity: format!("{kind}/{}/{split}/{index}", common.seed),
             })
             .collect();
-        let source = format!("{kind}, seed {}", common.seed);
+        let with = if self.poses.is_some() { ", with poses of files" } else { "" };
+        let source = format!("{kind}, seed {}{with}", common.seed);
         let scan = |work: &Work| {
             let Work { split, subject, .. } = work;
             common.output.join("scans").join(split.name()).join(subject).join(format!("{subject}.obj"))
@@ -127,11 +136,11 @@ impl Generate {
         let is_due = |work: &Work| self.save_scans && !scan(work).exists();
         // Where the cameras of the data set see it.
         let placed = |work: &Work| {
-            let mut mesh = person(&work.identity)?;
+            let mut mesh = person(&work.identity, poses.as_ref())?;
             place(&mut mesh, work, Collection::Other, &common.output)?;
             Ok(mesh)
         };
-        let made = make(common, &source, inputs, &works, |_, work| {
+        let made = make(common, &source, &inputs, &works, |_, work| {
             let mesh = placed(work)?;
             if is_due(work) {
                 export::write_obj(&mesh, &scan(work))?;

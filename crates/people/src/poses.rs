@@ -1,0 +1,411 @@
+//! Poses from motion files (BVH): the places of the joints become the angles of [`Pose`], for any body.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use glam::{Mat3, Vec3};
+use rand::Rng;
+use snapsnap_base::{FileError, file, quoted};
+
+use crate::math::{rotate_x, rotate_y, rotate_z};
+use crate::synth::figure::{Pose, sign};
+
+/// Largest file, in bytes.
+const MAX_BYTES: u64 = 64 << 20;
+/// Largest number of joints and of frames that are read.
+const MAX_JOINTS: usize = 4096;
+const MAX_FRAMES: usize = 4096;
+/// Largest lean of the trunk and bend of a knee of a standing person, degrees.
+const LEAN: f32 = 30.0;
+const KNEE: f32 = 60.0;
+/// Share of people in a pose from a file, if there are files.
+const SHARE: f32 = 0.3;
+/// Largest random change of an angle, degrees.
+const STRAY: f32 = 4.0;
+
+/// Standing poses of a folder of motion files.
+#[derive(Debug, Default)]
+pub struct Poses {
+    poses: Vec<Pose>,
+}
+
+impl Poses {
+    /// The standing poses in the files `.bvh` of a folder. Other poses, such as seated ones, are left out.
+    ///
+    /// # Errors
+    /// [`FileError`] for a folder or a file that cannot be read, and a folder without a standing pose.
+    pub fn open(folder: &Path) -> Result<Self, FileError> {
+        let entries = fs::read_dir(folder).and_then(Iterator::collect::<Result<Vec<_>, _>>);
+        let entries = entries.map_err(FileError::read(folder))?;
+        let mut paths: Vec<PathBuf> = entries.into_iter().map(|entry| entry.path()).collect();
+        paths.retain(|path| path.extension().is_some_and(|e| e.eq_ignore_ascii_case("bvh")));
+        paths.sort_unstable();
+        let mut poses = Vec::new();
+        for path in &paths {
+            poses.extend(read(path)?.into_iter().filter(Pose::stands));
+        }
+        if poses.is_empty() {
+            let message = format!("none of its {} files .bvh has a standing pose", paths.len());
+            return Err(FileError::unsuitable(folder, message));
+        }
+        Ok(Self { poses })
+    }
+
+    /// A random pose, often one of `poses`.
+    pub fn any(poses: Option<&Self>, random: &mut impl Rng) -> Pose {
+        match poses {
+            Some(poses) if random.random_range(0.0..1.0_f32) < SHARE => poses.draw(random),
+            _ => Pose::draw(random),
+        }
+    }
+
+    /// One of the poses, perhaps mirrored, slightly changed, and with another turn of the head and other fingers.
+    fn draw(&self, random: &mut impl Rng) -> Pose {
+        let other = Pose::draw(random);
+        let row = random.random_range(0..self.poses.len());
+        let pose = self.poses[row].clone();
+        let mut pose = if random.random() { pose.mirrored() } else { pose };
+        (pose.head, pose.fingers) = (other.head, other.fingers);
+        let angles = pose.trunk.iter_mut().chain(pose.arms.as_flattened_mut());
+        for angle in angles.chain(pose.legs.as_flattened_mut()) {
+            *angle += STRAY * random.random_range(-1.0..1.0_f32);
+        }
+        pose
+    }
+}
+
+/// A joint: its parent's row, its offset from the parent, and its channels.
+struct Joint {
+    name: String,
+    parent: Option<usize>,
+    offset: Vec3,
+    channels: Vec<Channel>,
+}
+
+/// The axis of a rotation; `None` for a position, since bones do not change their lengths.
+type Channel = Option<usize>;
+
+fn channel(word: &str) -> Option<Channel> {
+    let axis = match word.as_bytes().first()? {
+        b'X' | b'x' => 0,
+        b'Y' | b'y' => 1,
+        b'Z' | b'z' => 2,
+        _ => return None,
+    };
+    match word.get(1..)?.to_ascii_lowercase().as_str() {
+        "position" => Some(None),
+        "rotation" => Some(Some(axis)),
+        _ => None,
+    }
+}
+
+/// The poses of a motion file.
+///
+/// # Errors
+/// [`FileError`] naming the file and what is wrong.
+pub fn read(path: &Path) -> Result<Vec<Pose>, FileError> {
+    let text = file::read_text(path, MAX_BYTES).map_err(FileError::read(path))?;
+    parse(&text).map_err(|problem| FileError::unsuitable(path, problem))
+}
+
+fn parse(text: &str) -> Result<Vec<Pose>, String> {
+    let mut words = text.split_ascii_whitespace();
+    let expect = |found: Option<&str>, wanted: &str| match found {
+        Some(word) if word.eq_ignore_ascii_case(wanted) => Ok(()),
+        Some(word) => Err(format!("has `{}` instead of {wanted}", quoted(word))),
+        None => Err(format!("ends before {wanted}")),
+    };
+    expect(words.next(), "HIERARCHY")?;
+    let mut joints: Vec<Joint> = Vec::new();
+    // Rows of the joints around the current place; `None` for an end without a name.
+    let mut open: Vec<Option<usize>> = Vec::new();
+    loop {
+        let word = words.next().ok_or("ends within its joints")?;
+        let own = open.last().copied().flatten();
+        match word.to_ascii_uppercase().as_str() {
+            "ROOT" | "JOINT" => {
+                let name = words.next().ok_or("ends within its joints")?.to_owned();
+                expect(words.next(), "{")?;
+                if joints.len() == MAX_JOINTS {
+                    return Err(format!("has more than {MAX_JOINTS} joints"));
+                }
+                open.push(Some(joints.len()));
+                joints.push(Joint { name, parent: own, offset: Vec3::ZERO, channels: Vec::new() });
+            }
+            "END" => {
+                words.next();
+                expect(words.next(), "{")?;
+                open.push(None);
+            }
+            "OFFSET" => {
+                let mut next = || number(words.next());
+                let offset = Vec3::new(next()?, next()?, next()?);
+                if let Some(row) = own {
+                    joints[row].offset = offset;
+                }
+            }
+            "CHANNELS" => {
+                let row = own.ok_or("has channels outside of a joint")?;
+                let count: usize = words
+                    .next()
+                    .and_then(|word| word.parse().ok())
+                    .filter(|count| *count <= 6)
+                    .ok_or("has a joint without a number of channels up to 6")?;
+                let channels: Option<Vec<Channel>> = (0..count).map(|_| channel(words.next()?)).collect();
+                joints[row].channels = channels.ok_or("has a joint with unknown channels")?;
+            }
+            "}" => {
+                open.pop().ok_or("closes more joints than it opens")?;
+            }
+            "MOTION" => break,
+            _ => return Err(format!("has `{}` among its joints", quoted(word))),
+        }
+    }
+    expect(words.next(), "Frames:")?;
+    let frames: usize = words.next().and_then(|word| word.parse().ok()).ok_or("has no number of frames")?;
+    expect(words.next(), "Frame")?;
+    expect(words.next(), "Time:")?;
+    number(words.next())?;
+    let skeleton = Rows::find(&joints)?;
+    let mut poses = Vec::new();
+    for _ in 0..frames.min(MAX_FRAMES) {
+        let mut turns: Vec<Mat3> = Vec::with_capacity(joints.len());
+        let mut places: Vec<Vec3> = Vec::with_capacity(joints.len());
+        for joint in &joints {
+            let (mut turn, mut place) = (Mat3::IDENTITY, Vec3::ZERO);
+            if let Some(parent) = joint.parent {
+                turn = turns[parent];
+                place = places[parent] + turn * joint.offset;
+            }
+            for channel in &joint.channels {
+                let value = number(words.next())?;
+                if let Some(axis) = channel {
+                    turn *= [rotate_x, rotate_y, rotate_z][*axis](value);
+                }
+            }
+            turns.push(turn);
+            places.push(place);
+        }
+        poses.push(skeleton.pose(&places));
+    }
+    Ok(poses)
+}
+
+fn number(word: Option<&str>) -> Result<f32, String> {
+    let word = word.ok_or("ends within its numbers")?;
+    let number = word.parse().ok().filter(|value: &f32| value.abs() < 1e6);
+    number.ok_or_else(|| format!("has `{}` instead of a number", quoted(word)))
+}
+
+/// Rows of the joints that a pose is made of. Sides are 0 for the left and 1 for the right.
+struct Rows {
+    neck: usize,
+    /// Shoulder, elbow and wrist.
+    arms: [[usize; 3]; 2],
+    /// Hip, knee and ankle.
+    legs: [[usize; 3]; 2],
+}
+
+impl Rows {
+    fn find(joints: &[Joint]) -> Result<Self, String> {
+        let row = |names: &[&str], side: usize| {
+            let [long, short] = if side == 0 { ["Left", "L"] } else { ["Right", "R"] };
+            names.iter().find_map(|name| {
+                let wanted = [format!("{long}{name}"), format!("{name}.{short}"), format!("{name}_{short}")];
+                let is_it = |joint: &Joint| {
+                    let own = joint.name.rsplit(':').next().unwrap_or_default();
+                    wanted.iter().any(|wanted| own.eq_ignore_ascii_case(wanted))
+                };
+                joints.iter().position(is_it)
+            })
+        };
+        let need = |names: &[&str], side: usize| {
+            let word = if side == 0 { "left" } else { "right" };
+            row(names, side).ok_or_else(|| format!("has no {word} joint `{}`", names.join("` or `")))
+        };
+        let neck = |joint: &Joint| {
+            let name = joint.name.rsplit(':').next().unwrap_or_default().to_ascii_lowercase();
+            name == "neck" || name == "neck01"
+        };
+        let limb = |names: [&[&str]; 3], side: usize| -> Result<[usize; 3], String> {
+            Ok([need(names[0], side)?, need(names[1], side)?, need(names[2], side)?])
+        };
+        let arm: [&[&str]; 3] = [&["Arm", "upperarm01"], &["ForeArm", "lowerarm01"], &["Hand", "wrist"]];
+        let leg: [&[&str]; 3] = [&["UpLeg", "upperleg01"], &["Leg", "lowerleg01"], &["Foot", "foot"]];
+        Ok(Self {
+            neck: joints.iter().position(neck).ok_or("has no joint `Neck` or `neck01`")?,
+            arms: [limb(arm, 0)?, limb(arm, 1)?],
+            legs: [limb(leg, 0)?, limb(leg, 1)?],
+        })
+    }
+
+    /// The pose of joints at these places, in any position and direction.
+    fn pose(&self, places: &[Vec3]) -> Pose {
+        let at = |row: usize| places[row];
+        let [left, right] = self.legs.map(|leg| at(leg[0]));
+        let up = at(self.neck) - 0.5 * (left + right);
+        // Some files have y upwards, others z. The hips look along the third axis.
+        let vertical = if up.z.abs() > up.y.abs() { Vec3::Z } else { Vec3::Y };
+        let world = axes(left - right, vertical);
+        let inside = |v: Vec3| world.transpose() * v;
+        let chest = axes(inside(at(self.arms[0][0]) - at(self.arms[1][0])), inside(up));
+        // As [`Pose::trunk_frame`] shares a lean and a turn among pelvis and chest.
+        let pelvis = axes(Vec3::X, inside(up).lerp(up.length() * Vec3::Y, 0.7));
+        let front = chest.z_axis;
+        let turn = libm::atan2f(front.x, front.z).to_degrees();
+        let rest = rotate_y(-turn) * chest;
+        let lean = libm::asinf((-rest.z_axis.y).clamp(-1.0, 1.0)).to_degrees();
+        let straight = rotate_x(-lean) * rest;
+        let aside = libm::atan2f(straight.x_axis.y, straight.x_axis.x).to_degrees();
+        let mut pose = Pose { trunk: [lean, turn / 0.4, aside], ..Pose::default() };
+        for side in [0, 1] {
+            let [shoulder, elbow, wrist] = self.arms[side].map(|row| inside(at(row)));
+            let [raised, forwards] = hanging(chest.transpose() * (elbow - shoulder), side);
+            let upper = chest * rotate_x(-forwards) * rotate_z(sign(side) * raised);
+            let fore = upper.transpose() * (wrist - elbow).normalize_or(Vec3::NEG_Y);
+            let bend = libm::acosf((-fore.y).clamp(-1.0, 1.0)).to_degrees();
+            // A straight arm shows no twist.
+            let twist =
+                if bend > 8.0 { -sign(side) * libm::atan2f(fore.x, fore.z).to_degrees() } else { 0.0 };
+            pose.arms[side] = [raised, forwards, twist, bend];
+            let [hip, knee, ankle] = self.legs[side].map(|row| inside(at(row)));
+            let [apart, forwards] = hanging(pelvis.transpose() * (knee - hip), side);
+            let (thigh, calf) =
+                ((knee - hip).normalize_or(Vec3::NEG_Y), (ankle - knee).normalize_or(Vec3::NEG_Y));
+            pose.legs[side] = [forwards, apart, thigh.angle_between(calf).to_degrees()];
+        }
+        pose
+    }
+}
+
+/// Orthonormal axes with x about along `right` and y along `up`.
+fn axes(right: Vec3, up: Vec3) -> Mat3 {
+    let y = up.normalize_or(Vec3::Y);
+    let x = (right - right.dot(y) * y).normalize_or(y.any_orthonormal_vector());
+    Mat3::from_cols(x, y, x.cross(y))
+}
+
+/// Degrees by which a hanging limb is raised aside, and then forwards, to point along `way`.
+fn hanging(way: Vec3, side: usize) -> [f32; 2] {
+    let way = way.normalize_or(Vec3::NEG_Y);
+    let aside = sign(side) * libm::asinf(way.x.clamp(-1.0, 1.0)).to_degrees();
+    [aside, libm::atan2f(way.z, -way.y).to_degrees()]
+}
+
+impl Pose {
+    /// Whether this is a pose of a person who stands.
+    fn stands(&self) -> bool {
+        let [lean, _, aside] = self.trunk;
+        let is_straight = |leg: &[f32; 3]| leg[2] < KNEE && leg[0].abs() < KNEE && leg[1].abs() < LEAN;
+        lean.abs() < LEAN && aside.abs() < LEAN && self.legs.iter().all(is_straight)
+    }
+
+    /// The same with left and right exchanged.
+    fn mirrored(self) -> Self {
+        let ([lean, turn, aside], [nod, look, tilt]) = (self.trunk, self.head);
+        let ([left, right], [a, b]) = (self.arms, self.legs);
+        Self {
+            trunk: [lean, -turn, -aside],
+            head: [nod, -look, -tilt],
+            arms: [right, left],
+            legs: [b, a],
+            ..self
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use snapsnap_base::random::stream;
+
+    use super::*;
+    use crate::synth::figure::{Build, Figure};
+
+    /// A motion file of one frame without rotations, whose offsets are a figure's bones, turned, with z upwards.
+    fn bvh(figure: &Figure) -> String {
+        let turn = rotate_z(70.0);
+        let offset = |from: Vec3, to: Vec3| {
+            let way = to - from;
+            turn * Vec3::new(way.x, -way.z, way.y) * 10.0
+        };
+        let start = |name: &str, way: Vec3| {
+            let Vec3 { x, y, z } = way;
+            format!("JOINT {name}\n{{\nOFFSET {x} {y} {z}\nCHANNELS 3 Zrotation Xrotation Yrotation\n")
+        };
+        let chain = |names: [&str; 3], from: Vec3, places: [Vec3; 3]| {
+            let [a, b, c] = places;
+            let ends = format!("End Site\n{{\nOFFSET 0 0 0\n}}\n{}", "}\n".repeat(3));
+            start(names[0], offset(from, a))
+                + &start(names[1], offset(a, b))
+                + &start(names[2], offset(b, c))
+                + &ends
+        };
+        let hips = figure.pelvis.start;
+        let mut text = start("Hips", Vec3::ZERO).replace("JOINT", "ROOT");
+        text += &start("Neck", offset(hips, figure.chest.end));
+        text += "}\n";
+        for (side, word) in ["Left", "Right"].into_iter().enumerate() {
+            let names = |names: [&str; 3]| names.map(|name| format!("{word}{name}"));
+            let (arm, fore) = (figure.upper_arms[side], figure.forearms[side]);
+            let [a, b, c] = &names(["Arm", "ForeArm", "Hand"]);
+            text += &chain([a, b, c], hips, [arm.start, fore.start, fore.end]);
+            let (thigh, calf) = (figure.thighs[side], figure.calves[side]);
+            let [a, b, c] = &names(["UpLeg", "Leg", "Foot"]);
+            text += &chain([a, b, c], hips, [thigh.start, calf.start, calf.end]);
+        }
+        let zeros = "0 ".repeat(3 * 14);
+        format!("HIERARCHY\n{text}}}\nMOTION\nFrames: 1\nFrame Time: 0.04\n{zeros}\n")
+    }
+
+    /// Figures of random poses, written as motion files, come out in the same pose.
+    #[test]
+    fn joints_give_the_pose_that_they_were_made_of() {
+        let mut random = stream("test/poses");
+        let build = Build::draw(&mut random);
+        for index in 0..40 {
+            let mut pose = Pose::draw(&mut random);
+            // Larger arms have two descriptions.
+            pose.arms.iter_mut().for_each(|arm| arm[0] = arm[0].min(80.0));
+            let figure = Figure::new(build.clone(), &pose);
+            let found = parse(&bvh(&figure)).expect("reads").remove(0);
+            let again = Figure::new(build.clone(), &found);
+            let turned = |a: Vec3, b: Vec3| a.angle_between(b).to_degrees();
+            let ways = |figure: &Figure| {
+                let chest = figure.chest.frame.transpose();
+                let pelvis = figure.pelvis.frame.transpose();
+                let way = |bone: &crate::synth::figure::Bone| (bone.end - bone.start).normalize();
+                let arms = figure.upper_arms.iter().chain(&figure.forearms).map(|bone| chest * way(bone));
+                let legs = figure.thighs.iter().chain(&figure.calves).map(|bone| pelvis * way(bone));
+                arms.chain(legs).collect::<Vec<_>>()
+            };
+            for (limb, (a, b)) in ways(&figure).into_iter().zip(ways(&again)).enumerate() {
+                // Hips and shoulders are turned and leant as their joints show, not as the trunk's axes are.
+                assert!(turned(a, b) < 9.0, "pose {index}, limb {limb}: {} {pose:?} {found:?}", turned(a, b));
+            }
+        }
+    }
+
+    #[test]
+    fn damaged_motion_files_are_refused() {
+        let figure = Figure::new(Build::draw(&mut stream("a")), &Pose::default());
+        let sound = bvh(&figure);
+        assert_eq!(parse(&sound).expect("reads").len(), 1);
+        for (from, to, expected) in [
+            ("HIERARCHY", "HIER", "instead of HIERARCHY"),
+            ("Frames: 1", "Frames: 2", "ends within its numbers"),
+            ("Frames: 1", "Frames: many", "no number of frames"),
+            ("CHANNELS 3", "CHANNELS 9", "number of channels"),
+            ("Zrotation", "Wrotation", "unknown channels"),
+            ("LeftForeArm", "Left", "no left joint `ForeArm` or `lowerarm01`"),
+            ("MOTION", "}\nMOTION", "closes more joints than it opens"),
+            ("OFFSET 0 0 0", "OFFSET 0 0 inf", "`inf` instead of a number"),
+            ("End Site", "Begin Site", "`Begin` among its joints"),
+        ] {
+            let error = parse(&sound.replacen(from, to, 1)).expect_err(expected);
+            assert!(error.contains(expected), "{expected}: {error}");
+        }
+        for end in (0..sound.len() - 90).step_by(37) {
+            assert!(parse(&sound[..end]).is_err(), "{end}");
+        }
+    }
+}
