@@ -124,9 +124,8 @@ impl Person<'_> {
         0.001 + 0.5 * self.outfit.lower_thickness + flare + self.folds(vertex)
     }
 
-    /// The top, outside of the trousers or of what is below a skirt.
-    pub fn top(&self, bottom: &Piece) -> Piece {
-        let mut top = self.layer(
+    pub fn top(&self) -> Piece {
+        self.layer(
             &[Kind::Trunk, Kind::Arm],
             |vertex| self.in_top(vertex),
             |vertex| {
@@ -146,11 +145,7 @@ impl Person<'_> {
                 let over = smoothstep(-0.03, 0.0, self.in_bottom(vertex));
                 off.max(over * (self.off_bottom(vertex) + GAP))
             },
-        );
-        // Sleeves may touch trousers.
-        let gap = |vertex: &Vertex| if ORDER[vertex.part()].0 == Kind::Trunk { 0.5 * GAP } else { -FAR };
-        push_out(&mut top.net, &bottom.net, false, gap);
-        top
+        )
     }
 
     pub fn bottom(&self) -> Piece {

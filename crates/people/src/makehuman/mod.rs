@@ -190,9 +190,7 @@ impl<'a> Person<'a> {
         let hair = self.hair(&skin).filter(|_| self.worn.hair.is_none());
         let mut garments = Vec::new();
         if self.worn.suit.is_none() {
-            let bottom = self.bottom();
-            let top = self.top(&bottom);
-            garments.extend([bottom, top]);
+            garments.extend([self.bottom(), self.top()]);
         }
         if self.worn.shoes.is_none() {
             garments.push(self.shoes());
