@@ -42,7 +42,7 @@ fn skinned_meshes_stand_where_their_joints_put_them() {
     }
     // An arm that a joint turns by a quarter around z points upwards.
     let raised = character(1.0, |json| {
-        json["nodes"][6]["rotation"] = json!([0.0, 0.0, 0.5_f32.sqrt(), 0.5_f32.sqrt()])
+        json["nodes"][6]["rotation"] = json!([0.0, 0.0, 0.5_f32.sqrt(), 0.5_f32.sqrt()]);
     });
     let (_, high) = import::read(&write(folder.path(), "raised.glb", &raised)).expect("reads").bounds();
     assert!((high.y - (1.45 + 0.7 + 0.04)).abs() < 1e-4, "{high}");
@@ -164,7 +164,8 @@ fn what_is_wrong_with_a_character_is_named() {
         error.to_string()
     };
     let changed = |change: &dyn Fn(&mut Value)| error(&character(1.0, |json| change(json)));
-    let cases: [(&str, &dyn Fn(&mut Value)); 9] = [
+    type Change<'a> = &'a dyn Fn(&mut Value);
+    let cases: [(&str, Change); 9] = [
         ("has no joint `LeftForeArm`", &|json| json["nodes"][7]["name"] = json!("Ellbogen")),
         ("has no joint `Hips`", &|json| json["nodes"][0]["name"] = json!("")),
         ("has no skin", &|json| {

@@ -1,4 +1,4 @@
-//! Poses from motion files (BVH): the places of the joints become the angles of [`Pose`], for any body.
+//! Poses from motion files (BVH): the places of the joints become the angles of a pose, for any body.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -249,7 +249,7 @@ impl Rows {
         let world = axes(left - right, vertical);
         let inside = |v: Vec3| world.transpose() * v;
         let chest = axes(inside(at(self.arms[0][0]) - at(self.arms[1][0])), inside(up));
-        // As [`Pose::trunk_frame`] shares a lean and a turn among pelvis and chest.
+        // As `Pose::trunk_frame` shares a lean and a turn among pelvis and chest.
         let pelvis = axes(Vec3::X, inside(up).lerp(up.length() * Vec3::Y, 0.7));
         let front = chest.z_axis;
         let turn = libm::atan2f(front.x, front.z).to_degrees();

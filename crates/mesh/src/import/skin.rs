@@ -120,7 +120,8 @@ impl File<'_> {
         let shares = reader.read_weights(0).into_iter().flat_map(|weights| weights.into_f32());
         let weights = rows.zip(shares).enumerate().map(|(position, (rows, shares))| {
             let sum: f32 = shares.iter().sum();
-            if shares.iter().any(|share| !(*share >= 0.0)) || !((sum - 1.0).abs() <= LARGEST_ERROR) {
+            let are_shares = shares.iter().all(|share| *share >= 0.0) && (sum - 1.0).abs() <= LARGEST_ERROR;
+            if !are_shares {
                 let message =
                     format!("position {position} of a skin has the weights {shares:?}, which are not shares");
                 return Err(self.wrong(message));

@@ -36,6 +36,9 @@ struct Binding {
 /// Two vertices of the base mesh, and their distance along an axis for which offsets are made, metres.
 type Scale = ([u32; 2], f32);
 
+/// A face: its vertices, and their texture coordinates.
+type Corners = (Vec<u32>, Vec<Vec2>);
+
 /// A proxy.
 #[derive(Debug, Clone)]
 pub struct Proxy {
@@ -45,7 +48,7 @@ pub struct Proxy {
     /// Whether a vertex of the base mesh lies below it and is left out.
     pub hides: Vec<bool>,
     /// Corners of three or four, and their texture coordinates.
-    faces: Vec<(Vec<u32>, Vec<Vec2>)>,
+    faces: Vec<Corners>,
 }
 
 /// A proxy on a body, in pieces that hang together.
@@ -240,7 +243,7 @@ fn binding(line: &str, vertices: usize) -> Option<Binding> {
     }
     let rows = numbers(&mut words).filter(|rows: &[u32; 3]| rows.iter().all(inside))?;
     let shares: [f32; 3] = numbers(&mut words)?;
-    if shares.iter().any(|share| !(share.abs() < 100.0)) {
+    if !shares.iter().all(|share| share.abs() < 100.0) {
         return None;
     }
     Some(Binding { rows, shares, offset: vector(words)? })
@@ -264,7 +267,7 @@ fn hide(line: &str, hides: &mut [bool]) -> Option<()> {
 }
 
 /// Faces of an OBJ of so many vertices, with texture coordinates, 0 without.
-fn read_faces(path: &Path, vertices: usize) -> Result<Vec<(Vec<u32>, Vec<Vec2>)>, FileError> {
+fn read_faces(path: &Path, vertices: usize) -> Result<Vec<Corners>, FileError> {
     let text = read_text(path)?;
     let (mut count, mut texcoords, mut faces) = (0, Vec::new(), Vec::new());
     for (number, line) in text.lines().enumerate() {
