@@ -11,8 +11,8 @@ fn a_mesh_is_as_far_from_the_truth_as_it_was_moved_until_it_is_aligned() {
     let temporary = tempfile::tempdir().expect("a folder");
     let (meshes, report) = (temporary.path().join("meshes"), temporary.path().join("report"));
     fs::create_dir(&meshes).expect("a folder");
-    // Only one of the two has a mesh, moved by 3 cm and turned by 4°.
-    let scan = fs::read_to_string(people().join("scans/test/0000/0000.obj")).expect("the saved scan");
+    // Only one of the two has a mesh, moved by 3 cm and turned by 4°. The other wears a skirt, which looks alike when turned.
+    let scan = fs::read_to_string(people().join("scans/test/0001/0001.obj")).expect("the saved scan");
     let (sin, cos) = 4.0_f64.to_radians().sin_cos();
     let lines =
         scan.lines().filter(|line| !line.starts_with("mtllib") && !line.starts_with("usemtl")).map(|line| {
@@ -20,7 +20,7 @@ fn a_mesh_is_as_far_from_the_truth_as_it_was_moved_until_it_is_aligned() {
             let v: Vec<f64> = rest.split_whitespace().map(|v| v.parse().expect("a number")).collect();
             format!("v {} {} {}", cos * v[0] + sin * v[2] + 0.03, v[1], cos * v[2] - sin * v[0])
         });
-    fs::write(meshes.join("0000.obj"), lines.collect::<Vec<_>>().join("\n") + "\n").expect("writes");
+    fs::write(meshes.join("0001.obj"), lines.collect::<Vec<_>>().join("\n") + "\n").expect("writes");
     let run = |icp: &[&str]| {
         let mut command = snapsnap();
         command
@@ -28,7 +28,7 @@ fn a_mesh_is_as_far_from_the_truth_as_it_was_moved_until_it_is_aligned() {
             .arg(snapsnap_tests::root().join("configs/eval.toml"));
         command.arg("--data").arg(people()).arg("--mesh-dir").arg(&meshes).args(icp);
         let (code, said) = ended(command.arg("-o").arg(&report));
-        assert!(code == Some(1) && said.contains("0001") && said.contains("has no mesh"), "{said}");
+        assert!(code == Some(1) && said.contains("0000") && said.contains("has no mesh"), "{said}");
         let found = json(&report);
         assert_eq!(
             (found["people"].as_u64(), found["left_out"].as_array().map(Vec::len)),
@@ -41,8 +41,7 @@ fn a_mesh_is_as_far_from_the_truth_as_it_was_moved_until_it_is_aligned() {
     assert!(apart > 1.0 && aligned.is_null(), "{apart} {aligned}");
     let (after, facing_after, aligned) = run(&["--icp"]);
     assert!(after < 0.6 * apart && facing_after > facing, "{apart} → {after}, {facing} → {facing_after}");
-    // People in wide clothes are nearly round: a turn is found less exactly.
-    assert!(aligned[0].as_f64().is_some_and(|degrees| (degrees - 4.0).abs() < 2.0), "{aligned}");
+    assert!(aligned[0].as_f64().is_some_and(|degrees| (degrees - 4.0).abs() < 1.5), "{aligned}");
     let text = fs::read_to_string(report.join("report.md")).expect("a report");
     assert!(text.contains("rigid, by iterated closest points"), "{text}");
 }
