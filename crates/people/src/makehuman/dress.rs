@@ -124,7 +124,16 @@ impl Person<'_> {
         0.001 + 0.5 * self.outfit.lower_thickness + flare + self.folds(vertex)
     }
 
-    pub fn top(&self) -> Piece {
+    /// The bottom and the top. The bottom is pressed in below the top, as skin is below both.
+    pub fn layers(&self) -> [Piece; 2] {
+        let (mut bottom, top) = (self.bottom(), self.top());
+        let depth = |vertex: &Vertex| self.in_top(vertex).min(self.in_bottom(vertex));
+        let depths: Vec<f32> = bottom.net.vertices.iter().map(depth).collect();
+        press_in(&mut bottom.net, &depths, &top.net, GAP);
+        [bottom, top]
+    }
+
+    fn top(&self) -> Piece {
         self.layer(
             &[Kind::Trunk, Kind::Arm],
             |vertex| self.in_top(vertex),
@@ -148,7 +157,7 @@ impl Person<'_> {
         )
     }
 
-    pub fn bottom(&self) -> Piece {
+    fn bottom(&self) -> Piece {
         self.layer(
             &[Kind::Trunk, Kind::Leg],
             |vertex| self.in_bottom(vertex),
@@ -273,7 +282,7 @@ fn press_in(skin: &mut Net, depths: &[f32], cloth: &Net, gap: f32) {
     }
     // Then the nearest cloth in the pose, of the cloth that is near in the resting pose.
     let posed = tree(cloth.vertices.iter().map(|vertex| vertex.posed));
-    for _ in 0..2 {
+    for _ in 0..4 {
         let places = coordinates(covered.iter().map(|row| skin.vertices[*row].posed));
         let found = posed.query_batch(&places).nearest_n::<SquaredEuclidean<f32>>(AROUND).execute();
         for (row, found) in covered.iter().zip(&found) {

@@ -190,7 +190,7 @@ impl<'a> Person<'a> {
         let hair = self.hair(&skin).filter(|_| self.worn.hair.is_none());
         let mut garments = Vec::new();
         if self.worn.suit.is_none() {
-            garments.extend([self.bottom(), self.top()]);
+            garments.extend(self.layers());
         }
         if self.worn.shoes.is_none() {
             garments.push(self.shoes());

@@ -75,7 +75,8 @@ fn nothing_comes_through_cloth() {
     let people = (0..).map(|index| Person::of(&library, &format!("test/cloth/{index}"), None).expect("made"));
     for person in people.filter(|person| person.worn.suit.is_none() && person.worn.shoes.is_none()).take(10) {
         let whole = person.group("body").subdivide();
-        let garments = [person.bottom(), person.top(), person.shoes()];
+        let [bottom, top] = person.layers();
+        let garments = [bottom, top, person.shoes()];
         let skin = person.pressed_skin(person.skin(), &garments).net;
         assert_eq!(skin.faces.len(), whole.faces.len());
         let [bottom, top, shoes] = garments.map(|piece| piece.net);
@@ -86,9 +87,7 @@ fn nothing_comes_through_cloth() {
             (&skin, &shoes, &|v| person.in_shoes(v), 0),
             (&bottom, &top, &|v| person.in_top(v).min(person.in_bottom(v)), 1),
         ];
-        // The tail of a coat hides the trousers.
-        let is_coat = person.outfit.top_length > 1.0;
-        for (inner, cloth, inside, kind) in layers.into_iter().filter(|layer| layer.3 == 0 || !is_coat) {
+        for (inner, cloth, inside, kind) in layers {
             let (out, all) = through(inner, cloth, inside);
             found[kind] = (found[kind].0 + out, found[kind].1 + all);
         }
