@@ -2,6 +2,7 @@
 //! characters from files ([`avatars`]).
 
 pub mod avatars;
+mod files;
 pub mod makehuman;
 mod math;
 mod pattern;

@@ -1,13 +1,14 @@
 //! Poses from motion files (BVH): the places of the joints become the angles of a pose, for any body.
 
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use glam::{Mat3, Vec3};
 use rand::Rng;
 use snapsnap_base::{FileError, file, quoted};
 
+use crate::files::with_ending;
 use crate::math::{rotate_x, rotate_y, rotate_z};
+use crate::skeleton::hanging;
 use crate::synth::figure::{Pose, sign};
 
 /// Largest file, in bytes.
@@ -35,20 +36,24 @@ impl Poses {
     /// # Errors
     /// [`FileError`] for a folder or a file that cannot be read, and a folder without a standing pose.
     pub fn open(folder: &Path) -> Result<Self, FileError> {
-        let entries = fs::read_dir(folder).and_then(Iterator::collect::<Result<Vec<_>, _>>);
-        let entries = entries.map_err(FileError::read(folder))?;
-        let mut paths: Vec<PathBuf> = entries.into_iter().map(|entry| entry.path()).collect();
-        paths.retain(|path| path.extension().is_some_and(|e| e.eq_ignore_ascii_case("bvh")));
-        paths.sort_unstable();
+        let none = || FileError::unsuitable(folder, "none of its files .bvh has a standing pose");
+        Self::among(&with_ending(folder, "bvh")?)?.ok_or_else(none)
+    }
+
+    /// As [`Self::open`], but `None` without the folder or without a standing pose.
+    ///
+    /// # Errors
+    /// [`FileError`] for a file that cannot be read.
+    pub fn within(folder: &Path) -> Result<Option<Self>, FileError> {
+        if folder.is_dir() { Self::among(&with_ending(folder, "bvh")?) } else { Ok(None) }
+    }
+
+    fn among(paths: &[PathBuf]) -> Result<Option<Self>, FileError> {
         let mut poses = Vec::new();
-        for path in &paths {
+        for path in paths {
             poses.extend(read(path)?.into_iter().filter(Pose::stands));
         }
-        if poses.is_empty() {
-            let message = format!("none of its {} files .bvh has a standing pose", paths.len());
-            return Err(FileError::unsuitable(folder, message));
-        }
-        Ok(Self { poses })
+        Ok((!poses.is_empty()).then_some(Self { poses }))
     }
 
     /// A random pose, often one of `poses`.
@@ -246,11 +251,11 @@ impl Rows {
         let up = at(self.neck) - 0.5 * (left + right);
         // Some files have y upwards, others z. The hips look along the third axis.
         let vertical = if up.z.abs() > up.y.abs() { Vec3::Z } else { Vec3::Y };
-        let world = axes(left - right, vertical);
+        let world = hanging(-vertical, left - right);
         let inside = |v: Vec3| world.transpose() * v;
-        let chest = axes(inside(at(self.arms[0][0]) - at(self.arms[1][0])), inside(up));
+        let chest = hanging(-inside(up), inside(at(self.arms[0][0]) - at(self.arms[1][0])));
         // As `Pose::trunk_frame` shares a lean and a turn among pelvis and chest.
-        let pelvis = axes(Vec3::X, inside(up).lerp(up.length() * Vec3::Y, 0.7));
+        let pelvis = hanging(-inside(up).lerp(up.length() * Vec3::Y, 0.7), Vec3::X);
         let front = chest.z_axis;
         let turn = libm::atan2f(front.x, front.z).to_degrees();
         let rest = rotate_y(-turn) * chest;
@@ -260,16 +265,16 @@ impl Rows {
         let mut pose = Pose { trunk: [lean, turn / 0.4, aside], ..Pose::default() };
         for side in [0, 1] {
             let [shoulder, elbow, wrist] = self.arms[side].map(|row| inside(at(row)));
-            let [raised, forwards] = hanging(chest.transpose() * (elbow - shoulder), side);
-            let upper = chest * rotate_x(-forwards) * rotate_z(sign(side) * raised);
+            let [apart, forwards] = raised(chest.transpose() * (elbow - shoulder), side);
+            let upper = chest * rotate_x(-forwards) * rotate_z(sign(side) * apart);
             let fore = upper.transpose() * (wrist - elbow).normalize_or(Vec3::NEG_Y);
             let bend = libm::acosf((-fore.y).clamp(-1.0, 1.0)).to_degrees();
             // A straight arm shows no twist.
             let twist =
                 if bend > 8.0 { -sign(side) * libm::atan2f(fore.x, fore.z).to_degrees() } else { 0.0 };
-            pose.arms[side] = [raised, forwards, twist, bend];
+            pose.arms[side] = [apart, forwards, twist, bend];
             let [hip, knee, ankle] = self.legs[side].map(|row| inside(at(row)));
-            let [apart, forwards] = hanging(pelvis.transpose() * (knee - hip), side);
+            let [apart, forwards] = raised(pelvis.transpose() * (knee - hip), side);
             let (thigh, calf) =
                 ((knee - hip).normalize_or(Vec3::NEG_Y), (ankle - knee).normalize_or(Vec3::NEG_Y));
             pose.legs[side] = [forwards, apart, thigh.angle_between(calf).to_degrees()];
@@ -278,15 +283,8 @@ impl Rows {
     }
 }
 
-/// Orthonormal axes with x about along `right` and y along `up`.
-fn axes(right: Vec3, up: Vec3) -> Mat3 {
-    let y = up.normalize_or(Vec3::Y);
-    let x = (right - right.dot(y) * y).normalize_or(y.any_orthonormal_vector());
-    Mat3::from_cols(x, y, x.cross(y))
-}
-
 /// Degrees by which a hanging limb is raised aside, and then forwards, to point along `way`.
-fn hanging(way: Vec3, side: usize) -> [f32; 2] {
+fn raised(way: Vec3, side: usize) -> [f32; 2] {
     let way = way.normalize_or(Vec3::NEG_Y);
     let aside = sign(side) * libm::asinf(way.x.clamp(-1.0, 1.0)).to_degrees();
     [aside, libm::atan2f(way.z, -way.y).to_degrees()]

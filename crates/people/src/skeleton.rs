@@ -134,7 +134,7 @@ fn halfway(a: Mat3, b: Mat3) -> Mat3 {
 
 /// Axes of a limb that hangs along `down` and bends around `hinge`.
 pub fn hanging(down: Vec3, hinge: Vec3) -> Mat3 {
-    let up = -down.normalize_or_zero();
+    let up = (-down).normalize_or(Vec3::Y);
     let right = (hinge - hinge.dot(up) * up).normalize_or(up.any_orthonormal_vector());
     Mat3::from_cols(right, up, right.cross(up))
 }

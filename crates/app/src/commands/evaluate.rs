@@ -48,7 +48,7 @@ pub struct Arguments {
     /// Also evaluate the model on other photographs: grey gives every pixel of the person their mean colour, so that only
     /// the outline is left.
     #[arg(long, value_parser = one_of(INPUTS), value_name = "KIND", conflicts_with = "mesh_dir")]
-    inputs: Option<Handling>,
+    inputs: Option<bool>,
     /// Evaluate the meshes NAME.obj, .ply or .glb in this folder instead of weights.
     #[arg(long, value_name = "DIR", conflicts_with_all = ["weights", "against"])]
     mesh_dir: Option<PathBuf>,
@@ -66,8 +66,8 @@ pub struct Arguments {
 }
 
 const ICP: [(&str, &str, Align); 2] = [("rigid", "", Align::Rigidly), ("similarity", "", Align::Similarly)];
-const INPUTS: [(&str, &str, Handling); 1] =
-    [("grey", "", Handling { grey: true, place: 0, exposure: 0.0, mask: 0.0, cut: 0.0 })];
+/// Kinds of photographs, and whether they are grey.
+const INPUTS: [(&str, &str, bool); 1] = [("grey", "", true)];
 /// The end of the message about failed parts.
 const REST: &str = "the rest, if there is any, was evaluated";
 
@@ -215,7 +215,7 @@ fn config_of(arguments: &Arguments) -> Result<EvalConfig, Failure> {
         let other = Variant { weights: Some(against.clone()), ..Variant::default() };
         config.ablations.insert("against".into(), other);
     }
-    if let Some(Handling { grey, .. }) = arguments.inputs {
+    if let Some(grey) = arguments.inputs {
         let photographs = Some(Handling { grey, ..config.photographs });
         config.ablations.insert("grey".into(), Variant { photographs, ..Variant::default() });
     }

@@ -171,7 +171,7 @@ impl File<'_> {
                         self.elements = self.elements.saturating_add(accessor.count());
                     }
                 }
-                // Corners that no accessor lists, and empty primitives.
+                // Primitives without data cost a little as well.
                 self.elements += 1;
                 if self.elements > MAX_ELEMENTS {
                     let message =

@@ -104,9 +104,9 @@ pub struct Surroundings {
 }
 
 impl Surroundings {
-    /// Scales the light so that the brightest direction without shadows has a luminance of 1, and the sky so that this is
-    /// `contrast` times the luminance of the darkest direction. A contrast that the lamps alone do not reach is not
-    /// reached.
+    /// Scales the sky so that the luminance of the brightest direction without shadows is `contrast` times that of the
+    /// darkest, and then all light so that no channel of any direction exceeds 1. A contrast that the lamps alone do not
+    /// reach is not reached.
     pub fn new(mut lamps: Vec<Lamp>, sky: [Vec3; 2], contrast: f32) -> Self {
         for lamp in &mut lamps {
             lamp.direction = lamp.direction.normalize_or(Vec3::Y);
@@ -114,14 +114,14 @@ impl Surroundings {
             lamp.color *= 1.0 / (PI * lamp.radius * lamp.radius).min(TAU);
         }
         let ways = ways();
-        let reflected = |surroundings: &Self| {
+        // What surfaces of all directions reflect.
+        let reflected = |surroundings: &Self| -> Vec<Vec3> {
             let light = ways.iter().map(|d| surroundings.from(*d)).collect::<Vec<_>>();
             let sum = |normal: &Vec3| {
                 let parts = ways.iter().zip(&light).map(|(d, light)| normal.dot(*d).max(0.0) * *light);
-                luminance(parts.sum::<Vec3>() * SHARE)
+                parts.sum::<Vec3>() * SHARE
             };
-            let all = ways.iter().map(sum);
-            all.fold((f32::INFINITY, f32::MIN_POSITIVE), |(low, high), v| (low.min(v), high.max(v)))
+            ways.iter().map(sum).collect()
         };
         let mut found = Self { lamps, sky };
         // The contrast falls with the strength of the sky.
@@ -129,10 +129,12 @@ impl Surroundings {
         for _ in 0..24 {
             let middle = 0.5 * (weak + strong);
             found.sky = sky.map(|s| s * middle);
-            let (darkest, brightest) = reflected(&found);
+            let all = reflected(&found).into_iter().map(luminance);
+            let (darkest, brightest) =
+                all.fold((f32::INFINITY, 0.0_f32), |(low, high), v| (low.min(v), high.max(v)));
             if brightest > contrast * darkest { weak = middle } else { strong = middle }
         }
-        let (_, brightest) = reflected(&found);
+        let brightest = reflected(&found).iter().map(|v| v.max_element()).fold(f32::MIN_POSITIVE, f32::max);
         found.sky = found.sky.map(|s| s / brightest);
         found.lamps.iter_mut().for_each(|lamp| lamp.color /= brightest);
         found

@@ -356,6 +356,12 @@ fn a_ball_alone_has_the_light_of_its_normals_with_the_given_contrast() {
         let (low, high) = light.iter().map(linear).fold((9.0_f32, 0.0_f32), |(l, h), v| (l.min(v), h.max(v)));
         assert!((high - 1.0).abs() < 0.03, "{contrast}: {high}");
         assert!((high / low / contrast - 1.0).abs() < 0.08, "{contrast}: {low} {high}");
+        // No channel of coloured light is clipped either.
+        let red = Lamp { color: Vec3::new(1.2, 1.0, 0.8), ..lamp };
+        let surroundings = Surroundings::new(vec![red], [Vec3::ONE; 2], contrast);
+        let colored = renderer.occlusion().light(&surroundings, &renderer.normals);
+        let most = colored.iter().fold(Vec3::ZERO, |most, light| most.max(light[0]));
+        assert!((most.x - 1.0).abs() < 0.03 && most.y < most.x && most.z < most.y, "{contrast}: {most}");
         // Inside of a closed surface it is dark.
         assert!(light.iter().all(|light| light[1].x < 0.1), "{contrast}");
     }

@@ -5,7 +5,6 @@ mod colors;
 mod joints;
 
 use std::collections::BTreeSet;
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use glam::{Mat3, Vec3};
@@ -16,6 +15,7 @@ use snapsnap_base::random::stream;
 use snapsnap_mesh::import::{self, Rigged};
 use snapsnap_mesh::mesh::Mesh;
 
+use crate::files::with_ending;
 use crate::math::rotate_y;
 use crate::poses::Poses;
 use crate::skeleton::{self, Owner};
@@ -50,19 +50,10 @@ impl Avatars {
     /// # Errors
     /// [`FileError`] if the folder cannot be read, or has no such file.
     pub fn open(folder: &Path, is_chosen: impl Fn(usize) -> bool) -> Result<Self, FileError> {
-        let mut files = Vec::new();
-        for entry in fs::read_dir(folder).map_err(FileError::read(folder))? {
-            let path = entry.map_err(FileError::read(folder))?.path();
-            let is_glb = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("glb"));
-            let is_hidden = path.file_name().is_some_and(|name| name.to_string_lossy().starts_with('.'));
-            if is_glb && !is_hidden && path.is_file() {
-                files.push(path);
-            }
-        }
+        let mut files = with_ending(folder, "glb")?;
         if files.is_empty() {
             return Err(FileError::unsuitable(folder, "holds no character: no file .glb"));
         }
-        files.sort_unstable();
         let people: BTreeSet<String> = files.iter().map(|path| person_of(path)).collect();
         let people: Vec<String> = people.into_iter().collect();
         let index = |path: &Path| people.binary_search(&person_of(path)).unwrap_or(0);

@@ -89,8 +89,7 @@ impl Library {
             return Err(FileError::unsuitable(&path, format!("has no bone `{bone}`")));
         }
         let wardrobe = Wardrobe::open(&root)?;
-        let poses = Some(root.join("poses")).filter(|folder| folder.is_dir());
-        let poses = poses.map(|folder| Poses::open(&folder)).transpose()?;
+        let poses = Poses::within(&root.join("poses"))?;
         let (targets, proxies) = Default::default();
         Ok(Self { root, positions, groups, bones, weights, targets, poses, wardrobe, proxies })
     }

@@ -1,7 +1,6 @@
 //! Clothes, hair, hats and shoes of MakeHuman's asset collection: meshes bound to the base mesh (`.mhclo` and `.obj`).
 
 use std::collections::HashMap;
-use std::fs;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
@@ -11,6 +10,7 @@ use snapsnap_base::FileError;
 
 use super::files::{METRES, read_text, vector, wrong};
 use super::net::{Net, Vertex};
+use crate::files::{entries, with_ending};
 
 /// Purpose of a proxy.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -60,7 +60,7 @@ pub struct Fitted {
     pub pieces: Vec<usize>,
 }
 
-/// Names of the proxies of each kind and sex that a folder has.
+/// The proxies of a folder, by kind.
 #[derive(Debug, Default)]
 pub struct Wardrobe {
     files: Vec<(Kind, PathBuf)>,
@@ -74,10 +74,10 @@ impl Wardrobe {
     pub fn open(root: &Path) -> Result<Self, FileError> {
         let mut files = Vec::new();
         for folder in ["clothes", "hair"] {
-            for asset in entries(&root.join(folder))? {
-                let found = entries(&asset)?;
-                let found = found.into_iter().filter(|path| path.extension().is_some_and(|e| e == "mhclo"));
-                for path in found {
+            let path = root.join(folder);
+            let assets = if path.is_dir() { entries(&path)? } else { Vec::new() };
+            for asset in assets.iter().filter(|asset| asset.is_dir()) {
+                for path in with_ending(asset, "mhclo")? {
                     let kind = if folder == "hair" { Kind::Hair } else { kind(&read_text(&path)?) };
                     files.push((kind, path));
                 }
@@ -104,29 +104,19 @@ impl Wardrobe {
     }
 }
 
-/// Entries of a folder in order; none if it does not exist.
-fn entries(folder: &Path) -> Result<Vec<PathBuf>, FileError> {
-    if !folder.is_dir() {
-        return Ok(Vec::new());
-    }
-    let entries = fs::read_dir(folder).and_then(Iterator::collect::<Result<Vec<_>, _>>);
-    let mut paths: Vec<PathBuf> =
-        entries.map_err(FileError::read(folder))?.into_iter().map(|entry| entry.path()).collect();
-    paths.sort_unstable();
-    Ok(paths)
-}
-
 /// The kind of clothes, by their tags.
 fn kind(text: &str) -> Kind {
     let has = |tag: &str| text.lines().any(|line| line.trim().eq_ignore_ascii_case(&format!("tag {tag}")));
-    match () {
-        () if has("Shoes") => Kind::Shoes,
-        () if has("Hats") => Kind::Hat,
-        () => Kind::Suit,
+    if has("Shoes") {
+        Kind::Shoes
+    } else if has("Hats") {
+        Kind::Hat
+    } else {
+        Kind::Suit
     }
 }
 
-/// `count` numbers.
+/// The next N numbers.
 fn numbers<'a, T: FromStr, const N: usize>(words: &mut impl Iterator<Item = &'a str>) -> Option<[T; N]> {
     let values: Option<Vec<T>> = (0..N).map(|_| words.next()?.parse().ok()).collect();
     values?.try_into().ok()
