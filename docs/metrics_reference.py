@@ -32,7 +32,7 @@ def slope(h, w):
 
 def people(x, y, w, h):
     """A part of the sheet of people, which is in the repository."""
-    return np.asarray(Image.open(ROOT / "docs/people-synth.png").convert("RGB"))[y : y + h, x : x + w]
+    return np.asarray(Image.open(ROOT / "tests/data/metrics/people.png").convert("RGB"))[y : y + h, x : x + w]
 
 
 def figures(a, b, inside=None):

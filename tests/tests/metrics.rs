@@ -14,7 +14,7 @@ use snapsnap_eval::region::{Region, margin};
 use snapsnap_eval::score::Score;
 use snapsnap_eval::similarity::{psnr, ssim, ssim_gaussian, ssim_of_loss};
 use snapsnap_splat::Camera;
-use snapsnap_tests::{data, root};
+use snapsnap_tests::data;
 
 /// Numbers in [0, 1) that any language makes alike.
 fn number(stream: u32, place: usize) -> f64 {
@@ -33,7 +33,7 @@ fn slope([h, w]: [u32; 2]) -> RgbImage {
 }
 
 fn people(x: u32, y: u32, w: u32, h: u32) -> RgbImage {
-    let sheet = image::open(root().join("docs/people-synth.png")).expect("the sheet of people").into_rgb8();
+    let sheet = image::open(data("metrics/people.png")).expect("the sheet of people").into_rgb8();
     image::imageops::crop_imm(&sheet, x, y, w, h).to_image()
 }
 

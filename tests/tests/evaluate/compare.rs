@@ -6,7 +6,7 @@ use std::process::Command;
 
 use image::{GrayImage, Luma, Rgb, RgbImage};
 use serde_json::Value;
-use snapsnap_tests::{data, refused, root, snapsnap, succeed};
+use snapsnap_tests::{data, refused, snapsnap, succeed};
 
 use super::ended;
 
@@ -24,7 +24,7 @@ fn json(command: &mut Command) -> Value {
 #[test]
 fn figures_are_those_of_scikit_image_in_every_window() {
     let temporary = tempfile::tempdir().expect("a folder");
-    let sheet = image::open(root().join("docs/people-synth.png")).expect("the sheet").into_rgb8();
+    let sheet = image::open(data("metrics/people.png")).expect("the sheet").into_rgb8();
     let [a, b, mask] = ["a.png", "b.png", "mask.png"].map(|name| temporary.path().join(name));
     for (path, x) in [(&a, 11), (&b, 10)] {
         image::imageops::crop_imm(&sheet, x, 40, 160, 256).to_image().save(path).expect("writes");
@@ -61,7 +61,7 @@ fn figures_are_those_of_scikit_image_in_every_window() {
 
 #[test]
 fn a_picture_is_infinitely_like_itself_and_that_is_printed() {
-    let sheet = root().join("docs/people-synth.png");
+    let sheet = data("metrics/people.png");
     let said = succeed(&mut compare(&sheet, &sheet));
     assert!(said.contains("inf dB") && said.contains("1.000000"), "{said}");
     let found = json(&mut compare(&sheet, &sheet));
