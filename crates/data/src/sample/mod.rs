@@ -52,6 +52,9 @@ pub struct SampleConfig {
     /// Stage 2: whether samples contain the points of four views for stage 1's loss: `stage2.points_weight`.
     #[serde(skip)]
     pub points: bool,
+    /// Stage 1: whether samples contain the second surface that faces each side camera, such as the flank behind an
+    /// arm. The data set must contain it: `views.second_depth`.
+    pub second_depth: bool,
     /// Share of the samples whose photographs are placed on their canvas like a user's photographs. Their points are
     /// scaled and moved into the nominal cameras' views.
     pub placed_share: f32,
@@ -74,6 +77,7 @@ impl Default for SampleConfig {
             random_targets: 3,
             high_resolution: false,
             points: false,
+            second_depth: false,
             placed_share: 0.0,
             person_height: 739,
             seed: 1,
@@ -103,6 +107,7 @@ impl SampleConfig {
             ("front_within_degrees", "must be 180", self.front_within_degrees != 180.0),
             ("augment", "must be off", self.augment != Augment::none()),
             ("placed_share", "must be 0", self.placed_share > 0.0),
+            ("second_depth", "must be false", self.second_depth),
         ];
         if let Some((key, message, _)) = beside_compat.into_iter().find(|(.., wrong)| self.compat && *wrong) {
             return Some((key.into(), format!("{message} beside `compat = true`")));
@@ -177,6 +182,9 @@ impl Source {
         }
         if config.high_resolution && !folder.description().high_resolution {
             return Err(wrong("has no views at twice the side, which `high_resolution` needs".into()));
+        }
+        if config.second_depth && !folder.description().second_depth {
+            return Err(wrong("has no second surfaces, which `second_depth` needs".into()));
         }
         let subjects = folder.subjects(split)?;
         if subjects.is_empty() {

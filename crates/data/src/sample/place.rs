@@ -26,6 +26,9 @@ pub(super) struct Four {
     /// `[4,H,W,3]` in metres in the front's frame, and their validity `[4,H,W]`.
     pub points: Vec<f32>,
     pub valid: Vec<f32>,
+    /// `[2,H,W,3]` and `[2,H,W]`: the same of the second surfaces of right and left. Empty without
+    /// `samples.second_depth`.
+    pub second: Points,
     /// The front camera. The points times `scale` are in its frame: it moves with placed points.
     pub front: Camera,
     pub scale: f64,
@@ -49,20 +52,27 @@ impl Source {
             Ok(StoredView { camera: self.camera(&stored.camera), ..stored })
         };
         let views: Vec<_> = order.iter().enumerate().map(view).collect::<Result<_, FileError>>()?;
+        let second = |i: usize| {
+            let depth = self.folder.second_depth(self.split, subject, order[i])?;
+            Ok(StoredView { color: Default::default(), mask: Default::default(), depth, camera: views[i].camera })
+        };
+        let seconds = if self.config.second_depth { vec![second(2)?, second(3)?] } else { Vec::new() };
         let photographs =
             self.photographs([0, 1].map(|i| (&views[i].color, &views[i].mask)), is_placed, random);
         let (mut front, mut scale) = (views[0].camera, 1.0);
-        let (mut points, mut valid) = (Vec::new(), Vec::new());
+        let [mut first, mut second] = <[Points; 2]>::default();
         if !is_placed {
-            for view in &views {
-                let far = if compat { COMPAT_FAR } else { 0.0 };
-                points.extend(unproject(&view.depth, &view.camera, &front.world_to_camera, far));
+            let far = if compat { COMPAT_FAR } else { 0.0 };
+            let add = |to: &mut Points, view: &StoredView| {
+                to.0.extend(unproject(&view.depth, &view.camera, &front.world_to_camera, far));
                 let there = |pixel: usize| match compat {
                     true => view.mask.as_raw()[pixel] >= INSIDE,
                     false => view.depth[pixel] > 0.0,
                 };
-                valid.extend((0..view.depth.len()).map(|pixel| f32::from(u8::from(there(pixel)))));
-            }
+                to.1.extend((0..view.depth.len()).map(|pixel| f32::from(u8::from(there(pixel)))));
+            };
+            views.iter().for_each(|view| add(&mut first, view));
+            seconds.iter().for_each(|view| add(&mut second, view));
         } else {
             let nominal = Camera::orbit_at_yaw_degrees(0.0, front.width);
             scale = scale_of(&photographs[0].mapping, &front);
@@ -71,17 +81,25 @@ impl Source {
             front.world_to_camera.translation +=
                 scale * shift(rays.zip(seen).filter_map(|(ray, point)| Some((ray, point?))));
             let photographed = [0, 1].map(|i| views[i].through(&photographs[i].mapping, &front, scale));
-            let sides =
-                [(2, 90.0), (3, 270.0)].map(|(i, degrees)| views[i].as_nominal(&front, scale, degrees));
-            for seen in photographed.into_iter().chain(sides).flatten() {
-                points.extend(seen.unwrap_or_default().as_vec3().to_array());
-                valid.push(f32::from(u8::from(seen.is_some())));
-            }
+            let add = |to: &mut Points, map: Seen| {
+                for seen in map {
+                    to.0.extend(seen.unwrap_or_default().as_vec3().to_array());
+                    to.1.push(f32::from(u8::from(seen.is_some())));
+                }
+            };
+            let side = |(view, degrees): (&StoredView, f64)| view.as_nominal(&front, scale, degrees);
+            let sides = |views: &[StoredView]| views.iter().zip([90.0, 270.0]).map(side).collect::<Vec<_>>();
+            photographed.into_iter().chain(sides(&views[2..])).for_each(|map| add(&mut first, map));
+            sides(&seconds).into_iter().for_each(|map| add(&mut second, map));
         }
         let (images, masks) = joined(photographs);
-        Ok(Four { images, masks, points, valid, front, scale })
+        let (points, valid) = first;
+        Ok(Four { images, masks, points, valid, second, front, scale })
     }
 }
+
+/// Points of several maps, and their validity.
+pub(super) type Points = (Vec<f32>, Vec<f32>);
 
 /// Points of a canvas's pixels, row by row, in the front's frame; `None` for pixels without a point.
 type Seen = Vec<Option<DVec3>>;

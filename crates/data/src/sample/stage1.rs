@@ -30,6 +30,11 @@ pub struct Stage1Item {
     pub points: Vec<f32>,
     /// `[4,H,W]` 1 for pixels that have a point, 0 for others.
     pub valid: Vec<f32>,
+    /// `[2,H,W,3]` points of the second surfaces that face the cameras of right and left, as `points`. Empty without
+    /// `samples.second_depth`.
+    pub second_points: Vec<f32>,
+    /// `[2,H,W]` as `valid`, for `second_points`.
+    pub second_valid: Vec<f32>,
 }
 
 /// A batch of B samples on a device.
@@ -67,10 +72,11 @@ impl Stage1Item {
         let order = source.folder.description().arrangement.four(first, count);
         let side = source.folder.description().resolution as usize;
         let is_placed = source.is_placed(&mut random);
-        let Four { images, masks, points, valid, .. } =
+        let Four { images, masks, points, valid, second, .. } =
             source.four(subject, &order, is_placed, &mut random)?;
+        let (second_points, second_valid) = second;
         let name = format!("{}: {subject}, view {first}", source.folder.root().display());
-        let mut item = Self { name, side, images, masks, points, valid };
+        let mut item = Self { name, side, images, masks, points, valid, second_points, second_valid };
         if source.config.augment.flip && random.random() {
             item.flip();
         }
@@ -80,19 +86,21 @@ impl Stage1Item {
     /// Mirrors the sample: left becomes right, also for the sides.
     fn flip(&mut self) {
         let (side, area) = (self.side, self.side * self.side);
-        for image in [&mut self.images, &mut self.masks, &mut self.valid] {
+        for image in [&mut self.images, &mut self.masks, &mut self.valid, &mut self.second_valid] {
             image.chunks_exact_mut(side).for_each(<[f32]>::reverse);
         }
-        for line in self.points.chunks_exact_mut(3 * side) {
+        let lines = self.points.chunks_exact_mut(3 * side);
+        for line in lines.chain(self.second_points.chunks_exact_mut(3 * side)) {
             let (points, _) = line.as_chunks_mut::<3>();
             points.reverse();
             points.iter_mut().for_each(|point| point[0] = -point[0]);
         }
         // Right and left are the third and the fourth.
-        let (right, left) = self.points[6 * area..].split_at_mut(3 * area);
-        right.swap_with_slice(left);
-        let (right, left) = self.valid[2 * area..].split_at_mut(area);
-        right.swap_with_slice(left);
+        let maps = [&mut self.points[6 * area..], &mut self.valid[2 * area..]];
+        for map in maps.into_iter().chain([&mut self.second_points[..], &mut self.second_valid[..]]) {
+            let (right, left) = map.split_at_mut(map.len() / 2);
+            right.swap_with_slice(left);
+        }
     }
 }
 

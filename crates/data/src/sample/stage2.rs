@@ -57,6 +57,8 @@ impl Stage2 {
                 "has no masks at twice the side, which `background_color` needs beside `high_resolution`";
             return Err(FileError::unsuitable(folder.root(), message));
         }
+        // Only stage 1 has second surfaces.
+        let config = SampleConfig { second_depth: false, ..config };
         Ok(Self { source: Source::new(folder, split, config, 4)?, make: Stage2Item::new })
     }
 }
@@ -94,9 +96,10 @@ impl Stage2Item {
             let pictures = [picture(front)?, picture(back)?];
             let pictures = pictures.each_ref().map(|(color, mask)| (color, mask));
             let (images, masks) = joined(source.photographs(pictures, false, &mut random));
-            Four { images, masks, points: Vec::new(), valid: Vec::new(), front: cameras[0], scale: 1.0 }
+            let (points, valid, second) = Default::default();
+            Four { images, masks, points, valid, second, front: cameras[0], scale: 1.0 }
         };
-        let Four { images, masks, points, valid, front, scale } = four;
+        let Four { images, masks, points, valid, front, scale, .. } = four;
         cameras[0] = front;
         let (points, valid) = if config.points { (points, valid) } else { Default::default() };
         Ok(Self {

@@ -1,4 +1,5 @@
-//! MakeHuman's data: a base mesh of a few tubes with all the names that people are made by.
+//! MakeHuman's data: a base mesh of a few tubes with all the names that people are made by, clothes and hair bound to
+//! it, and a motion file.
 
 use std::path::Path;
 
@@ -7,17 +8,24 @@ use glam::Vec3;
 use super::super::Format;
 use super::{put, scans};
 
-pub const FORMATS: &[Format] = &[Format {
-    name: "makehuman",
+/// What all have in common. The person of this seed wears a suit, shoes and hair.
+const PEOPLE: Format = Format {
+    name: "",
     sample: write,
-    changed: &["base.obj", ".mhskel", ".mhw", ".target"],
-    command: "prepare makehuman in --subjects 1 -o out --set views.count=2 --set views.resolution=16 --set views.samples_per_axis=1",
+    changed: &[],
+    command: "prepare makehuman in --subjects 1 --seed SEED -o out --set views.count=2 --set views.resolution=16 --set views.samples_per_axis=1",
     file: None,
     partial: false,
     kept: scans::DESCRIPTIONS,
     whole: scans::data_set,
     share: 8,
-}];
+};
+
+pub const FORMATS: &[Format] = &[
+    Format { name: "makehuman", changed: &["base.obj", ".mhskel", ".mhw", ".target"], ..PEOPLE },
+    Format { name: "mhclo", changed: &[".mhclo", "worn.obj"], ..PEOPLE },
+    Format { name: "bvh", changed: &[".bvh"], ..PEOPLE },
+];
 
 /// Corners of a tube's rings.
 const CORNERS: usize = 6;
@@ -160,9 +168,51 @@ fn write(folder: &Path) {
         "data/rigs/default_weights.mhw",
         pretty(serde_json::json!({"license": "CC0", "weights": weights})),
     );
+    // The trunk's lowest ring is the first of the base mesh, the head's follows its three rings.
+    wear(folder, "clothes/suit", "", 0);
+    wear(folder, "clothes/shoes", "tag Shoes\n", CORNERS);
+    wear(folder, "hair/long", "", 3 * CORNERS);
+    put(folder, "data/poses/stand.bvh", motion(&bones));
     for name in targets() {
         put(folder, &format!("data/targets/{name}.target"), "# a target\n0 0 .1 0\n7 0.01 0 -0.02\n");
     }
+}
+
+/// A tube of clothes or hair around the trunk or the head. Its vertices are bound to one vertex of the base mesh, or to
+/// three.
+fn wear(folder: &Path, asset: &str, tags: &str, first: usize) {
+    let mut clothes = format!("# CC0\nname {asset}\n{tags}obj_file worn.obj\nx_scale 0 3 2.8\nverts 0\n");
+    let mut mesh = String::new();
+    for row in 0..2 * CORNERS {
+        let at = first + row;
+        clothes += &match row % 2 {
+            0 => format!("{at}\n"),
+            _ => format!("{at} {first} {} 0.8 0.1 0.1 0.0 0.05 -0.02\n", first + 1),
+        };
+        mesh += &format!("v 0 0 {row}\nvt 0.{row} 0.5\n");
+    }
+    for corner in 1..=CORNERS {
+        let next = corner % CORNERS + 1;
+        let [c, d] = [next, corner].map(|row| row + CORNERS);
+        mesh += &format!("f {corner}/{corner} {next}/{next} {c}/{c} {d}/{d}\n");
+    }
+    clothes += &format!("\ndelete_verts\n{first} - {} {}\n", first + 2, first + CORNERS);
+    put(folder, &format!("data/{asset}/worn.mhclo"), clothes);
+    put(folder, &format!("data/{asset}/worn.obj"), mesh);
+}
+
+/// A motion file of one frame in which the bones rest.
+fn motion(bones: &[(String, Vec3, Vec3)]) -> String {
+    let mut text = String::from("HIERARCHY\nROOT root\n{\nOFFSET 0 0 0\nCHANNELS 6 Xposition Yposition Zposition ");
+    text += "Zrotation Xrotation Yrotation\n";
+    for (name, head, _) in &bones[1..] {
+        let Vec3 { x, y, z } = *head - bones[0].1;
+        text += &format!(
+            "JOINT {name}\n{{\nOFFSET {x} {y} {z}\nCHANNELS 3 Zrotation Xrotation Yrotation\nEnd Site\n{{\nOFFSET 0 0 0\n}}\n}}\n"
+        );
+    }
+    let numbers = "0 ".repeat(6 + 3 * (bones.len() - 1));
+    text + &format!("}}\nMOTION\nFrames: 1\nFrame Time: 0.04\n{numbers}\n")
 }
 
 /// Names of all targets that a person may be mixed from.

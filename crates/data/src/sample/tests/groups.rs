@@ -8,7 +8,7 @@ use crate::testing::made;
 
 /// Distances in pixels between the points of the view number `view` of a sample and the centres of their pixels in
 /// `camera`. `to_world` transforms the points from the front's frame.
-fn distances(
+pub fn distances(
     (points, valid): (&[f32], &[f32]),
     view: usize,
     to_world: &RigidTransform,

@@ -1,5 +1,6 @@
 mod depth;
 mod groups;
+mod second;
 
 use burn::data::dataloader::batcher::Batcher;
 use burn::data::dataset::Dataset;

@@ -1,0 +1,93 @@
+//! Second surfaces of side views.
+
+use super::*;
+use crate::prepare::DataConfig;
+use crate::testing::made;
+use snapsnap_mesh::mesh::{Face, Mesh};
+
+/// A block with a slab beside its right side, as an arm hangs beside a flank: the slab's half size is a part of the
+/// block's.
+fn armed() -> Mesh {
+    let (mut mesh, arm) = (block(), block());
+    let first = mesh.positions.len() as u32;
+    let (middle, half) = BLOCK;
+    let beside = Vec3::new(1.5 * half.x, 0.0, 0.0);
+    let share = Vec3::new(0.1, 0.6, 0.4);
+    mesh.positions.extend(arm.positions.iter().map(|p| middle + beside + share * (*p - middle)));
+    mesh.faces.extend(arm.faces.iter().map(|f| Face { positions: f.positions.map(|row| row + first), ..*f }));
+    mesh
+}
+
+/// The points of a map that has one.
+fn there(points: &[f32], valid: &[f32], map: usize, side: usize) -> Vec<Vec3> {
+    let (points, valid) = (&points[3 * map * side * side..], &valid[map * side * side..][..side * side]);
+    points_of(points).zip(valid).filter(|(_, valid)| **valid > 0.5).map(|(point, _)| point).collect()
+}
+
+#[test]
+fn samples_carry_the_flank_behind_an_arm() {
+    let side = 128;
+    let mut config = DataConfig::default();
+    (config.views.count, config.views.resolution) = (4, side as u32);
+    config.views.second_depth = true;
+    let (_temporary, folder) = made(&config, &armed(), 1);
+    let samples = SampleConfig {
+        second_depth: true,
+        front_within_degrees: 0.0,
+        augment: Augment::none(),
+        ..SampleConfig::default()
+    };
+    let sample = |config: SampleConfig, index: usize| stage1(&folder, config).sample(index).expect("reads");
+    let plain = sample(samples.clone(), 0);
+    let to_world = Camera::orbit_at_yaw_degrees(0.0, side as u32).world_to_camera.inverse();
+    let (middle, half) = BLOCK;
+    // The right camera sees the block's flank behind the arm, the left one the arm's inner side behind the block.
+    for (map, flank) in [(0, middle.x + half.x), (1, middle.x + 1.4 * half.x)] {
+        let second = there(&plain.second_points, &plain.second_valid, map, side);
+        let seen = there(&plain.points, &plain.valid, 2 + map, side).len();
+        assert!((200..seen).contains(&second.len()), "{} of {seen}", second.len());
+        let off = |p: &Vec3| (to_world.apply(p.as_dvec3()).x as f32 - flank).abs();
+        let worst = second.iter().map(off).fold(0.0, f32::max);
+        assert!(worst < 1e-5, "map {map}: {worst} m");
+    }
+    let without = sample(SampleConfig { second_depth: false, ..samples.clone() }, 0);
+    assert_eq!((&without.points, &without.images), (&plain.points, &plain.images));
+    assert!(without.second_points.is_empty() && without.second_valid.is_empty());
+
+    // A mirrored sample has the left's second surface, mirrored, on the right.
+    let flip = SampleConfig { augment: Augment { flip: true, ..Augment::none() }, ..samples.clone() };
+    let flipped = (0..16).map(|index| sample(flip.clone(), index)).find(|item| item.points != plain.points);
+    let flipped = flipped.expect("one of sixteen is mirrored");
+    for (map, other) in [(0, 1), (1, 0)] {
+        for row in 0..side {
+            for column in 0..side {
+                let at = (map * side + row) * side + column;
+                let from = (other * side + row) * side + side - 1 - column;
+                assert_eq!(flipped.second_valid[at], plain.second_valid[from]);
+                let [x, y, z] = [0, 1, 2].map(|axis| plain.second_points[3 * from + axis]);
+                assert_eq!(flipped.second_points[3 * at..3 * at + 3], [-x, y, z]);
+            }
+        }
+    }
+
+    // Placed samples have them on the rays of the nominal cameras.
+    let placed = sample(SampleConfig { placed_share: 1.0, person_height: 700, ..samples.clone() }, 0);
+    assert_ne!(placed.second_points, plain.second_points);
+    for (map, degrees) in [(0, 90.0), (1, 270.0)] {
+        let camera = Camera::orbit_at_yaw_degrees(degrees, side as u32);
+        let points = (&placed.second_points[..], &placed.second_valid[..]);
+        let off = groups::distances(points, map, &to_world, &camera);
+        let mean = off.iter().sum::<f64>() / off.len() as f64;
+        assert!(off.len() > 200 && mean < 0.5, "map {map}: {} points, {mean} px", off.len());
+    }
+}
+
+#[test]
+fn second_surfaces_need_data_that_has_them() {
+    let (_temporary, folder) = data_set(&block(), Layout::Exact, 16, 4, false, 1);
+    let samples = SampleConfig { second_depth: true, ..SampleConfig::default() };
+    let error = Stage1::new(folder, TRAIN, samples).expect_err("has none").to_string();
+    assert!(error.contains("has no second surfaces, which `second_depth` needs"), "{error}");
+    let (key, _) = SampleConfig { second_depth: true, ..SampleConfig::compat() }.problem().expect("a problem");
+    assert_eq!(key, "second_depth");
+}
