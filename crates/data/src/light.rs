@@ -39,7 +39,8 @@ pub struct LightConfig {
     pub follows: Follows,
     /// Largest number of lamps; each subject has one to so many.
     pub lamps: usize,
-    /// Range of the luminance of the brightest over that of the darkest direction of a surface, before shadows.
+    /// Range of the luminance of the brightest over that of the darkest direction of a surface, before shadows. Shown
+    /// values differ less: by the 2.2nd root of it.
     pub contrast: [f32; 2],
     /// Largest deviation of the channels of a lamp's colour, as a share.
     pub color: f32,
@@ -50,7 +51,7 @@ pub struct LightConfig {
 impl Default for LightConfig {
     fn default() -> Self {
         let (kind, follows) = (Kind::default(), Follows::default());
-        Self { kind, follows, lamps: 3, contrast: [1.3, 12.0], color: 0.2, seed: 0 }
+        Self { kind, follows, lamps: 3, contrast: [1.5, 50.0], color: 0.2, seed: 0 }
     }
 }
 

@@ -54,7 +54,12 @@ impl Source {
         let views: Vec<_> = order.iter().enumerate().map(view).collect::<Result<_, FileError>>()?;
         let second = |i: usize| {
             let depth = self.folder.second_depth(self.split, subject, order[i])?;
-            Ok(StoredView { color: Default::default(), mask: Default::default(), depth, camera: views[i].camera })
+            Ok(StoredView {
+                color: Default::default(),
+                mask: Default::default(),
+                depth,
+                camera: views[i].camera,
+            })
         };
         let seconds = if self.config.second_depth { vec![second(2)?, second(3)?] } else { Vec::new() };
         let photographs =

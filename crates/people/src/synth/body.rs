@@ -34,7 +34,14 @@ impl Body {
                 union = union.min(outside);
                 continue;
             }
-            let mut d = part.distance(p);
+            let skin = if part.drape.is_none() { part.skin(p) } else { f32::NEG_INFINITY };
+            // Cloth, whose thickness takes long to compute, cannot reach from there either.
+            let outside = skin - part.thickest();
+            if outside > enough.max(0.0) + 0.06 {
+                union = union.min(outside);
+                continue;
+            }
+            let mut d = part.dressed(p, skin);
             if d < nearest.0 {
                 nearest = (d, index);
             }
@@ -44,7 +51,7 @@ impl Body {
                 Kind::Skirt if hips.is_finite() => d = smooth_min(d, hips, 0.05),
                 _ => {}
             }
-            let joint = if part.joint > 0.0 {
+            let joint = if part.joint > 0.0 && (union - d).abs() < part.joint + 0.004 {
                 // Limbs are joined smoothly to the trunk at their start only.
                 let along = part.chart(p).1;
                 part.joint * (1.0 - smoothstep(0.0, 0.5 * part.length, along)) + 0.004

@@ -220,15 +220,33 @@ impl Part {
 
     /// Distance to the part's surface, clothes included.
     pub fn distance(&self, p: Vec3) -> f32 {
-        if let Some(drape) = &self.drape {
-            return drape.distance(p);
-        }
+        let skin = if self.drape.is_none() { self.skin(p) } else { 0.0 };
+        self.dressed(p, skin)
+    }
+
+    /// Largest thickness of the part's cloth, metres.
+    pub fn thickest(&self) -> f32 {
+        let most = |layer: &Layer| layer.thickness + layer.flare.max(0.0) + layer.folds.abs();
+        self.layers.iter().map(most).fold(0.0, f32::max)
+    }
+
+    /// Distance to the skin.
+    pub fn skin(&self, p: Vec3) -> f32 {
         let mut skin = f32::INFINITY;
         for shape in &self.shapes {
             let d = shape.distance(p);
             skin = if skin.is_finite() { smooth_min(skin, d, self.blend) } else { d };
         }
-        if self.layers.is_empty() { skin } else { skin - self.thickness(p, self.chart(p)) }
+        skin
+    }
+
+    /// Distance to the part's surface, from the distance to the skin, which drapes do not have.
+    pub fn dressed(&self, p: Vec3, skin: f32) -> f32 {
+        match &self.drape {
+            Some(drape) => drape.distance(p),
+            None if self.layers.is_empty() => skin,
+            None => skin - self.thickness(p, self.chart(p)),
+        }
     }
 }
 

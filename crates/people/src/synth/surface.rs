@@ -9,7 +9,7 @@ use rayon::prelude::*;
 
 use super::body::Body;
 
-/// Samples along the edge of a block. Blocks without surface are not sampled.
+/// Samples along the edge of a block. Blocks without surface are not sampled, nor are their parts of half the edge.
 const BLOCK: usize = 8;
 /// Largest factor by which distances may be too large where surfaces lean or are crumpled.
 const SLACK: f32 = 1.4;
@@ -29,28 +29,12 @@ pub fn mesh(body: &Body, cell: f32) -> Surface {
     let origin = low - Vec3::splat(2.0 * cell);
     let counts = ((high - origin) / cell).ceil().as_ivec3() + IVec3::splat(3);
     let [nx, ny, nz] = counts.to_array().map(|n| (n as usize).next_multiple_of(BLOCK));
-    let place = |x: usize, y: usize, z: usize| origin + cell * Vec3::new(x as f32, y as f32, z as f32);
-    let reach = SLACK * cell * (BLOCK as f32 / 2.0) * 1.75;
-
     let mut values = vec![0.0_f32; nx * ny * nz];
     values.par_chunks_mut(nx * ny * BLOCK).enumerate().for_each(|(slab, values)| {
-        let z0 = slab * BLOCK;
-        for y0 in (0..ny).step_by(BLOCK) {
-            for x0 in (0..nx).step_by(BLOCK) {
-                let middle = place(x0, y0, z0) + Vec3::splat(cell * (BLOCK - 1) as f32 / 2.0);
-                let far = body.distance(middle, reach).0;
-                for z in 0..BLOCK {
-                    for y in y0..y0 + BLOCK {
-                        let row = (z * ny + y) * nx + x0;
-                        for (x, value) in values[row..row + BLOCK].iter_mut().enumerate() {
-                            *value = if far.abs() > reach {
-                                far
-                            } else {
-                                body.distance(place(x0 + x, y, z0 + z), 2.0 * cell).0
-                            };
-                        }
-                    }
-                }
+        let mut slab = Slab { body, origin, first: slab * BLOCK, cell, values, row: nx, layer: nx * ny };
+        for y in (0..ny).step_by(BLOCK) {
+            for x in (0..nx).step_by(BLOCK) {
+                slab.fill([x, y, 0], BLOCK);
             }
         }
     });
@@ -67,16 +51,64 @@ pub fn mesh(body: &Body, cell: f32) -> Surface {
     Surface { positions, faces, parts }
 }
 
-/// Moves a point of the net onto the surface by Newton's method, within its cell. Also returns the row of its part.
+/// Layers of samples of the distance.
+struct Slab<'a> {
+    body: &'a Body,
+    /// Place of the grid's first sample.
+    origin: Vec3,
+    /// First layer in the grid.
+    first: usize,
+    cell: f32,
+    values: &'a mut [f32],
+    /// Samples of a row and of a layer.
+    row: usize,
+    layer: usize,
+}
+
+impl Slab<'_> {
+    /// Samples a cube of `edge` samples. Where its middle is too far from the surface, it has the middle's distance.
+    fn fill(&mut self, start: [usize; 3], edge: usize) {
+        let place = |[x, y, z]: [usize; 3]| {
+            self.origin + self.cell * Vec3::new(x as f32, y as f32, (self.first + z) as f32)
+        };
+        let half = (edge - 1) as f32 / 2.0;
+        // The neighbours of its outermost samples count, too.
+        let reach = SLACK * self.cell * (3.0_f32.sqrt() * half + 1.0);
+        let far = self.body.distance(place(start) + Vec3::splat(self.cell * half), reach).0;
+        let corner = |step: usize, i: usize| {
+            [0, 1, 2].map(|axis| start[axis] + if i >> axis & 1 == 1 { step } else { 0 })
+        };
+        if far.abs() > reach {
+            for z in start[2]..start[2] + edge {
+                for y in start[1]..start[1] + edge {
+                    let first = z * self.layer + y * self.row + start[0];
+                    self.values[first..first + edge].fill(far);
+                }
+            }
+        } else if edge > 2 {
+            (0..8).for_each(|i| self.fill(corner(edge / 2, i), edge / 2));
+        } else {
+            for [x, y, z] in (0..8).map(|i| corner(1, i)) {
+                let value = self.body.distance(place([x, y, z]), 2.0 * self.cell).0;
+                self.values[z * self.layer + y * self.row + x] = value;
+            }
+        }
+    }
+}
+
+/// Moves a point of the net onto the surface by two steps along the gradient, within its cell. Also returns the row of
+/// its part.
 fn settle(body: &Body, start: Vec3, cell: f32) -> (Vec3, u8) {
     let distance = |p: Vec3| body.distance(p, 4.0 * cell).0;
-    let step = 0.2 * cell;
+    // Corners of a tetrahedron. Opposite points along each axis would be six.
+    let corners = [[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]].map(Vec3::from);
+    let step = 0.15 * cell;
+    let sum: Vec3 = corners.iter().map(|corner| *corner * distance(start + step * *corner)).sum();
+    let gradient = sum / (4.0 * step);
+    let way = gradient / gradient.length_squared().max(0.1);
     let mut p = start;
     for _ in 0..2 {
-        let d = distance(p);
-        let slope = |axis: Vec3| (distance(p + step * axis) - distance(p - step * axis)) / (2.0 * step);
-        let gradient = Vec3::new(slope(Vec3::X), slope(Vec3::Y), slope(Vec3::Z));
-        let moved = p - gradient * (d / gradient.length_squared().max(0.1));
+        let moved = p - way * distance(p);
         p = start + (moved - start).clamp_length_max(0.7 * cell);
     }
     (p, body.owner(p, cell) as u8)

@@ -13,7 +13,7 @@ const PEOPLE: Format = Format {
     name: "",
     sample: write,
     changed: &[],
-    command: "prepare makehuman in --subjects 1 --seed SEED -o out --set views.count=2 --set views.resolution=16 --set views.samples_per_axis=1",
+    command: "prepare makehuman in --subjects 1 --seed 3 -o out --set views.count=2 --set views.resolution=16 --set views.samples_per_axis=1",
     file: None,
     partial: false,
     kept: scans::DESCRIPTIONS,
@@ -203,7 +203,8 @@ fn wear(folder: &Path, asset: &str, tags: &str, first: usize) {
 
 /// A motion file of one frame in which the bones rest.
 fn motion(bones: &[(String, Vec3, Vec3)]) -> String {
-    let mut text = String::from("HIERARCHY\nROOT root\n{\nOFFSET 0 0 0\nCHANNELS 6 Xposition Yposition Zposition ");
+    let mut text =
+        String::from("HIERARCHY\nROOT root\n{\nOFFSET 0 0 0\nCHANNELS 6 Xposition Yposition Zposition ");
     text += "Zrotation Xrotation Yrotation\n";
     for (name, head, _) in &bones[1..] {
         let Vec3 { x, y, z } = *head - bones[0].1;

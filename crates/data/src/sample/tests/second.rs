@@ -88,6 +88,7 @@ fn second_surfaces_need_data_that_has_them() {
     let samples = SampleConfig { second_depth: true, ..SampleConfig::default() };
     let error = Stage1::new(folder, TRAIN, samples).expect_err("has none").to_string();
     assert!(error.contains("has no second surfaces, which `second_depth` needs"), "{error}");
-    let (key, _) = SampleConfig { second_depth: true, ..SampleConfig::compat() }.problem().expect("a problem");
+    let (key, _) =
+        SampleConfig { second_depth: true, ..SampleConfig::compat() }.problem().expect("a problem");
     assert_eq!(key, "second_depth");
 }
