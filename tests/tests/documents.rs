@@ -12,7 +12,7 @@ use std::time::Instant;
 use snapsnap_tests::{data, root, shared, snapsnap, succeed, toml_config};
 
 /// In the order in which a reader meets them: each page's commands find what earlier ones made.
-const PAGES: [&str; 21] = [
+const PAGES: [&str; 22] = [
     "README.md",
     "CONTRIBUTING.md",
     "docs/training.md",
@@ -33,6 +33,7 @@ const PAGES: [&str; 21] = [
     "docs/notes/inference.md",
     "docs/notes/splat.md",
     "docs/notes/data.md",
+    "docs/notes/people.md",
     "docs/notes/look.md",
 ];
 /// Tasks of `cargo xtask` that are no commands of the program; the suite itself and its neighbours.
@@ -64,8 +65,8 @@ fn recorded(page: &str, script: &str, arguments: &[String]) -> Vec<Words> {
     fs::write(&commands, "").expect("written");
     let mut shell = Command::new("/bin/bash");
     shell.args(["-c", &format!("{RECORDER}{script}"), page]).args(arguments).env("COMMANDS", &commands);
-    // Of the sweep's rows, which are all alike.
-    shell.env("ROWS", "base transformer regressor");
+    // Of the rows of sweeps, which are all alike.
+    shell.env("ROWS", "base transformer regressor all");
     // Nothing but what is recorded may be started.
     let output = shell.env("PATH", "/nowhere").current_dir(temporary.path()).output().expect("bash starts");
     assert!(output.status.success(), "{page}: {script}\n{}", String::from_utf8_lossy(&output.stderr));
@@ -141,11 +142,12 @@ fn less(words: &[String]) -> Words {
     }
     let mut more: Vec<&str> = Vec::new();
     match words[0].as_str() {
-        "prepare" if matches!(words[1].as_str(), "synth" | "makehuman") => {
-            if words[1] == "makehuman" && !shared("makehuman").is_dir() {
+        "prepare" if matches!(words[1].as_str(), "synth" | "makehuman" | "avatars") => {
+            let folder = shared(&words[1]);
+            if words[1] != "synth" && !folder.is_dir() {
                 println!(
                     "SKIPPED: no {}; simple people instead: {}",
-                    shared("makehuman").display(),
+                    folder.display(),
                     words.join(" ")
                 );
                 words.splice(1..3, ["synth".to_owned()]);
@@ -246,6 +248,7 @@ fn place() -> tempfile::TempDir {
     }
     fs::write(to("published.toml"), toml_config(&data("pipeline").join("config.json"))).expect("written");
     symlink(shared("makehuman"), to("path/to/makehuman/data")).expect("linked");
+    symlink(shared("avatars"), to("path/to/avatars")).expect("linked");
     let cone: String = (0..12)
         .map(|i| f64::from(i) * std::f64::consts::TAU / 12.0)
         .map(|angle| format!("v {} 0 {}\n", 0.3 * angle.cos(), 0.2 * angle.sin()))

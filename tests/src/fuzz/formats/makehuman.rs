@@ -13,7 +13,7 @@ const PEOPLE: Format = Format {
     name: "",
     sample: write,
     changed: &[],
-    command: "prepare makehuman in --subjects 1 --seed 3 -o out --set views.count=2 --set views.resolution=16 --set views.samples_per_axis=1",
+    command: "prepare makehuman in --subjects 1 --seed 2 -o out --set views.count=2 --set views.resolution=16 --set views.samples_per_axis=1",
     file: None,
     partial: false,
     kept: scans::DESCRIPTIONS,

@@ -1,0 +1,35 @@
+#!/usr/bin/env bash
+# Leave one maker out (docs/notes/data.md): bash configs/default/makers.sh MAKEHUMAN_DATA AVATARS, in the repository's root. It trains
+# stage 1 on people of all three makers, and without each of them, and judges each network on held-out people of every maker.
+# ROWS="all no-synth" trains these rows only. An interrupted run continues when it is started again.
+set -eu
+makehuman=$1 avatars=$2
+folder=people/makers runs=runs/makers
+# people KIND…: 400 training people and 40 held-out people.
+people() {
+  for split in "val 40" "train 400"; do
+    # Avatars that cannot be read are skipped, with exit code 2.
+    cargo xtask prepare "$@" --split "${split% *}" --subjects "${split#* }" --seed 301 --config configs/data/default.toml \
+      --set 'light.kind="random"' -o "$folder/$1" || [ "$1" = avatars ]
+  done
+}
+people synth
+people makehuman "$makehuman"
+people avatars "$avatars"
+train() { cargo xtask train-stage1 --config configs/default/stage1.toml --resume "$@" --set training.preview_every=0; }
+# row NAME MAKER…: the training on these makers, and one step without effect on each maker for its validation.
+row() {
+  name=$1
+  shift
+  case " ${ROWS-$name} " in *" $name "*) ;; *) return 0 ;; esac
+  train --data "${@/#/$folder/}" --set training.steps=2000 --set training.validate_every=1000 --set training.validation_samples=60 \
+    -o "$runs/$name"
+  for maker in synth makehuman avatars; do
+    train --data "$folder/$maker" --weights "$runs/$name/best.safetensors" --set training.steps=1 --set schedule.warm_up=0 \
+      --set optimizer.rate=1e-12 --set optimizer.muon.rate=1e-12 --set training.validation_samples=160 -o "$runs/$name-on-$maker"
+  done
+}
+row all synth makehuman avatars
+row no-synth makehuman avatars
+row no-makehuman synth avatars
+row no-avatars synth makehuman
