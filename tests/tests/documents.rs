@@ -145,11 +145,7 @@ fn less(words: &[String]) -> Words {
         "prepare" if matches!(words[1].as_str(), "synth" | "makehuman" | "avatars") => {
             let folder = shared(&words[1]);
             if words[1] != "synth" && !folder.is_dir() {
-                println!(
-                    "SKIPPED: no {}; simple people instead: {}",
-                    folder.display(),
-                    words.join(" ")
-                );
+                println!("SKIPPED: no {}; simple people instead: {}", folder.display(), words.join(" "));
                 words.splice(1..3, ["synth".to_owned()]);
             }
             let count = words.iter().position(|word| word == "--subjects").expect("how many people");

@@ -42,7 +42,7 @@ const COMMON: [Kind; 5] = [Kind::Plain, Kind::Plain, Kind::Plain, Kind::Knit, Ki
 const QUIET: [Kind; 6] = [Kind::Plain, Kind::Denim, Kind::Plain, Kind::Knit, Kind::Checks, Kind::Stripes];
 
 /// A cloth.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Pattern {
     kind: Kind,
     colors: [Vec3; 3],

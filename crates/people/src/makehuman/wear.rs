@@ -119,6 +119,7 @@ impl Person<'_> {
 }
 
 /// The colour of a piece.
+#[derive(PartialEq)]
 enum Cloth<'a> {
     Plain(Vec3),
     Pattern(&'a Pattern),
@@ -164,10 +165,18 @@ impl Fitted {
         mesh.positions.extend(vertices.iter().map(|vertex| vertex.posed));
         let size = self.metres();
         let mut materials: Vec<Option<u32>> = vec![None; self.pieces.iter().max().map_or(0, |last| last + 1)];
+        // Hair and hats have many pieces of one colour.
+        let mut made: Vec<(Cloth, u32)> = Vec::new();
         for ((face, texcoords), piece) in faces.iter().zip(&self.texcoords).zip(&self.pieces) {
             let material = *materials[*piece].get_or_insert_with(|| {
-                mesh.materials.push(material(&cloth(*piece), size));
-                mesh.materials.len() as u32 - 1
+                let cloth = cloth(*piece);
+                if let Some((_, material)) = made.iter().find(|(other, _)| *other == cloth) {
+                    return *material;
+                }
+                let row = mesh.materials.len() as u32;
+                mesh.materials.push(material(&cloth, size));
+                made.push((cloth, row));
+                row
             });
             let place = mesh.texcoords.len() as u32;
             mesh.texcoords.extend(texcoords);

@@ -14,7 +14,7 @@ const SIDE: u32 = 192;
 /// Largest number of subjects on a sheet.
 const MOST: usize = 48;
 /// Pictures in a row: three subjects.
-const COLUMNS: u32 = 9;
+const COLUMNS: usize = 9;
 /// Colour of the background.
 const BACKGROUND: [u8; 3] = [235; 3];
 
@@ -29,7 +29,10 @@ pub fn write(path: &Path, folder: &Folder, subjects: &[&Work]) -> Result<(), Fai
             pictures.push(shrink(&color, &mask));
         }
     }
-    write_png(path, &sheet(&pictures, COLUMNS.min(pictures.len() as u32)))
+    let columns = pictures.len().min(COLUMNS);
+    let empty = RgbImage::from_pixel(SIDE, SIDE, image::Rgb(BACKGROUND));
+    pictures.resize(pictures.len().next_multiple_of(columns), empty);
+    write_png(path, &sheet(&pictures, columns as u32))
 }
 
 /// The view over the background colour, without its margin, resized to the sheet's pictures.
