@@ -171,7 +171,14 @@ fn less(words: &[String]) -> Words {
             }
         }
         "evaluate" => {
-            for key in ["data.subjects=1", "report.people=1", "views.compared=[1]", "views.turns=[0]"] {
+            let keys = [
+                "data.subjects=1",
+                "report.people=1",
+                "views.compared=[1]",
+                "views.turns=[0]",
+                "views.resolution=0",
+            ];
+            for key in keys {
                 more.extend(["--set", key]);
             }
         }
