@@ -183,16 +183,22 @@ fn validations_of_sixteen_bits_are_close_to_thirty_two() {
     }
     let state = fs::read(temporary.path().join("f16/state/state.safetensors")).expect("a state");
     assert!(String::from_utf8_lossy(&state[..20_000]).contains("\\\"loss_scale\\\":{"));
-    // The regressor as well, on a frozen predictor. Validations are in f32.
+    // The regressor as well, on a frozen predictor. Validations are in f32. At the config's own rate its score falls and
+    // rises by a dB every few steps in any precision, so that rounding decides where it stands. This rate is stable.
     let start = temporary.path().join("f32/best.safetensors");
-    let scores = ["f32", "f16"].map(|precision| {
+    let scores = ["f32", "f16", "bf16"].map(|precision| {
         let run = temporary.path().join(format!("two-{precision}"));
         let set = format!("--set=training.precision={precision}");
-        succeed(train(2, &config, &run).args([&set, "--set=training.steps=10"]).arg("--weights").arg(&start));
-        logged(&run, "validation/psnr_masked").last().expect("validations").1
+        let mut command = train(2, &config, &run);
+        command.args([&set, "--set=training.steps=20", "--set=optimizer.rate=1e-3"]);
+        succeed(command.arg("--set=optimizer.muon.rate=1e-3").arg("--weights").arg(&start));
+        let scores = logged(&run, "validation/psnr_masked");
+        (scores[0].1, scores[1].1)
     });
     println!("stage 2: {scores:?} dB");
-    assert!((scores[0] - scores[1]).abs() < 0.1, "{scores:?}");
+    for (first, last) in scores {
+        assert!(last > first + 0.1 && (last - scores[0].1).abs() < 0.02, "{scores:?}");
+    }
     let mut rehearsal = train(1, &config, &temporary.path().join("rehearsal"));
     succeed(rehearsal.args(["--dry-run", "--set=training.precision=f16"]));
     let mut command = snapsnap();
