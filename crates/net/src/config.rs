@@ -10,7 +10,7 @@ pub use snapsnap_base::config::{ConfigError, Schema};
 
 pub use modes::{
     Anchor, Body, ConfMode, Downsample, Fusion, HeadKind, Precision, PrecisionChoice, RegressorColor,
-    RegressorStart, RotationFrame, Upsample, WorldFrame,
+    RegressorStart, RotationFrame, Sides, Upsample, WorldFrame,
 };
 
 /// Largest distance, in pixels, of an input pixel that influences an output pixel of the regressor, statistics aside. It is
@@ -70,6 +70,11 @@ pub struct NetworkConfig {
     pub head: HeadKind,
     /// Whether the right and left heads exist; without them only the two photographed sides are predicted.
     pub side_heads: bool,
+    /// Origin of the maps of the unseen sides.
+    pub sides: Sides,
+    /// Channels of the network of completed sides at 1, 2, 4 and 8 times the finest pixel.
+    #[serde(deserialize_with = "snapsnap_base::config::four")]
+    pub side_dims: [usize; 4],
     /// Fusion of the tokens of the two photographs into those of the unseen sides.
     pub fusion: Fusion,
     /// Activation of the confidence channel.
@@ -134,6 +139,8 @@ impl Default for NetworkConfig {
             hooks: [0, 6, 9, 12],
             head: HeadKind::Dpt,
             side_heads: true,
+            sides: Sides::Predicted,
+            side_dims: [32, 48, 64, 96],
             fusion: Fusion::Mean,
             conf_mode: ConfMode::Sigmoid,
             resolution: 1024,
@@ -184,6 +191,10 @@ pub struct RegressorConfig {
     /// Source of a Gaussian's colour; unset: the pixel with a geometric start, else the network.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub color: Option<RegressorColor>,
+    /// Largest corrections of the colours of photographed pixels and of the pixels of unseen sides, as shares of the range from
+    /// black to white. Unset: half of the range.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub color_limits: Option<[f64; 2]>,
     /// Whether pixels that the person covers in part have the person's colour, not mixed with grey.
     pub straight_color: bool,
     /// With `mode.crop`, pixels around the person's box that the network receives; unset: all that influence the person's
@@ -203,6 +214,11 @@ impl RegressorConfig {
         self.start.unwrap_or(RegressorStart::Published)
     }
 
+    /// Largest corrections of colours of photographs and of unseen sides, as shares of the range from black to white.
+    pub fn color_limits(&self) -> [f64; 2] {
+        self.color_limits.unwrap_or([0.5; 2])
+    }
+
     /// Source of a Gaussian's colour.
     pub fn color(&self) -> RegressorColor {
         self.color.unwrap_or(match self.start() {
@@ -220,6 +236,7 @@ impl Default for RegressorConfig {
             groups: 16,
             start: None,
             color: None,
+            color_limits: None,
             straight_color: false,
             margin: None,
         }

@@ -75,6 +75,12 @@ impl Window {
         Self { rows: whole(&self.rows), columns: whole(&columns) }
     }
 
+    /// The same part of a canvas that is `factor` times smaller, which divides all edges.
+    pub fn shrunk(&self, factor: usize) -> Self {
+        let shrink = |r: &Range<usize>| r.start / factor..r.end / factor;
+        Self { rows: shrink(&self.rows), columns: shrink(&self.columns) }
+    }
+
     /// This part of images `[.., side, side]`, the last two axes.
     pub fn cut<const D: usize>(&self, images: Tensor<D>) -> Tensor<D> {
         let rows = images.narrow(D - 2, self.rows.start, self.rows.len());

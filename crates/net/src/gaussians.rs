@@ -151,8 +151,17 @@ fn pixel(rgb: &[f32], area: usize, i: usize) -> [f32; 3] {
     [rgb[i], rgb[area + i], rgb[2 * area + i]]
 }
 
-/// The regressor on a window of some views, which are one batch. Views without a valid pixel have no part.
-pub fn regress(network: &Regressor, config: &Config, views: &[Seen], window: &Window) -> Vec<Part> {
+/// The regressor on a window of some views, which are one batch: both photographs (`pair` 0) or both unseen sides (1). Views
+/// without a valid pixel have no part.
+pub fn regress(
+    network: &Regressor,
+    config: &Config,
+    pair: usize,
+    views: &[Seen],
+    window: &Window,
+) -> Vec<Part> {
+    // Colours are in [−1, 1].
+    let color_limit = 2.0 * config.regressor.color_limits()[pair];
     let (side, device) = (config.network.resolution, views[0].points.device());
     let (h, w) = (window.rows.len(), window.columns.len());
     let (colors, points): (Vec<_>, Vec<_>) = views
@@ -177,7 +186,7 @@ pub fn regress(network: &Regressor, config: &Config, views: &[Seen], window: &Wi
         let rows = Tensor::<1, Int>::from_data(TensorData::new(rows, [n]), &device);
         let pick = |x: Tensor<4>, c: usize| x.narrow(0, i, 1).reshape([h * w, c]).select(0, rows.clone());
         let geometry = Geometry::is_needed(&config.regressor)
-            .then(|| Geometry::new(view.image, &view.points, view.valid, side));
+            .then(|| Geometry::new(view.image, &view.points, view.valid, side, color_limit));
         parts.push(Part {
             features: pick(features.clone(), FEATURES),
             points: pick(points.clone(), 3),
@@ -201,7 +210,7 @@ pub fn geometric(views: &[Seen], device: &Device) -> Gaussians {
         Part {
             features: Tensor::zeros([n, FEATURES], device),
             points: view.points.clone().reshape([side * side, 3]).select(0, rows),
-            geometry: Some(Geometry::new(view.image, &view.points, view.valid, side)),
+            geometry: Some(Geometry::new(view.image, &view.points, view.valid, side, 1.0)),
         }
     };
     let parts = views.iter().filter(|view| view.valid.contains(&true)).map(part).collect();

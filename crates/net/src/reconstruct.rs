@@ -239,10 +239,15 @@ impl Run<'_> {
             self.plan
                 .push(format!("{} of {all} tokens left out: they show no person", all - input.grid.tokens()));
         }
+        let images = input.images.clone();
         let encoded = self.timed("encoder", |_| net.encode(input));
         let decoded = self.timed("decoders", |_| net.decode(encoded));
-        let heads = if net.views().len() == 4 { "heads (4)" } else { "heads (2)" };
+        let heads = if net.has_side_heads() { "heads (4)" } else { "heads (2)" };
         let maps = self.timed(heads, |_| net.heads(&decoded));
+        let maps = match maps.len() < net.views().len() {
+            true => self.timed("completed sides", |_| net.complete(maps, &decoded, &images, &window)),
+            false => maps,
+        };
         self.timed("up-sampling", |_| {
             let enlarge = |(view, map): (View, PointMap)| {
                 let mask = ((view as usize) < 2).then(|| masks.clone().narrow(0, view as usize, 1));
@@ -303,7 +308,7 @@ impl Run<'_> {
                         valid: &valid[v],
                     })
                     .collect();
-                regress(network, &run.model.config, &views, &window)
+                regress(network, &run.model.config, pair, &views, &window)
             });
             parts.extend(part);
         }

@@ -71,7 +71,7 @@ pub fn predict(
     let finished = |(view, map): (View, PointMap)| {
         (view, predictor.finished(config, view, map, &window, mask_of(view, masks).as_ref()))
     };
-    let maps = predictor.forward(Input::new(config, photographs, of_input, &window));
+    let maps = predictor.forward(Input::new(config, photographs, of_input, &window), &window);
     let maps = maps.into_iter().map(finished).collect();
     Prediction { window, maps }
 }

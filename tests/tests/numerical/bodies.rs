@@ -32,7 +32,8 @@ fn images([h, w]: [usize; 2], channels: usize, seed: u32, device: &Device) -> Te
 
 /// Points and confidences of all views.
 fn maps(net: &PointPredictor, input: Input) -> Vec<(View, Vec<f32>)> {
-    let maps = net.forward(input).into_iter();
+    let window = Window::whole(input.images.dims()[2]);
+    let maps = net.forward(input, &window).into_iter();
     maps.map(|(view, map)| (view, [values(map.points), values(map.conf)].concat())).collect()
 }
 
@@ -106,7 +107,7 @@ fn a_mirrored_back_is_the_back_of_a_mirrored_photograph() {
         other.images = other.images.slice_assign([0..2, 4..5, 0..h, 0..w], rays);
         assert_same("input", &values(seen.images.clone()), &values(other.images.clone()));
         let net = |config: &Config| random_predictor(config, 5, &device);
-        let (a, b) = (net(&mirrored).forward(seen), net(&plain).forward(other));
+        let (a, b) = (net(&mirrored).forward(seen, &window), net(&plain).forward(other, &window));
         for ((view, a), (_, b)) in a.into_iter().zip(b) {
             let b = if view == View::Back { b.points.flip([2]) } else { b.points };
             assert_same(view.name(), &values(a.points), &values(b));
@@ -128,7 +129,7 @@ fn predictions_of_both_ways_are_symmetric() {
         let of = |config: &Config, flip: bool| {
             let seen = |x: &Tensor<4>| if flip { x.clone().flip([3]) } else { x.clone() };
             let input = Input::new(config, seen(&colors), seen(&masks), &window);
-            random_predictor(config, 5, &device).forward(input)
+            random_predictor(config, 5, &device).forward(input, &window)
         };
         let mirrored = |map: &PointMap| {
             let [b, h, w, _] = map.points.dims();

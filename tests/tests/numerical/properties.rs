@@ -252,7 +252,7 @@ fn swapping_two_heads_weights_swaps_their_outputs() {
         |seed| Tensor::<4>::from_data(TensorData::new(noise(3 * 64 * 64, seed), [1, 3, 64, 64]), &device);
     let points = |weights: &WeightFile| {
         let net = weights.point_predictor(&device).expect("weights");
-        let maps = net.forward(pair(image(1), image(2)));
+        let maps = net.forward(pair(image(1), image(2)), &Window::whole(64));
         maps.into_iter().map(|(_, map)| values(map.points)).collect::<Vec<_>>()
     };
     let before = points(&weights);
@@ -281,7 +281,7 @@ fn every_fusion_and_head_gives_points_of_its_own_on_oblong_pictures() {
             let config = config(&[&format!("network.head={head}"), &format!("network.fusion={fusion}")]);
             let (_file, weights) = weights(&config, 2);
             let net = weights.point_predictor(&device).expect("weights");
-            let maps = net.forward(pair(image(1), image(2)));
+            let maps = net.forward(pair(image(1), image(2)), &Window::whole(64));
             assert_eq!(maps.len(), 4);
             let right = values(maps[2].1.points.clone());
             assert_eq!(maps[2].1.points.dims(), [1, 48, 80, 3]);
@@ -292,7 +292,7 @@ fn every_fusion_and_head_gives_points_of_its_own_on_oblong_pictures() {
         let config = config(&[&format!("network.head={head}"), "network.side_heads=false"]);
         let (_file, weights) = weights(&config, 2);
         let net = weights.point_predictor(&device).expect("weights");
-        assert_eq!(net.forward(pair(image(1), image(2))).len(), 2);
+        assert_eq!(net.forward(pair(image(1), image(2)), &Window::whole(64)).len(), 2);
     }
 }
 

@@ -5,7 +5,7 @@ use snapsnap_base::config::outside;
 use crate::weights::schema::{self, TensorSpec};
 
 use super::{
-    Anchor, Body, Config, Downsample, HeadKind, RegressorColor, RegressorStart, RotationFrame, Schema,
+    Anchor, Body, Config, Downsample, HeadKind, RegressorColor, RegressorStart, RotationFrame, Schema, Sides,
     Upsample, WorldFrame,
 };
 
@@ -26,6 +26,7 @@ impl Config {
     fn size_problem(&self) -> Option<Problem> {
         let (n, r) = (&self.network, &self.regressor);
         let branches = n.layer_dims.map(|dim| ("network.layer_dims", dim, 1..=8_192));
+        let sides = n.side_dims.map(|dim| ("network.side_dims", dim, 1..=8_192));
         let sizes = [
             ("network.enc_dim", n.enc_dim, 1..=8_192),
             ("network.enc_depth", n.enc_depth, 1..=128),
@@ -46,7 +47,7 @@ impl Config {
             ("regressor.groups", r.groups, 1..=1_024),
             ("regressor.margin", r.margin.unwrap_or(0), 0..=4_096),
         ];
-        outside(sizes.into_iter().chain(branches))
+        outside(sizes.into_iter().chain(branches).chain(sides))
     }
 
     /// The first refused value, for sizes that are each in their range.
@@ -80,6 +81,20 @@ impl Config {
         if !is_transformer && n.drop_empty {
             return refuse("network.drop_empty", "must be false: a convolution has no tokens to drop".into());
         }
+        let completed = [
+            ("network.body", n.body == Body::Convolution, "\"convolution\""),
+            ("network.anchor", n.anchor == Anchor::Ray, "\"ray\""),
+            ("network.mask_channel", n.mask_channel, "true"),
+            ("network.mirror", n.mirror, "true"),
+            ("network.patch", n.patch == 8, "8"),
+            // The person's halves have a whole number of pixels at every level.
+            ("network.net_resolution", n.net_resolution.is_multiple_of(2 * n.patch), "a multiple of 16"),
+        ];
+        if let Some((key, _, needed)) =
+            completed.into_iter().find(|(_, holds, _)| n.sides == Sides::Completed && !holds)
+        {
+            return refuse(key, format!("must be {needed} beside `network.sides = \"completed\"`"));
+        }
         if !n.net_resolution.is_multiple_of(n.patch) {
             let message = format!("{} is no multiple of the patch {}", n.net_resolution, n.patch);
             return refuse("network.net_resolution", message);
@@ -96,6 +111,16 @@ impl Config {
             return refuse("network.conf_threshold", "is not a number".into());
         }
         if let Some((key, message)) = outside([("network.delta", n.delta, 1e-6..=1e6)]) {
+            return refuse(key, message);
+        }
+        if r.color_limits.is_some() && r.color() != RegressorColor::Residual {
+            return refuse(
+                "regressor.color_limits",
+                "has no meaning where `regressor.color` is \"free\"".into(),
+            );
+        }
+        let limits = r.color_limits().map(|limit| ("regressor.color_limits", limit, 1e-3..=1.0));
+        if let Some((key, message)) = outside(limits) {
             return refuse(key, message);
         }
         if r.networks == 2 && !n.side_heads {
@@ -136,6 +161,7 @@ impl Config {
             ("network.mask_channel", !self.network.mask_channel, "false"),
             ("network.ray_channels", !self.network.ray_channels, "false"),
             ("network.mirror", !self.network.mirror, "false"),
+            ("network.sides", self.network.sides == Sides::Predicted, "\"predicted\""),
             ("network.both_ways", !self.network.both_ways, "false"),
             ("network.on_rays", !self.network.on_rays, "false"),
             ("network.hull_margin", self.network.hull_margin.is_none(), "unset"),
@@ -143,6 +169,7 @@ impl Config {
             ("network.drop_empty", !self.network.drop_empty, "false"),
             ("regressor.start", self.regressor.start() == RegressorStart::Published, "\"published\""),
             ("regressor.color", self.regressor.color() == RegressorColor::Free, "\"free\""),
+            ("regressor.color_limits", self.regressor.color_limits.is_none(), "unset"),
             ("regressor.straight_color", !self.regressor.straight_color, "false"),
             ("mode.rotation_frame", self.rotation_frame() == RotationFrame::World, "\"world\""),
             ("mode.downsample", self.downsample() == Downsample::Nearest, "\"nearest\""),

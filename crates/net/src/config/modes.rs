@@ -48,6 +48,15 @@ choices! {
         Concat,
     }
 
+    /// Origin of the maps of the unseen sides.
+    Sides {
+        /// Heads beside those of the photographs.
+        Predicted,
+        /// The points of both photographs, projected into the sides' cameras and completed
+        /// (docs/method.md, "Completed sides").
+        Completed,
+    }
+
     /// Activation of the confidence channel (docs/method.md, "Points and confidence").
     ConfMode {
         /// 1 / (1 + e^−x), Snap-Snap.

@@ -38,6 +38,37 @@ fn impossible_sizes_name_the_key() {
 }
 
 #[test]
+fn completed_sides_need_what_they_are_made_of() {
+    let lines = "[network]\nsides = \"completed\"\nbody = \"convolution\"\nanchor = \"ray\"\nmask_channel = true\nmirror = true\n\
+                 patch = 8\n";
+    Config::from_toml(lines, "x", &[]).expect("valid");
+    for (set, key) in [
+        ("network.body=transformer", "network.body"),
+        ("network.anchor=none", "network.anchor"),
+        ("network.mask_channel=false", "network.mask_channel"),
+        ("network.mirror=false", "network.mirror"),
+        ("network.patch=16", "network.patch"),
+        ("network.net_resolution=8", "network.net_resolution"),
+        ("network.side_dims=[0,1,1,1]", "network.side_dims"),
+    ] {
+        let message = refusal(lines, &[set]);
+        assert!(message.contains(key) && !message.contains("line"), "{set}: {message}");
+    }
+}
+
+#[test]
+fn limits_of_colours_are_shares_of_the_range_of_corrected_colours() {
+    let residual = "[regressor]\nstart = \"geometric\"\n";
+    let set = |limits: &str| format!("regressor.color_limits={limits}");
+    let config = Config::from_toml(residual, "x", &[set("[0.03,0.1]")]).expect("valid");
+    assert_eq!(config.regressor.color_limits(), [0.03, 0.1]);
+    for limits in ["[0,0.1]", "[0.1,1.5]", "[0.1,nan]"] {
+        assert!(refusal(residual, &[&set(limits)]).contains("regressor.color_limits"), "{limits}");
+    }
+    assert!(refusal("", &[&set("[0.1,0.1]")]).contains("regressor.color"));
+}
+
+#[test]
 fn a_fix_beside_compat_is_a_contradiction() {
     let message = refusal("[mode]\ncompat = true\ndownsample = \"area\"\n", &[]);
     assert!(message.contains("mode.downsample") && message.contains("nearest"), "{message}");

@@ -3,35 +3,70 @@
 
 use burn::tensor::{Device, Tensor, TensorData};
 use glam::{DVec2, DVec3};
-use snapsnap_splat::Camera;
+use snapsnap_splat::{Camera, RigidTransform};
 
 use super::View;
 use crate::crop::Window;
 
-/// The anchors of a view's pixels in a window of a canvas of `side`² pixels, `[1, h, w, 3]` metres, front camera's frame.
-pub fn anchors(view: View, side: usize, window: &Window, device: &Device) -> Tensor<4> {
-    let yaw = match view {
+/// Yaw of a view's nominal camera, degrees.
+fn yaw(view: View) -> f64 {
+    match view {
         View::Front => 0.0,
         View::Right => 90.0,
         View::Back => 180.0,
         View::Left => 270.0,
-    };
-    let [front, camera] = [0.0, yaw].map(|yaw| Camera::orbit_at_yaw_degrees(yaw, side as u32));
-    let (centre, to_world) = (camera.centre(), camera.world_to_camera.rotation.inverse());
-    // The axis is the world's y; towards the camera, level.
-    let normal = DVec3::new(centre.x, 0.0, centre.z).normalize();
-    let mut values = Vec::with_capacity(3 * window.rows.len() * window.columns.len());
-    for row in window.rows.clone() {
-        for column in window.columns.clone() {
-            let pixel = DVec2::new(column as f64 + 0.5, row as f64 + 0.5);
-            let ray = (pixel - camera.principal_point) / camera.focal;
-            let ray = to_world * DVec3::new(ray.x, ray.y, 1.0);
-            let there = centre - ray * (centre.dot(normal) / ray.dot(normal));
-            let there = front.world_to_camera.rotation * there + front.world_to_camera.translation;
-            values.extend(there.to_array().map(|v| v as f32));
+    }
+}
+
+/// A view's nominal camera of a canvas of `side`² pixels, and the motion from the front camera's frame to its own.
+pub(super) fn nominal(view: View, side: usize) -> (Camera, RigidTransform) {
+    let [front, camera] = [0.0, yaw(view)].map(|yaw| Camera::orbit_at_yaw_degrees(yaw, side as u32));
+    (camera, front.world_to_camera.inverse().then(&camera.world_to_camera))
+}
+
+/// The rays of a view's pixels in a window of a canvas of `side`² pixels.
+pub(super) struct Rays {
+    /// Directions in the front camera's frame `[1, h, w, 3]`, as long as a metre of depth.
+    pub directions: Tensor<4>,
+    /// Depths of the anchors `[1, h, w, 1]`, metres.
+    pub depths: Tensor<4>,
+    /// Centre of the camera in the front camera's frame `[1, 1, 1, 3]`, metres.
+    centre: Tensor<4>,
+}
+
+impl Rays {
+    pub(super) fn new(view: View, side: usize, window: &Window, device: &Device) -> Self {
+        let (camera, from_front) = nominal(view, side);
+        let to_front = from_front.inverse();
+        let centre = camera.centre();
+        // The axis is the world's y; towards the camera, level.
+        let normal = camera.world_to_camera.rotation * DVec3::new(centre.x, 0.0, centre.z).normalize();
+        let away = normal.dot(camera.world_to_camera.translation);
+        let (h, w) = (window.rows.len(), window.columns.len());
+        let (mut directions, mut depths) = (Vec::with_capacity(3 * h * w), Vec::with_capacity(h * w));
+        for row in window.rows.clone() {
+            for column in window.columns.clone() {
+                let pixel = DVec2::new(column as f64 + 0.5, row as f64 + 0.5);
+                let ray = ((pixel - camera.principal_point) / camera.focal).extend(1.0);
+                directions.extend((to_front.rotation * ray).to_array().map(|v| v as f32));
+                depths.push((away / normal.dot(ray)) as f32);
+            }
+        }
+        let tensor =
+            |values: Vec<f32>, dims: [usize; 4]| Tensor::from_data(TensorData::new(values, dims), device);
+        let centre = to_front.translation.to_array().map(|v| v as f32).to_vec();
+        Self {
+            directions: tensor(directions, [1, h, w, 3]),
+            depths: tensor(depths, [1, h, w, 1]),
+            centre: tensor(centre, [1, 1, 1, 3]),
         }
     }
-    Tensor::from_data(TensorData::new(values, [1, window.rows.len(), window.columns.len(), 3]), device)
+}
+
+/// The anchors of a view's pixels in a window of a canvas of `side`² pixels, `[1, h, w, 3]` metres, front camera's frame.
+pub fn anchors(view: View, side: usize, window: &Window, device: &Device) -> Tensor<4> {
+    let Rays { directions, depths, centre } = Rays::new(view, side, window, device);
+    directions * depths + centre
 }
 
 #[cfg(test)]

@@ -4,6 +4,7 @@
 mod anchor;
 mod attention;
 mod block;
+mod completion;
 mod convolution;
 mod dpt;
 mod dust3r;
@@ -11,6 +12,7 @@ mod input;
 mod linear;
 mod predictor;
 mod rays;
+mod shells;
 
 pub use anchor::anchors;
 pub use convolution::{Levels, PointUNet};

@@ -5,11 +5,12 @@ use burn::tensor::activation::sigmoid;
 use burn::tensor::{Device, Tensor};
 
 use super::anchor::anchors;
+use super::completion::Photographed;
 use super::convolution::{Levels, PointUNet};
 use super::dust3r::{Dust3r, Grid, TokenMaps, View};
 use super::input::Input;
 use super::rays::on_rays;
-use crate::config::{self, Anchor, ConfMode, Config, Downsample, NetworkConfig, Upsample};
+use crate::config::{self, Anchor, ConfMode, Config, Downsample, NetworkConfig, Sides, Upsample};
 use crate::crop::Window;
 use crate::resample::shrink;
 use snapsnap_ops::bilinear;
@@ -122,8 +123,8 @@ pub enum Encoded {
 pub enum Decoded {
     /// Token maps of the front and of the back.
     Tokens([TokenMaps; 2], Grid),
-    /// Feature images of the convolutional body.
-    Levels(Levels),
+    /// Feature images of the convolutional body, and the features of the photographs' pixels `[B, last_dim, h, w]`.
+    Levels(Levels, Tensor<4>),
 }
 
 /// The network between photographs and raw points.
@@ -180,6 +181,11 @@ impl PointPredictor {
             Body::Convolution(net) => net.has_sides(),
         };
         if sides { &View::ALL } else { &View::ALL[..2] }
+    }
+
+    /// Whether the unseen sides have heads of their own.
+    pub fn has_side_heads(&self) -> bool {
+        self.views().len() == View::ALL.len() && self.config.sides == Sides::Predicted
     }
 
     /// Whether the layer of this name in a checkpoint is a last one: its output is the raw points, which only activations
@@ -278,7 +284,7 @@ impl PointPredictor {
         }
     }
 
-    /// The decoder of a transformer, which joins both photographs. Features of a convolution stay as they are.
+    /// The decoder, which joins both photographs.
     pub fn decode(&self, encoded: Encoded) -> Decoded {
         match encoded {
             Encoded::Tokens(tokens, grid) => {
@@ -286,26 +292,31 @@ impl PointPredictor {
                 let (front, back) = (tokens.clone().narrow(0, 0, b), tokens.narrow(0, b, b));
                 Decoded::Tokens(self.transformer().decode(front, back, &grid), grid)
             }
-            Encoded::Levels(levels) => Decoded::Levels(levels),
+            Encoded::Levels(levels) => {
+                let Body::Convolution(net) = &self.body else { panic!("encoded by another network") };
+                let features = net.features(&levels);
+                Decoded::Levels(levels, features)
+            }
         }
     }
 
-    /// Raw x, y, z, confidence `[B, 4, h, w]` of [`Self::views`], before their activation.
+    /// Raw x, y, z, confidence `[B, 4, h, w]` of [`Self::views`], before their activation. Completed sides are left out.
     pub fn raw(&self, decoded: &Decoded) -> Vec<Tensor<4>> {
         match (&self.body, decoded) {
             (Body::Transformer(net), Decoded::Tokens(maps, grid)) => {
                 self.views().iter().map(|view| net.raw_points(*view, maps, grid)).collect()
             }
-            (Body::Convolution(net), Decoded::Levels(levels)) => {
-                let sides = net.has_sides().then(|| net.sides(levels));
-                net.photographed(levels).into_iter().chain(sides.into_iter().flatten()).collect()
-            }
+            (Body::Convolution(net), Decoded::Levels(levels, features)) => net
+                .photographed(features.clone())
+                .into_iter()
+                .chain(net.sides(levels).into_iter().flatten())
+                .collect(),
             _ => panic!("decoded by another network"),
         }
     }
 
-    /// Activated maps of all views at the network's resolution, in network units and without anchors. With
-    /// `network.both_ways`, the batch of `decoded` is twice that of the result.
+    /// Activated maps at the network's resolution, in network units and without anchors. With `network.both_ways`, the batch
+    /// of `decoded` is twice that of the result. Completed sides are left out ([`Self::complete`]).
     pub fn heads(&self, decoded: &Decoded) -> Vec<(View, PointMap)> {
         let raw = self.raw(decoded);
         let map = |(&view, raw): (&View, Tensor<4>)| {
@@ -313,12 +324,59 @@ impl PointPredictor {
             let raw = if self.config.mirror && view == View::Back { raw.flip([3]) } else { raw };
             (view, activate(raw, &self.config))
         };
-        let maps: Vec<_> = self.views().iter().zip(raw).map(map).collect();
+        let maps: Vec<_> = View::ALL.iter().zip(raw).map(map).collect();
         if self.config.both_ways { mean_with_mirrored(&maps) } else { maps }
     }
 
-    /// `encode`, `decode` and `heads` in turn.
-    pub fn forward(&self, input: Input) -> Vec<(View, PointMap)> {
-        self.heads(&self.decode(self.encode(input)))
+    /// The network of completed sides.
+    #[cfg(test)]
+    pub(super) fn completion(&self) -> Option<&super::completion::Completion> {
+        let Body::Convolution(net) = &self.body else { return None };
+        net.completion()
+    }
+
+    /// Appends the maps of completed sides to those of front and back, in network units and without anchors. `images` are
+    /// those of the input, of the `window` of the canvas. Without completed sides, the maps stay as they are.
+    pub fn complete(
+        &self,
+        mut maps: Vec<(View, PointMap)>,
+        decoded: &Decoded,
+        images: &Tensor<4>,
+        window: &Window,
+    ) -> Vec<(View, PointMap)> {
+        let (Body::Convolution(net), Decoded::Levels(levels, features)) = (&self.body, decoded) else {
+            return maps;
+        };
+        let Some(completion) = net.completion() else { return maps };
+        let config = &self.config;
+        let window = window.shrunk(config.resolution / config.net_resolution);
+        let b = maps[0].1.conf.dims()[0];
+        // With `both_ways`, mirror images follow. The back is mirrored in the input, but not in its map.
+        let of_person = |x: &Tensor<4>| x.clone().narrow(0, 0, b);
+        let [front, back] = [0, images.dims()[0] / 2].map(|from| images.clone().narrow(0, from, b));
+        let seen = Tensor::stack::<5>(vec![front, back.flip([3])], 1);
+        let points = maps.iter().map(|(view, map)| {
+            let anchors = anchors(*view, config.net_resolution, &window, &map.points.device());
+            map.points.clone() * self.delta().reshape([1, 1, 1, 1]) + anchors
+        });
+        let photographed = Photographed {
+            points: Tensor::stack(points.collect(), 1),
+            colors: seen.clone().narrow(2, 0, 3),
+            masks: seen.narrow(2, 3, 1),
+            features: of_person(features),
+            levels: &levels.images.iter().map(of_person).collect::<Vec<_>>(),
+            window: &window,
+        };
+        let sides = completion.forward(&photographed, &self.delta());
+        let side = |(view, raw)| (view, activate(raw, config));
+        maps.extend([View::Right, View::Left].into_iter().zip(sides).map(side));
+        maps
+    }
+
+    /// All maps of a `window` of the canvas: `encode`, `decode`, `heads` and `complete` in turn.
+    pub fn forward(&self, input: Input, window: &Window) -> Vec<(View, PointMap)> {
+        let images = input.images.clone();
+        let decoded = self.decode(self.encode(input));
+        self.complete(self.heads(&decoded), &decoded, &images, window)
     }
 }

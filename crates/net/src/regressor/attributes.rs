@@ -29,6 +29,8 @@ pub struct Geometry {
     pub spacing: Tensor<2>,
     /// Colours of the pixels `[N, 3]` in [−1, 1].
     pub colors: Tensor<2>,
+    /// Largest correction of a colour in [−1, 1].
+    pub color_limit: f64,
 }
 
 /// Standard deviation of a Gaussian at the start over the distance of its neighbours. (Rendered at right angles, true
@@ -49,8 +51,8 @@ impl Geometry {
     }
 
     /// The geometry of the valid pixels of a view on a canvas of `side`² pixels, row by row, from colours `[3, S, S]` and
-    /// points `[1, S, S, 3]`.
-    pub fn new(image: &[f32], points: &Tensor<4>, valid: &[bool], side: usize) -> Self {
+    /// points `[1, S, S, 3]`. `color_limit` is the largest correction of a colour in [−1, 1].
+    pub fn new(image: &[f32], points: &Tensor<4>, valid: &[bool], side: usize, color_limit: f64) -> Self {
         let device = points.device();
         let points = host(points.clone());
         let point = |i: usize| [points[3 * i], points[3 * i + 1], points[3 * i + 2]];
@@ -79,6 +81,7 @@ impl Geometry {
         Self {
             spacing: Tensor::from_data(TensorData::new(spacing, [n, 1]), &device),
             colors: Tensor::from_data(TensorData::new(colors, [n, 3]), &device),
+            color_limit,
         }
     }
 }
@@ -86,11 +89,14 @@ impl Geometry {
 impl Attributes {
     /// Attributes of features `[N, 14]`, relative to the `geometry` if the config uses it.
     pub fn new(config: &RegressorConfig, features: Tensor<2>, geometry: Option<Geometry>) -> Self {
-        let Some(Geometry { spacing, colors }) = geometry else { return Self::from_features(features) };
+        let Some(Geometry { spacing, colors, color_limit }) = geometry else {
+            return Self::from_features(features);
+        };
         let part = |from: usize, width: usize| features.clone().narrow(1, from, width);
         let color = match config.color() {
             RegressorColor::Free => part(8, 3).tanh(),
-            RegressorColor::Residual => colors + part(8, 3).tanh(),
+            // Small corrections are the same for every limit.
+            RegressorColor::Residual => colors + (part(8, 3) / color_limit).tanh() * color_limit,
         };
         if config.start() == RegressorStart::Published {
             return Self { color, ..Self::from_features(features.clone()) };
@@ -173,6 +179,7 @@ mod tests {
         let geometry = Geometry {
             spacing: Tensor::from_data([[0.01]], &device),
             colors: Tensor::from_data([[0.5, -0.25, 1.0]], &device),
+            color_limit: 1.0,
         };
         let of = |start, color| {
             let config = RegressorConfig { start, color, ..RegressorConfig::default() };
@@ -190,6 +197,30 @@ mod tests {
         assert_eq!(of(geometric, free).1, of(geometric, residual).1);
         assert_eq!(of(published, free).1, of(published, residual).1);
         assert_ne!(of(published, free).1, of(geometric, free).1);
+    }
+
+    /// A small correction is the network's for any limit. A large one ends at the limit.
+    #[test]
+    fn corrections_of_colours_end_at_their_limit() {
+        let device = Device::flex();
+        let color = |feature: f32, color_limit: f64| {
+            let mut features = [0.0; 14];
+            features[8] = feature;
+            let config =
+                RegressorConfig { start: Some(RegressorStart::Geometric), ..RegressorConfig::default() };
+            let geometry = Geometry {
+                spacing: Tensor::from_data([[0.01]], &device),
+                colors: Tensor::from_data([[0.5, -0.25, 1.0]], &device),
+                color_limit,
+            };
+            values(Attributes::new(&config, Tensor::from_data([features], &device), Some(geometry)).color)[0]
+        };
+        for limit in [0.06, 0.2, 1.0] {
+            assert!((color(0.01, limit) - 0.51).abs() < 1e-4, "{limit}");
+            for sign in [-1.0, 1.0] {
+                assert!((color(sign * 30.0, limit) - 0.5 - sign * limit as f32).abs() < 1e-6, "{limit}");
+            }
+        }
     }
 
     #[test]

@@ -103,7 +103,7 @@ pub(super) fn gaussians(
         let seen: Vec<_> = (first..first + 2)
             .map(|v| Seen { image: images[v], points: points.clone().narrow(0, v, 1), valid: &valid[v] })
             .collect();
-        parts.extend(regress(regressor, config, &seen, &window));
+        parts.extend(regress(regressor, config, pair, &seen, &window));
     }
     if parts.is_empty() {
         return None;

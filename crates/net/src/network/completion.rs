@@ -1,0 +1,291 @@
+//! The unseen sides from the photographs' points (docs/method.md, "Completed sides"): the points are projected into the
+//! side's camera, and a U-shaped network completes what they leave open. The left is the right of the mirrored person, so
+//! that one network serves both.
+
+use burn::module::Module;
+use burn::nn::conv::Conv2d;
+use burn::tensor::{Device, Tensor};
+
+use super::View;
+use super::anchor::Rays;
+use super::convolution::{UNet, UNetSizes};
+use super::dpt::conv1x1;
+use super::shells::{Visible, depths};
+use crate::config::NetworkConfig;
+use crate::crop::Window;
+use snapsnap_ops::host;
+use snapsnap_ops::layers::conv2d;
+
+/// Channels of a photographed pixel's features on a side.
+const FEATURES: usize = 16;
+/// Channels of the input: depth, colour, front or back, and features of the nearest point, and depth of the farthest.
+const INPUTS: usize = 1 + 3 + 2 + FEATURES + 1;
+/// Depths beside the plane through the body's axis are in metres over this, so that they are as large as colours.
+const DEPTH_UNIT: f64 = 0.2;
+
+/// What both photographs tell, at the network's resolution.
+pub struct Photographed<'a> {
+    /// `[B, 2, h, w, 3]` front and back: points in metres, front camera's frame.
+    pub points: Tensor<5>,
+    /// `[B, 2, 3, h, w]` colours in [−1, 1].
+    pub colors: Tensor<5>,
+    /// `[B, 2, 1, h, w]` share of the person.
+    pub masks: Tensor<5>,
+    /// `[B, last_dim, h, w]` of the predictor's decoder, for front and mirrored back.
+    pub features: Tensor<4>,
+    /// Images of the predictor's levels `[B, layer_dims, ..]`.
+    pub levels: &'a [Tensor<4>],
+    /// Part of the canvas of `net_resolution`² pixels, symmetric.
+    pub window: &'a Window,
+}
+
+/// The network.
+#[derive(Module, Debug)]
+pub struct Completion {
+    embed: Conv2d,
+    /// By level: from the predictor's row means over both halves of the person.
+    rows: Vec<Conv2d>,
+    body: UNet,
+    #[module(skip)]
+    side: usize,
+}
+
+impl Completion {
+    pub(super) fn new(config: &NetworkConfig, device: &Device) -> Self {
+        let (c, widths) = (config, config.side_dims);
+        let sizes =
+            UNetSizes { inputs: INPUTS, outputs: 2, widths, blocks: [c.dec_dim, c.dec_depth, c.dec_heads] };
+        Self {
+            embed: conv1x1(c.last_dim, FEATURES, device),
+            rows: widths.iter().zip(c.layer_dims).map(|(to, from)| conv1x1(2 * from, *to, device)).collect(),
+            body: UNet::new(c, &sizes, device),
+            side: c.net_resolution,
+        }
+    }
+
+    /// Raw x, y, z, confidence `[B, 4, h, w]` of the right and the left, as differences from the anchors over δ `[1]`.
+    pub(super) fn forward(&self, photographed: &Photographed, delta: &Tensor<1>) -> [Tensor<4>; 2] {
+        let [b, _, h, w, _] = photographed.points.dims();
+        let table = self.table(photographed);
+        let points = photographed.points.clone().reshape([b, 2 * h * w, 3]);
+        let [there, inside] = [host(points.clone().detach()), host(photographed.masks.clone())];
+        let seen = [View::Right, View::Left].map(|view| {
+            let rows =
+                Visible::new(view, self.side, photographed.window, [&there, &inside], b, &points.device());
+            Seen::new(view, self.side, photographed.window, (points.clone(), table.clone()), rows)
+        });
+        let images: Vec<Tensor<4>> = seen
+            .iter()
+            .zip([false, true])
+            .map(|(seen, mirrored)| if mirrored { seen.image.clone().flip([3]) } else { seen.image.clone() })
+            .collect();
+        let levels = self.body.encode(Tensor::cat(images, 0), Some(self.row_means(photographed.levels)));
+        let out = self.body.out(self.body.features(&levels));
+        let out = [out.clone().narrow(0, 0, b), out.narrow(0, b, b).flip([3])];
+        let [right, left] = seen;
+        let raw = |seen: Seen, out: Tensor<4>| {
+            let beside = seen.depth / delta.clone().reshape([1, 1, 1, 1]) + out.clone().narrow(1, 0, 1);
+            let directions = seen.directions.permute([0, 3, 1, 2]);
+            Tensor::cat(vec![directions * beside, out.narrow(1, 1, 1)], 1)
+        };
+        let [of_right, of_left] = out;
+        [raw(right, of_right), raw(left, of_left)]
+    }
+
+    /// Colour, shell and features of all pixels of both photographs `[B, N, 5 + FEATURES]`.
+    fn table(&self, Photographed { colors, features, .. }: &Photographed) -> Tensor<3> {
+        let ([b, _, _, h, w], device) = (colors.dims(), colors.device());
+        let features = conv2d(&self.embed, features.clone(), true);
+        // The back photograph is not mirrored here.
+        let features = Tensor::stack::<5>(vec![features.clone(), features.flip([3])], 1);
+        let shells = Tensor::<2>::eye(2, &device).reshape([1, 2, 2, 1, 1]).expand([b, 2, 2, h, w]);
+        let all = Tensor::cat(vec![colors.clone(), shells, features], 2);
+        let channels = all.dims()[2];
+        all.permute([0, 1, 3, 4, 2]).reshape([b, 2 * h * w, channels])
+    }
+
+    /// By level, for right and mirrored left `[2·B, side_dims, h, 1]`: means over the near and the far half of the person.
+    fn row_means(&self, levels: &[Tensor<4>]) -> Vec<Tensor<4>> {
+        let means = |(layer, image): (&Conv2d, &Tensor<4>)| {
+            let half = image.dims()[3] / 2;
+            // The right camera is on the side of the front picture's right half.
+            let [left, right] = [0, half].map(|from| image.clone().narrow(3, from, half).mean_dim(3));
+            let ways = [[right.clone(), left.clone()], [left, right]].map(|way| Tensor::cat(way.to_vec(), 1));
+            conv2d(layer, Tensor::cat(ways.to_vec(), 0), false)
+        };
+        self.rows.iter().zip(levels).map(means).collect()
+    }
+}
+
+/// The points of both photographs in the picture of a side.
+struct Seen {
+    /// Input of the network `[B, INPUTS, h, w]`.
+    image: Tensor<4>,
+    /// Depth of the nearest point beside the anchor `[B, 1, h, w]`, metres; 0 where there is no point.
+    depth: Tensor<4>,
+    /// Directions of the rays `[1, h, w, 3]`, as long as a metre of depth.
+    directions: Tensor<4>,
+}
+
+impl Seen {
+    /// Of `points` `[B, N, 3]` and the table of their channels.
+    fn new(
+        view: View,
+        side: usize,
+        window: &Window,
+        (points, table): (Tensor<3>, Tensor<3>),
+        rows: Visible,
+    ) -> Self {
+        let ([b, n, _], device) = (points.dims(), points.device());
+        let (h, w) = (window.rows.len(), window.columns.len());
+        let table = Tensor::cat(vec![depths(view, points), table], 2);
+        let c = table.dims()[2];
+        let table = Tensor::cat(vec![table, Tensor::zeros([b, 1, c], &device)], 1).reshape([b * (n + 1), c]);
+        let image = |x: Tensor<2>, c: usize| x.reshape([b, h, w, c]).permute([0, 3, 1, 2]);
+        let farthest = image(table.clone().narrow(1, 0, 1).select(0, rows.farthest), 1);
+        let nearest = image(table.select(0, rows.nearest), c);
+        let rays = Rays::new(view, side, window, &device);
+        let anchors = rays.depths.permute([0, 3, 1, 2]);
+        let covered = nearest.clone().narrow(1, 4, 2).sum_dim(1);
+        let beside = |depth: Tensor<4>| (depth - anchors.clone()) * covered.clone();
+        let depth = beside(nearest.clone().narrow(1, 0, 1));
+        let image = Tensor::cat(
+            vec![depth.clone() / DEPTH_UNIT, nearest.narrow(1, 1, c - 1), beside(farthest) / DEPTH_UNIT],
+            1,
+        );
+        Self { image, depth, directions: rays.directions }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use burn::tensor::TensorData;
+
+    use super::*;
+    use crate::config::{Body, Config};
+    use crate::network::anchors;
+    use crate::weights::random_predictor;
+
+    const SIDE: usize = 64;
+    const WIDTHS: [usize; 4] = [4, 4, 8, 8];
+
+    fn config() -> NetworkConfig {
+        NetworkConfig {
+            body: Body::Convolution,
+            patch: 8,
+            enc_dim: 16,
+            enc_heads: 2,
+            enc_depth: 1,
+            dec_dim: 16,
+            dec_heads: 2,
+            dec_depth: 1,
+            layer_dims: WIDTHS,
+            side_dims: WIDTHS,
+            last_dim: 8,
+            resolution: SIDE,
+            net_resolution: SIDE,
+            anchor: crate::config::Anchor::Ray,
+            mask_channel: true,
+            mirror: true,
+            sides: crate::config::Sides::Completed,
+            ..NetworkConfig::default()
+        }
+    }
+
+    fn noise<const D: usize>(dims: [usize; D], seed: u32) -> Tensor<D> {
+        let mut state = seed;
+        let mut next = || {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            (state >> 8) as f32 / (1 << 23) as f32 - 1.0
+        };
+        let values = (0..dims.iter().product()).map(|_| next()).collect::<Vec<_>>();
+        Tensor::from_data(TensorData::new(values, dims), &Device::flex())
+    }
+
+    /// A person whose front and back bulge by up to 10 cm, with random colours and features.
+    fn person<'a>(window: &'a Window, levels: &'a [Tensor<4>]) -> Photographed<'a> {
+        let (h, w, device) = (window.rows.len(), window.columns.len(), Device::flex());
+        let points = [View::Front, View::Back].map(|view| {
+            let away = if view == View::Front { -1.0 } else { 1.0 };
+            let off = (noise([1, h, w, 1], view as u32 + 1) + 1.2) * (0.05 * away);
+            let z = Tensor::<1>::from_floats([0.0, 0.0, 1.0], &device).reshape([1, 1, 1, 3]);
+            anchors(view, SIDE, window, &device) + off * z
+        });
+        Photographed {
+            points: Tensor::stack(points.to_vec(), 1),
+            colors: noise([1, 2, 3, h, w], 3),
+            masks: (noise([1, 2, 1, h, w], 4) + 0.9).clamp(0.0, 1.0),
+            features: noise([1, 8, h, w], 5),
+            levels,
+            window,
+        }
+    }
+
+    fn network() -> Completion {
+        let config = Config { network: config(), ..Config::default() };
+        random_predictor(&config, 3, &Device::flex()).completion().expect("completed sides").clone()
+    }
+
+    /// The mirrored person's right is the mirrored left, and the other way round.
+    #[test]
+    fn a_mirrored_person_has_mirrored_sides_exchanged() {
+        let window = Window { rows: 8..56, columns: 16..48 };
+        let (h, w) = (48, 32);
+        let levels: Vec<Tensor<4>> =
+            (0..4).map(|l| noise([1, WIDTHS[l], h >> l, w >> l], 7 + l as u32)).collect();
+        let mirrored_levels: Vec<Tensor<4>> = levels.iter().map(|level| level.clone().flip([3])).collect();
+        let (net, delta) = (network(), Tensor::full([1], 0.2, &Device::flex()));
+        let plain = person(&window, &levels);
+        let points = plain.points.clone().flip([3]);
+        let x = -points.clone().narrow(4, 0, 1);
+        let mirrored = Photographed {
+            points: points.slice_assign([0..1, 0..2, 0..h, 0..w, 0..1], x),
+            colors: plain.colors.clone().flip([4]),
+            masks: plain.masks.clone().flip([4]),
+            features: plain.features.clone().flip([3]),
+            levels: &mirrored_levels,
+            window: &window,
+        };
+        let (sides, exchanged) = (net.forward(&plain, &delta), net.forward(&mirrored, &delta));
+        for (side, other) in [(0, 1), (1, 0)] {
+            let expected = sides[side].clone().flip([3]);
+            let x = -expected.clone().narrow(1, 0, 1);
+            let expected = host(expected.slice_assign([0..1, 0..1, 0..h, 0..w], x));
+            let got = host(exchanged[other].clone());
+            let apart = got.iter().zip(&expected).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            assert!(apart < 2e-4, "{apart}");
+        }
+        assert!(host(sides[0].clone()) != host(sides[1].clone()));
+    }
+
+    /// Without corrections, a side's points are those of the photographs, and they follow them.
+    #[test]
+    fn uncorrected_sides_are_the_photographs_points() {
+        let window = Window { rows: 8..56, columns: 16..48 };
+        let levels: Vec<Tensor<4>> =
+            (0..4).map(|l| Tensor::zeros([1, WIDTHS[l], 48 >> l, 32 >> l], &Device::flex())).collect();
+        let net = network();
+        let none = |out: Tensor<4>| host(out.narrow(1, 0, 3).permute([0, 2, 3, 1]));
+        let person = person(&window, &levels);
+        let known = host(person.points.clone());
+        let inside = host(person.masks.clone());
+        let (right, seen) = {
+            let points = person.points.clone().reshape([1, 2 * 48 * 32, 3]);
+            let rows = Visible::new(View::Right, SIDE, &window, [&known, &inside], 1, &Device::flex());
+            let seen = Seen::new(View::Right, SIDE, &window, (points, net.table(&person)), rows);
+            let raw = seen.directions.clone().permute([0, 3, 1, 2]) * seen.depth.clone();
+            (none(raw), host(seen.image.narrow(1, 4, 2).sum_dim(1)))
+        };
+        let anchors = host(anchors(View::Right, SIDE, &window, &Device::flex()));
+        let mut covered = 0;
+        for (i, _) in seen.iter().enumerate().filter(|(_, seen)| **seen > 0.5) {
+            let point: Vec<f32> = (0..3).map(|c| right[3 * i + c] + anchors[3 * i + c]).collect();
+            let distance = |p: &[f32]| (0..3).map(|c| (p[c] - point[c]).powi(2)).sum::<f32>().sqrt();
+            let nearest = known.chunks_exact(3).map(distance).fold(f32::INFINITY, f32::min);
+            // Half the diagonal of a pixel at 2.2 m.
+            assert!(nearest < 0.032, "{i}: {nearest} m");
+            covered += 1;
+        }
+        assert!(covered > 200, "{covered}");
+    }
+}

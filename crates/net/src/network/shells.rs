@@ -1,0 +1,128 @@
+//! The points of both photographs as the camera of an unseen side sees them (docs/method.md, "Completed sides").
+
+use burn::tensor::{Device, Int, Tensor, TensorData};
+use glam::DVec3;
+
+use super::View;
+use super::anchor::nominal;
+use crate::crop::Window;
+
+/// For every pixel of a side, the nearest and the farthest of N points: `[B·h·w]` rows of tables of N + 1 rows for each
+/// sample. The last row means that there is none.
+pub struct Visible {
+    pub nearest: Tensor<1, Int>,
+    pub farthest: Tensor<1, Int>,
+}
+
+impl Visible {
+    /// `points` `[B, N, 3]`, metres in the front camera's frame, as the camera of `view` sees them in a window of a canvas of
+    /// `side`² pixels. Points that are not `inside` `[B, N]` are left out.
+    pub fn new(
+        view: View,
+        side: usize,
+        window: &Window,
+        [points, inside]: [&[f32]; 2],
+        batch: usize,
+        device: &Device,
+    ) -> Self {
+        let (camera, to_side) = nominal(view, side);
+        let (n, w) = (inside.len() / batch, window.columns.len());
+        let area = window.rows.len() * w;
+        let none = |sample: usize| (sample * (n + 1) + n) as i64;
+        let (mut nearest, mut farthest) =
+            (Vec::with_capacity(batch * area), Vec::with_capacity(batch * area));
+        for (sample, (points, inside)) in points.chunks_exact(3 * n).zip(inside.chunks_exact(n)).enumerate() {
+            let mut depths = vec![[f64::INFINITY, f64::NEG_INFINITY]; area];
+            let mut rows = vec![[none(sample); 2]; area];
+            for (i, point) in points.chunks_exact(3).enumerate().filter(|(i, _)| inside[*i] >= 0.5) {
+                let p = to_side.apply(DVec3::new(point[0].into(), point[1].into(), point[2].into()));
+                let place = camera.focal * p.truncate() / p.z + camera.principal_point;
+                let there = p.z > 0.0 && place.is_finite() && place.min_element() >= 0.0;
+                let (column, row) = (place.x as usize, place.y as usize);
+                if !there || !window.rows.contains(&row) || !window.columns.contains(&column) {
+                    continue;
+                }
+                let pixel = (row - window.rows.start) * w + column - window.columns.start;
+                let row = (sample * (n + 1) + i) as i64;
+                if p.z < depths[pixel][0] {
+                    (depths[pixel][0], rows[pixel][0]) = (p.z, row);
+                }
+                if p.z > depths[pixel][1] {
+                    (depths[pixel][1], rows[pixel][1]) = (p.z, row);
+                }
+            }
+            nearest.extend(rows.iter().map(|row| row[0]));
+            farthest.extend(rows.iter().map(|row| row[1]));
+        }
+        let tensor = |rows: Vec<i64>| Tensor::from_data(TensorData::new(rows, [batch * area]), device);
+        Self { nearest: tensor(nearest), farthest: tensor(farthest) }
+    }
+}
+
+/// Depths `[B, N, 1]` of points `[B, N, 3]` (metres, front camera's frame) from the camera of `view`.
+pub fn depths(view: View, points: Tensor<3>) -> Tensor<3> {
+    let (_, to_side) = nominal(view, 1);
+    let axis = to_side.rotation.row(2).as_vec3().to_array();
+    let axis = Tensor::<3>::from_data([[axis]], &points.device());
+    (points * axis).sum_dim(2) + to_side.translation.z
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::DVec2;
+    use snapsnap_ops::host;
+
+    const SIDE: usize = 64;
+
+    /// Points in the front camera's frame that the camera of `view` sees at these pixels and depths.
+    fn seen(view: View, places: &[(f64, f64, f64)]) -> Vec<f32> {
+        let (camera, to_side) = nominal(view, SIDE);
+        let back = to_side.inverse();
+        let point = |&(column, row, depth): &(f64, f64, f64)| {
+            let ray = (DVec2::new(column, row) - camera.principal_point) / camera.focal;
+            back.apply(ray.extend(1.0) * depth).as_vec3().to_array()
+        };
+        places.iter().flat_map(point).collect()
+    }
+
+    #[test]
+    fn pixels_of_a_side_show_the_nearest_and_the_farthest_point_inside() {
+        let device = Device::flex();
+        let window = Window { rows: 8..56, columns: 16..48 };
+        for view in [View::Right, View::Left] {
+            // Four points of a pixel, the nearest outside of the person; a point beside the window; one behind the camera.
+            let mut points = seen(
+                view,
+                &[
+                    (20.5, 30.4, 2.0),
+                    (20.1, 30.9, 1.8),
+                    (20.9, 30.1, 2.3),
+                    (20.5, 30.5, 1.0),
+                    (60.0, 30.0, 2.0),
+                    (20.5, 30.5, -2.0),
+                ],
+            );
+            points.extend([f32::NAN; 3]);
+            let mut inside = [1.0; 7];
+            inside[3] = 0.2;
+            let twice = [points.clone(), points.clone()].concat();
+            let both = [inside, inside].concat();
+            let visible = Visible::new(view, SIDE, &window, [&twice, &both], 2, &device);
+            let rows =
+                |x: Tensor<1, Int>| x.into_data().convert::<i64>().try_into_vec::<i64>().expect("rows");
+            let (nearest, farthest) = (rows(visible.nearest), rows(visible.farthest));
+            let (area, pixel) = (48 * 32, (30 - 8) * 32 + 20 - 16);
+            for i in 0..2 * area {
+                let first = 8 * (i / area) as i64;
+                let expected = if i % area == pixel { [1, 2] } else { [7, 7] };
+                assert_eq!([nearest[i], farthest[i]], expected.map(|row| first + row), "{view:?} {i}");
+            }
+            let finite = Tensor::<3>::from_data(TensorData::new(points[..18].to_vec(), [1, 6, 3]), &device);
+            let depths = host(depths(view, finite));
+            for (depth, expected) in depths.iter().zip([2.0, 1.8, 2.3, 1.0, 2.0, -2.0]) {
+                assert!((depth - expected).abs() < 1e-5, "{view:?}: {depths:?}");
+            }
+        }
+    }
+}
