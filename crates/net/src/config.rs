@@ -75,6 +75,8 @@ pub struct NetworkConfig {
     /// Channels of the network of completed sides at 1, 2, 4 and 8 times the finest pixel.
     #[serde(deserialize_with = "snapsnap_base::config::four")]
     pub side_dims: [usize; 4],
+    /// Whether completed sides have the second surface that faces their cameras, too, such as the flank behind an arm.
+    pub second_layer: bool,
     /// Fusion of the tokens of the two photographs into those of the unseen sides.
     pub fusion: Fusion,
     /// Activation of the confidence channel.
@@ -141,6 +143,7 @@ impl Default for NetworkConfig {
             side_heads: true,
             sides: Sides::Predicted,
             side_dims: [32, 48, 64, 96],
+            second_layer: false,
             fusion: Fusion::Mean,
             conf_mode: ConfMode::Sigmoid,
             resolution: 1024,

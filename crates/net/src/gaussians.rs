@@ -118,8 +118,8 @@ pub fn photograph_colors<'a>(config: &RegressorConfig, rgb: &'a [f32], mask: &[f
     Cow::Owned(colors)
 }
 
-/// Pseudo images of the right and the left `[3, S, S]`: every valid pixel has the colour of the nearest valid point of the
-/// photographs `[3, S, S]`. `points` are all four views' `[4, S, S, 3]`.
+/// Pseudo images of the sides' maps `[3, S, S]`: every valid pixel has the colour of the nearest valid point of the
+/// photographs `[3, S, S]`. `points` are all views' `[V, S, S, 3]`.
 pub fn side_images(photos: [&[f32]; 2], points: &[f32], valid: &[Vec<bool>]) -> Vec<Vec<f32>> {
     let area = valid[0].len();
     let point = |view: usize, i: usize| -> [f32; 3] {
@@ -130,7 +130,7 @@ pub fn side_images(photos: [&[f32]; 2], points: &[f32], valid: &[Vec<bool>]) -> 
         let (photo, mask) = (photos[view], &valid[view]);
         (0..area).filter(|&i| mask[i]).map(move |i| (point(view, i), pixel(photo, area, i)))
     }));
-    (2..4).map(|view| paint(cloud.as_ref(), |i| point(view, i), &valid[view])).collect()
+    (2..valid.len()).map(|view| paint(cloud.as_ref(), |i| point(view, i), &valid[view])).collect()
 }
 
 fn paint(cloud: Option<&Cloud>, point: impl Fn(usize) -> [f32; 3], valid: &[bool]) -> Vec<f32> {
@@ -151,7 +151,7 @@ fn pixel(rgb: &[f32], area: usize, i: usize) -> [f32; 3] {
     [rgb[i], rgb[area + i], rgb[2 * area + i]]
 }
 
-/// The regressor on a window of some views, which are one batch: both photographs (`pair` 0) or both unseen sides (1). Views
+/// The regressor on a window of some views, which are one batch: both photographs (`pair` 0), or the two unseen sides. Views
 /// without a valid pixel have no part.
 pub fn regress(
     network: &Regressor,
@@ -161,7 +161,7 @@ pub fn regress(
     window: &Window,
 ) -> Vec<Part> {
     // Colours are in [−1, 1].
-    let color_limit = 2.0 * config.regressor.color_limits()[pair];
+    let color_limit = 2.0 * config.regressor.color_limits()[pair.min(1)];
     let (side, device) = (config.network.resolution, views[0].points.device());
     let (h, w) = (window.rows.len(), window.columns.len());
     let (colors, points): (Vec<_>, Vec<_>) = views

@@ -35,7 +35,7 @@ pub struct Reconstruction {
     pub maps: PointMap,
     /// Per view, `[S, S]`: whether the pixel became a Gaussian.
     pub valid: Vec<Vec<bool>>,
-    /// Pseudo images of the right and the left `[3, S, S]` in [−1, 1], −1 where there is no point.
+    /// Pseudo images of the sides' maps `[3, S, S]` in [−1, 1], −1 where there is no point.
     pub side_images: Vec<Vec<f32>>,
     /// The Gaussians, view after view, row-major, in the front camera's frame.
     pub gaussians: Gaussians,
@@ -281,7 +281,10 @@ impl Run<'_> {
     ) -> Gaussians {
         let images: Vec<&[f32]> = colors.into_iter().chain(side_images.iter().map(Vec::as_slice)).collect();
         let mut parts = Vec::new();
-        for (pair, what) in ["regressor (front, back)", "regressor (sides)"].into_iter().enumerate() {
+        for (pair, what) in ["regressor (front, back)", "regressor (sides)", "regressor (second surfaces)"]
+            .into_iter()
+            .enumerate()
+        {
             let pair_views = 2 * pair..(2 * pair + 2).min(images.len());
             if pair_views.is_empty() {
                 continue;

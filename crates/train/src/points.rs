@@ -76,15 +76,15 @@ pub fn predict(
     Prediction { window, maps }
 }
 
-/// The losses of predicted maps. `points` `[B,V,S,S,3]` are the true points in metres in the front camera's frame, and
-/// `valid` `[B,V,S,S]`, 0 or 1, marks the pixels that have one. Confidences must be probabilities. The means are over
+/// The losses of predicted maps of the first V views. `points` `[B,V,S,S,3]` are the true points in metres in the front
+/// camera's frame, and `valid` `[B,V,S,S]`, 0 or 1, marks the pixels that have one. Confidences must be probabilities. The means are over
 /// the pixels of all samples.
 pub fn losses(prediction: &Prediction, points: &Tensor<5>, valid: &Tensor<4>) -> Losses {
     let Prediction { window, maps } = prediction;
     let (b, h, w) = (points.dims()[0], window.rows.len(), window.columns.len());
     let mut regression = Vec::new();
     let mut confidence = Vec::new();
-    for (view, map) in maps {
+    for (view, map) in maps.iter().filter(|(view, _)| (*view as usize) < points.dims()[1]) {
         let row = *view as usize;
         let inside = window.cut(valid.clone().narrow(1, row, 1)).reshape([b, h, w]);
         let there = inside.clone().greater_elem(0.5);

@@ -119,8 +119,9 @@ impl Task for PointTask {
             rows.resize(maps.len(), Vec::new());
             for ((view, points, conf), row) in maps.into_iter().zip(&mut rows) {
                 let at = |points: &[f32], i: usize| Vec3::from_slice(&points[3 * i..]);
-                let truth = |i: usize| at(&item.points, view * area + i);
-                let there = |i: usize| item.valid[view * area + i] > 0.5;
+                let (true_points, valid) = item.truth(view).unwrap_or_default();
+                let truth = |i: usize| at(true_points, i);
+                let there = |i: usize| valid.get(i).is_some_and(|valid| *valid > 0.5);
                 let threshold = self.networks.network.conf_threshold;
                 let seen =
                     |i: usize| if view < 2 { item.masks[view * area + i] > 0.5 } else { conf[i] > threshold };
@@ -138,7 +139,9 @@ impl Task for PointTask {
                 ]);
             }
         }
-        let note = format!("rows: front, back, right, left; white errors: {:.0} cm or more", 100.0 * WORST);
+        let names = networks.predictor.as_ref().map_or(&[][..], |predictor| predictor.views());
+        let names: Vec<&str> = names.iter().map(|view| view.name()).collect();
+        let note = format!("rows: {}; white errors: {:.0} cm or more", names.join(", "), 100.0 * WORST);
         Ok(grid(&rows, &["photo", "points", "truth", "error"], &note))
     }
 }
@@ -152,7 +155,7 @@ fn place_color(p: Vec3) -> [f32; 3] {
 #[derive(Default)]
 struct Errors {
     /// Per view: number of people, mean distances in metres, and mean distances without each person's mean shift.
-    views: [[f64; 3]; 4],
+    views: [[f64; 3]; 6],
     /// Numbers of side pixels in the intersection and in the union of prediction and ground truth.
     overlap: [f64; 2],
 }
@@ -162,18 +165,16 @@ impl Errors {
         let area = item.side * item.side;
         let pairs: Vec<Pair> = maps
             .iter()
-            .map(|(view, points, _)| Pair {
-                view: *view,
-                points,
-                truth: &item.points[3 * view * area..3 * (view + 1) * area],
-                valid: &item.valid[view * area..(view + 1) * area],
+            .filter_map(|(view, points, _)| {
+                let (truth, valid) = item.truth(*view)?;
+                Some(Pair { view: *view, points, truth, valid })
             })
             .collect();
         for error in point_errors(&pairs) {
             let sums = &mut self.views[error.view];
             [1.0, error.mean, error.centred].iter().zip(sums).for_each(|(v, sum)| *sum += v);
         }
-        for (view, _, conf) in maps.iter().filter(|(view, ..)| *view > 1) {
+        for (view, _, conf) in maps.iter().filter(|(view, ..)| (2..4).contains(view)) {
             for (conf, valid) in conf.iter().zip(&item.valid[*view * area..]) {
                 let (seen, there) = (*conf > threshold, *valid > 0.5);
                 self.overlap[0] += f64::from(u8::from(seen && there));
@@ -183,19 +184,23 @@ impl Errors {
     }
 
     fn validation(&self) -> Validation {
-        const NAMES: [[&str; 2]; 4] = [
+        const NAMES: [[&str; 2]; 6] = [
             ["front_mm", "front_centred_mm"],
             ["back_mm", "back_centred_mm"],
             ["right_mm", "right_centred_mm"],
             ["left_mm", "left_centred_mm"],
+            ["right_second_mm", "right_second_centred_mm"],
+            ["left_second_mm", "left_second_centred_mm"],
         ];
         let mut figures = Vec::new();
         let (mut sum, mut count) = (0.0, 0.0);
         for (names, [people, error, centred]) in NAMES.iter().zip(self.views) {
             if people > 0.0 {
                 figures.extend([(names[0], 1e3 * error / people), (names[1], 1e3 * centred / people)]);
-                sum += 1e3 * error / people;
-                count += 1.0;
+                if figures.len() <= 8 {
+                    sum += 1e3 * error / people;
+                    count += 1.0;
+                }
             }
         }
         if self.overlap[1] > 0.0 {

@@ -12,7 +12,7 @@ use snapsnap_base::config::Schema;
 use snapsnap_data::dataset::{Folder, Split};
 use snapsnap_data::prepare::{DataConfig, Subject};
 use snapsnap_net::Window;
-use snapsnap_net::config::{Body, NetworkConfig};
+use snapsnap_net::config::{Anchor, Body, Sides};
 use snapsnap_net::network::{PointMap, View, activate};
 use snapsnap_net::weights::{random_predictor, random_regressors};
 use snapsnap_people::synth;
@@ -44,6 +44,7 @@ fn config() -> TrainConfig {
 fn people(root: &std::path::Path) -> Arc<Folder> {
     let mut config = DataConfig::default();
     (config.views.count, config.views.resolution) = (4, 64);
+    config.views.second_depth = true;
     let folder = Folder::create(&root.join("people"), config.description("test")).expect("makes");
     for index in 0..2 {
         // With most people, elements of almost no gradient turn AdamW's first step around by their rounding alone.
@@ -117,10 +118,18 @@ fn compare(stage: &str, on: impl Fn(&Device) -> (f64, Rows, Networks), device: &
 }
 
 /// The config as it is: a transformer with colours as its only channels.
-const TRANSFORMER: fn(&mut NetworkConfig) = |_| {};
-const CONVOLUTION: fn(&mut NetworkConfig) = |network| {
+const TRANSFORMER: fn(&mut TrainConfig) = |_| {};
+const CONVOLUTION: fn(&mut TrainConfig) = |config| {
+    let network = &mut config.network;
     network.body = Body::Convolution;
     (network.mask_channel, network.ray_channels, network.mirror) = (true, true, true);
+};
+const COMPLETED: fn(&mut TrainConfig) = |config| {
+    CONVOLUTION(config);
+    let network = &mut config.network;
+    (network.anchor, network.patch, network.sides) = (Anchor::Ray, 8, Sides::Completed);
+    (network.second_layer, network.side_dims) = (true, [4, 4, 8, 8]);
+    config.samples.second_depth = true;
 };
 
 #[test]
@@ -134,9 +143,11 @@ fn a_step_of_stage_1_is_the_same_on_every_device() {
     }
     let temporary = tempfile::tempdir().expect("temporary folder");
     let folder = people(temporary.path());
-    for (body, change) in [("transformer", TRANSFORMER), ("convolution", CONVOLUTION)] {
+    for (body, change) in
+        [("transformer", TRANSFORMER), ("convolution", CONVOLUTION), ("completed sides", COMPLETED)]
+    {
         let mut config = config();
-        change(&mut config.network);
+        change(&mut config);
         let on = |device: &Device| {
             let task = PointTask::new(from_ref(&folder), &config, from_ref(device)).expect("a task");
             let predictor = Some(random_predictor(&config.networks(), 3, device));
@@ -261,7 +272,7 @@ fn gradients_of_the_losses_are_finite_differences() {
     let (h, w) = (4, 5);
     let config = config().networks();
     let mut published = config.clone();
-    published.network.anchor = snapsnap_net::config::Anchor::None;
+    published.network.anchor = Anchor::None;
     let truth = tensor(&random(&[2, 1, h, w, 3], -1.0..1.0, 1), [2, 1, h, w, 3]);
     let valid: Vec<f64> = random(&[2, 1, h, w], 0.0..1.0, 2).iter().map(|v| f64::from(*v > 0.4)).collect();
     let valid = tensor(&valid, [2, 1, h, w]);

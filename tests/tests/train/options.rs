@@ -9,7 +9,7 @@ use rand_chacha::ChaCha8Rng;
 use snapsnap_net::weights::write_tensors;
 use snapsnap_tests::{refused, snapsnap, succeed};
 
-use super::{logged, people, place, results, train};
+use super::{logged, people, place, results, train, train_on};
 
 /// Cached maps give the same bytes as predicted ones. Damaged files are written again.
 #[test]
@@ -162,6 +162,57 @@ fn automatic_precision_is_that_of_the_processor() {
     };
     assert!(said("auto").contains(&format!("precision: {name}")));
     assert!(said("f32").contains("precision: f32\n") && said("bf16").contains("precision: bf16, by "));
+}
+
+/// Completed sides with their second surfaces, from the data to the Gaussians.
+#[test]
+fn second_surfaces_of_completed_sides_are_trained_and_become_gaussians() {
+    let (temporary, config) = place();
+    let [data, one, two] = ["people", "one", "two"].map(|name| temporary.path().join(name));
+    for (split, count) in [("train", "2"), ("val", "1")] {
+        let mut command = snapsnap();
+        command.args(["prepare", "synth", "--seed", "5", "--split", split, "--subjects", count, "--set"]);
+        command.args(["views.count=4", "--set=views.resolution=64", "--set=views.second_depth=true", "-o"]);
+        succeed(command.arg(&data));
+    }
+    const KEYS: [&str; 8] = [
+        "network.body=convolution",
+        "network.patch=8",
+        "network.mask_channel=true",
+        "network.mirror=true",
+        "network.sides=completed",
+        "network.second_layer=true",
+        "network.side_dims=[4,4,8,8]",
+        "network.conf_threshold=0.01",
+    ];
+    let keys = KEYS.map(|key| format!("--set={key}"));
+    let with = |stage: u32, people: &Path, run: &Path| {
+        let mut command = train_on(people, stage, &config, run);
+        command.args(&keys).args(["--set=samples.second_depth=true", "--set=training.steps=10"]);
+        command
+    };
+    let said = refused(train_on(&data, 1, &config, &one).args(&keys));
+    assert!(said.contains("samples.second_depth"), "{said}");
+    let said = refused(&mut with(1, people(), &one));
+    assert!(said.contains("second surfaces"), "{said}");
+    succeed(&mut with(1, &data, &one));
+    for name in ["validation/right_second_mm", "validation/left_second_mm"] {
+        let (_, error) = *logged(&one, name).last().expect("a validation");
+        assert!(error > 1.0 && error < 2000.0, "{name}: {error}");
+    }
+    succeed(with(2, &data, &two).arg("--weights").arg(one.join("last.safetensors")));
+    let view = |view: u32| data.join(format!("val/img/0000/{view}.png"));
+    let mut command = snapsnap();
+    command.current_dir(temporary.path()).arg("reconstruct").arg(view(0)).arg(view(2));
+    command.args(["--as-is", "--device=cpu", "-v", "--dump=all.safetensors", "--weights"]);
+    let said = succeed(command.arg(two.join("last.safetensors")));
+    assert!(said.contains("completed sides") && said.contains("regressor (second surfaces)"), "{said}");
+    for name in ["right-second", "left-second"] {
+        let line = said.lines().find(|line| line.contains(&format!("{name}: "))).unwrap_or_default();
+        assert!(line.contains("pixels become Gaussians") && !line.contains(": 0 of"), "{name}: {said}");
+    }
+    let dump = fs::read(temporary.path().join("all.safetensors")).expect("reads");
+    assert!(String::from_utf8_lossy(&dump[..1000]).contains("[6,64,64,3]"));
 }
 
 /// The loss scale of f16 is reduced within a few steps, which are skipped.

@@ -44,9 +44,9 @@ pub struct Stage1Batch {
     pub images: Tensor<5>,
     /// `[B,2,H,W]`.
     pub masks: Tensor<4>,
-    /// `[B,4,H,W,3]`.
+    /// `[B,V,H,W,3]`: V is 4, or 6 with the second surfaces of right and left.
     pub points: Tensor<5>,
-    /// `[B,4,H,W]`.
+    /// `[B,V,H,W]`.
     pub valid: Tensor<4>,
 }
 
@@ -64,6 +64,17 @@ impl Stage1 {
 }
 
 impl Stage1Item {
+    /// True points `[H,W,3]` of a view and which pixels have one `[H,W]`. Views are in the order of the heads; 4 and 5 are the
+    /// second surfaces of right and left. `None` for second surfaces that the sample does not contain.
+    pub fn truth(&self, view: usize) -> Option<(&[f32], &[f32])> {
+        let area = self.side * self.side;
+        let (points, valid, row) = match view {
+            0..4 => (&self.points, &self.valid, view),
+            _ => (&self.second_points, &self.second_valid, view - 4),
+        };
+        Some((points.get(3 * row * area..3 * (row + 1) * area)?, valid.get(row * area..(row + 1) * area)?))
+    }
+
     fn new(source: &Source, index: usize) -> Result<Self, FileError> {
         let (subject, mut random) = source.subject(1, index);
         let count = source.folder.description().views;
@@ -111,22 +122,29 @@ pub struct Stage1Batcher;
 impl Batcher<Stage1Item, Stage1Batch> for Stage1Batcher {
     fn batch(&self, items: Vec<Stage1Item>, device: &Device) -> Stage1Batch {
         let (b, side) = (items.len(), items.first().map_or(0, |item| item.side));
+        let views = 4 + items.first().map_or(0, |item| item.second_valid.len() / (side * side));
+        let none: &[f32] = &[];
         Stage1Batch {
-            images: stacked(&items, |item| &item.images, [b, 2, 3, side, side], device),
-            masks: stacked(&items, |item| &item.masks, [b, 2, side, side], device),
-            points: stacked(&items, |item| &item.points, [b, 4, side, side, 3], device),
-            valid: stacked(&items, |item| &item.valid, [b, 4, side, side], device),
+            images: stacked(&items, |item| [&item.images, none], [b, 2, 3, side, side], device),
+            masks: stacked(&items, |item| [&item.masks, none], [b, 2, side, side], device),
+            points: stacked(
+                &items,
+                |item| [&item.points, &item.second_points],
+                [b, views, side, side, 3],
+                device,
+            ),
+            valid: stacked(&items, |item| [&item.valid, &item.second_valid], [b, views, side, side], device),
         }
     }
 }
 
-/// One field of all items as one tensor.
+/// Two fields of all items as one tensor.
 fn stacked<const D: usize>(
     items: &[Stage1Item],
-    of: fn(&Stage1Item) -> &Vec<f32>,
+    of: impl Fn(&Stage1Item) -> [&[f32]; 2],
     shape: [usize; D],
     device: &Device,
 ) -> Tensor<D> {
-    let values: Vec<f32> = items.iter().flat_map(|item| of(item).iter().copied()).collect();
+    let values: Vec<f32> = items.iter().flat_map(|item| of(item).concat()).collect();
     Tensor::from_data(TensorData::new(values, shape), device)
 }

@@ -203,7 +203,7 @@ fn errors(
     for azimuth in SIDES {
         truths.push(side_points(people.test(), row, item, inputs[0], azimuth, side)?);
     }
-    let with_truth = maps.iter().map(|(view, points)| (*view, points, &truths[*view]));
+    let with_truth = maps.iter().filter_map(|(view, points)| Some((*view, points, truths.get(*view)?)));
     let pairs = with_truth.map(|(view, points, (truth, valid))| Pair { view, points, truth, valid });
     Ok(point_errors(&pairs.collect::<Vec<_>>()))
 }

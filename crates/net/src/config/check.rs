@@ -95,6 +95,9 @@ impl Config {
         {
             return refuse(key, format!("must be {needed} beside `network.sides = \"completed\"`"));
         }
+        if n.second_layer && (n.sides != Sides::Completed || !n.side_heads) {
+            return refuse("network.second_layer", "needs `network.sides = \"completed\"`".into());
+        }
         if !n.net_resolution.is_multiple_of(n.patch) {
             let message = format!("{} is no multiple of the patch {}", n.net_resolution, n.patch);
             return refuse("network.net_resolution", message);
@@ -162,6 +165,7 @@ impl Config {
             ("network.ray_channels", !self.network.ray_channels, "false"),
             ("network.mirror", !self.network.mirror, "false"),
             ("network.sides", self.network.sides == Sides::Predicted, "\"predicted\""),
+            ("network.second_layer", !self.network.second_layer, "false"),
             ("network.both_ways", !self.network.both_ways, "false"),
             ("network.on_rays", !self.network.on_rays, "false"),
             ("network.hull_margin", self.network.hull_margin.is_none(), "unset"),

@@ -54,6 +54,7 @@ fn completed_sides_need_what_they_are_made_of() {
         let message = refusal(lines, &[set]);
         assert!(message.contains(key) && !message.contains("line"), "{set}: {message}");
     }
+    assert!(refusal("", &["network.second_layer=true"]).contains("network.second_layer"));
 }
 
 #[test]

@@ -12,9 +12,9 @@ use crate::crop::Window;
 fn yaw(view: View) -> f64 {
     match view {
         View::Front => 0.0,
-        View::Right => 90.0,
+        View::Right | View::RightSecond => 90.0,
         View::Back => 180.0,
-        View::Left => 270.0,
+        View::Left | View::LeftSecond => 270.0,
     }
 }
 

@@ -18,8 +18,9 @@ use snapsnap_ops::layers::conv2d;
 
 /// Channels of a photographed pixel's features on a side.
 const FEATURES: usize = 16;
-/// Channels of the input: depth, colour, front or back, and features of the nearest point, and depth of the farthest.
-const INPUTS: usize = 1 + 3 + 2 + FEATURES + 1;
+/// Channels of the input: depth, colour, front or back, and features of the nearest point; depth of a second one, and whether
+/// there is one; depth of the farthest.
+const INPUTS: usize = 1 + 3 + 2 + FEATURES + 2 + 1;
 /// Depths beside the plane through the body's axis are in metres over this, so that they are as large as colours.
 const DEPTH_UNIT: f64 = 0.2;
 
@@ -48,23 +49,31 @@ pub struct Completion {
     body: UNet,
     #[module(skip)]
     side: usize,
+    #[module(skip)]
+    second_layer: bool,
 }
 
 impl Completion {
     pub(super) fn new(config: &NetworkConfig, device: &Device) -> Self {
         let (c, widths) = (config, config.side_dims);
-        let sizes =
-            UNetSizes { inputs: INPUTS, outputs: 2, widths, blocks: [c.dec_dim, c.dec_depth, c.dec_heads] };
+        let sizes = UNetSizes {
+            inputs: INPUTS,
+            outputs: if c.second_layer { 4 } else { 2 },
+            widths,
+            blocks: [c.dec_dim, c.dec_depth, c.dec_heads],
+        };
         Self {
             embed: conv1x1(c.last_dim, FEATURES, device),
             rows: widths.iter().zip(c.layer_dims).map(|(to, from)| conv1x1(2 * from, *to, device)).collect(),
             body: UNet::new(c, &sizes, device),
             side: c.net_resolution,
+            second_layer: c.second_layer,
         }
     }
 
-    /// Raw x, y, z, confidence `[B, 4, h, w]` of the right and the left, as differences from the anchors over δ `[1]`.
-    pub(super) fn forward(&self, photographed: &Photographed, delta: &Tensor<1>) -> [Tensor<4>; 2] {
+    /// Raw x, y, z, confidence `[B, 4, h, w]` of the right and the left, as differences from the anchors over δ `[1]`, and the
+    /// same of their second surfaces, if the network has them.
+    pub(super) fn forward(&self, photographed: &Photographed, delta: &Tensor<1>) -> Vec<Tensor<4>> {
         let [b, _, h, w, _] = photographed.points.dims();
         let table = self.table(photographed);
         let points = photographed.points.clone().reshape([b, 2 * h * w, 3]);
@@ -82,14 +91,14 @@ impl Completion {
         let levels = self.body.encode(Tensor::cat(images, 0), Some(self.row_means(photographed.levels)));
         let out = self.body.out(self.body.features(&levels));
         let out = [out.clone().narrow(0, 0, b), out.narrow(0, b, b).flip([3])];
-        let [right, left] = seen;
-        let raw = |seen: Seen, out: Tensor<4>| {
-            let beside = seen.depth / delta.clone().reshape([1, 1, 1, 1]) + out.clone().narrow(1, 0, 1);
-            let directions = seen.directions.permute([0, 3, 1, 2]);
-            Tensor::cat(vec![directions * beside, out.narrow(1, 1, 1)], 1)
+        let raw = |layer: usize, seen: &Seen, out: &Tensor<4>| {
+            let known = seen.depths[layer].clone() / delta.clone().reshape([1, 1, 1, 1]);
+            let beside = known + out.clone().narrow(1, 2 * layer, 1);
+            let directions = seen.directions.clone().permute([0, 3, 1, 2]);
+            Tensor::cat(vec![directions * beside, out.clone().narrow(1, 2 * layer + 1, 1)], 1)
         };
-        let [of_right, of_left] = out;
-        [raw(right, of_right), raw(left, of_left)]
+        let of_layer = |layer| seen.iter().zip(&out).map(move |(seen, out)| raw(layer, seen, out));
+        (0..if self.second_layer { 2 } else { 1 }).flat_map(of_layer).collect()
     }
 
     /// Colour, shell and features of all pixels of both photographs `[B, N, 5 + FEATURES]`.
@@ -121,8 +130,8 @@ impl Completion {
 struct Seen {
     /// Input of the network `[B, INPUTS, h, w]`.
     image: Tensor<4>,
-    /// Depth of the nearest point beside the anchor `[B, 1, h, w]`, metres; 0 where there is no point.
-    depth: Tensor<4>,
+    /// Depths of the nearest and of a second point beside the anchor `[B, 1, h, w]`, metres; 0 where there is no point.
+    depths: [Tensor<4>; 2],
     /// Directions of the rays `[1, h, w, 3]`, as long as a metre of depth.
     directions: Tensor<4>,
 }
@@ -142,18 +151,25 @@ impl Seen {
         let c = table.dims()[2];
         let table = Tensor::cat(vec![table, Tensor::zeros([b, 1, c], &device)], 1).reshape([b * (n + 1), c]);
         let image = |x: Tensor<2>, c: usize| x.reshape([b, h, w, c]).permute([0, 3, 1, 2]);
-        let farthest = image(table.clone().narrow(1, 0, 1).select(0, rows.farthest), 1);
+        let [second, farthest] =
+            [rows.second, rows.farthest].map(|rows| image(table.clone().narrow(1, 0, 6).select(0, rows), 6));
         let nearest = image(table.select(0, rows.nearest), c);
         let rays = Rays::new(view, side, window, &device);
         let anchors = rays.depths.permute([0, 3, 1, 2]);
-        let covered = nearest.clone().narrow(1, 4, 2).sum_dim(1);
-        let beside = |depth: Tensor<4>| (depth - anchors.clone()) * covered.clone();
-        let depth = beside(nearest.clone().narrow(1, 0, 1));
+        let is_there = |point: &Tensor<4>| point.clone().narrow(1, 4, 2).sum_dim(1);
+        let beside = |point: &Tensor<4>| (point.clone().narrow(1, 0, 1) - anchors.clone()) * is_there(point);
+        let depths = [beside(&nearest), beside(&second)];
         let image = Tensor::cat(
-            vec![depth.clone() / DEPTH_UNIT, nearest.narrow(1, 1, c - 1), beside(farthest) / DEPTH_UNIT],
+            vec![
+                depths[0].clone() / DEPTH_UNIT,
+                nearest.narrow(1, 1, c - 1),
+                depths[1].clone() / DEPTH_UNIT,
+                is_there(&second),
+                beside(&farthest) / DEPTH_UNIT,
+            ],
             1,
         );
-        Self { image, depth, directions: rays.directions }
+        Self { image, depths, directions: rays.directions }
     }
 }
 
@@ -163,6 +179,7 @@ mod tests {
 
     use super::*;
     use crate::config::{Body, Config};
+    use crate::network::anchor::nominal;
     use crate::network::anchors;
     use crate::weights::random_predictor;
 
@@ -188,6 +205,7 @@ mod tests {
             mask_channel: true,
             mirror: true,
             sides: crate::config::Sides::Completed,
+            second_layer: true,
             ..NetworkConfig::default()
         }
     }
@@ -247,7 +265,7 @@ mod tests {
             window: &window,
         };
         let (sides, exchanged) = (net.forward(&plain, &delta), net.forward(&mirrored, &delta));
-        for (side, other) in [(0, 1), (1, 0)] {
+        for (side, other) in [(0, 1), (1, 0), (2, 3), (3, 2)] {
             let expected = sides[side].clone().flip([3]);
             let x = -expected.clone().narrow(1, 0, 1);
             let expected = host(expected.slice_assign([0..1, 0..1, 0..h, 0..w], x));
@@ -255,7 +273,37 @@ mod tests {
             let apart = got.iter().zip(&expected).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
             assert!(apart < 2e-4, "{apart}");
         }
-        assert!(host(sides[0].clone()) != host(sides[1].clone()));
+        assert!(
+            host(sides[0].clone()) != host(sides[1].clone())
+                && host(sides[0].clone()) != host(sides[2].clone())
+        );
+    }
+
+    /// The depth of a pixel follows the point that it shows, and no other.
+    #[test]
+    fn gradients_reach_the_points_that_a_side_shows() {
+        let window = Window { rows: 8..56, columns: 16..48 };
+        let device = Device::flex().autodiff();
+        let n = 2 * 48 * 32;
+        let person = person(&window, &[]);
+        let (known, inside) = (host(person.points.clone()), host(person.masks.clone()));
+        let points =
+            Tensor::<3>::from_data(TensorData::new(known.clone(), [1, n, 3]), &device).require_grad();
+        let rows = Visible::new(View::Right, SIDE, &window, [&known, &inside], 1, &device);
+        let shown: Vec<i64> = rows.nearest.clone().into_data().convert::<i64>().try_into_vec().expect("rows");
+        let table = Tensor::cat(
+            vec![Tensor::zeros([1, n, 3], &device), Tensor::ones([1, n, 2 + FEATURES], &device)],
+            2,
+        );
+        // Two channels tell which photograph a point is of; here each counts a half.
+        let seen = Seen::new(View::Right, SIDE, &window, (points.clone(), table * 0.5), rows);
+        let gradients = seen.depths[0].clone().sum().backward();
+        let gradient = host(points.grad(&gradients).expect("a gradient"));
+        let axis = nominal(View::Right, SIDE).1.rotation.row(2).as_vec3().to_array();
+        for (i, gradient) in gradient.chunks_exact(3).enumerate() {
+            let expected = if shown.contains(&(i as i64)) { axis } else { [0.0; 3] };
+            assert!((0..3).all(|c| (gradient[c] - expected[c]).abs() < 1e-5), "{i}: {gradient:?}");
+        }
     }
 
     /// Without corrections, a side's points are those of the photographs, and they follow them.
@@ -273,7 +321,7 @@ mod tests {
             let points = person.points.clone().reshape([1, 2 * 48 * 32, 3]);
             let rows = Visible::new(View::Right, SIDE, &window, [&known, &inside], 1, &Device::flex());
             let seen = Seen::new(View::Right, SIDE, &window, (points, net.table(&person)), rows);
-            let raw = seen.directions.clone().permute([0, 3, 1, 2]) * seen.depth.clone();
+            let raw = seen.directions.clone().permute([0, 3, 1, 2]) * seen.depths[0].clone();
             (none(raw), host(seen.image.narrow(1, 4, 2).sum_dim(1)))
         };
         let anchors = host(anchors(View::Right, SIDE, &window, &Device::flex()));

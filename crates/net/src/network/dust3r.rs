@@ -27,15 +27,22 @@ pub enum View {
     Right,
     /// Unseen; camera yaw +270° from the front.
     Left,
+    /// The second surface that faces the right's camera, such as the flank behind an arm.
+    RightSecond,
+    /// The same of the left.
+    LeftSecond,
 }
 
 impl View {
     /// All views in the order of the heads, of the fixtures and of the concatenated Gaussians.
     pub const ALL: [Self; 4] = [Self::Front, Self::Back, Self::Right, Self::Left];
+    /// The same, followed by the second surfaces of the sides (`network.second_layer`).
+    pub const WITH_SECOND: [Self; 6] =
+        [Self::Front, Self::Back, Self::Right, Self::Left, Self::RightSecond, Self::LeftSecond];
 
     /// Lower-case name.
     pub fn name(self) -> &'static str {
-        ["front", "back", "right", "left"][self as usize]
+        ["front", "back", "right", "left", "right-second", "left-second"][self as usize]
     }
 }
 
@@ -243,12 +250,13 @@ impl Dust3r {
             View::Back => &self.downstream_head2,
             View::Right => self.downstream_head3.as_ref().expect("a network with side heads"),
             View::Left => self.downstream_head4.as_ref().expect("a network with side heads"),
+            View::RightSecond | View::LeftSecond => panic!("the transformer has no second surfaces"),
         };
         let all = |tokens: &Tensor<3>| grid.spread(tokens.clone());
         let tokens = |i: usize| match view {
             View::Front => all(&front[i]),
             View::Back => all(&back[i]),
-            View::Right | View::Left => self.fuse(all(&front[i]), all(&back[i]), grid.size),
+            _ => self.fuse(all(&front[i]), all(&back[i]), grid.size),
         };
         match head {
             Head::Linear(head) => head.forward(tokens(self.config.dec_depth), grid.size),

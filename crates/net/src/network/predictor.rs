@@ -180,12 +180,16 @@ impl PointPredictor {
             Body::Transformer(net) => net.has_sides(),
             Body::Convolution(net) => net.has_sides(),
         };
-        if sides { &View::ALL } else { &View::ALL[..2] }
+        match (sides, self.config.second_layer) {
+            (true, true) => &View::WITH_SECOND,
+            (true, false) => &View::ALL,
+            (false, _) => &View::ALL[..2],
+        }
     }
 
     /// Whether the unseen sides have heads of their own.
     pub fn has_side_heads(&self) -> bool {
-        self.views().len() == View::ALL.len() && self.config.sides == Sides::Predicted
+        self.views().len() > 2 && self.config.sides == Sides::Predicted
     }
 
     /// Whether the layer of this name in a checkpoint is a last one: its output is the raw points, which only activations
@@ -368,8 +372,9 @@ impl PointPredictor {
             window: &window,
         };
         let sides = completion.forward(&photographed, &self.delta());
-        let side = |(view, raw)| (view, activate(raw, config));
-        maps.extend([View::Right, View::Left].into_iter().zip(sides).map(side));
+        maps.extend(
+            View::WITH_SECOND[2..].iter().zip(sides).map(|(view, raw)| (*view, activate(raw, config))),
+        );
         maps
     }
 

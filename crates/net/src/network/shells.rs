@@ -7,10 +7,14 @@ use super::View;
 use super::anchor::nominal;
 use crate::crop::Window;
 
-/// For every pixel of a side, the nearest and the farthest of N points: `[B·h·w]` rows of tables of N + 1 rows for each
-/// sample. The last row means that there is none.
+/// A point that lies so far behind the nearest, in metres, is of another limb.
+const APART: f64 = 0.05;
+
+/// For every pixel of a side, the nearest of N points, the nearest of those that are [`APART`] behind it, and the farthest:
+/// `[B·h·w]` rows of tables of N + 1 rows for each sample. The last row means that there is none.
 pub struct Visible {
     pub nearest: Tensor<1, Int>,
+    pub second: Tensor<1, Int>,
     pub farthest: Tensor<1, Int>,
 }
 
@@ -29,33 +33,41 @@ impl Visible {
         let (n, w) = (inside.len() / batch, window.columns.len());
         let area = window.rows.len() * w;
         let none = |sample: usize| (sample * (n + 1) + n) as i64;
-        let (mut nearest, mut farthest) =
-            (Vec::with_capacity(batch * area), Vec::with_capacity(batch * area));
+        let mut found: [Vec<i64>; 3] = Default::default();
         for (sample, (points, inside)) in points.chunks_exact(3 * n).zip(inside.chunks_exact(n)).enumerate() {
-            let mut depths = vec![[f64::INFINITY, f64::NEG_INFINITY]; area];
-            let mut rows = vec![[none(sample); 2]; area];
-            for (i, point) in points.chunks_exact(3).enumerate().filter(|(i, _)| inside[*i] >= 0.5) {
+            let seen = |(i, point): (usize, &[f32])| {
                 let p = to_side.apply(DVec3::new(point[0].into(), point[1].into(), point[2].into()));
                 let place = camera.focal * p.truncate() / p.z + camera.principal_point;
                 let there = p.z > 0.0 && place.is_finite() && place.min_element() >= 0.0;
                 let (column, row) = (place.x as usize, place.y as usize);
                 if !there || !window.rows.contains(&row) || !window.columns.contains(&column) {
-                    continue;
+                    return None;
                 }
                 let pixel = (row - window.rows.start) * w + column - window.columns.start;
-                let row = (sample * (n + 1) + i) as i64;
-                if p.z < depths[pixel][0] {
-                    (depths[pixel][0], rows[pixel][0]) = (p.z, row);
+                Some((pixel, p.z, (sample * (n + 1) + i) as i64))
+            };
+            let of_person = points.chunks_exact(3).enumerate().filter(|(i, _)| inside[*i] >= 0.5);
+            let seen: Vec<(usize, f64, i64)> = of_person.filter_map(seen).collect();
+            // The first of all points with the smallest distance beyond `from`.
+            let nearest = |from: &dyn Fn(usize) -> f64, distance: fn(f64) -> f64| {
+                let mut best = vec![(f64::INFINITY, none(sample)); area];
+                for &(pixel, depth, row) in &seen {
+                    if depth >= from(pixel) && distance(depth) < best[pixel].0 {
+                        best[pixel] = (distance(depth), row);
+                    }
                 }
-                if p.z > depths[pixel][1] {
-                    (depths[pixel][1], rows[pixel][1]) = (p.z, row);
-                }
+                best
+            };
+            let first = nearest(&|_| 0.0, |depth| depth);
+            let second = nearest(&|pixel| first[pixel].0 + APART, |depth| depth);
+            let farthest = nearest(&|_| 0.0, |depth| -depth);
+            for (rows, best) in found.iter_mut().zip([first, second, farthest]) {
+                rows.extend(best.iter().map(|(_, row)| row));
             }
-            nearest.extend(rows.iter().map(|row| row[0]));
-            farthest.extend(rows.iter().map(|row| row[1]));
         }
-        let tensor = |rows: Vec<i64>| Tensor::from_data(TensorData::new(rows, [batch * area]), device);
-        Self { nearest: tensor(nearest), farthest: tensor(farthest) }
+        let [nearest, second, farthest] =
+            found.map(|rows| Tensor::from_data(TensorData::new(rows, [batch * area]), device));
+        Self { nearest, second, farthest }
     }
 }
 
@@ -87,11 +99,12 @@ mod tests {
     }
 
     #[test]
-    fn pixels_of_a_side_show_the_nearest_and_the_farthest_point_inside() {
+    fn pixels_of_a_side_show_the_nearest_a_second_and_the_farthest_point_inside() {
         let device = Device::flex();
         let window = Window { rows: 8..56, columns: 16..48 };
         for view in [View::Right, View::Left] {
-            // Four points of a pixel, the nearest outside of the person; a point beside the window; one behind the camera.
+            // Five points of a pixel, of which one is no person's and two are of one surface; a point beside the window; one
+            // behind the camera; one that is no point.
             let mut points = seen(
                 view,
                 &[
@@ -101,26 +114,28 @@ mod tests {
                     (20.5, 30.5, 1.0),
                     (60.0, 30.0, 2.0),
                     (20.5, 30.5, -2.0),
+                    (20.5, 30.6, 1.84),
                 ],
             );
             points.extend([f32::NAN; 3]);
-            let mut inside = [1.0; 7];
+            let mut inside = [1.0; 8];
             inside[3] = 0.2;
             let twice = [points.clone(), points.clone()].concat();
             let both = [inside, inside].concat();
             let visible = Visible::new(view, SIDE, &window, [&twice, &both], 2, &device);
             let rows =
                 |x: Tensor<1, Int>| x.into_data().convert::<i64>().try_into_vec::<i64>().expect("rows");
-            let (nearest, farthest) = (rows(visible.nearest), rows(visible.farthest));
+            let found = [visible.nearest, visible.second, visible.farthest].map(rows);
             let (area, pixel) = (48 * 32, (30 - 8) * 32 + 20 - 16);
             for i in 0..2 * area {
-                let first = 8 * (i / area) as i64;
-                let expected = if i % area == pixel { [1, 2] } else { [7, 7] };
-                assert_eq!([nearest[i], farthest[i]], expected.map(|row| first + row), "{view:?} {i}");
+                let first = 9 * (i / area) as i64;
+                let expected = if i % area == pixel { [1, 0, 2] } else { [8; 3] };
+                let got = [0, 1, 2].map(|kind| found[kind][i] - first);
+                assert_eq!(got, expected, "{view:?} {i}");
             }
-            let finite = Tensor::<3>::from_data(TensorData::new(points[..18].to_vec(), [1, 6, 3]), &device);
+            let finite = Tensor::<3>::from_data(TensorData::new(points[..21].to_vec(), [1, 7, 3]), &device);
             let depths = host(depths(view, finite));
-            for (depth, expected) in depths.iter().zip([2.0, 1.8, 2.3, 1.0, 2.0, -2.0]) {
+            for (depth, expected) in depths.iter().zip([2.0, 1.8, 2.3, 1.0, 2.0, -2.0, 1.84]) {
                 assert!((depth - expected).abs() < 1e-5, "{view:?}: {depths:?}");
             }
         }

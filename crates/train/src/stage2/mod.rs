@@ -73,7 +73,9 @@ impl GaussianTask {
         predictor: Option<PointPredictor>,
         devices: &[Device],
     ) -> Result<Self, TrainError> {
-        let samples = SampleConfig { points: config.stage2.points_weight > 0.0, ..config.samples() };
+        let points = config.stage2.points_weight > 0.0;
+        // Second surfaces are trained in stage 1 alone.
+        let samples = SampleConfig { points, second_depth: false, ..config.samples() };
         let data = Data::new(folders, config, &samples, Stage2::new)?;
         let (mut lpips, mut lpips_from) = (Vec::new(), 0);
         if let Some(LpipsConfig { weight, after, files }) = &config.stage2.lpips

@@ -25,7 +25,7 @@ const SCALE_PENALTY: f64 = 2.0;
 /// Gaussians and targets of a step.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Phase {
-    /// Views whose Gaussians are rendered.
+    /// Views whose Gaussians are rendered; second surfaces belong to the sides.
     pub views: Range<usize>,
     /// Weight of the mean scale.
     pub scale_weight: f64,
@@ -94,7 +94,8 @@ pub(super) fn gaussians(
         Tensor::<4>::from_data(TensorData::new(points, [views, side, side, 3]), device)
     };
     let mut parts = Vec::new();
-    for (pair, first) in (0..views).step_by(2).enumerate().filter(|(_, v)| phase.views.contains(v)) {
+    for (pair, first) in (0..views).step_by(2).enumerate().filter(|(_, v)| phase.views.contains(&(*v).min(2)))
+    {
         let person = Window::around(valid[first..first + 2].iter().map(Vec::as_slice), side);
         let Some(person) = person else { continue };
         let window =
