@@ -39,7 +39,7 @@ fn a_mesh_is_as_far_from_the_truth_as_it_was_moved_until_it_is_aligned() {
     };
     let (apart, facing, aligned) = run(&[]);
     assert!(apart > 1.0 && aligned.is_null(), "{apart} {aligned}");
-    let (after, facing_after, aligned) = run(&["--icp"]);
+    let (after, facing_after, aligned) = run(&["--align"]);
     assert!(after < 0.6 * apart && facing_after > facing, "{apart} → {after}, {facing} → {facing_after}");
     assert!(aligned[0].as_f64().is_some_and(|degrees| (degrees - 4.0).abs() < 1.5), "{aligned}");
     let text = fs::read_to_string(report.join("report.md")).expect("a report");

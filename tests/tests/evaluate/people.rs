@@ -8,6 +8,30 @@ use snapsnap_tests::{refused, root, snapsnap, succeed};
 
 use super::{copied, ended, evaluate, json, people, weights};
 
+/// The program's own weights on people in a ring of views.
+#[test]
+fn aligned_models_have_smaller_errors_and_the_report_says_how_they_moved() {
+    let temporary = tempfile::tempdir().expect("a folder");
+    let own = root().join("assets/weights/default.safetensors").display().to_string();
+    let run = |name: &str, arguments: &[&str]| {
+        let report = temporary.path().join(name);
+        let common = ["--weights", &own, "--set", "metrics.mesh=false", "--set", "views.compared=[1]"];
+        succeed(&mut evaluate(people(), &report, &[&common, arguments].concat()));
+        (json(&report), fs::read_to_string(report.join("report.md")).expect("a report"))
+    };
+    let ((plain, text), (moved, moved_text)) = (run("plain", &[]), run("moved", &["--align", "similarity"]));
+    assert_eq!(plain["alignment"]["method"], "none");
+    assert!(plain["alignment"]["mean_degrees_cm_scale"].is_null() && !text.contains("## Alignment"));
+    assert_eq!(moved["alignment"]["method"], "similarity");
+    let figures = moved["alignment"]["mean_degrees_cm_scale"].as_array().expect("three figures");
+    assert!(figures.iter().all(|figure| figure.as_f64().is_some_and(|figure| figure > 0.0)), "{figures:?}");
+    assert!(moved_text.contains("## Alignment") && moved_text.contains("rigid and scale"), "{moved_text}");
+    let apart = |report: &Value| report["geometry_cm"]["to_truth"]["mean"].as_f64().expect("a distance");
+    assert!(apart(&moved) < apart(&plain), "{} → {}", apart(&plain), apart(&moved));
+    // Baselines stay.
+    assert_eq!(moved["baselines"], plain["baselines"]);
+}
+
 #[test]
 fn a_report_has_its_keys_and_follows_from_its_tables() {
     let temporary = tempfile::tempdir().expect("a folder");
@@ -306,7 +330,8 @@ fn wrong_evaluations_are_refused_with_the_reason() {
     wrong(&["--set", "ablations.a.photographs={mask=\"wide\"}"], &["mask", "f32"]);
     wrong(&["--device", "abacus"], &["abacus", "Here there are"]);
     wrong(&["--lpips", "nowhere.pth"], &["nowhere.pth"]);
-    wrong(&["--icp"], &["--mesh-dir"]);
+    wrong(&["--align", "nowhere"], &["--align", "similarity"]);
+    wrong(&["--set", "metrics.align=\"nowhere\""], &["unknown variant `nowhere`", "`similarity`"]);
     let said = refused(&mut evaluate(people(), &people().join("report"), &[]));
     assert!(said.contains("lies in a data set"), "{said}");
     let said = refused(&mut evaluate(temporary.path(), &report, &[]));

@@ -12,10 +12,11 @@ use snapsnap_base::config::Schema;
 use snapsnap_data::sample::Handling;
 use snapsnap_eval::baselines::MeanPictures;
 use snapsnap_eval::evaluate::config::EvalConfig;
-use snapsnap_eval::evaluate::meshes::{Align, evaluate_meshes};
+use snapsnap_eval::evaluate::meshes::evaluate_meshes;
 use snapsnap_eval::evaluate::model::Model;
 use snapsnap_eval::evaluate::person::People;
 use snapsnap_eval::evaluate::{Contestant, Kind, LeftOut, evaluate, sheet};
+use snapsnap_eval::geometry::Align;
 use snapsnap_eval::report;
 use snapsnap_eval::report::evaluation::{Cost, Evaluation};
 use snapsnap_eval::variant::Variant;
@@ -52,9 +53,10 @@ pub struct Arguments {
     /// Evaluate the meshes NAME.obj, .ply or .glb in this folder instead of weights.
     #[arg(long, value_name = "DIR", conflicts_with_all = ["weights", "against"])]
     mesh_dir: Option<PathBuf>,
-    /// Align meshes with the ground truth first: turned and moved (rigid), or scaled as well (similarity).
-    #[arg(long, value_parser = one_of(ICP), value_name = "HOW", num_args = 0..=1, default_missing_value = "rigid")]
-    icp: Option<Align>,
+    /// Align models or meshes with the ground truth first: turned and moved (rigid), or scaled as well (similarity).
+    #[arg(long, alias = "icp", value_parser = one_of(ALIGN), value_name = "HOW", num_args = 0..=1)]
+    #[arg(default_missing_value = "rigid")]
+    align: Option<Align>,
     #[command(flatten)]
     lpips: perceptual::Arguments,
     /// Folder of the report.
@@ -65,16 +67,13 @@ pub struct Arguments {
     device: Option<String>,
 }
 
-const ICP: [(&str, &str, Align); 2] = [("rigid", "", Align::Rigidly), ("similarity", "", Align::Similarly)];
+const ALIGN: [(&str, &str, Align); 2] = [("rigid", "", Align::Rigid), ("similarity", "", Align::Similarity)];
 /// Kinds of photographs, and whether they are grey.
 const INPUTS: [(&str, &str, bool); 1] = [("grey", "", true)];
 /// The end of the message about failed parts.
 const REST: &str = "the rest, if there is any, was evaluated";
 
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
-    if arguments.icp.is_some() && arguments.mesh_dir.is_none() {
-        bail!("--icp needs --mesh-dir: only meshes are moved");
-    }
     let config = config_of(arguments)?;
     let (sets, mut missing) = data_sets(&config)?;
     let roots = sets.iter().map(|set| set.folder().root());
@@ -180,16 +179,11 @@ fn judge_meshes(
         bail!("--mesh-dir {}: is no folder", meshes.display());
     }
     let folder = ReportFolder::new(&arguments.output, &[&arguments.config])?;
-    let align = arguments.icp.unwrap_or(Align::No);
-    let alignment = match align {
-        Align::No => "none: as the meshes are",
-        Align::Rigidly => "rigid, by iterated closest points",
-        Align::Similarly => "rigid and scale, by iterated closest points",
-    };
+    let alignment = config.metrics.align.description();
     let total = sets.iter().map(|set| set.chosen().len()).sum();
     let progress = Progress::steps(total, "people");
     let done = |done: usize, total: usize| progress.step(done, total, "people");
-    let (figures, mut left_out) = evaluate_meshes(config, sets, meshes, align, &done);
+    let (figures, mut left_out) = evaluate_meshes(config, sets, meshes, &done);
     drop(progress);
     left_out.splice(0..0, missing);
     let header = header("cpu");
@@ -214,6 +208,9 @@ fn config_of(arguments: &Arguments) -> Result<EvalConfig, Failure> {
     if let Some(against) = &arguments.against {
         let other = Variant { weights: Some(against.clone()), ..Variant::default() };
         config.ablations.insert("against".into(), other);
+    }
+    if let Some(align) = arguments.align {
+        config.metrics.align = align;
     }
     if let Some(grey) = arguments.inputs {
         let photographs = Some(Handling { grey, ..config.photographs });

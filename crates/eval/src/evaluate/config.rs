@@ -9,6 +9,7 @@ use snapsnap_data::dataset::Split;
 use snapsnap_data::sample::Handling;
 use snapsnap_splat::{Preset, RenderOptions};
 
+use crate::geometry::Align;
 use crate::variant::{Variant, names_twice, views_problem};
 
 /// The config of an evaluation.
@@ -177,6 +178,9 @@ pub struct MetricsSection {
     pub opaque: f32,
     /// Whether the mesh of `snapsnap mesh` is measured too, which takes seconds per person.
     pub mesh: bool,
+    /// Alignment of models and meshes with the ground truth before anything is measured. Baselines stay as they are.
+    /// `--align` replaces it.
+    pub align: Align,
 }
 
 impl Default for MetricsSection {
@@ -187,6 +191,7 @@ impl Default for MetricsSection {
             geometry: true,
             opaque: 0.5,
             mesh: false,
+            align: Align::None,
         }
     }
 }

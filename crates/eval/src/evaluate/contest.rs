@@ -5,15 +5,19 @@ use std::time::Duration;
 use burn::tensor::Device;
 use snapsnap_data::sample::{Handling, TestItem};
 use snapsnap_net::Photograph;
+use snapsnap_ops::host;
 use snapsnap_splat::{Camera, Gaussians};
 
 use super::config::ViewsSection;
-use super::model::{Model, no_gaussian};
+use super::meshes::ALIGNED;
+use super::model::{Made, Model, no_gaussian};
 use super::person::{People, Points, nearest_view, photograph, points};
 use super::rendered;
 use super::sides::side_points;
+use super::surface::{Truth, thinned};
 use crate::EvalError;
 use crate::baselines::{MeanPictures, billboard, true_points};
+use crate::geometry::{Align, double, icp, points as centres_of};
 use crate::pictures::Picture;
 use crate::points::{Pair, PointError, point_errors};
 
@@ -57,6 +61,8 @@ pub struct Shown {
     pub lost: usize,
     /// Time of the reconstruction.
     pub time: Option<Duration>,
+    /// Degrees, centimetres (of the middle) and factor of the alignment, if there was one.
+    pub aligned: Option<[f64; 3]>,
 }
 
 impl Contestant {
@@ -93,10 +99,11 @@ impl Contestant {
         }
     }
 
-    /// Its result for a person's photographs. `canvas` is the side of the baselines' canvas in pixels.
+    /// Its result for a person's photographs. `canvas` is the side of the baselines' canvas in pixels. Models are aligned with
+    /// the truth first.
     ///
     /// # Errors
-    /// [`EvalError`] if files cannot be read, or no Gaussian came out.
+    /// [`EvalError`] if files cannot be read, no Gaussian came out, or there is no truth for an alignment.
     pub(super) fn prepare(
         &self,
         people: &People,
@@ -104,8 +111,9 @@ impl Contestant {
         item: &TestItem,
         inputs: &[usize],
         canvas: usize,
+        (align, truth): (Align, Option<&Truth>),
     ) -> Result<Shown, EvalError> {
-        let of = |gaussians| Shown { gaussians, points: Ok(Vec::new()), lost: 0, time: None };
+        let of = |gaussians| Shown { gaussians, points: Ok(Vec::new()), lost: 0, time: None, aligned: None };
         let plain = |gaussians: Gaussians| {
             if gaussians.is_empty() { Err(no_gaussian()) } else { Ok(of(Some(gaussians))) }
         };
@@ -114,11 +122,21 @@ impl Contestant {
                 let is_changed = model.photographs != Handling::default();
                 let own = is_changed.then(|| people.item(row, inputs, &model.photographs)).transpose()?;
                 let item = own.as_ref().unwrap_or(item);
-                let made = model.reconstruct(item, inputs)?;
+                let mut made = model.reconstruct(item, inputs)?;
+                let aligned = match align {
+                    Align::None => None,
+                    _ => Some(aligned(&mut made, align, truth, &item.cameras[inputs[0]])?),
+                };
                 // Pictures can be compared without errors of points.
                 let points = errors(people, row, item, inputs, &made.maps, model.side());
                 let points = points.map_err(|e| e.to_string());
-                Ok(Shown { points, lost: made.lost, time: Some(made.time), ..plain(made.gaussians)? })
+                Ok(Shown {
+                    points,
+                    lost: made.lost,
+                    time: Some(made.time),
+                    aligned,
+                    ..plain(made.gaussians)?
+                })
             }
             Means::Billboard(device) => {
                 let (photographs, valid) = on_canvas(item, inputs.len(), canvas);
@@ -167,6 +185,34 @@ impl Contestant {
     }
 }
 
+/// Aligns Gaussians (world frame) and point maps (frame of the `front` camera) with the truth, by the centres of opaque
+/// Gaussians. Returns the figures of the motion.
+fn aligned(
+    made: &mut Made,
+    align: Align,
+    truth: Option<&Truth>,
+    front: &Camera,
+) -> Result<[f64; 3], EvalError> {
+    /// Least opacity of Gaussians that count.
+    const OPAQUE: f32 = 0.5;
+    let truth = truth.ok_or_else(|| EvalError::Empty("there is no ground truth to align with".into()))?;
+    let opacities = host(made.gaussians.opacities.clone());
+    let centres = centres_of(&made.gaussians.means)?.into_iter().zip(opacities);
+    let centres: Vec<[f32; 3]> = centres.filter(|(_, opacity)| *opacity >= OPAQUE).map(|(p, _)| p).collect();
+    let centres = thinned(&centres, ALIGNED);
+    let motion = icp(&centres, &thinned(&truth.points, 10 * ALIGNED), align == Align::Similarity)?;
+    made.gaussians = made.gaussians.clone().scaled(motion.scale).transformed(&motion.rigid());
+    let (to_world, to_front) = (front.world_to_camera.inverse(), front.world_to_camera);
+    for (_, points) in &mut made.maps {
+        // Pixels without a prediction have the point 0.
+        for point in points.as_chunks_mut::<3>().0.iter_mut().filter(|point| **point != [0.0; 3]) {
+            let moved = motion.apply(to_world.apply(double(*point)).as_vec3().to_array());
+            *point = to_front.apply(double(moved)).as_vec3().to_array();
+        }
+    }
+    Ok(motion.figures(&centres))
+}
+
 /// The photographs `[3,S,S]` on a canvas, and the pixels that are at least half the person's. Those have the person's
 /// own colour.
 fn on_canvas(item: &TestItem, count: usize, side: usize) -> (Vec<Vec<f32>>, Vec<Vec<bool>>) {
@@ -206,4 +252,70 @@ fn errors(
     let with_truth = maps.iter().filter_map(|(view, points)| Some((*view, points, truths.get(*view)?)));
     let pairs = with_truth.map(|(view, points, (truth, valid))| Pair { view, points, truth, valid });
     Ok(point_errors(&pairs.collect::<Vec<_>>()))
+}
+
+#[cfg(test)]
+mod tests {
+    use burn::tensor::{Tensor, TensorData};
+    use glam::{DQuat, DVec3};
+    use rand::{Rng, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    use super::*;
+
+    /// Gaussians and maps of a cloud, moved by a known similarity that is smaller than the distance of neighbours, come back.
+    #[test]
+    fn aligned_models_lie_on_the_truth() {
+        let front = Camera::orbit_at_yaw_degrees(0.0, 64);
+        let mut random = ChaCha8Rng::seed_from_u64(1);
+        let size = [0.6_f32, 1.8, 0.4];
+        let cloud: Vec<[f32; 3]> =
+            (0..2000).map(|_| size.map(|size| size * random.random_range(-0.5..0.5_f32))).collect();
+        let turn = DQuat::from_euler(glam::EulerRot::XYZ, 0.004, -0.003, 0.002);
+        let moved: Vec<[f32; 3]> = cloud
+            .iter()
+            .map(|p| (0.998 * (turn * double(*p)) + DVec3::new(0.001, -0.002, 0.001)).as_vec3().to_array())
+            .collect();
+        let seen = |points: &[[f32; 3]]| -> Vec<f32> {
+            points.iter().flat_map(|p| front.world_to_camera.apply(double(*p)).as_vec3().to_array()).collect()
+        };
+        let truth = Truth { points: cloud.clone(), views: Vec::new() };
+        for (align, most) in [(Align::Similarity, 1e-5), (Align::Rigid, 2e-3)] {
+            let device = Device::flex();
+            let n = moved.len();
+            let tensor =
+                |values: Vec<f32>, c: usize| Tensor::<2>::from_data(TensorData::new(values, [n, c]), &device);
+            let gaussians = Gaussians::new(
+                tensor(moved.concat(), 3),
+                tensor([1.0, 0.0, 0.0, 0.0].repeat(n), 4),
+                tensor(vec![0.01; 3 * n], 3),
+                Tensor::ones([n], &device),
+                tensor(vec![0.5; 3 * n], 3),
+            );
+            // The last pixel has no prediction.
+            let maps = vec![(1, [seen(&moved), vec![0.0; 3]].concat())];
+            let mut made = Made {
+                gaussians: gaussians.expect("valid"),
+                maps,
+                lost: 0,
+                time: Duration::ZERO,
+                modules: Vec::new(),
+                plan: Vec::new(),
+            };
+            let [degrees, _, scale] = aligned(&mut made, align, Some(&truth), &front).expect("aligned");
+            let farthest =
+                |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0_f32, f32::max);
+            let apart = farthest(&host(made.gaussians.means.clone()), &cloud.concat());
+            assert!(apart < most, "{align:?}: {apart} m");
+            let map = &made.maps[0].1;
+            assert!(farthest(map, &seen(&cloud)) < 2.0 * most && map[3 * n..] == [0.0; 3], "{align:?}");
+            let expected = if align == Align::Rigid { 1.0 } else { 1.0 / 0.998 };
+            let turned = turn.to_axis_angle().1.to_degrees();
+            assert!((scale - expected).abs() < 1e-5 && (degrees - turned).abs() < 0.01, "{degrees}° {scale}");
+            let size = host(made.gaussians.scales.clone())[0];
+            assert!((f64::from(size) - 0.01 * scale).abs() < 1e-6, "{size}");
+            let nothing = aligned(&mut made, align, None, &front);
+            assert!(nothing.is_err_and(|e| e.to_string().contains("no ground truth")));
+        }
+    }
 }

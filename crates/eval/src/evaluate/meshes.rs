@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use glam::{DVec3, Vec3};
+use glam::Vec3;
 use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
 use snapsnap_base::FileError;
@@ -15,12 +15,12 @@ use super::person::People;
 use super::surface::{thinned, truth as truth_of};
 use super::{LeftOut, missing, name_of};
 use crate::EvalError;
-use crate::geometry::{Alignment, chamfer, double, icp, point_to_surface, sampled};
+use crate::geometry::{Align, chamfer, icp, point_to_surface, sampled};
 
 /// Points drawn from each surface.
 const POINTS: usize = 50_000;
 /// Points drawn for an alignment.
-const ALIGNED: usize = 5_000;
+pub(super) const ALIGNED: usize = 5_000;
 /// Seeds of the points of a mesh and of the scan. With one seed, equal meshes would get equal points.
 const SEEDS: [u64; 2] = [1, 2];
 
@@ -45,24 +45,12 @@ pub struct MeshFigures {
     pub aligned: Option<[f64; 3]>,
 }
 
-/// Alignment of meshes with the ground truth before they are measured.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Align {
-    /// None.
-    No,
-    /// Rotation and translation.
-    Rigidly,
-    /// Rotation, translation and scale.
-    Similarly,
-}
-
 /// Compares the meshes NAME.obj, .ply or .glb in a folder with the ground truth. `progress` is called with the number
 /// of finished people and their total.
 pub fn evaluate_meshes(
     config: &EvalConfig,
     sets: &[People],
     folder: &Path,
-    align: Align,
     progress: &dyn Fn(usize, usize),
 ) -> (Vec<MeshFigures>, Vec<LeftOut>) {
     let total = sets.iter().map(|set| set.chosen().len()).sum();
@@ -70,7 +58,7 @@ pub fn evaluate_meshes(
     let people = sets.iter().flat_map(|set| set.chosen().iter().map(move |row| (set, *row)));
     for (done, (people, row)) in people.enumerate() {
         let name = name_of(sets, people, row);
-        match one(config, people, row, &name, folder, align) {
+        match one(config, people, row, &name, folder) {
             Ok(found) => figures.push(found),
             Err(e) => left_out.push(LeftOut::new(name, e)),
         }
@@ -86,7 +74,6 @@ fn one(
     row: usize,
     name: &str,
     folder: &Path,
-    align: Align,
 ) -> Result<MeshFigures, EvalError> {
     let subject = people.test().name(row);
     let mut mesh = import::read(&find(folder, subject)?)?;
@@ -106,17 +93,12 @@ fn one(
         None => seen.points.clone(),
     };
     let mut aligned = None;
-    if align != Align::No {
+    if config.metrics.align != Align::None {
         let points = sampled(&mesh, ALIGNED, SEEDS[0])?;
-        let motion = icp(&points, &thinned(&truth, 10 * ALIGNED), align == Align::Similarly)?;
+        let scale = config.metrics.align == Align::Similarity;
+        let motion = icp(&points, &thinned(&truth, 10 * ALIGNED), scale)?;
         mesh.positions.iter_mut().for_each(|p| *p = Vec3::from_array(motion.apply(p.to_array())));
-        let Alignment { scale, rotation, .. } = motion;
-        let angle = 2.0 * rotation.w.abs().min(1.0).acos();
-        // The motion of the world's origin has no meaning, that of the middle has.
-        let middle = |points: &[[f32; 3]]| points.iter().map(|p| double(*p)).sum::<DVec3>() / ALIGNED as f64;
-        let after: Vec<[f32; 3]> = points.iter().map(|p| motion.apply(*p)).collect();
-        let moved = middle(&after) - middle(&points);
-        aligned = Some([angle.to_degrees(), 1e2 * moved.length(), scale]);
+        aligned = Some(motion.figures(&points));
     }
     let surface = sampled(&mesh, POINTS, SEEDS[0])?;
     let apart = chamfer(&surface, &truth)?;

@@ -17,6 +17,7 @@ use snapsnap_data::sample::{Handling, TestItem};
 use snapsnap_splat::{Camera, Gaussians, render};
 
 use crate::EvalError;
+use crate::geometry::Align;
 use crate::lpips::Lpips;
 use crate::pictures::Picture;
 use crate::points::PointError;
@@ -64,6 +65,8 @@ pub struct Judged {
     pub times: Vec<Duration>,
     /// Number of Gaussians, likewise.
     pub gaussians: Vec<usize>,
+    /// Degrees, centimetres (of the middle) and factor of the alignments, likewise.
+    pub aligned: Vec<[f64; 3]>,
 }
 
 /// Means of each person's views, by row of [`Outcome::people`].
@@ -132,7 +135,8 @@ pub fn evaluate(
             let person = outcome.people.len();
             outcome.people.push(name_of(sets, people, row));
             let at = Place { config, contestants, lpips, people, row, person };
-            let is_measured = config.metrics.geometry || config.metrics.mesh;
+            let metrics = &config.metrics;
+            let is_measured = metrics.geometry || metrics.mesh || metrics.align != Align::None;
             let truth = is_measured.then(|| truth(people, row));
             let truth = truth.and_then(|truth| at.kept(&mut outcome, ", geometry", truth));
             for &turn in &config.views.turns {
@@ -224,7 +228,7 @@ impl Place<'_> {
         let Some(item) = self.kept(outcome, "", item) else { return };
         let mut shown = Vec::new();
         for (i, contestant) in contestants.iter().enumerate() {
-            let made = contestant.prepare(people, row, &item, &inputs, side);
+            let made = contestant.prepare(people, row, &item, &inputs, side, (config.metrics.align, truth));
             let made = self.kept(outcome, &format!(", {}", contestant.name), made);
             if let Some(made) = &made {
                 self.measure(i, made, truth, outcome);
@@ -274,6 +278,7 @@ impl Place<'_> {
         judged.points.extend(points.filter(|points| !points.is_empty()).map(|points| (person, points)));
         judged.times.extend(made.time);
         judged.gaussians.extend(made.gaussians.as_ref().map(Gaussians::len));
+        judged.aligned.extend(made.aligned);
         let is_baseline = judged.kind == Kind::Baseline;
         let Some((truth, gaussians)) = truth.zip(made.gaussians.as_ref()) else { return };
         if config.metrics.geometry {
@@ -374,7 +379,9 @@ fn pictures(
     let inputs = people.inputs(&config.views, config.views.turns[0]);
     let item = people.item(row, &inputs, &Handling::default())?;
     let side = people.side(&config.views);
-    let shown = contestant.prepare(people, row, &item, &inputs, side)?;
+    let align = config.metrics.align;
+    let truth = (align != Align::None).then(|| truth(people, row)).transpose()?;
+    let shown = contestant.prepare(people, row, &item, &inputs, side, (align, truth.as_ref()))?;
     let mut pictures = Vec::new();
     for view in &inputs[..2] {
         let (target, _) = people.target(row, *view, side)?;

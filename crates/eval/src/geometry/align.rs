@@ -1,6 +1,8 @@
-//! Rigid alignment of meshes that are not in the world frame, by iterated closest points (Besl & McKay 1992).
+//! Alignment of reconstructions that are not in the world frame, by iterated closest points (Besl & McKay 1992).
 
 use glam::{DMat3, DQuat, DVec3};
+use serde::{Deserialize, Serialize};
+use snapsnap_splat::RigidTransform;
 
 use super::{check_points, double, nearest};
 use crate::EvalError;
@@ -9,6 +11,30 @@ use crate::EvalError;
 const MOST: usize = 100;
 /// Least relative decrease of the mean squared distance in a step.
 const ENOUGH: f64 = 1e-6;
+
+/// Alignment of reconstructions with the ground truth before they are compared.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Align {
+    /// They are compared as they are.
+    #[default]
+    None,
+    /// Rotation and translation.
+    Rigid,
+    /// Rotation, translation and scale.
+    Similarity,
+}
+
+impl Align {
+    /// What is done, for reports.
+    pub fn description(self) -> &'static str {
+        match self {
+            Self::None => "none",
+            Self::Rigid => "rigid, by iterated closest points",
+            Self::Similarity => "rigid and scale, by iterated closest points",
+        }
+    }
+}
 
 /// x ↦ scale · rotation · x + translation.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -27,6 +53,20 @@ impl Alignment {
     /// The moved point.
     pub fn apply(&self, point: [f32; 3]) -> [f32; 3] {
         (self.scale * (self.rotation * double(point)) + self.translation).as_vec3().to_array()
+    }
+
+    /// The rigid part, for points that are scaled already.
+    pub fn rigid(&self) -> RigidTransform {
+        RigidTransform { rotation: DMat3::from_quat(self.rotation), translation: self.translation }
+    }
+
+    /// Degrees of the rotation, motion of the points' middle in hundredths of their unit, and scale.
+    pub fn figures(&self, points: &[[f32; 3]]) -> [f64; 3] {
+        let angle = 2.0 * self.rotation.w.abs().min(1.0).acos();
+        // The motion of the world's origin has no meaning, that of the middle has.
+        let middle = points.iter().map(|p| double(*p)).sum::<DVec3>() / points.len() as f64;
+        let moved = self.scale * (self.rotation * middle) + self.translation - middle;
+        [angle.to_degrees(), 1e2 * moved.length(), self.scale]
     }
 }
 

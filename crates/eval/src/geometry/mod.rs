@@ -16,7 +16,7 @@ use snapsnap_mesh::mesh::Mesh;
 use snapsnap_net::Neighbours;
 
 use crate::EvalError;
-pub use align::{Alignment, icp};
+pub use align::{Align, Alignment, icp};
 pub use normals::{consistency, normals};
 
 /// Largest coordinate of a point in metres. The squares of larger ones overflow f32.

@@ -126,7 +126,7 @@ pub const FORMATS: &[Format] = &[
         name: "evaluation-mesh",
         sample,
         changed: &["0000.obj"],
-        command: "evaluate --config in/e.toml --mesh-dir in/scans --icp similarity -o out",
+        command: "evaluate --config in/e.toml --mesh-dir in/scans --align similarity -o out",
         whole: |work| report(work, "geometry_cm"),
         ..REPORT
     },

@@ -2,9 +2,10 @@
 
 use std::fmt::Write;
 
-use super::{Cost, Evaluation, FIGURES, point_means, seconds, surface_intervals};
+use super::{Cost, Evaluation, FIGURES, alignment_means, point_means, seconds, surface_intervals};
 use crate::evaluate::config::Protocol;
 use crate::evaluate::{Judged, Kind, Surface, by_person};
+use crate::geometry::Align;
 use crate::points::VIEWS;
 use crate::report::{cell, escaped, left_out_markdown, table_markdown};
 use crate::statistics::Interval;
@@ -23,6 +24,7 @@ impl Evaluation<'_> {
             "* {people} people; {}; intervals: 95 %, bootstrap over people; SSIM and LPIPS × 100\n",
             self.outcome.pictures
         );
+        self.alignment_markdown(&mut text);
         for (i, protocol) in self.protocols() {
             let row = |judged: &Judged| {
                 let people = by_person(&judged.rows, i);
@@ -71,6 +73,28 @@ impl Evaluation<'_> {
         text.trim_end().to_owned() + "\n" + &left_out_markdown(&self.outcome.left_out)
     }
 
+    /// How models were moved before anything was measured.
+    fn alignment_markdown(&self, text: &mut String) {
+        let align = self.config.metrics.align;
+        if align == Align::None {
+            return;
+        }
+        let moved = self.outcome.judged.iter().filter(|judged| !judged.aligned.is_empty());
+        let row = |judged: &Judged| {
+            let means = alignment_means(judged).map(|[degrees, cm, scale]| {
+                [format!("{degrees:.1}"), format!("{cm:.1}"), format!("{scale:.3}")]
+            });
+            [vec![judged.name.clone()], means.unwrap_or_default().into()].concat()
+        };
+        let _ = writeln!(
+            text,
+            "## Alignment\n\nEvery model was aligned with the ground truth before anything was measured ({}); baselines were not. Means of \
+             rotation in degrees, motion of the middle in cm, and scale:\n\n{}",
+            align.description(),
+            table_markdown(&["", "degrees", "cm", "scale"], moved.map(row))
+        );
+    }
+
     fn geometry_markdown(&self, text: &mut String) {
         let made: Vec<&Judged> = self.outcome.judged.iter().filter(|j| !j.gaussians.is_empty()).collect();
         let with_points: Vec<&&Judged> = made.iter().filter(|judged| !judged.points.is_empty()).collect();
@@ -103,7 +127,7 @@ impl Evaluation<'_> {
             let header = ["", "to the truth", "from the truth", "Chamfer", "normals"];
             let _ = writeln!(
                 text,
-                "## Surface\n\nDistances, in cm and without alignment, between the ground-truth points of all views and the centres of the \
+                "## Surface\n\nDistances in cm between the ground-truth points of all views and the centres of the \
                  Gaussians with an opacity of at least {}, or points drawn from the meshes of the Gaussians; normals: mean cosine from \
                  the views nearest to 0, 90, 180 and 270°, in maps of 256² at most.\n\n{}",
                 self.config.metrics.opaque,

@@ -112,6 +112,10 @@ impl Evaluation<'_> {
             })
         });
         report["points_mm"] = self.model().map_or(json!({}), points_json);
+        report["alignment"] = json!({
+            "method": self.config.metrics.align,
+            "mean_degrees_cm_scale": self.model().and_then(alignment_means),
+        });
         report["geometry_cm"] = self.model().map_or(Value::Null, |model| geometry_json(&model.surface));
         report["mesh_cm"] = self.model().map_or(Value::Null, |model| geometry_json(&model.mesh));
         report["seconds"] = self.model().map_or(Value::Null, seconds_json);
@@ -234,6 +238,12 @@ fn point_means(judged: &Judged, view: usize) -> Option<[f64; 3]> {
     let errors = || judged.points.iter().flat_map(|(_, errors)| errors).filter(|error| error.view == view);
     let over = |of: fn(&PointError) -> f64| mean(&errors().map(of).collect::<Vec<_>>());
     Some([over(|e| 1e3 * e.mean)?, over(|e| 1e3 * e.centred)?, over(|e| e.missed)?])
+}
+
+/// Means over people and turns: degrees, centimetres, scale.
+fn alignment_means(judged: &Judged) -> Option<[f64; 3]> {
+    let over = |i: usize| mean(&judged.aligned.iter().map(|figures| figures[i]).collect::<Vec<_>>());
+    Some([over(0)?, over(1)?, over(2)?])
 }
 
 fn points_json(judged: &Judged) -> Value {
