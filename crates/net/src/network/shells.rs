@@ -125,14 +125,16 @@ mod tests {
             let visible = Visible::new(view, SIDE, &window, [&twice, &both], 2, &device);
             let rows =
                 |x: Tensor<1, Int>| x.into_data().convert::<i64>().try_into_vec::<i64>().expect("rows");
-            let found = [visible.nearest, visible.second, visible.farthest].map(rows);
+            let [nearest, second, farthest] = [visible.nearest, visible.second, visible.farthest].map(rows);
+            let found = nearest.iter().zip(second).zip(farthest).map(|((a, b), c)| [*a, b, c]);
             let (area, pixel) = (48 * 32, (30 - 8) * 32 + 20 - 16);
-            for i in 0..2 * area {
-                let first = 9 * (i / area) as i64;
+            for (i, found) in found.enumerate() {
                 let expected = if i % area == pixel { [1, 0, 2] } else { [8; 3] };
-                let got = [0, 1, 2].map(|kind| found[kind][i] - first);
-                assert_eq!(got, expected, "{view:?} {i}");
+                // The second sample's table follows the first one's.
+                let first = if i < area { 0 } else { 9 };
+                assert_eq!(found.map(|row| row - first), expected, "{view:?} {i}");
             }
+            assert_eq!(nearest.len(), 2 * area);
             let finite = Tensor::<3>::from_data(TensorData::new(points[..21].to_vec(), [1, 7, 3]), &device);
             let depths = host(depths(view, finite));
             for (depth, expected) in depths.iter().zip([2.0, 1.8, 2.3, 1.0, 2.0, -2.0, 1.84]) {
