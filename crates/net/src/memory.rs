@@ -17,7 +17,9 @@ impl Config {
         let area = |side: usize| (side as u64).saturating_mul(side as u64);
         // A head's maps at half the network's resolution and at all of it.
         let head = area(n.net_resolution).saturating_mul(F32 * n.feature_dim as u64);
-        let canvas = area(n.resolution).saturating_mul(PER_PIXEL);
+        // Second surfaces are two more views.
+        let per_pixel = if n.second_layer { PER_PIXEL * 3 / 2 } else { PER_PIXEL };
+        let canvas = area(n.resolution).saturating_mul(per_pixel);
         BASE.saturating_add(parameters.saturating_mul(F32)).saturating_add(head).saturating_add(canvas)
     }
 }

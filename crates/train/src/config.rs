@@ -275,12 +275,6 @@ impl TrainConfig {
         if self.network.conf_mode != ConfMode::Sigmoid {
             return refuse("network.conf_mode", "must be \"sigmoid\" to be trained");
         }
-        if self.network.second_layer && !self.samples.second_depth {
-            return refuse(
-                "samples.second_depth",
-                "must be true beside `network.second_layer`, which it trains",
-            );
-        }
         if two.curriculum && !self.network.side_heads {
             let message =
                 "must be false beside `network.side_heads = false`: the curriculum begins with the sides";

@@ -50,6 +50,12 @@ impl PointTask {
         config: &TrainConfig,
         devices: &[Device],
     ) -> Result<Self, TrainError> {
+        if config.network.second_layer && !config.samples.second_depth {
+            let why = "it gives the true second surfaces";
+            let message =
+                format!("`samples.second_depth`: must be true beside `network.second_layer`: {why}");
+            return Err(TrainError::Unsuitable(message));
+        }
         Ok(Self {
             networks: config.networks(),
             confidence: config.stage1.confidence_weight,
@@ -120,8 +126,8 @@ impl Task for PointTask {
             for ((view, points, conf), row) in maps.into_iter().zip(&mut rows) {
                 let at = |points: &[f32], i: usize| Vec3::from_slice(&points[3 * i..]);
                 let (true_points, valid) = item.truth(view).unwrap_or_default();
-                let truth = |i: usize| at(true_points, i);
                 let there = |i: usize| valid.get(i).is_some_and(|valid| *valid > 0.5);
+                let truth = |i: usize| if there(i) { at(true_points, i) } else { Vec3::ZERO };
                 let threshold = self.networks.network.conf_threshold;
                 let seen =
                     |i: usize| if view < 2 { item.masks[view * area + i] > 0.5 } else { conf[i] > threshold };
@@ -194,10 +200,11 @@ impl Errors {
         ];
         let mut figures = Vec::new();
         let (mut sum, mut count) = (0.0, 0.0);
-        for (names, [people, error, centred]) in NAMES.iter().zip(self.views) {
+        for (view, (names, [people, error, centred])) in NAMES.iter().zip(self.views).enumerate() {
             if people > 0.0 {
                 figures.extend([(names[0], 1e3 * error / people), (names[1], 1e3 * centred / people)]);
-                if figures.len() <= 8 {
+                // Second surfaces are no part of the score.
+                if view < 4 {
                     sum += 1e3 * error / people;
                     count += 1.0;
                 }

@@ -67,7 +67,8 @@ pub struct Arguments {
     device: Option<String>,
 }
 
-const ALIGN: [(&str, &str, Align); 2] = [("rigid", "", Align::Rigid), ("similarity", "", Align::Similarity)];
+const ALIGN: [(&str, &str, Align); 3] =
+    [("none", "", Align::None), ("rigid", "", Align::Rigid), ("similarity", "", Align::Similarity)];
 /// Kinds of photographs, and whether they are grey.
 const INPUTS: [(&str, &str, bool); 1] = [("grey", "", true)];
 /// The end of the message about failed parts.

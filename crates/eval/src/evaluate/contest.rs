@@ -8,7 +8,7 @@ use snapsnap_net::Photograph;
 use snapsnap_ops::host;
 use snapsnap_splat::{Camera, Gaussians};
 
-use super::config::ViewsSection;
+use super::config::{MetricsSection, ViewsSection};
 use super::meshes::ALIGNED;
 use super::model::{Made, Model, no_gaussian};
 use super::person::{People, Points, nearest_view, photograph, points};
@@ -17,7 +17,7 @@ use super::sides::side_points;
 use super::surface::{Truth, thinned};
 use crate::EvalError;
 use crate::baselines::{MeanPictures, billboard, true_points};
-use crate::geometry::{Align, double, icp, points as centres_of};
+use crate::geometry::{Align, double, icp};
 use crate::pictures::Picture;
 use crate::points::{Pair, PointError, point_errors};
 
@@ -111,7 +111,7 @@ impl Contestant {
         item: &TestItem,
         inputs: &[usize],
         canvas: usize,
-        (align, truth): (Align, Option<&Truth>),
+        (metrics, truth): (&MetricsSection, Option<&Truth>),
     ) -> Result<Shown, EvalError> {
         let of = |gaussians| Shown { gaussians, points: Ok(Vec::new()), lost: 0, time: None, aligned: None };
         let plain = |gaussians: Gaussians| {
@@ -123,9 +123,9 @@ impl Contestant {
                 let own = is_changed.then(|| people.item(row, inputs, &model.photographs)).transpose()?;
                 let item = own.as_ref().unwrap_or(item);
                 let mut made = model.reconstruct(item, inputs)?;
-                let aligned = match align {
+                let aligned = match metrics.align {
                     Align::None => None,
-                    _ => Some(aligned(&mut made, align, truth, &item.cameras[inputs[0]])?),
+                    _ => Some(aligned(&mut made, metrics, truth, &item.cameras[inputs[0]])?),
                 };
                 // Pictures can be compared without errors of points.
                 let points = errors(people, row, item, inputs, &made.maps, model.side());
@@ -189,16 +189,20 @@ impl Contestant {
 /// Gaussians. Returns the figures of the motion.
 fn aligned(
     made: &mut Made,
-    align: Align,
+    metrics: &MetricsSection,
     truth: Option<&Truth>,
     front: &Camera,
 ) -> Result<[f64; 3], EvalError> {
-    /// Least opacity of Gaussians that count.
-    const OPAQUE: f32 = 0.5;
+    let (align, opaque) = (metrics.align, metrics.opaque);
     let truth = truth.ok_or_else(|| EvalError::Empty("there is no ground truth to align with".into()))?;
     let opacities = host(made.gaussians.opacities.clone());
-    let centres = centres_of(&made.gaussians.means)?.into_iter().zip(opacities);
-    let centres: Vec<[f32; 3]> = centres.filter(|(_, opacity)| *opacity >= OPAQUE).map(|(p, _)| p).collect();
+    let means = host(made.gaussians.means.clone());
+    let centres = means.as_chunks().0.iter().zip(opacities);
+    let centres: Vec<[f32; 3]> = centres.filter(|(_, own)| *own >= opaque).map(|(p, _)| *p).collect();
+    if centres.is_empty() {
+        let message = format!("no Gaussian has an opacity of {opaque}: there is nothing to align");
+        return Err(EvalError::Empty(message));
+    }
     let centres = thinned(&centres, ALIGNED);
     let motion = icp(&centres, &thinned(&truth.points, 10 * ALIGNED), align == Align::Similarity)?;
     made.gaussians = made.gaussians.clone().scaled(motion.scale).transformed(&motion.rigid());
@@ -281,6 +285,7 @@ mod tests {
         };
         let truth = Truth { points: cloud.clone(), views: Vec::new() };
         for (align, most) in [(Align::Similarity, 1e-5), (Align::Rigid, 2e-3)] {
+            let metrics = MetricsSection { align, ..MetricsSection::default() };
             let device = Device::flex();
             let n = moved.len();
             let tensor =
@@ -302,7 +307,7 @@ mod tests {
                 modules: Vec::new(),
                 plan: Vec::new(),
             };
-            let [degrees, _, scale] = aligned(&mut made, align, Some(&truth), &front).expect("aligned");
+            let [degrees, _, scale] = aligned(&mut made, &metrics, Some(&truth), &front).expect("aligned");
             let farthest =
                 |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0_f32, f32::max);
             let apart = farthest(&host(made.gaussians.means.clone()), &cloud.concat());
@@ -314,7 +319,7 @@ mod tests {
             assert!((scale - expected).abs() < 1e-5 && (degrees - turned).abs() < 0.01, "{degrees}° {scale}");
             let size = host(made.gaussians.scales.clone())[0];
             assert!((f64::from(size) - 0.01 * scale).abs() < 1e-6, "{size}");
-            let nothing = aligned(&mut made, align, None, &front);
+            let nothing = aligned(&mut made, &metrics, None, &front);
             assert!(nothing.is_err_and(|e| e.to_string().contains("no ground truth")));
         }
     }

@@ -228,7 +228,7 @@ impl Place<'_> {
         let Some(item) = self.kept(outcome, "", item) else { return };
         let mut shown = Vec::new();
         for (i, contestant) in contestants.iter().enumerate() {
-            let made = contestant.prepare(people, row, &item, &inputs, side, (config.metrics.align, truth));
+            let made = contestant.prepare(people, row, &item, &inputs, side, (&config.metrics, truth));
             let made = self.kept(outcome, &format!(", {}", contestant.name), made);
             if let Some(made) = &made {
                 self.measure(i, made, truth, outcome);
@@ -379,9 +379,8 @@ fn pictures(
     let inputs = people.inputs(&config.views, config.views.turns[0]);
     let item = people.item(row, &inputs, &Handling::default())?;
     let side = people.side(&config.views);
-    let align = config.metrics.align;
-    let truth = (align != Align::None).then(|| truth(people, row)).transpose()?;
-    let shown = contestant.prepare(people, row, &item, &inputs, side, (align, truth.as_ref()))?;
+    let truth = (config.metrics.align != Align::None).then(|| truth(people, row)).transpose()?;
+    let shown = contestant.prepare(people, row, &item, &inputs, side, (&config.metrics, truth.as_ref()))?;
     let mut pictures = Vec::new();
     for view in &inputs[..2] {
         let (target, _) = people.target(row, *view, side)?;

@@ -96,7 +96,8 @@ impl Config {
             return refuse(key, format!("must be {needed} beside `network.sides = \"completed\"`"));
         }
         if n.second_layer && (n.sides != Sides::Completed || !n.side_heads) {
-            return refuse("network.second_layer", "needs `network.sides = \"completed\"`".into());
+            let needed = "`network.sides = \"completed\"` and `network.side_heads = true`";
+            return refuse("network.second_layer", format!("needs {needed}"));
         }
         if !n.net_resolution.is_multiple_of(n.patch) {
             let message = format!("{} is no multiple of the patch {}", n.net_resolution, n.patch);

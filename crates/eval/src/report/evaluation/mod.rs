@@ -109,6 +109,7 @@ impl Evaluation<'_> {
                 "geometry_cm": geometry_json(&judged.surface),
                 "mesh_cm": geometry_json(&judged.mesh),
                 "seconds": seconds_json(judged),
+                "mean_degrees_cm_scale": alignment_means(judged),
             })
         });
         report["points_mm"] = self.model().map_or(json!({}), points_json);
