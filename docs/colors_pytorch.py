@@ -137,9 +137,9 @@ def study(kind, options, train, held_out):
         with torch.autocast("cpu", torch.bfloat16):
             return model(x.contiguous(memory_format=torch.channels_last)).float()
 
-    start, steps, share = time.monotonic(), 0, 0.0
+    start, steps, share = time.process_time(), 0, 0.0
     while share < 1:
-        share = (time.monotonic() - start) / (60 * options.minutes)
+        share = (time.process_time() - start) / (60 * options.minutes)
         for group in optimizer.param_groups:
             group["lr"] = 2e-3 * min(1, (steps + 1) / 50) * (0.01 + 0.99 * (1 + math.cos(math.pi * min(share, 1))) / 2)
         rows = torch.randint(len(train[1]), (8,), generator=random)

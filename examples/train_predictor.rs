@@ -77,7 +77,7 @@ fn compare(networks: &Networks, config: &Config, items: Vec<Stage1Item>, device:
     let predictor = networks.predictor.as_ref().expect("the predictor is trained");
     let batch = Stage1Batcher.batch(items, device);
     let prediction = predict(predictor, config, batch.images, &batch.masks);
-    losses(&prediction, &batch.points, &batch.valid)
+    losses(&prediction, &batch.points, &batch.valid, false)
 }
 
 /// Mean distance of predicted from true points over the four views, millimetres.

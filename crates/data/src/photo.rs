@@ -2,6 +2,7 @@
 
 mod doubts;
 mod placing;
+mod rim;
 mod specks;
 #[cfg(test)]
 mod tests;
@@ -134,14 +135,13 @@ impl<'a> Cutout<'a> {
                 format!("the mask is {mask_width}×{mask_height}, its picture {path} is {width}×{height}");
             return Err(FileError::unsuitable(mask_path, message));
         }
-        let rgb = picture.into_rgb8();
+        let mut rgb = picture.into_rgb8();
         // The demo includes every pixel that is not 0. Lossy masks have many such pixels outside the person.
         let least = if matches!(placement, Placement::Demo { .. }) { 1 } else { u8::MAX.div_ceil(2) };
-        // The demo has no such step.
-        let specks = if matches!(placement, Placement::Training { .. }) {
-            specks::remove(&mut mask, least)
-        } else {
-            0
+        // The demo has no such steps.
+        let (specks, rim) = match placement {
+            Placement::Training { .. } => (specks::remove(&mut mask, least), rim::clean(&mut rgb, &mut mask)),
+            _ => (0, 0),
         };
         let person = Rect::around(&mask, least).ok_or_else(|| nobody(mask_path, placement))?;
         if is_single_colour(&rgb, &mask) {
@@ -154,6 +154,9 @@ impl<'a> Cutout<'a> {
         );
         if specks > 0 {
             source += &format!(", {specks} specks of the mask left out");
+        }
+        if rim > 0 {
+            source += &format!(", {rim} pixels of the mask's rim left out: they show the background");
         }
         Ok(Self { path, mask_path, rgb, mask, person, source })
     }

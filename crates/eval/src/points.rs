@@ -58,9 +58,59 @@ pub fn point_errors(pairs: &[Pair]) -> Vec<PointError> {
     pairs.iter().filter_map(error).collect()
 }
 
+/// Mean angle in degrees between the normals of predicted and true points, whose rows have `side` pixels. A normal is that of the
+/// triangle of a pixel and its neighbours on the right and below. `None` without a triangle of one true surface.
+pub fn normal_error(pair: &Pair, side: usize) -> Option<f64> {
+    /// Largest side in metres of a triangle of one surface.
+    const WHOLE: f64 = 0.04;
+    let (points, truth) = (pair.points.as_chunks().0, pair.truth.as_chunks().0);
+    let is_valid = |i: usize| pair.valid.get(i).is_some_and(|valid| *valid > 0.5);
+    let (mut sum, mut count) = (0.0, 0_u32);
+    for i in (0..points.len()).filter(|i| i % side + 1 < side) {
+        if ![i, i + 1, i + side].into_iter().all(is_valid) {
+            continue;
+        }
+        let sides = |map: &[[f32; 3]]| [i + 1, i + side].map(|to| double(map[to]) - double(map[i]));
+        let ([a, b], [c, d]) = (sides(points), sides(truth));
+        let (predicted, true_normal) = (a.cross(b), c.cross(d));
+        if c.length().max(d.length()) < WHOLE && true_normal.length() > 0.0 && predicted.is_finite() {
+            // The angle of vectors of any length, 90° for a length of 0.
+            let (across, along) = (predicted.cross(true_normal).length(), predicted.dot(true_normal));
+            sum += if predicted.length() > 0.0 { across.atan2(along).to_degrees() } else { 90.0 };
+            count += 1;
+        }
+    }
+    (count > 0).then(|| sum / f64::from(count))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn normals_differ_by_the_angle_between_the_surfaces() {
+        // A wall, and the same wall turned about the vertical by 30°, seen in 4 × 3 pixels of a centimetre.
+        let wall = |slope: f32| -> Vec<f32> {
+            (0..12).flat_map(|i| [0.01 * (i % 4) as f32, 0.01 * (i / 4) as f32, 2.0 + slope * (i % 4) as f32]).collect()
+        };
+        let (flat, turned) = (wall(0.0), wall(0.01 * 30.0_f32.to_radians().tan()));
+        let mut valid = [1.0; 12];
+        let error = |points: &[f32], truth: &[f32], valid: &[f32]| {
+            normal_error(&Pair { view: 0, points, truth, valid }, 4)
+        };
+        assert!(error(&turned, &turned, &valid).is_some_and(|degrees| degrees < 1e-3));
+        assert!(error(&turned, &flat, &valid).is_some_and(|degrees| (degrees - 30.0).abs() < 1e-3));
+        // A point that is not finite spoils its own triangles alone.
+        let mut spoiled = turned.clone();
+        spoiled[0] = f32::NAN;
+        assert!(error(&spoiled, &flat, &valid).is_some_and(|degrees| (degrees - 30.0).abs() < 1e-3));
+        assert!(error(&[0.5; 36], &flat, &valid).is_some_and(|degrees| (degrees - 90.0).abs() < 1e-6));
+        // Triangles need three valid points on one surface.
+        valid[5] = 0.0;
+        assert_eq!(error(&turned, &flat, &valid).map(|degrees| degrees.round()), Some(30.0));
+        assert_eq!(error(&turned, &flat, &[0.0; 12]), None);
+        assert_eq!(error(&flat, &wall(0.05), &[1.0; 12]), None);
+    }
 
     #[test]
     fn errors_are_mean_distances_with_and_without_the_common_shift() {

@@ -273,6 +273,7 @@ pub fn placed(config: &Config, gaussians: Gaussians, camera_to_world: &RigidTran
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::weights::random_regressors;
 
     /// A wall at two metres, half of which is a metre closer. The pixels along the step lie between both.
     #[test]
@@ -291,6 +292,37 @@ mod tests {
             let kept = |i: usize| i != 3 && !(step && i > 7 && matches!(i % side, 3 | 4));
             assert_eq!(valid, (0..64).map(kept).collect::<Vec<_>>());
             assert_eq!(lost, if step { 14 } else { 0 });
+        }
+    }
+
+    /// The first limit of `regressor.color_limits` is the photographs', the second that of all surfaces of the sides.
+    #[test]
+    fn colours_of_photographs_and_sides_have_their_own_limits() {
+        let (side, device) = (16, Device::flex());
+        let mut config = Config::default();
+        config.network.resolution = side;
+        config.regressor.start = Some(RegressorStart::Geometric);
+        config.regressor.color_limits = Some([0.03, 0.2]);
+        // The published start has no layer of zeros.
+        let mut published = config.clone();
+        (published.regressor.start, published.regressor.color_limits) = (None, None);
+        let network = &random_regressors(&published, 5, &device)[0];
+        let value = |i: usize| (i * 37 % 101) as f32 / 101.0;
+        let image: Vec<f32> = (0..3 * side * side).map(|i| 0.8 * value(i) - 0.4).collect();
+        let points: Vec<f32> =
+            (0..side * side).flat_map(|i| [(i % side) as f32, (i / side) as f32, 300.0 + value(i)]).collect();
+        let points = Tensor::from_data(TensorData::new(points, [1, side, side, 3]), &device) * 0.007;
+        let valid = vec![true; side * side];
+        for (pair, limit) in [(0, 0.03), (1, 0.2), (2, 0.2)] {
+            let view = || Seen { image: &image, points: points.clone(), valid: &valid };
+            let parts = regress(network, &config, pair, &[view(), view()], &Window::whole(side));
+            let (gaussians, _) = assemble(&config, parts, &device);
+            let colors = host(gaussians.colors);
+            let worst = colors.chunks_exact(3).enumerate().fold(0.0_f32, |worst, (i, color)| {
+                let own = pixel(&image, side * side, i % (side * side)).map(|c| 0.5 * c + 0.5);
+                (0..3).fold(worst, |worst, c| worst.max((color[c] - own[c]).abs()))
+            });
+            assert!(worst <= limit + 1e-6 && worst > 0.9 * limit, "pair {pair}: {worst}");
         }
     }
 

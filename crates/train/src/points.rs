@@ -7,8 +7,13 @@ use snapsnap_net::config::{Config, NetworkConfig};
 use snapsnap_net::network::{Input, PointMap, PointPredictor, View};
 use snapsnap_ops::host;
 
+use crate::config::Stage1Config;
+use crate::task::Part;
+
 /// Least square of a distance with a gradient. The direction of a smaller error is noise.
 const MIN_SQUARE: f64 = 1e-24;
+/// Distances in pixels between which the relief is compared.
+const SPACINGS: [usize; 4] = [1, 2, 4, 8];
 /// Lower limit of probabilities: the smallest normal f32. (PyTorch's binary cross-entropy has e⁻¹⁰⁰.) Smaller
 /// probabilities have no gradient, since the gradient of log 0 is not finite.
 const MIN_PROBABILITY: f64 = 1.2e-38;
@@ -20,6 +25,22 @@ pub struct Losses {
     pub regression: Tensor<1>,
     /// Mean binary cross-entropy of the confidences per view, summed: `[1]`.
     pub confidence: Tensor<1>,
+    /// Mean error in metres of the differences between pixels that are 1, 2, 4 and 8 apart, per view, summed: `[1]`; if it
+    /// was asked for.
+    pub relief: Option<Tensor<1>>,
+}
+
+impl Losses {
+    /// The losses with their weights.
+    pub fn parts(self, config: &Stage1Config) -> Vec<Part> {
+        let Stage1Config { confidence_weight, relief_weight } = *config;
+        let mut parts = vec![
+            Part { name: "points", weight: 1.0, value: self.regression },
+            Part { name: "confidence", weight: confidence_weight, value: self.confidence },
+        ];
+        parts.extend(self.relief.map(|value| Part { name: "relief", weight: relief_weight, value }));
+        parts
+    }
 }
 
 /// Point maps of all views on the predictor's window of the canvas.
@@ -78,12 +99,13 @@ pub fn predict(
 
 /// The losses of predicted maps of the first V views. `points` `[B,V,S,S,3]` are the true points in metres in the front
 /// camera's frame, and `valid` `[B,V,S,S]`, 0 or 1, marks the pixels that have one. Confidences must be probabilities. The means are over
-/// the pixels of all samples.
-pub fn losses(prediction: &Prediction, points: &Tensor<5>, valid: &Tensor<4>) -> Losses {
+/// the pixels of all samples. `relief` asks for that loss.
+pub fn losses(prediction: &Prediction, points: &Tensor<5>, valid: &Tensor<4>, relief: bool) -> Losses {
     let Prediction { window, maps } = prediction;
     let (b, h, w) = (points.dims()[0], window.rows.len(), window.columns.len());
     let mut regression = Vec::new();
     let mut confidence = Vec::new();
+    let mut reliefs = Vec::new();
     for (view, map) in maps.iter().filter(|(view, _)| (*view as usize) < points.dims()[1]) {
         let row = *view as usize;
         let inside = window.cut(valid.clone().narrow(1, row, 1)).reshape([b, h, w]);
@@ -93,9 +115,10 @@ pub fn losses(prediction: &Prediction, points: &Tensor<5>, valid: &Tensor<4>) ->
         // Invalid points may be 10⁸ metres or NaN. They must not reach the gradient.
         let nowhere = there.clone().bool_not().unsqueeze_dim::<4>(3).expand([b, h, w, 3]);
         let off = (map.points.clone() - truth).mask_fill(nowhere, 0.0);
-        let distance = off.square().sum_dim(3).clamp_min(MIN_SQUARE).sqrt().reshape([b, h, w]);
-        let count = inside.clone().sum().clamp_min(1.0);
-        regression.push((distance * inside.clone()).sum() / count);
+        if relief {
+            reliefs.push(relief_error(&off, &inside));
+        }
+        regression.push(mean_length(off, inside.clone()));
 
         let log = |p: Tensor<3>| p.clamp_min(MIN_PROBABILITY).log();
         let (sure, unsure) = (log(map.conf.clone()), log(1.0 - map.conf.clone()));
@@ -104,5 +127,30 @@ pub fn losses(prediction: &Prediction, points: &Tensor<5>, valid: &Tensor<4>) ->
         confidence.push(-entropy.mean());
     }
     let sum = |parts: Vec<Tensor<1>>| Tensor::cat(parts, 0).sum();
-    Losses { regression: sum(regression), confidence: sum(confidence) }
+    Losses {
+        regression: sum(regression),
+        confidence: sum(confidence),
+        relief: relief.then(|| sum(reliefs)),
+    }
+}
+
+/// Mean length of vectors `[B,h,w,3]` where `weight` `[B,h,w]` is 1; 0 if it is 1 nowhere.
+fn mean_length(vectors: Tensor<4>, weight: Tensor<3>) -> Tensor<1> {
+    let length = vectors.square().sum_dim(3).clamp_min(MIN_SQUARE).sqrt().squeeze_dim::<3>(3);
+    (length * weight.clone()).sum() / weight.sum().clamp_min(1.0)
+}
+
+/// Mean error of differences between pixels: of the differences of errors `off` `[B,h,w,3]` between two pixels that are `inside`
+/// `[B,h,w]`, [`SPACINGS`] apart in a row or a column, each spacing and direction alike.
+fn relief_error(off: &Tensor<4>, inside: &Tensor<3>) -> Tensor<1> {
+    let mut errors = Vec::new();
+    for spacing in SPACINGS {
+        for axis in [1, 2] {
+            let Some(rest) = off.dims()[axis].checked_sub(spacing).filter(|rest| *rest > 0) else { continue };
+            let between = off.clone().narrow(axis, spacing, rest) - off.clone().narrow(axis, 0, rest);
+            let both = inside.clone().narrow(axis, spacing, rest) * inside.clone().narrow(axis, 0, rest);
+            errors.push(mean_length(between, both));
+        }
+    }
+    Tensor::cat(errors, 0).mean()
 }

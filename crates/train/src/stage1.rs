@@ -14,12 +14,12 @@ use snapsnap_net::network::{PointMap, View};
 use snapsnap_ops::host;
 
 use crate::TrainError;
-use crate::config::TrainConfig;
+use crate::config::{Stage1Config, TrainConfig};
 use crate::data::Data;
 use crate::networks::Networks;
 use crate::points::{Prediction, losses, predict};
 use crate::task::{Moment, Part, Task, Validation};
-use snapsnap_eval::points::{Pair, point_errors};
+use snapsnap_eval::points::{Pair, normal_error, point_errors};
 use snapsnap_eval::preview::{grid, heat, picture};
 
 /// Samples of a preview.
@@ -33,8 +33,7 @@ type Map = (usize, Vec<f32>, Vec<f32>);
 /// The training of the point predictor.
 pub struct PointTask {
     networks: Config,
-    /// λ.
-    confidence: f64,
+    losses: Stage1Config,
     data: Data<Stage1Item>,
     /// Training devices, with gradients.
     devices: Vec<Device>,
@@ -58,7 +57,7 @@ impl PointTask {
         }
         Ok(Self {
             networks: config.networks(),
-            confidence: config.stage1.confidence_weight,
+            losses: config.stage1.clone(),
             data: Data::new(folders, config, &config.samples(), Stage1::new)?,
             devices: devices.to_vec(),
         })
@@ -97,11 +96,9 @@ impl Task for PointTask {
         at: Moment,
     ) -> Result<Vec<Part>, TrainError> {
         let batch = Stage1Batcher.batch(items, &self.devices[at.device_index]);
-        let losses = losses(&self.predict(networks, &batch), &batch.points, &batch.valid);
-        Ok(vec![
-            Part { name: "points", weight: 1.0, value: losses.regression },
-            Part { name: "confidence", weight: self.confidence, value: losses.confidence },
-        ])
+        let prediction = self.predict(networks, &batch);
+        let relief = self.losses.relief_weight > 0.0;
+        Ok(losses(&prediction, &batch.points, &batch.valid, relief).parts(&self.losses))
     }
 
     fn validate(&self, networks: &Networks) -> Result<Option<Validation>, TrainError> {
@@ -162,6 +159,8 @@ fn place_color(p: Vec3) -> [f32; 3] {
 struct Errors {
     /// Per view: number of people, mean distances in metres, and mean distances without each person's mean shift.
     views: [[f64; 3]; 6],
+    /// Number of maps of photographs with normals, and their mean errors in degrees.
+    normals: [f64; 2],
     /// Numbers of side pixels in the intersection and in the union of prediction and ground truth.
     overlap: [f64; 2],
 }
@@ -179,6 +178,9 @@ impl Errors {
         for error in point_errors(&pairs) {
             let sums = &mut self.views[error.view];
             [1.0, error.mean, error.centred].iter().zip(sums).for_each(|(v, sum)| *sum += v);
+        }
+        for degrees in pairs.iter().take(2).filter_map(|pair| normal_error(pair, item.side)) {
+            [1.0, degrees].iter().zip(&mut self.normals).for_each(|(v, sum)| *sum += v);
         }
         for (view, _, conf) in maps.iter().filter(|(view, ..)| (2..4).contains(view)) {
             for (conf, valid) in conf.iter().zip(&item.valid[*view * area..]) {
@@ -209,6 +211,9 @@ impl Errors {
                     count += 1.0;
                 }
             }
+        }
+        if self.normals[0] > 0.0 {
+            figures.push(("normals_degrees", self.normals[1] / self.normals[0]));
         }
         if self.overlap[1] > 0.0 {
             figures.push(("sides_iou", self.overlap[0] / self.overlap[1]));

@@ -281,8 +281,8 @@ fn gradients_of_the_losses_are_finite_differences() {
             let PointMap { points, conf } = activate(raw, &config.network);
             let window = Window { rows: 0..h, columns: 0..w };
             let prediction = Prediction { window, maps: vec![(View::Front, PointMap { points, conf })] };
-            let losses = losses(&prediction, &truth, &valid);
-            losses.regression + losses.confidence * 0.5
+            let losses = losses(&prediction, &truth, &valid, true);
+            losses.regression + losses.confidence * 0.5 + losses.relief.expect("was asked for")
         };
         check(&format!("stage 1, {name}"), &random(&[2, 4, h, w], -1.5..1.5, 3), [2, 4, h, w], stage1);
     }

@@ -109,6 +109,7 @@ fn follow(steps: usize) {
             &prediction,
             &truth.reshape([1, 4, side, side, 3]),
             &masks.reshape([1, 4, side, side]),
+            false,
         );
         let got = [losses.regression.clone(), losses.confidence.clone()];
         let [r, c] = got.map(|loss| f64::from(loss.into_scalar::<f32>()));

@@ -3,7 +3,7 @@
 use glam::DVec2;
 use image::{GenericImageView, GrayImage, RgbImage, imageops};
 
-use super::{Canvas, REFERENCE_SIDE, Rect, THRESHOLD, planes, unit};
+use super::{Canvas, REFERENCE_SIDE, Rect, THRESHOLD, planes, rim, unit};
 use crate::resize::lanczos3;
 
 /// Middle row of a training subject on a canvas of 1024. The subject covers rows 124.39 to 862.52
@@ -93,9 +93,13 @@ fn median_column(mask: &GrayImage, person: Rect) -> u32 {
 /// Places photographs on canvases of `side` pixels as [`super::Placement::Training`] does, two photographs from one
 /// place together; `None` if a mask is empty.
 pub fn place(photographs: &[(RgbImage, GrayImage)], height: usize, side: usize) -> Option<Vec<Canvas>> {
+    let mut photographs = photographs.to_vec();
+    photographs.iter_mut().for_each(|(rgb, mask)| {
+        rim::clean(rgb, mask);
+    });
     let people = photographs.iter().map(|(_, mask)| Rect::around(mask, u8::MAX.div_ceil(2)));
     let people: Vec<Rect> = people.collect::<Option<_>>()?;
-    let common = match (photographs, people.as_slice()) {
+    let common = match (&*photographs, people.as_slice()) {
         ([(_, front), (_, back)], [a, b]) => together([front, back], [*a, *b]),
         _ => None,
     };

@@ -22,6 +22,8 @@ pub struct Handling {
     pub place: usize,
     /// Difference of exposure, in stops, between the first photograph and the others. Each is changed by half of it.
     pub exposure: f32,
+    /// Colour of the background from 0 to 1, black if unset. It shows through masks that are too large.
+    pub background: Option<[f32; 3]>,
     /// Error of the masks in pixels of 1024: above 0 they are too large, below 0 too small.
     pub mask: f32,
     /// Share of the person's width that the frame cuts off, on the left of the first photograph and on the right of the
@@ -37,11 +39,13 @@ impl Handling {
         if self.place != 0 && !(16..=1024).contains(&self.place) {
             return Some(("place", format!("is {}, must be 0 or 16 to 1024", self.place)));
         }
+        let background = self.background.unwrap_or_default().map(|value| ("background", value, 0.0..=1.0));
         outside([
             ("exposure", self.exposure, -4.0..=4.0),
             ("mask", self.mask, -64.0..=64.0),
             ("cut", self.cut, 0.0..=0.9),
         ])
+        .or_else(|| outside(background))
     }
 
     /// The changed photograph number `place` of a person, and its mask.
@@ -57,6 +61,13 @@ impl Handling {
         if self.exposure != 0.0 {
             let gain = (if place == 0 { 0.5 } else { -0.5 } * self.exposure).exp2();
             color.iter_mut().for_each(|v| *v = (f32::from(*v) * gain).round().min(255.0) as u8);
+        }
+        if let Some(background) = self.background {
+            for (pixel, share) in color.pixels_mut().zip(mask.pixels()) {
+                let share = f32::from(share.0[0]) / 255.0;
+                let mixed = |c: usize| share * f32::from(pixel.0[c]) + (1.0 - share) * 255.0 * background[c];
+                pixel.0 = [0, 1, 2].map(|c| mixed(c).round() as u8);
+            }
         }
         let reach = self.mask * mask.width() as f32 / REFERENCE_SIDE;
         if reach != 0.0 {

@@ -118,8 +118,9 @@ fn point_loss(count: usize, device: &Device) -> Found {
     let prediction = Prediction { window: Window::whole(SIDE), maps: vec![(View::Front, map)] };
     let truth = Tensor::<5>::from_data(TensorData::new(truth, [1, 1, SIDE, SIDE, 3]), &device);
     let valid = Tensor::<4>::from_data(TensorData::new(valid, [1, 1, SIDE, SIDE]), &device);
-    let loss = losses(&prediction, &truth, &valid);
-    let gradient = host(predicted.grad(&loss.regression.clone().backward()).expect("tracked"));
+    let loss = losses(&prediction, &truth, &valid, true);
+    let both = loss.regression.clone() + loss.relief.expect("was asked for");
+    let gradient = host(predicted.grad(&both.backward()).expect("tracked"));
     let got = host(loss.regression)[0];
     let expected = if count > 0 { (0.4_f64 * 0.4 + 0.3 * 0.3 + 0.5 * 0.5).sqrt() } else { 0.0 };
     Found { value: Some((f64::from(got) - expected).abs()), ..Found::default() }

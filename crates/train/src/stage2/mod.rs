@@ -23,7 +23,7 @@ use snapsnap_ops::host;
 use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
 
 use crate::TrainError;
-use crate::config::{LpipsConfig, Stage2Config, TrainConfig};
+use crate::config::{LpipsConfig, Stage1Config, Stage2Config, TrainConfig};
 use crate::data::Data;
 use crate::networks::Networks;
 use crate::photometric::Photometric;
@@ -45,8 +45,8 @@ const WORST: f32 = 0.5;
 pub struct GaussianTask {
     config: Config,
     loss_config: Stage2Config,
-    /// λ of the point loss.
-    confidence: f64,
+    /// Weights of the point loss.
+    stage1: Stage1Config,
     seed: u64,
     /// The predictor, unless it is trained as well.
     frozen: Option<Frozen>,
@@ -88,7 +88,7 @@ impl GaussianTask {
         Ok(Self {
             config: config.networks(),
             loss_config: config.stage2.clone(),
-            confidence: config.stage1.confidence_weight,
+            stage1: config.stage1.clone(),
             seed: config.training.seed,
             frozen: predictor.map(|predictor| Frozen::new(config, predictor, devices)),
             lpips,
@@ -233,9 +233,10 @@ impl Task for GaussianTask {
                 let (side, points, valid) = (item.side, item.points.clone(), item.valid.clone());
                 let points = Tensor::from_data(TensorData::new(points, [1, 4, side, side, 3]), device);
                 let valid = Tensor::from_data(TensorData::new(valid, [1, 4, side, side]), device);
-                let of_points = points_losses(&prediction, &points, &valid);
-                let value = of_points.regression + of_points.confidence * self.confidence;
-                add("points", config.points_weight, value);
+                let relief = self.stage1.relief_weight > 0.0;
+                let parts = points_losses(&prediction, &points, &valid, relief).parts(&self.stage1);
+                let value = parts.into_iter().map(|part| part.value * part.weight);
+                add("points", config.points_weight, value.reduce(|a, b| a + b).expect("two parts"));
             }
             let made = gaussians(&self.config, networks, item, prediction, &phase, noise, device);
             // A sample without a valid pixel counts in the points' loss alone; each part is a mean over the samples that have it.

@@ -82,6 +82,31 @@ fn samples_carry_the_flank_behind_an_arm() {
     }
 }
 
+/// Second surfaces follow the four views in batches, sample by sample.
+#[test]
+fn batches_have_second_surfaces_after_the_views() {
+    let mut config = DataConfig::default();
+    (config.views.count, config.views.resolution) = (4, 64);
+    config.views.second_depth = true;
+    let (_temporary, folder) = made(&config, &armed(), 1);
+    let samples = SampleConfig { second_depth: true, ..SampleConfig::default() };
+    let mut items: Vec<_> =
+        (0..8).map(|i| stage1(&folder, samples.clone()).sample(i).expect("reads")).collect();
+    items.dedup_by(|a, b| a.second_points == b.second_points);
+    items.truncate(2);
+    let batch = Stage1Batcher.batch(items.clone(), &Device::flex());
+    assert_eq!((batch.points.dims(), batch.valid.dims()), ([2, 6, 64, 64, 3], [2, 6, 64, 64]));
+    for (sample, item) in items.iter().enumerate() {
+        for view in 0..6 {
+            let points: Vec<f32> =
+                batch.points.clone().slice([sample..sample + 1, view..view + 1]).into_data().try_into_vec().expect("f32");
+            let valid: Vec<f32> =
+                batch.valid.clone().slice([sample..sample + 1, view..view + 1]).into_data().try_into_vec().expect("f32");
+            assert!(item.truth(view) == Some((&points, &valid)), "sample {sample}, view {view}");
+        }
+    }
+}
+
 #[test]
 fn second_surfaces_need_data_that_has_them() {
     let (_temporary, folder) = data_set(&block(), Layout::Exact, 16, 4, false, 1);

@@ -1,0 +1,360 @@
+//! The rim of a mask that is too large: pixels of the background's colour leave the mask, and pixels that mix person and background
+//! receive the person's colour (docs/method.md, "Rims").
+
+use glam::Vec3;
+use image::{GrayImage, Rgb, RgbImage};
+
+use super::Rect;
+
+/// Width of the rim in pixels for a person of [`HEIGHT`] pixels, and its limit in pixels of the photograph. Masks that are too large
+/// by two thirds of it are corrected.
+const REACH: u32 = 6;
+const HEIGHT: u32 = 739;
+const MAX_REACH: u32 = 64;
+/// Least distance of the colours of person and background at which they are told apart. Channels are 0 to 1.
+const DISTINCT: f32 = 0.12;
+/// Largest distance of a mixed colour from the line between both, as a share of its length, and in addition to it.
+const OFF_LINE: (f32, f32) = (0.35, 0.03);
+/// Shares of the background in a pixel: up to the first, the pixel is the person's; from the second on, it is the background's.
+const MIXED: (f32, f32) = (0.1, 0.9);
+/// A mask is too large if so much of its outline has more of the background than of the person. Only places with [`DISTINCT`]
+/// colours count; they must be the second share of the outline or more.
+const SHOWN: (f32, f32) = (0.4, 0.1);
+/// An outline has one colour if this share of it is this close to its median. It is the background's if no more than the last
+/// share of the person behind the outline has it as well.
+const UNIFORM: (f32, f32, f32) = (0.6, 0.08, 0.3);
+/// Mask value from which a pixel is the person's.
+const INSIDE: u8 = 128;
+
+/// Takes the background out of the rim of `mask` and of the colours there. Returns the number of pixels that left the mask.
+pub(super) fn clean(rgb: &mut RgbImage, mask: &mut GrayImage) -> usize {
+    let Some(person) = Rect::around(mask, INSIDE) else { return 0 };
+    let reach = (REACH * person.height).div_ceil(HEIGHT).clamp(1, MAX_REACH);
+    let rim = Rim::new(mask, person, reach as i8);
+    let colors = Colors::new(&rim, rgb);
+    let shares = colors.shares(&rim, &colors.outside).or_else(|| {
+        let uniform = vec![colors.uniform(&rim)?; colors.own.len()];
+        colors.shares(&rim, &uniform)
+    });
+    let Some(shares) = shares else { return 0 };
+    let mut lost = 0;
+    for (i, share) in shares.into_iter().enumerate().filter(|(_, share)| *share > MIXED.0) {
+        let (x, y) = rim.place(rim.pixels[i]);
+        let value = &mut mask.get_pixel_mut(x, y).0[0];
+        *value = if share < MIXED.1 { (f32::from(*value) * (1.0 - share)).round() as u8 } else { 0 };
+        lost += usize::from(*value < INSIDE);
+        rgb.put_pixel(x, y, Rgb((255.0 * colors.inside[i]).to_array().map(|c| c.round() as u8)));
+    }
+    // Soft pixels beyond those that left are the background's as well.
+    for &pixel in &rim.beyond {
+        let (x, y) = rim.place(pixel);
+        let level = rim.levels[pixel];
+        let inner = |to: &usize| rim.levels[*to] == if level == -1 { 1 } else { level + 1 };
+        let is_out = |to: usize| {
+            let (x, y) = rim.place(to);
+            mask.get_pixel(x, y).0[0] < INSIDE / 2
+        };
+        if mask.get_pixel(x, y).0[0] > 0 && rim.neighbours(pixel).filter(inner).all(is_out) {
+            mask.get_pixel_mut(x, y).0[0] = 0;
+        }
+    }
+    lost
+}
+
+/// Pixels near the outline of a mask, in a part of the picture.
+struct Rim {
+    part: Rect,
+    /// For each pixel of the part: 1 and more inside, counted from the outline; −1 and less outside; 0 farther from it.
+    levels: Vec<i8>,
+    /// Pixels inside, level by level.
+    pixels: Vec<usize>,
+    /// Pixels outside, level by level.
+    beyond: Vec<usize>,
+}
+
+impl Rim {
+    fn new(mask: &GrayImage, person: Rect, reach: i8) -> Self {
+        let whole = Rect { x: 0, y: 0, width: mask.width(), height: mask.height() };
+        let part = whole.clipped_around(person, [reach as u32 + 1; 2]);
+        let is_inside: Vec<bool> = (part.y..part.y + part.height)
+            .flat_map(|y| (part.x..part.x + part.width).map(move |x| (x, y)))
+            .map(|(x, y)| mask.get_pixel(x, y).0[0] >= INSIDE)
+            .collect();
+        let mut rim = Self { part, levels: vec![0; is_inside.len()], pixels: Vec::new(), beyond: Vec::new() };
+        for inside in [true, false] {
+            let sign = if inside { 1 } else { -1 };
+            let outline = |&at: &usize| {
+                is_inside[at] == inside && rim.direct(at).any(|to| is_inside[to] != inside)
+            };
+            let mut last: Vec<usize> = (0..is_inside.len()).filter(outline).collect();
+            let mut all = Vec::new();
+            for level in 1..=reach {
+                last.iter().for_each(|at| rim.levels[*at] = sign * level);
+                // Steps to four and to eight neighbours in turn come close to a circle.
+                let mut next: Vec<usize> = match level % 2 {
+                    0 => last.iter().flat_map(|at| rim.neighbours(*at)).collect(),
+                    _ => last.iter().flat_map(|at| rim.direct(*at)).collect(),
+                };
+                next.retain(|at| is_inside[*at] == inside && rim.levels[*at] == 0);
+                next.sort_unstable();
+                next.dedup();
+                all.append(&mut last);
+                last = next;
+            }
+            *if inside { &mut rim.pixels } else { &mut rim.beyond } = all;
+        }
+        rim
+    }
+
+    /// The place in the picture.
+    fn place(&self, at: usize) -> (u32, u32) {
+        let at = at as u32;
+        (self.part.x + at % self.part.width, self.part.y + at / self.part.width)
+    }
+
+    /// The neighbours inside of the part.
+    fn neighbours(&self, at: usize) -> impl Iterator<Item = usize> + use<> {
+        let (width, height) = (self.part.width as usize, self.part.height as usize);
+        let (x, y) = (at % width, at / width);
+        let rows = y.saturating_sub(1)..(y + 2).min(height);
+        rows.flat_map(move |row| (x.saturating_sub(1)..(x + 2).min(width)).map(move |column| row * width + column))
+            .filter(move |to| *to != at)
+    }
+
+    /// Those of them that share a side.
+    fn direct(&self, at: usize) -> impl Iterator<Item = usize> + use<> {
+        let width = self.part.width as usize;
+        self.neighbours(at).filter(move |to| to.abs_diff(at) == width || to.abs_diff(at) == 1)
+    }
+}
+
+/// Colours at the pixels of a rim, channels 0 to 1.
+struct Colors {
+    /// For each pixel of the part, its index among the rim's; `u32::MAX` for others.
+    index: Vec<u32>,
+    own: Vec<Vec3>,
+    /// Of the person behind the rim.
+    inside: Vec<Vec3>,
+    /// Of the picture beyond the rim.
+    outside: Vec<Vec3>,
+}
+
+impl Colors {
+    fn new(rim: &Rim, rgb: &RgbImage) -> Self {
+        let color = |at: usize| {
+            let (x, y) = rim.place(at);
+            Vec3::from(rgb.get_pixel(x, y).0.map(f32::from)) / 255.0
+        };
+        let mut index = vec![u32::MAX; rim.levels.len()];
+        for pixels in [&rim.pixels, &rim.beyond] {
+            pixels.iter().enumerate().for_each(|(i, at)| index[*at] = i as u32);
+        }
+        let own: Vec<Vec3> = rim.pixels.iter().map(|at| color(*at)).collect();
+        // The person's colour comes outwards from behind the rim, the background's inwards from beyond it.
+        let deepest = rim.pixels.last().map_or(0, |at| rim.levels[*at]);
+        let mut inside = own.clone();
+        for (i, &at) in rim.pixels.iter().enumerate().rev() {
+            let level = rim.levels[at];
+            let of = |to: usize| match rim.levels[to] {
+                0 if level == deepest => Some(color(to)),
+                deeper if deeper == level + 1 => Some(inside[index[to] as usize]),
+                _ => None,
+            };
+            inside[i] = mean(rim.neighbours(at).filter_map(of)).unwrap_or(own[i]);
+        }
+        let mut beyond: Vec<Vec3> = rim.beyond.iter().map(|at| color(*at)).collect();
+        for (i, &at) in rim.beyond.iter().enumerate().rev() {
+            let farther = rim.neighbours(at).filter(|to| rim.levels[*to] == rim.levels[at] - 1);
+            if let Some(color) = mean(farther.map(|to| beyond[index[to] as usize])) {
+                beyond[i] = color;
+            }
+        }
+        let mut outside = own.clone();
+        for (i, &at) in rim.pixels.iter().enumerate() {
+            let before = if rim.levels[at] == 1 { -1 } else { rim.levels[at] - 1 };
+            let of = |to: usize| {
+                let from = if before < 0 { &beyond } else { &outside };
+                (rim.levels[to] == before).then(|| from[index[to] as usize])
+            };
+            outside[i] = mean(rim.neighbours(at).filter_map(of)).unwrap_or(own[i]);
+        }
+        Self { index, own, inside, outside }
+    }
+
+    /// The outline's colour, if it has but one and the person behind it has others.
+    fn uniform(&self, rim: &Rim) -> Option<Vec3> {
+        let outline = rim.pixels.iter().take_while(|at| rim.levels[**at] == 1).count();
+        let median = |channel: usize| {
+            let mut values: Vec<f32> = self.own[..outline].iter().map(|color| color[channel]).collect();
+            values.sort_unstable_by(f32::total_cmp);
+            values.get(outline / 2).copied()
+        };
+        let color = Vec3::new(median(0)?, median(1)?, median(2)?);
+        let share = |colors: &[Vec3]| {
+            colors[..outline].iter().filter(|c| c.distance(color) < UNIFORM.1).count() as f32 / outline as f32
+        };
+        (share(&self.own) >= UNIFORM.0 && share(&self.inside) <= UNIFORM.2).then_some(color)
+    }
+
+    /// The share of the `background` in each pixel of the rim; 0 where nothing but person lies between it and the outline.
+    /// `None` if the mask is not too large.
+    fn shares(&self, rim: &Rim, background: &[Vec3]) -> Option<Vec<f32>> {
+        // Share, and whether colours are distinct.
+        let share = |i: usize| {
+            let (person, line) = (self.inside[i], background[i] - self.inside[i]);
+            let length = line.length();
+            if length < DISTINCT {
+                return (0.0, false);
+            }
+            let share = (self.own[i] - person).dot(line) / line.length_squared();
+            let off = (self.own[i] - person - share * line).length();
+            (if off > OFF_LINE.0 * length + OFF_LINE.1 { 0.0 } else { share.clamp(0.0, 1.0) }, true)
+        };
+        let mut shares = vec![0.0; self.own.len()];
+        let (mut outline, mut distinct, mut shown) = (0, 0, 0);
+        for (i, &at) in rim.pixels.iter().enumerate() {
+            let (share, is_distinct) = share(i);
+            let level = rim.levels[at];
+            if level == 1 {
+                outline += 1;
+                distinct += usize::from(is_distinct);
+                shown += usize::from(share > 0.5);
+            }
+            let is_gone = |to: usize| rim.levels[to] == level - 1 && shares[self.index[to] as usize] > 0.5;
+            if level == 1 || rim.neighbours(at).any(is_gone) {
+                shares[i] = share;
+            }
+        }
+        let is_too_large =
+            shown as f32 >= SHOWN.0 * distinct as f32 && distinct as f32 >= SHOWN.1 * outline as f32;
+        (is_too_large && shown > 0).then_some(shares)
+    }
+}
+
+fn mean(colors: impl Iterator<Item = Vec3>) -> Option<Vec3> {
+    let (sum, count) = colors.fold((Vec3::ZERO, 0.0), |(sum, count), color| (sum + color, count + 1.0));
+    (count > 0.0).then(|| sum / count)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use image::Luma;
+
+    const SIZE: (u32, u32) = (320, 800);
+
+    /// Distance from the outline of an upright ellipse in pixels, above 0 outside.
+    fn outside(x: u32, y: u32) -> f32 {
+        let place = glam::Vec2::new(x as f32, y as f32) - glam::Vec2::new(159.5, 399.5);
+        let radii = glam::Vec2::new(120.0, 370.0);
+        let length = (place / radii).length();
+        // To first order.
+        (length - 1.0) * length / (place / (radii * radii)).length().max(1e-3)
+    }
+
+    fn mask(grown: f32) -> GrayImage {
+        GrayImage::from_fn(SIZE.0, SIZE.1, |x, y| {
+            Luma([(255.0 * (grown + 0.5 - outside(x, y)).clamp(0.0, 1.0)).round() as u8])
+        })
+    }
+
+    /// A person in four colours with a fine pattern.
+    fn person(x: u32, y: u32) -> Vec3 {
+        let color = [[0.8, 0.6, 0.5], [0.2, 0.3, 0.7], [0.7, 0.2, 0.2], [0.25, 0.2, 0.15]][(y / 200) as usize];
+        Vec3::from(color) + 0.05 * ((x * 7 + y * 13) % 5) as f32 - 0.1
+    }
+
+    fn picture(background: impl Fn(u32, u32) -> Vec3) -> RgbImage {
+        let soft = mask(0.0);
+        RgbImage::from_fn(SIZE.0, SIZE.1, |x, y| {
+            let share = f32::from(soft.get_pixel(x, y).0[0]) / 255.0;
+            let color = background(x, y).lerp(person(x, y), share);
+            Rgb((255.0 * color).to_array().map(|c| c.round() as u8))
+        })
+    }
+
+    /// Mean colour error of the outline.
+    fn error(rgb: &RgbImage, mask: &GrayImage) -> f32 {
+        let rim = Rim::new(mask, Rect::around(mask, INSIDE).expect("a person"), 1);
+        let error = |at: &usize| {
+            let (x, y) = rim.place(*at);
+            (Vec3::from(rgb.get_pixel(x, y).0.map(f32::from)) / 255.0).distance(person(x, y))
+        };
+        rim.pixels.iter().map(error).sum::<f32>() / rim.pixels.len() as f32
+    }
+
+    fn area(mask: &GrayImage) -> f32 {
+        mask.pixels().map(|share| f32::from(share.0[0]) / 255.0).sum()
+    }
+
+    type Background = fn(u32, u32) -> Vec3;
+    const BACKGROUNDS: [(&str, Background); 4] = [
+        ("white", |_, _| Vec3::ONE),
+        ("grey", |_, _| Vec3::splat(0.5)),
+        ("black", |_, _| Vec3::ZERO),
+        ("lawn and sky", |x, y| match y < 400 {
+            true => Vec3::new(0.5, 0.7, 0.95) + 0.00015 * x as f32,
+            false => Vec3::new(0.3, 0.6, 0.1) + 0.04 * ((x * 31 + y * 17) % 7) as f32 / 7.0,
+        }),
+    ];
+
+    #[test]
+    fn a_background_that_bleeds_into_the_mask_is_taken_out() {
+        let truth = area(&mask(0.0));
+        for (name, background) in BACKGROUNDS {
+            for grown in [1.0, 2.0, 3.0, 4.0] {
+                let (mut rgb, mut mask) = (picture(background), mask(grown));
+                let (before, too_much) = (error(&rgb, &mask), area(&mask) - truth);
+                let lost = clean(&mut rgb, &mut mask);
+                let (after, left) = (error(&rgb, &mask), area(&mask) - truth);
+                println!("{name}, {grown}: {lost} pixels, {too_much} → {left} too much, error {before} → {after}");
+                assert!(left.abs() < 0.15 * too_much && before > 0.3 && after < 0.12, "{name}, {grown}");
+            }
+        }
+    }
+
+    /// Files of cut-outs often hold nothing where they are transparent.
+    #[test]
+    fn a_stripe_of_one_colour_is_known_without_the_background() {
+        for (name, background) in &BACKGROUNDS[..3] {
+            let (mut rgb, mut grown) = (picture(background), mask(3.0));
+            for (pixel, share) in rgb.pixels_mut().zip(grown.pixels()) {
+                if share.0[0] == 0 {
+                    pixel.0 = [90, 200, 10];
+                }
+            }
+            assert!(clean(&mut rgb, &mut grown) > 500, "{name}");
+            assert!(area(&grown) < 1.02 * area(&mask(0.0)), "{name}");
+        }
+    }
+
+    #[test]
+    fn good_masks_and_small_ones_stay_as_they_are() {
+        let white: Background = |_, _| Vec3::ONE;
+        for (name, background) in BACKGROUNDS.into_iter().chain([("white", white)]) {
+            for grown in [-3.0, -1.0, 0.0] {
+                let (mut rgb, mut mask) = (picture(background), mask(grown));
+                let same = (rgb.clone(), mask.clone());
+                assert_eq!(clean(&mut rgb, &mut mask), 0, "{name}, {grown}");
+                assert!((rgb, mask) == same, "{name}, {grown}");
+            }
+        }
+        // A person in the background's colour.
+        let mut grown = mask(3.0);
+        let mut rgb = RgbImage::from_pixel(SIZE.0, SIZE.1, Rgb([250; 3]));
+        assert_eq!(clean(&mut rgb, &mut grown), 0);
+    }
+
+    #[test]
+    fn extreme_masks_lose_nothing() {
+        let only = |at: Option<(u32, u32)>| {
+            GrayImage::from_fn(9, 300, |x, y| Luma([if at.is_none_or(|at| at == (x, y)) { 255 } else { 0 }]))
+        };
+        for mut mask in [only(None), only(Some((0, 299))), GrayImage::new(9, 300), GrayImage::new(1, 1)] {
+            let same = mask.clone();
+            let mut rgb = RgbImage::from_fn(mask.width(), mask.height(), |x, y| Rgb([x as u8, y as u8, 7]));
+            assert_eq!(clean(&mut rgb, &mut mask), 0);
+            assert_eq!(mask, same);
+        }
+    }
+}
