@@ -2,6 +2,8 @@
 
     python docs/colors_pytorch.py people/makers --size 128 --minutes 4
 
+Minutes are those of the processor, all threads together.
+
 The folder holds `prepare`'s data sets synth, makehuman and avatars (configs/default/makers.sh makes them). Each front and back photograph
 is a sample by itself. The network predicts its depth beside the upright plane through the body's axis. Its input is the outline with the
 pixel's place, and:
@@ -76,7 +78,7 @@ def load(folder, split, size, views):
 class Net(torch.nn.Module):
     """A U-shaped network of five levels."""
 
-    def __init__(self, planes, widths=(16, 32, 64, 96, 128)):
+    def __init__(self, planes, widths=(8, 16, 32, 64, 96)):
         super().__init__()
         block = lambda a, b: torch.nn.Sequential(
             torch.nn.Conv2d(a, b, 3, padding=1), torch.nn.GroupNorm(8, b), torch.nn.GELU(),

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Leave one maker out (docs/notes/data.md): bash configs/default/makers.sh MAKEHUMAN_DATA AVATARS, in the repository's root. It trains
+# Leave one maker out (docs/notes/people.md): bash configs/default/makers.sh MAKEHUMAN_DATA AVATARS, in the repository's root. It trains
 # stage 1 on people of all three makers, and without each of them, and judges each network on held-out people of every maker.
 # ROWS="all no-synth" trains these rows only. An interrupted run continues when it is started again.
 set -eu

@@ -76,17 +76,25 @@ impl Rim {
     fn new(mask: &GrayImage, person: Rect, reach: i8) -> Self {
         let whole = Rect { x: 0, y: 0, width: mask.width(), height: mask.height() };
         let part = whole.clipped_around(person, [reach as u32 + 1; 2]);
-        let is_inside: Vec<bool> = (part.y..part.y + part.height)
-            .flat_map(|y| (part.x..part.x + part.width).map(move |x| (x, y)))
-            .map(|(x, y)| mask.get_pixel(x, y).0[0] >= INSIDE)
-            .collect();
+        let (width, rows) = (part.width as usize, part.y..part.y + part.height);
+        let row = |y: u32| &mask.as_raw()[(y * mask.width() + part.x) as usize..][..width];
+        let is_inside: Vec<bool> = rows.flat_map(|y| row(y).iter().map(|value| *value >= INSIDE)).collect();
         let mut rim = Self { part, levels: vec![0; is_inside.len()], pixels: Vec::new(), beyond: Vec::new() };
-        for inside in [true, false] {
+        // Pixels beside the outline, first those inside. Every pixel is looked at, so that this takes most of the time.
+        let mut outlines = [Vec::new(), Vec::new()];
+        for (at, inside) in is_inside.iter().enumerate() {
+            let differs = |to: Option<usize>| to.and_then(|to| is_inside.get(to)).is_some_and(|to| to != inside);
+            let column = at % width;
+            if differs((column > 0).then(|| at - 1))
+                || differs((column + 1 < width).then_some(at + 1))
+                || differs(at.checked_sub(width))
+                || differs(Some(at + width))
+            {
+                outlines[usize::from(!inside)].push(at);
+            }
+        }
+        for (inside, mut last) in [true, false].into_iter().zip(outlines) {
             let sign = if inside { 1 } else { -1 };
-            let outline = |&at: &usize| {
-                is_inside[at] == inside && rim.direct(at).any(|to| is_inside[to] != inside)
-            };
-            let mut last: Vec<usize> = (0..is_inside.len()).filter(outline).collect();
             let mut all = Vec::new();
             for level in 1..=reach {
                 last.iter().for_each(|at| rim.levels[*at] = sign * level);

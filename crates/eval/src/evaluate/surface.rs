@@ -6,6 +6,7 @@ use snapsnap_data::sample::Handling;
 use snapsnap_mesh::fuse::{Options, fuse};
 use snapsnap_mesh::mesh::Mesh;
 use snapsnap_mesh::view::{Renderer, ViewOptions};
+use snapsnap_net::dilated;
 use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
 
 use super::at_once;
@@ -21,8 +22,14 @@ const MOST: usize = 60_000;
 const NORMALS: usize = 256;
 /// Seed of the points drawn from a mesh.
 const SEED: u64 = 1;
-/// Directions from which normals are compared, degrees from the first view.
-const DIRECTIONS: [f64; 4] = [0.0, 90.0, 180.0, 270.0];
+/// Directions from which surfaces are compared, degrees from the first view. Normals are compared from the first four.
+const DIRECTIONS: [f64; 8] = [0.0, 90.0, 180.0, 270.0, 45.0, 135.0, 225.0, 315.0];
+/// Least coverage of a pixel that is closed.
+const CLOSED: f32 = 0.9;
+/// Largest distance in metres of a closed pixel's surface behind the true one. The inner side of a person's back lies farther.
+const BEHIND: f32 = 0.06;
+/// Width of a person's rim in pixels that does not count. A slightly wrong outline is no hole.
+const RIM: usize = 3;
 
 /// Distances of a surface from the ground truth.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -31,14 +38,26 @@ pub struct Surface {
     pub chamfer: Chamfer,
     /// Mean cosine of normals from four sides, at pixels with both normals.
     pub normals: Option<f64>,
+    /// Share of the true surface's pixels, from eight sides, that are not covered or show what lies behind; `None` for meshes.
+    pub open: Option<f64>,
+}
+
+/// A view of the truth with at most 256² pixels.
+pub struct TrueView {
+    /// Its camera.
+    pub camera: Camera,
+    /// Metres, 0 where the person is not.
+    pub depth: Vec<f32>,
+    /// Normals, if they are compared.
+    pub normals: Option<Vec<Option<DVec3>>>,
 }
 
 /// Ground truth of a person.
 pub struct Truth {
     /// World frame, metres.
     pub points: Vec<[f32; 3]>,
-    /// Cameras of the views nearest to the four directions, with at most 256² pixels, and their normals.
-    pub views: Vec<(Camera, Vec<Option<DVec3>>)>,
+    /// The views nearest to the eight directions.
+    pub views: Vec<TrueView>,
 }
 
 /// Ground truth of a person from the depth maps.
@@ -54,15 +73,17 @@ pub fn truth(people: &People, row: usize) -> Result<Truth, EvalError> {
         let there: Vec<usize> = (0..valid.len()).filter(|i| valid[*i] > 0.5).collect();
         let in_world = |i| to_world.apply(double(points.as_chunks().0[i])).as_vec3().to_array();
         let kept: Vec<[f32; 3]> = thinned(&there, PER_VIEW).into_iter().map(in_world).collect();
-        let normals = directions.contains(&view).then(|| {
+        let seen = directions.contains(&view).then(|| {
             let stored = camera.width as usize;
             let side = part_of(stored, NORMALS);
             let (points, valid) = means(&points, &valid, stored, side);
             let camera = camera.resized(side as u32, side as u32);
             let depth = |i: usize| if valid[i] > 0.5 { points[3 * i + 2] } else { 0.0 };
-            (camera, normals(&(0..valid.len()).map(depth).collect::<Vec<f32>>(), &camera))
+            let depth: Vec<f32> = (0..valid.len()).map(depth).collect();
+            let normals = directions[..4].contains(&view).then(|| normals(&depth, &camera));
+            TrueView { camera, depth, normals }
         });
-        Ok((kept, normals))
+        Ok((kept, seen))
     };
     let numbered: Vec<(usize, &Camera)> = cameras.iter().enumerate().collect();
     let mut found = Vec::new();
@@ -88,7 +109,8 @@ impl Truth {
         depth: impl Fn(&Camera) -> Result<Vec<f32>, EvalError>,
     ) -> Result<Option<f64>, EvalError> {
         let (mut sum, mut count) = (0.0, 0);
-        for (camera, expected) in &self.views {
+        let with_normals = self.views.iter().filter_map(|view| Some((&view.camera, view.normals.as_ref()?)));
+        for (camera, expected) in with_normals {
             if let Some((cosine, pixels)) = consistency(&normals(&depth(camera)?, camera), expected) {
                 sum += cosine * pixels as f64;
                 count += pixels;
@@ -105,6 +127,28 @@ impl Truth {
         let renderer = Renderer::new(mesh).map_err(|e| EvalError::Empty(e.to_string()))?;
         let options = ViewOptions { samples: 1, ..ViewOptions::default() };
         self.agreement(|camera| Ok(renderer.draw(camera, &options).depth))
+    }
+
+    /// Share of the true surface's pixels that are open in the pictures of `depth` (metres, not divided by coverage) and coverage
+    /// that `drawn` returns. `None` without such a pixel.
+    ///
+    /// # Errors
+    /// Those of `drawn`.
+    pub fn open(
+        &self,
+        drawn: impl Fn(&Camera) -> Result<[Vec<f32>; 2], EvalError>,
+    ) -> Result<Option<f64>, EvalError> {
+        let (mut open, mut count) = (0_u64, 0_u64);
+        for TrueView { camera, depth: truth, .. } in &self.views {
+            let [depth, alpha] = drawn(camera)?;
+            let outside: Vec<bool> = truth.iter().map(|z| *z <= 0.0).collect();
+            let near_outside = dilated(&outside, camera.width as usize, RIM);
+            for i in (0..truth.len()).filter(|i| !near_outside[*i]) {
+                count += 1;
+                open += u64::from(alpha[i] < CLOSED || depth[i] / alpha[i] > truth[i] + BEHIND);
+            }
+        }
+        Ok((count > 0).then(|| open as f64 / count as f64))
     }
 }
 
@@ -126,15 +170,21 @@ impl Surface {
         let there: Vec<[f32; 3]> =
             centres.into_iter().zip(opacities).filter(|(_, o)| *o >= opaque).map(|(p, _)| p).collect();
         let there = thinned(&there, MOST);
-        let depth = |camera: &Camera| {
+        let drawn = |camera: &Camera| {
             let options = RenderOptions { depth: true, ..RenderOptions::inria() };
             let rendered = render(gaussians, std::slice::from_ref(camera), &options)?;
-            let depth = snapsnap_ops::host(rendered.depth.expect("an option"));
-            let alpha = snapsnap_ops::host(rendered.alpha);
+            Ok([rendered.depth.expect("an option"), rendered.alpha].map(snapsnap_ops::host))
+        };
+        let depth = |camera: &Camera| {
+            let [depth, alpha] = drawn(camera)?;
             // Depths are weighted by coverage. A surface has at least half.
             Ok(depth.iter().zip(alpha).map(|(z, a)| if a > 0.5 { z / a } else { 0.0 }).collect())
         };
-        Ok(Self { chamfer: chamfer(&there, &truth.points)?, normals: truth.agreement(depth)? })
+        Ok(Self {
+            chamfer: chamfer(&there, &truth.points)?,
+            normals: truth.agreement(depth)?,
+            open: truth.open(drawn)?,
+        })
     }
 
     /// Distances of the mesh of Gaussians (world frame): of points drawn from it, and of the depths of its triangles.
@@ -145,6 +195,42 @@ impl Surface {
         let fused = fuse(&gaussians.clone().into(), Options::default(), &|_| {});
         let mesh = fused.map_err(|e| EvalError::Empty(e.to_string()))?.into_world();
         let drawn = sampled(&mesh, MOST, SEED)?;
-        Ok(Self { chamfer: chamfer(&drawn, &truth.points)?, normals: truth.agreement_of_mesh(&mesh)? })
+        Ok(Self {
+            chamfer: chamfer(&drawn, &truth.points)?,
+            normals: truth.agreement_of_mesh(&mesh)?,
+            open: None,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A wall of 32 × 40 pixels in the middle of a picture, drawn with a hole, with a part that shows a surface far behind, and with one
+    /// that is thin.
+    #[test]
+    fn open_pixels_are_uncovered_or_show_what_lies_behind() {
+        let side = 64;
+        let camera = Camera::orbit_at_yaw_degrees(0.0, side as u32);
+        let is_wall = |i: usize| (10..42).contains(&(i % side)) && (12..52).contains(&(i / side));
+        let depth: Vec<f32> = (0..side * side).map(|i| if is_wall(i) { 2.0 } else { 0.0 }).collect();
+        let views = vec![TrueView { camera, depth: depth.clone(), normals: None }];
+        let truth = Truth { points: Vec::new(), views };
+        let drawn = |of: &dyn Fn(usize) -> (f32, f32)| {
+            let (depth, alpha): (Vec<f32>, Vec<f32>) = (0..side * side).map(of).unzip();
+            truth.open(|_| Ok([depth.clone(), alpha.clone()])).expect("draws").expect("pixels")
+        };
+        // Without three pixels along every edge.
+        let inner = 26.0 * 34.0;
+        // Depths are weighted by coverage; 5 cm too far is an error, no hole.
+        assert_eq!(drawn(&|i| (0.95 * (depth[i] + 0.05), 0.95)), 0.0);
+        assert_eq!(drawn(&|i| if i % side == 20 { (0.0, 0.0) } else { (2.0, 1.0) }), 34.0 / inner);
+        assert_eq!(drawn(&|i| if i % side < 23 { (0.8 * 2.0, 0.8) } else { (2.0, 1.0) }), 10.0 * 34.0 / inner);
+        assert_eq!(drawn(&|i| if i / side < 20 { (2.2, 1.0) } else { (2.0, 1.0) }), 5.0 * 26.0 / inner);
+        // The rim may be wrong.
+        assert_eq!(drawn(&|i| if i % side < 13 { (0.0, 0.0) } else { (2.0, 1.0) }), 0.0);
+        let nobody = Truth { points: Vec::new(), views: Vec::new() };
+        assert_eq!(nobody.open(|_| Ok([Vec::new(), Vec::new()])).expect("draws"), None);
     }
 }

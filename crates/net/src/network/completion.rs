@@ -178,6 +178,7 @@ mod tests {
     use burn::tensor::TensorData;
 
     use burn::module::Param;
+    use glam::Vec3;
 
     use super::*;
     use crate::config::{Body, Config};
@@ -347,6 +348,7 @@ mod tests {
                 let mut covered = [0; 4];
                 for ((view, map), covered) in maps[2..].iter().zip(&mut covered) {
                     let anchors = host(anchors(*view, SIDE, &window, &Device::flex()));
+                    let (camera, to_side) = nominal(*view, SIDE);
                     for (point, anchor) in of(map).chunks_exact(3).zip(anchors.chunks_exact(3)) {
                         let apart = |p: &[f32]| {
                             (0..3).map(|c| (p[c] - point[c]).powi(2)).sum::<f32>().sqrt()
@@ -355,8 +357,9 @@ mod tests {
                             continue;
                         }
                         let nearest = known.chunks_exact(3).map(apart).fold(f32::INFINITY, f32::min);
-                        // Half the diagonal of a pixel at 2.2 m.
-                        assert!(nearest < 0.032, "{view:?}: {nearest} m");
+                        let depth = to_side.apply(Vec3::from_slice(point).as_dvec3()).z;
+                        let half_diagonal = 0.5_f64.sqrt() * depth / camera.focal.x;
+                        assert!(f64::from(nearest) < half_diagonal + 1e-4, "{view:?}: {nearest} m at {depth} m");
                         *covered += 1;
                     }
                 }

@@ -120,16 +120,18 @@ impl Evaluation<'_> {
         let surfaces: Vec<_> = centres.chain(meshes).filter(|(_, found)| !found.is_empty()).collect();
         if !surfaces.is_empty() {
             let row = |(name, found): (String, &Vec<(usize, Surface)>)| {
-                let [forward, backward, mean, normals] = surface_intervals(found);
+                let [forward, backward, mean, normals, open] = surface_intervals(found);
                 let distances = [forward, backward, mean].map(|distance| cell(distance, 1.0, 2));
-                [vec![name], distances.into(), vec![cell(normals, 1.0, 3)]].concat()
+                [vec![name], distances.into(), vec![cell(normals, 1.0, 3), cell(open, 100.0, 2)]].concat()
             };
-            let header = ["", "to the truth", "from the truth", "Chamfer", "normals"];
+            let header = ["", "to the truth", "from the truth", "Chamfer", "normals", "open, %"];
             let _ = writeln!(
                 text,
                 "## Surface\n\nDistances in cm between the ground-truth points of all views and the centres of the \
                  Gaussians with an opacity of at least {}, or points drawn from the meshes of the Gaussians; normals: mean cosine from \
-                 the views nearest to 0, 90, 180 and 270°, in maps of 256² at most.\n\n{}",
+                 the views nearest to 0, 90, 180 and 270°, in maps of 256² at most; open: share of the person's pixels that are covered by \
+                 less than 90 % or show a surface 6 cm or more behind the true one, from the views nearest to every 45°, without the three \
+                 outermost pixels.\n\n{}",
                 self.config.metrics.opaque,
                 table_markdown(&header, surfaces.into_iter().map(row))
             );

@@ -256,8 +256,8 @@ fn points_json(judged: &Judged) -> Value {
     VIEWS.iter().enumerate().map(view).collect()
 }
 
-/// Means over people: centimetres to the truth, from the truth and both, and cosines.
-fn surface_intervals(surfaces: &[(usize, Surface)]) -> [Option<Interval>; 4] {
+/// Means over people: centimetres to the truth, from the truth and both, cosines, and open shares.
+fn surface_intervals(surfaces: &[(usize, Surface)]) -> [Option<Interval>; 5] {
     let over = |of: fn(&Surface) -> Option<f64>| {
         let of_person = |turns: &[(usize, Surface)]| {
             mean(&turns.iter().filter_map(|(_, surface)| of(surface)).collect::<Vec<_>>())
@@ -270,12 +270,19 @@ fn surface_intervals(surfaces: &[(usize, Surface)]) -> [Option<Interval>; 4] {
         over(|s| Some(1e2 * s.chamfer.backward)),
         over(|s| Some(1e2 * s.chamfer.mean())),
         over(|s| s.normals),
+        over(|s| s.open),
     ]
 }
 
 fn geometry_json(surfaces: &[(usize, Surface)]) -> Value {
-    let [forward, backward, mean, normals] = surface_intervals(surfaces);
-    json!({ "to_truth": forward, "from_truth": backward, "chamfer": mean, "normal_consistency": normals })
+    let [forward, backward, mean, normals, open] = surface_intervals(surfaces);
+    json!({
+        "to_truth": forward,
+        "from_truth": backward,
+        "chamfer": mean,
+        "normal_consistency": normals,
+        "open_share": open,
+    })
 }
 
 /// Seconds, p50 and p95.
