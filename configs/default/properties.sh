@@ -18,11 +18,14 @@ people() {
   made() { cargo xtask prepare "$@" --split "$split" --subjects "$count" --seed "$seed" -o "$folder/$name/$1"; }
   made makehuman "$data" "$@"
   # Avatars that cannot be read are skipped, with exit code 2.
-  made avatars "$avatars" "$@" || true
+  made avatars "$avatars" "$@" || [ $? = 2 ]
 }
 phone="--config configs/data/phone.toml"
-people held val 40 43 "$makehuman" $phone
-cargo xtask prepare synth --split val --subjects 40 --seed 43 $phone -o $folder/held/synth
+# A training needs a training person, even for one step without effect.
+for split in "val 40" "train 1"; do
+  people held ${split% *} ${split#* } 43 "$makehuman" $phone
+  cargo xtask prepare synth --split "${split% *}" --subjects "${split#* }" --seed 43 $phone -o $folder/held/synth
+done
 train() {
   cargo xtask train-stage1 --config configs/default/stage1.toml --resume "$@" --set samples.placed_share=1.0 --set training.preview_every=0
 }

@@ -36,8 +36,6 @@ pub struct PointError {
 
 /// Errors of one person in every view with ground truth and predictions.
 pub fn point_errors(pairs: &[Pair]) -> Vec<PointError> {
-    // Pixels outside of the predictor's window have the point 0, the position of the first camera.
-    let is_predicted = |p: &[f32; 3]| p.iter().all(|v| v.is_finite()) && p.iter().any(|v| *v != 0.0);
     let differences = |pair: &Pair| -> Vec<DVec3> {
         let points = pair.points.as_chunks().0.iter().zip(pair.truth.as_chunks().0).zip(pair.valid);
         let there = points.filter(|((point, _), valid)| **valid > 0.5 && is_predicted(point));
@@ -58,22 +56,25 @@ pub fn point_errors(pairs: &[Pair]) -> Vec<PointError> {
     pairs.iter().filter_map(error).collect()
 }
 
-/// Mean angle in degrees between the normals of predicted and true points, whose rows have `side` pixels. A normal is that of the
-/// triangle of a pixel and its neighbours on the right and below. `None` without a triangle of one true surface.
+/// Mean angle in degrees between the normals of predicted and true points, on a canvas whose rows have `side` pixels. A normal is that
+/// of the triangle of a pixel and its neighbours on the right and below. `None` without a triangle of one true surface.
 pub fn normal_error(pair: &Pair, side: usize) -> Option<f64> {
-    /// Largest side in metres of a triangle of one surface.
-    const WHOLE: f64 = 0.04;
+    // Longer sides of a true triangle are steps from one surface to another. The nominal cameras' focal length is 0.8 of the
+    // canvas, and the person is two metres away.
+    let longest = 6.0 * 2.0 / (0.8 * side as f64);
     let (points, truth) = (pair.points.as_chunks().0, pair.truth.as_chunks().0);
-    let is_valid = |i: usize| pair.valid.get(i).is_some_and(|valid| *valid > 0.5);
+    let is_there = |i: usize| {
+        pair.valid.get(i).is_some_and(|valid| *valid > 0.5) && points.get(i).is_some_and(is_predicted)
+    };
     let (mut sum, mut count) = (0.0, 0_u32);
     for i in (0..points.len()).filter(|i| i % side + 1 < side) {
-        if ![i, i + 1, i + side].into_iter().all(is_valid) {
+        if ![i, i + 1, i + side].into_iter().all(is_there) {
             continue;
         }
         let sides = |map: &[[f32; 3]]| [i + 1, i + side].map(|to| double(map[to]) - double(map[i]));
         let ([a, b], [c, d]) = (sides(points), sides(truth));
         let (predicted, true_normal) = (a.cross(b), c.cross(d));
-        if c.length().max(d.length()) < WHOLE && true_normal.length() > 0.0 && predicted.is_finite() {
+        if c.length().max(d.length()) <= longest && true_normal.length() > 0.0 {
             // The angle of vectors of any length, 90° for a length of 0.
             let (across, along) = (predicted.cross(true_normal).length(), predicted.dot(true_normal));
             sum += if predicted.length() > 0.0 { across.atan2(along).to_degrees() } else { 90.0 };
@@ -81,6 +82,11 @@ pub fn normal_error(pair: &Pair, side: usize) -> Option<f64> {
         }
     }
     (count > 0).then(|| sum / f64::from(count))
+}
+
+/// Whether a pixel has a prediction. Pixels outside of the predictor's window have the point 0, the position of the first camera.
+fn is_predicted(point: &[f32; 3]) -> bool {
+    point.iter().all(|v| v.is_finite()) && point.iter().any(|v| *v != 0.0)
 }
 
 #[cfg(test)]
@@ -100,16 +106,22 @@ mod tests {
         };
         assert!(error(&turned, &turned, &valid).is_some_and(|degrees| degrees < 1e-3));
         assert!(error(&turned, &flat, &valid).is_some_and(|degrees| (degrees - 30.0).abs() < 1e-3));
-        // A point that is not finite spoils its own triangles alone.
-        let mut spoiled = turned.clone();
-        spoiled[0] = f32::NAN;
-        assert!(error(&spoiled, &flat, &valid).is_some_and(|degrees| (degrees - 30.0).abs() < 1e-3));
         assert!(error(&[0.5; 36], &flat, &valid).is_some_and(|degrees| (degrees - 90.0).abs() < 1e-6));
-        // Triangles need three valid points on one surface.
+        // Triangles with a point that is not finite, not predicted or not valid are left out.
+        let is_30 = |degrees: Option<f64>| degrees.is_some_and(|degrees| (degrees - 30.0).abs() < 1e-3);
+        for absent in [f32::NAN, 0.0] {
+            let mut without = turned.clone();
+            without[15..18].fill(absent);
+            assert!(is_30(error(&without, &flat, &valid)), "{absent}");
+        }
+        let mut wrong = turned.clone();
+        wrong[17] += 0.1;
+        assert!(!is_30(error(&wrong, &flat, &valid)));
         valid[5] = 0.0;
-        assert_eq!(error(&turned, &flat, &valid).map(|degrees| degrees.round()), Some(30.0));
+        assert!(is_30(error(&wrong, &flat, &valid)));
         assert_eq!(error(&turned, &flat, &[0.0; 12]), None);
-        assert_eq!(error(&flat, &wall(0.05), &[1.0; 12]), None);
+        // A pixel of a canvas of four is 62 cm wide; steps of more than six are no surface.
+        assert_eq!(error(&flat, &wall(4.0), &[1.0; 12]), None);
     }
 
     #[test]

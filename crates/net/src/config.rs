@@ -198,6 +198,9 @@ pub struct RegressorConfig {
     /// black to white. Unset: half of the range.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub color_limits: Option<[f64; 2]>,
+    /// Least opacities of the Gaussians of photographed pixels and of the pixels of unseen sides. Unset: 0.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub least_opacities: Option<[f64; 2]>,
     /// Whether pixels that the person covers in part have the person's colour, not mixed with grey.
     pub straight_color: bool,
     /// With `mode.crop`, pixels around the person's box that the network receives; unset: all that influence the person's
@@ -222,6 +225,11 @@ impl RegressorConfig {
         self.color_limits.unwrap_or([0.5; 2])
     }
 
+    /// Least opacities of the Gaussians of photographs and of unseen sides.
+    pub fn least_opacities(&self) -> [f64; 2] {
+        self.least_opacities.unwrap_or([0.0; 2])
+    }
+
     /// Source of a Gaussian's colour.
     pub fn color(&self) -> RegressorColor {
         self.color.unwrap_or(match self.start() {
@@ -240,6 +248,7 @@ impl Default for RegressorConfig {
             start: None,
             color: None,
             color_limits: None,
+            least_opacities: None,
             straight_color: false,
             margin: None,
         }

@@ -10,7 +10,7 @@ use snapsnap_splat::{Camera, Gaussians, RigidTransform};
 use crate::config::{Config, NetworkConfig, RegressorConfig, RegressorStart, RotationFrame};
 use crate::crop::Window;
 use crate::hull::Hull;
-use crate::regressor::{Attributes, FEATURES, Geometry, Regressor, Statistics};
+use crate::regressor::{Attributes, FEATURES, Geometry, Limits, Regressor, Statistics};
 use crate::sides::{Cloud, EMPTY, is_finite};
 
 /// One view on its square canvas of side S.
@@ -160,8 +160,7 @@ pub fn regress(
     views: &[Seen],
     window: &Window,
 ) -> Vec<Part> {
-    // Colours are in [−1, 1].
-    let color_limit = 2.0 * config.regressor.color_limits()[pair.min(1)];
+    let limits = Limits::of(&config.regressor, pair);
     let (side, device) = (config.network.resolution, views[0].points.device());
     let (h, w) = (window.rows.len(), window.columns.len());
     let (colors, points): (Vec<_>, Vec<_>) = views
@@ -186,7 +185,7 @@ pub fn regress(
         let rows = Tensor::<1, Int>::from_data(TensorData::new(rows, [n]), &device);
         let pick = |x: Tensor<4>, c: usize| x.narrow(0, i, 1).reshape([h * w, c]).select(0, rows.clone());
         let geometry = Geometry::is_needed(&config.regressor)
-            .then(|| Geometry::new(view.image, &view.points, view.valid, side, color_limit));
+            .then(|| Geometry::new(view.image, &view.points, view.valid, side, limits));
         parts.push(Part {
             features: pick(features.clone(), FEATURES),
             points: pick(points.clone(), 3),
@@ -201,6 +200,7 @@ pub fn regress(
 /// (docs/method.md, "Geometric start").
 pub fn geometric(views: &[Seen], device: &Device) -> Gaussians {
     let regressor = RegressorConfig { start: Some(RegressorStart::Geometric), ..RegressorConfig::default() };
+    let limits = Limits::of(&regressor, 0);
     let config = Config { regressor, ..Config::default() };
     let part = |view: &Seen| {
         let side = view.points.dims()[1];
@@ -210,7 +210,7 @@ pub fn geometric(views: &[Seen], device: &Device) -> Gaussians {
         Part {
             features: Tensor::zeros([n, FEATURES], device),
             points: view.points.clone().reshape([side * side, 3]).select(0, rows),
-            geometry: Some(Geometry::new(view.image, &view.points, view.valid, side, 1.0)),
+            geometry: Some(Geometry::new(view.image, &view.points, view.valid, side, limits)),
         }
     };
     let parts = views.iter().filter(|view| view.valid.contains(&true)).map(part).collect();

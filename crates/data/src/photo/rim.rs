@@ -13,48 +13,56 @@ const HEIGHT: u32 = 739;
 const MAX_REACH: u32 = 64;
 /// Least distance of the colours of person and background at which they are told apart. Channels are 0 to 1.
 const DISTINCT: f32 = 0.12;
+/// Least share of the outline with distinct colours.
+const LEAST_DISTINCT: f32 = 0.25;
+/// Share of the distinct outline that has more of the background than of the person if a mask is too large.
+const SHOWN: f32 = 0.4;
 /// Largest distance of a mixed colour from the line between both, as a share of its length, and in addition to it.
 const OFF_LINE: (f32, f32) = (0.35, 0.03);
-/// Shares of the background in a pixel: up to the first, the pixel is the person's; from the second on, it is the background's.
+/// Up to this share of the background, a pixel is the person's; from the second on, it is the background's.
 const MIXED: (f32, f32) = (0.1, 0.9);
-/// A mask is too large if so much of its outline has more of the background than of the person. Only places with [`DISTINCT`]
-/// colours count; they must be the second share of the outline or more.
-const SHOWN: (f32, f32) = (0.4, 0.1);
-/// An outline has one colour if this share of it is this close to its median. It is the background's if no more than the last
-/// share of the person behind the outline has it as well.
-const UNIFORM: (f32, f32, f32) = (0.6, 0.08, 0.3);
+/// Distance of colours that count as one, and the least share of the outline that has its median colour if it has but one.
+const ALIKE: f32 = 0.08;
+const UNIFORM: f32 = 0.6;
+/// Largest share of the person behind the outline that may have that colour as well.
+const WORN: f32 = 0.3;
 /// Mask value from which a pixel is the person's.
 const INSIDE: u8 = 128;
+/// An outline longer than this, in pixels and as a share of the person's box, is no person's.
+const LONGEST: (usize, usize) = (50_000, 20);
 
 /// Takes the background out of the rim of `mask` and of the colours there. Returns the number of pixels that left the mask.
 pub(super) fn clean(rgb: &mut RgbImage, mask: &mut GrayImage) -> usize {
     let Some(person) = Rect::around(mask, INSIDE) else { return 0 };
     let reach = (REACH * person.height).div_ceil(HEIGHT).clamp(1, MAX_REACH);
-    let rim = Rim::new(mask, person, reach as i8);
+    let Some(rim) = Rim::new(mask, person, reach as i8) else { return 0 };
     let colors = Colors::new(&rim, rgb);
-    let shares = colors.shares(&rim, &colors.outside).or_else(|| {
+    // A background of exactly one colour may stand for none. The outline then has to show it.
+    let shown = if colors.is_flat { None } else { colors.shares(&rim, &colors.outside) };
+    let shares = shown.or_else(|| {
         let uniform = vec![colors.uniform(&rim)?; colors.own.len()];
         colors.shares(&rim, &uniform)
     });
     let Some(shares) = shares else { return 0 };
+    let mut is_gone = vec![false; rim.levels.len()];
     let mut lost = 0;
     for (i, share) in shares.into_iter().enumerate().filter(|(_, share)| *share > MIXED.0) {
         let (x, y) = rim.place(rim.pixels[i]);
         let value = &mut mask.get_pixel_mut(x, y).0[0];
-        *value = if share < MIXED.1 { (f32::from(*value) * (1.0 - share)).round() as u8 } else { 0 };
+        // A soft pixel of the mask says itself how much of the person is in it.
+        *value = if share < MIXED.1 { (*value).min((255.0 * (1.0 - share)).round() as u8) } else { 0 };
+        is_gone[rim.pixels[i]] = *value < INSIDE;
         lost += usize::from(*value < INSIDE);
         rgb.put_pixel(x, y, Rgb((255.0 * colors.inside[i]).to_array().map(|c| c.round() as u8)));
     }
     // Soft pixels beyond those that left are the background's as well.
     for &pixel in &rim.beyond {
-        let (x, y) = rim.place(pixel);
         let level = rim.levels[pixel];
-        let inner = |to: &usize| rim.levels[*to] == if level == -1 { 1 } else { level + 1 };
-        let is_out = |to: usize| {
-            let (x, y) = rim.place(to);
-            mask.get_pixel(x, y).0[0] < INSIDE / 2
-        };
-        if mask.get_pixel(x, y).0[0] > 0 && rim.neighbours(pixel).filter(inner).all(is_out) {
+        let inner = if level == -1 { 1 } else { level + 1 };
+        let mut before = rim.neighbours(pixel).filter(|to| rim.levels[*to] == inner).peekable();
+        if before.peek().is_some() && before.all(|to| is_gone[to]) {
+            is_gone[pixel] = true;
+            let (x, y) = rim.place(pixel);
             mask.get_pixel_mut(x, y).0[0] = 0;
         }
     }
@@ -64,7 +72,8 @@ pub(super) fn clean(rgb: &mut RgbImage, mask: &mut GrayImage) -> usize {
 /// Pixels near the outline of a mask, in a part of the picture.
 struct Rim {
     part: Rect,
-    /// For each pixel of the part: 1 and more inside, counted from the outline; −1 and less outside; 0 farther from it.
+    /// For each pixel of the part: 1 and more inside, counted from the outline, [`DEEP`] behind the rim; −1 and less outside, 0
+    /// farther away.
     levels: Vec<i8>,
     /// Pixels inside, level by level.
     pixels: Vec<usize>,
@@ -72,8 +81,12 @@ struct Rim {
     beyond: Vec<usize>,
 }
 
+/// Level of pixels behind the rim.
+const DEEP: i8 = i8::MAX;
+
 impl Rim {
-    fn new(mask: &GrayImage, person: Rect, reach: i8) -> Self {
+    /// `None` if the outline is too long for a person.
+    fn new(mask: &GrayImage, person: Rect, reach: i8) -> Option<Self> {
         let whole = Rect { x: 0, y: 0, width: mask.width(), height: mask.height() };
         let part = whole.clipped_around(person, [reach as u32 + 1; 2]);
         let (width, rows) = (part.width as usize, part.y..part.y + part.height);
@@ -93,6 +106,9 @@ impl Rim {
                 outlines[usize::from(!inside)].push(at);
             }
         }
+        if outlines[0].len() > LONGEST.0.max(is_inside.len() / LONGEST.1) {
+            return None;
+        }
         for (inside, mut last) in [true, false].into_iter().zip(outlines) {
             let sign = if inside { 1 } else { -1 };
             let mut all = Vec::new();
@@ -111,7 +127,9 @@ impl Rim {
             }
             *if inside { &mut rim.pixels } else { &mut rim.beyond } = all;
         }
-        rim
+        let deep = rim.levels.iter_mut().zip(&is_inside).filter(|(level, inside)| **level == 0 && **inside);
+        deep.for_each(|(level, _)| *level = DEEP);
+        Some(rim)
     }
 
     /// The place in the picture.
@@ -143,8 +161,10 @@ struct Colors {
     own: Vec<Vec3>,
     /// Of the person behind the rim.
     inside: Vec<Vec3>,
-    /// Of the picture beyond the rim.
+    /// Of the picture outside of the mask.
     outside: Vec<Vec3>,
+    /// Whether the picture near the mask has exactly one colour.
+    is_flat: bool,
 }
 
 impl Colors {
@@ -159,18 +179,18 @@ impl Colors {
         }
         let own: Vec<Vec3> = rim.pixels.iter().map(|at| color(*at)).collect();
         // The person's colour comes outwards from behind the rim, the background's inwards from beyond it.
-        let deepest = rim.pixels.last().map_or(0, |at| rim.levels[*at]);
         let mut inside = own.clone();
         for (i, &at) in rim.pixels.iter().enumerate().rev() {
             let level = rim.levels[at];
             let of = |to: usize| match rim.levels[to] {
-                0 if level == deepest => Some(color(to)),
+                DEEP => Some(color(to)),
                 deeper if deeper == level + 1 => Some(inside[index[to] as usize]),
                 _ => None,
             };
             inside[i] = mean(rim.neighbours(at).filter_map(of)).unwrap_or(own[i]);
         }
         let mut beyond: Vec<Vec3> = rim.beyond.iter().map(|at| color(*at)).collect();
+        let is_flat = beyond.windows(2).all(|pair| pair[0] == pair[1]);
         for (i, &at) in rim.beyond.iter().enumerate().rev() {
             let farther = rim.neighbours(at).filter(|to| rim.levels[*to] == rim.levels[at] - 1);
             if let Some(color) = mean(farther.map(|to| beyond[index[to] as usize])) {
@@ -186,7 +206,7 @@ impl Colors {
             };
             outside[i] = mean(rim.neighbours(at).filter_map(of)).unwrap_or(own[i]);
         }
-        Self { index, own, inside, outside }
+        Self { index, own, inside, outside, is_flat }
     }
 
     /// The outline's colour, if it has but one and the person behind it has others.
@@ -199,9 +219,9 @@ impl Colors {
         };
         let color = Vec3::new(median(0)?, median(1)?, median(2)?);
         let share = |colors: &[Vec3]| {
-            colors[..outline].iter().filter(|c| c.distance(color) < UNIFORM.1).count() as f32 / outline as f32
+            colors[..outline].iter().filter(|c| c.distance(color) < ALIKE).count() as f32 / outline as f32
         };
-        (share(&self.own) >= UNIFORM.0 && share(&self.inside) <= UNIFORM.2).then_some(color)
+        (share(&self.own) >= UNIFORM && share(&self.inside) <= WORN).then_some(color)
     }
 
     /// The share of the `background` in each pixel of the rim; 0 where nothing but person lies between it and the outline.
@@ -234,7 +254,7 @@ impl Colors {
             }
         }
         let is_too_large =
-            shown as f32 >= SHOWN.0 * distinct as f32 && distinct as f32 >= SHOWN.1 * outline as f32;
+            shown as f32 >= SHOWN * distinct as f32 && distinct as f32 >= LEAST_DISTINCT * outline as f32;
         (is_too_large && shown > 0).then_some(shares)
     }
 }
@@ -283,7 +303,7 @@ mod tests {
 
     /// Mean colour error of the outline.
     fn error(rgb: &RgbImage, mask: &GrayImage) -> f32 {
-        let rim = Rim::new(mask, Rect::around(mask, INSIDE).expect("a person"), 1);
+        let rim = Rim::new(mask, Rect::around(mask, INSIDE).expect("a person"), 1).expect("an outline");
         let error = |at: &usize| {
             let (x, y) = rim.place(*at);
             (Vec3::from(rgb.get_pixel(x, y).0.map(f32::from)) / 255.0).distance(person(x, y))
@@ -338,8 +358,7 @@ mod tests {
 
     #[test]
     fn good_masks_and_small_ones_stay_as_they_are() {
-        let white: Background = |_, _| Vec3::ONE;
-        for (name, background) in BACKGROUNDS.into_iter().chain([("white", white)]) {
+        for (name, background) in BACKGROUNDS {
             for grown in [-3.0, -1.0, 0.0] {
                 let (mut rgb, mut mask) = (picture(background), mask(grown));
                 let same = (rgb.clone(), mask.clone());
@@ -347,10 +366,57 @@ mod tests {
                 assert!((rgb, mask) == same, "{name}, {grown}");
             }
         }
+        // A person who is dark towards the outline, as under a lamp beside the camera, cut out over nothing.
+        let mut shaded = picture(|_, _| Vec3::ZERO);
+        for (x, y, pixel) in shaded.enumerate_pixels_mut() {
+            let slope = (1.0 - (1.0 + outside(x, y).min(0.0) / 120.0).powi(2)).max(0.0).sqrt().powf(1.0 / 2.2);
+            let lit = slope * 255.0 * person(x, y);
+            pixel.0 = if outside(x, y) > 0.5 { [0; 3] } else { lit.to_array().map(|c| c.round() as u8) };
+        }
+        let (mut rgb, mut exact) = (shaded.clone(), mask(0.0));
+        assert_eq!(clean(&mut rgb, &mut exact), 0);
+        assert!(rgb == shaded && exact == mask(0.0));
         // A person in the background's colour.
         let mut grown = mask(3.0);
         let mut rgb = RgbImage::from_pixel(SIZE.0, SIZE.1, Rgb([250; 3]));
         assert_eq!(clean(&mut rgb, &mut grown), 0);
+    }
+
+    /// The right half of the mask is too large, the left is good and has a soft fringe. People who are small, or whose feet are beyond
+    /// the frame, are corrected as well.
+    #[test]
+    fn only_what_shows_the_background_leaves() {
+        let (mut rgb, good) = (picture(BACKGROUNDS[3].1), mask(0.0));
+        let fringe = |x: u32, y: u32| (90.0 * (1.0 - outside(x, y) / 8.0)).clamp(0.0, 90.0) as u8;
+        let mut half = mask(3.0);
+        for (x, y, value) in half.enumerate_pixels_mut().filter(|(x, ..)| *x < 160) {
+            value.0[0] = good.get_pixel(x, y).0[0].max(fringe(x, y));
+        }
+        let before = half.clone();
+        assert!(clean(&mut rgb, &mut half) > 1000);
+        let right = |mask: &GrayImage| area(&image::imageops::crop_imm(mask, 170, 0, 150, 800).to_image());
+        let too_much = right(&before) - right(&good);
+        assert!((right(&half) - right(&good)).abs() < 0.15 * too_much);
+        for (x, y, value) in half.enumerate_pixels().filter(|(x, ..)| *x < 150) {
+            // The person's own soft pixels may become a little softer.
+            let (value, before) = (value.0[0], before.get_pixel(x, y).0[0]);
+            let is_softer = before >= INSIDE && (INSIDE / 2..before).contains(&value);
+            assert!(value == before || is_softer, "{x}, {y}: {before} → {value}");
+        }
+
+        let small = |picture: &GrayImage| image::imageops::thumbnail(picture, 40, 100);
+        let mut tiny = image::imageops::thumbnail(&picture(BACKGROUNDS[3].1), 40, 100);
+        let (mut grown, exact) = (small(&mask(9.0)), small(&mask(0.0)));
+        let too_much = area(&grown) - area(&exact);
+        clean(&mut tiny, &mut grown);
+        assert!((area(&grown) - area(&exact)).abs() < 0.5 * too_much, "{}", area(&grown) - area(&exact));
+
+        let cut = |picture: GrayImage| image::imageops::crop_imm(&picture, 60, 0, 260, 500).to_image();
+        let mut rgb = image::imageops::crop_imm(&picture(BACKGROUNDS[3].1), 60, 0, 260, 500).to_image();
+        let (mut grown, exact) = (cut(mask(3.0)), cut(mask(0.0)));
+        clean(&mut rgb, &mut grown);
+        assert!((area(&grown) - area(&exact)).abs() < 0.02 * area(&exact));
+        assert!((100..200).all(|x| grown.get_pixel(x, 499).0[0] == 255), "nothing is beyond the frame");
     }
 
     #[test]
@@ -364,5 +430,11 @@ mod tests {
             assert_eq!(clean(&mut rgb, &mut mask), 0);
             assert_eq!(mask, same);
         }
+        // A photograph in place of a mask.
+        let mut noise = GrayImage::from_fn(700, 700, |x, y| Luma([((x * 37 + y * 101) % 251) as u8]));
+        let same = noise.clone();
+        let mut rgb = RgbImage::from_fn(700, 700, |x, y| Rgb([x as u8, y as u8, (x ^ y) as u8]));
+        assert_eq!(clean(&mut rgb, &mut noise), 0);
+        assert_eq!(noise, same);
     }
 }

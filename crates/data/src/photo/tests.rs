@@ -157,3 +157,33 @@ fn photographs_from_one_place_are_placed_together() {
         assert!(a.2.abs_diff(SIDE - 1) <= 1 && b.2.abs_diff(SIDE - 1) <= 1, "{a:?} {b:?}");
     }
 }
+
+/// A mask that is too large by a pixel, over a lawn: a user's photograph is corrected, and one that is the canvas already is not.
+#[test]
+fn rims_of_the_background_are_left_out_of_a_users_photographs() {
+    let side = SIDE as u32;
+    let distance = |x: u32, y: u32| ((x as f32 - 128.0) / 60.0).hypot((y as f32 - 128.0) / 110.0);
+    let picture = RgbaImage::from_fn(side, side, |x, y| {
+        let [r, g, b] = match distance(x, y) < 1.0 {
+            true => [170 + (y % 3) as u8, 60, 90],
+            false => [60, 150 + (x % 7) as u8, 30 + (y % 5) as u8],
+        };
+        Rgba([r, g, b, if distance(x, y) < 1.012 { 255 } else { 0 }])
+    });
+    let greenish = |canvas: &Canvas| {
+        let area = SIDE * SIDE;
+        (0..area).filter(|i| canvas.valid[*i] && canvas.rgb[area + i] > canvas.rgb[*i]).count()
+    };
+    let file = saved(&picture);
+    let corrected = one(file.path(), Placement::Training { height: 880 }).expect("a person");
+    assert!(corrected.report.contains("rim left out"), "{}", corrected.report);
+    assert_eq!(greenish(&corrected), 0);
+    for placement in [Placement::AsIs, Placement::Demo { height: 880 }] {
+        let canvas = one(file.path(), placement).expect("a person");
+        assert!(greenish(&canvas) > 300 && !canvas.report.contains("rim"), "{placement:?}: {}", greenish(&canvas));
+    }
+    let rgb = DynamicImage::from(picture.clone()).into_rgb8();
+    let mask = GrayImage::from_fn(side, side, |x, y| image::Luma([picture.get_pixel(x, y).0[3]]));
+    let training = place(&[(rgb, mask)], 880, SIDE).expect("a person");
+    assert_eq!(greenish(&training[0]), 0);
+}

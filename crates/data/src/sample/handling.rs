@@ -22,7 +22,7 @@ pub struct Handling {
     pub place: usize,
     /// Difference of exposure, in stops, between the first photograph and the others. Each is changed by half of it.
     pub exposure: f32,
-    /// Colour of the background from 0 to 1, black if unset. It shows through masks that are too large.
+    /// Colour of the background from 0 to 1; unset: the data set's. It shows through masks that are too large.
     pub background: Option<[f32; 3]>,
     /// Error of the masks in pixels of 1024: above 0 they are too large, below 0 too small.
     pub mask: f32,
@@ -123,6 +123,21 @@ mod tests {
     use image::{Luma, Rgb};
 
     use super::*;
+
+    #[test]
+    fn backgrounds_show_in_masks_that_are_too_large() {
+        let color = RgbImage::from_pixel(1024, 1, Rgb([100, 0, 40]));
+        let mask = GrayImage::from_fn(1024, 1, |x, _| Luma([[255, 51, 0][(x as usize).min(2)]]));
+        let handling = Handling { background: Some([0.0, 1.0, 0.5]), mask: 2.0, ..Handling::default() };
+        assert_eq!(handling.problem(), None);
+        let (mixed, grown) = handling.apply(0, color, mask);
+        let pixels: Vec<[u8; 3]> = mixed.pixels().take(3).map(|pixel| pixel.0).collect();
+        // A fifth of the second pixel is the person's.
+        assert_eq!(pixels, [[100, 0, 40], [20, 204, 110], [0, 255, 128]]);
+        assert_eq!(grown.get_pixel(2, 0).0, [255]);
+        let wrong = Handling { background: Some([0.0, 1.5, 0.5]), ..handling };
+        assert!(wrong.problem().is_some_and(|(key, message)| key == "background" && message.contains("1.5")));
+    }
 
     #[test]
     fn a_grey_person_has_the_mean_colour_of_its_pixels_alone() {

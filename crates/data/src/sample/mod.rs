@@ -56,7 +56,8 @@ pub struct SampleConfig {
     /// arm. The data set must contain it: `views.second_depth`.
     pub second_depth: bool,
     /// Share of the samples whose photographs are placed on their canvas like a user's photographs. Their points are
-    /// scaled and moved into the nominal cameras' views. Photographs of cameras whose distance or focal length varies always are.
+    /// scaled and moved into the nominal cameras' views. Above 0, all photographs of rigs whose distance or focal length varies
+    /// are placed.
     pub placed_share: f32,
     /// Height of a placed person in pixels of a canvas of 1024: `mode.person_height`.
     #[serde(skip)]
@@ -257,18 +258,16 @@ impl Source {
         canvases(&changed, if is_placed { self.config.person_height } else { 0 }, self.config.compat)
     }
 
-    /// Whether a sample's photographs are placed like a user's. All are in data sets whose cameras vary in distance or focal length:
-    /// as it is, such a photograph does not show how far away the person is.
+    /// Whether a sample's photographs are placed like a user's.
     fn is_placed(&self, random: &mut impl Rng) -> bool {
-        let rig = self.folder.description().drawn.as_ref().map(|drawn| &drawn.jitter.rig);
-        if !self.config.compat && rig.is_some_and(|rig| rig.distance > 0.0 || rig.focal > 0.0) {
-            return true;
-        }
         // A share of 0 draws no random number, so that it leaves the others as they are.
-        match self.config.placed_share {
-            0.0 => false,
-            share => random.random::<f32>() < share,
+        let share = self.config.placed_share;
+        if share == 0.0 {
+            return false;
         }
+        // A photograph that is not placed must have the nominal distance and focal length, or its points cannot be predicted.
+        let rig = self.folder.description().drawn.as_ref().map(|drawn| &drawn.jitter.rig);
+        rig.is_some_and(|rig| rig.distance > 0.0 || rig.focal > 0.0) || random.random::<f32>() < share
     }
 }
 

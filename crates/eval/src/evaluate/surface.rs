@@ -28,7 +28,8 @@ const DIRECTIONS: [f64; 8] = [0.0, 90.0, 180.0, 270.0, 45.0, 135.0, 225.0, 315.0
 const CLOSED: f32 = 0.9;
 /// Largest distance in metres of a closed pixel's surface behind the true one. The inner side of a person's back lies farther.
 const BEHIND: f32 = 0.06;
-/// Width of a person's rim in pixels that does not count. A slightly wrong outline is no hole.
+/// Width, in pixels of a map of [`NORMALS`], of what does not count beside a person's outline and beside steps of the depth by
+/// [`BEHIND`]. A slightly wrong outline is no hole.
 const RIM: usize = 3;
 
 /// Distances of a surface from the ground truth.
@@ -141,9 +142,15 @@ impl Truth {
         let (mut open, mut count) = (0_u64, 0_u64);
         for TrueView { camera, depth: truth, .. } in &self.views {
             let [depth, alpha] = drawn(camera)?;
-            let outside: Vec<bool> = truth.iter().map(|z| *z <= 0.0).collect();
-            let near_outside = dilated(&outside, camera.width as usize, RIM);
-            for i in (0..truth.len()).filter(|i| !near_outside[*i]) {
+            let width = camera.width as usize;
+            let is_step = |i: usize| {
+                let beside = [(i % width + 1 < width).then_some(i + 1), Some(i + width)];
+                let to = beside.into_iter().flatten().filter_map(|to| truth.get(to));
+                truth[i] <= 0.0 || to.into_iter().any(|z| (z - truth[i]).abs() > BEHIND)
+            };
+            let steps: Vec<bool> = (0..truth.len()).map(is_step).collect();
+            let is_left_out = dilated(&steps, width, (RIM * width).div_ceil(NORMALS));
+            for i in (0..truth.len()).filter(|i| !is_left_out[*i]) {
                 count += 1;
                 open += u64::from(alpha[i] < CLOSED || depth[i] / alpha[i] > truth[i] + BEHIND);
             }
@@ -211,25 +218,36 @@ mod tests {
     /// that is thin.
     #[test]
     fn open_pixels_are_uncovered_or_show_what_lies_behind() {
-        let side = 64;
+        let side = 256;
         let camera = Camera::orbit_at_yaw_degrees(0.0, side as u32);
-        let is_wall = |i: usize| (10..42).contains(&(i % side)) && (12..52).contains(&(i / side));
-        let depth: Vec<f32> = (0..side * side).map(|i| if is_wall(i) { 2.0 } else { 0.0 }).collect();
+        let is_wall = |i: usize| (10..42).contains(&(i % side)) && (12..92).contains(&(i / side));
+        // The lower half stands back by 10 cm.
+        let depth = |i: usize| if i / side < 52 { 2.0 } else { 2.1 };
+        let depth: Vec<f32> = (0..side * side).map(|i| if is_wall(i) { depth(i) } else { 0.0 }).collect();
         let views = vec![TrueView { camera, depth: depth.clone(), normals: None }];
         let truth = Truth { points: Vec::new(), views };
         let drawn = |of: &dyn Fn(usize) -> (f32, f32)| {
             let (depth, alpha): (Vec<f32>, Vec<f32>) = (0..side * side).map(of).unzip();
             truth.open(|_| Ok([depth.clone(), alpha.clone()])).expect("draws").expect("pixels")
         };
-        // Without three pixels along every edge.
-        let inner = 26.0 * 34.0;
+        // Without three pixels inside of the outline; the last pixels before an edge count as the edge on the right and below.
+        let (columns, rows) = ((13..38), (15..48).chain(55..88));
+        let (wide, high) = (columns.len() as f64, rows.clone().count() as f64);
+        let share = |of: &dyn Fn(usize, usize) -> bool| {
+            let open = rows.clone().flat_map(|row| columns.clone().map(move |column| (row, column)));
+            open.filter(|(row, column)| of(*row, *column)).count() as f64 / (wide * high)
+        };
         // Depths are weighted by coverage; 5 cm too far is an error, no hole.
         assert_eq!(drawn(&|i| (0.95 * (depth[i] + 0.05), 0.95)), 0.0);
-        assert_eq!(drawn(&|i| if i % side == 20 { (0.0, 0.0) } else { (2.0, 1.0) }), 34.0 / inner);
-        assert_eq!(drawn(&|i| if i % side < 23 { (0.8 * 2.0, 0.8) } else { (2.0, 1.0) }), 10.0 * 34.0 / inner);
-        assert_eq!(drawn(&|i| if i / side < 20 { (2.2, 1.0) } else { (2.0, 1.0) }), 5.0 * 26.0 / inner);
-        // The rim may be wrong.
-        assert_eq!(drawn(&|i| if i % side < 13 { (0.0, 0.0) } else { (2.0, 1.0) }), 0.0);
+        let hole = drawn(&|i| if i % side == 20 { (0.0, 0.0) } else { (depth[i], 1.0) });
+        assert_eq!(hole, share(&|_, column| column == 20));
+        let thin = drawn(&|i| if i % side < 23 { (0.8 * depth[i], 0.8) } else { (depth[i], 1.0) });
+        assert_eq!(thin, share(&|_, column| column < 23));
+        let behind = drawn(&|i| (if i / side < 20 { 2.2 } else { depth[i] }, 1.0));
+        assert_eq!(behind, share(&|row, _| row < 20));
+        // Outlines and steps may be wrong by three pixels.
+        assert_eq!(drawn(&|i| if i % side < 13 { (0.0, 0.0) } else { (depth[i], 1.0) }), 0.0);
+        assert_eq!(drawn(&|i| (if (49..52).contains(&(i / side)) { 2.1 } else { depth[i] }, 1.0)), 0.0);
         let nobody = Truth { points: Vec::new(), views: Vec::new() };
         assert_eq!(nobody.open(|_| Ok([Vec::new(), Vec::new()])).expect("draws"), None);
     }

@@ -123,6 +123,16 @@ impl Config {
                 "has no meaning where `regressor.color` is \"free\"".into(),
             );
         }
+        if r.least_opacities.is_some() && r.start() != RegressorStart::Geometric {
+            return refuse(
+                "regressor.least_opacities",
+                "has no meaning where `regressor.start` is \"published\"".into(),
+            );
+        }
+        let least = r.least_opacities().map(|least| ("regressor.least_opacities", least, 0.0..=1.0));
+        if let Some((key, message)) = outside(least) {
+            return refuse(key, message);
+        }
         let limits = r.color_limits().map(|limit| ("regressor.color_limits", limit, 1e-3..=1.0));
         if let Some((key, message)) = outside(limits) {
             return refuse(key, message);
@@ -175,6 +185,7 @@ impl Config {
             ("regressor.start", self.regressor.start() == RegressorStart::Published, "\"published\""),
             ("regressor.color", self.regressor.color() == RegressorColor::Free, "\"free\""),
             ("regressor.color_limits", self.regressor.color_limits.is_none(), "unset"),
+            ("regressor.least_opacities", self.regressor.least_opacities.is_none(), "unset"),
             ("regressor.straight_color", !self.regressor.straight_color, "false"),
             ("mode.rotation_frame", self.rotation_frame() == RotationFrame::World, "\"world\""),
             ("mode.downsample", self.downsample() == Downsample::Nearest, "\"nearest\""),

@@ -70,6 +70,18 @@ fn limits_of_colours_are_shares_of_the_range_of_corrected_colours() {
 }
 
 #[test]
+fn least_opacities_are_those_of_a_geometric_start() {
+    let geometric = "[regressor]\nstart = \"geometric\"\n";
+    let set = |least: &str| format!("regressor.least_opacities={least}");
+    let config = Config::from_toml(geometric, "x", &[set("[0.95,0]")]).expect("valid");
+    assert_eq!(config.regressor.least_opacities(), [0.95, 0.0]);
+    for least in ["[-0.1,0]", "[0,1.1]", "[nan,0]"] {
+        assert!(refusal(geometric, &[&set(least)]).contains("regressor.least_opacities"), "{least}");
+    }
+    assert!(refusal("", &[&set("[0.9,0.9]")]).contains("regressor.start"));
+}
+
+#[test]
 fn a_fix_beside_compat_is_a_contradiction() {
     let message = refusal("[mode]\ncompat = true\ndownsample = \"area\"\n", &[]);
     assert!(message.contains("mode.downsample") && message.contains("nearest"), "{message}");

@@ -29,8 +29,26 @@ pub struct Geometry {
     pub spacing: Tensor<2>,
     /// Colours of the pixels `[N, 3]` in [−1, 1].
     pub colors: Tensor<2>,
+    /// Limits of the network's corrections.
+    pub limits: Limits,
+}
+
+/// Limits of the attributes of a view's Gaussians.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Limits {
     /// Largest correction of a colour in [−1, 1].
-    pub color_limit: f64,
+    pub color: f64,
+    /// Least opacity.
+    pub opacity: f64,
+}
+
+impl Limits {
+    /// Those of both photographs (`pair` 0) or of the sides.
+    pub fn of(config: &RegressorConfig, pair: usize) -> Self {
+        let pair = pair.min(1);
+        // Colours are in [−1, 1].
+        Self { color: 2.0 * config.color_limits()[pair], opacity: config.least_opacities()[pair] }
+    }
 }
 
 /// Standard deviation of a Gaussian at the start over the distance of its neighbours. (Rendered at right angles, true
@@ -51,8 +69,8 @@ impl Geometry {
     }
 
     /// The geometry of the valid pixels of a view on a canvas of `side`² pixels, row by row, from colours `[3, S, S]` and
-    /// points `[1, S, S, 3]`. `color_limit` is the largest correction of a colour in [−1, 1].
-    pub fn new(image: &[f32], points: &Tensor<4>, valid: &[bool], side: usize, color_limit: f64) -> Self {
+    /// points `[1, S, S, 3]`.
+    pub fn new(image: &[f32], points: &Tensor<4>, valid: &[bool], side: usize, limits: Limits) -> Self {
         let device = points.device();
         let points = host(points.clone());
         let point = |i: usize| [points[3 * i], points[3 * i + 1], points[3 * i + 2]];
@@ -81,7 +99,7 @@ impl Geometry {
         Self {
             spacing: Tensor::from_data(TensorData::new(spacing, [n, 1]), &device),
             colors: Tensor::from_data(TensorData::new(colors, [n, 3]), &device),
-            color_limit,
+            limits,
         }
     }
 }
@@ -89,21 +107,21 @@ impl Geometry {
 impl Attributes {
     /// Attributes of features `[N, 14]`, relative to the `geometry` if the config uses it.
     pub fn new(config: &RegressorConfig, features: Tensor<2>, geometry: Option<Geometry>) -> Self {
-        let Some(Geometry { spacing, colors, color_limit }) = geometry else {
+        let Some(Geometry { spacing, colors, limits }) = geometry else {
             return Self::from_features(features);
         };
         let part = |from: usize, width: usize| features.clone().narrow(1, from, width);
         let color = match config.color() {
             RegressorColor::Free => part(8, 3).tanh(),
             // Small corrections are the same for every limit.
-            RegressorColor::Residual => colors + (part(8, 3) / color_limit).tanh() * color_limit,
+            RegressorColor::Residual => colors + (part(8, 3) / limits.color).tanh() * limits.color,
         };
         if config.start() == RegressorStart::Published {
             return Self { color, ..Self::from_features(features.clone()) };
         }
         let upright = Tensor::from_data([[1.0, 0.0, 0.0, 0.0]], &features.device());
         Self {
-            opacity: sigmoid(part(0, 1) + START_OPACITY),
+            opacity: sigmoid(part(0, 1) + START_OPACITY) * (1.0 - limits.opacity) + limits.opacity,
             scale: (part(1, 3).tanh() * LOG_SCALE).exp() * (spacing.clone() * START_SCALE),
             rotation: unit(part(4, 4) + upright),
             color,
@@ -179,7 +197,7 @@ mod tests {
         let geometry = Geometry {
             spacing: Tensor::from_data([[0.01]], &device),
             colors: Tensor::from_data([[0.5, -0.25, 1.0]], &device),
-            color_limit: 1.0,
+            limits: Limits { color: 1.0, opacity: 0.0 },
         };
         let of = |start, color| {
             let config = RegressorConfig { start, color, ..RegressorConfig::default() };
@@ -211,7 +229,7 @@ mod tests {
             let geometry = Geometry {
                 spacing: Tensor::from_data([[0.01]], &device),
                 colors: Tensor::from_data([[0.5, -0.25, 1.0]], &device),
-                color_limit,
+                limits: Limits { color: color_limit, opacity: 0.0 },
             };
             values(Attributes::new(&config, Tensor::from_data([features], &device), Some(geometry)).color)[0]
         };
@@ -220,6 +238,28 @@ mod tests {
             for sign in [-1.0, 1.0] {
                 assert!((color(sign * 30.0, limit) - 0.5 - sign * limit as f32).abs() < 1e-6, "{limit}");
             }
+        }
+    }
+
+    #[test]
+    fn opacities_end_at_their_least_value() {
+        let device = Device::flex();
+        let opacity = |feature: f32, least: f64| {
+            let mut features = [0.0; 14];
+            features[0] = feature;
+            let config =
+                RegressorConfig { start: Some(RegressorStart::Geometric), ..RegressorConfig::default() };
+            let geometry = Geometry {
+                spacing: Tensor::from_data([[0.01]], &device),
+                colors: Tensor::from_data([[0.0; 3]], &device),
+                limits: Limits { color: 1.0, opacity: least },
+            };
+            values(Attributes::new(&config, Tensor::from_data([features], &device), Some(geometry)).opacity)[0]
+        };
+        for (feature, least, expected) in
+            [(0.0, 0.0, 0.9), (0.0, 0.8, 0.98), (-40.0, 0.8, 0.8), (40.0, 0.8, 1.0), (-40.0, 1.0, 1.0)]
+        {
+            assert!((opacity(feature, least) - expected).abs() < 1e-6, "{feature}, {least}");
         }
     }
 

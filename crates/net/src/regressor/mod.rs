@@ -14,7 +14,7 @@ use burn::nn::conv::{Conv2d, Conv2dConfig};
 use burn::tensor::{Device, Tensor};
 
 pub use crate::config::RECEPTIVE_RADIUS;
-pub use attributes::{Attributes, Geometry};
+pub use attributes::{Attributes, Geometry, Limits};
 pub use statistics::Statistics;
 pub use unet::UNet;
 
