@@ -127,11 +127,7 @@ pub fn losses(prediction: &Prediction, points: &Tensor<5>, valid: &Tensor<4>, re
         confidence.push(-entropy.mean());
     }
     let sum = |parts: Vec<Tensor<1>>| Tensor::cat(parts, 0).sum();
-    Losses {
-        regression: sum(regression),
-        confidence: sum(confidence),
-        relief: relief.then(|| sum(reliefs)),
-    }
+    Losses { regression: sum(regression), confidence: sum(confidence), relief: relief.then(|| sum(reliefs)) }
 }
 
 /// Mean length of vectors `[B,h,w,3]` where `weight` `[B,h,w]` is 1; 0 if it is 1 nowhere.
@@ -180,7 +176,8 @@ mod tests {
         let expected = 0.005 * (1.0 + 2.0 + 4.0 + 8.0) / 8.0;
         assert!((error(&slope, &|_, _| true) - expected).abs() < 1e-8);
         // Pairs with a pixel outside do not count.
-        let spike = |row: usize, column: usize| if (row, column) == (4, 5) { [9.0; 3] } else { slope(row, column) };
+        let spike =
+            |row: usize, column: usize| if (row, column) == (4, 5) { [9.0; 3] } else { slope(row, column) };
         assert!((error(&spike, &|row, column| (row, column) != (4, 5)) - expected).abs() < 1e-8);
         assert!(error(&spike, &|_, _| true) > 2.0 * expected);
         assert_eq!(error(&slope, &|_, _| false), 0.0);

@@ -96,7 +96,8 @@ impl Rim {
         // Pixels beside the outline, first those inside. Every pixel is looked at, so that this takes most of the time.
         let mut outlines = [Vec::new(), Vec::new()];
         for (at, inside) in is_inside.iter().enumerate() {
-            let differs = |to: Option<usize>| to.and_then(|to| is_inside.get(to)).is_some_and(|to| to != inside);
+            let differs =
+                |to: Option<usize>| to.and_then(|to| is_inside.get(to)).is_some_and(|to| to != inside);
             let column = at % width;
             if differs((column > 0).then(|| at - 1))
                 || differs((column + 1 < width).then_some(at + 1))
@@ -143,8 +144,10 @@ impl Rim {
         let (width, height) = (self.part.width as usize, self.part.height as usize);
         let (x, y) = (at % width, at / width);
         let rows = y.saturating_sub(1)..(y + 2).min(height);
-        rows.flat_map(move |row| (x.saturating_sub(1)..(x + 2).min(width)).map(move |column| row * width + column))
-            .filter(move |to| *to != at)
+        rows.flat_map(move |row| {
+            (x.saturating_sub(1)..(x + 2).min(width)).map(move |column| row * width + column)
+        })
+        .filter(move |to| *to != at)
     }
 
     /// Those of them that share a side.
@@ -288,7 +291,8 @@ mod tests {
 
     /// A person in four colours with a fine pattern.
     fn person(x: u32, y: u32) -> Vec3 {
-        let color = [[0.8, 0.6, 0.5], [0.2, 0.3, 0.7], [0.7, 0.2, 0.2], [0.25, 0.2, 0.15]][(y / 200) as usize];
+        let color =
+            [[0.8, 0.6, 0.5], [0.2, 0.3, 0.7], [0.7, 0.2, 0.2], [0.25, 0.2, 0.15]][(y / 200) as usize];
         Vec3::from(color) + 0.05 * ((x * 7 + y * 13) % 5) as f32 - 0.1
     }
 
@@ -335,7 +339,9 @@ mod tests {
                 let (before, too_much) = (error(&rgb, &mask), area(&mask) - truth);
                 let lost = clean(&mut rgb, &mut mask);
                 let (after, left) = (error(&rgb, &mask), area(&mask) - truth);
-                println!("{name}, {grown}: {lost} pixels, {too_much} → {left} too much, error {before} → {after}");
+                println!(
+                    "{name}, {grown}: {lost} pixels, {too_much} → {left} too much, error {before} → {after}"
+                );
                 assert!(left.abs() < 0.15 * too_much && before > 0.3 && after < 0.12, "{name}, {grown}");
             }
         }
@@ -369,7 +375,8 @@ mod tests {
         // A person who is dark towards the outline, as under a lamp beside the camera, cut out over nothing.
         let mut shaded = picture(|_, _| Vec3::ZERO);
         for (x, y, pixel) in shaded.enumerate_pixels_mut() {
-            let slope = (1.0 - (1.0 + outside(x, y).min(0.0) / 120.0).powi(2)).max(0.0).sqrt().powf(1.0 / 2.2);
+            let slope =
+                (1.0 - (1.0 + outside(x, y).min(0.0) / 120.0).powi(2)).max(0.0).sqrt().powf(1.0 / 2.2);
             let lit = slope * 255.0 * person(x, y);
             pixel.0 = if outside(x, y) > 0.5 { [0; 3] } else { lit.to_array().map(|c| c.round() as u8) };
         }

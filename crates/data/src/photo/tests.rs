@@ -180,7 +180,11 @@ fn rims_of_the_background_are_left_out_of_a_users_photographs() {
     assert_eq!(greenish(&corrected), 0);
     for placement in [Placement::AsIs, Placement::Demo { height: 880 }] {
         let canvas = one(file.path(), placement).expect("a person");
-        assert!(greenish(&canvas) > 300 && !canvas.report.contains("rim"), "{placement:?}: {}", greenish(&canvas));
+        assert!(
+            greenish(&canvas) > 300 && !canvas.report.contains("rim"),
+            "{placement:?}: {}",
+            greenish(&canvas)
+        );
     }
     let rgb = DynamicImage::from(picture.clone()).into_rgb8();
     let mask = GrayImage::from_fn(side, side, |x, y| image::Luma([picture.get_pixel(x, y).0[3]]));

@@ -350,16 +350,17 @@ mod tests {
                     let anchors = host(anchors(*view, SIDE, &window, &Device::flex()));
                     let (camera, to_side) = nominal(*view, SIDE);
                     for (point, anchor) in of(map).chunks_exact(3).zip(anchors.chunks_exact(3)) {
-                        let apart = |p: &[f32]| {
-                            (0..3).map(|c| (p[c] - point[c]).powi(2)).sum::<f32>().sqrt()
-                        };
+                        let apart = |p: &[f32]| (0..3).map(|c| (p[c] - point[c]).powi(2)).sum::<f32>().sqrt();
                         if apart(anchor) < 1e-5 {
                             continue;
                         }
                         let nearest = known.chunks_exact(3).map(apart).fold(f32::INFINITY, f32::min);
                         let depth = to_side.apply(Vec3::from_slice(point).as_dvec3()).z;
                         let half_diagonal = 0.5_f64.sqrt() * depth / camera.focal.x;
-                        assert!(f64::from(nearest) < half_diagonal + 1e-4, "{view:?}: {nearest} m at {depth} m");
+                        assert!(
+                            f64::from(nearest) < half_diagonal + 1e-4,
+                            "{view:?}: {nearest} m at {depth} m"
+                        );
                         *covered += 1;
                     }
                 }

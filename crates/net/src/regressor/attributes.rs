@@ -254,7 +254,8 @@ mod tests {
                 colors: Tensor::from_data([[0.0; 3]], &device),
                 limits: Limits { color: 1.0, opacity: least },
             };
-            values(Attributes::new(&config, Tensor::from_data([features], &device), Some(geometry)).opacity)[0]
+            values(Attributes::new(&config, Tensor::from_data([features], &device), Some(geometry)).opacity)
+                [0]
         };
         for (feature, least, expected) in
             [(0.0, 0.0, 0.9), (0.0, 0.8, 0.98), (-40.0, 0.8, 0.8), (40.0, 0.8, 1.0), (-40.0, 1.0, 1.0)]

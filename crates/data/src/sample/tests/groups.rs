@@ -82,7 +82,8 @@ fn placed_samples_fit_the_nominal_cameras() {
     };
     let item =
         Stage2::new(folder.clone(), TRAIN, samples.clone()).expect("samples").sample(0).expect("a sample");
-    let first = |samples| Stage1::new(folder.clone(), TRAIN, samples).expect("samples").sample(0).expect("a sample");
+    let first =
+        |samples| Stage1::new(folder.clone(), TRAIN, samples).expect("samples").sample(0).expect("a sample");
     let placed = first(samples.clone());
     assert!((&placed.points, &placed.images) == (&item.points, &item.images));
     // The cameras' distance varies: all samples are placed, or none.

@@ -98,10 +98,20 @@ fn batches_have_second_surfaces_after_the_views() {
     assert_eq!((batch.points.dims(), batch.valid.dims()), ([2, 6, 64, 64, 3], [2, 6, 64, 64]));
     for (sample, item) in items.iter().enumerate() {
         for view in 0..6 {
-            let points: Vec<f32> =
-                batch.points.clone().slice([sample..sample + 1, view..view + 1]).into_data().try_into_vec().expect("f32");
-            let valid: Vec<f32> =
-                batch.valid.clone().slice([sample..sample + 1, view..view + 1]).into_data().try_into_vec().expect("f32");
+            let points: Vec<f32> = batch
+                .points
+                .clone()
+                .slice([sample..sample + 1, view..view + 1])
+                .into_data()
+                .try_into_vec()
+                .expect("f32");
+            let valid: Vec<f32> = batch
+                .valid
+                .clone()
+                .slice([sample..sample + 1, view..view + 1])
+                .into_data()
+                .try_into_vec()
+                .expect("f32");
             assert!(item.truth(view) == Some((&points, &valid)), "sample {sample}, view {view}");
         }
     }
