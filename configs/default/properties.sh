@@ -5,31 +5,25 @@
 set -eu
 makehuman=$1 avatars=$2
 folder=people/properties runs=runs/properties
-# The same data without clothes and hair.
-bare=$folder/bare
-mkdir -p "$bare"
-for entry in "$makehuman"/*; do
-  case $entry in */clothes | */hair) ;; *) ln -sfn "$(realpath "$entry")" "$bare" ;; esac
-done
-# people NAME SPLIT COUNT SEED MAKEHUMAN OPTION…
+# people NAME SPLIT COUNT SEED OPTION…
 people() {
-  name=$1 split=$2 count=$3 seed=$4 data=$5
-  shift 5
+  name=$1 split=$2 count=$3 seed=$4
+  shift 4
   made() { cargo xtask prepare "$@" --split "$split" --subjects "$count" --seed "$seed" -o "$folder/$name/$1"; }
-  made makehuman "$data" "$@"
+  made makehuman "$makehuman" "$@"
   # Avatars that cannot be read are skipped, with exit code 2.
   made avatars "$avatars" "$@" || [ $? = 2 ]
 }
 phone="--config configs/data/phone.toml"
 # A training needs a training person, even for one step without effect.
 for split in "val 40" "train 1"; do
-  people held ${split% *} ${split#* } 43 "$makehuman" $phone
+  people held ${split% *} ${split#* } 43 $phone
   cargo xtask prepare synth --split "${split% *}" --subjects "${split#* }" --seed 43 $phone -o $folder/held/synth
 done
 train() {
   cargo xtask train-stage1 --config configs/default/stage1.toml --resume "$@" --set samples.placed_share=1.0 --set training.preview_every=0
 }
-# row NAME MAKEHUMAN OPTION…
+# row NAME OPTION…
 row() {
   name=$1
   case " ${ROWS-$name} " in *" $name "*) ;; *) return 0 ;; esac
@@ -41,7 +35,6 @@ row() {
       --set optimizer.rate=1e-12 --set optimizer.muon.rate=1e-12 --set training.validation_samples=160 -o "$runs/$name-on-$maker"
   done
 }
-row all "$makehuman" $phone
-row cameras "$makehuman" --config configs/data/default.toml --set 'light.kind="random"'
-row light "$makehuman" $phone --set 'light.kind="even"'
-row clothes "$bare" $phone
+row all $phone
+row cameras --config configs/data/default.toml --set 'light.kind="random"'
+row light $phone --set 'light.kind="even"'
