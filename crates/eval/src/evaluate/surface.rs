@@ -214,8 +214,8 @@ impl Surface {
 mod tests {
     use super::*;
 
-    /// A wall of 32 × 40 pixels in the middle of a picture, drawn with a hole, with a part that shows a surface far behind, and with one
-    /// that is thin.
+    /// A wall of 32 × 80 pixels whose lower half stands back, drawn with a hole, with a part that shows a surface far behind, and with
+    /// one that is thin.
     #[test]
     fn open_pixels_are_uncovered_or_show_what_lies_behind() {
         let side = 256;

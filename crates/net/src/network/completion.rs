@@ -175,9 +175,8 @@ impl Seen {
 
 #[cfg(test)]
 mod tests {
-    use burn::tensor::TensorData;
-
     use burn::module::Param;
+    use burn::tensor::TensorData;
     use glam::Vec3;
 
     use super::*;

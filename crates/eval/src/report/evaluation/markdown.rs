@@ -130,8 +130,8 @@ impl Evaluation<'_> {
                 "## Surface\n\nDistances in cm between the ground-truth points of all views and the centres of the \
                  Gaussians with an opacity of at least {}, or points drawn from the meshes of the Gaussians; normals: mean cosine from \
                  the views nearest to 0, 90, 180 and 270°, in maps of 256² at most; open: share of the person's pixels that are covered by \
-                 less than 90 % or show a surface 6 cm or more behind the true one, from the views nearest to every 45°, without the three \
-                 outermost pixels.\n\n{}",
+                 less than 90 % or show a surface more than 6 cm behind the true one, from the views nearest to every 45°, without the rim \
+                 and without steps of the true depth.\n\n{}",
                 self.config.metrics.opaque,
                 table_markdown(&header, surfaces.into_iter().map(row))
             );
