@@ -5,8 +5,8 @@
 Minutes are those of the processor, all threads together.
 
 The folder holds `prepare`'s data sets synth, makehuman and avatars (configs/default/makers.sh makes them). Each front and back photograph
-is a sample by itself. The network predicts its depth beside the upright plane through the body's axis. Its input is the outline with the
-pixel's place, and:
+is a sample by itself. The network predicts its relief: the depth without the coarse body, which is the mean depth of cells of 14 cm,
+interpolated between them. It trains on windows of 128 pixels. Its input is the outline, the pixel's place, the coarse body, and:
 
 outline      nothing else
 photographs  the photograph with a random exposure of 0.7 stops
@@ -72,7 +72,17 @@ def load(folder, split, size, views):
                 mean = lambda x: (block(x) / np.maximum(count, 1) * mask).astype(np.float16)
                 kept.append((mean(color), mask, mean(depth), mean(normals), maker))
     stack = lambda at: torch.from_numpy(np.stack([row[at] for row in kept]))
-    return stack(0), stack(1), stack(2), stack(3), [row[4] for row in kept]
+    color, mask, depth, normals = (stack(at) for at in range(4))
+    coarse = body(depth, mask)
+    return color, mask, depth - coarse, normals, coarse, [row[4] for row in kept]
+
+
+def body(depth, mask):
+    """Mean depth of cells of 14 cm, interpolated between the cells that have pixels."""
+    size = mask.shape[-1]
+    cells = [F.avg_pool2d(x[:, None].float(), size // 16) for x in (depth * mask, mask)]
+    whole = [F.interpolate(x, size=(size, size), mode="bilinear") for x in cells]
+    return ((whole[0] / whole[1].clamp_min(1e-6))[:, 0] * mask).to(depth.dtype)
 
 
 class Net(torch.nn.Module):
@@ -109,10 +119,8 @@ def shade(normals, random):
     return out[:, None] / out.amax((1, 2))[:, None, None, None]
 
 
-def inputs(kind, color, mask, normals, random):
-    batch, size = len(mask), mask.shape[-1]
-    line = torch.linspace(-1, 1, size)
-    place = torch.stack([line.expand(size, size), line[:, None].expand(size, size)]).expand(batch, 2, size, size)
+def inputs(kind, color, mask, normals, coarse, place, random):
+    batch = len(mask)
     uniform = lambda *shape: torch.rand(*shape, generator=random)
     gain = 2 ** (1.4 * uniform(batch, 1, 1, 1) - 0.7)
     light = torch.nn.functional.normalize(torch.tensor([0.5, -0.6, -0.6]), dim=0)
@@ -123,19 +131,32 @@ def inputs(kind, color, mask, normals, random):
         "clay": lambda: [torch.einsum("bihw,i->bhw", normals, light)[:, None].clamp_min(0)],
         "normals": lambda: [normals],
     }[kind]()
-    return torch.cat([mask[:, None].float(), place * mask[:, None], *[m * mask[:, None] for m in more]], 1)
+    return torch.cat([mask[:, None].float(), *[m * mask[:, None] for m in [place, 10 * coarse[:, None], *more]]], 1)
+
+
+def window(data, rows, random):
+    """A window of 128 pixels around a random pixel of each person."""
+    size, side = data[1].shape[-1], 128
+    line = torch.linspace(-1, 1, size)
+    place = torch.stack([line.expand(size, size), line[:, None].expand(size, size)])
+    cut = []
+    for row in rows:
+        at = data[1][row].nonzero()
+        at = at[torch.randint(len(at), (), generator=random)]
+        y, x = ((at - side // 2).clamp(0, size - side)).tolist()
+        cut.append([part[..., y : y + side, x : x + side] for part in (*(data[k][row] for k in range(5)), place)])
+    return [torch.stack(parts) for parts in zip(*cut)]
 
 
 def study(kind, options, train, held_out):
     torch.manual_seed(0)
     random = torch.Generator().manual_seed(1)
-    net = Net(3 + PLANES[kind]).to(memory_format=torch.channels_last)
+    net = Net(4 + PLANES[kind]).to(memory_format=torch.channels_last)
     average = torch.optim.swa_utils.AveragedModel(net, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(0.99))
     optimizer = torch.optim.AdamW(net.parameters(), lr=2e-3, weight_decay=0.02)
 
-    def predict(model, rows, data, random):
-        color, mask, _, normals, _ = data
-        x = inputs(kind, color[rows].float(), mask[rows], normals[rows].float(), random)
+    def predict(model, color, mask, _, normals, coarse, place):
+        x = inputs(kind, color.float(), mask, normals.float(), coarse.float(), place, random)
         with torch.autocast("cpu", torch.bfloat16):
             return model(x.contiguous(memory_format=torch.channels_last)).float()
 
@@ -144,10 +165,9 @@ def study(kind, options, train, held_out):
         share = (time.process_time() - start) / (60 * options.minutes)
         for group in optimizer.param_groups:
             group["lr"] = 2e-3 * min(1, (steps + 1) / 50) * (0.01 + 0.99 * (1 + math.cos(math.pi * min(share, 1))) / 2)
-        rows = torch.randint(len(train[1]), (8,), generator=random)
-        mask = train[1][rows]
-        error = (predict(net, rows, train, random) - train[2][rows].float() * 10).abs()
-        loss = (error * mask).sum() / mask.sum()
+        sample = window(train, torch.randint(len(train[1]), (8,), generator=random).tolist(), random)
+        error = (predict(net, *sample) - sample[2].float() * 20).abs() * sample[1]
+        loss = error.sum() / sample[1].sum()
         optimizer.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
@@ -156,16 +176,17 @@ def study(kind, options, train, held_out):
         steps += 1
     figures = {}
     random.manual_seed(2)
+    line = torch.linspace(-1, 1, options.size)
+    place = torch.stack([line.expand(options.size, options.size), line[:, None].expand(options.size, options.size)])
     with torch.no_grad():
-        for row, maker in enumerate(held_out[4]):
-            rows, mask = torch.tensor([row]), held_out[1][row]
-            error = (predict(average, rows, held_out, random)[0] / 10 - held_out[2][row].float()).abs()[mask]
+        for row, maker in enumerate(held_out[5]):
+            sample = [part[row][None] for part in held_out[:5]]
+            error = (predict(average, *sample, place[None])[0] / 20 - sample[2][0].float()).abs()[sample[1][0]]
             figures.setdefault((maker, "front" if row % 2 == 0 else "back"), []).append(1000 * error.mean().item())
     means = {key: sum(row) / len(row) for key, row in figures.items()}
     print(f"{options.size}² {kind}: {steps} steps, {sum(p.numel() for p in net.parameters()) / 1e6:.2f} M parameters; mm:",
           ", ".join(f"{maker} {side} {value:.1f}" for (maker, side), value in means.items()),
           f"; mean {sum(means.values()) / len(means):.2f}", flush=True)
-
 
 
 def main():
@@ -177,6 +198,8 @@ def main():
     options = parser.parse_args()
     train = load(options.folder, "train", options.size, (0, 1, 4, 5))
     held_out = load(options.folder, "val", options.size, (0, 1))
+    relief = [1000 * depth[mask].float().abs().mean().item() for mask, depth in zip(held_out[1], held_out[2])]
+    print(f"{options.size}² the coarse body alone: {sum(relief) / len(relief):.2f} mm", flush=True)
     for kind in options.inputs:
         study(kind, options, train, held_out)
 

@@ -7,6 +7,7 @@
 #![cfg_attr(doc, doc = "\n", doc = include_str!("../../../docs/architecture.md"))]
 
 mod commands;
+mod cutouts;
 mod device;
 mod dump;
 mod failure;

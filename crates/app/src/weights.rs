@@ -1,10 +1,13 @@
 //! The weights of a command.
 
+use std::cell::OnceCell;
 use std::path::Path;
 
+use burn::tensor::Device;
 use snapsnap_base::config::Schema;
+use snapsnap_net::U2Net;
 use snapsnap_net::config::Config;
-use snapsnap_net::weights::WeightFile;
+use snapsnap_net::weights::{Source, WeightFile};
 
 use crate::commands::ConfigArguments;
 use crate::failure::Failure;
@@ -13,8 +16,23 @@ use crate::failure::Failure;
 const IN_FOLDER: &str = "weights.safetensors";
 /// The default weights, trained on synthetic people (docs/weights.md).
 const DEFAULT: &[u8] = include_bytes!("../../../assets/weights/default.safetensors");
+/// The weights of the network that removes backgrounds (docs/u2netp_convert.py).
+const U2NET: &[u8] = include_bytes!("../../../assets/weights/u2netp.safetensors");
 /// Name of the default weights, in place of a path.
 pub const DEFAULT_NAME: &str = "the default weights";
+
+/// The network that finds a person's pixels, from 0 to 1, on the CPU: it is small, and a GPU's kernels would take longer to compile.
+pub fn segmenter() -> impl Fn(&[f32]) -> Vec<f32> {
+    let device = Device::flex();
+    let loaded = OnceCell::new();
+    move |rgb| {
+        let load = || {
+            let source = Source::embedded("U²-Net", U2NET).expect("a file of the program's own");
+            U2Net::load(&source, &device).expect("weights of the program's own")
+        };
+        loaded.get_or_init(load).forward(rgb, &device)
+    }
+}
 
 /// Opens a weight file, or `weights.safetensors` in a folder, or without a path the default weights. --config and --set override the
 /// stored config.

@@ -1,6 +1,7 @@
 //! A photograph and its mask → a square canvas, with the person at the networks' place and size.
 
 mod doubts;
+mod matting;
 mod placing;
 mod rim;
 mod specks;
@@ -16,6 +17,8 @@ use crate::resize::bilinear;
 use snapsnap_base::FileError;
 use snapsnap_mesh::picture::{self, MAX_BYTES};
 
+use matting::matte;
+pub use matting::{FOUND, Segmenter};
 pub use placing::Mapping;
 pub(crate) use placing::place;
 use placing::{Standing, placed, together};
@@ -44,6 +47,17 @@ pub enum Placement {
     },
 }
 
+/// Who tells a photograph's person from the background.
+#[derive(Clone, Copy)]
+pub enum Cutting<'a> {
+    /// Masks and alpha channels alone.
+    Given,
+    /// A network, for photographs without either.
+    Missing(&'a Segmenter<'a>),
+    /// A network, for all photographs without a mask's file.
+    All(&'a Segmenter<'a>),
+}
+
 /// One photograph on its canvas; arrays are row-major, side S.
 #[derive(Debug, Clone)]
 pub struct Canvas {
@@ -64,34 +78,37 @@ pub struct Canvas {
 pub struct Pair {
     /// Front and back on their canvases.
     pub canvases: [Canvas; 2],
+    /// Colours and masks of front and back before their placement.
+    pub cutouts: [(RgbImage, GrayImage); 2],
     /// Signs that they are not photographs as the networks need them, a sentence each: a mask that touches three borders, a
     /// person who is wider than high, equal pictures, silhouettes that do not fit one another.
     pub doubts: Vec<String>,
 }
 
 /// Loads the photographs of front and back and places each on a canvas of `side` pixels. The mask of the person is the
-/// file in `masks` (white: person) or, without one, the picture's alpha channel. With [`Placement::Training`],
+/// file in `masks` (white: person) or, without one, what `cutting` says. With [`Placement::Training`],
 /// photographs whose sizes and boxes agree are taken for photographs from one place. They get the same scale and
 /// offset.
 ///
 /// # Errors
-/// [`FileError`]: unreadable files, a mask of another size, an empty or missing mask, a picture below 64 pixels or of a
-/// single colour, or, with [`Placement::AsIs`], of another size than the canvas.
+/// [`FileError`]: unreadable files, a mask of another size, an empty or missing mask, a photograph in which the network finds nobody, a
+/// picture below 64 pixels or of a single colour, or, with [`Placement::AsIs`], of another size than the canvas.
 pub fn load(
     paths: [&Path; 2],
     masks: [Option<&Path>; 2],
+    cutting: Cutting,
     side: usize,
     placement: Placement,
 ) -> Result<Pair, FileError> {
-    let front = Cutout::read(paths[0], masks[0], side, placement)?;
-    let back = Cutout::read(paths[1], masks[1], side, placement)?;
+    let front = Cutout::read(paths[0], masks[0], cutting, side, placement)?;
+    let back = Cutout::read(paths[1], masks[1], cutting, side, placement)?;
     let doubts = doubts::doubts(&front, &back);
     let common = match placement {
         Placement::Training { .. } => together([&front.mask, &back.mask], [front.person, back.person]),
         _ => None,
     };
     let canvases = [front.canvas(common, side, placement)?, back.canvas(common, side, placement)?];
-    Ok(Pair { canvases, doubts })
+    Ok(Pair { canvases, cutouts: [front, back].map(|cutout| (cutout.rgb, cutout.mask)), doubts })
 }
 
 /// A photograph without its background.
@@ -110,6 +127,7 @@ impl<'a> Cutout<'a> {
     fn read(
         path: &'a Path,
         mask: Option<&'a Path>,
+        cutting: Cutting,
         side: usize,
         placement: Placement,
     ) -> Result<Self, FileError> {
@@ -124,23 +142,39 @@ impl<'a> Cutout<'a> {
             let message = format!("is {width}×{height}; both sides must have at least {MIN_SIDE} pixels");
             return Err(FileError::unsuitable(path, message));
         }
-        let (mut mask, mask_path) = match mask {
-            Some(mask_path) => (grey(&picture::decode(mask_path, MAX_BYTES)?), mask_path),
-            None => (alpha(&picture).map_err(|message| FileError::unsuitable(path, message))?, path),
+        let (given, mask_path) = match (mask, cutting) {
+            (Some(mask_path), _) => (Ok(grey(&picture::decode(mask_path, MAX_BYTES)?)), mask_path),
+            (None, Cutting::All(_)) => (Err(""), path),
+            (None, _) => (alpha(&picture), path),
         };
-        let (mask_width, mask_height) = mask.dimensions();
-        if (mask_width, mask_height) != (width, height) {
+        if let Ok((mask_width, mask_height)) = given.as_ref().map(GrayImage::dimensions)
+            && (mask_width, mask_height) != (width, height)
+        {
             let path = path.display();
             let message =
                 format!("the mask is {mask_width}×{mask_height}, its picture {path} is {width}×{height}");
             return Err(FileError::unsuitable(mask_path, message));
         }
-        let mut rgb = picture.into_rgb8();
+        let is_given = given.is_ok();
+        let rgb = picture.into_rgb8();
+        let (mut rgb, mut mask) = match (given, cutting) {
+            (Ok(mask), _) => (rgb, mask),
+            (Err(_), Cutting::Missing(segment) | Cutting::All(segment)) => {
+                matte(rgb, segment).ok_or_else(|| {
+                    let message =
+                        "no person was found in the picture: give masks with --masks FRONT_MASK BACK_MASK";
+                    FileError::unsuitable(path, message)
+                })?
+            }
+            (Err(message), Cutting::Given) => return Err(FileError::unsuitable(path, message)),
+        };
         // The demo includes every pixel that is not 0. Lossy masks have many such pixels outside the person.
         let least = if matches!(placement, Placement::Demo { .. }) { 1 } else { u8::MAX.div_ceil(2) };
-        // The demo has no such steps.
+        // The demo has no such steps, and a network's mask needs none.
         let (specks, rim) = match placement {
-            Placement::Training { .. } => (specks::remove(&mut mask, least), rim::clean(&mut rgb, &mut mask)),
+            Placement::Training { .. } if is_given => {
+                (specks::remove(&mut mask, least), rim::clean(&mut rgb, &mut mask))
+            }
             _ => (0, 0),
         };
         let person = Rect::around(&mask, least).ok_or_else(|| nobody(mask_path, placement))?;
@@ -148,8 +182,13 @@ impl<'a> Cutout<'a> {
             let message = "the person is of a single colour: this is no photograph";
             return Err(FileError::unsuitable(path, message));
         }
+        let cut_out = if is_given {
+            String::new()
+        } else {
+            format!(", cut out by the network at {}×{}", rgb.width(), rgb.height())
+        };
         let mut source = format!(
-            "{width}×{height}, person's box {}×{} at ({}, {})",
+            "{width}×{height}{cut_out}, person's box {}×{} at ({}, {})",
             person.width, person.height, person.x, person.y
         );
         if specks > 0 {
@@ -163,19 +202,20 @@ impl<'a> Cutout<'a> {
 
     /// Places the photograph by the person's box, or by the common box of both photographs.
     fn canvas(
-        self,
+        &self,
         common: Option<Standing>,
         side: usize,
         placement: Placement,
     ) -> Result<Canvas, FileError> {
         let Self { mask_path, rgb, mask, person, source, .. } = self;
         let canvas = match placement {
-            Placement::AsIs => on_canvas(&rgb, &mask, source + ", used as it is"),
+            Placement::AsIs => on_canvas(rgb, mask, format!("{source}, used as it is")),
             Placement::Training { height } => {
-                let source = if common.is_some() { source + ", with the other" } else { source };
-                placed(&rgb, &mask, common.unwrap_or(Standing::alone(person)), [height, side], &source)
+                let with = if common.is_some() { ", with the other" } else { "" };
+                let standing = common.unwrap_or(Standing::alone(*person));
+                placed(rgb, mask, standing, [height, side], &format!("{source}{with}"))
             }
-            Placement::Demo { height } => placed_as_demo(&rgb, &mask, person, [height, side], &source),
+            Placement::Demo { height } => placed_as_demo(rgb, mask, *person, [height, side], source),
         };
         if canvas.valid.contains(&true) { Ok(canvas) } else { Err(nobody(mask_path, placement)) }
     }
@@ -201,7 +241,7 @@ fn grey(picture: &DynamicImage) -> GrayImage {
 fn alpha(picture: &DynamicImage) -> Result<GrayImage, &'static str> {
     if !picture.color().has_alpha() {
         return Err(
-            "has no alpha channel: cut the person out, or give masks with --masks FRONT_MASK BACK_MASK",
+            "has no alpha channel: cut the person out, give masks with --masks FRONT_MASK BACK_MASK, or let --cutout auto do it",
         );
     }
     // The usual case needs no copy.
@@ -209,8 +249,8 @@ fn alpha(picture: &DynamicImage) -> Result<GrayImage, &'static str> {
     let mask = GrayImage::from_fn(rgba.width(), rgba.height(), |x, y| image::Luma([rgba.get_pixel(x, y)[3]]));
     if mask.pixels().all(|p| p[0] == u8::MAX) {
         return Err(
-            "is opaque everywhere, so its alpha channel does not show the person: cut the person out, or \
-                    give masks with --masks FRONT_MASK BACK_MASK",
+            "is opaque everywhere, so its alpha channel does not show the person: cut the person out, give masks with --masks \
+                    FRONT_MASK BACK_MASK, or let --cutout auto do it",
         );
     }
     Ok(mask)

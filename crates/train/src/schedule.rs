@@ -28,6 +28,16 @@ pub enum Schedule {
         /// The last rate divided by the highest.
         end: f64,
     },
+    /// A linear rise, the highest rate, and a linear fall ("warmup-stable-decay"). While the rate is constant, it does not depend on
+    /// the number of steps, so that a run's end can be set later.
+    Trapezoid {
+        /// Steps in which the rate rises.
+        warm_up: usize,
+        /// Last steps, in which the rate falls.
+        fall: usize,
+        /// The last rate divided by the highest.
+        end: f64,
+    },
 }
 
 impl Default for Schedule {
@@ -49,7 +59,11 @@ impl Schedule {
             Self::Cosine { warm_up, .. } if warm_up > steps => {
                 Some(("warm_up", format!("is {warm_up}, must be at most `training.steps` ({steps})")))
             }
-            Self::Cosine { end, .. } => outside([("end", end, 0.0..=1.0)]),
+            Self::Trapezoid { warm_up, fall, .. } if warm_up.saturating_add(fall) > steps => {
+                let message = format!("is {fall}, with `warm_up` must be at most `training.steps` ({steps})");
+                Some(("fall", message))
+            }
+            Self::Cosine { end, .. } | Self::Trapezoid { end, .. } => outside([("end", end, 0.0..=1.0)]),
         }
     }
 
@@ -60,7 +74,7 @@ impl Schedule {
         };
         let steps = match self {
             Self::OneCycle { overhang, .. } => steps + overhang,
-            Self::Cosine { .. } => steps,
+            Self::Cosine { .. } | Self::Trapezoid { .. } => steps,
         };
         let at = step.min(steps.saturating_sub(1)) as f64;
         match *self {
@@ -73,10 +87,16 @@ impl Schedule {
                 let fall = (steps as f64 - 1.0 - peak).max(f64::MIN_POSITIVE);
                 anneal(1.0, start / end_divisor, (at - peak) / fall)
             }
-            Self::Cosine { warm_up, .. } if at < warm_up as f64 => (at + 1.0) / (warm_up as f64 + 1.0),
+            Self::Cosine { warm_up, .. } | Self::Trapezoid { warm_up, .. } if at < warm_up as f64 => {
+                (at + 1.0) / (warm_up as f64 + 1.0)
+            }
             Self::Cosine { warm_up, end } => {
                 let fall = (steps.saturating_sub(1).saturating_sub(warm_up)).max(1) as f64;
                 anneal(1.0, end, (at - warm_up as f64) / fall)
+            }
+            Self::Trapezoid { fall, end, .. } => {
+                let left = steps.saturating_sub(1) as f64 - at;
+                end + (1.0 - end) * (left / fall.max(1) as f64).min(1.0)
             }
         }
     }
@@ -110,5 +130,26 @@ mod tests {
         assert!((share(99) - 1.0).abs() < 1e-12 && (share(999) - 1e-3).abs() < 1e-12);
         let short = |step| Schedule::Cosine { warm_up: 0, end: 0.1 }.share(step, 1);
         assert!(short(0).is_finite() && short(7).is_finite());
+    }
+
+    #[test]
+    fn trapezoid_is_constant_until_it_falls() {
+        let schedule = Schedule::Trapezoid { warm_up: 9, fall: 100, end: 0.01 };
+        let share = |step| schedule.share(step, 1000);
+        assert!((share(0) - 0.1).abs() < 1e-12 && (share(8) - 0.9).abs() < 1e-12);
+        assert!((9..900).all(|step| share(step) == 1.0), "constant");
+        // 100 steps from the highest rate to the last.
+        assert!(
+            (share(949) - 0.505).abs() < 1e-12
+                && (share(999) - 0.01).abs() < 1e-12
+                && share(2000) == share(999)
+        );
+        assert_eq!(schedule.share(500, 100_000), share(500), "whatever the number of steps");
+        assert_eq!(schedule.problem(1000), None);
+        assert_eq!(schedule.problem(108).map(|(key, _)| key), Some("fall"));
+        let endless = Schedule::Trapezoid { warm_up: 1, fall: usize::MAX, end: 0.01 };
+        assert_eq!(endless.problem(1000).map(|(key, _)| key), Some("fall"));
+        let step = Schedule::Trapezoid { warm_up: 0, fall: 0, end: 0.0 };
+        assert_eq!([0, 8].map(|at| step.share(at, 10)), [1.0, 1.0]);
     }
 }

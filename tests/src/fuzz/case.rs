@@ -19,7 +19,7 @@ use super::{Format, INPUTS, ODD_INPUTS, Random, bytes, judge, text};
 /// Most changes to one file.
 const MOST_CHANGES: usize = 4;
 /// Files that are lists of lines, whose beginning may be a whole file.
-const LISTS: [&str; 5] = ["obj", "mtl", "toml", "target", "mhclo"];
+const LISTS: [&str; 4] = ["obj", "mtl", "toml", "target"];
 /// Largest share of another file that can never be taken for the whole.
 const CUT: f64 = 0.9;
 

@@ -7,7 +7,7 @@ use clap::Args;
 use image::imageops::FilterType;
 use image::{DynamicImage, RgbImage, imageops};
 use serde_json::json;
-use snapsnap_data::photo::{self, Canvas, Placement};
+use snapsnap_data::photo::{self, Canvas, Cutting, Placement};
 use snapsnap_eval::pictures::Picture;
 use snapsnap_eval::region::{Region, margin};
 use snapsnap_eval::similarity::psnr;
@@ -77,7 +77,8 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     // The sample pair fills its canvas. Hence its cameras are known, and other views can be compared.
     let [front, back] = PHOTOGRAPHS.map(|(name, _)| folder.path.join(name));
     let canvases =
-        photo::load([&front, &back], [None; 2], config.network.resolution, Placement::AsIs)?.canvases;
+        photo::load([&front, &back], [None; 2], Cutting::Given, config.network.resolution, Placement::AsIs)?
+            .canvases;
     let [front, back] = canvases.map(|Canvas { rgb, mask, valid, .. }| Photograph { rgb, mask, valid });
     let precision = PrecisionChoice::Auto.of_weights(&config, &device);
     let reconstructor = Reconstructor::load(&weights, &device)?.in_precision(precision);

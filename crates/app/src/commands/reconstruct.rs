@@ -7,7 +7,7 @@ use burn::tensor::Device;
 use clap::Args;
 use snapsnap_base::config::Schema;
 use snapsnap_base::file;
-use snapsnap_data::photo::{self, Canvas, Pair, Placement};
+use snapsnap_data::photo::{self, Canvas, Cutting, Pair, Placement};
 use snapsnap_mesh::picture;
 use snapsnap_net::precision::{Precision, PrecisionChoice, unit_of_cpu};
 use snapsnap_net::weights::schema::Part;
@@ -20,7 +20,7 @@ use super::{ConfigArguments, check_kind, check_outputs, is_same_file};
 use crate::failure::{Failure, bail};
 use crate::progress::Progress;
 use crate::turntable::Turntable;
-use crate::{device, dump, memory, output, say, weights};
+use crate::{cutouts, device, dump, memory, output, say, weights};
 
 /// Bytes per pixel of a photograph while it is placed on its canvas: 4 of the decoded picture, 3 + 1 of its colours and mask,
 /// 4 of a plane of f32, 3 + 1 of the other photograph's colours and mask, and 2 to spare.
@@ -28,13 +28,20 @@ const BYTES_PER_PIXEL: u64 = 18;
 
 #[derive(Args)]
 pub struct Arguments {
-    /// Photograph of the front: RGBA, or RGB with --masks.
+    /// Photograph of the front. Without an alpha channel or --masks, a network removes the background.
     front: PathBuf,
     /// Photograph of the back.
     back: PathBuf,
     /// Masks of the two photographs (white: person).
     #[arg(long, num_args = 2, value_names = ["FRONT_MASK", "BACK_MASK"])]
     masks: Option<Vec<PathBuf>>,
+    /// Who removes the background: auto: the network where neither an alpha channel nor --masks does; network: the network, whatever
+    /// the alpha channels say; none: alpha channels and --masks alone.
+    #[arg(long, value_name = "auto|network|none", default_value = "auto", value_parser = ["auto", "network", "none"])]
+    cutout: String,
+    /// Also write the photographs without background: front.png and back.png.
+    #[arg(long, value_name = "DIR")]
+    save_cutouts: Option<PathBuf>,
     /// Use the pictures as the canvas, without cropping, scaling and centring.
     #[arg(long)]
     as_is: bool,
@@ -108,7 +115,11 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
         Some(path) => Some(Target::new(path, &arguments.surface)?),
         None => arguments.surface.must_be_unused("without --mesh there is no mesh to shape")?,
     };
-    let config_path = check_paths(arguments, weights.path(), turntable.as_ref(), target.as_ref())?;
+    if arguments.masks.is_some() && arguments.cutout == "network" {
+        bail!("--cutout network: --masks already tells the person from the background");
+    }
+    let saved = arguments.save_cutouts.as_deref().map(cutouts::paths).transpose()?;
+    let config_path = check_paths(arguments, weights.path(), turntable.as_ref(), target.as_ref(), &saved)?;
     device::begin_search(&arguments.device);
     for path in [&arguments.front, &arguments.back] {
         let [width, height] = picture::size(path)?;
@@ -125,12 +136,23 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let since = Instant::now();
     let masks = [0, 1].map(|i| masks.get(i).map(PathBuf::as_path));
     let paths = [arguments.front.as_path(), &arguments.back];
-    let Pair { canvases, doubts } = photo::load(paths, masks, config.network.resolution, placement)?;
+    let segmenter = weights::segmenter();
+    let cutting = match &*arguments.cutout {
+        "none" => Cutting::Given,
+        "network" => Cutting::All(&segmenter),
+        _ => Cutting::Missing(&segmenter),
+    };
+    let Pair { canvases, cutouts, doubts } =
+        photo::load(paths, masks, cutting, config.network.resolution, placement)?;
     if arguments.strict && !doubts.is_empty() {
         bail!("{} (--strict)", doubts.join("\n"));
     }
     doubts.iter().for_each(|doubt| say::note(&format!("warning: {doubt}")));
     timed("photographs", since);
+    for (path, (rgb, mask)) in saved.iter().flatten().zip(&cutouts) {
+        cutouts::save(path, rgb, mask)?;
+    }
+    drop(cutouts);
     let since = Instant::now();
     let device = device::choose(&arguments.device)?;
     timed("finding the device", since);
@@ -202,6 +224,7 @@ fn check_paths(
     weights: &Path,
     turntable: Option<&Turntable>,
     mesh: Option<&Target>,
+    saved: &Option<[PathBuf; 2]>,
 ) -> Result<Option<PathBuf>, Failure> {
     let mut inputs: Vec<&Path> = vec![&arguments.front, &arguments.back, weights];
     inputs.extend(arguments.masks.iter().flatten().map(PathBuf::as_path));
@@ -215,6 +238,7 @@ fn check_paths(
     let outputs = [Some(&arguments.output), arguments.dump.as_ref(), config_path.as_ref()];
     let mut outputs: Vec<&Path> = outputs.into_iter().flatten().map(PathBuf::as_path).collect();
     outputs.extend(mesh.map(Target::files).unwrap_or_default());
+    outputs.extend(saved.iter().flatten().map(PathBuf::as_path));
     let mut pictures = Vec::new();
     if let Some(turntable) = turntable {
         outputs.iter().try_for_each(|output| turntable.check_apart(output))?;

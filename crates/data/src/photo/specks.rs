@@ -13,11 +13,11 @@ const NEAR: f32 = 0.06;
 const LARGE: f32 = 0.03;
 
 /// Pieces of a mask on a grid.
-struct Pieces {
+pub(super) struct Pieces {
     /// For each cell, row by row, the number of its piece, counted from 1; 0 for empty cells.
-    of: Vec<u32>,
+    pub of: Vec<u32>,
     /// Number of cells and box in cells of each piece.
-    pieces: Vec<(usize, Rect)>,
+    pub pieces: Vec<(usize, Rect)>,
 }
 
 /// Sets the mask to 0 at specks: small pieces far from the largest piece of the pixels that reach `least`. Returns their number.
@@ -59,7 +59,7 @@ fn overlap(a: &Rect, b: &Rect, near: u32) -> bool {
 }
 
 /// The connected pieces of the marked cells, with diagonal neighbours.
-fn pieces(marked: &[bool], columns: u32) -> Pieces {
+pub(super) fn pieces(marked: &[bool], columns: u32) -> Pieces {
     let rows = marked.len() as u32 / columns;
     let mut found = Pieces { of: vec![0; marked.len()], pieces: Vec::new() };
     let mut waiting = Vec::new();

@@ -29,7 +29,8 @@ fn quarters() -> tempfile::NamedTempFile {
 
 /// The canvas of a photograph that is front and back.
 fn one(path: &Path, placement: Placement) -> Result<Canvas, FileError> {
-    load([path, path], [None; 2], SIDE, placement).map(|Pair { canvases: [canvas, _], .. }| canvas)
+    load([path, path], [None; 2], Cutting::Given, SIDE, placement)
+        .map(|Pair { canvases: [canvas, _], .. }| canvas)
 }
 
 fn check_quarters(canvas: &Canvas, rows: std::ops::Range<usize>) {

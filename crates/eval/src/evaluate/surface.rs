@@ -101,23 +101,17 @@ pub fn truth(people: &People, row: usize) -> Result<Truth, EvalError> {
 }
 
 impl Truth {
-    /// Mean cosine between the normals of the ground truth and those of the depth maps that `depth` returns.
-    ///
-    /// # Errors
-    /// Those of `depth`.
-    pub fn agreement(
-        &self,
-        depth: impl Fn(&Camera) -> Result<Vec<f32>, EvalError>,
-    ) -> Result<Option<f64>, EvalError> {
+    /// Mean cosine between the normals of the ground truth and those of the depth maps that `depth` returns for the views.
+    pub fn agreement(&self, depth: impl Fn(usize) -> Vec<f32>) -> Option<f64> {
         let (mut sum, mut count) = (0.0, 0);
-        let with_normals = self.views.iter().filter_map(|view| Some((&view.camera, view.normals.as_ref()?)));
-        for (camera, expected) in with_normals {
-            if let Some((cosine, pixels)) = consistency(&normals(&depth(camera)?, camera), expected) {
+        for (i, view) in self.views.iter().enumerate() {
+            let Some(expected) = &view.normals else { continue };
+            if let Some((cosine, pixels)) = consistency(&normals(&depth(i), &view.camera), expected) {
                 sum += cosine * pixels as f64;
                 count += pixels;
             }
         }
-        Ok((count > 0).then(|| sum / count as f64))
+        (count > 0).then(|| sum / count as f64)
     }
 
     /// The same for a mesh (world frame, metres).
@@ -127,21 +121,14 @@ impl Truth {
     pub fn agreement_of_mesh(&self, mesh: &Mesh) -> Result<Option<f64>, EvalError> {
         let renderer = Renderer::new(mesh).map_err(|e| EvalError::Empty(e.to_string()))?;
         let options = ViewOptions { samples: 1, ..ViewOptions::default() };
-        self.agreement(|camera| Ok(renderer.draw(camera, &options).depth))
+        Ok(self.agreement(|i| renderer.draw(&self.views[i].camera, &options).depth))
     }
 
-    /// Share of the true surface's pixels that are open in the pictures of `depth` (metres, not divided by coverage) and coverage
-    /// that `drawn` returns. `None` without such a pixel.
-    ///
-    /// # Errors
-    /// Those of `drawn`.
-    pub fn open(
-        &self,
-        drawn: impl Fn(&Camera) -> Result<[Vec<f32>; 2], EvalError>,
-    ) -> Result<Option<f64>, EvalError> {
+    /// Share of the true surface's pixels that are open in the views' pictures of depth (metres, not divided by coverage) and
+    /// coverage. `None` without such a pixel.
+    pub fn open(&self, drawn: &[[Vec<f32>; 2]]) -> Option<f64> {
         let (mut open, mut count) = (0_u64, 0_u64);
-        for TrueView { camera, depth: truth, .. } in &self.views {
-            let [depth, alpha] = drawn(camera)?;
+        for (TrueView { camera, depth: truth, .. }, [depth, alpha]) in self.views.iter().zip(drawn) {
             let width = camera.width as usize;
             let is_step = |i: usize| {
                 let beside = [(i % width + 1 < width).then_some(i + 1), Some(i + width)];
@@ -155,7 +142,7 @@ impl Truth {
                 open += u64::from(alpha[i] < CLOSED || depth[i] / alpha[i] > truth[i] + BEHIND);
             }
         }
-        Ok((count > 0).then(|| open as f64 / count as f64))
+        (count > 0).then(|| open as f64 / count as f64)
     }
 }
 
@@ -177,20 +164,20 @@ impl Surface {
         let there: Vec<[f32; 3]> =
             centres.into_iter().zip(opacities).filter(|(_, o)| *o >= opaque).map(|(p, _)| p).collect();
         let there = thinned(&there, MOST);
-        let drawn = |camera: &Camera| {
-            let options = RenderOptions { depth: true, ..RenderOptions::inria() };
-            let rendered = render(gaussians, std::slice::from_ref(camera), &options)?;
+        let options = RenderOptions { depth: true, ..RenderOptions::inria() };
+        let drawn = |view: &TrueView| {
+            let rendered = render(gaussians, std::slice::from_ref(&view.camera), &options)?;
             Ok([rendered.depth.expect("an option"), rendered.alpha].map(snapsnap_ops::host))
         };
-        let depth = |camera: &Camera| {
-            let [depth, alpha] = drawn(camera)?;
-            // Depths are weighted by coverage. A surface has at least half.
-            Ok(depth.iter().zip(alpha).map(|(z, a)| if a > 0.5 { z / a } else { 0.0 }).collect())
+        let drawn: Vec<[Vec<f32>; 2]> = truth.views.iter().map(drawn).collect::<Result<_, EvalError>>()?;
+        // Depths are weighted by coverage. A surface has at least half.
+        let surface = |[depth, alpha]: &[Vec<f32>; 2]| {
+            depth.iter().zip(alpha).map(|(z, a)| if *a > 0.5 { z / a } else { 0.0 }).collect()
         };
         Ok(Self {
             chamfer: chamfer(&there, &truth.points)?,
-            normals: truth.agreement(depth)?,
-            open: truth.open(drawn)?,
+            normals: truth.agreement(|i| surface(&drawn[i])),
+            open: truth.open(&drawn),
         })
     }
 
@@ -228,7 +215,7 @@ mod tests {
         let truth = Truth { points: Vec::new(), views };
         let drawn = |of: &dyn Fn(usize) -> (f32, f32)| {
             let (depth, alpha): (Vec<f32>, Vec<f32>) = (0..side * side).map(of).unzip();
-            truth.open(|_| Ok([depth.clone(), alpha.clone()])).expect("draws").expect("pixels")
+            truth.open(&[[depth, alpha]]).expect("pixels")
         };
         // Without three pixels inside of the outline; the last pixels before an edge count as the edge on the right and below.
         let (columns, rows) = ((13..38), (15..48).chain(55..88));
@@ -249,6 +236,6 @@ mod tests {
         assert_eq!(drawn(&|i| if i % side < 13 { (0.0, 0.0) } else { (depth[i], 1.0) }), 0.0);
         assert_eq!(drawn(&|i| (if (49..52).contains(&(i / side)) { 2.1 } else { depth[i] }, 1.0)), 0.0);
         let nobody = Truth { points: Vec::new(), views: Vec::new() };
-        assert_eq!(nobody.open(|_| Ok([Vec::new(), Vec::new()])).expect("draws"), None);
+        assert_eq!(nobody.open(&[]), None);
     }
 }

@@ -10,7 +10,7 @@ use serde::Deserialize;
 use serde::de::DeserializeOwned;
 use snapsnap_base::{FileError, file, quoted};
 
-use super::proxy::{Proxy, Wardrobe};
+use super::proxy::Wardrobe;
 use crate::poses::Poses;
 
 /// Metres per unit of MakeHuman's files, a decimetre.
@@ -57,7 +57,6 @@ pub struct Library {
     pub poses: Option<Poses>,
     /// Clothes and hair.
     pub wardrobe: Wardrobe,
-    proxies: Mutex<HashMap<PathBuf, Arc<Proxy>>>,
 }
 
 impl Library {
@@ -88,10 +87,10 @@ impl Library {
             let path = root.join("rigs/default.mhskel");
             return Err(FileError::unsuitable(&path, format!("has no bone `{bone}`")));
         }
-        let wardrobe = Wardrobe::open(&root)?;
+        let wardrobe = Wardrobe::open(&root, positions.len())?;
         let poses = Poses::within(&root.join("poses"))?;
-        let (targets, proxies) = Default::default();
-        Ok(Self { root, positions, groups, bones, weights, targets, poses, wardrobe, proxies })
+        let targets = Mutex::default();
+        Ok(Self { root, positions, groups, bones, weights, targets, poses, wardrobe })
     }
 
     /// The morph target at the path `name` below `targets`, without its ending. Each file is read once.
@@ -101,14 +100,6 @@ impl Library {
     pub fn target(&self, name: &str) -> Result<Target, FileError> {
         let path = self.root.join("targets").join(format!("{name}.target"));
         once(&self.targets, &path, || read_target(&path, self.positions.len()))
-    }
-
-    /// A proxy of the wardrobe. Each file is read once.
-    ///
-    /// # Errors
-    /// [`FileError`] if it is damaged.
-    pub fn proxy(&self, path: &Path) -> Result<Arc<Proxy>, FileError> {
-        once(&self.proxies, path, || Proxy::read(path, self.positions.len()))
     }
 
     /// Names of the targets in a folder below `targets`, in order.

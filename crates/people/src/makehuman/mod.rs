@@ -126,7 +126,7 @@ impl<'a> Person<'a> {
         }
         let is_draped = matches!(outfit.lower, Lower::Skirt { .. }) || outfit.top_length > 1.0;
         let wardrobe = &mut stream(&format!("makehuman/wardrobe/{name}"));
-        let worn = Worn::draw(library, &outfit, mix.sex, is_draped, wardrobe)?;
+        let worn = Worn::draw(library, &outfit, mix.sex, is_draped, wardrobe);
         pose.spread_arms(0.5 * outfit.breadth());
 
         let joints = Joints::of(library, &rest);

@@ -1,8 +1,9 @@
 //! Clothes, hair, hats and shoes of MakeHuman's asset collection: meshes bound to the base mesh (`.mhclo` and `.obj`).
 
 use std::collections::HashMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::str::FromStr;
+use std::sync::Arc;
 
 use glam::{Vec2, Vec3};
 use rand::Rng;
@@ -42,6 +43,8 @@ type Corners = (Vec<u32>, Vec<Vec2>);
 /// A proxy.
 #[derive(Debug, Clone)]
 pub struct Proxy {
+    /// Purpose of clothes, by their tags.
+    kind: Kind,
     bindings: Vec<Binding>,
     /// For x, y and z.
     scales: [Option<Scale>; 3],
@@ -63,56 +66,48 @@ pub struct Fitted {
 /// The proxies of a folder, by kind.
 #[derive(Debug, Default)]
 pub struct Wardrobe {
-    files: Vec<(Kind, PathBuf)>,
+    proxies: Vec<Stored>,
+}
+
+/// A proxy of a wardrobe.
+#[derive(Debug)]
+struct Stored {
+    kind: Kind,
+    /// File name in lower case.
+    name: String,
+    proxy: Arc<Proxy>,
 }
 
 impl Wardrobe {
-    /// The proxies in the folders `clothes` and `hair` of MakeHuman's `data`. Without these, it is empty.
+    /// The proxies, of a base mesh of so many vertices, in the folders `clothes` and `hair` of MakeHuman's `data`. Without
+    /// these, it is empty. All of them are read, so that a damaged file is found whether or not somebody wears it.
     ///
     /// # Errors
-    /// [`FileError`] for a file that cannot be read.
-    pub fn open(root: &Path) -> Result<Self, FileError> {
-        let mut files = Vec::new();
+    /// [`FileError`] for a file that is damaged or cannot be read.
+    pub fn open(root: &Path, vertices: usize) -> Result<Self, FileError> {
+        let mut proxies = Vec::new();
         for folder in ["clothes", "hair"] {
             let path = root.join(folder);
             let assets = if path.is_dir() { entries(&path)? } else { Vec::new() };
             for asset in assets.iter().filter(|asset| asset.is_dir()) {
                 for path in with_ending(asset, "mhclo")? {
-                    let kind = if folder == "hair" { Kind::Hair } else { kind(&read_text(&path)?) };
-                    files.push((kind, path));
+                    let proxy = Proxy::read(&path, vertices)?;
+                    let kind = if folder == "hair" { Kind::Hair } else { proxy.kind };
+                    let name = path.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
+                    proxies.push(Stored { kind, name, proxy: Arc::new(proxy) });
                 }
             }
         }
-        Ok(Self { files })
+        Ok(Self { proxies })
     }
 
     /// One of this kind for this sex, 0 female and 1 male.
-    pub fn choose(&self, kind: Kind, sex: f32, random: &mut impl Rng) -> Option<&Path> {
-        let word = if sex < 0.5 { "male_" } else { "female_" };
-        let fits = |path: &Path| {
-            let name = path.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
-            !name.starts_with(word)
-        };
-        let files: Vec<&PathBuf> = self
-            .files
-            .iter()
-            .filter(|(own, path)| *own == kind && fits(path))
-            .map(|(_, path)| path)
-            .collect();
+    pub fn choose(&self, kind: Kind, sex: f32, random: &mut impl Rng) -> Option<Arc<Proxy>> {
+        let other = if sex < 0.5 { "male_" } else { "female_" };
+        let fits = |stored: &&Stored| stored.kind == kind && !stored.name.starts_with(other);
+        let fitting: Vec<&Stored> = self.proxies.iter().filter(fits).collect();
         let draw: f32 = random.random_range(0.0..1.0);
-        files.get((draw * files.len() as f32) as usize).map(|path| path.as_path())
-    }
-}
-
-/// The kind of clothes, by their tags.
-fn kind(text: &str) -> Kind {
-    let has = |tag: &str| text.lines().any(|line| line.trim().eq_ignore_ascii_case(&format!("tag {tag}")));
-    if has("Shoes") {
-        Kind::Shoes
-    } else if has("Hats") {
-        Kind::Hat
-    } else {
-        Kind::Suit
+        fitting.get((draw * fitting.len() as f32) as usize).map(|stored| stored.proxy.clone())
     }
 }
 
@@ -129,8 +124,13 @@ impl Proxy {
     /// [`FileError`] naming the file and the line.
     pub fn read(path: &Path, vertices: usize) -> Result<Self, FileError> {
         let text = read_text(path)?;
-        let mut proxy =
-            Self { bindings: Vec::new(), scales: [None; 3], hides: vec![false; vertices], faces: Vec::new() };
+        let mut proxy = Self {
+            kind: Kind::Suit,
+            bindings: Vec::new(),
+            scales: [None; 3],
+            hides: vec![false; vertices],
+            faces: Vec::new(),
+        };
         let mut mesh = None;
         let (mut is_list, mut is_hidden) = (false, false);
         let inside = |row: &u32| (*row as usize) < vertices;
@@ -149,6 +149,11 @@ impl Proxy {
             words.next();
             match first {
                 "obj_file" => mesh = words.next(),
+                "tag" => match words.next().map(str::to_ascii_lowercase).as_deref() {
+                    Some("shoes") => proxy.kind = Kind::Shoes,
+                    Some("hats") => proxy.kind = Kind::Hat,
+                    _ => {}
+                },
                 "verts" => (is_list, is_hidden) = (true, false),
                 "delete_verts" => (is_list, is_hidden) = (false, true),
                 "x_scale" | "y_scale" | "z_scale" => {

@@ -6,7 +6,6 @@ use glam::{Vec2, Vec3};
 use image::RgbImage;
 use rand::Rng;
 use rayon::prelude::*;
-use snapsnap_base::FileError;
 use snapsnap_mesh::mesh::{Face, Material, Mesh};
 
 use super::Person;
@@ -42,28 +41,24 @@ pub struct Worn {
 }
 
 impl Worn {
-    /// # Errors
-    /// [`FileError`] for a damaged file.
     pub fn draw(
         library: &Library,
         outfit: &Outfit,
         sex: f32,
         is_draped: bool,
         random: &mut impl Rng,
-    ) -> Result<Self, FileError> {
+    ) -> Self {
         let [suit, shoes, hair, hat] = [(); 4].map(|()| random.random_range(0.0..1.0_f32));
-        let mut choose = |kind: Kind, is_wanted: bool| {
-            let path = library.wardrobe.choose(kind, sex, random).filter(|_| is_wanted);
-            path.map(|path| library.proxy(path)).transpose()
-        };
-        let own_shoes = choose(Kind::Shoes, true)?;
-        let suit = choose(Kind::Suit, !is_draped && suit < SUITS && own_shoes.is_some())?;
+        let mut choose =
+            |kind: Kind, is_wanted: bool| library.wardrobe.choose(kind, sex, random).filter(|_| is_wanted);
+        let own_shoes = choose(Kind::Shoes, true);
+        let suit = choose(Kind::Suit, !is_draped && suit < SUITS && own_shoes.is_some());
         let has_shoes = suit.is_some() || shoes < SHOES;
         let has_hair = !matches!(outfit.cut, Cut::Bald | Cut::Cap);
-        let hair = choose(Kind::Hair, has_hair && hair < HAIR)?;
-        let hat = choose(Kind::Hat, has_hair && hat < HATS)?;
+        let hair = choose(Kind::Hair, has_hair && hair < HAIR);
+        let hat = choose(Kind::Hat, has_hair && hat < HATS);
         let other = Some(Pattern::draw_quiet(random));
-        Ok(Self { suit, shoes: own_shoes.filter(|_| has_shoes), hair, hat, other })
+        Self { suit, shoes: own_shoes.filter(|_| has_shoes), hair, hat, other }
     }
 
     /// Whether a vertex of the base mesh lies below clothes.

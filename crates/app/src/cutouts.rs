@@ -1,0 +1,27 @@
+//! `--save-cutouts`: the photographs without background.
+
+use std::io::Cursor;
+use std::path::{Path, PathBuf};
+
+use image::{GrayImage, ImageFormat, Rgb, RgbImage, Rgba, RgbaImage};
+
+use crate::failure::Failure;
+use crate::output::{make_folder, write};
+
+/// Paths of front and back in the folder. It is made if it is missing.
+pub fn paths(folder: &Path) -> Result<[PathBuf; 2], Failure> {
+    make_folder(folder)?;
+    Ok(["front.png", "back.png"].map(|name| folder.join(name)))
+}
+
+/// Writes a photograph with its mask as the alpha channel. Colours without coverage are black.
+pub fn save(path: &Path, rgb: &RgbImage, mask: &GrayImage) -> Result<(), Failure> {
+    let pixels = RgbaImage::from_fn(rgb.width(), rgb.height(), |x, y| {
+        let (Rgb([r, g, b]), alpha) = (*rgb.get_pixel(x, y), mask.get_pixel(x, y)[0]);
+        if alpha > 0 { Rgba([r, g, b, alpha]) } else { Rgba([0; 4]) }
+    });
+    let mut bytes = Vec::new();
+    let encoded = pixels.write_to(&mut Cursor::new(&mut bytes), ImageFormat::Png);
+    encoded.map_err(|e| Failure::Internal(format!("{}: cannot encode: {e}", path.display())))?;
+    write(path, &bytes)
+}

@@ -1,0 +1,225 @@
+//! Cuts a person out of a photograph (docs/method.md, "Background removal"): a network finds the pixels, a guided filter lays their edges
+//! onto those of the photograph (He et al., "Guided Image Filtering", 2013; He and Sun, "Fast Guided Filter", 2015), and the background's
+//! share is taken out of mixed colours (Forte, "Approximate Fast Foreground Colour Estimation", 2021).
+
+use glam::Vec3;
+use image::imageops::{self, FilterType};
+use image::{GrayImage, Luma, Rgb, RgbImage};
+use snapsnap_base::bilinear::{Tap, taps};
+
+use super::Rect;
+use super::specks::{Pieces, pieces};
+use crate::resize::bilinear;
+
+/// Side of the pictures that the network receives.
+pub const FOUND: usize = 320;
+/// Margin of the network's second look around the person's box, as a share of the box's longer side.
+const MARGIN: f32 = 0.1;
+/// Probability of a pixel of the person.
+const LIKELY: f32 = 0.5;
+/// Distance from the person's largest piece, in pixels of [`FOUND`], beyond which nothing belongs to it.
+const NEAR: usize = 6;
+/// Largest height of a cut-out. Canvases have 1024 rows.
+const HIGHEST: u32 = 2048;
+/// Longer side of the pictures on which filters are computed, their radius in pixels, and the variance below which the photograph has no
+/// edges.
+const FILTERED: u32 = 640;
+const RADIUS: usize = 4;
+const EPSILON: f32 = 1e-4;
+/// Coverages up to the first are background, from the second on the person.
+const SOFT: (f32, f32) = (0.1, 0.9);
+
+/// Colours from 0 to 1, `[3, FOUND, FOUND]` → probability of each pixel to belong to the person, `[FOUND, FOUND]`.
+pub type Segmenter<'a> = dyn Fn(&[f32]) -> Vec<f32> + 'a;
+
+/// Cuts the person out of a picture: its coverage, and the colours without the background's share. The picture is reduced first if the
+/// person is higher than [`HIGHEST`]. `None` if the network finds nobody.
+pub fn matte(mut picture: RgbImage, segment: &Segmenter) -> Option<(RgbImage, GrayImage)> {
+    let whole = Rect { x: 0, y: 0, width: picture.width(), height: picture.height() };
+    let (_, person) = largest(&found(&picture, whole, segment))?;
+    let mut part = around(person, whole);
+    // The person fills the second picture.
+    let mut probability = found(&picture, part, segment);
+    let (is_near, _) = largest(&probability)?;
+    probability.iter_mut().zip(&is_near).filter(|(_, near)| !**near).for_each(|(p, _)| *p = 0.0);
+
+    if part.height > HIGHEST {
+        let scale = f64::from(HIGHEST) / f64::from(part.height);
+        let scaled = |length: u32| (f64::from(length) * scale) as u32;
+        let size = [picture.width(), picture.height()].map(|side| scaled(side).max(1));
+        picture = imageops::resize(&picture, size[0], size[1], FilterType::Lanczos3);
+        let (x, y) = (scaled(part.x), scaled(part.y));
+        let (width, height) = (scaled(part.width).min(size[0] - x), scaled(part.height).min(size[1] - y));
+        part = Rect { x, y, width, height };
+    }
+    let mut mask = GrayImage::new(picture.width(), picture.height());
+    let person = imageops::crop_imm(&picture, part.x, part.y, part.width, part.height).to_image();
+    Filter::new(&person, probability).cut_out(&mut picture, &mut mask, part);
+    Some((picture, mask))
+}
+
+/// The network's answer for a part of a picture.
+fn found(picture: &RgbImage, part: Rect, segment: &Segmenter) -> Vec<f32> {
+    let part = imageops::crop_imm(picture, part.x, part.y, part.width, part.height);
+    let small = imageops::resize(&*part, FOUND as u32, FOUND as u32, FilterType::Lanczos3);
+    // The network was trained on pictures with a white point of 1.
+    let white = f32::from(small.as_raw().iter().copied().max().unwrap_or(0).max(1));
+    let plane = |channel: usize| small.pixels().map(move |pixel| f32::from(pixel[channel]) / white);
+    segment(&(0..3).flat_map(plane).collect::<Vec<f32>>())
+}
+
+/// Pixels within [`NEAR`] of the largest piece of likely ones, and that piece's box.
+fn largest(probability: &[f32]) -> Option<(Vec<bool>, Rect)> {
+    let likely: Vec<bool> = probability.iter().map(|p| *p > LIKELY).collect();
+    let Pieces { of, pieces } = pieces(&likely, FOUND as u32);
+    let (row, (_, person)) = pieces.iter().enumerate().max_by_key(|(_, (size, _))| *size)?;
+    let is_person: Vec<f32> = of.iter().map(|piece| f32::from(u8::from(*piece == row as u32 + 1))).collect();
+    let near = means(&is_person, FOUND, NEAR);
+    Some((near.iter().map(|share| *share > 1e-6).collect(), *person))
+}
+
+/// A box in pixels of [`FOUND`] with its margin, in pixels of the picture.
+fn around(person: Rect, whole: Rect) -> Rect {
+    let (sx, sy) = (whole.width as f32 / FOUND as f32, whole.height as f32 / FOUND as f32);
+    let margin = MARGIN * (person.width as f32 * sx).max(person.height as f32 * sy);
+    let span = |first: u32, length: u32, scale: f32, most: u32| {
+        let low = (first as f32 * scale - margin).max(0.0) as u32;
+        let high = (((first + length) as f32 * scale + margin).ceil() as u32).min(most);
+        (low.min(most - 1), high.max(low + 1).min(most))
+    };
+    let (x0, x1) = span(person.x, person.width, sx, whole.width);
+    let (y0, y1) = span(person.y, person.height, sy, whole.height);
+    Rect { x: x0, y: y0, width: x1 - x0, height: y1 - y0 }
+}
+
+/// What the full resolution needs of the filters: planes of a small picture.
+struct Filter {
+    size: [usize; 2],
+    /// Coverage = `slope` · colour + `offset`.
+    slope: Vec<Vec3>,
+    offset: Vec<f32>,
+    /// Mean colours of person and background around a pixel.
+    person: Vec<Vec3>,
+    background: Vec<Vec3>,
+}
+
+impl Filter {
+    fn new(rgb: &RgbImage, probability: Vec<f32>) -> Self {
+        let longer = rgb.width().max(rgb.height());
+        let scaled = |length: u32| (length * FILTERED.min(longer)).div_ceil(longer).max(1);
+        let (width, height) = (scaled(rgb.width()), scaled(rgb.height()));
+        let small = imageops::resize(rgb, width, height, FilterType::Triangle);
+        let color: Vec<Vec3> = small.pixels().map(unit).collect();
+        let size = [height as usize, width as usize];
+        let wide = size[1];
+        let p = bilinear(probability, [FOUND; 2], size);
+
+        let mean = |of: &dyn Fn(usize) -> f32| means(&(0..p.len()).map(of).collect::<Vec<_>>(), wide, RADIUS);
+        let mean_of_color: [Vec<f32>; 3] = std::array::from_fn(|c| mean(&|i| color[i][c]));
+        let mean_of_p = mean(&|i| p[i]);
+        let mean_of_both: [Vec<f32>; 3] = std::array::from_fn(|c| mean(&|i| color[i][c] * p[i]));
+        let products = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)];
+        let products = products.map(|(a, b)| mean(&|i| color[i][a] * color[i][b]));
+        let line = |i: usize| {
+            let at = |planes: &[Vec<f32>; 3]| Vec3::from_array(std::array::from_fn(|c| planes[c][i]));
+            let m = at(&mean_of_color);
+            let [rr, rg, rb, gg, gb, bb] = std::array::from_fn(|k| products[k][i]);
+            let covariance = glam::Mat3::from_cols(
+                Vec3::new(rr + EPSILON, rg, rb) - m * m.x,
+                Vec3::new(rg, gg + EPSILON, gb) - m * m.y,
+                Vec3::new(rb, gb, bb + EPSILON) - m * m.z,
+            );
+            let slope = covariance.inverse() * (at(&mean_of_both) - m * mean_of_p[i]);
+            (slope, mean_of_p[i] - slope.dot(m))
+        };
+        let (slope, offset): (Vec<Vec3>, Vec<f32>) = (0..p.len()).map(line).unzip();
+        let (slope, offset) = (mean_colors(&slope, wide), means(&offset, wide, RADIUS));
+        let alpha: Vec<f32> = (0..p.len()).map(|i| hard(slope[i].dot(color[i]) + offset[i])).collect();
+
+        // Both means are taken over the pixels that surely show one of the two, and reach as far as the filter's edges.
+        let of = |share: &dyn Fn(f32) -> f32| {
+            let weights: Vec<f32> = alpha.iter().map(|a| share(*a)).collect();
+            let weighted: Vec<Vec3> = color.iter().zip(&weights).map(|(c, w)| *c * *w).collect();
+            let (sums, weights) = (mean_colors(&weighted, wide), means(&weights, wide, RADIUS));
+            let own = |i: usize| if weights[i] > 1e-4 { sums[i] / weights[i] } else { color[i] };
+            (0..alpha.len()).map(own).collect::<Vec<Vec3>>()
+        };
+        let (person, background) = (of(&|a| a * a * a), of(&|a| (1.0 - a).powi(3)));
+        Self { size, slope, offset, person, background }
+    }
+
+    /// Writes the coverage and the person's colours in the part of a picture that the filter is of.
+    fn cut_out(&self, picture: &mut RgbImage, mask: &mut GrayImage, part: Rect) {
+        let across = taps(self.size[1], part.width as usize, false);
+        let down = taps(self.size[0], part.height as usize, false);
+        for (y, down) in (part.y..).zip(&down) {
+            for (x, across) in (part.x..).zip(&across) {
+                let (at, pixel) = ([*down, *across], picture.get_pixel_mut(x, y));
+                let color = unit(pixel);
+                let alpha = hard(self.at(&self.slope, at).dot(color) + self.at(&self.offset, at));
+                mask.put_pixel(x, y, Luma([(255.0 * alpha).round() as u8]));
+                if alpha > 0.0 && alpha < 1.0 {
+                    let (person, background) = (self.at(&self.person, at), self.at(&self.background, at));
+                    // What is left over belongs to the person by its share.
+                    let left = color - alpha * person - (1.0 - alpha) * background;
+                    let own = (person + alpha * left).clamp(Vec3::ZERO, Vec3::ONE);
+                    *pixel = Rgb(own.to_array().map(|c| (255.0 * c).round() as u8));
+                }
+            }
+        }
+    }
+
+    /// A plane between the pixels of the small picture.
+    fn at<T>(&self, plane: &[T], [(y0, y1, fy), (x0, x1, fx)]: [Tap; 2]) -> T
+    where
+        T: Copy + std::ops::Mul<f32, Output = T> + std::ops::Add<Output = T>,
+    {
+        let row = |y: usize| plane[y * self.size[1] + x0] * (1.0 - fx) + plane[y * self.size[1] + x1] * fx;
+        row(y0) * (1.0 - fy) + row(y1) * fy
+    }
+}
+
+fn unit(pixel: &Rgb<u8>) -> Vec3 {
+    Vec3::from_array(pixel.0.map(f32::from)) / 255.0
+}
+
+/// Coverage without the softness that a filter leaves everywhere.
+fn hard(alpha: f32) -> f32 {
+    ((alpha - SOFT.0) / (SOFT.1 - SOFT.0)).clamp(0.0, 1.0)
+}
+
+fn mean_colors(values: &[Vec3], width: usize) -> Vec<Vec3> {
+    let planes: [Vec<f32>; 3] = std::array::from_fn(|c| {
+        means(&values.iter().map(|value| value[c]).collect::<Vec<_>>(), width, RADIUS)
+    });
+    (0..values.len()).map(|i| Vec3::new(planes[0][i], planes[1][i], planes[2][i])).collect()
+}
+
+/// Means over the squares of pixels within `radius`, as far as they are in the picture.
+fn means(values: &[f32], width: usize, radius: usize) -> Vec<f32> {
+    let height = values.len() / width;
+    let line = |length: usize, read: &dyn Fn(usize) -> f64, write: &mut dyn FnMut(usize, f64)| {
+        let (mut sum, mut count) = (0.0, 0);
+        for at in 0..length + radius {
+            if at < length {
+                (sum, count) = (sum + read(at), count + 1);
+            }
+            if at > 2 * radius {
+                (sum, count) = (sum - read(at - 2 * radius - 1), count - 1);
+            }
+            if at >= radius {
+                write(at - radius, sum / f64::from(count));
+            }
+        }
+    };
+    let mut rows = vec![0.0; values.len()];
+    for y in 0..height {
+        let row = &values[y * width..][..width];
+        line(width, &|x| f64::from(row[x]), &mut |x, mean| rows[y * width + x] = mean);
+    }
+    let mut out = vec![0.0; values.len()];
+    for x in 0..width {
+        line(height, &|y| rows[y * width + x], &mut |y, mean| out[y * width + x] = mean as f32);
+    }
+    out
+}

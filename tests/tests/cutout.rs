@@ -1,0 +1,173 @@
+//! Photographs with a background: the network that removes it, the edges and colours that it leaves, and the options.
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use burn::tensor::Device;
+use image::{Rgb, RgbImage, RgbaImage};
+use snapsnap_net::U2Net;
+use snapsnap_net::weights::Source;
+use snapsnap_tests::{data, refused, root, snapsnap, succeed};
+
+/// The sample's picture of one side.
+fn sample(side: &str) -> RgbaImage {
+    image::open(root().join(format!("assets/sample/{side}.png"))).expect("the sample").to_rgba8()
+}
+
+/// A picture over a background.
+fn over(picture: &RgbaImage, background: impl Fn(u32, u32) -> [f32; 3]) -> RgbImage {
+    RgbImage::from_fn(picture.width(), picture.height(), |x, y| {
+        let ([r, g, b, a], behind) = (picture.get_pixel(x, y).0, background(x, y));
+        let share = f32::from(a) / 255.0;
+        let mixed = |own: u8, other: f32| (share * f32::from(own) + (1.0 - share) * other).round() as u8;
+        Rgb([mixed(r, behind[0]), mixed(g, behind[1]), mixed(b, behind[2])])
+    })
+}
+
+/// A wall that gets darker to the right, a window, a floor, and noise.
+fn room(x: u32, y: u32) -> [f32; 3] {
+    let (across, down) = (x as f32 / 1024.0, y as f32 / 1024.0);
+    let noise =
+        (x.wrapping_mul(2_654_435_761) ^ y.wrapping_mul(2_246_822_519)).wrapping_mul(3_266_489_917) >> 24;
+    let color = if down > 0.82 {
+        [120.0, 90.0 + 20.0 * across, 70.0]
+    } else if (0.75..0.95).contains(&across) && (0.1..0.5).contains(&down) {
+        [150.0, 180.0, 220.0]
+    } else {
+        [200.0 - 60.0 * across, 190.0 - 50.0 * across, 180.0 - 40.0 * across]
+    };
+    color.map(|value| value + noise as f32 / 32.0 - 4.0)
+}
+
+/// Front and back of the sample in the room.
+fn pair(folder: &Path) -> [PathBuf; 2] {
+    ["front", "back"].map(|side| {
+        let path = folder.join(format!("{side} in a room.png"));
+        over(&sample(side), room).save(&path).expect("written");
+        path
+    })
+}
+
+fn reconstruct(folder: &Path, [front, back]: &[PathBuf; 2]) -> Command {
+    let mut command = snapsnap();
+    command.args(["reconstruct", "--device", "cpu", "-o"]).arg(folder.join("human.ply")).arg(front).arg(back);
+    command
+}
+
+fn share(of: impl Iterator<Item = bool>) -> f64 {
+    let (set, all) = of.fold((0, 0), |(set, all), one| (set + u32::from(one), all + 1));
+    f64::from(set) / f64::from(all)
+}
+
+/// `docs/u2netp_convert.py` wrote the reference: ONNX Runtime's output for the same picture, at every eighth pixel.
+#[test]
+fn the_network_is_that_of_onnx_runtime() {
+    let front = sample("front");
+    let at = |row: u32| row * front.width() / 320;
+    let value = |channel: usize| {
+        let front = &front;
+        (0..320 * 320).map(move |i| {
+            let (x, y) = (i % 320, i / 320);
+            let pixel = front.get_pixel(at(x), at(y)).0.map(|v| f64::from(v) / 255.0);
+            let behind = [f64::from(x) / 320.0, f64::from(y) / 320.0, 0.4][channel];
+            (pixel[3] * pixel[channel] + (1.0 - pixel[3]) * behind) as f32
+        })
+    };
+    let rgb: Vec<f32> = (0..3).flat_map(value).collect();
+    let device = Device::flex();
+    let source = Source::open(&root().join("assets/weights/u2netp.safetensors")).expect("weights");
+    let found = U2Net::load(&source, &device).expect("weights").forward(&rgb, &device);
+    let expected = std::fs::read(data("u2netp.f32")).expect("reference");
+    let expected = expected.as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes));
+    let apart = expected.enumerate().map(|(i, expected)| {
+        let (x, y) = (i % 40, i / 40);
+        (found[(8 * y + 4) * 320 + 8 * x + 4] - expected).abs()
+    });
+    let (largest, count) =
+        apart.fold((0.0_f32, 0), |(largest, count), apart| (largest.max(apart), count + 1));
+    println!("largest difference {largest:e}");
+    assert!(count == 1600 && largest < 1e-3, "{largest}");
+}
+
+#[test]
+fn people_in_a_room_are_cut_out() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let photographs = pair(temporary.path());
+    let cutouts = temporary.path().join("a/b");
+    let said =
+        succeed(reconstruct(temporary.path(), &photographs).arg("-v").arg("--save-cutouts").arg(&cutouts));
+    assert!(said.contains("cut out by the network"), "{said}");
+    assert!(temporary.path().join("human.ply").exists());
+    for side in ["front", "back"] {
+        let (truth, photograph) = (sample(side), over(&sample(side), room));
+        let found = image::open(cutouts.join(format!("{side}.png"))).expect("a cut-out").to_rgba8();
+        assert_eq!(found.dimensions(), truth.dimensions());
+        let inside = |picture: &RgbaImage| picture.pixels().map(|p| p[3] > 127).collect::<Vec<_>>();
+        let (own, expected) = (inside(&found), inside(&truth));
+        let both = own.iter().zip(&expected).filter(|(a, b)| **a && **b).count() as f64;
+        let union = own.iter().zip(&expected).filter(|(a, b)| **a || **b).count() as f64;
+        println!("{side}: IoU {:.4}", both / union);
+        assert!(both / union > 0.985, "{side}: {}", both / union);
+        // Mixed pixels are closer to the person's colour than they were in the photograph.
+        let distance = |a: &[u8], b: &[u8]| (0..3).map(|c| a[c].abs_diff(b[c]) as u32).sum::<u32>();
+        let mixed = truth
+            .enumerate_pixels()
+            .filter(|(x, y, p)| (40..216).contains(&p[3]) && found.get_pixel(*x, *y)[3] > 127);
+        let [mut before, mut after] = [0, 0];
+        for (x, y, pixel) in mixed {
+            before += distance(&photograph.get_pixel(x, y).0, &pixel.0);
+            after += distance(&found.get_pixel(x, y).0, &pixel.0);
+        }
+        println!("{side}: colour errors of mixed pixels {before} before, {after} after");
+        assert!(after * 10 < before * 7, "{side}: {before} {after}");
+        assert!(
+            share(found.pixels().map(|p| p[3] == 0 && p.0 != [0; 4])) == 0.0,
+            "nothing stays behind the mask"
+        );
+    }
+}
+
+#[test]
+fn alpha_channels_win_unless_the_network_is_asked_for() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let photographs = ["front", "back"].map(|side| root().join(format!("assets/sample/{side}.png")));
+    let cutouts = temporary.path().join("cutouts");
+    succeed(reconstruct(temporary.path(), &photographs).arg("--save-cutouts").arg(&cutouts));
+    let alpha = |path: &Path| -> Vec<u8> {
+        image::open(path).expect("a picture").to_rgba8().pixels().map(|p| p[3]).collect()
+    };
+    assert!(alpha(&cutouts.join("front.png")) == alpha(&photographs[0]), "the alpha channel is the mask");
+    let mut network = reconstruct(temporary.path(), &photographs);
+    let said = succeed(network.args(["-v", "--cutout", "network"]));
+    assert!(said.contains("cut out by the network"), "{said}");
+}
+
+#[test]
+fn what_cannot_be_cut_out_is_refused() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let photographs = pair(temporary.path());
+    let none = refused(reconstruct(temporary.path(), &photographs).args(["--cutout", "none"]));
+    assert!(none.contains("front in a room.png") && none.contains("--cutout auto"), "{none}");
+    let masks = refused(
+        reconstruct(temporary.path(), &photographs)
+            .args(["--cutout", "network", "--masks"])
+            .args(["front", "back"].map(|side| root().join(format!("assets/sample/{side}.png")))),
+    );
+    assert!(masks.contains("--masks already"), "{masks}");
+    // A wall alone.
+    let empty = ["a.png", "b.png"].map(|name| {
+        let path = temporary.path().join(name);
+        RgbImage::from_pixel(200, 300, Rgb([180, 170, 160])).save(&path).expect("written");
+        path
+    });
+    let nobody = refused(&mut reconstruct(temporary.path(), &empty));
+    assert!(nobody.contains("a.png") && nobody.contains("no person was found"), "{nobody}");
+    // A cut-out would replace a photograph.
+    let folder = temporary.path().join("own");
+    std::fs::create_dir(&folder).expect("a folder");
+    let own = ["front.png", "back.png"].map(|name| folder.join(name));
+    photographs.iter().zip(&own).for_each(|(from, to)| drop(std::fs::copy(from, to).expect("a copy")));
+    let input = refused(reconstruct(temporary.path(), &own).arg("--save-cutouts").arg(&folder));
+    assert!(input.contains("is an input of this command"), "{input}");
+    assert!(!temporary.path().join("human.ply").exists());
+}
