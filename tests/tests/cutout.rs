@@ -166,7 +166,9 @@ fn what_cannot_be_cut_out_is_refused() {
     let folder = temporary.path().join("own");
     std::fs::create_dir(&folder).expect("a folder");
     let own = ["front.png", "back.png"].map(|name| folder.join(name));
-    photographs.iter().zip(&own).for_each(|(from, to)| drop(std::fs::copy(from, to).expect("a copy")));
+    for (from, to) in photographs.iter().zip(&own) {
+        std::fs::copy(from, to).expect("a copy");
+    }
     let input = refused(reconstruct(temporary.path(), &own).arg("--save-cutouts").arg(&folder));
     assert!(input.contains("is an input of this command"), "{input}");
     assert!(!temporary.path().join("human.ply").exists());

@@ -8,8 +8,8 @@ use glam::I64Vec3;
 
 use super::grid::{Grid, STEPS};
 
-/// Width of the widest closed tunnel in cubes, 3 cm for a person of 1.7 m.
-const WIDEST: f32 = 5.0;
+/// Width of the widest closed tunnel in cubes, 5 cm for a person of 1.7 m.
+const WIDEST: f32 = 8.0;
 /// Thickness that walls get on either side, in cubes.
 const THICKER: usize = 1;
 
@@ -184,11 +184,11 @@ mod tests {
         // Walls are thin.
         let whole = handles(&plate(&[])).1;
         assert!(handles(&narrow).1 < before.1 + 0.5 * (whole - before.1));
-        let mut wide = plate(&[4.0, 6.0]);
+        let mut wide = plate(&[6.0, 8.0]);
         let values = wide.values.clone();
         assert_eq!((wide.close_tunnels(), handles(&wide).0), (0, 2));
         assert_eq!(wide.values, values);
-        let mut both = plate(&[4.0, 2.0]);
+        let mut both = plate(&[6.0, 2.0]);
         assert_eq!((both.close_tunnels(), handles(&both).0), (1, 1));
     }
 
