@@ -26,6 +26,8 @@ const HIGHEST: u32 = 2048;
 const FILTERED: u32 = 640;
 const RADIUS: usize = 4;
 const EPSILON: f32 = 1e-4;
+/// Least probability in a gap of the person that is none, such as a shadow below the chin. Between an arm and the body it is far lower.
+const NO_GAP: f32 = 0.2;
 /// Coverages up to the first are background, from the second on the person.
 const SOFT: (f32, f32) = (0.1, 0.9);
 
@@ -133,8 +135,11 @@ impl Filter {
             (slope, mean_of_p[i] - slope.dot(m))
         };
         let (slope, offset): (Vec<Vec3>, Vec<f32>) = (0..p.len()).map(line).unzip();
-        let (slope, offset) = (mean_colors(&slope, wide), means(&offset, wide, RADIUS));
-        let alpha: Vec<f32> = (0..p.len()).map(|i| hard(slope[i].dot(color[i]) + offset[i])).collect();
+        let (mut slope, mut offset) = (mean_colors(&slope, wide), means(&offset, wide, RADIUS));
+        let mut alpha: Vec<f32> = (0..p.len()).map(|i| hard(slope[i].dot(color[i]) + offset[i])).collect();
+        for i in no_gaps(&alpha, &p, wide) {
+            (slope[i], offset[i], alpha[i]) = (Vec3::ZERO, 1.0, 1.0);
+        }
 
         // Both means are taken over the pixels that surely show one of the two, and reach as far as the filter's edges.
         let of = |share: &dyn Fn(f32) -> f32| {
@@ -183,6 +188,16 @@ fn unit(pixel: &Rgb<u8>) -> Vec3 {
     Vec3::from_array(pixel.0.map(f32::from)) / 255.0
 }
 
+/// Pixels of gaps in the person that are none.
+fn no_gaps(alpha: &[f32], p: &[f32], width: usize) -> Vec<usize> {
+    let is_open: Vec<bool> = alpha.iter().map(|a| *a < SOFT.1).collect();
+    let Pieces { of, pieces } = pieces(&is_open, width as u32);
+    // Piece 0 is the person.
+    let mut least = vec![f32::INFINITY; pieces.len() + 1];
+    of.iter().zip(p).for_each(|(piece, p)| least[*piece as usize] = least[*piece as usize].min(*p));
+    (0..of.len()).filter(|i| of[*i] > 0 && least[of[*i] as usize] > NO_GAP).collect()
+}
+
 /// Coverage without the softness that a filter leaves everywhere.
 fn hard(alpha: f32) -> f32 {
     ((alpha - SOFT.0) / (SOFT.1 - SOFT.0)).clamp(0.0, 1.0)
@@ -222,4 +237,78 @@ fn means(values: &[f32], width: usize, radius: usize) -> Vec<f32> {
         line(height, &|y| rows[y * width + x], &mut |y, mean| out[y * width + x] = mean as f32);
     }
     out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const PERSON: [u8; 3] = [200, 60, 40];
+    const WALL: [u8; 3] = [60, 120, 160];
+
+    /// A photograph of a person of 100 × 300 units in a picture of 300 × 400, `scale` pixels to a unit, with a dark spot on the chest. The
+    /// pixels along the left edge are half wall.
+    fn photograph(scale: u32) -> RgbImage {
+        RgbImage::from_fn(300 * scale, 400 * scale, |x, y| {
+            let is_tall = (50 * scale..350 * scale).contains(&y);
+            let is_spot = (145..155).contains(&(x / scale)) && (100..110).contains(&(y / scale));
+            match x / scale {
+                _ if x == 100 * scale && is_tall => Rgb(std::array::from_fn(|c| PERSON[c].midpoint(WALL[c]))),
+                100..200 if is_tall && is_spot => Rgb([30, 30, 30]),
+                100..200 if is_tall => Rgb(PERSON),
+                _ => Rgb(WALL),
+            }
+        })
+    }
+
+    /// A network that finds what is redder than the wall, blurred, and is unsure about the spot.
+    fn network(rgb: &[f32]) -> Vec<f32> {
+        let (red, blue) = (&rgb[..FOUND * FOUND], &rgb[2 * FOUND * FOUND..]);
+        let of = |(red, blue): (&f32, &f32)| {
+            if red > blue { 1.0 } else { f32::from((red - blue).abs() < 0.02) * 0.4 }
+        };
+        means(&red.iter().zip(blue).map(of).collect::<Vec<f32>>(), FOUND, 3)
+    }
+
+    #[test]
+    fn edges_and_colours_are_those_of_the_photograph() {
+        let (rgb, mask) = matte(photograph(2), &network).expect("a person");
+        assert_eq!((rgb.dimensions(), mask.dimensions()), ((600, 800), (600, 800)));
+        let is_person = |x: u32, y: u32| (200..400).contains(&x) && (100..700).contains(&y);
+        let wrong = mask.enumerate_pixels().filter(|(x, y, value)| {
+            let mixed = *x == 200;
+            !mixed && (value[0] >= 128) != is_person(*x, *y)
+        });
+        // Corners are rounder than the photograph's.
+        let wrong = wrong.count();
+        assert!(wrong < 40, "{wrong} pixels");
+        assert_eq!(mask.get_pixel(300, 210)[0], 255, "the spot is no gap");
+        assert_eq!(rgb.get_pixel(300, 210).0, [30, 30, 30], "colours inside stay");
+        // A pixel of both shows the person's colour.
+        let mixed = rgb.get_pixel(200, 400).0;
+        let apart = (0..3).map(|c| mixed[c].abs_diff(PERSON[c])).max().expect("three channels");
+        assert!(apart < 30, "{mixed:?}");
+    }
+
+    #[test]
+    fn tall_people_are_reduced_and_nobody_is_nobody() {
+        let (rgb, mask) = matte(photograph(8), &network).expect("a person");
+        // The person with margins has some 2900 rows before.
+        assert!(rgb.height() < 3200 && rgb.dimensions() == mask.dimensions(), "{:?}", rgb.dimensions());
+        let rows = mask.rows().filter(|row| row.clone().any(|value| value[0] > 127)).count() as f32;
+        assert!((rows / rgb.height() as f32 - 0.75).abs() < 0.01, "{rows}");
+        assert!(matte(RgbImage::from_pixel(90, 80, Rgb(WALL)), &network).is_none());
+        assert!(matte(RgbImage::new(1, 1), &|_| vec![0.0; FOUND * FOUND]).is_none());
+        // Everything is the person.
+        let (_, mask) = matte(RgbImage::from_pixel(70, 64, Rgb(PERSON)), &network).expect("a person");
+        assert!(mask.pixels().all(|value| value[0] == 255));
+    }
+
+    #[test]
+    fn means_are_those_of_the_pixels_in_the_picture() {
+        let values = [1.0, 2.0, 6.0, 3.0, 4.0, 8.0];
+        assert_eq!(means(&values, 3, 1), [2.5, 4.0, 5.0, 2.5, 4.0, 5.0]);
+        assert_eq!(means(&values, 3, 9), [4.0; 6]);
+        assert_eq!(means(&[7.0], 1, 4), [7.0]);
+    }
 }
