@@ -282,7 +282,7 @@ fn unsuitable_configs_weights_devices_and_outputs_are_refused_by_name() {
     case(&["--device", "cuda:0"], &["cuda", "--features cuda"]);
     case(&["--device", "wgpu:99"], &["wgpu:99"]);
     case(&["-o", "no/such/folder/human.ply"], &["no/such/folder/human.ply", "cannot write"]);
-    case(&["-o", "human.glb"], &["human.glb", "neither .ply nor .spz"]);
+    case(&["-o", "human.obj"], &["human.obj", "is no .ply, .spz, .glb or .sog"]);
     case(&["--dump", "no/such/folder/dump"], &["no/such/folder/dump"]);
 
     // Without --weights it is the default ones that do not fit.

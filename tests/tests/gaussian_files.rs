@@ -226,6 +226,185 @@ fn every_command_that_reads_a_ply_reads_an_spz() {
     assert!(temporary.path().join("renders/001.png").is_file());
 }
 
+/// A GLB has the same Gaussians with activated values and unit quaternions, for any SH degree.
+#[test]
+fn a_glb_is_the_same_cloud() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let path = |name: &str| temporary.path().join(name);
+    for degree in 0..=3 {
+        fs::write(path("a.ply"), ply_bytes(&cloud(50, degree), Format::Little, "", b"")).expect("written");
+        for (from, to) in [("a.ply", "b.glb"), ("b.glb", "c.ply")] {
+            succeed(snapsnap().arg("convert").args([path(from), path(to)]));
+        }
+        let read = |name: &str| scene::read(&path(name), &Device::flex()).expect("a file");
+        let before = read("a.ply");
+        for name in ["b.glb", "c.ply"] {
+            let after = read(name);
+            let (a, b) = (before.gaussians.clone(), after.gaussians);
+            assert!(values(a.means) == values(b.means) && values(a.colors) == values(b.colors), "{name}");
+            check_rotations(values(a.rotations), values(b.rotations));
+            for (a, b) in [(values(a.scales), values(b.scales)), (values(a.opacities), values(b.opacities))] {
+                assert!(a.iter().zip(&b).all(|(a, b)| (a - b).abs() <= 2e-6 * a.abs().max(0.1)), "{name}");
+            }
+            let harmonics = [before.harmonics.clone(), after.harmonics].map(|h| h.map(values));
+            assert!(
+                harmonics[0] == harmonics[1] && harmonics[0].is_some() == (degree > 0),
+                "{name}, degree {degree}"
+            );
+        }
+    }
+}
+
+/// The JSON of a GLB, and what follows it.
+fn parts(glb: &[u8]) -> (serde_json::Value, &[u8]) {
+    let length = u32::from_le_bytes(glb[12..16].try_into().expect("four bytes")) as usize;
+    (serde_json::from_slice(&glb[20..20 + length]).expect("JSON"), &glb[20 + length..])
+}
+
+/// The GLB with another JSON.
+fn with_json(json: &serde_json::Value, rest: &[u8]) -> Vec<u8> {
+    let mut json = serde_json::to_vec(json).expect("JSON");
+    json.resize(json.len().next_multiple_of(4), b' ');
+    let words = [0x4654_6c67, 2, (20 + json.len() + rest.len()) as u32, json.len() as u32, 0x4e4f_534a];
+    let words: Vec<u8> = words.iter().flat_map(|word: &u32| word.to_le_bytes()).collect();
+    [words, json, rest.to_vec()].concat()
+}
+
+#[test]
+fn glbs_without_gaussians_or_with_others_are_refused() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let path = |name: &str| temporary.path().join(name);
+    ply(&path("a.ply"), 5, None);
+    succeed(snapsnap().arg("convert").args([path("a.ply"), path("a.glb")]));
+    let sound = fs::read(path("a.glb")).expect("a file");
+    let (json, rest) = parts(&sound);
+    assert_eq!(
+        json["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]["kernel"],
+        "ellipse"
+    );
+    let refusal = |bytes: &[u8]| {
+        fs::write(path("bad.glb"), bytes).expect("written");
+        let message = refused(snapsnap().arg("convert").args([path("bad.glb"), path("b.ply")]));
+        assert!(message.contains("bad.glb") && !path("b.ply").exists(), "{message}");
+        message
+    };
+    let changed = |change: &dyn Fn(&mut serde_json::Value)| {
+        let mut json = json.clone();
+        change(&mut json);
+        refusal(&with_json(&json, rest))
+    };
+    assert!(refusal(&sound[..sound.len() - 100]).contains("ends after"));
+    assert!(refusal(&sound[..30]).contains("ends"));
+    assert!(refusal(b"glTF").contains("ends within its header"));
+    assert!(
+        changed(&|json| json["meshes"][0]["primitives"][0]["extensions"] = serde_json::json!({}))
+            .contains("no Gaussians")
+    );
+    assert!(
+        changed(&|json| json["nodes"][0]["translation"] = serde_json::json!([0.0, 1.0, 0.0]))
+            .contains("moved")
+    );
+    assert!(
+        changed(&|json| json["accessors"][1]["componentType"] = serde_json::json!(5120))
+            .contains("VEC4 of floats")
+    );
+    assert!(changed(&|json| json["accessors"][2]["count"] = serde_json::json!(4)).contains("`scale_0`"));
+    assert!(
+        changed(&|json| json["accessors"][0]["count"] = serde_json::json!(u64::MAX))
+            .contains("outside of the file")
+    );
+    assert!(
+        changed(&|json| json["bufferViews"][0]["byteStride"] = serde_json::json!(0))
+            .contains("outside of the file")
+    );
+    assert!(
+        changed(&|json| json["bufferViews"][0]["byteOffset"] = serde_json::json!(u64::MAX))
+            .contains("outside")
+    );
+    // A mesh of triangles.
+    let mut triangles = vec![0_u8; 0];
+    triangles.extend(with_json(&serde_json::json!({"asset": {"version": "2.0"}}), rest));
+    assert!(refusal(&triangles).contains("no Gaussians"));
+}
+
+/// A picture of a SOG, by its name.
+fn sog_picture(archive: &mut zip::ZipArchive<fs::File>, name: &str) -> Vec<[u8; 4]> {
+    let mut bytes = Vec::new();
+    std::io::Read::read_to_end(&mut archive.by_name(name).expect("a member"), &mut bytes).expect("read");
+    let picture =
+        image::load_from_memory_with_format(&bytes, image::ImageFormat::WebP).expect("WebP").to_rgba8();
+    picture.pixels().map(|pixel| pixel.0).collect()
+}
+
+/// The values of a SOG, decoded as its specification says, are those of the cloud within the steps of bytes.
+#[test]
+fn a_sog_has_the_clouds_values_in_its_steps() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let path = |name: &str| temporary.path().join(name);
+    let n = 300;
+    fs::write(path("a.ply"), ply_bytes(&cloud(n, 1), Format::Little, "", b"")).expect("written");
+    let said = succeed(snapsnap().arg("convert").args([path("a.ply"), path("a.sog")]));
+    assert!(said.contains("degree 1 became degree 0"), "{said}");
+    let first = fs::read(path("a.sog")).expect("a file");
+    succeed(snapsnap().arg("convert").args([path("a.ply"), path("b.sog")]));
+    assert!(first == fs::read(path("b.sog")).expect("a file"), "the same bytes again");
+    let message = refused(snapsnap().arg("convert").args([path("a.sog"), path("c.ply")]));
+    assert!(message.contains("a SOG is written, but not read"), "{message}");
+
+    let mut archive = zip::ZipArchive::new(fs::File::open(path("a.sog")).expect("a file")).expect("a ZIP");
+    let meta: serde_json::Value =
+        serde_json::from_reader(archive.by_name("meta.json").expect("a member")).expect("JSON");
+    assert_eq!((&meta["version"], &meta["count"]), (&serde_json::json!(2), &serde_json::json!(n)));
+    let numbers = |value: &serde_json::Value| -> Vec<f32> {
+        value.as_array().expect("a list").iter().map(|v| v.as_f64().expect("a number") as f32).collect()
+    };
+    let [scales, colors] = ["scales", "sh0"].map(|name| numbers(&meta[name]["codebook"]));
+    assert_eq!([scales.len(), colors.len()], [256; 2]);
+    let [low, high] = ["mins", "maxs"].map(|name| numbers(&meta["means"][name]));
+    let pictures = ["means_l", "means_u", "quats", "scales", "sh0"]
+        .map(|name| sog_picture(&mut archive, &format!("{name}.webp")));
+    assert!(pictures.iter().all(|picture| picture.len() == 18 * 17), "{}", pictures[0].len());
+
+    let before = scene::read(&path("a.ply"), &Device::flex()).expect("a file").gaussians;
+    let [means, rotations, logs, dc] = [
+        values(before.means),
+        values(before.rotations),
+        values(before.scales.log()),
+        values((before.colors - 0.5) / 0.282_094_8),
+    ];
+    let opacities = values(before.opacities);
+    let mut found = vec![0; n];
+    for i in 0..n {
+        let [l, u, q, s, c] = pictures.each_ref().map(|picture| picture[i]);
+        let place: [f32; 3] = std::array::from_fn(|axis| {
+            let share = f32::from(u16::from_le_bytes([l[axis], u[axis]])) / 65535.0;
+            let log = low[axis] + share * (high[axis] - low[axis]);
+            // Viewers turn a SOG by 180° about z.
+            [-1.0, -1.0, 1.0][axis] * log.signum() * log.abs().exp_m1()
+        });
+        let distance =
+            |row: usize| (0..3).map(|axis| (means[3 * row + axis] - place[axis]).abs()).fold(0.0, f32::max);
+        let row = (0..n).min_by(|a, b| distance(*a).total_cmp(&distance(*b))).expect("rows");
+        found[row] += 1;
+        assert!(distance(row) < 2e-4, "{place:?}");
+        let kept = [q[0], q[1], q[2]].map(|byte| (f32::from(byte) / 255.0 - 0.5) * std::f32::consts::SQRT_2);
+        let left_out = (1.0 - kept.iter().map(|v| v * v).sum::<f32>()).max(0.0).sqrt();
+        let mut quaternion = kept.to_vec();
+        quaternion.insert(usize::from(q[3] - 252), left_out);
+        let own = &rotations[4 * row..][..4];
+        let own = [-own[3], -own[2], own[1], own[0]];
+        let length = own.iter().map(|v| v * v).sum::<f32>().sqrt();
+        let cosine = own.iter().zip(&quaternion).map(|(a, b)| a * b / length).sum::<f32>();
+        assert!(cosine.abs() > 0.9998, "{own:?} {quaternion:?}");
+        for axis in 0..3 {
+            assert!((scales[usize::from(s[axis])] - logs[3 * row + axis]).abs() < 0.05);
+            assert!((colors[usize::from(c[axis])] - dc[3 * row + axis]).abs() < 0.05);
+        }
+        assert!((f32::from(c[3]) / 255.0 - opacities[row]).abs() < 0.51 / 255.0);
+    }
+    assert!(found.iter().all(|count| *count == 1), "each Gaussian once");
+}
+
 #[test]
 fn conversions_that_cannot_be_are_refused() {
     let temporary = tempfile::tempdir().expect("temporary folder");
@@ -240,7 +419,7 @@ fn conversions_that_cannot_be_are_refused() {
     let path = |name: &str| temporary.path().join(name);
     ply(&path("a.ply"), 5, None);
     let convert = |from: &str, to: &str| refused(snapsnap().arg("convert").args([path(from), path(to)]));
-    assert!(convert("a.ply", "a.splat").contains("neither .ply nor .spz"));
+    assert!(convert("a.ply", "a.splat").contains("is no .ply, .spz, .glb or .sog"));
     assert!(convert("a.ply", "a.ply").contains("would be overwritten"));
     assert!(convert("none.ply", "b.spz").contains("none.ply: cannot read"));
     fs::copy(data("spz/v4_degree1.spz"), path("v4.spz")).expect("copied");

@@ -1,6 +1,7 @@
 //! A photograph and its mask → a square canvas, with the person at the networks' place and size.
 
 mod doubts;
+mod exposure;
 mod matting;
 mod placing;
 mod rim;
@@ -17,6 +18,7 @@ use crate::resize::bilinear;
 use snapsnap_base::FileError;
 use snapsnap_mesh::picture::{self, MAX_BYTES};
 
+use exposure::match_back;
 use matting::matte;
 pub use matting::{FOUND, Segmenter};
 pub use placing::Mapping;
@@ -101,7 +103,13 @@ pub fn load(
     placement: Placement,
 ) -> Result<Pair, FileError> {
     let front = Cutout::read(paths[0], masks[0], cutting, side, placement)?;
-    let back = Cutout::read(paths[1], masks[1], cutting, side, placement)?;
+    let mut back = Cutout::read(paths[1], masks[1], cutting, side, placement)?;
+    if let Placement::Training { .. } = placement
+        && let Some([r, g, b]) = match_back((&front.rgb, &front.mask), (&mut back.rgb, &back.mask))
+    {
+        back.source +=
+            &format!(", made {r:.2}, {g:.2}, {b:.2} times as bright (red, green, blue) to match the front");
+    }
     let doubts = doubts::doubts(&front, &back);
     let common = match placement {
         Placement::Training { .. } => together([&front.mask, &back.mask], [front.person, back.person]),

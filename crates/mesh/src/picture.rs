@@ -1,5 +1,6 @@
 //! Picture files: photographs, masks and textures.
 
+mod heic;
 mod jpeg;
 #[cfg(test)]
 mod tests;
@@ -32,8 +33,11 @@ pub fn decode(path: &Path, most: u64) -> Result<DynamicImage, FileError> {
 /// # Errors
 /// [`FileError`] for a file that cannot be read or is no picture.
 pub fn size(path: &Path) -> Result<[u32; 2], FileError> {
-    let file = BufReader::new(file::open(path).map_err(FileError::read(path))?);
+    let mut file = BufReader::new(file::open(path).map_err(FileError::read(path))?);
     guarded(path, || {
+        if heic::is_heic(start(path, &mut file)?) {
+            return Ok(heic::size(&whole(path, file)?).map_err(unreadable(path))?.0);
+        }
         let reader = ImageReader::new(file).with_guessed_format().map_err(FileError::read(path))?;
         let size = reader.into_dimensions();
         size.map(Into::into).map_err(unreadable(path))
@@ -53,7 +57,19 @@ pub fn unreadable(path: &Path) -> impl Fn(ImageError) -> FileError {
     move |source| FileError::unsuitable(path, format!("not a readable image: {source}"))
 }
 
-fn decode_from(path: &Path, source: impl BufRead + Seek, most: u64) -> Result<DynamicImage, FileError> {
+/// The first bytes of a file, which are read again.
+fn start<'a>(path: &Path, source: &'a mut impl BufRead) -> Result<&'a [u8], FileError> {
+    source.fill_buf().map_err(FileError::read(path))
+}
+
+/// The bytes of a file, up to [`MAX_FILE`].
+fn whole(path: &Path, source: impl Read) -> Result<Vec<u8>, FileError> {
+    let mut bytes = Vec::new();
+    source.take(MAX_FILE).read_to_end(&mut bytes).map_err(FileError::read(path))?;
+    Ok(bytes)
+}
+
+fn decode_from(path: &Path, mut source: impl BufRead + Seek, most: u64) -> Result<DynamicImage, FileError> {
     let failed = unreadable(path);
     let check = |[width, height]: [u32; 2], stored: u64| {
         // Every picture becomes red, green and blue.
@@ -66,10 +82,15 @@ fn decode_from(path: &Path, source: impl BufRead + Seek, most: u64) -> Result<Dy
             format!("is {width}×{height}, {mega} MiB in memory, more than {most}: make the picture smaller");
         Err(FileError::unsuitable(path, message))
     };
+    if heic::is_heic(start(path, &mut source)?) {
+        let bytes = whole(path, source)?;
+        let (size, needed) = heic::size(&bytes).map_err(&failed)?;
+        check(size, needed)?;
+        return heic::decode(&bytes).map_err(&failed);
+    }
     let reader = ImageReader::new(source).with_guessed_format().map_err(FileError::read(path))?;
     let (mut picture, orientation) = if reader.format() == Some(ImageFormat::Jpeg) {
-        let mut bytes = Vec::new();
-        reader.into_inner().take(MAX_FILE).read_to_end(&mut bytes).map_err(FileError::read(path))?;
+        let bytes = whole(path, reader.into_inner())?;
         let jpeg = jpeg::Jpeg::open(&bytes).map_err(&failed)?;
         check(jpeg.size, 0)?;
         jpeg.decode().map_err(&failed)?

@@ -1,4 +1,4 @@
-//! Files of Gaussians, PLY or SPZ. The first bytes of a file decide its kind when it is read; its name decides when it
+//! Files of Gaussians: PLY, SPZ, GLB, and SOG, which is only written. The first bytes of a file decide its kind when it is read; its name decides when it
 //! is written.
 
 use std::io::{self, Read, Write};
@@ -9,7 +9,10 @@ use snapsnap_base::{FileError, file};
 
 use crate::stored::Problem;
 pub use crate::stored::{Loaded, Stored};
-use crate::{Gaussians, SplatError, ply, spz};
+use crate::{Gaussians, SplatError, glb, ply, sog, spz};
+
+/// First bytes of a ZIP archive.
+const ZIP: [u8; 2] = *b"PK";
 
 /// Kinds of files.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -18,6 +21,10 @@ pub enum Kind {
     Ply,
     /// Niantic's compressed splats.
     Spz,
+    /// Binary glTF with the extension `KHR_gaussian_splatting`.
+    Glb,
+    /// PlayCanvas' compressed splats, which are only written.
+    Sog,
 }
 
 impl Kind {
@@ -27,21 +34,23 @@ impl Kind {
         match extension.as_str() {
             "ply" => Some(Self::Ply),
             "spz" => Some(Self::Spz),
+            "glb" => Some(Self::Glb),
+            "sog" => Some(Self::Sog),
             _ => None,
         }
     }
 
-    /// The kind of `path` by its extension: SPZ for `.spz`, else PLY.
+    /// The kind of `path` by its extension; PLY if it has none of them.
     pub fn of(path: &Path) -> Self {
         Self::named(path).unwrap_or(Self::Ply)
     }
 }
 
 impl Stored {
-    /// Reads a file of either kind.
+    /// Reads a file of any kind but SOG.
     ///
     /// # Errors
-    /// [`SplatError::File`] if it cannot be read, is of neither kind, is truncated, or lacks a property.
+    /// [`SplatError::File`] if it cannot be read, is of none of these kinds, is truncated, or lacks a property.
     pub fn read(path: &Path) -> Result<Self, SplatError> {
         let cannot = FileError::read(path);
         let mut file = file::open(path).map_err(&cannot)?;
@@ -52,6 +61,8 @@ impl Stored {
         let whole = start.as_slice().chain(file);
         let read = match magic {
             spz::GZIP => spz::read(whole, length),
+            glb::MAGIC => glb::read(whole, length),
+            ZIP => Err("a ZIP archive; a SOG is written, but not read".to_owned().into()),
             spz::BARE => Err("SPZ of version 4 or later; 1 to 3 are read".to_owned().into()),
             _ => ply::read(whole),
         };
@@ -103,6 +114,8 @@ impl Stored {
         match kind {
             Kind::Ply => Vec::new(),
             Kind::Spz => spz::losses(self),
+            Kind::Glb => Vec::new(),
+            Kind::Sog => sog::losses(self),
         }
     }
 
@@ -110,6 +123,8 @@ impl Stored {
         match kind {
             Kind::Ply => ply::write(self, None, out),
             Kind::Spz => spz::write(self, out),
+            Kind::Glb => glb::write(self, out),
+            Kind::Sog => sog::write(self, out),
         }
     }
 
@@ -120,14 +135,17 @@ impl Stored {
                 return Err(SplatError::NotFinite { field, index });
             }
         }
-        match kind {
+        let checked = match kind {
             Kind::Ply => Ok(()),
-            Kind::Spz => Ok(spz::check(self).map_err(|problem| FileError::unsuitable(path, problem))?),
-        }
+            Kind::Spz => spz::check(self),
+            Kind::Glb => glb::check(self),
+            Kind::Sog => sog::check(self),
+        };
+        Ok(checked.map_err(|problem| FileError::unsuitable(path, problem))?)
     }
 }
 
-/// Reads the Gaussians of a PLY or SPZ onto `device`; as [`Stored::read`] and [`Stored::load`].
+/// Reads the Gaussians of a file onto `device`; as [`Stored::read`] and [`Stored::load`].
 ///
 /// # Errors
 /// Those of [`Stored::read`].

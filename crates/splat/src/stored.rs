@@ -179,7 +179,8 @@ impl From<String> for Problem {
     }
 }
 
-fn logit(opacity: f32) -> f32 {
+/// The logit of an opacity, kept away from infinity.
+pub(crate) fn logit(opacity: f32) -> f32 {
     let opacity = opacity.clamp(OPACITY_MARGIN, 1.0 - OPACITY_MARGIN);
     (opacity / (1.0 - opacity)).ln()
 }

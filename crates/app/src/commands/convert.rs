@@ -11,9 +11,9 @@ use crate::say;
 
 #[derive(Args)]
 pub struct Arguments {
-    /// File of Gaussians, PLY or SPZ.
+    /// File of Gaussians: PLY, SPZ, or GLB.
     input: PathBuf,
-    /// Output file: .ply or .spz.
+    /// Output file: .ply, .spz, .glb (KHR_gaussian_splatting) or .sog.
     output: PathBuf,
     #[command(flatten)]
     axes: AxesArguments,
@@ -31,12 +31,17 @@ pub struct AxesArguments {
 impl AxesArguments {
     /// Refuses y down for a kind of file that has y up by definition.
     pub fn check(&self, output: &Path) -> Result<(), Failure> {
-        match self.y_down && Kind::of(output) == Kind::Spz {
-            true => {
-                Err(Failure::file(output, "--y-down: an SPZ has y up by definition, and viewers know it"))
-            }
-            false => Ok(()),
+        let name = match Kind::of(output) {
+            Kind::Spz => "an SPZ",
+            Kind::Glb => "a GLB",
+            Kind::Sog => "a SOG",
+            Kind::Ply => return Ok(()),
+        };
+        if self.y_down {
+            let message = format!("--y-down: {name} has y up by definition, and viewers know it");
+            return Err(Failure::file(output, message));
         }
+        Ok(())
     }
 
     /// Writes the file, whole or not at all.

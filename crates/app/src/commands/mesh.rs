@@ -29,7 +29,7 @@ const COMPARABLE: f64 = 0.1;
 
 #[derive(Args)]
 pub struct Arguments {
-    /// File of Gaussians, PLY or SPZ.
+    /// File of Gaussians: PLY, SPZ or GLB.
     input: PathBuf,
     /// Output file: .glb, .obj or .ply.
     #[arg(short, long, value_name = "FILE")]

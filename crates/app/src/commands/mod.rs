@@ -82,7 +82,7 @@ pub fn check_kind(path: &Path) -> Result<(), Failure> {
     if Kind::named(path).is_some() || file::is_special(path) {
         return Ok(());
     }
-    Err(Failure::file(path, "is neither .ply nor .spz; the extension says what to write"))
+    Err(Failure::file(path, "is no .ply, .spz, .glb or .sog; the extension says what to write"))
 }
 
 /// Refuses an output folder in a data set (one of `roots`). There it would be a subject without pictures.

@@ -60,7 +60,7 @@ pub struct Arguments {
     /// trained so.
     #[arg(long, value_name = "auto|f32|bf16", default_value = "auto", value_parser = precision)]
     precision: PrecisionChoice,
-    /// File of Gaussians to write, .ply or .spz. The resolved config is written beside it.
+    /// File of Gaussians to write: .ply, .spz, .glb or .sog. The resolved config is written beside it.
     #[arg(short, long, default_value = "human.ply")]
     output: PathBuf,
     #[command(flatten)]

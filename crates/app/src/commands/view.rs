@@ -24,7 +24,7 @@ use crate::{interrupt, say};
 
 #[derive(Args)]
 pub struct Arguments {
-    /// File of Gaussians, PLY or SPZ.
+    /// File of Gaussians: PLY, SPZ or GLB.
     input: PathBuf,
     /// Port on 127.0.0.1 [default: a free one].
     #[arg(long)]

@@ -3,6 +3,7 @@
 use glam::DVec2;
 use image::{GenericImageView, GrayImage, RgbImage, imageops};
 
+use super::exposure::match_back;
 use super::{Canvas, REFERENCE_SIDE, Rect, THRESHOLD, planes, rim, unit};
 use crate::resize::lanczos3;
 
@@ -97,6 +98,9 @@ pub fn place(photographs: &[(RgbImage, GrayImage)], height: usize, side: usize) 
     photographs.iter_mut().for_each(|(rgb, mask)| {
         rim::clean(rgb, mask);
     });
+    if let [(front, front_mask), (back, mask)] = &mut *photographs {
+        match_back((front, front_mask), (back, mask));
+    }
     let people = photographs.iter().map(|(_, mask)| Rect::around(mask, u8::MAX.div_ceil(2)));
     let people: Vec<Rect> = people.collect::<Option<_>>()?;
     let common = match (&*photographs, people.as_slice()) {

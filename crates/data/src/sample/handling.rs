@@ -22,6 +22,8 @@ pub struct Handling {
     pub place: usize,
     /// Difference of exposure, in stops, between the first photograph and the others. Each is changed by half of it.
     pub exposure: f32,
+    /// Exposure of the back, in stops beside the front's, which stays as it is.
+    pub back_exposure: f32,
     /// Colour of the background from 0 to 1; unset: the data set's. It shows through masks that are too large.
     pub background: Option<[f32; 3]>,
     /// Error of the masks in pixels of 1024: above 0 they are too large, below 0 too small.
@@ -42,6 +44,7 @@ impl Handling {
         let background = self.background.unwrap_or_default().map(|value| ("background", value, 0.0..=1.0));
         outside([
             ("exposure", self.exposure, -4.0..=4.0),
+            ("back_exposure", self.back_exposure, -4.0..=4.0),
             ("mask", self.mask, -64.0..=64.0),
             ("cut", self.cut, 0.0..=0.9),
         ])
@@ -58,8 +61,9 @@ impl Handling {
         if self.grey {
             flatten(&mut color, &mask);
         }
-        if self.exposure != 0.0 {
-            let gain = (if place == 0 { 0.5 } else { -0.5 } * self.exposure).exp2();
+        let stops = if place == 0 { 0.5 * self.exposure } else { self.back_exposure - 0.5 * self.exposure };
+        if stops != 0.0 {
+            let gain = stops.exp2();
             color.iter_mut().for_each(|v| *v = (f32::from(*v) * gain).round().min(255.0) as u8);
         }
         if let Some(background) = self.background {

@@ -79,3 +79,36 @@ fn sizes_are_checked_before_pixels_are_decoded() {
     let refused = error(&jpeg, u64::MAX);
     assert!(refused.contains("the file ends before the picture does"), "{refused}");
 }
+
+/// 96×64: a grey ramp of 8 columns, red, and blue from column 48 on. Made with libheif.
+const HEIC: &[u8] = include_bytes!("../../tests/small.heic");
+
+#[test]
+fn heic_pictures_are_read_and_damaged_ones_refused() {
+    let folder = tempfile::tempdir().expect("temporary folder");
+    let path = folder.path().join("a.heic");
+    let saved = |bytes: &[u8]| fs::write(&path, bytes).expect("writes");
+    saved(HEIC);
+    assert_eq!(size(&path).expect("a size"), [96, 64]);
+    let picture = decode(&path, MAX_BYTES).expect("decodes").into_rgb8();
+    for (x, y, expected) in [(30, 20, [200, 60, 40]), (80, 50, [40, 90, 200]), (3, 32, [128, 128, 128])] {
+        let found = picture.get_pixel(x, y).0;
+        assert!((0..3).all(|c| found[c].abs_diff(expected[c]) < 8), "{x}, {y}: {found:?}");
+    }
+    let refused = decode(&path, 16 * 96 * 64 - 1).map(|_| ()).expect_err("too large").to_string();
+    assert!(refused.contains("is 96×64"), "{refused}");
+    for length in (12..HEIC.len()).step_by(7) {
+        saved(&HEIC[..length]);
+        let error = decode(&path, MAX_BYTES).map(|_| ()).expect_err("cut").to_string();
+        assert!(error.contains("not a readable image") && error.contains("a.heic"), "{length}: {error}");
+    }
+    // A size of 60,000² in a kilobyte.
+    let mut large = HEIC.to_vec();
+    let ispe = large.windows(4).position(|kind| kind == b"ispe").expect("a size");
+    large[ispe + 8..ispe + 16].copy_from_slice(&[0, 0, 0xea, 0x60, 0, 0, 0xea, 0x60]);
+    saved(&large);
+    // The sizes of the box and of the bitstream disagree: either is refused or the bitstream's is taken.
+    if let Ok(picture) = decode(&path, MAX_BYTES) {
+        assert_eq!((picture.width(), picture.height()), (96, 64));
+    }
+}

@@ -1,4 +1,4 @@
-//! Files of Gaussians, PLY and SPZ, and the cameras that they are rendered from.
+//! Files of Gaussians, PLY, SPZ and GLB, and the cameras that they are rendered from.
 
 use std::fs;
 use std::path::Path;
@@ -57,6 +57,13 @@ pub const FORMATS: &[Format] = &[
         sample: |folder| scene::write(&three(), &folder.join("h.spz")).expect("written"),
         changed: &["h.spz"],
         command: "render in/h.spz --orbit 2 --size 16x24 --device cpu -o out --raw out.safetensors",
+        ..RENDER
+    },
+    Format {
+        name: "gaussians-glb",
+        sample: |folder| scene::write(&three(), &folder.join("h.glb")).expect("written"),
+        changed: &["h.glb"],
+        command: "render in/h.glb --orbit 2 --size 16x24 --device cpu -o out --raw out.safetensors",
         ..RENDER
     },
     // With spherical harmonics, from another implementation.
