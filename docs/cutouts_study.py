@@ -1,4 +1,4 @@
-"""Cut-outs of made people in front of photographed backgrounds (docs/notes/look.md): IoU and boundary IoU of the network's answers and of
+"""Cut-outs of made people in front of photographed backgrounds (docs/notes/photographs.md): IoU and boundary IoU of the network's answers and of
 what `reconstruct --save-cutouts` writes.
 
     snapsnap prepare avatars AVATARS --split test --subjects 5 --seed 5 --config configs/data/evaluation.toml --set views.count=2 -o people/cut

@@ -1,9 +1,9 @@
 // Draws files of Gaussians in other people's viewers, in headless Chromium: which of them shows a PLY upright?
 //
-//   npm install @playcanvas/supersplat-viewer@1.36.2 @sparkjsdev/spark@2.2.0 three@0.180.0 playwright-core@1.64.1
-//   node viewers_reference.mjs OUT VIEWER FILE [VIEWER FILE …]        VIEWER is supersplat or spark
+//   npm install @playcanvas/supersplat-viewer@1.36.2 @sparkjsdev/spark@2.2.0 three@0.180.0 babylonjs@9.35.0 babylonjs-loaders@9.35.0 playwright-core@1.64.1
+//   node viewers_reference.mjs OUT VIEWER FILE [VIEWER FILE …]        VIEWER is supersplat, spark or babylon
 //
-// Writes OUT/VIEWER-FILE.png for each pair. Both viewers look at the person from +z with the viewer's own up direction.
+// Writes OUT/VIEWER-FILE.png for each pair. The viewers look at the person from +z with the viewer's own up direction.
 
 import { createServer } from "node:http";
 import { readFile, mkdir } from "node:fs/promises";
@@ -44,12 +44,22 @@ scene.add(new SparkRenderer({ renderer })); const mesh = new SplatMesh({ url: ne
 scene.add(mesh); await mesh.initialized; renderer.setAnimationLoop(() => renderer.render(scene, camera));
 setTimeout(() => { document.title = "shown"; }, 8000); </script>`;
 
+const BABYLON = `<!doctype html><style>body{margin:0}canvas{width:100vw;height:100vh}</style><canvas id="c"></canvas>
+<script src="/m/babylonjs/babylon.js"></script><script src="/m/babylonjs-loaders/babylonjs.loaders.js"></script><script type="module">
+const engine = new BABYLON.Engine(document.getElementById("c"), true); const scene = new BABYLON.Scene(engine);
+scene.useRightHandedSystem = true; scene.clearColor = new BABYLON.Color4(0.4, 0.4, 0.4, 1);
+const camera = new BABYLON.FreeCamera("camera", new BABYLON.Vector3(0, 0.9, 3), scene); camera.setTarget(new BABYLON.Vector3(0, 0.9, 0));
+camera.fov = 50 * Math.PI / 180; camera.minZ = 0.1;
+await BABYLON.ImportMeshAsync(new URLSearchParams(location.search).get("content"), scene);
+engine.runRenderLoop(() => scene.render()); </script>`;
+
 const files = new Map();
 const server = createServer(async (request, response) => {
   const { pathname } = new URL(request.url, "http://localhost");
   try {
     let body;
     if (pathname === "/spark.html") body = SPARK;
+    else if (pathname === "/babylon.html") body = BABYLON;
     else if (pathname === "/settings.json") body = JSON.stringify(SETTINGS);
     else if (pathname === "/below.json") body = JSON.stringify(below);
     else if (pathname.startsWith("/f/")) body = await readFile(files.get(basename(pathname)));
@@ -74,9 +84,9 @@ for (let i = 0; i + 1 < rest.length; i += 2) {
   page.on("pageerror", (error) => console.error(`${viewer} ${file}: ${error}`));
   const content = `/f/${basename(file)}`;
   const settings = file.endsWith(".ply") && !file.includes("down") ? "/below.json" : "/settings.json";
-  const url = viewer === "spark" ? `/spark.html?content=${content}` : `/index.html?webgl&noui&noanim&content=${content}&settings=${settings}`;
+  const url = viewer !== "supersplat" ? `/${viewer}.html?content=${content}` : `/index.html?webgl&noui&noanim&content=${content}&settings=${settings}`;
   await page.goto(host + url);
-  await page.waitForTimeout(viewer === "spark" ? 15_000 : 25_000);
+  await page.waitForTimeout(viewer === "supersplat" ? 25_000 : 15_000);
   await page.screenshot({ path: join(out, `${viewer}-${basename(file)}.png`), timeout: 120_000 });
   console.log(`${viewer} ${file}`);
   await page.close();

@@ -72,12 +72,12 @@ enum Command {
     /// Gaussians, pictures and a report of the program's sample pair.
     #[command(after_help = "Example: snapsnap demo")]
     Demo(commands::demo::Arguments),
-    /// Turn a front and a back photograph into a Gaussian PLY.
+    /// Turn a front and a back photograph into Gaussians.
     #[command(
-        after_help = "Example: snapsnap reconstruct front.png back.png -o human.ply --turntable turn.gif -v"
+        after_help = "Example: snapsnap reconstruct front.jpg back.jpg -o human.ply --turntable turn.gif -v"
     )]
     Reconstruct(commands::reconstruct::Arguments),
-    /// Render a Gaussian PLY into pictures.
+    /// Render a file of Gaussians into pictures.
     #[command(after_help = "Example: snapsnap render human.ply --orbit 12 --size 1024x1024 -o renders")]
     Render(commands::render::Arguments),
     /// Show a file of Gaussians in the browser.
@@ -86,7 +86,7 @@ enum Command {
     /// Make one closed surface of Gaussians: a mesh for modelling programs and game engines.
     #[command(after_help = "Example: snapsnap mesh human.ply -o human.glb")]
     Mesh(commands::mesh::Arguments),
-    /// Turn a file of Gaussians into another kind: PLY, or SPZ, which is an eighth as large.
+    /// Turn a file of Gaussians into another kind: PLY, SPZ, which is an eighth as large, GLB or SOG.
     #[command(after_help = "Example: snapsnap convert human.ply human.spz")]
     Convert(commands::convert::Arguments),
     /// Make or check a data set of people to train on.

@@ -21,6 +21,15 @@ pub fn remove(path: &Path) -> Result<(), Failure> {
     }
 }
 
+/// Refuses a path that is no folder, or none that can be made.
+pub fn check_folder(path: &Path) -> Result<(), Failure> {
+    if path.exists() && !path.is_dir() {
+        return Err(Failure::file(path, "exists and is no folder"));
+    }
+    let existing = path.ancestors().find(|path| path.exists()).unwrap_or(Path::new("."));
+    tempfile::tempfile_in(existing).map(drop).map_err(|e| Failure::cannot_write(path, &e))
+}
+
 /// Makes a folder and its parents unless they exist.
 pub fn make_folder(path: &Path) -> Result<(), Failure> {
     fs::create_dir_all(path).map_err(|e| Failure::file(path, format_args!("cannot make this folder: {e}")))

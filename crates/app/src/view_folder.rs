@@ -8,7 +8,7 @@ use snapsnap_splat::{Camera, cameras};
 
 use crate::commands::{is_same_file, place};
 use crate::failure::Failure;
-use crate::output::{make_folder, remove};
+use crate::output::{check_folder, make_folder, remove};
 use crate::pictures::write_png;
 
 /// Name of the file of cameras.
@@ -25,11 +25,7 @@ pub struct ViewFolder {
 impl ViewFolder {
     /// Refuses paths that are no writable folder. `given` is the file of the command's cameras.
     pub fn new(path: &Path, views: usize, given: Option<&Path>) -> Result<Self, Failure> {
-        if path.exists() && !path.is_dir() {
-            return Err(Failure::file(path, "exists and is no folder"));
-        }
-        let existing = path.ancestors().find(|path| path.exists()).unwrap_or(Path::new("."));
-        tempfile::tempfile_in(existing).map_err(|e| Failure::cannot_write(path, &e))?;
+        check_folder(path)?;
         let keeps_cameras = given.is_some_and(|given| is_same_file(given, &path.join(CAMERAS)));
         Ok(Self { path: path.to_owned(), views, keeps_cameras })
     }

@@ -9,7 +9,7 @@ use std::io::{self, Read, Write};
 use serde_json::{Map, Value, json};
 
 use crate::sh;
-use crate::stored::{Problem, Stored, logit};
+use crate::stored::{MIN_SCALE, Problem, Stored, logit};
 
 /// First bytes of a file.
 pub(crate) const MAGIC: [u8; 2] = *b"gl";
@@ -58,6 +58,9 @@ pub(crate) fn check(stored: &Stored) -> Result<(), String> {
     let bytes = 4 * stored.len() as u64 * (stored.columns.len() as u64 + 1) + (1 << 16);
     if stored.is_empty() {
         return Err("a GLB has one Gaussian at least".into());
+    }
+    if stored.columns[7..10].iter().flatten().any(|log| !log.exp().is_finite()) {
+        return Err("a scale is too large for a GLB".into());
     }
     if bytes > MAX_LENGTH {
         return Err(format!(
@@ -119,16 +122,10 @@ pub(crate) fn write(stored: &Stored, out: &mut impl Write) -> io::Result<()> {
         };
         let is_rotation = name.ends_with("ROTATION");
         for i in 0..n {
-            let length: f32 =
-                if is_rotation { columns.iter().map(|c| c[i] * c[i]).sum::<f32>().sqrt() } else { 1.0 };
-            for (place, column) in columns.iter().enumerate() {
-                let value = match length {
-                    // A quaternion of no length is no rotation, as for the rasteriser.
-                    0.0 => f32::from(u8::from(place == 3)),
-                    _ => activate(column[i]) / length,
-                };
-                out.write_all(&value.to_le_bytes())?;
-            }
+            let values = columns.iter().map(|column| activate(column[i]));
+            let values: Vec<f32> =
+                if is_rotation { unit(values.map(f64::from)).to_vec() } else { values.collect() };
+            values.iter().try_for_each(|value| out.write_all(&value.to_le_bytes()))?;
         }
     }
     for i in 0..n {
@@ -137,6 +134,15 @@ pub(crate) fn write(stored: &Stored, out: &mut impl Write) -> io::Result<()> {
         out.write_all(&color.map(|value| (255.0 * value).round() as u8))?;
     }
     Ok(())
+}
+
+/// A quaternion (x, y, z, w) of length 1. One of no length is no rotation, as for the rasteriser.
+fn unit(values: impl Iterator<Item = f64>) -> [f32; 4] {
+    let values: Vec<f64> = values.collect();
+    let length = values.iter().map(|v| v * v).sum::<f64>().sqrt();
+    let part =
+        |i: usize| if length > 0.0 { (values[i] / length) as f32 } else { f32::from(u8::from(i == 3)) };
+    std::array::from_fn(part)
 }
 
 fn sigmoid(value: f32) -> f32 {
@@ -198,9 +204,14 @@ impl File<'_> {
         if primitive["extensions"][EXTENSION]["extensions"].is_object() {
             return Err("its Gaussians are compressed by another extension".into());
         }
-        let nodes: Vec<&Value> = list("nodes").iter().filter(|node| node["mesh"] == json!(mesh)).collect();
-        if nodes.len() != 1 || list("nodes").iter().any(is_moved) {
-            return Err("its nodes are moved, turned or scaled, which is not read".into());
+        let nodes = list("nodes").iter().filter(|node| node["mesh"] == json!(mesh)).count();
+        if nodes != 1 {
+            return Err(format!(
+                "its Gaussians are placed {nodes} times; files that place them once are read"
+            ));
+        }
+        if list("nodes").iter().any(is_moved) {
+            return Err("one of its nodes is moved, turned or scaled, which is not read".into());
         }
         let attributes = &primitive["attributes"];
         let named = |name: &str| format!("{EXTENSION}:{name}");
@@ -221,7 +232,12 @@ impl File<'_> {
         };
         add(&positions, 3, &[0, 1, 2], |v| v);
         add(&read(&named("ROTATION"), 4)?, 4, &[3, 0, 1, 2], |v| v);
-        add(&read(&named("SCALE"), 3)?, 3, &[0, 1, 2], |v| v.max(f32::MIN_POSITIVE).ln());
+        add(
+            &read(&named("SCALE"), 3)?,
+            3,
+            &[0, 1, 2],
+            |v| if v < MIN_SCALE { MIN_SCALE.ln() } else { v.ln() },
+        );
         add(&read(&named("OPACITY"), 1)?, 1, &[0], logit);
         let bands: Result<Vec<Vec<f32>>, String> =
             (0..coefficients).map(|band| read(&named(&coefficient(band)), 3)).collect();
@@ -268,7 +284,7 @@ impl File<'_> {
                 end <= self.binary.len() as u64 && stride >= 4 * size as u64 && view["buffer"] == json!(0);
             inside.then_some((first as usize, stride as usize, count as usize))
         };
-        let (first, stride, count) = place().ok_or_else(|| bad("lies outside of the file"))?;
+        let (first, stride, count) = place().ok_or_else(|| bad("is empty, or lies outside of the file"))?;
         let value = |at: usize| f32::from_le_bytes(self.binary[at..at + 4].try_into().expect("four bytes"));
         Ok((0..count).flat_map(|i| (0..size).map(move |c| first + i * stride + 4 * c)).map(value).collect())
     }

@@ -19,6 +19,8 @@ const CODES: usize = 256;
 const ROUNDS: usize = 12;
 /// Alpha of a quaternion whose first component was left out.
 const FIRST_LEFT_OUT: u8 = 252;
+/// Largest value of a Gaussian. Ranges beyond it have no size in f32.
+const LARGEST: f32 = 1e30;
 /// Largest side of a WebP picture.
 const MAX_SIDE: usize = 16_383;
 
@@ -26,6 +28,9 @@ const MAX_SIDE: usize = 16_383;
 pub(crate) fn check(stored: &Stored) -> Result<(), String> {
     if stored.is_empty() {
         return Err("a SOG has one Gaussian at least".into());
+    }
+    if stored.columns.iter().flatten().any(|value| value.abs() > LARGEST) {
+        return Err(format!("a value beyond {LARGEST:e} is none of a SOG"));
     }
     if stored.len() > MAX_SIDE * MAX_SIDE {
         return Err(format!("{} Gaussians; a SOG has {} at most", stored.len(), MAX_SIDE * MAX_SIDE));
@@ -128,8 +133,9 @@ fn picture(order: &[u32], [width, height]: [usize; 2], of: &dyn Fn(usize) -> [u8
 
 /// A quaternion (w, x, y, z) without its largest component, in the steps of bytes.
 fn smallest_three(q: [f32; 4]) -> [u8; 4] {
-    let length = q.iter().map(|v| v * v).sum::<f32>().sqrt();
-    let q = if length > 0.0 { q.map(|v| v / length) } else { [1.0, 0.0, 0.0, 0.0] };
+    let q = q.map(f64::from);
+    let length = q.iter().map(|v| v * v).sum::<f64>().sqrt();
+    let q = if length > 0.0 { q.map(|v| (v / length) as f32) } else { [1.0, 0.0, 0.0, 0.0] };
     let largest = (0..4).max_by(|a, b| q[*a].abs().total_cmp(&q[*b].abs())).expect("four components");
     // A quaternion and its negative are one rotation; the largest component becomes positive.
     let step =
@@ -176,11 +182,11 @@ impl Codebook {
             .collect();
         let (low, high) = (values[0], values[values.len() - 1]);
         // Half of the codes follow the values, half their range, so that rare values have one near them.
-        let along = |i: usize, count: usize| i as f32 / (count - 1) as f32;
         let mut codes: Vec<f32> = (0..CODES / 2)
             .flat_map(|i| {
-                let share = along(i, CODES / 2);
-                [values[(share * (values.len() - 1) as f32) as usize], low + share * (high - low)]
+                let last = CODES / 2 - 1;
+                let share = i as f32 / last as f32;
+                [values[i * (values.len() - 1) / last], low + share * (high - low)]
             })
             .collect();
         for _ in 0..ROUNDS {

@@ -9,7 +9,7 @@ use crate::{Camera, Gaussians, SplatError, sh};
 /// Opacities are stored as logits; f32 saturates to ±∞ at 0 and 1, so they are kept this far away from both.
 const OPACITY_MARGIN: f32 = 1e-6;
 /// Scales are stored as logarithms; a scale that underflowed to 0 is stored as this many metres.
-const MIN_SCALE: f32 = 1e-10;
+pub(crate) const MIN_SCALE: f32 = 1e-10;
 
 /// A file's Gaussians.
 #[derive(Debug, Clone)]

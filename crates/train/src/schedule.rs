@@ -94,9 +94,10 @@ impl Schedule {
                 let fall = (steps.saturating_sub(1).saturating_sub(warm_up)).max(1) as f64;
                 anneal(1.0, end, (at - warm_up as f64) / fall)
             }
+            Self::Trapezoid { fall: 0, .. } => 1.0,
             Self::Trapezoid { fall, end, .. } => {
                 let left = steps.saturating_sub(1) as f64 - at;
-                end + (1.0 - end) * (left / fall.max(1) as f64).min(1.0)
+                end + (1.0 - end) * (left / fall as f64).min(1.0)
             }
         }
     }
@@ -150,6 +151,6 @@ mod tests {
         let endless = Schedule::Trapezoid { warm_up: 1, fall: usize::MAX, end: 0.01 };
         assert_eq!(endless.problem(1000).map(|(key, _)| key), Some("fall"));
         let step = Schedule::Trapezoid { warm_up: 0, fall: 0, end: 0.0 };
-        assert_eq!([0, 8].map(|at| step.share(at, 10)), [1.0, 1.0]);
+        assert_eq!([0, 8, 9].map(|at| step.share(at, 10)), [1.0; 3]);
     }
 }

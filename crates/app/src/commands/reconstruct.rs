@@ -39,7 +39,8 @@ pub struct Arguments {
     /// the alpha channels say; none: alpha channels and --masks alone.
     #[arg(long, value_name = "auto|network|none", default_value = "auto", value_parser = ["auto", "network", "none"])]
     cutout: String,
-    /// Also write the photographs without background: front.png and back.png.
+    /// Also write the photographs as they are placed: without background, at most 4096 pixels long if the network removed it, the
+    /// back's colours matched to the front's. The files are front.png and back.png.
     #[arg(long, value_name = "DIR")]
     save_cutouts: Option<PathBuf>,
     /// Use the pictures as the canvas, without cropping, scaling and centring.
@@ -238,7 +239,10 @@ fn check_paths(
     let outputs = [Some(&arguments.output), arguments.dump.as_ref(), config_path.as_ref()];
     let mut outputs: Vec<&Path> = outputs.into_iter().flatten().map(PathBuf::as_path).collect();
     outputs.extend(mesh.map(Target::files).unwrap_or_default());
-    outputs.extend(saved.iter().flatten().map(PathBuf::as_path));
+    // A missing folder has no files that could be in the way.
+    outputs.extend(
+        saved.iter().flatten().map(PathBuf::as_path).filter(|path| path.parent().is_some_and(Path::is_dir)),
+    );
     let mut pictures = Vec::new();
     if let Some(turntable) = turntable {
         outputs.iter().try_for_each(|output| turntable.check_apart(output))?;

@@ -39,7 +39,7 @@ const PRESETS: [(&str, &str, Preset); 2] = [
 #[derive(Args)]
 #[command(group = clap::ArgGroup::new("views").required(true).args(["cameras", "orbit"]))]
 pub struct Arguments {
-    /// Gaussian PLY, SH degree 0 to 3.
+    /// File of Gaussians: PLY, SPZ or GLB, SH degree 0 to 3.
     ply: PathBuf,
     /// Cameras to render into.
     #[arg(long, value_name = "cameras.json")]

@@ -2,7 +2,7 @@
 //! onto those of the photograph (He et al., "Guided Image Filtering", 2013; He and Sun, "Fast Guided Filter", 2015), and the background's
 //! share is taken out of mixed colours (Forte, "Approximate Fast Foreground Colour Estimation", 2021).
 
-use glam::Vec3;
+use glam::{Mat3, Vec3};
 use image::imageops::{self, FilterType};
 use image::{GrayImage, Luma, Rgb, RgbImage};
 use snapsnap_base::bilinear::{Tap, taps};
@@ -19,8 +19,8 @@ const MARGIN: f32 = 0.1;
 const LIKELY: f32 = 0.5;
 /// Distance from the person's largest piece, in pixels of [`FOUND`], beyond which nothing belongs to it.
 const NEAR: usize = 6;
-/// Largest height of a cut-out. Canvases have 1024 rows.
-const HIGHEST: u32 = 2048;
+/// Longest side of a cut-out. Pictures of more pixels are reduced first, two of one size alike. Canvases have 1024 rows.
+const LONGEST: u32 = 4096;
 /// Longer side of the pictures on which filters are computed, their radius in pixels, and the variance below which the photograph has no
 /// edges.
 const FILTERED: u32 = 640;
@@ -28,32 +28,33 @@ const RADIUS: usize = 4;
 const EPSILON: f32 = 1e-4;
 /// Least probability in a gap of the person that is none, such as a shadow below the chin. Between an arm and the body it is far lower.
 const NO_GAP: f32 = 0.2;
-/// Coverages up to the first are background, from the second on the person.
-const SOFT: (f32, f32) = (0.1, 0.9);
+/// Least coverage of a pixel that is no part of a gap.
+const WHOLE: f32 = 0.95;
+/// The filter leaves edges soft. Up to the first value a pixel shows the background, from the second on the person: for the mask, and for
+/// colours, of which a mixed one does more harm than a corrected one.
+const SOFT: (f32, f32) = (0.3, 0.7);
+const MIXED: (f32, f32) = (0.1, 0.9);
 
 /// Colours from 0 to 1, `[3, FOUND, FOUND]` → probability of each pixel to belong to the person, `[FOUND, FOUND]`.
 pub type Segmenter<'a> = dyn Fn(&[f32]) -> Vec<f32> + 'a;
 
-/// Cuts the person out of a picture: its coverage, and the colours without the background's share. The picture is reduced first if the
-/// person is higher than [`HIGHEST`]. `None` if the network finds nobody.
+/// Cuts the person out of a picture: its coverage, and the colours without the background's share. The picture is reduced first if it
+/// is longer than [`LONGEST`]. `None` if the network finds nobody.
 pub fn matte(mut picture: RgbImage, segment: &Segmenter) -> Option<(RgbImage, GrayImage)> {
+    let longest = picture.width().max(picture.height());
+    if longest > LONGEST {
+        let scaled = |side: u32| (u64::from(side) * u64::from(LONGEST) / u64::from(longest)).max(1) as u32;
+        // Unlike other filters, this one makes no copy in floats.
+        picture = imageops::thumbnail(&picture, scaled(picture.width()), scaled(picture.height()));
+    }
     let whole = Rect { x: 0, y: 0, width: picture.width(), height: picture.height() };
     let (_, person) = largest(&found(&picture, whole, segment))?;
-    let mut part = around(person, whole);
+    let part = around(person, whole);
     // The person fills the second picture.
     let mut probability = found(&picture, part, segment);
     let (is_near, _) = largest(&probability)?;
     probability.iter_mut().zip(&is_near).filter(|(_, near)| !**near).for_each(|(p, _)| *p = 0.0);
 
-    if part.height > HIGHEST {
-        let scale = f64::from(HIGHEST) / f64::from(part.height);
-        let scaled = |length: u32| (f64::from(length) * scale) as u32;
-        let size = [picture.width(), picture.height()].map(|side| scaled(side).max(1));
-        picture = imageops::resize(&picture, size[0], size[1], FilterType::Lanczos3);
-        let (x, y) = (scaled(part.x), scaled(part.y));
-        let (width, height) = (scaled(part.width).min(size[0] - x), scaled(part.height).min(size[1] - y));
-        part = Rect { x, y, width, height };
-    }
     let mut mask = GrayImage::new(picture.width(), picture.height());
     let person = imageops::crop_imm(&picture, part.x, part.y, part.width, part.height).to_image();
     Filter::new(&person, probability).cut_out(&mut picture, &mut mask, part);
@@ -126,17 +127,20 @@ impl Filter {
             let at = |planes: &[Vec<f32>; 3]| Vec3::from_array(std::array::from_fn(|c| planes[c][i]));
             let m = at(&mean_of_color);
             let [rr, rg, rb, gg, gb, bb] = std::array::from_fn(|k| products[k][i]);
-            let covariance = glam::Mat3::from_cols(
+            // In f64: the three colours of a grey edge are nearly one.
+            let covariance = Mat3::from_cols(
                 Vec3::new(rr + EPSILON, rg, rb) - m * m.x,
                 Vec3::new(rg, gg + EPSILON, gb) - m * m.y,
                 Vec3::new(rb, gb, bb + EPSILON) - m * m.z,
             );
-            let slope = covariance.inverse() * (at(&mean_of_both) - m * mean_of_p[i]);
+            let both = (at(&mean_of_both) - m * mean_of_p[i]).as_dvec3();
+            let slope = (covariance.as_dmat3().inverse() * both).as_vec3();
             (slope, mean_of_p[i] - slope.dot(m))
         };
         let (slope, offset): (Vec<Vec3>, Vec<f32>) = (0..p.len()).map(line).unzip();
         let (mut slope, mut offset) = (mean_colors(&slope, wide), means(&offset, wide, RADIUS));
-        let mut alpha: Vec<f32> = (0..p.len()).map(|i| hard(slope[i].dot(color[i]) + offset[i])).collect();
+        let mut alpha: Vec<f32> =
+            (0..p.len()).map(|i| between(slope[i].dot(color[i]) + offset[i], MIXED)).collect();
         for i in no_gaps(&alpha, &p, wide) {
             (slope[i], offset[i], alpha[i]) = (Vec3::ZERO, 1.0, 1.0);
         }
@@ -161,8 +165,9 @@ impl Filter {
             for (x, across) in (part.x..).zip(&across) {
                 let (at, pixel) = ([*down, *across], picture.get_pixel_mut(x, y));
                 let color = unit(pixel);
-                let alpha = hard(self.at(&self.slope, at).dot(color) + self.at(&self.offset, at));
-                mask.put_pixel(x, y, Luma([(255.0 * alpha).round() as u8]));
+                let share = self.at(&self.slope, at).dot(color) + self.at(&self.offset, at);
+                mask.put_pixel(x, y, Luma([(255.0 * between(share, SOFT)).round() as u8]));
+                let alpha = between(share, MIXED);
                 if alpha > 0.0 && alpha < 1.0 {
                     let (person, background) = (self.at(&self.person, at), self.at(&self.background, at));
                     // What is left over belongs to the person by its share.
@@ -190,7 +195,7 @@ fn unit(pixel: &Rgb<u8>) -> Vec3 {
 
 /// Pixels of gaps in the person that are none.
 fn no_gaps(alpha: &[f32], p: &[f32], width: usize) -> Vec<usize> {
-    let is_open: Vec<bool> = alpha.iter().map(|a| *a < SOFT.1).collect();
+    let is_open: Vec<bool> = alpha.iter().map(|a| *a < WHOLE).collect();
     let Pieces { of, pieces } = pieces(&is_open, width as u32);
     // Piece 0 is the person.
     let mut least = vec![f32::INFINITY; pieces.len() + 1];
@@ -198,9 +203,9 @@ fn no_gaps(alpha: &[f32], p: &[f32], width: usize) -> Vec<usize> {
     (0..of.len()).filter(|i| of[*i] > 0 && least[of[*i] as usize] > NO_GAP).collect()
 }
 
-/// Coverage without the softness that a filter leaves everywhere.
-fn hard(alpha: f32) -> f32 {
-    ((alpha - SOFT.0) / (SOFT.1 - SOFT.0)).clamp(0.0, 1.0)
+/// The share of the way from the first limit to the second.
+fn between(alpha: f32, (low, high): (f32, f32)) -> f32 {
+    ((alpha - low) / (high - low)).clamp(0.0, 1.0)
 }
 
 fn mean_colors(values: &[Vec3], width: usize) -> Vec<Vec3> {
@@ -291,12 +296,16 @@ mod tests {
     }
 
     #[test]
-    fn tall_people_are_reduced_and_nobody_is_nobody() {
-        let (rgb, mask) = matte(photograph(8), &network).expect("a person");
-        // The person with margins has some 2900 rows before.
-        assert!(rgb.height() < 3200 && rgb.dimensions() == mask.dimensions(), "{:?}", rgb.dimensions());
+    fn large_pictures_are_reduced_and_nobody_is_nobody() {
+        // 3600 × 4800 pixels.
+        let (rgb, mask) = matte(photograph(12), &network).expect("a person");
+        assert_eq!((rgb.dimensions(), mask.dimensions()), ((3072, 4096), (3072, 4096)));
         let rows = mask.rows().filter(|row| row.clone().any(|value| value[0] > 127)).count() as f32;
-        assert!((rows / rgb.height() as f32 - 0.75).abs() < 0.01, "{rows}");
+        assert!((rows / 4096.0 - 0.75).abs() < 0.01, "{rows}");
+        let line = RgbImage::from_fn(2, 70_000, |_, y| {
+            Rgb(if (9_000..60_000).contains(&y) { PERSON } else { WALL })
+        });
+        assert_eq!(matte(line, &network).expect("a person").1.dimensions(), (1, 4096));
         assert!(matte(RgbImage::from_pixel(90, 80, Rgb(WALL)), &network).is_none());
         assert!(matte(RgbImage::new(1, 1), &|_| vec![0.0; FOUND * FOUND]).is_none());
         // Everything is the person.

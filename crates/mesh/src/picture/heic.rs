@@ -22,15 +22,113 @@ fn damaged(message: impl ToString) -> ImageError {
     ImageError::Decoding(DecodingError::new(hint, message.to_string()))
 }
 
-/// Width and height of the picture, upright, and the bytes that decoding takes.
+/// Width and height of the picture, upright, and the bytes that decoding takes at most.
 pub fn size(bytes: &[u8]) -> Result<([u32; 2], u64), ImageError> {
     let info = heic_decoder::probe(bytes).map_err(damaged)?;
     let side = |length: usize| u32::try_from(length).map_err(damaged);
-    let pixels = (info.coded_width as u64).saturating_mul(info.coded_height as u64);
+    let mut pixels = (info.coded_width as u64).saturating_mul(info.coded_height as u64);
+    if contains(bytes, b"grid") {
+        // Tiles may be larger than the picture that is cut out of them. Each is one of the file's items.
+        let items = places(bytes, b"hvc1").count() as u64;
+        let largest = places(bytes, b"hvcC").filter_map(|at| coded_pixels(&bytes[at + 4..])).max();
+        pixels = pixels.max(items.saturating_mul(largest.unwrap_or(0)));
+    }
     if pixels > MAX_PIXELS_PER_BYTE * bytes.len() as u64 {
         return Err(damaged("the file is too short for its number of pixels"));
     }
-    Ok(([side(info.width)?, side(info.height)?], pixels.saturating_mul(BYTES_PER_PIXEL)))
+    let each = if info.alpha_bit_depth.is_some() { 2 * BYTES_PER_PIXEL } else { BYTES_PER_PIXEL };
+    Ok(([side(info.width)?, side(info.height)?], pixels.saturating_mul(each)))
+}
+
+fn places<'a>(bytes: &'a [u8], kind: &'a [u8; 4]) -> impl Iterator<Item = usize> + 'a {
+    bytes.windows(4).enumerate().filter(move |(_, found)| *found == kind).map(|(at, _)| at)
+}
+
+fn contains(bytes: &[u8], kind: &[u8; 4]) -> bool {
+    places(bytes, kind).next().is_some()
+}
+
+/// Pixels of a picture, from the sequence parameter set in a decoder's configuration (ISO/IEC 14496-15, 8.3.2.1; ITU-T H.265, 7.3.2.2).
+fn coded_pixels(configuration: &[u8]) -> Option<u64> {
+    const SEQUENCE: u8 = 33;
+    let length = |at: usize| {
+        Some(usize::from(u16::from_be_bytes([*configuration.get(at)?, *configuration.get(at + 1)?])))
+    };
+    let mut at = 23;
+    for _ in 0..*configuration.get(22)? {
+        let is_sequence = configuration.get(at)? & 0x3f == SEQUENCE;
+        let count = length(at + 1)?;
+        at += 3;
+        for _ in 0..count {
+            let unit = configuration.get(at + 2..at + 2 + length(at)?)?;
+            if is_sequence {
+                return Bits::of(unit).pixels();
+            }
+            at += 2 + unit.len();
+        }
+    }
+    None
+}
+
+/// Bits of a parameter set.
+struct Bits {
+    bytes: Vec<u8>,
+    at: usize,
+}
+
+impl Bits {
+    /// The bytes behind the header of two, without those that only keep start codes from appearing (H.265, 7.3.1.1).
+    fn of(unit: &[u8]) -> Self {
+        let mut bytes: Vec<u8> = Vec::with_capacity(unit.len());
+        let mut zeros = 0;
+        for &byte in unit.iter().skip(2) {
+            if zeros >= 2 && byte == 3 {
+                zeros = 0;
+                continue;
+            }
+            zeros = if byte == 0 { zeros + 1 } else { 0 };
+            bytes.push(byte);
+        }
+        Self { bytes, at: 0 }
+    }
+
+    fn bit(&mut self) -> Option<u64> {
+        let byte = *self.bytes.get(self.at / 8)?;
+        self.at += 1;
+        Some(u64::from(byte >> (7 - (self.at - 1) % 8) & 1))
+    }
+
+    fn number(&mut self, bits: u32) -> Option<u64> {
+        (0..bits).try_fold(0, |number, _| Some(number << 1 | self.bit()?))
+    }
+
+    /// An unsigned number in the code of Exp-Golomb (H.265, 9.2).
+    fn golomb(&mut self) -> Option<u64> {
+        let mut zeros = 0;
+        while self.bit()? == 0 {
+            zeros += 1;
+        }
+        (zeros < 33).then(|| Some((1_u64 << zeros) - 1 + self.number(zeros)?)).flatten()
+    }
+
+    fn pixels(mut self) -> Option<u64> {
+        self.number(4)?;
+        let layers = self.number(3)?;
+        // Nesting, then the general profile and level.
+        self.at += 1 + 96;
+        let mut skipped = 0;
+        if layers > 0 {
+            for _ in 0..layers {
+                skipped += 88 * self.bit()? + 8 * self.bit()?;
+            }
+            self.at += 2 * (8 - layers) as usize + skipped as usize;
+        }
+        self.golomb()?;
+        if self.golomb()? == 3 {
+            self.bit()?;
+        }
+        self.golomb()?.checked_mul(self.golomb()?)
+    }
 }
 
 /// The picture, turned upright as the file says.

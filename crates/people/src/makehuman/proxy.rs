@@ -151,7 +151,7 @@ impl Proxy {
                 "obj_file" => mesh = words.next(),
                 "tag" => match words.next().map(str::to_ascii_lowercase).as_deref() {
                     Some("shoes") => proxy.kind = Kind::Shoes,
-                    Some("hats") => proxy.kind = Kind::Hat,
+                    Some("hats") if proxy.kind == Kind::Suit => proxy.kind = Kind::Hat,
                     _ => {}
                 },
                 "verts" => (is_list, is_hidden) = (true, false),
