@@ -109,7 +109,7 @@ fn people_in_a_room_are_cut_out() {
         println!("{side}: IoU {:.4}", both / union);
         assert!(both / union > 0.985, "{side}: {}", both / union);
         // Mixed pixels are closer to the person's colour than they were in the photograph.
-        let distance = |a: &[u8], b: &[u8]| (0..3).map(|c| a[c].abs_diff(b[c]) as u32).sum::<u32>();
+        let distance = |a: &[u8], b: &[u8]| (0..3).map(|c| u32::from(a[c].abs_diff(b[c]))).sum::<u32>();
         let mixed = truth
             .enumerate_pixels()
             .filter(|(x, y, p)| (40..216).contains(&p[3]) && found.get_pixel(*x, *y)[3] > 127);

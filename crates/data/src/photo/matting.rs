@@ -33,7 +33,7 @@ const WHOLE: f32 = 0.95;
 /// The filter leaves edges soft. Up to the first value a pixel shows the background, from the second on the person: for the mask, and for
 /// colours, of which a mixed one does more harm than a corrected one.
 const SOFT: (f32, f32) = (0.3, 0.7);
-const MIXED: (f32, f32) = (0.1, 0.9);
+const MIXED: (f32, f32) = (0.1, 0.8);
 
 /// Colours from 0 to 1, `[3, FOUND, FOUND]` → probability of each pixel to belong to the person, `[FOUND, FOUND]`.
 pub type Segmenter<'a> = dyn Fn(&[f32]) -> Vec<f32> + 'a;
