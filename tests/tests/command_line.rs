@@ -222,7 +222,7 @@ fn exif_orientation_is_honoured() {
 fn unsuitable_pictures_are_refused_by_name() {
     let place = Workplace::new();
     let case = |front: &str, wanted: &[&str]| {
-        let message = place.refusal(&mut place.reconstruct(front, "back.png"));
+        let message = place.refusal(place.reconstruct(front, "back.png").args(["--cutout", "none"]));
         for text in wanted.iter().chain(&[front]) {
             assert!(message.contains(text), "{front}: {message}");
         }
@@ -235,6 +235,8 @@ fn unsuitable_pictures_are_refused_by_name() {
     case("cut.png", &["not a readable image"]);
     RgbImage::from_pixel(100, 100, Rgb([1, 2, 3])).save(place.path("rgb.png")).expect("PNG");
     case("rgb.png", &["no alpha channel", "--masks"]);
+    let message = place.refusal(&mut place.reconstruct("rgb.png", "back.png"));
+    assert!(message.contains("rgb.png: no person was found") && message.contains("--masks"), "{message}");
     RgbaImage::from_fn(100, 100, |x, y| Rgba([x as u8, y as u8, 0, 255]))
         .save(place.path("solid.png"))
         .expect("PNG");
