@@ -181,7 +181,10 @@ fn write(folder: &Path) {
 /// A tube of clothes or hair around the trunk or the head. Its vertices are bound to one vertex of the base mesh, or to
 /// three.
 fn wear(folder: &Path, asset: &str, tags: &str, first: usize) {
-    let mut clothes = format!("# CC0\nname {asset}\n{tags}obj_file worn.obj\nx_scale 0 3 2.8\nverts 0\n");
+    // What is hidden may be missing, so it stands before the vertices: a file that was cut then lacks some of these.
+    let hidden = format!("delete_verts\n{first} - {} {}\n", first + 2, first + CORNERS);
+    let mut clothes =
+        format!("# CC0\nname {asset}\n{tags}obj_file worn.obj\nx_scale 0 3 2.8\n{hidden}verts 0\n");
     let mut mesh = String::new();
     for row in 0..2 * CORNERS {
         let at = first + row;
@@ -196,7 +199,6 @@ fn wear(folder: &Path, asset: &str, tags: &str, first: usize) {
         let [c, d] = [next, corner].map(|row| row + CORNERS);
         mesh += &format!("f {corner}/{corner} {next}/{next} {c}/{c} {d}/{d}\n");
     }
-    clothes += &format!("\ndelete_verts\n{first} - {} {}\n", first + 2, first + CORNERS);
     put(folder, &format!("data/{asset}/worn.mhclo"), clothes);
     put(folder, &format!("data/{asset}/worn.obj"), mesh);
 }
