@@ -5,7 +5,7 @@ use std::process::Command;
 
 use burn::tensor::Device;
 use image::{Rgb, RgbImage, RgbaImage};
-use snapsnap_net::U2Net;
+use snapsnap_net::u2net::U2Net;
 use snapsnap_net::weights::Source;
 use snapsnap_tests::{data, refused, root, snapsnap, succeed};
 

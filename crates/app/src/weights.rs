@@ -5,8 +5,9 @@ use std::path::Path;
 
 use burn::tensor::Device;
 use snapsnap_base::config::Schema;
-use snapsnap_net::U2Net;
+use snapsnap_data::photo::FOUND;
 use snapsnap_net::config::Config;
+use snapsnap_net::u2net::{SIDE, U2Net};
 use snapsnap_net::weights::{Source, WeightFile};
 
 use crate::commands::ConfigArguments;
@@ -20,6 +21,9 @@ const DEFAULT: &[u8] = include_bytes!("../../../assets/weights/default.safetenso
 const U2NET: &[u8] = include_bytes!("../../../assets/weights/u2netp.safetensors");
 /// Name of the default weights, in place of a path.
 pub const DEFAULT_NAME: &str = "the default weights";
+
+// The photographs are resized for the network.
+const _: () = assert!(FOUND == SIDE);
 
 /// The network that finds a person's pixels, from 0 to 1, on the CPU: it is small, and a GPU's kernels would take longer to compile.
 pub fn segmenter() -> impl Fn(&[f32]) -> Vec<f32> {

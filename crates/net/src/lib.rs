@@ -13,11 +13,10 @@ mod reconstruct;
 pub mod regressor;
 pub mod resample;
 pub mod sides;
-mod u2net;
+pub mod u2net;
 pub mod weights;
 
 pub use crop::Window;
 pub use hull::dilated;
 pub use neighbours::Neighbours;
 pub use reconstruct::{Photograph, Reconstruction, Reconstructor};
-pub use u2net::U2Net;

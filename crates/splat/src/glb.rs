@@ -9,7 +9,7 @@ use std::io::{self, Read, Write};
 use serde_json::{Map, Value, json};
 
 use crate::sh;
-use crate::stored::{MIN_SCALE, Problem, Stored, logit};
+use crate::stored::{MIN_SCALE, Problem, Stored, logit, opacity};
 
 /// First bytes of a file.
 pub(crate) const MAGIC: [u8; 2] = *b"gl";
@@ -117,7 +117,7 @@ pub(crate) fn write(stored: &Stored, out: &mut impl Write) -> io::Result<()> {
     for (name, _, columns) in &attributes {
         let activate: fn(f32) -> f32 = match name.rsplit(':').next() {
             Some("SCALE") => f32::exp,
-            Some("OPACITY") => sigmoid,
+            Some("OPACITY") => opacity,
             _ => |value| value,
         };
         let is_rotation = name.ends_with("ROTATION");
@@ -130,7 +130,7 @@ pub(crate) fn write(stored: &Stored, out: &mut impl Write) -> io::Result<()> {
     }
     for i in 0..n {
         let color = |channel: usize| linear(0.5 + sh::C0 * stored.band(0, channel)[i]);
-        let color = [color(0), color(1), color(2), sigmoid(stored.columns[10][i])];
+        let color = [color(0), color(1), color(2), opacity(stored.columns[10][i])];
         out.write_all(&color.map(|value| (255.0 * value).round() as u8))?;
     }
     Ok(())
@@ -143,10 +143,6 @@ fn unit(values: impl Iterator<Item = f64>) -> [f32; 4] {
     let part =
         |i: usize| if length > 0.0 { (values[i] / length) as f32 } else { f32::from(u8::from(i == 3)) };
     std::array::from_fn(part)
-}
-
-fn sigmoid(value: f32) -> f32 {
-    1.0 / (1.0 + (-value).exp())
 }
 
 /// From sRGB to linear light (IEC 61966-2-1).

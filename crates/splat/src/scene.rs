@@ -1,5 +1,5 @@
-//! Files of Gaussians: PLY, SPZ, GLB, and SOG, which is only written. The first bytes of a file decide its kind when it is read; its name decides when it
-//! is written.
+//! Files of Gaussians: PLY, SPZ, GLB, and SOG, which is only written. The first bytes of a file decide its kind when it is
+//! read; its name decides when it is written.
 
 use std::io::{self, Read, Write};
 use std::path::Path;

@@ -11,7 +11,7 @@ use serde_json::json;
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, DateTime, ZipWriter};
 
-use crate::stored::Stored;
+use crate::stored::{Stored, opacity};
 
 /// Values of a codebook.
 const CODES: usize = 256;
@@ -58,9 +58,7 @@ pub(crate) fn write(stored: &Stored, out: &mut impl Write) -> io::Result<()> {
         let values = stored.columns[axis].iter();
         values.map(|v| sign * v.signum() * v.abs().ln_1p()).collect::<Vec<f32>>()
     });
-    let limits = logs.each_ref().map(|values| {
-        values.iter().fold((f32::INFINITY, f32::NEG_INFINITY), |(low, high), v| (low.min(*v), high.max(*v)))
-    });
+    let limits = logs.each_ref().map(|values| range(values));
     let place = |i: usize| {
         [0, 1, 2].map(|axis| {
             let (low, high) = limits[axis];
@@ -81,7 +79,7 @@ pub(crate) fn write(stored: &Stored, out: &mut impl Write) -> io::Result<()> {
     };
     let color = |i: usize| {
         let [r, g, b] = code(&colors, 11, i);
-        [r, g, b, (255.0 / (1.0 + (-stored.columns[10][i]).exp())).round() as u8]
+        [r, g, b, (255.0 * opacity(stored.columns[10][i])).round() as u8]
     };
     let pixels = |of: &dyn Fn(usize) -> [u8; 4]| picture(&order, size, of);
     let meta = json!({
@@ -118,6 +116,11 @@ pub(crate) fn write(stored: &Stored, out: &mut impl Write) -> io::Result<()> {
     out.write_all(&archive.finish()?.into_inner())
 }
 
+/// The least and the largest value.
+fn range(values: &[f32]) -> (f32, f32) {
+    values.iter().fold((f32::INFINITY, f32::NEG_INFINITY), |(low, high), v| (low.min(*v), high.max(*v)))
+}
+
 /// A lossless picture. Pixels behind the last Gaussian repeat it.
 fn picture(order: &[u32], [width, height]: [usize; 2], of: &dyn Fn(usize) -> [u8; 4]) -> io::Result<Vec<u8>> {
     let last = *order.last().expect("one Gaussian at least");
@@ -149,9 +152,7 @@ fn smallest_three(q: [f32; 4]) -> [u8; 4] {
 fn along_a_curve(stored: &Stored) -> Vec<u32> {
     let axes = [0, 1, 2].map(|axis| {
         let values = &stored.columns[axis];
-        let (low, high) = values
-            .iter()
-            .fold((f32::INFINITY, f32::NEG_INFINITY), |(low, high), v| (low.min(*v), high.max(*v)));
+        let (low, high) = range(values);
         (values, low, high)
     });
     // The longest side has 1024 steps.

@@ -144,7 +144,7 @@ impl Stored {
             means: rows(3, 0, |v| v),
             rotations: rows(4, 3, |v| v),
             scales: rows(3, 7, f32::exp),
-            opacities: rows(1, 10, |v| 1.0 / (1.0 + (-v).exp())).squeeze_dim(1),
+            opacities: rows(1, 10, opacity).squeeze_dim(1),
             colors: rows(3, 11, |v| {
                 let color = 0.5 + sh::C0 * v;
                 // Not `max`: it would turn a NaN into black.
@@ -177,6 +177,11 @@ impl From<String> for Problem {
     fn from(problem: String) -> Self {
         Self::Content(problem)
     }
+}
+
+/// The opacity of a logit.
+pub(crate) fn opacity(logit: f32) -> f32 {
+    1.0 / (1.0 + (-logit).exp())
 }
 
 /// The logit of an opacity, kept away from infinity.

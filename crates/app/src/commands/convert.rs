@@ -29,16 +29,11 @@ pub struct AxesArguments {
 }
 
 impl AxesArguments {
-    /// Refuses y down for a kind of file that has y up by definition.
+    /// Refuses y down for kinds of files whose axes viewers know.
     pub fn check(&self, output: &Path) -> Result<(), Failure> {
-        let name = match Kind::of(output) {
-            Kind::Spz => "an SPZ",
-            Kind::Glb => "a GLB",
-            Kind::Sog => "a SOG",
-            Kind::Ply => return Ok(()),
-        };
-        if self.y_down {
-            let message = format!("--y-down: {name} has y up by definition, and viewers know it");
+        if self.y_down && Kind::of(output) != Kind::Ply {
+            let message =
+                "--y-down is for PLYs: an SPZ and a GLB have y up by definition, and a SOG is turned already";
             return Err(Failure::file(output, message));
         }
         Ok(())

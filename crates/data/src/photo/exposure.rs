@@ -18,8 +18,8 @@ const DARK: f32 = 0.02;
 /// Brightest channel of colours that are compared: darker ones are noise, brighter ones clipped.
 const USABLE: (f32, f32) = (0.06, 0.97);
 /// Least differences of the brightness and of a channel beside it that are corrected, and the largest corrections, as logarithms of
-/// ratios. Without any difference of the cameras people differ by up to 0.16 and 0.07 in light that stays with the camera, and by 0.26 in a
-/// room that is brighter in front of them.
+/// ratios. The former lie above the differences of people who were photographed alike: light that stays with the camera, or a room that is
+/// brighter in front of them, makes front and back differ as well.
 const BRIGHTNESS: (f32, f32) = (0.28, 0.8);
 const BALANCE: (f32, f32) = (0.08, 0.3);
 /// Mask value of pixels that show the person alone.

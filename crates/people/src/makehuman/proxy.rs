@@ -43,7 +43,7 @@ type Corners = (Vec<u32>, Vec<Vec2>);
 /// A proxy.
 #[derive(Debug, Clone)]
 pub struct Proxy {
-    /// Purpose of clothes, by their tags.
+    /// Clothes have it by their tags.
     kind: Kind,
     bindings: Vec<Binding>,
     /// For x, y and z.
@@ -72,7 +72,6 @@ pub struct Wardrobe {
 /// A proxy of a wardrobe.
 #[derive(Debug)]
 struct Stored {
-    kind: Kind,
     /// File name in lower case.
     name: String,
     proxy: Arc<Proxy>,
@@ -91,10 +90,12 @@ impl Wardrobe {
             let assets = if path.is_dir() { entries(&path)? } else { Vec::new() };
             for asset in assets.iter().filter(|asset| asset.is_dir()) {
                 for path in with_ending(asset, "mhclo")? {
-                    let proxy = Proxy::read(&path, vertices)?;
-                    let kind = if folder == "hair" { Kind::Hair } else { proxy.kind };
+                    let mut proxy = Proxy::read(&path, vertices)?;
+                    if folder == "hair" {
+                        proxy.kind = Kind::Hair;
+                    }
                     let name = path.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
-                    proxies.push(Stored { kind, name, proxy: Arc::new(proxy) });
+                    proxies.push(Stored { name, proxy: Arc::new(proxy) });
                 }
             }
         }
@@ -104,7 +105,7 @@ impl Wardrobe {
     /// One of this kind for this sex, 0 female and 1 male.
     pub fn choose(&self, kind: Kind, sex: f32, random: &mut impl Rng) -> Option<Arc<Proxy>> {
         let other = if sex < 0.5 { "male_" } else { "female_" };
-        let fits = |stored: &&Stored| stored.kind == kind && !stored.name.starts_with(other);
+        let fits = |stored: &&Stored| stored.proxy.kind == kind && !stored.name.starts_with(other);
         let fitting: Vec<&Stored> = self.proxies.iter().filter(fits).collect();
         let draw: f32 = random.random_range(0.0..1.0);
         fitting.get((draw * fitting.len() as f32) as usize).map(|stored| stored.proxy.clone())

@@ -12,6 +12,8 @@ use super::{gaussians, put, weights};
 const SIDE: u32 = 64;
 /// A progressive JPEG of that side, which the encoder at hand does not write.
 const PROGRESSIVE: &[u8] = include_bytes!("../../../../crates/mesh/tests/progressive.jpg");
+/// A HEIC of that side, made with libheif.
+const HEIC: &[u8] = include_bytes!("../../../../crates/mesh/tests/square.heic");
 
 /// What all have in common.
 const PICTURE: Format = Format {
@@ -83,6 +85,14 @@ pub const FORMATS: &[Format] = &[
     Format {
         name: "picture-jpeg-progressive",
         sample: |folder| with_masks(folder, PROGRESSIVE),
+        changed: &["front.jpg"],
+        command: MASKED,
+        ..PICTURE
+    },
+    // The first bytes of a picture say what it is, not its name.
+    Format {
+        name: "picture-heic",
+        sample: |folder| with_masks(folder, HEIC),
         changed: &["front.jpg"],
         command: MASKED,
         ..PICTURE
