@@ -11,7 +11,7 @@ use std::error::Error;
 use std::path::{Path, PathBuf};
 
 use burn::tensor::Device;
-use snapsnap_data::photo::{self, Canvas, Cutting, Placement};
+use snapsnap_data::photo::{self, Canvas, Cutting, Placement, Source};
 use snapsnap_net::weights::WeightFile;
 use snapsnap_net::{Photograph, Reconstructor};
 use snapsnap_splat::scene;
@@ -29,9 +29,8 @@ fn main() -> Result<(), Box<dyn Error>> {
 
     // Each person is scaled and moved to the place that the networks were trained for.
     let placement = Placement::Training { height: config.person_height() };
-    let paths = photographs.each_ref().map(PathBuf::as_path);
-    let canvases =
-        photo::load(paths, [None, None], Cutting::Given, config.network.resolution, placement)?.canvases;
+    let sources = photographs.each_ref().map(|path| Source::file(path));
+    let canvases = photo::load(sources, Cutting::Given, config.network.resolution, placement)?.canvases;
     let [front, back] = canvases.map(|Canvas { rgb, mask, valid, .. }| Photograph { rgb, mask, valid });
 
     let result = reconstructor.reconstruct(&front, &back, &|module| println!("{module}"));

@@ -9,11 +9,13 @@
 mod commands;
 mod cutouts;
 mod device;
+mod downloads;
 mod dump;
 mod failure;
 mod interrupt;
 mod memory;
 mod output;
+mod page;
 mod perceptual;
 mod pictures;
 mod progress;
@@ -50,7 +52,8 @@ fn keep_pages() {
 const FIRST_STEPS: &str = "First steps:
   snapsnap demo                                            the sample pair: Gaussians, turntable, report
   snapsnap reconstruct front.png back.png -o human.ply     your own photographs
-  snapsnap view human.ply --open                           look at the result";
+  snapsnap view human.ply --open                           look at the result
+  snapsnap studio --open                                   all of it in the browser";
 
 #[derive(Parser)]
 #[command(
@@ -80,6 +83,9 @@ enum Command {
     /// Render a file of Gaussians into pictures.
     #[command(after_help = "Example: snapsnap render human.ply --orbit 12 --size 1024x1024 -o renders")]
     Render(commands::render::Arguments),
+    /// Make people of photographs in the browser: cut out, correct, reconstruct, look, download.
+    #[command(after_help = "Example: snapsnap studio --open")]
+    Studio(commands::studio::Arguments),
     /// Show a file of Gaussians in the browser.
     #[command(after_help = "Example: snapsnap view human.ply --open")]
     View(commands::view::Arguments),
@@ -189,6 +195,7 @@ fn main() -> ExitCode {
         Command::Demo(arguments) => commands::demo::run(&arguments),
         Command::Reconstruct(arguments) => commands::reconstruct::run(&arguments),
         Command::Render(arguments) => commands::render::run(&arguments),
+        Command::Studio(arguments) => commands::studio::run(&arguments),
         Command::View(arguments) => commands::view::run(&arguments),
         Command::Mesh(arguments) => commands::mesh::run(&arguments),
         Command::Convert(arguments) => commands::convert::run(&arguments),

@@ -9,7 +9,6 @@ use image::{Delay, Frame, RgbImage, imageops};
 use snapsnap_eval::preview;
 
 use crate::failure::Failure;
-use crate::output::write;
 
 /// Speed of the search for a GIF's colours: 1 is best, 30 fastest.
 const GIF_SPEED: i32 = 10;
@@ -35,16 +34,16 @@ pub fn write_png(path: &Path, picture: &RgbImage) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Writes an endless animation, whole or not at all.
-pub fn write_gif(path: &Path, pictures: &[RgbImage], frames_per_second: u32) -> Result<(), Failure> {
+/// The file of an endless animation.
+pub fn gif(pictures: &[RgbImage], frames_per_second: u32) -> Result<Vec<u8>, Failure> {
     let mut bytes = Vec::new();
     let mut encoder = GifEncoder::new_with_speed(&mut bytes, GIF_SPEED);
     let delay = Delay::from_numer_denom_ms(1000, frames_per_second);
     let frames = pictures.iter().map(|picture| Frame::from_parts(picture.convert(), 0, 0, delay));
     let encoded = encoder.set_repeat(Repeat::Infinite).and_then(|()| encoder.encode_frames(frames));
-    encoded.map_err(|e| Failure::Internal(format!("{}: cannot encode: {e}", path.display())))?;
+    encoded.map_err(|e| Failure::Internal(format!("an animation: cannot encode: {e}")))?;
     drop(encoder);
-    write(path, &bytes)
+    Ok(bytes)
 }
 
 /// Pictures of one size in rows of `columns`.

@@ -1,10 +1,10 @@
-//! A small web server for local clients, with one request per connection. The time of a connection is bounded. Contents are
-//! shared by all connections.
+//! A small web server for local clients, with one request per connection. The time of a connection and the memory of all uploads are
+//! bounded. Contents are shared by all connections.
 
 use std::io::{self, Read, Write};
 use std::net::{Shutdown, TcpListener, TcpStream};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -18,14 +18,19 @@ const LONGEST: usize = 16 << 10;
 const HEADERS: usize = 64;
 /// Time limit of a request.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// Time limit of an answer.
+/// Time limit of an answer or an upload.
 const LONGEST_ANSWER: Duration = Duration::from_secs(600);
-/// Time that every answer may take, and bytes per second that it must reach beyond that time. A client behind an SSH tunnel is
-/// faster.
+/// Time that every answer and upload may take, and bytes per second that it must reach beyond that time. A client behind an SSH tunnel
+/// is faster.
 const ALLOWANCE: Duration = Duration::from_secs(10);
 const SLOWEST: u64 = 512 << 10;
-/// Bytes of one write.
+/// Bytes of one write or read.
 const PART: usize = 256 << 10;
+/// Largest number of bytes of all uploads that are in memory.
+const MOST_HELD: u64 = 600 << 20;
+
+/// Bytes of all uploads that are in memory.
+static HELD: AtomicU64 = AtomicU64::new(0);
 
 /// A request.
 pub struct Request {
@@ -39,6 +44,12 @@ pub struct Request {
     pub origin: Option<String>,
     /// The `Sec-Fetch-Site` header, by which a browser names the requesting page's relation to the server.
     pub fetch_site: Option<String>,
+    /// The `X-Job` header, the page's name for its work.
+    pub job: Option<String>,
+    /// The `X-Parts` header: lengths of the body's parts.
+    pub parts: Option<String>,
+    /// Length of the body.
+    length: Option<u64>,
 }
 
 /// Content of an answer.
@@ -51,8 +62,77 @@ pub struct Answer {
     pub content: Content,
 }
 
+/// Status and message of a refused request.
+pub type Refusal = (StatusCode, &'static str);
+
+/// The body of a request, which is read on demand.
+pub struct Body<'a> {
+    stream: &'a mut TcpStream,
+    /// Bytes that arrived with the headers.
+    begun: Vec<u8>,
+    length: Option<u64>,
+}
+
+impl Body<'_> {
+    /// Reads the body. Refuses one of more than `most` bytes, a slow client, and a body beyond [`MOST_HELD`]. Memory grows with the bytes
+    /// that arrive, whatever their number is said to be.
+    pub fn read(&mut self, most: u64) -> Result<Upload, Refusal> {
+        let length = self.length.ok_or((StatusCode::LENGTH_REQUIRED, "the request has no Content-Length"))?;
+        if length > most {
+            return Err((StatusCode::PAYLOAD_TOO_LARGE, "the file is too large"));
+        }
+        let mut upload = Upload(Vec::new());
+        let begun = std::mem::take(&mut self.begun);
+        upload.append(&begun[..begun.len().min(length as usize)])?;
+        let start = Instant::now();
+        let mut part = vec![0; PART];
+        while (upload.0.len() as u64) < length {
+            let left = time_left(start, upload.0.len() as u64).ok();
+            let left = left.filter(|left| self.stream.set_read_timeout(Some(*left)).is_ok());
+            left.ok_or((StatusCode::REQUEST_TIMEOUT, "the upload is too slow"))?;
+            let wanted = (length - upload.0.len() as u64).min(PART as u64) as usize;
+            match self.stream.read(&mut part[..wanted]) {
+                Ok(n) if n > 0 => upload.append(&part[..n])?,
+                Err(e) if e.kind() == io::ErrorKind::Interrupted => {}
+                _ => return Err((StatusCode::BAD_REQUEST, "the upload was cut short")),
+            }
+        }
+        Ok(upload)
+    }
+}
+
+/// An uploaded body in memory.
+pub struct Upload(Vec<u8>);
+
+impl Upload {
+    fn append(&mut self, bytes: &[u8]) -> Result<(), Refusal> {
+        let held = HELD.fetch_add(bytes.len() as u64, Ordering::Relaxed) + bytes.len() as u64;
+        if held > MOST_HELD {
+            HELD.fetch_sub(bytes.len() as u64, Ordering::Relaxed);
+            return Err((
+                StatusCode::SERVICE_UNAVAILABLE,
+                "the server holds too many uploads; try again in a minute",
+            ));
+        }
+        self.0.extend(bytes);
+        Ok(())
+    }
+}
+
+impl AsRef<[u8]> for Upload {
+    fn as_ref(&self) -> &[u8] {
+        &self.0
+    }
+}
+
+impl Drop for Upload {
+    fn drop(&mut self) {
+        HELD.fetch_sub(self.0.len() as u64, Ordering::Relaxed);
+    }
+}
+
 /// Answers requests until the program ends.
-pub fn serve(listener: &TcpListener, answer: &(dyn Fn(&Request) -> Answer + Sync)) -> ! {
+pub fn serve(listener: &TcpListener, answer: &(dyn Fn(&Request, &mut Body) -> Answer + Sync)) -> ! {
     let open = AtomicUsize::new(0);
     thread::scope(|scope| {
         loop {
@@ -78,9 +158,12 @@ pub fn serve(listener: &TcpListener, answer: &(dyn Fn(&Request) -> Answer + Sync
     })
 }
 
-fn converse(mut stream: TcpStream, answer: &dyn Fn(&Request) -> Answer) -> io::Result<()> {
+fn converse(mut stream: TcpStream, answer: &dyn Fn(&Request, &mut Body) -> Answer) -> io::Result<()> {
     let (is_head, answered) = match request(&mut stream)? {
-        Ok(request) => (request.method == "HEAD", answer(&request)),
+        Ok((request, begun)) => {
+            let mut body = Body { stream: &mut stream, begun, length: request.length };
+            (request.method == "HEAD", answer(&request, &mut body))
+        }
         Err((status, why)) => (false, Answer { status, headers: Vec::new(), content: Arc::new(why) }),
     };
     let Answer { status, headers, content } = answered;
@@ -100,7 +183,7 @@ fn converse(mut stream: TcpStream, answer: &dyn Fn(&Request) -> Answer) -> io::R
     stream.shutdown(Shutdown::Write)?;
     stream.set_read_timeout(Some(Duration::from_millis(500)))?;
     let end = Instant::now() + Duration::from_secs(2);
-    let mut rest = [0; 4096];
+    let mut rest = vec![0; PART];
     while Instant::now() < end && stream.read(&mut rest)? > 0 {}
     Ok(())
 }
@@ -108,12 +191,7 @@ fn converse(mut stream: TcpStream, answer: &dyn Fn(&Request) -> Answer) -> io::R
 /// Sends a part of an answer that began at `start`, after `sent` other bytes. A client that reads too slowly is left.
 fn send(stream: &mut TcpStream, mut part: &[u8], start: Instant, mut sent: u64) -> io::Result<()> {
     while !part.is_empty() {
-        let end = (ALLOWANCE + Duration::from_secs(sent / SLOWEST)).min(LONGEST_ANSWER);
-        let left = end.saturating_sub(start.elapsed());
-        if left.is_zero() {
-            return Err(io::ErrorKind::TimedOut.into());
-        }
-        stream.set_write_timeout(Some(left))?;
+        stream.set_write_timeout(Some(time_left(start, sent)?))?;
         match stream.write(part) {
             Ok(0) => return Err(io::ErrorKind::WriteZero.into()),
             Ok(n) => {
@@ -127,11 +205,15 @@ fn send(stream: &mut TcpStream, mut part: &[u8], start: Instant, mut sent: u64) 
     Ok(())
 }
 
-/// Status and message of a refused request.
-type Refusal = (StatusCode, &'static str);
+/// The time that is left to a client who began at `start` and has read or written so many bytes.
+fn time_left(start: Instant, bytes: u64) -> io::Result<Duration> {
+    let end = (ALLOWANCE + Duration::from_secs(bytes / SLOWEST)).min(LONGEST_ANSWER);
+    let left = end.saturating_sub(start.elapsed());
+    if left.is_zero() { Err(io::ErrorKind::TimedOut.into()) } else { Ok(left) }
+}
 
-/// Reads a request line and its headers.
-fn request(stream: &mut TcpStream) -> io::Result<Result<Request, Refusal>> {
+/// Reads a request line and its headers, and what arrives of the body with them.
+fn request(stream: &mut TcpStream) -> io::Result<Result<(Request, Vec<u8>), Refusal>> {
     let end = Instant::now() + PATIENCE;
     let mut bytes = Vec::new();
     let mut part = [0; 2048];
@@ -149,7 +231,9 @@ fn request(stream: &mut TcpStream) -> io::Result<Result<Request, Refusal>> {
         let mut headers = [httparse::EMPTY_HEADER; HEADERS];
         let mut parsed = httparse::Request::new(&mut headers);
         match parsed.parse(&bytes) {
-            Ok(httparse::Status::Complete(_)) => return Ok(checked(&parsed)),
+            Ok(httparse::Status::Complete(head)) => {
+                return Ok(checked(&parsed).map(|request| (request, bytes[head..].to_vec())));
+            }
             Ok(httparse::Status::Partial) if bytes.len() < LONGEST => {}
             Ok(httparse::Status::Partial) | Err(httparse::Error::TooManyHeaders) => {
                 return Ok(Err((StatusCode::REQUEST_HEADER_FIELDS_TOO_LARGE, "too long a request")));
@@ -174,6 +258,15 @@ fn checked(parsed: &httparse::Request) -> Result<Request, Refusal> {
         let found = parsed.headers.iter().find(|header| header.name.eq_ignore_ascii_case(name))?;
         Some(String::from_utf8_lossy(found.value).into_owned())
     };
-    let (origin, fetch_site) = (header("origin"), header("sec-fetch-site"));
-    Ok(Request { path, host, method: parsed.method.unwrap_or_default().to_owned(), origin, fetch_site })
+    let length = header("content-length").and_then(|length| length.trim().parse().ok());
+    Ok(Request {
+        path,
+        host,
+        method: parsed.method.unwrap_or_default().to_owned(),
+        origin: header("origin"),
+        fetch_site: header("sec-fetch-site"),
+        job: header("x-job"),
+        parts: header("x-parts"),
+        length,
+    })
 }

@@ -3,10 +3,14 @@
 use std::path::{Path, PathBuf};
 use std::slice;
 
+use image::RgbImage;
+use snapsnap_splat::scene::Loaded;
 use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
 
+use crate::commands::render::MAX_INTERSECTIONS;
 use crate::failure::Failure;
-use crate::pictures::{picture, sheet, write_gif, write_png};
+use crate::output::write;
+use crate::pictures::{gif, picture, sheet, write_png};
 use crate::progress::Progress;
 use crate::view_folder::ViewFolder;
 
@@ -14,7 +18,7 @@ use crate::view_folder::ViewFolder;
 const SIZE: u32 = 512;
 /// Views of an animation or a folder, and frames per second of an animation.
 const FRAMES: usize = 40;
-const FRAMES_PER_SECOND: u32 = 20;
+pub const FRAMES_PER_SECOND: u32 = 20;
 /// Views and columns of a sheet.
 const SHEET: usize = 8;
 const SHEET_COLUMNS: u32 = 4;
@@ -63,12 +67,14 @@ impl Turntable {
     pub fn write(&self, gaussians: &Gaussians) -> Result<(), Failure> {
         let count = if matches!(self, Self::Sheet(_)) { SHEET } else { FRAMES };
         let orbit = Camera::orbit(count, SIZE, SIZE);
-        let options = RenderOptions::inria();
-        let pictures = Progress::over(orbit.iter(), "views")
-            .map(|camera| picture(&render(gaussians, slice::from_ref(camera), &options)?.color))
-            .collect::<Result<Vec<_>, Failure>>()?;
+        let progress = Progress::steps(count, "views");
+        let view = |camera: &Camera| {
+            picture(&render(gaussians, slice::from_ref(camera), &RenderOptions::inria())?.color)
+        };
+        let pictures = views(&orbit, &view, &|done, all| progress.step(done, all, "views"))?;
+        drop(progress);
         match self {
-            Self::Gif(path) => write_gif(path, &pictures, FRAMES_PER_SECOND),
+            Self::Gif(path) => write(path, &gif(&pictures, FRAMES_PER_SECOND)?),
             Self::Sheet(path) => write_png(path, &sheet(&pictures, SHEET_COLUMNS)),
             Self::Folder(folder) => {
                 folder.begin()?;
@@ -79,4 +85,22 @@ impl Turntable {
             }
         }
     }
+}
+
+/// The pictures of an animation of a file's Gaussians. `done` is called with the numbers of finished and of all pictures. Refuses
+/// scenes that would take far longer than a person's.
+pub fn all_around(scene: &Loaded, done: &dyn Fn(usize, usize)) -> Result<Vec<RgbImage>, Failure> {
+    let options = RenderOptions { max_intersections: MAX_INTERSECTIONS, ..RenderOptions::inria() };
+    let view =
+        |camera: &Camera| picture(&render(&scene.seen_by(camera)?, slice::from_ref(camera), &options)?.color);
+    views(&Camera::orbit(FRAMES, SIZE, SIZE), &view, done)
+}
+
+fn views(
+    cameras: &[Camera],
+    view: &dyn Fn(&Camera) -> Result<RgbImage, Failure>,
+    done: &dyn Fn(usize, usize),
+) -> Result<Vec<RgbImage>, Failure> {
+    let counted = |(i, camera)| view(camera).inspect(|_| done(i + 1, cameras.len()));
+    cameras.iter().enumerate().map(counted).collect()
 }

@@ -6,6 +6,7 @@ mod matting;
 mod placing;
 mod rim;
 mod specks;
+mod strokes;
 #[cfg(test)]
 mod tests;
 
@@ -60,6 +61,33 @@ pub enum Cutting<'a> {
     All(&'a Segmenter<'a>),
 }
 
+/// A photograph and what is known about it.
+#[derive(Clone, Copy)]
+pub struct Source<'a> {
+    /// Its file, or beside `bytes` a name for messages.
+    pub path: &'a Path,
+    /// The content of its file, if it is in memory.
+    pub bytes: Option<&'a [u8]>,
+    /// File of the mask (white: person).
+    pub mask: Option<&'a Path>,
+    /// Corrections of the mask, of any size: white keeps, black removes, 128 changes nothing.
+    pub strokes: Option<&'a GrayImage>,
+}
+
+impl<'a> Source<'a> {
+    /// A file alone.
+    pub fn file(path: &'a Path) -> Self {
+        Self { path, bytes: None, mask: None, strokes: None }
+    }
+
+    fn decode(&self) -> Result<DynamicImage, FileError> {
+        match self.bytes {
+            Some(bytes) => picture::decode_bytes(self.path, bytes, MAX_BYTES),
+            None => picture::decode(self.path, MAX_BYTES),
+        }
+    }
+}
+
 /// One photograph on its canvas; arrays are row-major, side S.
 #[derive(Debug, Clone)]
 pub struct Canvas {
@@ -87,8 +115,8 @@ pub struct Pair {
     pub doubts: Vec<String>,
 }
 
-/// Loads the photographs of front and back and places each on a canvas of `side` pixels. The mask of the person is the
-/// file in `masks` (white: person) or, without one, what `cutting` says. With [`Placement::Training`],
+/// Loads the photographs of front and back and places each on a canvas of `side` pixels. The mask of the person is the source's, or
+/// without one what `cutting` says. With [`Placement::Training`],
 /// photographs whose sizes and boxes agree are taken for photographs from one place. They get the same scale and
 /// offset.
 ///
@@ -96,14 +124,13 @@ pub struct Pair {
 /// [`FileError`]: unreadable files, a mask of another size, an empty or missing mask, a photograph in which the network finds nobody, a
 /// picture below 64 pixels or of a single colour, or, with [`Placement::AsIs`], of another size than the canvas.
 pub fn load(
-    paths: [&Path; 2],
-    masks: [Option<&Path>; 2],
+    [front, back]: [Source; 2],
     cutting: Cutting,
     side: usize,
     placement: Placement,
 ) -> Result<Pair, FileError> {
-    let front = Cutout::read(paths[0], masks[0], cutting, side, placement)?;
-    let mut back = Cutout::read(paths[1], masks[1], cutting, side, placement)?;
+    let front = Cutout::read(front, cutting, side, placement)?;
+    let mut back = Cutout::read(back, cutting, side, placement)?;
     if let Placement::Training { .. } = placement
         && let Some([r, g, b]) = match_back((&front.rgb, &front.mask), (&mut back.rgb, &back.mask))
     {
@@ -117,6 +144,15 @@ pub fn load(
     };
     let canvases = [front.canvas(common, side, placement)?, back.canvas(common, side, placement)?];
     Ok(Pair { canvases, cutouts: [front, back].map(|cutout| (cutout.rgb, cutout.mask)), doubts })
+}
+
+/// Colours and mask of one photograph, as [`load`] takes them for [`Placement::Training`].
+///
+/// # Errors
+/// As [`load`].
+pub fn cut_out(source: Source, cutting: Cutting) -> Result<(RgbImage, GrayImage), FileError> {
+    let Cutout { rgb, mask, .. } = Cutout::read(source, cutting, 0, Placement::Training { height: 0 })?;
+    Ok((rgb, mask))
 }
 
 /// A photograph without its background.
@@ -133,13 +169,13 @@ struct Cutout<'a> {
 
 impl<'a> Cutout<'a> {
     fn read(
-        path: &'a Path,
-        mask: Option<&'a Path>,
+        source: Source<'a>,
         cutting: Cutting,
         side: usize,
         placement: Placement,
     ) -> Result<Self, FileError> {
-        let picture = picture::decode(path, MAX_BYTES)?;
+        let Source { path, mask, strokes, .. } = source;
+        let picture = source.decode()?;
         let (width, height) = (picture.width(), picture.height());
         if placement == Placement::AsIs && (width as usize, height as usize) != (side, side) {
             let message =
@@ -166,14 +202,16 @@ impl<'a> Cutout<'a> {
         let is_given = given.is_ok();
         let rgb = picture.into_rgb8();
         let (mut rgb, mut mask) = match (given, cutting) {
-            (Ok(mask), _) => (rgb, mask),
-            (Err(_), Cutting::Missing(segment) | Cutting::All(segment)) => {
-                matte(rgb, segment).ok_or_else(|| {
+            (Ok(mut mask), _) => {
+                strokes.inspect(|strokes| strokes::paint(strokes, &mut mask, |_, _| {}));
+                (rgb, mask)
+            }
+            (Err(_), Cutting::Missing(segment) | Cutting::All(segment)) => matte(rgb, segment, strokes)
+                .ok_or_else(|| {
                     let message =
                         "no person was found in the picture: give masks with --masks FRONT_MASK BACK_MASK";
                     FileError::unsuitable(path, message)
-                })?
-            }
+                })?,
             (Err(message), Cutting::Given) => return Err(FileError::unsuitable(path, message)),
         };
         // The demo includes every pixel that is not 0. Lossy masks have many such pixels outside the person.

@@ -33,15 +33,25 @@ pub fn decode(path: &Path, most: u64) -> Result<DynamicImage, FileError> {
 /// # Errors
 /// [`FileError`] for a file that cannot be read or is no picture.
 pub fn size(path: &Path) -> Result<[u32; 2], FileError> {
-    let mut file = BufReader::new(file::open(path).map_err(FileError::read(path))?);
-    guarded(path, || {
-        if heic::is_heic(start(path, &mut file)?) {
-            return Ok(heic::size(&whole(path, file)?).map_err(unreadable(path))?.0);
-        }
-        let reader = ImageReader::new(file).with_guessed_format().map_err(FileError::read(path))?;
-        let size = reader.into_dimensions();
-        size.map(Into::into).map_err(unreadable(path))
-    })
+    let file = BufReader::new(file::open(path).map_err(FileError::read(path))?);
+    guarded(path, || size_from(path, file))
+}
+
+/// Width and height of the picture in `bytes`, which are a part of `path`.
+///
+/// # Errors
+/// As [`size`].
+pub fn size_of_bytes(path: &Path, bytes: &[u8]) -> Result<[u32; 2], FileError> {
+    guarded(path, || size_from(path, Cursor::new(bytes)))
+}
+
+fn size_from(path: &Path, mut source: impl BufRead + Seek) -> Result<[u32; 2], FileError> {
+    if heic::is_heic(start(path, &mut source)?) {
+        return Ok(heic::size(&whole(path, source)?).map_err(unreadable(path))?.0);
+    }
+    let reader = ImageReader::new(source).with_guessed_format().map_err(FileError::read(path))?;
+    let size = reader.into_dimensions();
+    size.map(Into::into).map_err(unreadable(path))
 }
 
 /// The picture in `bytes`, which are a part of `path`.

@@ -7,7 +7,7 @@ use clap::Args;
 use image::imageops::FilterType;
 use image::{DynamicImage, RgbImage, imageops};
 use serde_json::json;
-use snapsnap_data::photo::{self, Canvas, Cutting, Placement};
+use snapsnap_data::photo::{self, Canvas, Cutting, Placement, Source};
 use snapsnap_eval::pictures::Picture;
 use snapsnap_eval::region::{Region, margin};
 use snapsnap_eval::similarity::psnr;
@@ -75,10 +75,9 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let config = weights.config.clone();
     let since = Instant::now();
     // The sample pair fills its canvas. Hence its cameras are known, and other views can be compared.
-    let [front, back] = PHOTOGRAPHS.map(|(name, _)| folder.path.join(name));
-    let canvases =
-        photo::load([&front, &back], [None; 2], Cutting::Given, config.network.resolution, Placement::AsIs)?
-            .canvases;
+    let photographs = PHOTOGRAPHS.map(|(name, _)| folder.path.join(name));
+    let sources = photographs.each_ref().map(|path| Source::file(path));
+    let canvases = photo::load(sources, Cutting::Given, config.network.resolution, Placement::AsIs)?.canvases;
     let [front, back] = canvases.map(|Canvas { rgb, mask, valid, .. }| Photograph { rgb, mask, valid });
     let precision = PrecisionChoice::Auto.of_weights(&config, &device);
     let reconstructor = Reconstructor::load(&weights, &device)?.in_precision(precision);

@@ -13,6 +13,7 @@ pub mod prepare;
 pub mod reconstruct;
 pub mod render;
 pub mod stability;
+pub mod studio;
 pub mod train;
 pub mod view;
 pub mod weight_files;

@@ -7,9 +7,11 @@ use burn::tensor::Device;
 use clap::Args;
 use snapsnap_base::config::Schema;
 use snapsnap_base::file;
-use snapsnap_data::photo::{self, Canvas, Cutting, Pair, Placement};
+use snapsnap_data::photo::{self, Canvas, Cutting, Pair, Placement, Source};
 use snapsnap_mesh::picture;
+use snapsnap_net::config::Config;
 use snapsnap_net::precision::{Precision, PrecisionChoice, unit_of_cpu};
+use snapsnap_net::weights::WeightFile;
 use snapsnap_net::weights::schema::Part;
 use snapsnap_net::{Photograph, Reconstructor};
 use snapsnap_splat::scene::Stored;
@@ -49,18 +51,8 @@ pub struct Arguments {
     /// Refuse photographs that seem to be wrong, instead of a warning.
     #[arg(long)]
     strict: bool,
-    /// Weight file, or a folder that contains `weights.safetensors` [default: the program's own].
-    #[arg(long, value_name = "FILE|DIR")]
-    weights: Option<PathBuf>,
     #[command(flatten)]
-    config: ConfigArguments,
-    /// auto, cpu, ndarray, wgpu, vulkan, cuda or metal; wgpu:1 is the second adapter.
-    #[arg(long, default_value = "auto")]
-    device: String,
-    /// Products of the point predictor: f32, bf16, or auto: bf16 on a CPU with instructions for it, if the weights were
-    /// trained so.
-    #[arg(long, value_name = "auto|f32|bf16", default_value = "auto", value_parser = precision)]
-    precision: PrecisionChoice,
+    model: ModelArguments,
     /// File of Gaussians to write: .ply, .spz, .glb or .sog. The resolved config is written beside it.
     #[arg(short, long, default_value = "human.ply")]
     output: PathBuf,
@@ -80,6 +72,62 @@ pub struct Arguments {
     /// Print the modules that ran, the omitted ones with the reasons, and the time of each.
     #[arg(short, long)]
     verbose: bool,
+}
+
+/// The networks and what computes them.
+#[derive(Args)]
+pub struct ModelArguments {
+    /// Weight file, or a folder that contains `weights.safetensors` [default: the program's own].
+    #[arg(long, value_name = "FILE|DIR")]
+    weights: Option<PathBuf>,
+    #[command(flatten)]
+    config: ConfigArguments,
+    /// auto, cpu, ndarray, wgpu, vulkan, cuda or metal; wgpu:1 is the second adapter.
+    #[arg(long, default_value = "auto")]
+    device: String,
+    /// Products of the point predictor: f32, bf16, or auto: bf16 on a CPU with instructions for it, if the weights were
+    /// trained so.
+    #[arg(long, value_name = "auto|f32|bf16", default_value = "auto", value_parser = precision)]
+    precision: PrecisionChoice,
+}
+
+impl ModelArguments {
+    /// Opens the weights of both networks. `auto` looks for graphics cards meanwhile.
+    pub fn open(&self) -> Result<WeightFile, Failure> {
+        let weights = weights::open(self.weights.as_deref(), &self.config)?;
+        weights.require(Part::PointPredictor)?;
+        weights.require(Part::Regressor)?;
+        device::begin_search(&self.device);
+        Ok(weights)
+    }
+
+    /// The device, if the networks fit into its memory.
+    pub fn device(&self, weights: &WeightFile) -> Result<Device, Failure> {
+        let device = device::choose(&self.device)?;
+        memory::check_networks(weights, &device)?;
+        Ok(device)
+    }
+
+    /// Loads the networks.
+    pub fn load(&self, weights: &WeightFile, device: &Device) -> Result<(Reconstructor, Precision), Failure> {
+        let precision = self.precision.of_weights(&weights.config, device);
+        if !device.supports_dtype(precision.dtype()) {
+            bail!("--device {}: does not compute in {}", self.device, precision.name());
+        }
+        Ok((Reconstructor::load(weights, device)?.in_precision(precision), precision))
+    }
+}
+
+/// Refuses a photograph that memory cannot hold.
+pub fn check_memory(name: &Path, [width, height]: [u32; 2]) -> Result<(), Failure> {
+    let bytes = BYTES_PER_PIXEL * u64::from(width) * u64::from(height);
+    memory::check(&format!("{}, {width}×{height},", name.display()), bytes, "make the picture smaller")
+}
+
+/// The placement for these networks.
+pub fn placement(config: &Config) -> Placement {
+    let height = config.person_height();
+    if config.mode.compat { Placement::Demo { height } } else { Placement::Training { height } }
 }
 
 fn precision(text: &str) -> Result<PrecisionChoice, &'static str> {
@@ -105,9 +153,7 @@ fn in_words(precision: Precision, device: &Device) -> String {
 
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let start = Instant::now();
-    let weights = weights::open(arguments.weights.as_deref(), &arguments.config)?;
-    weights.require(Part::PointPredictor)?;
-    weights.require(Part::Regressor)?;
+    let weights = arguments.model.open()?;
     let config = weights.config.clone();
     let mut times = vec![("opening weights", start.elapsed())];
     let mut timed = |name: &'static str, since: Instant| times.push((name, since.elapsed()));
@@ -121,22 +167,13 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     }
     let saved = arguments.save_cutouts.as_deref().map(cutouts::paths).transpose()?;
     let config_path = check_paths(arguments, weights.path(), turntable.as_ref(), target.as_ref(), &saved)?;
-    device::begin_search(&arguments.device);
-    for path in [&arguments.front, &arguments.back] {
-        let [width, height] = picture::size(path)?;
-        let bytes = BYTES_PER_PIXEL * u64::from(width) * u64::from(height);
-        let what = format!("{}, {width}×{height},", path.display());
-        memory::check(&what, bytes, "make the picture smaller")?;
-    }
-    let placement = match (arguments.as_is, config.mode.compat) {
-        (true, _) => Placement::AsIs,
-        (false, true) => Placement::Demo { height: config.person_height() },
-        (false, false) => Placement::Training { height: config.person_height() },
-    };
+    let paths = [&arguments.front, &arguments.back];
+    paths.iter().try_for_each(|path| check_memory(path, picture::size(path)?))?;
+    let placement = if arguments.as_is { Placement::AsIs } else { placement(&config) };
     let masks = arguments.masks.as_deref().unwrap_or_default();
     let since = Instant::now();
-    let masks = [0, 1].map(|i| masks.get(i).map(PathBuf::as_path));
-    let paths = [arguments.front.as_path(), &arguments.back];
+    let sources =
+        [0, 1].map(|i| Source { mask: masks.get(i).map(PathBuf::as_path), ..Source::file(paths[i]) });
     let segmenter = weights::segmenter();
     let cutting = match &*arguments.cutout {
         "none" => Cutting::Given,
@@ -144,7 +181,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
         _ => Cutting::Missing(&segmenter),
     };
     let Pair { canvases, cutouts, doubts } =
-        photo::load(paths, masks, cutting, config.network.resolution, placement)?;
+        photo::load(sources, cutting, config.network.resolution, placement)?;
     if arguments.strict && !doubts.is_empty() {
         bail!("{} (--strict)", doubts.join("\n"));
     }
@@ -155,18 +192,13 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     }
     drop(cutouts);
     let since = Instant::now();
-    let device = device::choose(&arguments.device)?;
+    let device = arguments.model.device(&weights)?;
     timed("finding the device", since);
-    memory::check_networks(&weights, &device)?;
 
     let progress = Progress::stages();
     progress.stage("loading weights");
     let since = Instant::now();
-    let precision = arguments.precision.of_weights(&config, &device);
-    if !device.supports_dtype(precision.dtype()) {
-        bail!("--device {}: does not compute in {}", arguments.device, precision.name());
-    }
-    let reconstructor = Reconstructor::load(&weights, &device)?.in_precision(precision);
+    let (reconstructor, precision) = arguments.model.load(&weights, &device)?;
     timed("loading weights", since);
     let mut plan = vec![
         format!("device: {}", device::describe(&device)),
@@ -232,7 +264,7 @@ fn check_paths(
     let mut config_path = arguments.output.clone().into_os_string();
     config_path.push(".config.toml");
     let config_path = PathBuf::from(config_path);
-    let given = arguments.config.config.as_deref();
+    let given = arguments.model.config.config.as_deref();
     let is_given = given.is_some_and(|given| is_same_file(given, &config_path));
     let config_path = (!is_given && !file::is_special(&arguments.output)).then_some(config_path);
     inputs.extend(given);

@@ -28,7 +28,7 @@ const DEFAULT_SIDE: u32 = 1024;
 const MAX_PIXELS: u64 = 1 << 26;
 /// Largest number of pairs of a splat and a tile in a picture without --force: about two seconds on two cores. A scene of five
 /// million Gaussians has half as many.
-const MAX_INTERSECTIONS: u64 = 100_000_000;
+pub const MAX_INTERSECTIONS: u64 = 100_000_000;
 /// Default folder of the pictures.
 const DEFAULT_FOLDER: &str = "renders";
 const PRESETS: [(&str, &str, Preset); 2] = [

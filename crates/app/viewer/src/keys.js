@@ -7,7 +7,7 @@ const CLOSER = 0.9;
 
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
 
-/** Calls the page's actions by keys, unless a field or a menu has the focus. */
+/** Calls the page's actions by keys, unless a field or a menu has the focus or the studio is open. */
 export function listen(page) {
   const keys = {
     "+": () => page.zoom(CLOSER),
@@ -25,6 +25,9 @@ export function listen(page) {
   };
   window.addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey || ["INPUT", "SELECT"].includes(event.target.tagName)) {
+      return;
+    }
+    if (document.body.classList.contains("making")) {
       return;
     }
     const arrow = ARROWS[event.key];

@@ -1,4 +1,4 @@
-// The page of `snapsnap view`. World: metres, y up, a person who faces +z stands near the origin.
+// The page of `snapsnap view` and `snapsnap studio`. World: metres, y up, a person who faces +z stands near the origin.
 
 import { SparkRenderer, SplatFileType, SplatMesh } from "@sparkjsdev/spark";
 import * as THREE from "three";
@@ -6,7 +6,8 @@ import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { inBatches } from "./batches.js";
 import { bounds, nearestTo } from "./gaussians.js";
 import { listen } from "./keys.js";
-import { save, saveMesh } from "./saving.js";
+import { save, saveLong } from "./saving.js";
+import { openStudio } from "./studio.js";
 import "./style.css";
 
 const element = (id) => document.getElementById(id);
@@ -14,6 +15,23 @@ const canvas = element("canvas");
 
 function say(text) {
   element("message").textContent = text;
+}
+
+/** Where the server has the shown person's files. */
+let address = "./";
+const links = [...document.querySelectorAll("#downloads a")].map((link) => [link, link.getAttribute("href").slice(2)]);
+
+/** Shows a person of the studio. Without WebGL only the downloads lead there. */
+let showMade = async () => {};
+const isStudio = document.documentElement.classList.contains("studio");
+if (isStudio) {
+  element("downloads").classList.add("hidden");
+  openStudio((name) => {
+    address = `./people/${name}/`;
+    links.forEach(([link, file]) => link.setAttribute("href", address + file));
+    element("downloads").classList.remove("hidden");
+    return showMade();
+  });
 }
 
 function newRenderer() {
@@ -177,7 +195,7 @@ async function show(what, read) {
 
 async function served() {
   // The current file, without caches.
-  const answer = await fetch("./scene.ply", { cache: "no-store" });
+  const answer = await fetch(`${address}scene.ply`, { cache: "no-store" });
   if (!answer.ok) {
     throw new Error(await answer.text());
   }
@@ -255,10 +273,12 @@ function saveCamera() {
 }
 element("camera").addEventListener("click", saveCamera);
 
-element("mesh").addEventListener("click", (event) => {
-  event.preventDefault();
-  saveMesh(event.currentTarget, `${stem()}.glb`, say);
-});
+for (const link of document.querySelectorAll("#downloads .long")) {
+  link.addEventListener("click", (event) => {
+    event.preventDefault();
+    saveLong(link, `${stem()}.${link.id === "mesh" ? "glb" : "gif"}`, say);
+  });
+}
 
 function rotate() {
   controls.autoRotate = !controls.autoRotate;
@@ -355,6 +375,7 @@ renderer.setAnimationLoop((now) => {
 
 background();
 lookFrom(0);
-const ready = show("Cannot show the file", served);
+showMade = () => show("Cannot show the person", served);
+const ready = isStudio ? Promise.resolve() : show("Cannot show the file", served);
 // For tests and the browser's console.
 window.snapsnap = { ready, camera: cameraEntry, target: () => controls.target.toArray(), screenshot, lookFrom, renderer, spark };

@@ -1,7 +1,6 @@
 // Files that the page saves.
 
-/** Milliseconds between two questions about the progress of a mesh. */
-const INTERVAL = 500;
+import { ask } from "./asking.js";
 
 export function save(blob, name) {
   const link = document.createElement("a");
@@ -11,32 +10,23 @@ export function save(blob, name) {
   setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
 }
 
-/** Saves the mesh that a link leads to. `say` gets its progress, since the server makes it on demand. */
-export async function saveMesh(link, name, say) {
+/** Saves the file that a link leads to, which the server makes on demand. `say` gets its progress. */
+export async function saveLong(link, name, say) {
   if (link.classList.contains("busy")) {
     return;
   }
   link.classList.add("busy");
+  const what = link.id;
   const start = performance.now();
-  const timer = setInterval(async () => {
-    const answer = await fetch("./progress", { cache: "no-store" }).catch(() => null);
-    const stage = answer?.ok ? await answer.text() : "";
-    if (link.classList.contains("busy")) {
-      say(`Making the mesh: ${stage || "waiting"} … ${Math.round((performance.now() - start) / 1000)} s`);
-    }
-  }, INTERVAL);
-  say("Making the mesh …");
+  const step = (step) => say(`Making the ${what}: ${step} … ${Math.round((performance.now() - start) / 1000)} s`);
+  say(`Making the ${what} …`);
   let message = "";
   try {
-    const answer = await fetch(link.href, { cache: "no-store" });
-    if (!answer.ok) {
-      throw new Error(await answer.text());
-    }
+    const answer = await ask(link.href, {}, step);
     save(await answer.blob(), name);
   } catch (error) {
-    message = `No mesh: ${error.message ?? error}`;
+    message = `No ${what}: ${error.message ?? error}`;
   }
-  clearInterval(timer);
   link.classList.remove("busy");
   say(message);
 }

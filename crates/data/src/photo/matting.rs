@@ -9,6 +9,7 @@ use snapsnap_base::bilinear::{Tap, taps};
 
 use super::Rect;
 use super::specks::{Pieces, pieces};
+use super::strokes::paint;
 use crate::resize::bilinear;
 
 /// Side of the pictures that the network receives.
@@ -39,8 +40,12 @@ const MIXED: (f32, f32) = (0.1, 0.8);
 pub type Segmenter<'a> = dyn Fn(&[f32]) -> Vec<f32> + 'a;
 
 /// Cuts the person out of a picture: its coverage, and the colours without the background's share. The picture is reduced first if it
-/// is longer than [`LONGEST`]. `None` if the network finds nobody.
-pub fn matte(mut picture: RgbImage, segment: &Segmenter) -> Option<(RgbImage, GrayImage)> {
+/// is longer than [`LONGEST`]. `strokes` correct the coverage. `None` if the network finds nobody.
+pub fn matte(
+    mut picture: RgbImage,
+    segment: &Segmenter,
+    strokes: Option<&GrayImage>,
+) -> Option<(RgbImage, GrayImage)> {
     let longest = picture.width().max(picture.height());
     if longest > LONGEST {
         let scaled = |side: u32| (u64::from(side) * u64::from(LONGEST) / u64::from(longest)).max(1) as u32;
@@ -57,7 +62,11 @@ pub fn matte(mut picture: RgbImage, segment: &Segmenter) -> Option<(RgbImage, Gr
 
     let mut mask = GrayImage::new(picture.width(), picture.height());
     let person = imageops::crop_imm(&picture, part.x, part.y, part.width, part.height).to_image();
+    let taken = strokes.map(|strokes| (strokes, picture.clone()));
     Filter::new(&person, probability).cut_out(&mut picture, &mut mask, part);
+    if let Some((strokes, taken)) = taken {
+        paint(strokes, &mut mask, |x, y| picture.put_pixel(x, y, *taken.get_pixel(x, y)));
+    }
     Some((picture, mask))
 }
 
@@ -277,7 +286,7 @@ mod tests {
 
     #[test]
     fn edges_and_colours_are_those_of_the_photograph() {
-        let (rgb, mask) = matte(photograph(2), &network).expect("a person");
+        let (rgb, mask) = matte(photograph(2), &network, None).expect("a person");
         assert_eq!((rgb.dimensions(), mask.dimensions()), ((600, 800), (600, 800)));
         let is_person = |x: u32, y: u32| (200..400).contains(&x) && (100..700).contains(&y);
         let wrong = mask.enumerate_pixels().filter(|(x, y, value)| {
@@ -298,18 +307,18 @@ mod tests {
     #[test]
     fn large_pictures_are_reduced_and_nobody_is_nobody() {
         // 3600 × 4800 pixels.
-        let (rgb, mask) = matte(photograph(12), &network).expect("a person");
+        let (rgb, mask) = matte(photograph(12), &network, None).expect("a person");
         assert_eq!((rgb.dimensions(), mask.dimensions()), ((3072, 4096), (3072, 4096)));
         let rows = mask.rows().filter(|row| row.clone().any(|value| value[0] > 127)).count() as f32;
         assert!((rows / 4096.0 - 0.75).abs() < 0.01, "{rows}");
         let line = RgbImage::from_fn(2, 70_000, |_, y| {
             Rgb(if (9_000..60_000).contains(&y) { PERSON } else { WALL })
         });
-        assert_eq!(matte(line, &network).expect("a person").1.dimensions(), (1, 4096));
-        assert!(matte(RgbImage::from_pixel(90, 80, Rgb(WALL)), &network).is_none());
-        assert!(matte(RgbImage::new(1, 1), &|_| vec![0.0; FOUND * FOUND]).is_none());
+        assert_eq!(matte(line, &network, None).expect("a person").1.dimensions(), (1, 4096));
+        assert!(matte(RgbImage::from_pixel(90, 80, Rgb(WALL)), &network, None).is_none());
+        assert!(matte(RgbImage::new(1, 1), &|_| vec![0.0; FOUND * FOUND], None).is_none());
         // Everything is the person.
-        let (_, mask) = matte(RgbImage::from_pixel(70, 64, Rgb(PERSON)), &network).expect("a person");
+        let (_, mask) = matte(RgbImage::from_pixel(70, 64, Rgb(PERSON)), &network, None).expect("a person");
         assert!(mask.pixels().all(|value| value[0] == 255));
     }
 

@@ -59,6 +59,9 @@ pub struct SampleConfig {
     /// scaled and moved into the nominal cameras' views. Above 0, all photographs of rigs whose distance or focal length varies
     /// are placed.
     pub placed_share: f32,
+    /// Whether points are in the frame of a front camera that looks down by the nominal angle and is not rolled, instead of the
+    /// photograph's own. No picture shows that angle, and a user's person shall stand upright.
+    pub upright: bool,
     /// Height of a placed person in pixels of a canvas of 1024: `mode.person_height`.
     #[serde(skip)]
     pub person_height: usize,
@@ -80,6 +83,7 @@ impl Default for SampleConfig {
             points: false,
             second_depth: false,
             placed_share: 0.0,
+            upright: false,
             person_height: 739,
             seed: 1,
             augment: Augment::default(),
@@ -109,6 +113,7 @@ impl SampleConfig {
             ("augment", "must be off", self.augment != Augment::none()),
             ("placed_share", "must be 0", self.placed_share > 0.0),
             ("second_depth", "must be false", self.second_depth),
+            ("upright", "must be false", self.upright),
         ];
         if let Some((key, message, _)) = beside_compat.into_iter().find(|(.., wrong)| self.compat && *wrong) {
             return Some((key.into(), format!("{message} beside `compat = true`")));

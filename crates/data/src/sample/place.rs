@@ -6,7 +6,7 @@
 use glam::{DMat3, DVec2, DVec3};
 use rand::Rng;
 use snapsnap_base::FileError;
-use snapsnap_splat::{Camera, Orbit};
+use snapsnap_splat::{Camera, Orbit, RigidTransform};
 
 use super::{INSIDE, Source, joined};
 use crate::dataset::{StoredView, unproject};
@@ -35,6 +35,11 @@ pub(super) struct Four {
 }
 
 impl Source {
+    /// The front camera in whose frame a sample's points are.
+    pub(super) fn frame(&self, front: &Camera) -> Camera {
+        if self.config.upright { upright(front) } else { *front }
+    }
+
     /// Front, back, right and left of a subject.
     pub(super) fn four(
         &self,
@@ -64,7 +69,7 @@ impl Source {
         let seconds = if self.config.second_depth { vec![second(2)?, second(3)?] } else { Vec::new() };
         let photographs =
             self.photographs([0, 1].map(|i| (&views[i].color, &views[i].mask)), is_placed, random);
-        let (mut front, mut scale) = (views[0].camera, 1.0);
+        let (mut front, mut scale) = (self.frame(&views[0].camera), 1.0);
         let [mut first, mut second] = <[Points; 2]>::default();
         if !is_placed {
             let far = if compat { COMPAT_FAR } else { 0.0 };
@@ -164,6 +169,16 @@ impl StoredView {
 /// Centres of a square picture's pixels, row by row.
 fn centres(side: u32) -> impl Iterator<Item = DVec2> {
     (0..side).flat_map(move |row| (0..side).map(move |column| DVec2::new(column.into(), row.into()) + 0.5))
+}
+
+/// The camera turned about the body's middle until it looks down by the nominal angle, without roll.
+fn upright(camera: &Camera) -> Camera {
+    let nominal = Orbit::default();
+    let backward = -camera.world_to_camera.rotation.row(2);
+    let yaw_degrees = backward.x.atan2(backward.z).to_degrees();
+    let rotation = Orbit { yaw_degrees, ..nominal }.camera(camera.width).world_to_camera.rotation;
+    let translation = camera.world_to_camera.apply(nominal.centre) - rotation * nominal.centre;
+    Camera { world_to_camera: RigidTransform { rotation, translation }, ..*camera }
 }
 
 /// Scale of a camera's points relative to a nominal camera's, if `mapping` maps its photograph to the canvas. It is the

@@ -97,7 +97,7 @@ impl Stage2Item {
             let pictures = pictures.each_ref().map(|(color, mask)| (color, mask));
             let (images, masks) = joined(source.photographs(pictures, false, &mut random));
             let (points, valid, second) = Default::default();
-            Four { images, masks, points, valid, second, front: cameras[0], scale: 1.0 }
+            Four { images, masks, points, valid, second, front: source.frame(&cameras[0]), scale: 1.0 }
         };
         let Four { images, masks, points, valid, front, scale, .. } = four;
         cameras[0] = front;

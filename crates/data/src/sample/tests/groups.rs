@@ -131,3 +131,48 @@ fn placed_samples_fit_the_nominal_cameras() {
     let wrong = off.iter().filter(|off| **off > 1e-4).count();
     assert!(wrong * 20 < off.len(), "{wrong} of {} points", off.len());
 }
+
+/// Upright samples have their points in the frame of a camera of the nominal elevation without roll, and there they are still the
+/// person's surface.
+#[test]
+fn upright_samples_do_not_lean() {
+    let mut config = DataConfig::default();
+    (config.views.count, config.views.resolution) = (4, 128);
+    config.views.arrangement = Arrangement::Groups;
+    config.jitter.rig = Jitter { pitch: 15.0, roll: 5.0, yaw: 30.0, ..Jitter::default() };
+    let (_temporary, folder) = made(&config, person(), 1);
+    let folder = Arc::new(Folder::open(folder.root()).expect("opens"));
+    let stored = folder.depth(TRAIN, "0000", 0).expect("reads");
+    let item = |placed_share: f32, upright: bool| {
+        let samples = SampleConfig {
+            placed_share,
+            upright,
+            person_height: 700,
+            points: true,
+            repeat: 1,
+            augment: Augment::none(),
+            ..SampleConfig::default()
+        };
+        Stage2::new(folder.clone(), TRAIN, samples).expect("samples").sample(0).expect("a sample")
+    };
+    let rotation = |item: &Stage2Item| item.cameras[0].world_to_camera.rotation;
+    assert!(!rotation(&item(0.0, false)).abs_diff_eq(rotation(&item(0.0, true)), 0.02));
+    for placed_share in [0.0, 1.0] {
+        let item = item(placed_share, true);
+        let backward = -rotation(&item).row(2);
+        let yaw_degrees = backward.x.atan2(backward.z).to_degrees();
+        let nominal = Camera::orbit_at_yaw_degrees(yaw_degrees, 128).world_to_camera;
+        assert!(rotation(&item).abs_diff_eq(nominal.rotation, 1e-9), "{placed_share}: {:?}", rotation(&item));
+        let to_world = item.cameras[0].world_to_camera.inverse();
+        // In the photograph's own camera the points have the stored depths, but for some on the edge between two pixels.
+        let (mut seen, mut wrong) = (0, 0);
+        for pixel in (0..128 * 128).filter(|pixel| item.valid[*pixel] > 0.5) {
+            let point = item.scale * Vec3::from_slice(&item.points[3 * pixel..3 * pixel + 3]).as_dvec3();
+            let (place, depth) = stored.camera.project(to_world.apply(point)).expect("in front");
+            let there = f64::from(stored.depth[place.y as usize * 128 + place.x as usize]);
+            seen += 1;
+            wrong += i32::from((there - depth).abs() > 1e-4);
+        }
+        assert!(seen > 300 && wrong * 20 < seen, "{placed_share}: {wrong} of {seen} points");
+    }
+}

@@ -1,0 +1,217 @@
+//! `snapsnap studio`: a page (crates/app/viewer) that makes people of photographs. All of it stays in this process's memory.
+
+use std::collections::VecDeque;
+use std::io::Cursor;
+use std::path::Path;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Instant, SystemTime, UNIX_EPOCH};
+
+use clap::Args;
+use image::codecs::jpeg::JpegEncoder;
+use image::imageops::{self, FilterType};
+use image::{GrayImage, ImageFormat};
+use serde_json::json;
+use snapsnap_data::photo::{self, Canvas, Cutting, Pair, Source};
+use snapsnap_mesh::picture;
+use snapsnap_net::{Photograph, Reconstructor};
+use snapsnap_splat::scene::Stored;
+use ureq::http::StatusCode;
+
+use super::reconstruct::{ModelArguments, check_memory, placement};
+use crate::downloads::Download;
+use crate::failure::Failure;
+use crate::page::{self, Job, PageArguments, busy, text};
+use crate::server::{Answer, Body, Refusal, Request};
+use crate::weights;
+
+#[derive(Args)]
+pub struct Arguments {
+    #[command(flatten)]
+    model: ModelArguments,
+    #[command(flatten)]
+    page: PageArguments,
+}
+
+/// Largest photograph in bytes, as the page knows it (crates/app/viewer/src/studio.js), and largest picture of strokes.
+const LARGEST: u64 = 128 << 20;
+const LARGEST_STROKES: u64 = 4 << 20;
+/// Bytes of decoded strokes.
+const STROKES: u64 = 64 << 20;
+/// Longer side of the page's pictures in pixels, and their JPEG quality.
+const PREVIEW: u32 = 1024;
+const QUALITY: u8 = 90;
+/// Number of people in memory.
+const KEPT: usize = 4;
+
+/// The networks, for one job at a time.
+struct Networks {
+    reconstructor: Reconstructor,
+    segment: Box<dyn Fn(&[f32]) -> Vec<f32> + Send>,
+}
+
+struct Studio {
+    networks: Mutex<Networks>,
+    /// The last people, under their names in addresses.
+    people: Mutex<VecDeque<(String, Arc<Stored>)>>,
+    /// Number of people so far.
+    made: AtomicUsize,
+    /// The start of this server. A page of an earlier one finds none of its people here.
+    start: u128,
+    /// Locked while a mesh or an animation is made, which takes all cores.
+    long: Mutex<()>,
+}
+
+pub fn run(arguments: &Arguments) -> Result<(), Failure> {
+    let weights = arguments.model.open()?;
+    let device = arguments.model.device(&weights)?;
+    let (reconstructor, _) = arguments.model.load(&weights, &device)?;
+    let studio = Studio {
+        networks: Mutex::new(Networks { reconstructor, segment: Box::new(weights::segmenter()) }),
+        people: Mutex::default(),
+        made: AtomicUsize::new(0),
+        start: SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_nanos()),
+        long: Mutex::new(()),
+    };
+    page::show(page::Kind::Studio, &arguments.page, "the studio is open", &|request, body| {
+        studio.respond(request, body).unwrap_or_else(|refused| refused)
+    })
+}
+
+impl Studio {
+    /// The answer, or in an error the answer that refuses.
+    fn respond(&self, request: &Request, body: &mut Body) -> Result<Answer, Answer> {
+        match (request.method.as_str(), request.path.as_str()) {
+            ("POST", "/cutout") => self.cut_out(request, body),
+            ("POST", "/reconstruct") => self.reconstruct(request, body),
+            ("GET" | "HEAD", "/progress") => Ok(page::progress(request)),
+            ("GET" | "HEAD", path) => self.download(request, path),
+            ("POST", _) => Err(text(StatusCode::NOT_FOUND, "no such page")),
+            _ => Err(text(StatusCode::METHOD_NOT_ALLOWED, "GET, HEAD and POST only")),
+        }
+    }
+
+    /// The networks, after all earlier jobs.
+    fn networks(&self, job: &Job) -> MutexGuard<'_, Networks> {
+        job.step("waiting for another page");
+        self.networks.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// A photograph → its picture, as JPEG, and the person's mask, as PNG, both reduced to [`PREVIEW`].
+    fn cut_out(&self, request: &Request, body: &mut Body) -> Result<Answer, Answer> {
+        let upload = body.read(LARGEST)?;
+        let job = Job::of(request);
+        let name = Path::new("this photograph");
+        check_memory(name, picture::size_of_bytes(name, upload.as_ref())?)?;
+        let networks = self.networks(&job);
+        job.step("removing the background");
+        let source = Source { bytes: Some(upload.as_ref()), ..Source::file(name) };
+        let (rgb, mask) = photo::cut_out(source, Cutting::Missing(&*networks.segment))?;
+        drop((networks, upload));
+        let [width, height] = reduced(rgb.width(), rgb.height());
+        let small = imageops::resize(&rgb, width, height, FilterType::Triangle);
+        let mask = imageops::resize(&mask, width, height, FilterType::Triangle);
+        let (mut content, mut png) = (Vec::new(), Vec::new());
+        let cannot = |e| Failure::Internal(format!("a preview: cannot encode: {e}"));
+        JpegEncoder::new_with_quality(&mut content, QUALITY).encode_image(&small).map_err(cannot)?;
+        mask.write_to(&mut Cursor::new(&mut png), ImageFormat::Png).map_err(cannot)?;
+        let lengths = format!("{},{}", content.len(), png.len());
+        content.append(&mut png);
+        let mut answer = page::answer("application/octet-stream", Arc::new(content));
+        answer.headers.push(("X-Parts", lengths));
+        Ok(answer)
+    }
+
+    /// Two photographs and the strokes of each (a PNG or nothing) → the name of a person in memory.
+    fn reconstruct(&self, request: &Request, body: &mut Body) -> Result<Answer, Answer> {
+        let upload = body.read(2 * (LARGEST + LARGEST_STROKES))?;
+        let start = Instant::now();
+        let job = Job::of(request);
+        let [front, back, front_strokes, back_strokes] = parts(request, upload.as_ref())?;
+        let names = ["front photograph", "back photograph"].map(Path::new);
+        let photographs = [front, back];
+        for (name, bytes) in names.into_iter().zip(photographs) {
+            check_memory(name, picture::size_of_bytes(name, bytes)?)?;
+        }
+        let front_strokes = strokes("front strokes", front_strokes)?;
+        let back_strokes = strokes("back strokes", back_strokes)?;
+        let all = [front_strokes.as_ref(), back_strokes.as_ref()];
+        let source =
+            |i: usize| Source { bytes: Some(photographs[i]), strokes: all[i], ..Source::file(names[i]) };
+
+        let networks = self.networks(&job);
+        job.step("photographs");
+        let config = networks.reconstructor.config();
+        let cutting = Cutting::Missing(&*networks.segment);
+        let pair = photo::load([source(0), source(1)], cutting, config.network.resolution, placement(config));
+        let Pair { canvases, doubts, .. } = pair?;
+        let [front, back] = canvases.map(|Canvas { rgb, mask, valid, .. }| Photograph { rgb, mask, valid });
+        let result = networks.reconstructor.reconstruct(&front, &back, &|step| job.step(step));
+        if result.gaussians.is_empty() {
+            return Err(text(StatusCode::UNPROCESSABLE_ENTITY, "no Gaussian came out of these photographs"));
+        }
+        let stored = Stored::of(&result.in_world(config)).map_err(Failure::from)?;
+        drop(networks);
+        let name = format!("{:x}-{}", self.start, self.made.fetch_add(1, Ordering::Relaxed));
+        let gaussians = stored.len();
+        let mut people = self.people.lock().unwrap_or_else(PoisonError::into_inner);
+        people.truncate(KEPT - 1);
+        people.push_front((name.clone(), Arc::new(stored)));
+        let seconds = start.elapsed().as_secs_f64();
+        let made = json!({ "name": name, "gaussians": gaussians, "seconds": seconds, "warnings": doubts });
+        Ok(page::answer("application/json", Arc::new(made.to_string())))
+    }
+
+    /// A file of a person in memory: `/people/NAME/scene.spz`.
+    fn download(&self, request: &Request, path: &str) -> Result<Answer, Answer> {
+        let none = || text(StatusCode::NOT_FOUND, "no such page");
+        let (name, file) =
+            path.strip_prefix("/people/").and_then(|rest| rest.split_once('/')).ok_or_else(none)?;
+        let (extension, download) = Download::named(file).ok_or_else(none)?;
+        let people = self.people.lock().unwrap_or_else(PoisonError::into_inner);
+        let found = people.iter().find(|(other, _)| other == name).map(|(_, stored)| stored.clone());
+        drop(people);
+        let message = format!("this person is no longer in memory, which has the last {KEPT}: make it again");
+        let stored = found.ok_or_else(|| text(StatusCode::NOT_FOUND, &message))?;
+        let is_long = download.is_long();
+        let content = if is_long && request.method == "HEAD" {
+            Vec::new()
+        } else {
+            let only = is_long.then(|| self.long.try_lock());
+            if matches!(only, Some(Err(_))) {
+                return Err(busy());
+            }
+            let job = Job::of(request);
+            download.make(&stored, &|step| job.step(step))?
+        };
+        Ok(page::download(&format!("human.{extension}"), Arc::new(content)))
+    }
+}
+
+/// The size of a picture whose longer side is at most [`PREVIEW`].
+fn reduced(width: u32, height: u32) -> [u32; 2] {
+    let longer = width.max(height).max(PREVIEW);
+    [width, height].map(|side| (u64::from(side) * u64::from(PREVIEW) / u64::from(longer)).max(1) as u32)
+}
+
+/// The parts of a body, whose lengths `X-Parts` lists.
+fn parts<'a, const N: usize>(request: &Request, body: &'a [u8]) -> Result<[&'a [u8]; N], Refusal> {
+    const WRONG: Refusal = (StatusCode::BAD_REQUEST, "X-Parts does not fit the body");
+    let lengths: Vec<&str> = request.parts.as_deref().unwrap_or_default().split(',').collect();
+    let lengths: [&str; N] = lengths.try_into().map_err(|_| WRONG)?;
+    let mut rest = body;
+    let mut found = [&body[..0]; N];
+    for (part, length) in found.iter_mut().zip(lengths) {
+        let length = length.trim().parse().map_err(|_| WRONG)?;
+        (*part, rest) = rest.split_at_checked(length).ok_or(WRONG)?;
+    }
+    if rest.is_empty() { Ok(found) } else { Err(WRONG) }
+}
+
+/// Strokes of the page's brush; `None` if there are none.
+fn strokes(name: &str, bytes: &[u8]) -> Result<Option<GrayImage>, Failure> {
+    if bytes.is_empty() {
+        return Ok(None);
+    }
+    Ok(Some(picture::decode_bytes(Path::new(name), bytes, STROKES)?.into_luma8()))
+}

@@ -1,0 +1,59 @@
+//! Files that the page offers: Gaussians, a mesh and an animation.
+
+use burn::tensor::Device;
+use snapsnap_mesh::export::{self, Kind as MeshKind};
+use snapsnap_mesh::fuse::fuse;
+use snapsnap_splat::scene::{Kind, Stored};
+
+use crate::commands::mesh;
+use crate::failure::Failure;
+use crate::pictures::gif;
+use crate::turntable;
+
+/// A file of a scene.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub enum Download {
+    Gaussians(Kind),
+    Mesh,
+    Turntable,
+}
+
+/// Paths of the files behind `scene.`, which are also their extensions.
+const FILES: [(&str, Download); 6] = [
+    ("ply", Download::Gaussians(Kind::Ply)),
+    ("spz", Download::Gaussians(Kind::Spz)),
+    ("sog", Download::Gaussians(Kind::Sog)),
+    ("gaussians.glb", Download::Gaussians(Kind::Glb)),
+    ("glb", Download::Mesh),
+    ("gif", Download::Turntable),
+];
+
+impl Download {
+    /// The file that the page calls `name`, for example `scene.spz`, and its extension.
+    pub fn named(name: &str) -> Option<(&'static str, Self)> {
+        let extension = name.strip_prefix("scene.")?;
+        FILES.iter().copied().find(|(path, _)| *path == extension)
+    }
+
+    /// Whether it takes all cores for many seconds.
+    pub fn is_long(self) -> bool {
+        matches!(self, Self::Mesh | Self::Turntable)
+    }
+
+    /// The file's bytes. `step` is called with the name of each step of a long one.
+    pub fn make(self, stored: &Stored, step: &dyn Fn(&str)) -> Result<Vec<u8>, Failure> {
+        match self {
+            Self::Gaussians(kind) => Ok(stored.to_bytes(kind)?),
+            Self::Mesh => {
+                let fused = fuse(&stored.load(&Device::flex()), mesh::options(MeshKind::Glb), step)?;
+                export::glb_bytes(&fused.mesh, fused.offset).map_err(|e| Failure::Internal(e.to_string()))
+            }
+            Self::Turntable => {
+                let counted = |done, all| step(&format!("{done} of {all} pictures"));
+                let pictures = turntable::all_around(&stored.load(&Device::flex()), &counted)?;
+                step("animation");
+                gif(&pictures, turntable::FRAMES_PER_SECOND)
+            }
+        }
+    }
+}

@@ -1,0 +1,214 @@
+//! The page of `view` and `studio` (crates/app/viewer), and what both servers refuse and answer alike.
+
+use std::collections::HashMap;
+use std::io;
+use std::net::{Ipv4Addr, TcpListener};
+use std::sync::{Arc, LazyLock, Mutex, PoisonError};
+
+use clap::Args;
+use snapsnap_base::FileError;
+use ureq::http::StatusCode;
+
+use crate::failure::Failure;
+use crate::server::{Answer, Body, Content, Refusal, Request, serve};
+use crate::{interrupt, say};
+
+/// Options of a page.
+#[derive(Args)]
+pub struct PageArguments {
+    /// Port on 127.0.0.1 [default: a free one].
+    #[arg(long)]
+    port: Option<u16>,
+    /// Start the browser.
+    #[arg(long)]
+    open: bool,
+}
+
+/// Content security policy without any other host.
+const POLICY: &str = "default-src 'none'; script-src 'self' 'wasm-unsafe-eval' blob:; worker-src 'self' blob:; \
+                      connect-src 'self' blob: data:; img-src 'self' blob: data:; style-src 'self'; base-uri 'none'; \
+                      form-action 'none'; frame-ancestors 'none'";
+
+/// A file of the page: its path, type and content.
+type PageFile = (&'static str, &'static str, &'static [u8]);
+
+const FILES: [PageFile; 3] = [
+    ("/viewer.js", "text/javascript; charset=utf-8", include_bytes!("../../../assets/viewer/viewer.js")),
+    ("/viewer.css", "text/css; charset=utf-8", include_bytes!("../../../assets/viewer/viewer.css")),
+    ("/LICENSES.md", "text/markdown; charset=utf-8", include_bytes!("../../../assets/viewer/LICENSES.md")),
+];
+const INDEX: &str = include_str!("../viewer/index.html");
+/// The part of [`INDEX`] that tells the page's script which command serves it.
+const VIEW: &str = "<html lang=\"en\" class=\"view\">";
+
+/// A command's page.
+#[derive(Clone, Copy)]
+pub enum Kind {
+    /// Shows a file.
+    View,
+    /// Makes people of photographs.
+    Studio,
+}
+
+/// Serves the page until the program ends. `shows` is its content in words; `rest` answers what is no file of the page.
+pub fn show(
+    kind: Kind,
+    arguments: &PageArguments,
+    shows: &str,
+    rest: &(dyn Fn(&Request, &mut Body) -> Answer + Sync),
+) -> Result<(), Failure> {
+    let wanted = arguments.port.unwrap_or(0);
+    let cannot = |e: io::Error| Failure::Input(format!("--port {wanted}: cannot listen on 127.0.0.1: {e}"));
+    let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, wanted)).map_err(cannot)?;
+    let port = listener.local_addr().map_err(cannot)?.port();
+    let url = format!("http://127.0.0.1:{port}/");
+    interrupt::end_well();
+    // The address is printed with --quiet as well.
+    say::out(&url);
+    say::note(&format!("{shows}; Ctrl-C ends it"));
+    if arguments.open
+        && let Err(e) = open::that_detached(&url)
+    {
+        say::err(&format!("warning: --open: no browser could be started ({e}); open {url} by hand"));
+    }
+    serve(&listener, &|request, body| {
+        refused(request, port).or_else(|| file(kind, request)).unwrap_or_else(|| rest(request, body))
+    })
+}
+
+/// Refuses requests of anybody but this server's own page.
+fn refused(request: &Request, port: u16) -> Option<Answer> {
+    // Other names may belong to a page of another host whose name resolves to 127.0.0.1.
+    let is_local = |host: &String| {
+        let host = host.to_ascii_lowercase();
+        // Browsers omit port 80.
+        let name = host.strip_suffix(&format!(":{port}")).or((port == 80).then_some(host.as_str()));
+        name.is_some_and(|name| ["127.0.0.1", "localhost"].contains(&name))
+    };
+    if !request.host.as_ref().is_some_and(is_local) {
+        return Some(text(StatusCode::FORBIDDEN, "only for http://127.0.0.1"));
+    }
+    // A page of another site may lead here, but may not start any work.
+    let is_own_origin =
+        |origin: &String| origin.strip_prefix("http://").is_some_and(|host| is_local(&host.to_owned()));
+    let is_own_page = request.origin.as_ref().is_none_or(is_own_origin)
+        && request.fetch_site.as_deref().is_none_or(|site| ["same-origin", "none"].contains(&site));
+    (!is_own_page && request.path != "/")
+        .then(|| text(StatusCode::FORBIDDEN, "only for this server's own page"))
+}
+
+/// A file of the page.
+fn file(kind: Kind, request: &Request) -> Option<Answer> {
+    if !is_read(request) {
+        return None;
+    }
+    if request.path == "/" {
+        let index = match kind {
+            Kind::View => INDEX.to_owned(),
+            Kind::Studio => INDEX.replace(VIEW, &VIEW.replace("view", "studio")),
+        };
+        return Some(answer("text/html; charset=utf-8", Arc::new(index)));
+    }
+    let (_, kind, content) = FILES.iter().find(|(name, ..)| *name == request.path)?;
+    Some(answer(kind, Arc::new(*content)))
+}
+
+/// Whether the request only reads.
+pub fn is_read(request: &Request) -> bool {
+    ["GET", "HEAD"].contains(&request.method.as_str())
+}
+
+/// The answer that is a message.
+pub fn text(status: StatusCode, message: &str) -> Answer {
+    let content = Arc::new(say::printable(message).into_bytes());
+    Answer { status, ..answer("text/plain; charset=utf-8", content) }
+}
+
+/// The answer to a page that asks again later.
+pub fn busy() -> Answer {
+    text(StatusCode::SERVICE_UNAVAILABLE, "the server is busy with earlier requests; try again in a minute")
+}
+
+pub fn answer(kind: &str, content: Content) -> Answer {
+    let headers = vec![
+        ("Content-Type", kind.to_owned()),
+        ("Content-Security-Policy", POLICY.to_owned()),
+        ("X-Content-Type-Options", "nosniff".to_owned()),
+        // Another program may use the port later.
+        ("Cache-Control", "no-store".to_owned()),
+    ];
+    Answer { status: StatusCode::OK, headers, content }
+}
+
+/// The answer that is a file of this name.
+pub fn download(name: &str, content: Content) -> Answer {
+    let name = percent_encoded(name);
+    let mut answer = answer("application/octet-stream", content);
+    let disposition = format!("attachment; filename*=UTF-8''{name}");
+    answer.headers.extend([("Content-Disposition", disposition), ("X-Name", name)]);
+    answer
+}
+
+/// The text with percent codes for all bytes but unreserved characters (RFC 3986).
+pub fn percent_encoded(text: &str) -> String {
+    let plain = |byte: u8| byte.is_ascii_alphanumeric() || b"-._~".contains(&byte);
+    text.bytes()
+        .map(|byte| if plain(byte) { char::from(byte).to_string() } else { format!("%{byte:02X}") })
+        .collect()
+}
+
+/// The current step of each job that a page waits for.
+static STEPS: LazyLock<Mutex<HashMap<String, String>>> = LazyLock::new(Mutex::default);
+
+fn steps<T>(change: impl FnOnce(&mut HashMap<String, String>) -> T) -> T {
+    change(&mut STEPS.lock().unwrap_or_else(PoisonError::into_inner))
+}
+
+/// Work that a page waits for. `/progress` tells its steps.
+pub struct Job(String);
+
+impl Job {
+    /// The work of a request, under the page's name for it.
+    pub fn of(request: &Request) -> Self {
+        Self(request.job.clone().unwrap_or_default())
+    }
+
+    /// Tells the step that begins.
+    pub fn step(&self, name: &str) {
+        steps(|steps| steps.insert(self.0.clone(), name.to_owned()));
+    }
+}
+
+impl Drop for Job {
+    fn drop(&mut self) {
+        steps(|steps| steps.remove(&self.0));
+    }
+}
+
+/// The step of the job that the request names; nothing if there is none.
+pub fn progress(request: &Request) -> Answer {
+    let job = request.job.as_deref().unwrap_or_default();
+    text(StatusCode::OK, &steps(|steps| steps.get(job).cloned()).unwrap_or_default())
+}
+
+impl From<Refusal> for Answer {
+    fn from((status, message): Refusal) -> Self {
+        text(status, message)
+    }
+}
+
+impl From<Failure> for Answer {
+    fn from(failure: Failure) -> Self {
+        let status = match failure {
+            Failure::Input(_) => StatusCode::UNPROCESSABLE_ENTITY,
+            Failure::Internal(_) => StatusCode::INTERNAL_SERVER_ERROR,
+        };
+        text(status, &failure.to_string())
+    }
+}
+
+impl From<FileError> for Answer {
+    fn from(e: FileError) -> Self {
+        Failure::from(e).into()
+    }
+}

@@ -1,0 +1,26 @@
+// Requests whose work takes the server seconds.
+
+/** Milliseconds between two questions about progress. */
+const INTERVAL = 300;
+
+/** Sends a request, and calls `step` with the name of each step of the server's work for it. */
+export async function ask(path, options, step) {
+  const job = crypto.randomUUID();
+  const headers = { ...options.headers, "X-Job": job };
+  const timer = setInterval(async () => {
+    const answer = await fetch("./progress", { headers: { "X-Job": job }, cache: "no-store" }).catch(() => null);
+    const name = answer?.ok ? await answer.text() : "";
+    if (name) {
+      step(name);
+    }
+  }, INTERVAL);
+  try {
+    const answer = await fetch(path, { ...options, headers, cache: "no-store" });
+    if (!answer.ok) {
+      throw new Error(await answer.text());
+    }
+    return answer;
+  } finally {
+    clearInterval(timer);
+  }
+}

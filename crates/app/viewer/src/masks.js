@@ -1,0 +1,143 @@
+// A photograph with its mask, and the brush that corrects it.
+
+/** Least and usual width of the brush, as shares of the picture's longer side. */
+const WIDTH = 0.04;
+/** How bright the background is shown. */
+const BEHIND = 0.25;
+
+const canvasOf = (width, height) => Object.assign(document.createElement("canvas"), { width, height });
+
+export class Drawing {
+  /** `drawn` gets the number of strokes after each. */
+  constructor(canvas, drawn) {
+    this.canvas = canvas;
+    this.drawn = drawn;
+    this.keeps = true;
+    this.width = WIDTH;
+    this.clear();
+    canvas.addEventListener("pointerdown", (event) => {
+      if (this.picture && event.button === 0) {
+        canvas.setPointerCapture(event.pointerId);
+        this.current = { keeps: this.keeps, width: this.width * Math.max(canvas.width, canvas.height), points: [] };
+        this.lines.push(this.current);
+        this.extend(event);
+      }
+    });
+    canvas.addEventListener("pointermove", (event) => {
+      if (this.current) {
+        // A fast hand moves several times between two events.
+        (event.getCoalescedEvents?.() ?? []).forEach((moved) => this.place(moved));
+        this.extend(event);
+      }
+    });
+    for (const kind of ["pointerup", "pointercancel"]) {
+      canvas.addEventListener(kind, () => {
+        this.current = null;
+        this.drawn(this.lines.length);
+      });
+    }
+  }
+
+  setWidth(share) {
+    this.width = share;
+  }
+
+  clear() {
+    this.picture = null;
+    this.lines = [];
+    this.current = null;
+    this.drawn?.(0);
+  }
+
+  /** Shows a picture and its mask, white on the person, both of one size. */
+  open(picture, mask) {
+    this.clear();
+    this.picture = picture;
+    [this.canvas.width, this.canvas.height] = [picture.width, picture.height];
+    // A canvas masks by transparency, not by brightness.
+    const grey = canvasOf(mask.width, mask.height).getContext("2d");
+    grey.drawImage(mask, 0, 0);
+    const pixels = grey.getImageData(0, 0, mask.width, mask.height);
+    for (let i = 0; i < pixels.data.length; i += 4) {
+      pixels.data[i + 3] = pixels.data[i];
+    }
+    this.base = canvasOf(mask.width, mask.height);
+    this.base.getContext("2d").putImageData(pixels, 0, 0);
+    this.mask = canvasOf(mask.width, mask.height);
+    this.cut = canvasOf(mask.width, mask.height);
+    this.renew();
+  }
+
+  undo() {
+    this.lines.pop();
+    this.renew();
+    this.drawn(this.lines.length);
+  }
+
+  place(event) {
+    const box = this.canvas.getBoundingClientRect();
+    const x = ((event.clientX - box.left) / box.width) * this.canvas.width;
+    const y = ((event.clientY - box.top) / box.height) * this.canvas.height;
+    this.current.points.push([x, y]);
+  }
+
+  extend(event) {
+    this.place(event);
+    this.onMask(this.current);
+    this.show();
+  }
+
+  /** Draws a line in a color. */
+  line(context, { width, points }, color) {
+    Object.assign(context, { lineWidth: width, lineCap: "round", lineJoin: "round", strokeStyle: color });
+    context.beginPath();
+    context.moveTo(...points[0]);
+    // A single point is a line as well.
+    points.forEach((point) => context.lineTo(...point));
+    context.stroke();
+  }
+
+  onMask(line) {
+    const context = this.mask.getContext("2d");
+    context.globalCompositeOperation = line.keeps ? "source-over" : "destination-out";
+    this.line(context, line, "#fff");
+  }
+
+  /** Draws the mask of the network and all lines anew. */
+  renew() {
+    const context = this.mask.getContext("2d");
+    context.globalCompositeOperation = "copy";
+    context.drawImage(this.base, 0, 0);
+    this.lines.forEach((line) => this.onMask(line));
+    this.show();
+  }
+
+  show() {
+    const cut = this.cut.getContext("2d");
+    cut.globalCompositeOperation = "copy";
+    cut.drawImage(this.picture, 0, 0);
+    cut.globalCompositeOperation = "destination-in";
+    cut.drawImage(this.mask, 0, 0);
+    const context = this.canvas.getContext("2d");
+    context.globalAlpha = 1;
+    context.fillStyle = "#b03060";
+    context.fillRect(0, 0, this.canvas.width, this.canvas.height);
+    context.globalAlpha = BEHIND;
+    context.drawImage(this.picture, 0, 0);
+    context.globalAlpha = 1;
+    context.drawImage(this.cut, 0, 0);
+  }
+
+  /** The lines as a picture for the server: white keeps, black removes, 128 changes nothing. Empty without lines. */
+  async strokes() {
+    if (this.lines.length === 0) {
+      return new Blob([]);
+    }
+    const canvas = canvasOf(this.canvas.width, this.canvas.height);
+    const context = canvas.getContext("2d");
+    context.fillStyle = "rgb(128, 128, 128)";
+    context.fillRect(0, 0, canvas.width, canvas.height);
+    this.lines.forEach((line) => this.line(context, line, line.keeps ? "#fff" : "#000"));
+    return new Promise((done) => canvas.toBlob(done));
+  }
+}

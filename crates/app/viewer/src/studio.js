@@ -1,0 +1,172 @@
+// The studio: two photographs, their masks, and the person that the server makes of them.
+
+import { ask } from "./asking.js";
+import { Drawing } from "./masks.js";
+import { takePicture } from "./taking.js";
+
+const element = (id) => document.getElementById(id);
+
+/** Largest photograph in bytes, as the server knows it. */
+const LARGEST = 128 * 2 ** 20;
+/** One of the two photographs: a place for a file, then the picture with its mask. */
+class Photograph {
+  constructor(side, changed) {
+    this.root = document.querySelector(`.photograph[data-side="${side}"]`);
+    this.changed = changed;
+    this.file = null;
+    this.asked = 0;
+    this.drawing = new Drawing(this.root.querySelector("canvas"), (strokes) => this.drawn(strokes));
+    const part = (selector) => this.root.querySelector(selector);
+    const input = part("input[type=file]");
+    input.addEventListener("change", () => {
+      this.use(input.files[0]);
+      // The same file may be chosen again.
+      input.value = "";
+    });
+    for (const kind of ["dragover", "dragleave", "drop"]) {
+      this.root.addEventListener(kind, (event) => {
+        event.preventDefault();
+        this.root.classList.toggle("over", kind === "dragover");
+      });
+    }
+    this.root.addEventListener("drop", (event) => {
+      event.stopPropagation();
+      this.use(event.dataTransfer.files[0]);
+    });
+    const camera = part(".camera");
+    camera.classList.toggle("hidden", !navigator.mediaDevices?.getUserMedia);
+    camera.addEventListener("click", async () => this.use(await takePicture((text) => this.say(text))));
+    part(".other").addEventListener("click", () => this.clear());
+    part(".undo").addEventListener("click", () => this.drawing.undo());
+    for (const brush of this.root.querySelectorAll(".brush")) {
+      brush.addEventListener("click", () => this.choose(brush));
+    }
+    const width = part("input[type=range]");
+    width.addEventListener("input", () => this.drawing.setWidth(Number(width.value)));
+    this.choose(part(".brush"));
+    this.drawn(0);
+  }
+
+  choose(brush) {
+    for (const other of this.root.querySelectorAll(".brush")) {
+      other.setAttribute("aria-pressed", other === brush);
+    }
+    this.drawing.keeps = brush.dataset.keeps === "true";
+  }
+
+  drawn(strokes) {
+    this.root.querySelector(".undo").disabled = strokes === 0;
+  }
+
+  say(text) {
+    this.root.querySelector(".message").textContent = text;
+  }
+
+  /** Whether its mask is shown. */
+  get ready() {
+    return this.root.classList.contains("cut");
+  }
+
+  clear() {
+    this.asked += 1;
+    this.file = null;
+    this.drawing.clear();
+    this.root.classList.remove("cut", "busy");
+    this.say("");
+    this.changed();
+  }
+
+  /** Shows a file's picture with the mask that the server finds. */
+  async use(file) {
+    if (!file) {
+      return;
+    }
+    this.clear();
+    if (file.size > LARGEST) {
+      this.say(`${file.name} has ${Math.ceil(file.size / 2 ** 20)} MB; photographs may have up to ${LARGEST / 2 ** 20}.`);
+      return;
+    }
+    const own = this.asked;
+    this.root.classList.add("busy");
+    this.say("removing the background …");
+    try {
+      const answer = await ask("./cutout", { method: "POST", body: file }, (step) => own === this.asked && this.say(`${step} …`));
+      const [length] = answer.headers.get("x-parts").split(",").map(Number);
+      const bytes = await answer.blob();
+      const pictures = await Promise.all([bytes.slice(0, length, "image/jpeg"), bytes.slice(length)].map(createImageBitmap));
+      if (own === this.asked) {
+        this.file = file;
+        this.drawing.open(...pictures);
+        this.root.classList.add("cut");
+        this.say("");
+      }
+    } catch (error) {
+      if (own === this.asked) {
+        this.say(error.message ?? String(error));
+      }
+    }
+    if (own === this.asked) {
+      this.root.classList.remove("busy");
+      this.changed();
+    }
+  }
+}
+
+/** Starts the studio. `show` gets the name of a new person in the server's addresses. */
+export function openStudio(show) {
+  const make = element("make");
+  let working = false;
+  const changed = () => {
+    make.disabled = working || !photographs.every((photograph) => photograph.ready);
+  };
+  const photographs = ["front", "back"].map((side) => new Photograph(side, () => changed()));
+  changed();
+  const say = (text) => {
+    element("work").textContent = text;
+  };
+
+  const enter = (open) => {
+    element("studio").classList.toggle("hidden", !open);
+    document.body.classList.toggle("making", open);
+  };
+  element("photographs").addEventListener("click", () => enter(true));
+  element("again").addEventListener("click", () => {
+    photographs.forEach((photograph) => photograph.clear());
+    say("");
+    element("warnings").replaceChildren();
+  });
+
+  make.addEventListener("click", async () => {
+    working = true;
+    changed();
+    const files = photographs.map((photograph) => photograph.file);
+    const strokes = await Promise.all(photographs.map((photograph) => photograph.drawing.strokes()));
+    const parts = [...files, ...strokes];
+    const headers = { "X-Parts": parts.map((part) => part.size).join(",") };
+    const start = performance.now();
+    const step = (name) => say(`${name} … ${Math.round((performance.now() - start) / 1000)} s`);
+    step("sending");
+    try {
+      const answer = await ask("./reconstruct", { method: "POST", headers, body: new Blob(parts) }, step);
+      const person = await answer.json();
+      const warnings = person.warnings.map((text) => {
+        const item = document.createElement("li");
+        item.textContent = text;
+        return item;
+      });
+      element("warnings").replaceChildren(...warnings);
+      say(`${person.gaussians.toLocaleString("en")} Gaussians in ${person.seconds.toFixed(1)} s`);
+      await show(person.name);
+      // Warnings are read before the person is looked at.
+      enter(warnings.length > 0);
+      element("look").classList.remove("hidden");
+    } catch (error) {
+      say(error.message ?? String(error));
+    }
+    working = false;
+    changed();
+  });
+  element("look").addEventListener("click", () => enter(false));
+  enter(true);
+  return photographs;
+}

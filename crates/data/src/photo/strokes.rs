@@ -1,0 +1,48 @@
+//! Corrections of a mask by a user's brush.
+
+use image::imageops::{self, FilterType};
+use image::{GrayImage, Luma};
+
+/// Value of a pixel without a stroke.
+const UNTOUCHED: u8 = 128;
+
+/// Lays strokes of any size over a mask: white keeps, black removes, [`UNTOUCHED`] changes nothing, and values between are soft edges.
+/// `keep` is called with each pixel that strokes keep.
+pub fn paint(strokes: &GrayImage, mask: &mut GrayImage, mut keep: impl FnMut(u32, u32)) {
+    let strokes = imageops::resize(strokes, mask.width(), mask.height(), FilterType::Triangle);
+    for ((x, y, Luma([share])), Luma([stroke])) in mask.enumerate_pixels_mut().zip(strokes.pixels()) {
+        let [above, full] = [i32::from(*stroke) - i32::from(UNTOUCHED), i32::from(u8::MAX)];
+        if above > 0 {
+            let least = above * full / (full - i32::from(UNTOUCHED));
+            *share = (*share).max(least as u8);
+            keep(x, y);
+        } else {
+            let most = i32::from(*stroke) * full / i32::from(UNTOUCHED);
+            *share = (*share).min(most as u8);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn strokes_keep_and_remove_and_leave_the_rest() {
+        let mut mask = GrayImage::from_fn(40, 20, |x, _| Luma([if x < 20 { 200 } else { 10 }]));
+        // Half as large: the upper half keeps, the lower one removes, the outer columns are untouched.
+        let strokes = GrayImage::from_fn(20, 10, |x, y| match (x, y) {
+            (5..15, 0..5) => Luma([255]),
+            (5..15, _) => Luma([0]),
+            _ => Luma([UNTOUCHED]),
+        });
+        let mut kept = Vec::new();
+        paint(&strokes, &mut mask, |x, y| kept.push((x, y)));
+        for (x, y, expected) in
+            [(1, 3, 200), (38, 3, 10), (15, 3, 255), (25, 3, 255), (15, 16, 0), (25, 16, 0)]
+        {
+            assert_eq!(mask.get_pixel(x, y)[0], expected, "{x}, {y}");
+        }
+        assert!(kept.contains(&(25, 3)) && !kept.contains(&(1, 3)) && !kept.contains(&(25, 16)), "{kept:?}");
+    }
+}
