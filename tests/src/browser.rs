@@ -4,7 +4,7 @@ use std::env;
 use std::fs::File;
 use std::io::{BufRead, BufReader, Write};
 use std::os::unix::process::CommandExt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::mpsc::{Receiver, channel};
 use std::thread;
@@ -165,6 +165,14 @@ impl Page {
             assert!(Instant::now() < end, "never true: {expression}; errors: {:?}", self.errors);
             thread::sleep(Duration::from_millis(50));
         }
+    }
+
+    /// Chooses a file in the field that a selector names.
+    pub fn choose(&mut self, selector: &str, file: &Path) {
+        let field = format!("document.querySelector({})", json!(selector));
+        let found = self.ask("Runtime.evaluate", json!({ "expression": field }));
+        let files = json!({ "files": [file], "objectId": found["result"]["objectId"] });
+        self.ask("DOM.setFileInputFiles", files);
     }
 
     /// Presses a key, named as in the browser's events, with Shift or without.

@@ -1,9 +1,9 @@
-//! `snapsnap view` as a server.
+//! `snapsnap view` and `snapsnap studio` as servers.
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
 use std::path::Path;
-use std::process::{Child, Stdio};
+use std::process::{Child, Command, Stdio};
 
 use crate::snapsnap;
 
@@ -25,7 +25,19 @@ impl Server {
     /// Serves a file of Gaussians on a free port.
     pub fn new(file: &Path) -> Self {
         let mut command = snapsnap();
-        command.arg("view").arg(file).stdout(Stdio::piped()).stderr(Stdio::null());
+        command.arg("view").arg(file);
+        Self::started(command)
+    }
+
+    /// A studio on a free port, whose canvases have so many pixels.
+    pub fn studio(resolution: u32) -> Self {
+        let mut command = snapsnap();
+        command.args(["studio", "--device", "cpu", "--set", &format!("network.resolution={resolution}")]);
+        Self::started(command)
+    }
+
+    fn started(mut command: Command) -> Self {
+        command.stdout(Stdio::piped()).stderr(Stdio::null());
         let mut process = command.spawn().expect("started");
         let mut line = String::new();
         BufReader::new(process.stdout.take().expect("piped")).read_line(&mut line).expect("an address");
@@ -44,10 +56,22 @@ impl Server {
 
     /// Status, headers in lower case, and content.
     pub fn ask(&self, request: &str, host: Option<&str>) -> (u16, String, Vec<u8>) {
-        let mut stream = TcpStream::connect(("127.0.0.1", self.port)).expect("connected");
         let own = format!("127.0.0.1:{}", self.port);
         let host = host.unwrap_or(&own);
-        write!(stream, "{request} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n").expect("asked");
+        self.answer(format!("{request} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n").as_bytes())
+    }
+
+    /// As [`Self::ask`], with a body and further headers, each with its line's end.
+    pub fn post(&self, path: &str, headers: &str, body: &[u8]) -> (u16, String, Vec<u8>) {
+        let length = body.len();
+        let head = format!("Host: 127.0.0.1:{}\r\nContent-Length: {length}\r\n{headers}\r\n", self.port);
+        self.answer(&[format!("POST {path} HTTP/1.1\r\n{head}").as_bytes(), body].concat())
+    }
+
+    fn answer(&self, request: &[u8]) -> (u16, String, Vec<u8>) {
+        let mut stream = TcpStream::connect(("127.0.0.1", self.port)).expect("connected");
+        // A server that refuses a body need not read it.
+        let _ = stream.write_all(request);
         let mut answer = Vec::new();
         stream.read_to_end(&mut answer).expect("answered");
         let end = answer.windows(4).position(|w| w == b"\r\n\r\n").expect("headers");

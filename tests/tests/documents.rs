@@ -182,8 +182,8 @@ fn less(words: &[String]) -> Words {
                 more.extend(["--set", key]);
             }
         }
-        // It would serve for ever; tests/tests/view.rs asks it.
-        "view" => more.push("--help"),
+        // They would serve for ever; tests/tests/view.rs and studio.rs ask them.
+        "view" | "studio" => more.push("--help"),
         "bench" => {
             more.push("--quick");
             if words.iter().any(|word| word == "configs/bench.toml") {

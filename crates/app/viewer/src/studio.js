@@ -11,7 +11,12 @@ const LARGEST = 128 * 2 ** 20;
 /** One of the two photographs: a place for a file, then the picture with its mask. */
 class Photograph {
   constructor(side, changed) {
-    this.root = document.querySelector(`.photograph[data-side="${side}"]`);
+    this.root = element("photograph").content.cloneNode(true).firstElementChild;
+    this.root.dataset.side = side.toLowerCase();
+    this.root.querySelector("h2").textContent = side;
+    this.root.setAttribute("aria-label", `${side} photograph`);
+    this.root.querySelector("canvas").setAttribute("aria-label", `${side} photograph; paint to correct what belongs to the person`);
+    element("pair").append(this.root);
     this.changed = changed;
     this.file = null;
     this.asked = 0;
@@ -93,7 +98,7 @@ class Photograph {
       const answer = await ask("./cutout", { method: "POST", body: file }, (step) => own === this.asked && this.say(`${step} …`));
       const [length] = answer.headers.get("x-parts").split(",").map(Number);
       const bytes = await answer.blob();
-      const pictures = await Promise.all([bytes.slice(0, length, "image/jpeg"), bytes.slice(length)].map(createImageBitmap));
+      const pictures = await Promise.all([bytes.slice(0, length), bytes.slice(length)].map((part) => createImageBitmap(part)));
       if (own === this.asked) {
         this.file = file;
         this.drawing.open(...pictures);
@@ -119,7 +124,7 @@ export function openStudio(show) {
   const changed = () => {
     make.disabled = working || !photographs.every((photograph) => photograph.ready);
   };
-  const photographs = ["front", "back"].map((side) => new Photograph(side, () => changed()));
+  const photographs = ["Front", "Back"].map((side) => new Photograph(side, () => changed()));
   changed();
   const say = (text) => {
     element("work").textContent = text;
@@ -168,5 +173,4 @@ export function openStudio(show) {
   });
   element("look").addEventListener("click", () => enter(false));
   enter(true);
-  return photographs;
 }
