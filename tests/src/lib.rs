@@ -302,3 +302,24 @@ pub fn assert_close<const D: usize>(
     println!("{what}: relative error {error:.2e}");
     assert!(error <= bound, "{what}: relative error {error:.3e} > {bound:.0e}");
 }
+
+/// EXIF data of a telephone: a focal length in millimetres of 35 mm film, and Apple's maker note with an acceleration in thousandths of
+/// gravity.
+pub fn exif(focal: u16, acceleration: [i32; 3]) -> Vec<u8> {
+    let entry = |tag: u16, kind: u16, count: u32, value: [u8; 4]| {
+        [&tag.to_be_bytes()[..], &kind.to_be_bytes(), &count.to_be_bytes(), &value].concat()
+    };
+    let mut note = b"Apple iOS\0\0\x01MM\0\x01".to_vec();
+    note.extend(entry(8, 10, 3, 32_u32.to_be_bytes()));
+    note.extend([0; 4]);
+    acceleration.iter().for_each(|value| note.extend([value.to_be_bytes(), 1000_i32.to_be_bytes()].concat()));
+    let [high, low] = focal.to_be_bytes();
+    let mut tiff = b"MM\0\x2a\0\0\0\x08\0\x01".to_vec();
+    tiff.extend(entry(0x8769, 4, 1, 26_u32.to_be_bytes()));
+    tiff.extend([0; 4]);
+    tiff.extend(2_u16.to_be_bytes());
+    tiff.extend(entry(0x927c, 7, note.len() as u32, 56_u32.to_be_bytes()));
+    tiff.extend(entry(0xa405, 3, 1, [high, low, 0, 0]));
+    tiff.extend([0; 4]);
+    [tiff, note].concat()
+}

@@ -24,6 +24,7 @@ mod say;
 mod server;
 mod turntable;
 mod view_folder;
+mod viewpoint;
 mod weights;
 
 use std::process::ExitCode;

@@ -9,6 +9,7 @@ mod specks;
 mod strokes;
 #[cfg(test)]
 mod tests;
+mod viewpoint;
 
 use std::borrow::Cow;
 use std::path::Path;
@@ -25,6 +26,8 @@ pub use matting::{FOUND, Segmenter};
 pub use placing::Mapping;
 pub(crate) use placing::place;
 use placing::{Standing, placed, together};
+pub(crate) use viewpoint::on_plane;
+pub use viewpoint::{Shot, Viewpoint};
 
 /// Least side of a photograph in pixels.
 const MIN_SIDE: u32 = 64;

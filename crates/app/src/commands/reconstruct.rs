@@ -7,7 +7,7 @@ use burn::tensor::Device;
 use clap::Args;
 use snapsnap_base::config::Schema;
 use snapsnap_base::file;
-use snapsnap_data::photo::{self, Canvas, Cutting, Pair, Placement, Source};
+use snapsnap_data::photo::{self, Canvas, Cutting, Pair, Placement, Shot, Source};
 use snapsnap_mesh::picture;
 use snapsnap_net::config::Config;
 use snapsnap_net::precision::{Precision, PrecisionChoice, unit_of_cpu};
@@ -22,6 +22,7 @@ use super::{ConfigArguments, check_kind, check_outputs, is_same_file};
 use crate::failure::{Failure, bail};
 use crate::progress::Progress;
 use crate::turntable::Turntable;
+use crate::viewpoint::CameraArguments;
 use crate::{cutouts, device, dump, memory, output, say, weights};
 
 /// Bytes per pixel of a photograph while it is placed on its canvas: 4 of the decoded picture, 3 + 1 of its colours and mask,
@@ -51,6 +52,8 @@ pub struct Arguments {
     /// Refuse photographs that seem to be wrong, instead of a warning.
     #[arg(long)]
     strict: bool,
+    #[command(flatten)]
+    camera: CameraArguments,
     #[command(flatten)]
     model: ModelArguments,
     /// File of Gaussians to write: .ply, .spz, .glb or .sog. The resolved config is written beside it.
@@ -130,6 +133,15 @@ pub fn placement(config: &Config) -> Placement {
     if config.mode.compat { Placement::Demo { height } } else { Placement::Training { height } }
 }
 
+/// Why photographs' cameras are no matter, if they are not.
+pub fn unplaced(config: &Config, as_is: bool) -> Option<&'static str> {
+    match (as_is, config.mode.compat) {
+        (true, _) => Some("with --as-is the cameras are the nominal ones"),
+        (_, true) => Some("weights in `mode.compat` have the published demo's cameras"),
+        _ => None,
+    }
+}
+
 fn precision(text: &str) -> Result<PrecisionChoice, &'static str> {
     match text {
         "auto" => Ok(PrecisionChoice::Auto),
@@ -165,6 +177,8 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     if arguments.masks.is_some() && arguments.cutout == "network" {
         bail!("--cutout network: --masks already tells the person from the background");
     }
+    let unplaced = unplaced(&config, arguments.as_is);
+    arguments.camera.check(unplaced)?;
     let saved = arguments.save_cutouts.as_deref().map(cutouts::paths).transpose()?;
     let config_path = check_paths(arguments, weights.path(), turntable.as_ref(), target.as_ref(), &saved)?;
     let paths = [&arguments.front, &arguments.back];
@@ -190,6 +204,8 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     for (path, (rgb, mask)) in saved.iter().flatten().zip(&cutouts) {
         cutouts::save(path, rgb, mask)?;
     }
+    let shots =
+        [0, 1].map(|i| (Shot::of(&sources[i]), cutouts[i].0.dimensions().into(), canvases[i].mapping));
     drop(cutouts);
     let since = Instant::now();
     let device = arguments.model.device(&weights)?;
@@ -219,7 +235,12 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
 
     progress.stage("writing");
     let since = Instant::now();
-    let world = result.in_world(&config);
+    let mut world = result.in_world(&config);
+    if unplaced.is_none() {
+        let (person, cameras) = arguments.camera.person(world, &result, shots, config.network.resolution)?;
+        world = person;
+        plan.extend(["front", "back"].iter().zip(cameras).map(|(name, camera)| format!("{name}: {camera}")));
+    }
     arguments.axes.write(&Stored::of(&world)?, &arguments.output)?;
     if let Some(path) = &config_path {
         output::write(path, config.resolved().to_toml().as_bytes())?;

@@ -12,21 +12,24 @@ use image::codecs::jpeg::JpegEncoder;
 use image::imageops::{self, FilterType};
 use image::{GrayImage, ImageFormat};
 use serde_json::json;
-use snapsnap_data::photo::{self, Canvas, Cutting, Pair, Source};
+use snapsnap_data::photo::{self, Canvas, Cutting, Pair, Shot, Source};
 use snapsnap_mesh::picture;
 use snapsnap_net::{Photograph, Reconstructor};
 use snapsnap_splat::scene::Stored;
 use ureq::http::StatusCode;
 
-use super::reconstruct::{ModelArguments, check_memory, placement};
+use super::reconstruct::{ModelArguments, check_memory, placement, unplaced};
 use crate::downloads::Download;
 use crate::failure::Failure;
 use crate::page::{self, Job, PageArguments, busy, text};
 use crate::server::{Answer, Body, Refusal, Request};
+use crate::viewpoint::CameraArguments;
 use crate::weights;
 
 #[derive(Args)]
 pub struct Arguments {
+    #[command(flatten)]
+    camera: CameraArguments,
     #[command(flatten)]
     model: ModelArguments,
     #[command(flatten)]
@@ -50,7 +53,8 @@ struct Networks {
     segment: Box<dyn Fn(&[f32]) -> Vec<f32> + Send>,
 }
 
-struct Studio {
+struct Studio<'a> {
+    camera: &'a CameraArguments,
     networks: Mutex<Networks>,
     /// The last people, under their names in addresses.
     people: Mutex<VecDeque<(String, Arc<Stored>)>>,
@@ -64,9 +68,11 @@ struct Studio {
 
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let weights = arguments.model.open()?;
+    arguments.camera.check(unplaced(&weights.config, false))?;
     let device = arguments.model.device(&weights)?;
     let (reconstructor, _) = arguments.model.load(&weights, &device)?;
     let studio = Studio {
+        camera: &arguments.camera,
         networks: Mutex::new(Networks { reconstructor, segment: Box::new(weights::segmenter()) }),
         people: Mutex::default(),
         made: AtomicUsize::new(0),
@@ -78,7 +84,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     })
 }
 
-impl Studio {
+impl Studio<'_> {
     /// The answer, or in an error the answer that refuses.
     fn respond(&self, request: &Request, body: &mut Body) -> Result<Answer, Answer> {
         match (request.method.as_str(), request.path.as_str()) {
@@ -143,14 +149,22 @@ impl Studio {
         job.step("photographs");
         let config = networks.reconstructor.config();
         let cutting = Cutting::Missing(&*networks.segment);
-        let pair = photo::load([source(0), source(1)], cutting, config.network.resolution, placement(config));
-        let Pair { canvases, doubts, .. } = pair?;
+        let sources = [source(0), source(1)];
+        let Pair { canvases, doubts, cutouts } =
+            photo::load(sources, cutting, config.network.resolution, placement(config))?;
+        let shots =
+            [0, 1].map(|i| (Shot::of(&sources[i]), cutouts[i].0.dimensions().into(), canvases[i].mapping));
+        drop(cutouts);
         let [front, back] = canvases.map(|Canvas { rgb, mask, valid, .. }| Photograph { rgb, mask, valid });
         let result = networks.reconstructor.reconstruct(&front, &back, &|step| job.step(step));
         if result.gaussians.is_empty() {
             return Err(text(StatusCode::UNPROCESSABLE_ENTITY, "no Gaussian came out of these photographs"));
         }
-        let stored = Stored::of(&result.in_world(config)).map_err(Failure::from)?;
+        let mut world = result.in_world(config);
+        if unplaced(config, false).is_none() {
+            world = self.camera.person(world, &result, shots, config.network.resolution)?.0;
+        }
+        let stored = Stored::of(&world).map_err(Failure::from)?;
         drop(networks);
         let name = format!("{:x}-{}", self.start, self.made.fetch_add(1, Ordering::Relaxed));
         let gaussians = stored.len();

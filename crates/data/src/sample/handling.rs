@@ -5,7 +5,7 @@ use image::{GrayImage, RgbImage};
 use serde::{Deserialize, Serialize};
 
 use super::augment::moved;
-use super::place::{scale_of, shift};
+use super::place::{scale_of, shift, upright};
 use crate::photo::{Mapping, Rect};
 use snapsnap_base::config::outside;
 use snapsnap_splat::{Camera, RigidTransform};
@@ -91,20 +91,23 @@ impl Handling {
 
     /// Scale and transform from the nominal camera's frame, which is the frame of placed photographs' points, to the
     /// frame of the `camera` of the first photograph. `mapping` maps that photograph's pixels to the canvas. The scale
-    /// comes from the known camera, since photographs do not show size and distance. The shift then moves the canvas's
-    /// points `[S, S, 3]`, in metres, onto the rays of that camera.
+    /// comes from the known camera, since photographs do not show size and distance. So does the turn: a nominal camera
+    /// sees upright people, as a user's are. The shift then moves the canvas's points `[S, S, 3]`, in metres, onto the
+    /// rays of that camera.
     pub fn back(mapping: &Mapping, camera: &Camera, points: &[f32], valid: &[bool]) -> (f64, RigidTransform) {
         let side = f64::from(valid.len() as u32).sqrt() as usize;
         // The canvas may have another size than the photograph.
         let shrunk = f64::from(camera.width) / side as f64;
         let scale = scale_of(mapping, camera);
+        let upright = upright(camera).world_to_camera.rotation;
+        let rotation = camera.world_to_camera.rotation * upright.transpose();
         let seen = valid.iter().enumerate().filter(|(_, valid)| **valid).map(|(pixel, _)| {
             let canvas = DVec2::new((pixel % side) as f64, (pixel / side) as f64) + 0.5;
             let ray = (mapping.source(canvas * shrunk) - camera.principal_point) / camera.focal;
             let point = [0, 1, 2].map(|c| f64::from(points[3 * pixel + c]));
-            (ray, scale * DVec3::from(point))
+            (ray, scale * (rotation * DVec3::from(point)))
         });
-        (scale, RigidTransform { translation: shift(seen), ..RigidTransform::IDENTITY })
+        (scale, RigidTransform { rotation, translation: shift(seen) })
     }
 }
 

@@ -4,6 +4,7 @@ mod augment;
 mod handling;
 mod loader;
 mod place;
+mod rectified;
 mod stage1;
 mod stage2;
 mod test_set;
@@ -59,8 +60,9 @@ pub struct SampleConfig {
     /// scaled and moved into the nominal cameras' views. Above 0, all photographs of rigs whose distance or focal length varies
     /// are placed.
     pub placed_share: f32,
-    /// Whether points are in the frame of a front camera that looks down by the nominal angle and is not rolled, instead of the
-    /// photograph's own. No picture shows that angle, and a user's person shall stand upright.
+    /// Whether people are upright whatever the elevation of their photographs' cameras, which no picture shows. Stage 1 gets rectified
+    /// points: those of nominal cameras that would see the same pixels of an upright person. Points of stage 2 are in the frame of an
+    /// upright front camera.
     pub upright: bool,
     /// Height of a placed person in pixels of a canvas of 1024: `mode.person_height`.
     #[serde(skip)]

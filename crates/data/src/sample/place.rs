@@ -8,6 +8,7 @@ use rand::Rng;
 use snapsnap_base::FileError;
 use snapsnap_splat::{Camera, Orbit, RigidTransform};
 
+use super::rectified::Rectification;
 use super::{INSIDE, Source, joined};
 use crate::dataset::{StoredView, unproject};
 use crate::photo::Mapping;
@@ -15,7 +16,7 @@ use crate::photo::Mapping;
 /// Depth that the published code gives the background: 1/(0 + 10⁻⁸).
 const COMPAT_FAR: f32 = 1e8;
 /// Iterations of the search for a side pixel's depth.
-const LOOKUPS: usize = 3;
+pub(super) const LOOKUPS: usize = 3;
 
 /// Two photographs and the points of four views.
 pub(super) struct Four {
@@ -40,12 +41,12 @@ impl Source {
         if self.config.upright { upright(front) } else { *front }
     }
 
-    /// Front, back, right and left of a subject.
+    /// Front, back, right and left of a subject. `is_rectified` asks for rectified points where people are upright.
     pub(super) fn four(
         &self,
         subject: &str,
         order: &[usize; 4],
-        is_placed: bool,
+        [is_placed, is_rectified]: [bool; 2],
         random: &mut impl Rng,
     ) -> Result<Four, FileError> {
         let compat = self.config.compat;
@@ -71,7 +72,21 @@ impl Source {
             self.photographs([0, 1].map(|i| (&views[i].color, &views[i].mask)), is_placed, random);
         let (mut front, mut scale) = (self.frame(&views[0].camera), 1.0);
         let [mut first, mut second] = <[Points; 2]>::default();
-        if !is_placed {
+        let add_seen = |to: &mut Points, map: Seen| {
+            for seen in map {
+                to.0.extend(seen.unwrap_or_default().as_vec3().to_array());
+                to.1.push(f32::from(u8::from(seen.is_some())));
+            }
+        };
+        if is_rectified && self.config.upright {
+            let [a, b] = [0, 1].map(|i| (&views[i].camera, photographs[i].mapping));
+            let rectification = Rectification::new([a.0, b.0], [a.1, b.1]);
+            (0..2).for_each(|i| add_seen(&mut first, rectification.photographed(&views[i], i)));
+            for (to, sides) in [(&mut first, &views[2..]), (&mut second, &seconds)] {
+                let side = |(view, degrees)| rectification.of_side(view, degrees);
+                sides.iter().zip([90.0, 270.0]).map(side).for_each(|map| add_seen(to, map));
+            }
+        } else if !is_placed {
             let far = if compat { COMPAT_FAR } else { 0.0 };
             let add = |to: &mut Points, view: &StoredView| {
                 to.0.extend(unproject(&view.depth, &view.camera, &front.world_to_camera, far));
@@ -91,16 +106,10 @@ impl Source {
             front.world_to_camera.translation +=
                 scale * shift(rays.zip(seen).filter_map(|(ray, point)| Some((ray, point?))));
             let photographed = [0, 1].map(|i| views[i].through(&photographs[i].mapping, &front, scale));
-            let add = |to: &mut Points, map: Seen| {
-                for seen in map {
-                    to.0.extend(seen.unwrap_or_default().as_vec3().to_array());
-                    to.1.push(f32::from(u8::from(seen.is_some())));
-                }
-            };
             let side = |(view, degrees): (&StoredView, f64)| view.as_nominal(&front, scale, degrees);
             let sides = |views: &[StoredView]| views.iter().zip([90.0, 270.0]).map(side).collect::<Vec<_>>();
-            photographed.into_iter().chain(sides(&views[2..])).for_each(|map| add(&mut first, map));
-            sides(&seconds).into_iter().for_each(|map| add(&mut second, map));
+            photographed.into_iter().chain(sides(&views[2..])).for_each(|map| add_seen(&mut first, map));
+            sides(&seconds).into_iter().for_each(|map| add_seen(&mut second, map));
         }
         let (images, masks) = joined(photographs);
         let (points, valid) = first;
@@ -112,11 +121,11 @@ impl Source {
 pub(super) type Points = (Vec<f32>, Vec<f32>);
 
 /// Points of a canvas's pixels, row by row, in the front's frame; `None` for pixels without a point.
-type Seen = Vec<Option<DVec3>>;
+pub(super) type Seen = Vec<Option<DVec3>>;
 
 impl StoredView {
     /// The point at a place of the view, from its pixel's depth, in the camera's frame.
-    fn point(&self, place: DVec2) -> Option<DVec3> {
+    pub(super) fn point(&self, place: DVec2) -> Option<DVec3> {
         let side = self.camera.width as usize;
         let (column, row) = (place.x.floor(), place.y.floor());
         if column < 0.0 || row < 0.0 || column as usize >= side || row as usize >= side {
@@ -167,12 +176,12 @@ impl StoredView {
 }
 
 /// Centres of a square picture's pixels, row by row.
-fn centres(side: u32) -> impl Iterator<Item = DVec2> {
+pub(super) fn centres(side: u32) -> impl Iterator<Item = DVec2> {
     (0..side).flat_map(move |row| (0..side).map(move |column| DVec2::new(column.into(), row.into()) + 0.5))
 }
 
 /// The camera turned about the body's middle until it looks down by the nominal angle, without roll.
-fn upright(camera: &Camera) -> Camera {
+pub(super) fn upright(camera: &Camera) -> Camera {
     let nominal = Orbit::default();
     let backward = -camera.world_to_camera.rotation.row(2);
     let yaw_degrees = backward.x.atan2(backward.z).to_degrees();

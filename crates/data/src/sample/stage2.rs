@@ -90,7 +90,7 @@ impl Stage2Item {
         }
         let is_placed = source.is_placed(&mut random);
         let four = if config.points || is_placed {
-            source.four(subject, &order, is_placed, &mut random)?
+            source.four(subject, &order, [is_placed, false], &mut random)?
         } else {
             let picture = |view: usize| folder.picture(*split, subject, view, false);
             let pictures = [picture(front)?, picture(back)?];

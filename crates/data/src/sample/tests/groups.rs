@@ -1,5 +1,7 @@
 //! Views in groups.
 
+use glam::DVec3;
+
 use super::*;
 use crate::Jitter;
 use crate::dataset::check;
@@ -74,6 +76,7 @@ fn placed_samples_fit_the_nominal_cameras() {
     let folder = Arc::new(Folder::open(folder.root()).expect("opens"));
     let samples = SampleConfig {
         placed_share: 1.0,
+        upright: true,
         person_height: 700,
         points: true,
         repeat: 1,
@@ -85,7 +88,8 @@ fn placed_samples_fit_the_nominal_cameras() {
     let first =
         |samples| Stage1::new(folder.clone(), TRAIN, samples).expect("samples").sample(0).expect("a sample");
     let placed = first(samples.clone());
-    assert!((&placed.points, &placed.images) == (&item.points, &item.images));
+    let leaning = first(SampleConfig { upright: false, ..samples.clone() });
+    assert!(placed.images == item.images && placed.points != item.points && leaning.points != item.points);
     // The cameras' distance varies: all samples are placed, or none.
     let always = first(SampleConfig { placed_share: 1e-6, ..samples.clone() });
     assert!((&always.points, &always.images) == (&placed.points, &placed.images));
@@ -113,12 +117,14 @@ fn placed_samples_fit_the_nominal_cameras() {
     let valid: Vec<bool> = item.valid[..side * side].iter().map(|there| *there > 0.5).collect();
     let front = &item.points[..3 * side * side];
     let (scale, back) = Handling::back(&shown.mappings[0], &shown.cameras[0], front, &valid);
-    let moved = item.cameras[0].world_to_camera.translation - shown.cameras[0].world_to_camera.translation;
-    assert!(moved.length() > 0.02 && (back.translation + moved).length() < 1e-4, "{back:?}, {moved}");
+    let to_world = item.cameras[0].world_to_camera.inverse();
+    let expected = to_world.then(&shown.cameras[0].world_to_camera);
+    let apart = back.translation - expected.translation;
+    assert!(expected.translation.length() > 0.02 && apart.length() < 1e-4, "{back:?}, {expected:?}");
+    assert!(back.rotation.abs_diff_eq(expected.rotation, 1e-9), "{back:?}, {expected:?}");
     assert!((scale - item.scale).abs() < 1e-12 && (scale - 1.0).abs() > 0.02, "{scale}");
     // World points of the front lie on the surface of the stored depths.
     let stored = folder.depth(TRAIN, "0000", 0).expect("reads");
-    let to_world = item.cameras[0].world_to_camera.inverse();
     let mut off = Vec::new();
     for pixel in (0..side * side).filter(|pixel| item.valid[*pixel] > 0.5) {
         let point = item.scale * Vec3::from_slice(&item.points[3 * pixel..3 * pixel + 3]).as_dvec3();
@@ -174,5 +180,63 @@ fn upright_samples_do_not_lean() {
             wrong += i32::from((there - depth).abs() > 1e-4);
         }
         assert!(seen > 300 && wrong * 20 < seen, "{placed_share}: {wrong} of {seen} points");
+    }
+}
+
+/// Rectified points lie on the nominal cameras' rays of their pixels. Those of the photographs are as far ahead of the body's axis as the
+/// stored surface, and nominal cameras' points are left as they are.
+#[test]
+fn rectified_points_keep_their_distance_from_the_axis() {
+    for (is_nominal, placed_share) in [(true, 0.0), (false, 0.0), (false, 1.0)] {
+        let mut config = DataConfig::default();
+        (config.views.count, config.views.resolution) = (4, 128);
+        config.views.arrangement = Arrangement::Groups;
+        if !is_nominal {
+            config.jitter.rig = Jitter { pitch: 15.0, distance: 0.5, yaw: 30.0, ..Jitter::default() };
+        }
+        let (_temporary, folder) = made(&config, person(), 1);
+        let folder = Arc::new(Folder::open(folder.root()).expect("opens"));
+        let samples = SampleConfig {
+            placed_share,
+            person_height: 700,
+            repeat: 1,
+            augment: Augment::none(),
+            ..SampleConfig::default()
+        };
+        let item = |upright: bool| {
+            stage1(&folder, SampleConfig { upright, ..samples.clone() }).sample(0).expect("a sample")
+        };
+        let (upright, leaning) = (item(true), item(false));
+        let both = (0..4 * 128 * 128).filter(|pixel| upright.valid[*pixel] * leaning.valid[*pixel] > 0.5);
+        let apart = both.flat_map(|pixel| 3 * pixel..3 * pixel + 3);
+        let apart = apart.map(|i| (upright.points[i] - leaning.points[i]).abs()).fold(0.0, f32::max);
+        if is_nominal {
+            assert!(upright.valid == leaning.valid && apart < 1e-4, "{apart} m");
+        } else {
+            assert!(apart > 0.05, "{apart} m");
+        }
+        let around = Camera::orbit_at_yaw_degrees(0.0, 128).world_to_camera.inverse();
+        for (view, degrees) in [(0, 0.0), (1, 180.0), (2, 90.0), (3, 270.0)] {
+            let camera = Camera::orbit_at_yaw_degrees(degrees, 128);
+            let off = distances((&upright.points, &upright.valid), view, &around, &camera);
+            let (seen, most) = (off.len(), off.iter().copied().fold(0.0, f64::max));
+            let mean = off.iter().sum::<f64>() / seen as f64;
+            let limits = if view < 2 { (1e-3, 1e-2) } else { (0.4, 6.0) };
+            assert!(
+                seen > 300 && mean < limits.0 && most < limits.1,
+                "{placed_share}, view {view}: {seen} points, {mean}, {most} px"
+            );
+        }
+        // The person's depth, and no lean: the middle of the body is above the feet.
+        let points: Vec<DVec3> = (0..2 * 128 * 128)
+            .filter(|pixel| upright.valid[*pixel] > 0.5)
+            .map(|pixel| around.apply(Vec3::from_slice(&upright.points[3 * pixel..3 * pixel + 3]).as_dvec3()))
+            .collect();
+        let slice = |low: f64, high: f64| {
+            let z = || points.iter().filter(|p| (low..high).contains(&p.y)).map(|p| p.z);
+            0.5 * (z().fold(f64::MAX, f64::min) + z().fold(f64::MIN, f64::max))
+        };
+        let lean = slice(1.2, 1.4) - slice(0.3, 0.5);
+        assert!(lean.abs() < 0.05, "{placed_share}: {lean} m");
     }
 }

@@ -1,0 +1,142 @@
+//! The cameras of a user's photographs: what their files say, what options say, and the person that they make of the networks' one.
+
+use burn::tensor::{Tensor, TensorData};
+use clap::Args;
+use glam::Vec3;
+use snapsnap_data::photo::{Mapping, Shot, Viewpoint};
+use snapsnap_net::Reconstruction;
+use snapsnap_net::network::View;
+use snapsnap_splat::Gaussians;
+
+use crate::failure::{Failure, bail};
+use crate::pictures::read_back;
+
+/// Distances and elevations beyond which a camera photographs nobody who stands upright.
+const DISTANCES: std::ops::RangeInclusive<f64> = 1.0..=30.0;
+const ELEVATIONS: std::ops::RangeInclusive<f64> = -45.0..=60.0;
+/// Height of a person whose height is not given, in metres.
+const USUAL: f64 = 1.72;
+/// Share of the Gaussians above and below a person's height, which may be outliers.
+const OUTSIDE: f64 = 0.001;
+
+/// Options about the cameras and the person.
+#[derive(Args, Default)]
+pub struct CameraArguments {
+    /// Height of the person in metres [default: that of the networks, about 1.7].
+    #[arg(long, value_name = "METRES", value_parser = clap::value_parser!(f64))]
+    height: Option<f64>,
+    /// Focal length of both photographs in millimetres of 35 mm film [default: the files' own, else unknown].
+    #[arg(long, value_name = "MM", conflicts_with = "distance")]
+    focal: Option<f64>,
+    /// Distance of both cameras in metres [default: it follows from the focal length, else 2].
+    #[arg(long, value_name = "METRES")]
+    distance: Option<f64>,
+    /// How far both cameras look down at the person's middle, in degrees [default: what an iPhone's files say, else 8].
+    #[arg(long, value_name = "DEGREES", allow_hyphen_values = true)]
+    elevation: Option<f64>,
+}
+
+impl CameraArguments {
+    /// Refuses impossible values, and all with photographs that are placed otherwise than a user's (`why`).
+    pub fn check(&self, unplaced: Option<&str>) -> Result<(), Failure> {
+        let options = [
+            ("--height", self.height, 0.1..=10.0),
+            ("--focal", self.focal, 8.0..=1200.0),
+            ("--distance", self.distance, DISTANCES),
+            ("--elevation", self.elevation, ELEVATIONS),
+        ];
+        for (name, value, range) in options {
+            let Some(value) = value else { continue };
+            if !range.contains(&value) {
+                bail!("{name} {value}: must be from {} to {}", range.start(), range.end());
+            }
+            if let Some(why) = unplaced.filter(|_| name != "--height") {
+                bail!("{name}: {why}");
+            }
+        }
+        Ok(())
+    }
+
+    /// Where the camera of a photograph stood, and how that is known. `height` is the height of the networks' person.
+    fn viewpoint(
+        &self,
+        shot: Shot,
+        picture: [u32; 2],
+        mapping: &Mapping,
+        side: usize,
+        height: f64,
+    ) -> (Viewpoint, String) {
+        let nominal = Viewpoint::default();
+        let focal = self.focal.or(shot.focal);
+        let whence = if self.focal.is_some() { "--focal" } else { "the file" };
+        let seen = focal.map(|focal| Viewpoint::distance(focal, picture, mapping, side));
+        let (distance, how) = match (self.distance, focal, seen) {
+            (Some(distance), ..) => {
+                (distance * height / self.height.unwrap_or(USUAL), "--distance".to_owned())
+            }
+            (None, Some(focal), Some(seen)) if DISTANCES.contains(&seen) => {
+                (seen, format!("{focal} mm of 35 mm film, {whence}"))
+            }
+            (None, Some(focal), _) => (
+                nominal.distance,
+                format!("nominal: {focal} mm of 35 mm film, {whence}, does not fit a person of this size"),
+            ),
+            _ => (nominal.distance, "nominal: the focal length is unknown".to_owned()),
+        };
+        let pitch = shot
+            .pitch
+            .zip(focal)
+            .map(|(pitch, focal)| Viewpoint::elevation(pitch, focal, picture, mapping, side));
+        let (elevation, known) = match (self.elevation, pitch.filter(|pitch| ELEVATIONS.contains(pitch))) {
+            (Some(elevation), _) => (elevation, "--elevation"),
+            (None, Some(elevation)) => (elevation, "the file"),
+            (None, None) => (nominal.elevation, "nominal: unknown"),
+        };
+        let metres = distance * self.height.unwrap_or(USUAL) / height;
+        let assumed = if self.height.is_some() { "" } else { ", assumed" };
+        let height = self.height.unwrap_or(USUAL);
+        let report = format!(
+            "camera {metres:.2} m away ({how}; person {height} m high{assumed}), looking down by {elevation:.1}° ({known})"
+        );
+        (Viewpoint { elevation, distance }, report)
+    }
+
+    /// The networks' person as these cameras would have seen it, at its height, and reports about front and back. `world` contains
+    /// the Gaussians of `result` with y up.
+    pub fn person(
+        &self,
+        world: Gaussians,
+        result: &Reconstruction,
+        photographs: [(Shot, [u32; 2], Mapping); 2],
+        side: usize,
+    ) -> Result<(Gaussians, [String; 2]), Failure> {
+        let mut means = read_back(world.means.clone())?;
+        let height = height(&means);
+        let seats =
+            photographs.map(|(shot, picture, mapping)| self.viewpoint(shot, picture, &mapping, side, height));
+        if self.height.is_none() && seats.iter().all(|(seat, _)| *seat == Viewpoint::default()) {
+            return Ok((world, seats.map(|(_, report)| report)));
+        }
+        let views = result.views.iter().zip(&result.valid);
+        let view_of =
+            views.flat_map(|(view, valid)| valid.iter().filter(|valid| **valid).map(move |_| *view));
+        for (mean, view) in means.chunks_exact_mut(3).zip(view_of) {
+            let point = Vec3::from_slice(mean).as_dvec3();
+            let is_back = view == View::Back || view != View::Front && point.z < 0.0;
+            let moved = seats[usize::from(is_back)].0.restore(if is_back { 180.0 } else { 0.0 }, point);
+            mean.copy_from_slice(&moved.as_vec3().to_array());
+        }
+        let scale = self.height.map_or(1.0, |wanted| wanted / self::height(&means));
+        let device = world.means.device();
+        let means = Tensor::from_data(TensorData::new(means, world.means.dims()), &device);
+        Ok((Gaussians { means, ..world }.scaled(scale), seats.map(|(_, report)| report)))
+    }
+}
+
+/// The person's height above the floor, y = 0, in metres.
+fn height(means: &[f32]) -> f64 {
+    let mut heights: Vec<f32> = means.chunks_exact(3).map(|mean| mean[1]).collect();
+    heights.sort_unstable_by(f32::total_cmp);
+    let at = |share: f64| f64::from(heights[(share * (heights.len() - 1) as f64) as usize]);
+    at(1.0 - OUTSIDE) - at(OUTSIDE).min(0.0)
+}

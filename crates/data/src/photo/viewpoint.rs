@@ -1,0 +1,227 @@
+//! Where a photograph's camera stood, from the file or a user, and what follows for the person (docs/method.md, "Cameras of a user").
+
+use std::io::{BufReader, Cursor};
+
+use exif::{In, Tag, Value};
+use glam::{DVec2, DVec3};
+use snapsnap_base::{file, guarded};
+use snapsnap_splat::{Camera, Orbit};
+
+use super::{Mapping, Source};
+
+/// Diagonal of a frame of 35 mm film, in millimetres.
+const FILM: f64 = 43.267;
+/// Side of the nominal canvas. Its number does not matter.
+const SIDE: u32 = 1024;
+/// First bytes of Apple's maker note, and its entry with the acceleration that the telephone felt.
+const APPLE: &[u8] = b"Apple iOS\0";
+const ACCELERATION: u16 = 8;
+
+/// What a file says about its camera.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Shot {
+    /// Focal length in millimetres of 35 mm film.
+    pub focal: Option<f64>,
+    /// How far the optical axis looks down, in degrees.
+    pub pitch: Option<f64>,
+}
+
+impl Shot {
+    /// What the file's EXIF data say; nothing if there are none or they are damaged.
+    pub fn of(source: &Source) -> Self {
+        let reader = exif::Reader::new();
+        let read = || match source.bytes {
+            Some(bytes) => reader.read_from_container(&mut Cursor::new(bytes)).ok(),
+            None => reader.read_from_container(&mut BufReader::new(file::open(source.path).ok()?)).ok(),
+        };
+        let found = guarded(source.path, || Ok(read()));
+        found.ok().flatten().map_or(Self::default(), |found| Self::in_exif(&found))
+    }
+
+    fn in_exif(exif: &exif::Exif) -> Self {
+        let field = |tag| exif.get_field(tag, In::PRIMARY).map(|field| &field.value);
+        let focal = field(Tag::FocalLengthIn35mmFilm).and_then(|value| value.get_uint(0));
+        let note = match field(Tag::MakerNote) {
+            Some(Value::Undefined(bytes, _)) => acceleration(bytes),
+            _ => None,
+        };
+        // Seen from the front, x points left, y down and z into the telephone, as the camera at its back looks. What it feels is opposite
+        // to gravity.
+        let pitch = note
+            .filter(|up| (0.8..1.2).contains(&up.length()))
+            .map(|up| (-up.z / up.length()).asin().to_degrees());
+        Self { focal: focal.filter(|focal| *focal > 0).map(f64::from), pitch }
+    }
+}
+
+/// The acceleration vector in Apple's maker note, in units of gravity: a TIFF directory whose offsets count from the note's start.
+fn acceleration(note: &[u8]) -> Option<DVec3> {
+    let bytes = |at: usize, length: usize| note.get(at..at.checked_add(length)?);
+    let short = |at| bytes(at, 2).map(|b| u16::from_be_bytes([b[0], b[1]]));
+    let long = |at| bytes(at, 4).map(|b| u32::from_be_bytes([b[0], b[1], b[2], b[3]]));
+    if !note.starts_with(APPLE) || bytes(12, 2)? != b"MM" {
+        return None;
+    }
+    let entry =
+        (0..usize::from(short(14)?)).map(|i| 16 + 12 * i).find(|at| short(*at) == Some(ACCELERATION))?;
+    // Three signed fractions.
+    if short(entry + 2)? != 10 || long(entry + 4)? != 3 {
+        return None;
+    }
+    let place = long(entry + 8)? as usize;
+    let fraction = |i: usize| {
+        let [a, b] = [long(place + 8 * i)?, long(place + 8 * i + 4)?].map(|part| f64::from(part as i32));
+        (b != 0.0).then(|| a / b)
+    };
+    Some(DVec3::new(fraction(0)?, fraction(1)?, fraction(2)?))
+}
+
+/// The camera of a placed photograph, relative to the body's axis, in metres of the networks' person.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Viewpoint {
+    /// How far it looks down at the body's middle, in degrees.
+    pub elevation: f64,
+    /// Distance from the body's middle.
+    pub distance: f64,
+}
+
+impl Default for Viewpoint {
+    /// The nominal camera.
+    fn default() -> Self {
+        let Orbit { pitch_degrees: elevation, radius: distance, .. } = Orbit::default();
+        Self { elevation, distance }
+    }
+}
+
+impl Viewpoint {
+    /// The distance from which a lens sees a person of this size: `focal` is in millimetres of 35 mm film, `picture` the photograph's
+    /// width and height, and `mapping` its map to a canvas of `side` pixels.
+    pub fn distance(focal: f64, picture: [u32; 2], mapping: &Mapping, side: usize) -> f64 {
+        let Orbit { focal: nominal, radius, .. } = Orbit::default();
+        radius * pixels(focal, picture) * mapping.scale.y / (nominal * side as f64)
+    }
+
+    /// How far a camera whose optical axis looks down by `pitch` degrees looks down at the body's middle.
+    pub fn elevation(pitch: f64, focal: f64, picture: [u32; 2], mapping: &Mapping, side: usize) -> f64 {
+        let principal = Orbit::default().camera(side as u32).principal_point;
+        let below = mapping.source(principal).y - f64::from(picture[1]) / 2.0;
+        pitch + (below / pixels(focal, picture)).atan().to_degrees()
+    }
+
+    fn camera(&self, yaw_degrees: f64) -> Camera {
+        let nominal = Orbit::default();
+        // The person has the same size on the canvas.
+        let focal = nominal.focal * self.distance / nominal.radius;
+        Orbit { yaw_degrees, pitch_degrees: self.elevation, radius: self.distance, focal, ..nominal }
+            .camera(SIDE)
+    }
+
+    /// Moves a point from where the nominal camera of the front (`yaw_degrees` 0) or the back (180) sees it to where this one does, at
+    /// the same distance ahead of the body's axis. World: y up, the front camera above +z. Points that no camera sees stay.
+    pub fn restore(&self, yaw_degrees: f64, point: DVec3) -> DVec3 {
+        let seen = Camera::orbit_at_yaw_degrees(yaw_degrees, SIDE).project(point);
+        seen.and_then(|(place, _): (DVec2, f64)| on_plane(&self.camera(yaw_degrees), place, point.z))
+            .unwrap_or(point)
+    }
+}
+
+/// Where a pixel's ray meets the plane of this z; `None` behind the camera.
+pub(crate) fn on_plane(camera: &Camera, place: DVec2, z: f64) -> Option<DVec3> {
+    let ray = ((place - camera.principal_point) / camera.focal).extend(1.0);
+    let direction = camera.world_to_camera.rotation.transpose() * ray;
+    let eye = camera.centre();
+    let along = (z - eye.z) / direction.z;
+    (along.is_finite() && along > 0.0).then(|| eye + along * direction)
+}
+
+/// A focal length of 35 mm film in pixels of a picture.
+fn pixels(focal: f64, picture: [u32; 2]) -> f64 {
+    focal / FILM * f64::from(picture[0]).hypot(f64::from(picture[1]))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A telephone's EXIF segment: 26 mm, and Apple's note with this acceleration in thousandths.
+    pub fn segment(acceleration: [i32; 3]) -> Vec<u8> {
+        let mut note = [
+            APPLE,
+            b"\0\x01MM",
+            &[0, 1],
+            &ACCELERATION.to_be_bytes(),
+            &[0, 10, 0, 0, 0, 3],
+            &32_u32.to_be_bytes(),
+            &[0; 4],
+        ]
+        .concat();
+        assert_eq!(note.len(), 32);
+        acceleration
+            .iter()
+            .for_each(|value| note.extend([value.to_be_bytes(), 1000_i32.to_be_bytes()].concat()));
+        // Directories 0 and Exif, of one and two entries.
+        let entry = |tag: u16, kind: u16, count: u32, value: [u8; 4]| {
+            [&tag.to_be_bytes()[..], &kind.to_be_bytes(), &count.to_be_bytes(), &value].concat()
+        };
+        let mut tiff = b"MM\0\x2a\0\0\0\x08\0\x01".to_vec();
+        tiff.extend(entry(0x8769, 4, 1, 26_u32.to_be_bytes()));
+        tiff.extend([0; 4]);
+        tiff.extend(2_u16.to_be_bytes());
+        tiff.extend(entry(0x927c, 7, note.len() as u32, 56_u32.to_be_bytes()));
+        tiff.extend(entry(0xa405, 3, 1, [0, 26, 0, 0]));
+        tiff.extend([0; 4]);
+        assert_eq!(tiff.len(), 56);
+        [tiff, note].concat()
+    }
+
+    fn shot(tiff: &[u8]) -> Shot {
+        exif::Reader::new().read_raw(tiff.to_vec()).map_or(Shot::default(), |exif| Shot::in_exif(&exif))
+    }
+
+    #[test]
+    fn telephones_tell_focal_length_and_pitch() {
+        // Upright, and looking down by 10°.
+        assert_eq!(shot(&segment([0, -1000, 0])), Shot { focal: Some(26.0), pitch: Some(0.0) });
+        let pitch = shot(&segment([0, -985, -174])).pitch.expect("a pitch");
+        assert!((pitch - 10.0).abs() < 0.1, "{pitch}");
+        // A telephone that is being shaken tells nothing.
+        assert_eq!(shot(&segment([0, -2000, 0])).pitch, None);
+        let whole = segment([0, -1000, 0]);
+        for length in 0..whole.len() {
+            let found = shot(&whole[..length]);
+            assert!(
+                found.focal.is_none_or(|focal| focal == 26.0) && found.pitch.is_none_or(|pitch| pitch == 0.0)
+            );
+        }
+    }
+
+    #[test]
+    fn distances_follow_from_the_lens() {
+        // The nominal camera's field: 0.8 of the side of a square.
+        let picture = [1000, 1000];
+        let focal = 0.8 * FILM / 2.0_f64.sqrt();
+        let mapping = Mapping { scale: DVec2::splat(1.024), origin: DVec2::ZERO };
+        assert!((Viewpoint::distance(focal, picture, &mapping, 1024) - 2.0).abs() < 1e-9);
+        assert!((Viewpoint::distance(2.0 * focal, picture, &mapping, 1024) - 4.0).abs() < 1e-9);
+        // The body's middle is 25 of 1024 pixels below the picture's middle.
+        let elevation = Viewpoint::elevation(3.0, focal, picture, &mapping, 1024);
+        assert!((elevation - 3.0 - (25.0_f64 / 819.2).atan().to_degrees()).abs() < 1e-6, "{elevation}");
+    }
+
+    #[test]
+    fn known_cameras_move_points_along_their_planes() {
+        let point = DVec3::new(0.2, 1.5, 0.12);
+        let nominal = Viewpoint::default().restore(0.0, point);
+        assert!(nominal.abs_diff_eq(point, 1e-12), "{nominal}");
+        // A level camera far away sees heights as they are: the nominal one's picture of a point is a lower one there.
+        let level = Viewpoint { elevation: 0.0, distance: 1e6 };
+        let (place, _) = Camera::orbit_at_yaw_degrees(0.0, SIDE).project(point).expect("in front");
+        let moved = level.restore(0.0, point);
+        let expected = (537.0 - place.y) * 2.0 / (0.8 * 1024.0) + 0.85;
+        assert!((moved.z - point.z).abs() < 1e-9 && (moved.y - expected).abs() < 1e-4, "{moved}, {expected}");
+        // The back's camera is the front's, turned.
+        let front = level.restore(0.0, point);
+        let back = level.restore(180.0, DVec3::new(-point.x, point.y, -point.z));
+        assert!(back.abs_diff_eq(DVec3::new(-front.x, front.y, -front.z), 1e-9), "{front} {back}");
+    }
+}

@@ -1,0 +1,109 @@
+//! Cameras of a user's photographs: what files and options say, and the person's height.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use burn::tensor::Device;
+use snapsnap_splat::scene;
+use snapsnap_tests::{refused, root, snapsnap, succeed};
+
+/// The sample pair.
+fn pair() -> [PathBuf; 2] {
+    ["front", "back"].map(|side| root().join(format!("assets/sample/{side}.png")))
+}
+
+/// What `reconstruct -v` prints, and the centres of its Gaussians.
+fn reconstruct(folder: &Path, [front, back]: &[PathBuf; 2], options: &[&str]) -> (String, Vec<[f32; 3]>) {
+    let output = folder.join("human.ply");
+    let mut command = snapsnap();
+    command.arg("reconstruct").arg(front).arg(back).arg("-o").arg(&output);
+    let said =
+        succeed(command.args(["-v", "--device", "cpu", "--set", "network.resolution=256"]).args(options));
+    let means = scene::read(&output, &Device::flex()).expect("a PLY").gaussians.means;
+    let values: Vec<f32> = means.into_data().try_into_vec().expect("f32");
+    (said, values.as_chunks::<3>().0.to_vec())
+}
+
+fn range(values: impl Iterator<Item = f32>) -> [f32; 2] {
+    values.fold([f32::MAX, f32::MIN], |[low, high], value| [low.min(value), high.max(value)])
+}
+
+#[test]
+fn a_person_has_the_given_height() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let (_, usual) = reconstruct(temporary.path(), &pair(), &[]);
+    let (_, child) = reconstruct(temporary.path(), &pair(), &["--height", "1.1"]);
+    let [[_, usual_top], [_, top]] = [&usual, &child].map(|points| range(points.iter().map(|p| p[1])));
+    assert!((1.09..1.12).contains(&top), "{top}");
+    // All lengths alike.
+    for (a, b) in usual.iter().zip(&child) {
+        assert!((0..3).all(|c| (a[c] * top / usual_top - b[c]).abs() < 2e-3), "{a:?} {b:?}");
+    }
+}
+
+/// A telephone's file has its lens and its tilt. The same as options give the same person.
+#[test]
+fn a_telephone_tells_its_lens_and_its_tilt() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let folder = temporary.path();
+    let photographs = ["front", "back"].map(|side| {
+        let picture =
+            image::open(root().join(format!("assets/sample/{side}.png"))).expect("the sample").to_rgba8();
+        let over = image::RgbImage::from_fn(1024, 1024, |x, y| {
+            let pixel = picture.get_pixel(x, y);
+            let mixed = |c: usize| {
+                (u32::from(pixel[c]) * u32::from(pixel[3]) + 200 * (255 - u32::from(pixel[3]))) / 255
+            };
+            image::Rgb([0, 1, 2].map(|c| mixed(c) as u8))
+        });
+        let path = folder.join(side).with_extension("jpg");
+        over.save(&path).expect("written");
+        let bytes = fs::read(&path).expect("read");
+        // Behind the start of the image: a segment APP1. The telephone looks up by 10 degrees.
+        let tiff = snapsnap_tests::exif(26, [0, -985, 174]);
+        let length = (tiff.len() + 8) as u16;
+        let segment = [b"\xff\xe1", &length.to_be_bytes()[..], b"Exif\0\0", &tiff].concat();
+        fs::write(&path, [&bytes[..2], &segment, &bytes[2..]].concat()).expect("written");
+        path
+    });
+    let (said, own) = reconstruct(folder, &photographs, &[]);
+    assert_eq!(said.matches("26 mm of 35 mm film, the file").count(), 2, "{said}");
+    assert_eq!(said.matches("° (the file)").count(), 2, "{said}");
+    let (_, unknown) = reconstruct(folder, &photographs, &["--distance", "2", "--elevation", "8"]);
+    let moved = own.iter().zip(&unknown).map(|(a, b)| (a[1] - b[1]).abs()).fold(0.0, f32::max);
+    assert!((0.01..0.1).contains(&moved), "{moved} m");
+    let elevation =
+        said.split("looking down by ").nth(1).and_then(|rest| rest.split('°').next()).expect("degrees");
+    let (said, same) = reconstruct(folder, &photographs, &["--focal", "26", "--elevation", elevation]);
+    assert!(said.contains("--focal") && said.contains("(--elevation)"), "{said}");
+    let apart =
+        own.iter().zip(&same).flat_map(|(a, b)| (0..3).map(|c| (a[c] - b[c]).abs())).fold(0.0, f32::max);
+    assert!(apart < 1e-2, "{apart} m");
+    // Distances ahead of the axis stay.
+    assert!(own.iter().zip(&unknown).all(|(a, b)| (a[2] - b[2]).abs() < 1e-5));
+}
+
+#[test]
+fn impossible_cameras_are_refused() {
+    let [front, back] = pair();
+    let message = |options: &[&str]| {
+        let mut command = snapsnap();
+        refused(command.arg("reconstruct").arg(&front).arg(&back).args(options))
+    };
+    for (option, value) in [
+        ("--height", "0"),
+        ("--height", "NaN"),
+        ("--focal", "0"),
+        ("--distance", "0.2"),
+        ("--elevation", "-90"),
+    ] {
+        let said = message(&[option, value]);
+        assert!(said.contains(option) && said.contains("must be from"), "{said}");
+    }
+    for option in ["--focal", "--distance", "--elevation"] {
+        let said = message(&["--as-is", option, "20"]);
+        assert!(said.contains(option) && said.contains("--as-is"), "{said}");
+    }
+    let said = message(&["--focal", "26", "--distance", "2"]);
+    assert!(said.contains("cannot be used with"), "{said}");
+}
