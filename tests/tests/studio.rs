@@ -338,7 +338,7 @@ mod browser {
             page.wait("document.getElementById('studio') !== null && document.querySelectorAll('.photograph').length === 2");
             // Nothing is wider than the screen.
             let width = page.value("document.getElementById('studio').scrollWidth");
-            assert!(width.as_f64() <= Some(390.0), "{width}");
+            assert!(width.as_f64().is_some_and(|width| width <= 390.0), "{width}");
             for (side, file) in ["front", "back"].into_iter().zip(&files) {
                 page.choose(&field(side), file);
             }

@@ -3,6 +3,7 @@
 
 use std::io::{self, Read, Write};
 use std::net::{Shutdown, TcpListener, TcpStream};
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::thread;
@@ -73,6 +74,8 @@ pub struct Body<'a> {
     length: Option<u64>,
 }
 
+const SLOW: Refusal = (StatusCode::REQUEST_TIMEOUT, "the upload is too slow");
+
 impl Body<'_> {
     /// Reads the body. Refuses one of more than `most` bytes, a slow client, and a body beyond [`MOST_HELD`]. Memory grows with the bytes
     /// that arrive, whatever their number is said to be.
@@ -89,11 +92,14 @@ impl Body<'_> {
         while (upload.0.len() as u64) < length {
             let left = time_left(start, upload.0.len() as u64).ok();
             let left = left.filter(|left| self.stream.set_read_timeout(Some(*left)).is_ok());
-            left.ok_or((StatusCode::REQUEST_TIMEOUT, "the upload is too slow"))?;
+            left.ok_or(SLOW)?;
             let wanted = (length - upload.0.len() as u64).min(PART as u64) as usize;
             match self.stream.read(&mut part[..wanted]) {
                 Ok(n) if n > 0 => upload.append(&part[..n])?,
                 Err(e) if e.kind() == io::ErrorKind::Interrupted => {}
+                Err(e) if [io::ErrorKind::WouldBlock, io::ErrorKind::TimedOut].contains(&e.kind()) => {
+                    return Err(SLOW);
+                }
                 _ => return Err((StatusCode::BAD_REQUEST, "the upload was cut short")),
             }
         }
@@ -147,8 +153,8 @@ pub fn serve(listener: &TcpListener, answer: &(dyn Fn(&Request, &mut Body) -> An
                 continue;
             }
             let connection = move || {
-                // Errors of a connection concern only its client.
-                let _ = converse(stream, answer);
+                // Errors of a connection, and panics of the work for it, concern only its client.
+                let _ = catch_unwind(AssertUnwindSafe(|| converse(stream, answer)));
                 open.fetch_sub(1, Ordering::Relaxed);
             };
             if thread::Builder::new().spawn_scoped(scope, connection).is_err() {

@@ -1,4 +1,4 @@
-//! The cameras of a user's photographs: what their files say, what options say, and the person that they make of the networks' one.
+//! The cameras of a user's photographs, from their files and from options, and what they change about the person.
 
 use burn::tensor::{Tensor, TensorData};
 use clap::Args;
@@ -17,13 +17,13 @@ const ELEVATIONS: std::ops::RangeInclusive<f64> = -45.0..=60.0;
 /// Height of a person whose height is not given, in metres.
 const USUAL: f64 = 1.72;
 /// Share of the Gaussians above and below a person's height, which may be outliers.
-const OUTSIDE: f64 = 0.001;
+const OUTSIDE: f64 = 0.0002;
 
 /// Options about the cameras and the person.
 #[derive(Args, Default)]
 pub struct CameraArguments {
     /// Height of the person in metres [default: that of the networks, about 1.7].
-    #[arg(long, value_name = "METRES", value_parser = clap::value_parser!(f64))]
+    #[arg(long, value_name = "METRES")]
     height: Option<f64>,
     /// Focal length of both photographs in millimetres of 35 mm film [default: the files' own, else unknown].
     #[arg(long, value_name = "MM", conflicts_with = "distance")]
@@ -50,7 +50,7 @@ impl CameraArguments {
             if !range.contains(&value) {
                 bail!("{name} {value}: must be from {} to {}", range.start(), range.end());
             }
-            if let Some(why) = unplaced.filter(|_| name != "--height") {
+            if let Some(why) = unplaced {
                 bail!("{name}: {why}");
             }
         }
@@ -67,13 +67,12 @@ impl CameraArguments {
         height: f64,
     ) -> (Viewpoint, String) {
         let nominal = Viewpoint::default();
+        let tall = self.height.unwrap_or(USUAL);
         let focal = self.focal.or(shot.focal);
         let whence = if self.focal.is_some() { "--focal" } else { "the file" };
         let seen = focal.map(|focal| Viewpoint::distance(focal, picture, mapping, side));
         let (distance, how) = match (self.distance, focal, seen) {
-            (Some(distance), ..) => {
-                (distance * height / self.height.unwrap_or(USUAL), "--distance".to_owned())
-            }
+            (Some(distance), ..) => (distance * height / tall, "--distance".to_owned()),
             (None, Some(focal), Some(seen)) if DISTANCES.contains(&seen) => {
                 (seen, format!("{focal} mm of 35 mm film, {whence}"))
             }
@@ -92,17 +91,16 @@ impl CameraArguments {
             (None, Some(elevation)) => (elevation, "the file"),
             (None, None) => (nominal.elevation, "nominal: unknown"),
         };
-        let metres = distance * self.height.unwrap_or(USUAL) / height;
+        let metres = distance * tall / height;
         let assumed = if self.height.is_some() { "" } else { ", assumed" };
-        let height = self.height.unwrap_or(USUAL);
         let report = format!(
-            "camera {metres:.2} m away ({how}; person {height} m high{assumed}), looking down by {elevation:.1}° ({known})"
+            "camera {metres:.2} m away ({how}; person {tall} m high{assumed}), looking down by {elevation:.1}° ({known})"
         );
         (Viewpoint { elevation, distance }, report)
     }
 
-    /// The networks' person as these cameras would have seen it, at its height, and reports about front and back. `world` contains
-    /// the Gaussians of `result` with y up.
+    /// The person as these cameras saw it, at its height, and reports about front and back. `world` contains the Gaussians of
+    /// `result` with y up.
     pub fn person(
         &self,
         world: Gaussians,
@@ -111,32 +109,44 @@ impl CameraArguments {
         side: usize,
     ) -> Result<(Gaussians, [String; 2]), Failure> {
         let mut means = read_back(world.means.clone())?;
-        let height = height(&means);
-        let seats =
-            photographs.map(|(shot, picture, mapping)| self.viewpoint(shot, picture, &mapping, side, height));
+        let [floor, top] = range(&means);
+        let height = top - floor;
+        // Photographs of one person are taken with one camera.
+        let focal = photographs.iter().find_map(|(shot, ..)| shot.focal);
+        let pitch = photographs.iter().find_map(|(shot, ..)| shot.pitch);
+        let shared = |shot: Shot| Shot { focal: shot.focal.or(focal), pitch: shot.pitch.or(pitch) };
+        let seats = photographs
+            .map(|(shot, picture, mapping)| self.viewpoint(shared(shot), picture, &mapping, side, height));
         if self.height.is_none() && seats.iter().all(|(seat, _)| *seat == Viewpoint::default()) {
             return Ok((world, seats.map(|(_, report)| report)));
         }
         let views = result.views.iter().zip(&result.valid);
-        let view_of =
-            views.flat_map(|(view, valid)| valid.iter().filter(|valid| **valid).map(move |_| *view));
-        for (mean, view) in means.chunks_exact_mut(3).zip(view_of) {
+        let view_of = views.flat_map(|(view, valid)| valid.iter().filter(|valid| **valid).map(|_| *view));
+        // With lost Gaussians the views' pixels do not tell whose they are.
+        let view_of: Vec<Option<View>> = view_of.map(|view| (result.lost == 0).then_some(view)).collect();
+        for (i, mean) in means.chunks_exact_mut(3).enumerate() {
             let point = Vec3::from_slice(mean).as_dvec3();
-            let is_back = view == View::Back || view != View::Front && point.z < 0.0;
+            let is_back = match view_of.get(i).copied().flatten() {
+                Some(View::Front) => false,
+                Some(View::Back) => true,
+                _ => point.z < 0.0,
+            };
             let moved = seats[usize::from(is_back)].0.restore(if is_back { 180.0 } else { 0.0 }, point);
             mean.copy_from_slice(&moved.as_vec3().to_array());
         }
-        let scale = self.height.map_or(1.0, |wanted| wanted / self::height(&means));
+        let [low, top] = range(&means);
+        // The person stands where it stood.
+        means.iter_mut().skip(1).step_by(3).for_each(|y| *y += (floor - low) as f32);
+        let scale = self.height.map_or(1.0, |wanted| wanted / (top - low));
         let device = world.means.device();
         let means = Tensor::from_data(TensorData::new(means, world.means.dims()), &device);
         Ok((Gaussians { means, ..world }.scaled(scale), seats.map(|(_, report)| report)))
     }
 }
 
-/// The person's height above the floor, y = 0, in metres.
-fn height(means: &[f32]) -> f64 {
+/// The y of the person's lowest and highest Gaussians, without outliers, in metres.
+fn range(means: &[f32]) -> [f64; 2] {
     let mut heights: Vec<f32> = means.chunks_exact(3).map(|mean| mean[1]).collect();
     heights.sort_unstable_by(f32::total_cmp);
-    let at = |share: f64| f64::from(heights[(share * (heights.len() - 1) as f64) as usize]);
-    at(1.0 - OUTSIDE) - at(OUTSIDE).min(0.0)
+    [OUTSIDE, 1.0 - OUTSIDE].map(|share| f64::from(heights[(share * (heights.len() - 1) as f64) as usize]))
 }

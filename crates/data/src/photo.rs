@@ -205,10 +205,7 @@ impl<'a> Cutout<'a> {
         let is_given = given.is_ok();
         let rgb = picture.into_rgb8();
         let (mut rgb, mut mask) = match (given, cutting) {
-            (Ok(mut mask), _) => {
-                strokes.inspect(|strokes| strokes::paint(strokes, &mut mask, |_, _| {}));
-                (rgb, mask)
-            }
+            (Ok(mask), _) => (rgb, mask),
             (Err(_), Cutting::Missing(segment) | Cutting::All(segment)) => matte(rgb, segment, strokes)
                 .ok_or_else(|| {
                     let message =
@@ -226,6 +223,10 @@ impl<'a> Cutout<'a> {
             }
             _ => (0, 0),
         };
+        // A network's mask has them already.
+        if let Some(strokes) = strokes.filter(|_| is_given) {
+            strokes::paint(strokes, &mut mask, |_, _| {});
+        }
         let person = Rect::around(&mask, least).ok_or_else(|| nobody(mask_path, placement))?;
         if is_single_colour(&rgb, &mask) {
             let message = "the person is of a single colour: this is no photograph";

@@ -9,7 +9,7 @@ use snapsnap_base::config::Schema;
 use snapsnap_base::file;
 use snapsnap_data::photo::{self, Canvas, Cutting, Pair, Placement, Shot, Source};
 use snapsnap_mesh::picture;
-use snapsnap_net::config::Config;
+use snapsnap_net::config::{Config, WorldFrame};
 use snapsnap_net::precision::{Precision, PrecisionChoice, unit_of_cpu};
 use snapsnap_net::weights::WeightFile;
 use snapsnap_net::weights::schema::Part;
@@ -133,11 +133,12 @@ pub fn placement(config: &Config) -> Placement {
     if config.mode.compat { Placement::Demo { height } } else { Placement::Training { height } }
 }
 
-/// Why photographs' cameras are no matter, if they are not.
+/// Why options about cameras and heights have no effect, if so.
 pub fn unplaced(config: &Config, as_is: bool) -> Option<&'static str> {
     match (as_is, config.mode.compat) {
         (true, _) => Some("with --as-is the cameras are the nominal ones"),
         (_, true) => Some("weights in `mode.compat` have the published demo's cameras"),
+        _ if config.world_frame() == WorldFrame::Mirrored => Some("`mode.world_frame` is mirrored"),
         _ => None,
     }
 }

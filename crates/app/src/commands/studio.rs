@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 use std::io::Cursor;
 use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, TryLockError};
 use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
 use clap::Args;
@@ -47,10 +47,13 @@ const QUALITY: u8 = 90;
 /// Number of people in memory.
 const KEPT: usize = 4;
 
+/// A network that finds the person's pixels, for any thread.
+type Segment = dyn Fn(&[f32]) -> Vec<f32> + Send;
+
 /// The networks, for one job at a time.
 struct Networks {
     reconstructor: Reconstructor,
-    segment: Box<dyn Fn(&[f32]) -> Vec<f32> + Send>,
+    segment: Box<Segment>,
 }
 
 struct Studio<'a> {
@@ -192,7 +195,7 @@ impl Studio<'_> {
             Vec::new()
         } else {
             let only = is_long.then(|| self.long.try_lock());
-            if matches!(only, Some(Err(_))) {
+            if matches!(only, Some(Err(TryLockError::WouldBlock))) {
                 return Err(busy());
             }
             let job = Job::of(request);

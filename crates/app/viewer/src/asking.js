@@ -7,10 +7,12 @@ const INTERVAL = 300;
 export async function ask(path, options, step) {
   const job = crypto.randomUUID();
   const headers = { ...options.headers, "X-Job": job };
+  let open = true;
   const timer = setInterval(async () => {
     const answer = await fetch("./progress", { headers: { "X-Job": job }, cache: "no-store" }).catch(() => null);
     const name = answer?.ok ? await answer.text() : "";
-    if (name) {
+    // An answer may arrive after the work's end.
+    if (open && name) {
       step(name);
     }
   }, INTERVAL);
@@ -21,6 +23,7 @@ export async function ask(path, options, step) {
     }
     return answer;
   } finally {
+    open = false;
     clearInterval(timer);
   }
 }

@@ -17,6 +17,9 @@ function say(text) {
   element("message").textContent = text;
 }
 
+// Without this the browser would leave the page for a dropped file.
+["dragover", "drop"].forEach((kind) => window.addEventListener(kind, (event) => event.preventDefault()));
+
 /** Where the server has the shown person's files. */
 let address = "./";
 const links = [...document.querySelectorAll("#downloads a")].map((link) => [link, link.getAttribute("href").slice(2)]);
@@ -203,10 +206,9 @@ async function served() {
   return { bytes: new Uint8Array(await answer.arrayBuffer()), name, type: SplatFileType.PLY, served: true };
 }
 
-window.addEventListener("dragover", (event) => event.preventDefault());
 window.addEventListener("drop", (event) => {
-  event.preventDefault();
-  const file = event.dataTransfer.files[0];
+  // A photograph beside its place is no scene.
+  const file = document.body.classList.contains("making") ? null : event.dataTransfer.files[0];
   if (file) {
     show(file.name, async () => ({ bytes: new Uint8Array(await file.arrayBuffer()), name: file.name }));
   }

@@ -1,6 +1,6 @@
 // A photograph with its mask, and the brush that corrects it.
 
-/** Least and usual width of the brush, as shares of the picture's longer side. */
+/** Usual width of the brush, as a share of the picture's longer side. */
 const WIDTH = 0.04;
 /** How bright the background is shown. */
 const BEHIND = 0.25;
@@ -16,24 +16,27 @@ export class Drawing {
     this.width = WIDTH;
     this.clear();
     canvas.addEventListener("pointerdown", (event) => {
-      if (this.picture && event.button === 0) {
+      if (this.picture && event.button === 0 && !this.current) {
         canvas.setPointerCapture(event.pointerId);
+        this.pointer = event.pointerId;
         this.current = { keeps: this.keeps, width: this.width * Math.max(canvas.width, canvas.height), points: [] };
         this.lines.push(this.current);
         this.extend(event);
       }
     });
     canvas.addEventListener("pointermove", (event) => {
-      if (this.current) {
+      if (this.current && event.pointerId === this.pointer) {
         // A fast hand moves several times between two events.
         (event.getCoalescedEvents?.() ?? []).forEach((moved) => this.place(moved));
         this.extend(event);
       }
     });
     for (const kind of ["pointerup", "pointercancel"]) {
-      canvas.addEventListener(kind, () => {
-        this.current = null;
-        this.drawn(this.lines.length);
+      canvas.addEventListener(kind, (event) => {
+        if (event.pointerId === this.pointer) {
+          this.current = null;
+          this.drawn(this.lines.length);
+        }
       });
     }
   }
@@ -69,6 +72,9 @@ export class Drawing {
   }
 
   undo() {
+    if (this.current) {
+      return;
+    }
     this.lines.pop();
     this.renew();
     this.drawn(this.lines.length);

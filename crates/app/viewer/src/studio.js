@@ -141,32 +141,43 @@ export function openStudio(show) {
     element("warnings").replaceChildren();
   });
 
+  // Whoever starts again meanwhile does not want the former person.
+  let started = 0;
+  element("again").addEventListener("click", () => {
+    started += 1;
+  });
   make.addEventListener("click", async () => {
+    const own = started;
+    const isWanted = () => own === started;
     working = true;
     changed();
-    const files = photographs.map((photograph) => photograph.file);
-    const strokes = await Promise.all(photographs.map((photograph) => photograph.drawing.strokes()));
-    const parts = [...files, ...strokes];
-    const headers = { "X-Parts": parts.map((part) => part.size).join(",") };
-    const start = performance.now();
-    const step = (name) => say(`${name} … ${Math.round((performance.now() - start) / 1000)} s`);
-    step("sending");
     try {
+      const files = photographs.map((photograph) => photograph.file);
+      const strokes = await Promise.all(photographs.map((photograph) => photograph.drawing.strokes()));
+      const parts = [...files, ...strokes];
+      const headers = { "X-Parts": parts.map((part) => part.size).join(",") };
+      const start = performance.now();
+      const step = (name) => isWanted() && say(`${name} … ${Math.round((performance.now() - start) / 1000)} s`);
+      step("sending");
       const answer = await ask("./reconstruct", { method: "POST", headers, body: new Blob(parts) }, step);
       const person = await answer.json();
-      const warnings = person.warnings.map((text) => {
-        const item = document.createElement("li");
-        item.textContent = text;
-        return item;
-      });
-      element("warnings").replaceChildren(...warnings);
-      say(`${person.gaussians.toLocaleString("en")} Gaussians in ${person.seconds.toFixed(1)} s`);
-      await show(person.name);
-      // Warnings are read before the person is looked at.
-      enter(warnings.length > 0);
-      element("look").classList.remove("hidden");
+      if (isWanted()) {
+        const warnings = person.warnings.map((text) => {
+          const item = document.createElement("li");
+          item.textContent = text;
+          return item;
+        });
+        element("warnings").replaceChildren(...warnings);
+        say(`${person.gaussians.toLocaleString("en")} Gaussians in ${person.seconds.toFixed(1)} s`);
+        await show(person.name);
+        // Warnings are read before the person is looked at.
+        enter(warnings.length > 0);
+        element("look").classList.remove("hidden");
+      }
     } catch (error) {
-      say(error.message ?? String(error));
+      if (isWanted()) {
+        say(error.message ?? String(error));
+      }
     }
     working = false;
     changed();

@@ -5,8 +5,23 @@ const element = (id) => document.getElementById(id);
 /** Seconds until the picture of somebody who walks in front of the camera is taken. */
 const DELAY = 10;
 
+let taking = false;
+
 /** A picture from the camera, or nothing after an error, which `say` gets, or "Cancel". */
 export async function takePicture(say) {
+  // The browser may still be asking whether the page may use the camera.
+  if (taking) {
+    return null;
+  }
+  taking = true;
+  try {
+    return await take(say);
+  } finally {
+    taking = false;
+  }
+}
+
+async function take(say) {
   const dialog = element("taking");
   const video = dialog.querySelector("video");
   let stream;
@@ -45,7 +60,10 @@ export async function takePicture(say) {
     const canvas = Object.assign(document.createElement("canvas"), { width: video.videoWidth, height: video.videoHeight });
     canvas.getContext("2d").drawImage(video, 0, 0);
     const blob = await new Promise((done) => canvas.toBlob(done, "image/jpeg", 0.95));
-    picture = new File([blob], "camera.jpg", { type: "image/jpeg" });
+    picture = blob && new File([blob], "camera.jpg", { type: "image/jpeg" });
+  }
+  if (chosen && !picture) {
+    say("The camera gave no picture.");
   }
   stream.getTracks().forEach((track) => track.stop());
   video.srcObject = null;

@@ -3,14 +3,18 @@
 use image::imageops::{self, FilterType};
 use image::{GrayImage, Luma};
 
-/// Value of a pixel without a stroke.
+/// Value of a pixel without a stroke, and how far browsers that add noise to pictures may be from it.
 const UNTOUCHED: u8 = 128;
+const NOISE: u8 = 8;
 
 /// Lays strokes of any size over a mask: white keeps, black removes, [`UNTOUCHED`] changes nothing, and values between are soft edges.
 /// `keep` is called with each pixel that strokes keep.
 pub fn paint(strokes: &GrayImage, mask: &mut GrayImage, mut keep: impl FnMut(u32, u32)) {
     let strokes = imageops::resize(strokes, mask.width(), mask.height(), FilterType::Triangle);
     for ((x, y, Luma([share])), Luma([stroke])) in mask.enumerate_pixels_mut().zip(strokes.pixels()) {
+        if stroke.abs_diff(UNTOUCHED) <= NOISE {
+            continue;
+        }
         let [above, full] = [i32::from(*stroke) - i32::from(UNTOUCHED), i32::from(u8::MAX)];
         if above > 0 {
             let least = above * full / (full - i32::from(UNTOUCHED));

@@ -41,8 +41,10 @@ impl Shot {
     fn in_exif(exif: &exif::Exif) -> Self {
         let field = |tag| exif.get_field(tag, In::PRIMARY).map(|field| &field.value);
         let focal = field(Tag::FocalLengthIn35mmFilm).and_then(|value| value.get_uint(0));
+        // The camera beside the screen looks the other way.
+        let is_selfie = field(Tag::LensModel).is_some_and(|lens| matches!(lens, Value::Ascii(texts) if texts.iter().any(|text| text.windows(5).any(|part| part == b"front"))));
         let note = match field(Tag::MakerNote) {
-            Some(Value::Undefined(bytes, _)) => acceleration(bytes),
+            Some(Value::Undefined(bytes, _)) if !is_selfie => acceleration(bytes),
             _ => None,
         };
         // Seen from the front, x points left, y down and z into the telephone, as the camera at its back looks. What it feels is opposite
@@ -144,7 +146,7 @@ mod tests {
     use super::*;
 
     /// A telephone's EXIF segment: 26 mm, and Apple's note with this acceleration in thousandths.
-    pub fn segment(acceleration: [i32; 3]) -> Vec<u8> {
+    fn segment(acceleration: [i32; 3]) -> Vec<u8> {
         let mut note = [
             APPLE,
             b"\0\x01MM",

@@ -91,8 +91,8 @@ impl Handling {
 
     /// Scale and transform from the nominal camera's frame, which is the frame of placed photographs' points, to the
     /// frame of the `camera` of the first photograph. `mapping` maps that photograph's pixels to the canvas. The scale
-    /// comes from the known camera, since photographs do not show size and distance. So does the turn: a nominal camera
-    /// sees upright people, as a user's are. The shift then moves the canvas's points `[S, S, 3]`, in metres, onto the
+    /// comes from the known camera, since photographs do not show size and distance. The turn makes people upright, as a
+    /// user's are. The shift then moves the canvas's points `[S, S, 3]`, in metres, onto the
     /// rays of that camera.
     pub fn back(mapping: &Mapping, camera: &Camera, points: &[f32], valid: &[bool]) -> (f64, RigidTransform) {
         let side = f64::from(valid.len() as u32).sqrt() as usize;

@@ -1,5 +1,4 @@
-//! Rectified points: an upright person as the nominal cameras would have to see it to take the same photographs
-//! (docs/method.md, "Upright targets"). A photograph does not show its camera's elevation and distance. What it shows, together with
+//! Rectified points: those of an upright person whom the nominal cameras would photograph alike (docs/method.md, "Upright targets"). A photograph does not show its camera's elevation and distance. What it shows, together with
 //! knowledge about people, is how far in front of the body's axis a pixel's surface is. Each point therefore keeps its distance ahead
 //! of the axis, and moves to the nominal camera's ray of its pixel.
 
@@ -66,7 +65,7 @@ impl Rectification {
         let to_world = camera.world_to_camera.inverse();
         let seen = |place: DVec2| {
             let point = to_world.apply(view.point(mapping.source(place))?);
-            on_plane(nominal, place, point.z / self.scale).map(|p| self.to_front(p))
+            self.rectify(photograph, point).map(|p| self.to_front(p))
         };
         centres(nominal.width).map(seen).collect()
     }

@@ -219,13 +219,11 @@ fn rectified_points_keep_their_distance_from_the_axis() {
         for (view, degrees) in [(0, 0.0), (1, 180.0), (2, 90.0), (3, 270.0)] {
             let camera = Camera::orbit_at_yaw_degrees(degrees, 128);
             let off = distances((&upright.points, &upright.valid), view, &around, &camera);
-            let (seen, most) = (off.len(), off.iter().copied().fold(0.0, f64::max));
-            let mean = off.iter().sum::<f64>() / seen as f64;
-            let limits = if view < 2 { (1e-3, 1e-2) } else { (0.4, 6.0) };
-            assert!(
-                seen > 300 && mean < limits.0 && most < limits.1,
-                "{placed_share}, view {view}: {seen} points, {mean}, {most} px"
-            );
+            let seen = off.len();
+            // At edges, a side's pixel may have its neighbour's point. A third of so few pixels are at an edge.
+            let (near, edges) = if view < 2 { (1e-3, 0) } else { (1.0, seen / 10) };
+            let apart = off.iter().filter(|off| **off > near).count();
+            assert!(seen > 300 && apart <= edges, "{placed_share}, view {view}: {apart} of {seen} points");
         }
         // The person's depth, and no lean: the middle of the body is above the feet.
         let points: Vec<DVec3> = (0..2 * 128 * 128)
