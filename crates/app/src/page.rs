@@ -150,7 +150,7 @@ pub fn download(name: &str, content: Content) -> Answer {
 }
 
 /// The text with percent codes for all bytes but unreserved characters (RFC 3986).
-pub fn percent_encoded(text: &str) -> String {
+fn percent_encoded(text: &str) -> String {
     let plain = |byte: u8| byte.is_ascii_alphanumeric() || b"-._~".contains(&byte);
     text.bytes()
         .map(|byte| if plain(byte) { char::from(byte).to_string() } else { format!("%{byte:02X}") })

@@ -120,6 +120,7 @@ impl CameraArguments {
         if self.height.is_none() && seats.iter().all(|(seat, _)| *seat == Viewpoint::default()) {
             return Ok((world, seats.map(|(_, report)| report)));
         }
+        let [front, back] = [seats[0].0.restorer(0.0), seats[1].0.restorer(180.0)];
         let views = result.views.iter().zip(&result.valid);
         let view_of = views.flat_map(|(view, valid)| valid.iter().filter(|valid| **valid).map(|_| *view));
         // With lost Gaussians the views' pixels do not tell whose they are.
@@ -131,7 +132,7 @@ impl CameraArguments {
                 Some(View::Back) => true,
                 _ => point.z < 0.0,
             };
-            let moved = seats[usize::from(is_back)].0.restore(if is_back { 180.0 } else { 0.0 }, point);
+            let moved = if is_back { back(point) } else { front(point) };
             mean.copy_from_slice(&moved.as_vec3().to_array());
         }
         let [low, top] = range(&means);

@@ -118,12 +118,14 @@ impl Viewpoint {
             .camera(SIDE)
     }
 
-    /// Moves a point from where the nominal camera of the front (`yaw_degrees` 0) or the back (180) sees it to where this one does, at
-    /// the same distance ahead of the body's axis. World: y up, the front camera above +z. Points that no camera sees stay.
-    pub fn restore(&self, yaw_degrees: f64, point: DVec3) -> DVec3 {
-        let seen = Camera::orbit_at_yaw_degrees(yaw_degrees, SIDE).project(point);
-        seen.and_then(|(place, _): (DVec2, f64)| on_plane(&self.camera(yaw_degrees), place, point.z))
-            .unwrap_or(point)
+    /// A map of points from where the nominal camera of the front (`yaw_degrees` 0) or the back (180) sees them to where this one does,
+    /// at the same distance ahead of the body's axis. World: y up, the front camera above +z. Points that no camera sees stay.
+    pub fn restorer(&self, yaw_degrees: f64) -> impl Fn(DVec3) -> DVec3 + use<> {
+        let (nominal, own) = (Camera::orbit_at_yaw_degrees(yaw_degrees, SIDE), self.camera(yaw_degrees));
+        move |point| {
+            let seen = nominal.project(point);
+            seen.and_then(|(place, _)| on_plane(&own, place, point.z)).unwrap_or(point)
+        }
     }
 }
 
@@ -213,17 +215,17 @@ mod tests {
     #[test]
     fn known_cameras_move_points_along_their_planes() {
         let point = DVec3::new(0.2, 1.5, 0.12);
-        let nominal = Viewpoint::default().restore(0.0, point);
+        let nominal = Viewpoint::default().restorer(0.0)(point);
         assert!(nominal.abs_diff_eq(point, 1e-12), "{nominal}");
         // A level camera far away sees heights as they are: the nominal one's picture of a point is a lower one there.
         let level = Viewpoint { elevation: 0.0, distance: 1e6 };
         let (place, _) = Camera::orbit_at_yaw_degrees(0.0, SIDE).project(point).expect("in front");
-        let moved = level.restore(0.0, point);
+        let moved = level.restorer(0.0)(point);
         let expected = (537.0 - place.y) * 2.0 / (0.8 * 1024.0) + 0.85;
         assert!((moved.z - point.z).abs() < 1e-9 && (moved.y - expected).abs() < 1e-4, "{moved}, {expected}");
         // The back's camera is the front's, turned.
-        let front = level.restore(0.0, point);
-        let back = level.restore(180.0, DVec3::new(-point.x, point.y, -point.z));
+        let front = level.restorer(0.0)(point);
+        let back = level.restorer(180.0)(DVec3::new(-point.x, point.y, -point.z));
         assert!(back.abs_diff_eq(DVec3::new(-front.x, front.y, -front.z), 1e-9), "{front} {back}");
     }
 }
