@@ -49,8 +49,19 @@ impl Server {
     /// Memory of the process in bytes.
     #[cfg(target_os = "linux")]
     pub fn memory(&self) -> u64 {
+        self.status("VmRSS:")
+    }
+
+    /// Address space of the process in bytes: memory that it asked for, used or not.
+    #[cfg(target_os = "linux")]
+    pub fn address_space(&self) -> u64 {
+        self.status("VmSize:")
+    }
+
+    #[cfg(target_os = "linux")]
+    fn status(&self, key: &str) -> u64 {
         let status = std::fs::read_to_string(format!("/proc/{}/status", self.process.id())).expect("running");
-        let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:")).expect("a line");
+        let line = status.lines().find_map(|line| line.strip_prefix(key)).expect("a line");
         line.trim().trim_end_matches(" kB").parse::<u64>().expect("a number") << 10
     }
 
