@@ -30,7 +30,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     // Each person is scaled and moved to the place that the networks were trained for.
     let placement = Placement::Training { height: config.person_height() };
     let sources = photographs.each_ref().map(|path| Source::file(path));
-    let canvases = photo::load(sources, Cutting::Given, config.network.resolution, placement)?.canvases;
+    let canvases = photo::load(sources, Cutting::Given, config.network.resolution, placement, None)?.canvases;
     let [front, back] = canvases.map(|Canvas { rgb, mask, valid, .. }| Photograph { rgb, mask, valid });
 
     let result = reconstructor.reconstruct(&front, &back, &|module| println!("{module}"));

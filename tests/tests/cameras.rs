@@ -4,6 +4,9 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use burn::tensor::Device;
+use glam::{DMat3, DVec2};
+use image::RgbaImage;
+use image::imageops::interpolate_bilinear;
 use snapsnap_splat::scene;
 use snapsnap_tests::{refused, root, snapsnap, succeed};
 
@@ -97,6 +100,43 @@ fn a_telephone_tells_its_lens_and_its_tilt() {
     assert!(apart < 3e-3, "{apart} m");
     // Distances ahead of the axis stay.
     assert!(own.iter().zip(&unknown).all(|(a, b)| (a[2] - b[2]).abs() < 1e-5));
+}
+
+/// A person far beside the middle of a wide-angle picture is the one of a picture that was taken straight ahead, if the lens is known.
+#[test]
+fn a_known_lens_turns_pictures_towards_the_person() {
+    const FOCAL: f64 = 0.8 * 1024.0;
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let folder = temporary.path();
+    let rotation = DMat3::from_rotation_y(-17_f64.to_radians());
+    let aside = ["front", "back"].map(|side| {
+        let path = root().join(format!("assets/sample/{side}.png"));
+        let picture = image::open(path).expect("the sample").to_rgba8();
+        let turned = RgbaImage::from_fn(1024, 1024, |x, y| {
+            let place = (DVec2::new(f64::from(x), f64::from(y)) + 0.5 - 512.0) / FOCAL;
+            let ray = rotation * place.extend(1.0);
+            let [x, y] = (FOCAL * ray.truncate() / ray.z + 512.0 - 0.5).as_vec2().to_array();
+            interpolate_bilinear(&picture, x, y).filter(|_| ray.z > 0.0).unwrap_or(image::Rgba([0; 4]))
+        });
+        let path = folder.join(side).with_extension("png");
+        turned.save(&path).expect("written");
+        path
+    });
+    // The lens of 0.8 times the picture's side.
+    let focal = ["--focal", "24.477"];
+    let (_, ahead) = reconstruct(folder, &pair(), &focal);
+    let (said, turned) = reconstruct(folder, &aside, &focal);
+    assert_eq!(said.matches("turned towards the person by 1").count(), 2, "{said}");
+    let (said, unknown) = reconstruct(folder, &aside, &[]);
+    assert!(!said.contains("turned"), "{said}");
+    let size = |points: &[[f32; 3]], axis: usize| {
+        let [low, high] = range(points.iter().map(|p| p[axis]));
+        high - low
+    };
+    let shape = |points: &[[f32; 3]]| size(points, 0) / size(points, 1);
+    let [ahead, turned, unknown] = [&ahead, &turned, &unknown].map(|points| shape(points));
+    assert!((turned / ahead - 1.0).abs() < 0.015, "{turned} {ahead}");
+    assert!((0.025..0.08).contains(&(unknown / ahead - 1.0)), "{unknown} {ahead}");
 }
 
 #[test]

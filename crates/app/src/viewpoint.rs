@@ -3,9 +3,8 @@
 use burn::tensor::{Tensor, TensorData};
 use clap::Args;
 use glam::Vec3;
-use snapsnap_data::photo::{Mapping, Shot, Viewpoint};
+use snapsnap_data::photo::{FOCALS, Mapping, Shot, Viewpoint};
 use snapsnap_net::Reconstruction;
-use snapsnap_net::network::View;
 use snapsnap_splat::Gaussians;
 
 use crate::failure::{Failure, bail};
@@ -41,7 +40,7 @@ impl CameraArguments {
     pub fn check(&self, unplaced: Option<&str>) -> Result<(), Failure> {
         let options = [
             ("--height", self.height, 0.1..=10.0),
-            ("--focal", self.focal, 8.0..=1200.0),
+            ("--focal", self.focal, FOCALS),
             ("--distance", self.distance, DISTANCES),
             ("--elevation", self.elevation, ELEVATIONS),
         ];
@@ -57,6 +56,11 @@ impl CameraArguments {
         Ok(())
     }
 
+    /// The focal length of both photographs, if it is given.
+    pub fn focal(&self) -> Option<f64> {
+        self.focal
+    }
+
     /// Where the camera of a photograph stood, and how that is known. `height` is the height of the networks' person.
     fn viewpoint(
         &self,
@@ -68,17 +72,17 @@ impl CameraArguments {
     ) -> (Viewpoint, String) {
         let nominal = Viewpoint::default();
         let tall = self.height.unwrap_or(USUAL);
-        let focal = self.focal.or(shot.focal);
+        let focal = shot.focal;
         let whence = if self.focal.is_some() { "--focal" } else { "the file" };
         let seen = focal.map(|focal| Viewpoint::distance(focal, picture, mapping, side));
         let (distance, how) = match (self.distance, focal, seen) {
             (Some(distance), ..) => (distance * height / tall, "--distance".to_owned()),
             (None, Some(focal), Some(seen)) if DISTANCES.contains(&seen) => {
-                (seen, format!("{focal} mm of 35 mm film, {whence}"))
+                (seen, format!("{focal:.0} mm of 35 mm film, {whence}"))
             }
             (None, Some(focal), _) => (
                 nominal.distance,
-                format!("nominal: {focal} mm of 35 mm film, {whence}, does not fit a person of this size"),
+                format!("nominal: {focal:.0} mm of 35 mm film, {whence}, does not fit a person of this size"),
             ),
             _ => (nominal.distance, "nominal: the focal length is unknown".to_owned()),
         };
@@ -111,27 +115,16 @@ impl CameraArguments {
         let mut means = read_back(world.means.clone())?;
         let [floor, top] = range(&means);
         let height = top - floor;
-        // Photographs of one person are taken with one camera.
-        let focal = photographs.iter().find_map(|(shot, ..)| shot.focal);
-        let pitch = photographs.iter().find_map(|(shot, ..)| shot.pitch);
-        let shared = |shot: Shot| Shot { focal: shot.focal.or(focal), pitch: shot.pitch.or(pitch) };
-        let seats = photographs
-            .map(|(shot, picture, mapping)| self.viewpoint(shared(shot), picture, &mapping, side, height));
+        let seats =
+            photographs.map(|(shot, picture, mapping)| self.viewpoint(shot, picture, &mapping, side, height));
         if self.height.is_none() && seats.iter().all(|(seat, _)| *seat == Viewpoint::default()) {
             return Ok((world, seats.map(|(_, report)| report)));
         }
         let [front, back] = [seats[0].0.restorer(0.0), seats[1].0.restorer(180.0)];
-        let views = result.views.iter().zip(&result.valid);
-        let view_of = views.flat_map(|(view, valid)| valid.iter().filter(|valid| **valid).map(|_| *view));
-        // With lost Gaussians the views' pixels do not tell whose they are.
-        let view_of: Vec<Option<View>> = view_of.map(|view| (result.lost == 0).then_some(view)).collect();
+        let [of_front, of_back] = result.photographed();
         for (i, mean) in means.chunks_exact_mut(3).enumerate() {
             let point = Vec3::from_slice(mean).as_dvec3();
-            let is_back = match view_of.get(i).copied().flatten() {
-                Some(View::Front) => false,
-                Some(View::Back) => true,
-                _ => point.z < 0.0,
-            };
+            let is_back = i >= of_front && (i < of_front + of_back || point.z < 0.0);
             let moved = if is_back { back(point) } else { front(point) };
             mean.copy_from_slice(&moved.as_vec3().to_array());
         }

@@ -4,11 +4,13 @@ mod doubts;
 mod exposure;
 mod matting;
 mod placing;
+mod planes;
 mod rim;
 mod specks;
 mod strokes;
 #[cfg(test)]
 mod tests;
+mod turning;
 mod viewpoint;
 
 use std::borrow::Cow;
@@ -26,8 +28,9 @@ pub use matting::{FOUND, Segmenter};
 pub use placing::Mapping;
 pub(crate) use placing::place;
 use placing::{Standing, placed, together};
-pub(crate) use viewpoint::on_plane;
-pub use viewpoint::{Shot, Viewpoint};
+pub(crate) use planes::PlaneMap;
+use turning::Turn;
+pub use viewpoint::{FOCALS, Shot, Viewpoint};
 
 /// Least side of a photograph in pixels.
 const MIN_SIDE: u32 = 64;
@@ -113,6 +116,8 @@ pub struct Pair {
     pub canvases: [Canvas; 2],
     /// Colours and masks of front and back before their placement.
     pub cutouts: [(RgbImage, GrayImage); 2],
+    /// Their cameras, as far as they are known.
+    pub shots: [Shot; 2],
     /// Signs that they are not photographs as the networks need them, a sentence each: a mask that touches three borders, a
     /// person who is wider than high, equal pictures, silhouettes that do not fit one another.
     pub doubts: Vec<String>,
@@ -121,7 +126,8 @@ pub struct Pair {
 /// Loads the photographs of front and back and places each on a canvas of `side` pixels. The mask of the person is the source's, or
 /// without one what `cutting` says. With [`Placement::Training`],
 /// photographs whose sizes and boxes agree are taken for photographs from one place. They get the same scale and
-/// offset.
+/// offset. If a focal length is known, from the files or as `focal` in millimetres of 35 mm film, people beside the middle are turned
+/// into it.
 ///
 /// # Errors
 /// [`FileError`]: unreadable files, a mask of another size, an empty or missing mask, a photograph in which the network finds nobody, a
@@ -131,9 +137,23 @@ pub fn load(
     cutting: Cutting,
     side: usize,
     placement: Placement,
+    focal: Option<f64>,
 ) -> Result<Pair, FileError> {
-    let front = Cutout::read(front, cutting, side, placement)?;
+    let mut shots = [front, back].map(|source| Shot::of(&source));
+    // Photographs of one person are taken with one camera.
+    let found =
+        Shot { focal: focal.or(shots[0].focal).or(shots[1].focal), pitch: shots[0].pitch.or(shots[1].pitch) };
+    for shot in &mut shots {
+        *shot = Shot { focal: focal.or(shot.focal).or(found.focal), pitch: shot.pitch.or(found.pitch) };
+    }
+    let mut front = Cutout::read(front, cutting, side, placement)?;
     let mut back = Cutout::read(back, cutting, side, placement)?;
+    if let Placement::Training { .. } = placement {
+        let common = together([&front.mask, &back.mask], [front.person, back.person]);
+        for (cutout, shot) in [&mut front, &mut back].into_iter().zip(&mut shots) {
+            cutout.turn(common, shot);
+        }
+    }
     if let Placement::Training { .. } = placement
         && let Some([r, g, b]) = match_back((&front.rgb, &front.mask), (&mut back.rgb, &back.mask))
     {
@@ -146,7 +166,7 @@ pub fn load(
         _ => None,
     };
     let canvases = [front.canvas(common, side, placement)?, back.canvas(common, side, placement)?];
-    Ok(Pair { canvases, cutouts: [front, back].map(|cutout| (cutout.rgb, cutout.mask)), doubts })
+    Ok(Pair { canvases, cutouts: [front, back].map(|cutout| (cutout.rgb, cutout.mask)), shots, doubts })
 }
 
 /// Colours and mask of one photograph, as [`load`] takes them for [`Placement::Training`].
@@ -248,6 +268,17 @@ impl<'a> Cutout<'a> {
             source += &format!(", {rim} pixels of the mask's rim left out: they show the background");
         }
         Ok(Self { path, mask_path, rgb, mask, person, source })
+    }
+
+    /// Turns the photograph towards the middle of the person's box, or of the common box of both photographs. `shot` is then the turned
+    /// camera.
+    fn turn(&mut self, common: Option<Standing>, shot: &mut Shot) {
+        let person = common.map_or(self.person, |standing| standing.person);
+        let Some(turn) = Turn::towards(person, self.rgb.dimensions().into(), *shot) else { return };
+        let (rgb, mask) = turn.apply(&self.rgb, &self.mask);
+        let Some(person) = Rect::around(&mask, u8::MAX.div_ceil(2)) else { return };
+        (self.rgb, self.mask, self.person, *shot) = (rgb, mask, person, turn.shot);
+        self.source += &format!(", {}", turn.report());
     }
 
     /// Places the photograph by the person's box, or by the common box of both photographs.

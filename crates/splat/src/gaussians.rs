@@ -1,7 +1,7 @@
 //! A set of 3D Gaussians as tensors on one device.
 
 use burn::tensor::{Device, Tensor};
-use glam::DQuat;
+use glam::{DMat3, DQuat, DVec3};
 
 use crate::{RigidTransform, SplatError};
 
@@ -73,11 +73,7 @@ impl Gaussians {
 
     /// Moves the centres by `transform`; leaves the quaternions alone.
     pub fn with_means_transformed(mut self, transform: &RigidTransform) -> Self {
-        // Row vectors: (R·p)ᵀ = pᵀ·Rᵀ, and glam's columns are the rows of Rᵀ.
-        let rows = transform.rotation.to_cols_array_2d().map(|column| column.map(|v| v as f32));
-        let translation = [transform.translation.to_array().map(|v| v as f32)];
-        let translation = Tensor::<2>::from_floats(translation, &self.device());
-        self.means = times(self.means, &rows) + translation;
+        self.means = affine(self.means, &transform.rotation, transform.translation);
         self
     }
 
@@ -104,6 +100,15 @@ impl Gaussians {
     }
 }
 
+/// Points `[N,3]` times a matrix, plus a translation.
+pub fn affine(points: Tensor<2>, matrix: &DMat3, translation: DVec3) -> Tensor<2> {
+    // Row vectors: (M·p)ᵀ = pᵀ·Mᵀ, and glam's columns are the rows of Mᵀ.
+    let rows = matrix.to_cols_array_2d().map(|column| column.map(|v| v as f32));
+    let translation = [translation.to_array().map(|v| v as f32)];
+    let translation = Tensor::<2>::from_floats(translation, &points.device());
+    times(points, &rows) + translation
+}
+
 /// `x` `[N, K]` times a small constant matrix given by its K rows. As a sum of K scaled rows: a GPU would tune a matrix
 /// product for seconds, and not every backend multiplies matrices without rows.
 fn times<const C: usize>(x: Tensor<2>, rows: &[[f32; C]]) -> Tensor<2> {
@@ -118,7 +123,6 @@ mod tests {
     use super::*;
     use crate::Camera;
     use burn::tensor::TensorData;
-    use glam::{DMat3, DVec3};
 
     fn one(rotation: DQuat, mean: DVec3, device: &Device) -> Gaussians {
         let row = |v: &[f64]| {

@@ -21,7 +21,7 @@ mod vjp;
 
 pub use camera::{Camera, Orbit, RigidTransform};
 pub use error::SplatError;
-pub use gaussians::Gaussians;
+pub use gaussians::{Gaussians, affine};
 pub use op::{Counts, MAX_SIDE};
 pub use options::{MIN_ALPHA, MIN_TRANSMITTANCE, Preset, RenderOptions, TILE};
 pub use render::{Rendered, render};

@@ -77,7 +77,8 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     // The sample pair fills its canvas. Hence its cameras are known, and other views can be compared.
     let photographs = PHOTOGRAPHS.map(|(name, _)| folder.path.join(name));
     let sources = photographs.each_ref().map(|path| Source::file(path));
-    let canvases = photo::load(sources, Cutting::Given, config.network.resolution, Placement::AsIs)?.canvases;
+    let canvases =
+        photo::load(sources, Cutting::Given, config.network.resolution, Placement::AsIs, None)?.canvases;
     let [front, back] = canvases.map(|Canvas { rgb, mask, valid, .. }| Photograph { rgb, mask, valid });
     let precision = PrecisionChoice::Auto.of_weights(&config, &device);
     let reconstructor = Reconstructor::load(&weights, &device)?.in_precision(precision);

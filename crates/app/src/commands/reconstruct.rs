@@ -7,7 +7,7 @@ use burn::tensor::Device;
 use clap::Args;
 use snapsnap_base::config::Schema;
 use snapsnap_base::file;
-use snapsnap_data::photo::{self, Canvas, Cutting, Pair, Placement, Shot, Source};
+use snapsnap_data::photo::{self, Canvas, Cutting, Pair, Placement, Source};
 use snapsnap_mesh::picture;
 use snapsnap_net::config::{Config, WorldFrame};
 use snapsnap_net::precision::{Precision, PrecisionChoice, unit_of_cpu};
@@ -195,8 +195,9 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
         "network" => Cutting::All(&segmenter),
         _ => Cutting::Missing(&segmenter),
     };
-    let Pair { canvases, cutouts, doubts } =
-        photo::load(sources, cutting, config.network.resolution, placement)?;
+    let focal = arguments.camera.focal();
+    let Pair { canvases, cutouts, shots, doubts } =
+        photo::load(sources, cutting, config.network.resolution, placement, focal)?;
     if arguments.strict && !doubts.is_empty() {
         bail!("{} (--strict)", doubts.join("\n"));
     }
@@ -205,8 +206,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     for (path, (rgb, mask)) in saved.iter().flatten().zip(&cutouts) {
         cutouts::save(path, rgb, mask)?;
     }
-    let shots =
-        [0, 1].map(|i| (Shot::of(&sources[i]), cutouts[i].0.dimensions().into(), canvases[i].mapping));
+    let shots = [0, 1].map(|i| (shots[i], cutouts[i].0.dimensions().into(), canvases[i].mapping));
     drop(cutouts);
     let since = Instant::now();
     let device = arguments.model.device(&weights)?;

@@ -12,7 +12,7 @@ use image::codecs::jpeg::JpegEncoder;
 use image::imageops::{self, FilterType};
 use image::{GrayImage, ImageFormat};
 use serde_json::json;
-use snapsnap_data::photo::{self, Canvas, Cutting, Pair, Shot, Source};
+use snapsnap_data::photo::{self, Canvas, Cutting, Pair, Source};
 use snapsnap_mesh::picture;
 use snapsnap_net::{Photograph, Reconstructor};
 use snapsnap_splat::scene::Stored;
@@ -153,10 +153,10 @@ impl Studio<'_> {
         let config = networks.reconstructor.config();
         let cutting = Cutting::Missing(&*networks.segment);
         let sources = [source(0), source(1)];
-        let Pair { canvases, doubts, cutouts } =
-            photo::load(sources, cutting, config.network.resolution, placement(config))?;
-        let shots =
-            [0, 1].map(|i| (Shot::of(&sources[i]), cutouts[i].0.dimensions().into(), canvases[i].mapping));
+        let focal = self.camera.focal();
+        let Pair { canvases, cutouts, shots, doubts } =
+            photo::load(sources, cutting, config.network.resolution, placement(config), focal)?;
+        let shots = [0, 1].map(|i| (shots[i], cutouts[i].0.dimensions().into(), canvases[i].mapping));
         drop(cutouts);
         let [front, back] = canvases.map(|Canvas { rgb, mask, valid, .. }| Photograph { rgb, mask, valid });
         let result = networks.reconstructor.reconstruct(&front, &back, &|step| job.step(step));

@@ -40,12 +40,17 @@ impl Mapping {
     pub fn source(&self, canvas: DVec2) -> DVec2 {
         (canvas - self.origin) / self.scale
     }
+
+    /// The map from the canvas to the photograph.
+    pub(crate) fn inverse(&self) -> Self {
+        Self { scale: 1.0 / self.scale, origin: -self.origin / self.scale }
+    }
 }
 
 /// The box that is placed, and its axis.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Standing {
-    person: Rect,
+    pub person: Rect,
     /// Column that is placed in the middle of the canvas.
     axis: f32,
 }

@@ -29,7 +29,7 @@ fn quarters() -> tempfile::NamedTempFile {
 
 /// The canvas of a photograph that is front and back.
 fn one(path: &Path, placement: Placement) -> Result<Canvas, FileError> {
-    load([Source::file(path); 2], Cutting::Given, SIDE, placement)
+    load([Source::file(path); 2], Cutting::Given, SIDE, placement, None)
         .map(|Pair { canvases: [canvas, _], .. }| canvas)
 }
 

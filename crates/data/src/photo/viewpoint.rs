@@ -3,12 +3,14 @@
 use std::io::{BufReader, Cursor};
 
 use exif::{In, Tag, Value};
-use glam::{DVec2, DVec3};
+use glam::DVec3;
 use snapsnap_base::{file, guarded};
 use snapsnap_splat::{Camera, Orbit};
 
-use super::{Mapping, Source};
+use super::{Mapping, PlaneMap, Source};
 
+/// Focal lengths of lenses, in millimetres of 35 mm film.
+pub const FOCALS: std::ops::RangeInclusive<f64> = 8.0..=1200.0;
 /// Diagonal of a frame of 35 mm film, in millimetres.
 const FILM: f64 = 43.267;
 /// Side of the nominal canvas. Its number does not matter.
@@ -52,7 +54,7 @@ impl Shot {
         let pitch = note
             .filter(|up| (0.8..1.2).contains(&up.length()))
             .map(|up| (-up.z / up.length()).asin().to_degrees());
-        Self { focal: focal.filter(|focal| *focal > 0).map(f64::from), pitch }
+        Self { focal: focal.map(f64::from).filter(|focal| FOCALS.contains(focal)), pitch }
     }
 }
 
@@ -121,30 +123,21 @@ impl Viewpoint {
     /// A map of points from where the nominal camera of the front (`yaw_degrees` 0) or the back (180) sees them to where this one does,
     /// at the same distance ahead of the body's axis. World: y up, the front camera above +z. Points that no camera sees stay.
     pub fn restorer(&self, yaw_degrees: f64) -> impl Fn(DVec3) -> DVec3 + use<> {
-        let (nominal, own) = (Camera::orbit_at_yaw_degrees(yaw_degrees, SIDE), self.camera(yaw_degrees));
-        move |point| {
-            let seen = nominal.project(point);
-            seen.and_then(|(place, _)| on_plane(&own, place, point.z)).unwrap_or(point)
-        }
+        let nominal = Camera::orbit_at_yaw_degrees(yaw_degrees, SIDE);
+        let map = PlaneMap::new(&nominal, &self.camera(yaw_degrees), &Mapping::AS_IT_IS, 1.0);
+        move |point| map.apply(point).unwrap_or(point)
     }
 }
 
-/// Where a pixel's ray meets the plane of this z; `None` behind the camera.
-pub(crate) fn on_plane(camera: &Camera, place: DVec2, z: f64) -> Option<DVec3> {
-    let ray = ((place - camera.principal_point) / camera.focal).extend(1.0);
-    let direction = camera.world_to_camera.rotation.transpose() * ray;
-    let eye = camera.centre();
-    let along = (z - eye.z) / direction.z;
-    (along.is_finite() && along > 0.0).then(|| eye + along * direction)
-}
-
 /// A focal length of 35 mm film in pixels of a picture.
-fn pixels(focal: f64, picture: [u32; 2]) -> f64 {
+pub(super) fn pixels(focal: f64, picture: [u32; 2]) -> f64 {
     focal / FILM * f64::from(picture[0]).hypot(f64::from(picture[1]))
 }
 
 #[cfg(test)]
 mod tests {
+    use glam::DVec2;
+
     use super::*;
 
     /// A telephone's EXIF segment: 26 mm, and Apple's note with this acceleration in thousandths.

@@ -1,14 +1,11 @@
 //! Properties of a user's photographs that a data set's views do not have.
 
-use glam::{DVec2, DVec3};
 use image::{GrayImage, RgbImage};
 use serde::{Deserialize, Serialize};
 
 use super::augment::moved;
-use super::place::{scale_of, shift, upright};
-use crate::photo::{Mapping, Rect};
+use crate::photo::Rect;
 use snapsnap_base::config::outside;
-use snapsnap_splat::{Camera, RigidTransform};
 
 /// Canvas side that lengths refer to.
 const REFERENCE_SIDE: f32 = 1024.0;
@@ -17,8 +14,8 @@ const REFERENCE_SIDE: f32 = 1024.0;
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Handling {
-    /// Height, in pixels of 1024, of people who are placed on their canvas like a user's. The result is moved back into
-    /// the photographs' own cameras' views. 0: photographs are the canvas already.
+    /// Height, in pixels of 1024, of people who are placed on their canvas like a user's. The result is restored into the
+    /// photographs' own cameras' views. 0: photographs are the canvas already.
     pub place: usize,
     /// Difference of exposure, in stops, between the first photograph and the others. Each is changed by half of it.
     pub exposure: f32,
@@ -87,27 +84,6 @@ impl Handling {
             }
         }
         (color, mask)
-    }
-
-    /// Scale and transform from the nominal camera's frame, which is the frame of placed photographs' points, to the
-    /// frame of the `camera` of the first photograph. `mapping` maps that photograph's pixels to the canvas. The scale
-    /// comes from the known camera, since photographs do not show size and distance. The turn makes people upright, as a
-    /// user's are. The shift then moves the canvas's points `[S, S, 3]`, in metres, onto the
-    /// rays of that camera.
-    pub fn back(mapping: &Mapping, camera: &Camera, points: &[f32], valid: &[bool]) -> (f64, RigidTransform) {
-        let side = f64::from(valid.len() as u32).sqrt() as usize;
-        // The canvas may have another size than the photograph.
-        let shrunk = f64::from(camera.width) / side as f64;
-        let scale = scale_of(mapping, camera);
-        let upright = upright(camera).world_to_camera.rotation;
-        let rotation = camera.world_to_camera.rotation * upright.transpose();
-        let seen = valid.iter().enumerate().filter(|(_, valid)| **valid).map(|(pixel, _)| {
-            let canvas = DVec2::new((pixel % side) as f64, (pixel / side) as f64) + 0.5;
-            let ray = (mapping.source(canvas * shrunk) - camera.principal_point) / camera.focal;
-            let point = [0, 1, 2].map(|c| f64::from(points[3 * pixel + c]));
-            (ray, scale * (rotation * DVec3::from(point)))
-        });
-        (scale, RigidTransform { rotation, translation: shift(seen) })
     }
 }
 

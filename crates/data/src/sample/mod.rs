@@ -25,6 +25,7 @@ use crate::photo::{Canvas, on_canvas, place};
 pub use augment::Augment;
 pub use handling::Handling;
 pub use loader::{Batches, Loader};
+pub use rectified::Restoration;
 use snapsnap_base::FileError;
 use snapsnap_base::config::outside;
 use snapsnap_base::random::stream;
@@ -60,9 +61,9 @@ pub struct SampleConfig {
     /// scaled and moved into the nominal cameras' views. Above 0, all photographs of rigs whose distance or focal length varies
     /// are placed.
     pub placed_share: f32,
-    /// Whether people are upright whatever the elevation of their photographs' cameras, which no picture shows. Stage 1 gets rectified
-    /// points: those of nominal cameras that would see the same pixels of an upright person. Points of stage 2 are in the frame of an
-    /// upright front camera.
+    /// Whether people are upright whatever the elevation of their photographs' cameras, which no picture shows. Points are rectified:
+    /// those of nominal cameras that would see the same pixels of an upright person. In stage 2, people are restored before they
+    /// are rendered.
     pub upright: bool,
     /// Height of a placed person in pixels of a canvas of 1024: `mode.person_height`.
     #[serde(skip)]

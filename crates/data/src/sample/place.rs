@@ -6,9 +6,9 @@
 use glam::{DMat3, DVec2, DVec3};
 use rand::Rng;
 use snapsnap_base::FileError;
-use snapsnap_splat::{Camera, Orbit, RigidTransform};
+use snapsnap_splat::{Camera, Orbit};
 
-use super::rectified::Rectification;
+use super::rectified::{Rectification, Restoration};
 use super::{INSIDE, Source, joined};
 use crate::dataset::{StoredView, unproject};
 use crate::photo::Mapping;
@@ -33,20 +33,31 @@ pub(super) struct Four {
     /// The front camera. The points times `scale` are in its frame: it moves with placed points.
     pub front: Camera,
     pub scale: f64,
+    /// What moves upright points back to the photographed person.
+    pub restoration: Option<Restoration>,
+}
+
+impl Four {
+    /// Photographs alone. `front` is the front photograph's camera.
+    pub(super) fn without_points(
+        images: Vec<f32>,
+        masks: Vec<f32>,
+        front: Camera,
+        restoration: Option<Restoration>,
+    ) -> Self {
+        let (front, scale) = restoration.as_ref().map_or((front, 1.0), |back| (back.front, back.scale));
+        let (points, valid, second) = Default::default();
+        Self { images, masks, points, valid, second, front, scale, restoration }
+    }
 }
 
 impl Source {
-    /// The front camera in whose frame a sample's points are.
-    pub(super) fn frame(&self, front: &Camera) -> Camera {
-        if self.config.upright { upright(front) } else { *front }
-    }
-
-    /// Front, back, right and left of a subject. `is_rectified` asks for rectified points where people are upright.
+    /// Front, back, right and left of a subject.
     pub(super) fn four(
         &self,
         subject: &str,
         order: &[usize; 4],
-        [is_placed, is_rectified]: [bool; 2],
+        is_placed: bool,
         random: &mut impl Rng,
     ) -> Result<Four, FileError> {
         let compat = self.config.compat;
@@ -70,7 +81,7 @@ impl Source {
         let seconds = if self.config.second_depth { vec![second(2)?, second(3)?] } else { Vec::new() };
         let photographs =
             self.photographs([0, 1].map(|i| (&views[i].color, &views[i].mask)), is_placed, random);
-        let (mut front, mut scale) = (self.frame(&views[0].camera), 1.0);
+        let (mut front, mut scale, mut restoration) = (views[0].camera, 1.0, None);
         let [mut first, mut second] = <[Points; 2]>::default();
         let add_seen = |to: &mut Points, map: Seen| {
             for seen in map {
@@ -78,9 +89,10 @@ impl Source {
                 to.1.push(f32::from(u8::from(seen.is_some())));
             }
         };
-        if is_rectified && self.config.upright {
-            let [a, b] = [0, 1].map(|i| (&views[i].camera, photographs[i].mapping));
-            let rectification = Rectification::new([a.0, b.0], [a.1, b.1]);
+        if self.config.upright {
+            let (rectification, back) =
+                Rectification::new([0, 1].map(|i| &views[i].camera), [0, 1].map(|i| &photographs[i].mapping));
+            (front, scale, restoration) = (back.front, back.scale, Some(back));
             (0..2).for_each(|i| add_seen(&mut first, rectification.photographed(&views[i], i)));
             for (to, sides) in [(&mut first, &views[2..]), (&mut second, &seconds)] {
                 let side = |(view, degrees)| rectification.of_side(view, degrees);
@@ -113,7 +125,7 @@ impl Source {
         }
         let (images, masks) = joined(photographs);
         let (points, valid) = first;
-        Ok(Four { images, masks, points, valid, second, front, scale })
+        Ok(Four { images, masks, points, valid, second, front, scale, restoration })
     }
 }
 
@@ -178,16 +190,6 @@ impl StoredView {
 /// Centres of a square picture's pixels, row by row.
 pub(super) fn centres(side: u32) -> impl Iterator<Item = DVec2> {
     (0..side).flat_map(move |row| (0..side).map(move |column| DVec2::new(column.into(), row.into()) + 0.5))
-}
-
-/// The camera turned about the body's middle until it looks down by the nominal angle, without roll.
-pub(super) fn upright(camera: &Camera) -> Camera {
-    let nominal = Orbit::default();
-    let backward = -camera.world_to_camera.rotation.row(2);
-    let yaw_degrees = backward.x.atan2(backward.z).to_degrees();
-    let rotation = Orbit { yaw_degrees, ..nominal }.camera(camera.width).world_to_camera.rotation;
-    let translation = camera.world_to_camera.apply(nominal.centre) - rotation * nominal.centre;
-    Camera { world_to_camera: RigidTransform { rotation, translation }, ..*camera }
 }
 
 /// Scale of a camera's points relative to a nominal camera's, if `mapping` maps its photograph to the canvas. It is the

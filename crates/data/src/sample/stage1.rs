@@ -84,7 +84,7 @@ impl Stage1Item {
         let side = source.folder.description().resolution as usize;
         let is_placed = source.is_placed(&mut random);
         let Four { images, masks, points, valid, second, .. } =
-            source.four(subject, &order, [is_placed, true], &mut random)?;
+            source.four(subject, &order, is_placed, &mut random)?;
         let (second_points, second_valid) = second;
         let name = format!("{}: {subject}, view {first}", source.folder.root().display());
         let mut item = Self { name, side, images, masks, points, valid, second_points, second_valid };

@@ -6,7 +6,7 @@ use rand::Rng;
 use snapsnap_splat::Camera;
 
 use super::place::Four;
-use super::{SampleConfig, Source, Stage, joined};
+use super::{Restoration, SampleConfig, Source, Stage, joined};
 use crate::dataset::{Folder, Layout, Split};
 use snapsnap_base::FileError;
 
@@ -25,11 +25,14 @@ pub struct Stage2Item {
     pub images: Vec<f32>,
     /// `[2,H,W]` share of the person in the input masks; with `compat` 1 or 0.
     pub masks: Vec<f32>,
-    /// Cameras of front, back, right and left, side H. The front camera of a placed sample is moved with its points.
+    /// Cameras of front, back, right and left, side H. The front camera of a placed or upright sample is moved with its points.
     pub cameras: [Camera; 4],
-    /// Scale of a placed sample: the person's size in metres over the size of the points.
+    /// Scale of a placed or upright sample: the person's size in metres over the size of the points.
     pub scale: f64,
-    /// `[4,H,W,3]` points of these views, in metres in the front camera's frame; empty without `points` of the config.
+    /// Moves upright people to where the photographs' cameras saw them, before they are scaled.
+    pub restoration: Option<Restoration>,
+    /// `[4,H,W,3]` points of these views, in metres in the front camera's frame; rectified if people are upright; empty without
+    /// `points` of the config.
     pub points: Vec<f32>,
     /// `[4,H,W]` 1 for pixels that have a point, 0 for others; empty like `points`.
     pub valid: Vec<f32>,
@@ -89,17 +92,21 @@ impl Stage2Item {
             target_cameras.push(source.camera(&stored));
         }
         let is_placed = source.is_placed(&mut random);
-        let four = if config.points || is_placed {
-            source.four(subject, &order, [is_placed, false], &mut random)?
+        // Without upright people, a placed front camera depends on the points.
+        let needs_points = config.points || is_placed && !config.upright;
+        let four = if needs_points {
+            source.four(subject, &order, is_placed, &mut random)?
         } else {
             let picture = |view: usize| folder.picture(*split, subject, view, false);
             let pictures = [picture(front)?, picture(back)?];
             let pictures = pictures.each_ref().map(|(color, mask)| (color, mask));
-            let (images, masks) = joined(source.photographs(pictures, false, &mut random));
-            let (points, valid, second) = Default::default();
-            Four { images, masks, points, valid, second, front: source.frame(&cameras[0]), scale: 1.0 }
+            let photographs = source.photographs(pictures, is_placed, &mut random);
+            let mappings = [0, 1].map(|i| &photographs[i].mapping);
+            let restoration = config.upright.then(|| Restoration::new([&cameras[0], &cameras[1]], mappings));
+            let (images, masks) = joined(photographs);
+            Four::without_points(images, masks, cameras[0], restoration)
         };
-        let Four { images, masks, points, valid, front, scale, .. } = four;
+        let Four { images, masks, points, valid, front, scale, restoration, .. } = four;
         cameras[0] = front;
         let (points, valid) = if config.points { (points, valid) } else { Default::default() };
         Ok(Self {
@@ -109,6 +116,7 @@ impl Stage2Item {
             masks,
             cameras,
             scale,
+            restoration,
             points,
             valid,
             target_side: target_side as usize,

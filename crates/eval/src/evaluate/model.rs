@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use snapsnap_data::photo::Mapping;
-use snapsnap_data::sample::{Handling, TestItem};
+use snapsnap_data::sample::{Handling, Restoration, TestItem};
 use snapsnap_net::config::PrecisionChoice;
 use snapsnap_net::gaussians::placed;
 use snapsnap_net::weights::{WeightFile, WeightsError};
@@ -86,17 +86,24 @@ impl Model {
         let (mut modules, mut plan) = (Vec::<(&'static str, Duration)>::new(), Vec::new());
         for first in 0..count {
             let pair = [&photographs[first], &photographs[(first + 1) % inputs.len()]];
-            let made = self.reconstructor.reconstruct(pair[0], pair[1], &|_| ());
+            let mut made = self.reconstructor.reconstruct(pair[0], pair[1], &|_| ());
             let camera = &item.cameras[inputs[first]];
             let mut to_world = camera.world_to_camera.inverse();
-            let mut gaussians = self.thinned(&made, side);
+            let mut scale = 1.0;
             let is_placed = item.mappings[first] != Mapping::AS_IT_IS;
             if is_placed {
-                let points = host(made.maps.points.clone().narrow(0, 0, 1));
-                let (scale, back) = Handling::back(&item.mappings[first], camera, &points, &made.valid[0]);
-                gaussians = gaussians.scaled(scale);
-                to_world = back.then(&to_world);
+                // The second of more than two photographs is a neighbour, and shows no back.
+                let opposite = camera.turned(180.0);
+                let second = if count == 1 {
+                    (&item.cameras[inputs[1]], &item.mappings[1])
+                } else {
+                    (&opposite, &item.mappings[first])
+                };
+                let restoration = Restoration::new([camera, second.0], [&item.mappings[first], second.1]);
+                made.gaussians = restoration.person(made.gaussians.clone(), made.photographed());
+                (scale, to_world) = (restoration.scale, restoration.front.world_to_camera.inverse());
             }
+            let gaussians = self.thinned(&made, side).scaled(scale);
             parts.push(placed(self.reconstructor.config(), gaussians, &to_world));
             lost += made.lost;
             for (name, time) in &made.times {

@@ -109,9 +109,21 @@ pub(super) fn gaussians(
     if parts.is_empty() {
         return None;
     }
-    let (gaussians, _) = assemble(config, parts, device);
+    let (gaussians, lost) = assemble(config, parts, device);
     let to_world = item.cameras[View::Front as usize].world_to_camera.inverse();
-    (!gaussians.is_empty()).then(|| placed(config, gaussians.scaled(item.scale), &to_world))
+    if gaussians.is_empty() {
+        return None;
+    }
+    let person = match &item.restoration {
+        Some(restoration) => {
+            // Lost Gaussians leave open whose pixels the others are.
+            let is_known = lost == 0 && phase.views.start == 0;
+            let count = |view: usize| valid[view].iter().filter(|valid| is_known && **valid).count();
+            restoration.person(gaussians, [count(0), count(1)])
+        }
+        None => gaussians,
+    };
+    Some(placed(config, person.scaled(item.scale), &to_world))
 }
 
 /// Target pictures `[V,3,h,w]` and masks `[V,h,w]` of the views with these indices.
