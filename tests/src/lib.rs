@@ -121,7 +121,12 @@ pub fn snapsnap() -> Command {
             "snapsnap",
             "--target-dir",
         ]);
-        assert!(build.arg(target).status().expect("cargo starts").success(), "the program builds");
+        build.arg(target);
+        // Those of the tests' own build.
+        if let Some(features) = std::env::var_os("SNAPSNAP_FEATURES") {
+            build.arg("--features").arg(features);
+        }
+        assert!(build.status().expect("cargo starts").success(), "the program builds");
         release.join("snapsnap").with_extension(std::env::consts::EXE_EXTENSION)
     });
     let mut command = Command::new(program);

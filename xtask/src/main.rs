@@ -1,6 +1,8 @@
 //! `cargo xtask …`: tests, lints, and the program's own commands, on the one release build.
 
 use std::env;
+use std::fs;
+use std::path::{Path, PathBuf};
 use std::process::{Command, ExitCode};
 
 mod bundle;
@@ -50,25 +52,61 @@ fn main() -> ExitCode {
     if done { ExitCode::SUCCESS } else { ExitCode::FAILURE }
 }
 
+/// The feature for MPI, if this machine can build it: that takes `mpicc` and libclang.
+fn features() -> Option<&'static str> {
+    let mpicc = Command::new("mpicc").arg("-show").output().is_ok_and(|output| output.status.success());
+    let missing = match (mpicc, has_libclang()) {
+        (true, true) => return Some("mpi"),
+        (false, _) => "mpicc",
+        (_, false) => "libclang",
+    };
+    let packages = "libopenmpi-dev openmpi-bin libclang-dev";
+    println!("== without MPI: there is no {missing} (Debian: apt-get install {packages})");
+    None
+}
+
+fn has_libclang() -> bool {
+    let entries = |folder: &Path| {
+        let entries = fs::read_dir(folder).into_iter().flatten().flatten();
+        entries.map(|entry| entry.path()).collect::<Vec<_>>()
+    };
+    let below = entries(Path::new("/usr/lib")).into_iter().flat_map(|folder| [folder.join("lib"), folder]);
+    let mut folders = below.chain(["/usr/lib".into(), "/usr/lib64".into()]);
+    let is_it =
+        |path: &PathBuf| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with("libclang"));
+    env::var_os("LIBCLANG_PATH").is_some() || folders.any(|folder| entries(&folder).iter().any(is_it))
+}
+
 fn test(filter: &[String]) -> bool {
-    let all = ["test", "--release", "--workspace", "--no-fail-fast"];
+    let mut all = vec!["test", "--release", "--workspace", "--no-fail-fast"];
+    let features = features();
+    all.extend(features.map(|_| "--features=snapsnap/mpi"));
     let numerical = ["--test", "numerical"];
     let filter = || ["--"].into_iter().chain(filter.iter().map(String::as_str));
     // Output is shown so that skipped tests are seen with their reasons.
     let show = ["--show-output"];
-    let mut passed = succeeds("flex", cargo(&all).args(filter()).args(show));
+    // The tests build the program.
+    let environment = || features.map(|features| ("SNAPSNAP_FEATURES", features));
+    let mut passed = succeeds("flex", cargo(&all).args(filter()).args(show).envs(environment()));
     for device in FURTHER_DEVICES {
         let mut command = cargo(&all);
         passed &= succeeds(
             device,
-            command.args(numerical).args(filter()).args(show).env("SNAPSNAP_TEST_DEVICE", device),
+            command
+                .args(numerical)
+                .args(filter())
+                .args(show)
+                .envs(environment())
+                .env("SNAPSNAP_TEST_DEVICE", device),
         );
     }
     passed
 }
 
 fn lint() -> bool {
-    let clippy = ["clippy", "--release", "--workspace", "--all-targets", "--", "-D", "warnings"];
+    let mut clippy = vec!["clippy", "--release", "--workspace", "--all-targets"];
+    clippy.extend(features().map(|_| "--features=snapsnap/mpi"));
+    clippy.extend(["--", "-D", "warnings"]);
     let doc = ["doc", "--release", "--workspace", "--no-deps", "--document-private-items"];
     succeeds("format", &mut cargo(&["fmt", "--all", "--check"]))
         & succeeds("clippy", &mut cargo(&clippy))

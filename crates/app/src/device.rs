@@ -49,6 +49,25 @@ pub fn choose(name: &str) -> Result<Device, Failure> {
     }
 }
 
+/// The device called `name` for the process number `turn` of several on this machine: without an index, they take the cards in turn.
+///
+/// # Errors
+/// As [`choose`].
+pub fn choose_in_turn(name: &str, turn: usize) -> Result<Device, Failure> {
+    let device = choose(name)?;
+    if memory::is_cpu(&device) || name.contains(':') {
+        return Ok(device);
+    }
+    let cards: Vec<&Adapter> = adapters().iter().filter(|adapter| adapter.is_card).collect();
+    let of_kind =
+        |card: &&&Adapter| if name == "auto" { card.kind == cards[0].kind } else { card.kind == name };
+    let cards: Vec<&Adapter> = cards.iter().filter(of_kind).copied().collect();
+    match cards.get(turn % cards.len().max(1)) {
+        Some(card) => choose(&card.device()),
+        None => Ok(device),
+    }
+}
+
 /// Lists the adapters on another thread if [`choose`] will need them for `name`; it takes a tenth of a second.
 pub fn begin_search(name: &str) {
     if name == "auto" {

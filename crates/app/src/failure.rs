@@ -3,7 +3,6 @@
 use std::fmt;
 use std::io;
 use std::path::Path;
-use std::process::ExitCode;
 
 use snapsnap_base::FileError;
 use snapsnap_base::config::ConfigError;
@@ -49,10 +48,11 @@ impl Failure {
         }
     }
 
-    pub fn exit_code(&self) -> ExitCode {
+    /// The program's exit code.
+    pub fn code(&self) -> u8 {
         match self {
-            Self::Input(_) => ExitCode::from(2),
-            Self::Internal(_) => ExitCode::FAILURE,
+            Self::Input(_) => 2,
+            Self::Internal(_) => 1,
         }
     }
 }

@@ -1,23 +1,29 @@
-//! Ctrl-C. Most commands end at once, without temporary files. A training saves its state first.
+//! Ctrl-C and termination signals. Most commands end at once, without temporary files. A training saves its state first.
 
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, LazyLock};
 
 use snapsnap_base::file;
 
 use crate::say;
 
-/// Whether the command ends itself after the first Ctrl-C.
+/// Whether the command ends itself after the first signal.
 static PATIENT: AtomicBool = AtomicBool::new(false);
+/// Whether there was a signal.
+static SIGNALLED: AtomicBool = AtomicBool::new(false);
 /// Whether the command must end itself.
-static STOP: AtomicBool = AtomicBool::new(false);
+static STOP: LazyLock<Arc<AtomicBool>> = LazyLock::new(Arc::default);
+/// Whether that is because of SIGTERM or SIGUSR1.
+static TERMINATED: LazyLock<Arc<AtomicBool>> = LazyLock::new(Arc::default);
 /// Whether Ctrl-C is the normal end of the command.
 static WELL: AtomicBool = AtomicBool::new(false);
 
 /// Installs the handler of Ctrl-C and of termination signals.
 pub fn listen() {
     let handler = ctrlc::set_handler(|| {
-        if PATIENT.load(Ordering::Relaxed) && !STOP.swap(true, Ordering::Relaxed) {
-            say::err("stopping after this step; once more ends it at once");
+        if PATIENT.load(Ordering::Relaxed) && !SIGNALLED.swap(true, Ordering::Relaxed) {
+            STOP.store(true, Ordering::Relaxed);
+            say::note("stopping after this step; once more ends it at once");
             return;
         }
         file::remove_unfinished();
@@ -29,10 +35,26 @@ pub fn listen() {
     }
 }
 
-/// From now on the first Ctrl-C sets the returned flag instead of ending the program.
+/// From now on the first signal sets the returned flag instead of ending the program. SIGUSR1 is such a signal as well: batch systems
+/// can send it before a job's time is over.
 pub fn patiently() -> &'static AtomicBool {
     PATIENT.store(true, Ordering::Relaxed);
+    #[cfg(unix)]
+    for signal in [signal_hook::consts::SIGTERM, signal_hook::consts::SIGUSR1] {
+        for flag in [&TERMINATED, &STOP] {
+            if let Err(e) = signal_hook::flag::register(signal, Arc::clone(flag)) {
+                say::err(&format!(
+                    "warning: signal {signal} will end the training without a checkpoint: {e}"
+                ));
+            }
+        }
+    }
     &STOP
+}
+
+/// Whether SIGTERM or SIGUSR1 came.
+pub fn was_terminated() -> bool {
+    TERMINATED.load(Ordering::Relaxed)
 }
 
 /// From now on Ctrl-C ends the program with exit code 0.

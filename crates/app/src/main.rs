@@ -201,8 +201,8 @@ fn main() -> ExitCode {
         Command::Mesh(arguments) => commands::mesh::run(&arguments),
         Command::Convert(arguments) => commands::convert::run(&arguments),
         Command::Prepare(arguments) => commands::prepare::run(&arguments),
-        Command::TrainStage1(arguments) => commands::train::stage1(&arguments),
-        Command::TrainStage2(arguments) => commands::train::stage2(&arguments),
+        Command::TrainStage1(arguments) => return ended_with(commands::train::stage1(&arguments)),
+        Command::TrainStage2(arguments) => return ended_with(commands::train::stage2(&arguments)),
         Command::Evaluate(arguments) => commands::evaluate::run(&arguments),
         Command::Bench(arguments) => commands::bench::run(&arguments),
         Command::Stability(arguments) => commands::stability::run(&arguments),
@@ -248,11 +248,12 @@ fn check_threads() -> Result<(), failure::Failure> {
 }
 
 fn ended(result: Result<(), failure::Failure>) -> ExitCode {
-    match result {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(failure) => {
-            say::err(&format!("error: {failure}"));
-            failure.exit_code()
-        }
-    }
+    ended_with(result.map(|()| ExitCode::SUCCESS))
+}
+
+fn ended_with(result: Result<ExitCode, failure::Failure>) -> ExitCode {
+    result.unwrap_or_else(|failure| {
+        say::err(&format!("error: {failure}"));
+        ExitCode::from(failure.code())
+    })
 }

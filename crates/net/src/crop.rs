@@ -4,6 +4,7 @@ use std::fmt;
 use std::ops::Range;
 
 use burn::tensor::Tensor;
+use serde::{Deserialize, Serialize};
 
 use crate::config::Config;
 
@@ -11,7 +12,7 @@ use crate::config::Config;
 const ALIGNMENT: usize = 4;
 
 /// Rows and columns of a square canvas.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Window {
     /// Rows.
     pub rows: Range<usize>,
@@ -40,10 +41,16 @@ impl Window {
         found
     }
 
-    /// Part of the canvas that the point predictor receives: the whole canvas, or the window of the persons in the masks.
-    pub fn of_predictor<'a>(config: &Config, masks: impl Iterator<Item = &'a [bool]>) -> Self {
+    /// The smallest window that contains both.
+    pub fn united(&self, other: &Self) -> Self {
+        let both = |a: &Range<usize>, b: &Range<usize>| a.start.min(b.start)..a.end.max(b.end);
+        Self { rows: both(&self.rows, &other.rows), columns: both(&self.columns, &other.columns) }
+    }
+
+    /// Part of the canvas that the point predictor receives: the whole canvas, or the window around the box `person`.
+    pub fn of_predictor(config: &Config, person: Option<Self>) -> Self {
         let side = config.network.resolution;
-        let person = if config.network.window { Self::around(masks, side) } else { None };
+        let person = person.filter(|_| config.network.window);
         let cell = config.network.patch * config.upsample_factor();
         let window = person.map_or_else(|| Self::whole(side), |person| person.in_cells(cell, side));
         if config.network.mirror || config.network.both_ways { window.symmetric(side) } else { window }

@@ -275,7 +275,10 @@ impl Run<'_> {
     fn predictor_window(&self, photos: [&Photograph; 2]) -> Window {
         let config = &self.model.config;
         let masks = photos.map(|photo| photo.mask.iter().map(|m| *m > 0.0).collect::<Vec<_>>());
-        Window::of_predictor(config, masks.iter().map(Vec::as_slice))
+        Window::of_predictor(
+            config,
+            Window::around(masks.iter().map(Vec::as_slice), config.network.resolution),
+        )
     }
 
     /// Gaussians of all valid pixels, view after view.

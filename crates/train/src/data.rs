@@ -4,12 +4,15 @@ use std::sync::Arc;
 
 use burn::data::dataset::Dataset;
 use burn::data::dataset::transform::ComposedDataset;
+use serde::Serialize;
+use serde::de::DeserializeOwned;
 use snapsnap_base::FileError;
 use snapsnap_data::dataset::{Folder, Split};
 use snapsnap_data::sample::{Augment, SampleConfig, Stage};
 
 use crate::TrainError;
 use crate::config::{TrainConfig, ValidationSplit};
+use crate::ranks::Ranks;
 
 /// The samples of a training and of its validations, from all data sets.
 pub struct Data<I> {
@@ -68,10 +71,33 @@ impl<I: Clone + Send + Sync + 'static> Data<I> {
         ComposedDataset::new(self.training.iter().map(|set| set.with_epoch(pass)).collect())
     }
 
+    /// Sums over all samples of the validation, of which each rank adds its share: one sum per rank, on all ranks. If a sample of
+    /// any rank fails, all ranks get its error.
+    pub(crate) fn validated<S: Default + Serialize + DeserializeOwned>(
+        &self,
+        ranks: &Ranks,
+        mut add: impl FnMut(&mut S, I) -> Result<(), TrainError>,
+    ) -> Result<Vec<S>, TrainError> {
+        let mut sum = S::default();
+        let mut share = ranks.share(self.count);
+        let failed = share.try_for_each(|place| add(&mut sum, self.validated_item(place, self.count)?)).err();
+        let failures = ranks.gather(&failed.as_ref().map(ToString::to_string));
+        match (failed, failures.into_iter().flatten().next()) {
+            (Some(own), _) => Err(own),
+            (None, Some(other)) => Err(TrainError::Unsuitable(other)),
+            (None, None) => Ok(ranks.gather(&sum)),
+        }
+    }
+
     /// At most `count` samples of the validation, spread over all data sets.
     pub(crate) fn validation(&self, count: usize) -> impl Iterator<Item = Result<I, TrainError>> {
-        let (len, count) = (self.validation.len(), count.min(self.count));
-        let get = move |i| self.validation.get(i * len / count);
-        (0..count).map(move |i| get(i).map_err(|e| TrainError::Unsuitable(e.to_string())))
+        let count = count.min(self.count);
+        (0..count).map(move |place| self.validated_item(place, count))
+    }
+
+    /// One of `count` samples that are spread over all data sets.
+    fn validated_item(&self, place: usize, count: usize) -> Result<I, TrainError> {
+        let item = self.validation.get(place * self.validation.len() / count);
+        item.map_err(|e| TrainError::Unsuitable(e.to_string()))
     }
 }

@@ -1,11 +1,14 @@
 //! The gradients of a step, their common norm, and its limit.
 
+use std::collections::BTreeMap;
+
 use burn::module::Param;
-use burn::tensor::{Gradients, Tensor};
+use burn::tensor::{Device, Gradients, Tensor};
 use snapsnap_net::weights::{NamedVisitor, Path};
 use snapsnap_ops::host;
 
-use crate::networks::{Networks, Rows};
+use crate::networks::{Networks, Rows, row};
+use crate::ranks::Ranks;
 
 /// The gradients of all parameters that have one.
 pub fn collect(networks: &Networks, gradients: &mut Gradients) -> Rows {
@@ -34,6 +37,43 @@ pub fn add(sum: &mut Rows, gradients: Rows) {
         };
         sum.insert(name, total);
     }
+}
+
+/// Sums of all ranks' gradients, where a rank may lack some. The ranks have the same networks, with parameters of these lengths.
+pub fn reduce(
+    ranks: &Ranks,
+    mut gradients: Rows,
+    lengths: &BTreeMap<String, usize>,
+    device: &Device,
+) -> Rows {
+    /// Values that are summed at once.
+    const BUCKET: usize = 1 << 22;
+    if ranks.size() == 1 {
+        return gradients;
+    }
+    let present: Vec<bool> = lengths.keys().map(|name| gradients.contains_key(name)).collect();
+    let everywhere = ranks.gather(&present);
+    let is_present = |place: usize| everywhere.iter().any(|present| present[place]);
+    let mut sums = Rows::new();
+    let (mut bucket, mut inside) = (Vec::new(), Vec::new());
+    for (place, (name, length)) in lengths.iter().enumerate() {
+        if is_present(place) {
+            let values = gradients.remove(name).map_or_else(|| vec![0.0; *length], host);
+            bucket.extend(values);
+            inside.push((name, *length));
+        }
+        if !inside.is_empty() && (bucket.len() >= BUCKET || place + 1 == lengths.len()) {
+            ranks.sum(&mut bucket);
+            let mut rest = &bucket[..];
+            for (name, length) in inside.drain(..) {
+                let (values, others) = rest.split_at(length);
+                sums.insert(name.clone(), row(values.to_vec(), device));
+                rest = others;
+            }
+            bucket.clear();
+        }
+    }
+    sums
 }
 
 /// The Euclidean norm of all gradients together. It is not finite if a gradient is not.

@@ -1,21 +1,21 @@
 //! Steps of a training: samples → loss → gradients → weights. This module writes no files.
 
 use std::collections::BTreeMap;
-use std::panic::resume_unwind;
-use std::thread;
 
 use burn::data::dataset::Dataset;
-use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
 use snapsnap_data::sample::{Batches, Loader};
 use snapsnap_ops::host;
 
 use crate::config::TrainConfig;
 use crate::ema::Average;
+use crate::identity::Identity;
 use crate::networks::{Networks, Rows};
 use crate::optimizer::Optimizer;
 use crate::precision::{LossScale, Precision, lower};
+use crate::ranks::Ranks;
 use crate::task::{Moment, Task};
 use crate::{TrainError, gradients};
 
@@ -50,8 +50,11 @@ pub(crate) struct Learner<'a, T: Task> {
     pub average: Option<Average>,
     pub optimizer: Optimizer,
     pub progress: Progress,
-    /// Training devices, with gradients.
-    devices: &'a [Device],
+    pub ranks: &'a Ranks,
+    /// With gradients.
+    device: &'a Device,
+    /// Numbers of values of all parameters.
+    lengths: BTreeMap<String, usize>,
     samples: Samples<'a, T>,
 }
 
@@ -59,17 +62,26 @@ pub(crate) struct Learner<'a, T: Task> {
 pub(crate) type Skipped = String;
 
 impl<'a, T: Task> Learner<'a, T> {
-    /// The beginning of a run. `networks` are on the first device.
-    pub fn new(task: &'a T, config: &'a TrainConfig, networks: Networks, devices: &'a [Device]) -> Self {
+    /// The beginning of a run. `networks` are on `device`, which has gradients.
+    pub fn new(
+        task: &'a T,
+        config: &'a TrainConfig,
+        networks: Networks,
+        device: &'a Device,
+        ranks: &'a Ranks,
+    ) -> Self {
         let share = config.training.ema_decay;
+        let lengths = networks.shapes().into_iter().map(|(name, shape)| (name, shape.iter().product()));
         Self {
             task,
             config,
             average: (share > 0.0).then(|| Average::new(share, networks.rows())),
             optimizer: config.optimizer.init(),
+            lengths: lengths.collect(),
             networks,
             progress: Progress { stage: T::STAGE, ..Progress::default() },
-            devices,
+            ranks,
+            device,
             samples: Samples::new(task, config),
         }
     }
@@ -81,6 +93,27 @@ impl<'a, T: Task> Learner<'a, T> {
             Some(average) => networks.with_rows(&average.rows),
             None => networks,
         }
+    }
+
+    /// Whether all ranks train the same networks on the same data.
+    ///
+    /// # Errors
+    /// [`TrainError::Unsuitable`] if not.
+    pub fn compare(&self, identity: &Identity) -> Result<(), TrainError> {
+        if self.ranks.size() == 1 {
+            return Ok(());
+        }
+        let mut hash = Sha256::new();
+        for values in self.networks.checkpoint().values() {
+            values.iter().for_each(|value| hash.update(value.to_le_bytes()));
+        }
+        let own = (identity.clone(), format!("{:x}", hash.finalize()), self.ranks.host().to_owned());
+        let all = self.ranks.gather(&own);
+        let other = all.iter().enumerate().find(|(_, other)| (&other.0, &other.1) != (&all[0].0, &all[0].1));
+        let Some((rank, (there, _, host))) = other else { return Ok(()) };
+        let why = all[0].0.refusal(there, false).unwrap_or_else(|| "other weights".to_owned());
+        let message = format!("rank {rank} on {host} does not have what rank 0 on {} has: {why}", all[0].2);
+        Err(TrainError::Unsuitable(message))
     }
 
     /// Makes one step. Returns its values for the log, or the reason why it was skipped. A skipped step counts as well.
@@ -106,40 +139,57 @@ impl<'a, T: Task> Learner<'a, T> {
         *scale = (self.config.precision() == Precision::F16).then(|| scale.unwrap_or_default());
         let scale = scale.map_or(1.0, |scale| scale.factor);
         let (mut sum, mut values) = (Rows::new(), BTreeMap::<String, f64>::new());
-        let mut all: Vec<String> = Vec::new();
-        let skipped = |why: &str, all: &[String]| Ok(Err(format!("{why} (samples: {})", all.join("; "))));
+        let mut names: Vec<String> = Vec::new();
         for batch in 0..t.accumulate {
-            let items = match self.samples.get(step * t.accumulate as u64 + batch as u64) {
-                Ok(items) => items,
+            let Loaded { items, first, count } = match self.load(step * t.accumulate as u64 + batch as u64) {
+                Ok(loaded) => loaded,
                 // The reason names the damaged file.
                 Err(why) => return Ok(Err(why)),
             };
-            all.extend(items.iter().map(|item| T::name(item).to_owned()));
-            let at = Moment { step, batch: batch as u64, device_index: 0 };
-            let how = How { precision: self.config.precision(), scale, share: 1.0 / t.accumulate as f64 };
-            let made = match on_devices(self.task, &self.networks, self.devices, items, at, how) {
+            let share = items.len() as f64 / (count * t.accumulate) as f64;
+            names.extend(items.iter().map(|item| T::name(item).to_owned()));
+            // The whole batch decides on the window.
+            let extents = self.ranks.gather(&self.task.extent(&items)).into_iter().flatten();
+            let extent = extents.reduce(|all, extent| all.united(&extent));
+            let at = Moment { step, batch: batch as u64, first, extent };
+            let made = match self.losses(items, at, How { precision: self.config.precision(), scale, share })
+            {
                 // A scene that the rasteriser refuses costs the sample, not the run.
-                Err(TrainError::Splat(e)) => return skipped(&e.to_string(), &all),
-                made => made?,
+                Err(TrainError::Splat(e)) => Err(e.to_string()),
+                made => match made? {
+                    Made { gradients: None, .. } => Err("the loss is not finite".to_owned()),
+                    Made { values, gradients: Some(gradients) } => {
+                        gradients::add(&mut sum, gradients);
+                        Ok(values
+                            .into_iter()
+                            .map(|(name, value)| (name.to_owned(), value.to_bits()))
+                            .collect())
+                    }
+                },
             };
-            if made.values.is_empty() {
-                return skipped("no pixel is part of a person, as the point predictor sees it", &all);
+            let made: Result<BTreeMap<String, u64>, Skipped> = made.map_err(|why| of_samples(&why, &names));
+            let everywhere = self.ranks.gather(&made);
+            let everywhere = match everywhere.into_iter().collect::<Result<Vec<_>, Skipped>>() {
+                Ok(everywhere) => everywhere,
+                Err(why) => return Ok(Err(why)),
+            };
+            if everywhere.iter().all(BTreeMap::is_empty) {
+                return Ok(Err(
+                    self.everywhere("no pixel is part of a person, as the point predictor sees it", names)
+                ));
             }
-            for (name, value) in &made.values {
-                *values.entry((*name).to_owned()).or_default() += value;
-            }
-            match made.gradients {
-                Some(gradients) => gradients::add(&mut sum, gradients),
-                None => return skipped("the loss is not finite", &all),
+            for (name, bits) in everywhere.into_iter().flatten() {
+                *values.entry(name).or_default() += f64::from_bits(bits);
             }
         }
+        let sum = gradients::reduce(self.ranks, sum, &self.lengths, &self.device.clone().inner());
         let norm = gradients::norm(&sum);
         let clipped = gradients::clip_factor(norm, t.clip);
         if let Some(scale) = &mut self.progress.loss_scale {
             scale.update(clipped.is_some());
         }
         let Some(factor) = clipped else {
-            return skipped("a gradient is not finite", &all);
+            return Ok(Err(self.everywhere("a gradient is not finite", names)));
         };
         let share = self.config.schedule.share(step as usize, t.steps);
         let networks = std::mem::take(&mut self.networks);
@@ -151,6 +201,60 @@ impl<'a, T: Task> Learner<'a, T> {
         values.insert("norm".to_owned(), norm);
         Ok(Ok(values))
     }
+
+    /// A reason that concerns the samples of all ranks. `names` are those of this one.
+    fn everywhere(&self, why: &str, names: Vec<String>) -> Skipped {
+        of_samples(why, &self.ranks.gather(&names).concat())
+    }
+
+    /// Losses and gradients of a part of a batch, times its share.
+    fn losses(
+        &self,
+        items: Vec<T::Item>,
+        at: Moment,
+        How { precision, scale, share }: How,
+    ) -> Result<Made, TrainError> {
+        let nothing = Made { values: BTreeMap::new(), gradients: Some(Rows::new()) };
+        // There may be more ranks than samples in the last batch of a pass.
+        if items.is_empty() {
+            return Ok(nothing);
+        }
+        let parts = self.task.losses(&lower(precision, &self.networks), items, at)?;
+        if parts.is_empty() {
+            return Ok(nothing);
+        }
+        let read = host(Tensor::cat(parts.iter().map(|part| part.value.clone()).collect(), 0));
+        let (mut values, mut total) = (BTreeMap::new(), 0.0);
+        for (part, value) in parts.iter().zip(read) {
+            values.insert(part.name, share * f64::from(value));
+            total += part.weight * f64::from(value);
+        }
+        values.insert("loss", share * total);
+        if !total.is_finite() {
+            return Ok(Made { values, gradients: None });
+        }
+        let weighted = parts.into_iter().map(|part| part.value * (part.weight * share * scale)).collect();
+        let mut tracked = Tensor::cat(weighted, 0).sum().backward();
+        let mut rows = gradients::collect(&self.networks, &mut tracked);
+        if scale != 1.0 {
+            rows.values_mut().for_each(|row| *row = row.clone() / scale);
+        }
+        Ok(Made { values, gradients: Some(rows) })
+    }
+
+    /// This rank's part of a batch, by the batch's number since the beginning of the run; or the reason why a part of it cannot be loaded.
+    fn load(&mut self, number: u64) -> Result<Loaded<T::Item>, Skipped> {
+        let loaded = self.samples.get(number, self.ranks);
+        let reasons = self.ranks.gather(&loaded.as_ref().err().cloned());
+        match reasons.into_iter().flatten().next() {
+            Some(why) => Err(why),
+            None => loaded,
+        }
+    }
+}
+
+fn of_samples(why: &str, names: &[String]) -> Skipped {
+    format!("{why} (samples: {})", names.join("; "))
 }
 
 /// Result of a batch: the loss and its parts by name, none if no sample shows a person; and the gradients, unless a
@@ -170,116 +274,48 @@ struct How {
     share: f64,
 }
 
-/// Loss and gradients of a batch, times its share. Several devices compute equal parts of the batch at once, and the
-/// first device averages losses and gradients. (Burn has collectives for CUDA only. Copies work on every device.)
-fn on_devices<T: Task>(
-    task: &T,
-    networks: &Networks,
-    devices: &[Device],
-    mut items: Vec<T::Item>,
-    at: Moment,
-    how: How,
-) -> Result<Made, TrainError> {
-    if devices.len() == 1 {
-        return on_device(task, networks, items, at, how);
-    }
-    let (all, size) = (items.len() as f64, items.len().div_ceil(devices.len()));
-    let mut parts = Vec::new();
-    while !items.is_empty() {
-        let rest = items.split_off(size.min(items.len()));
-        parts.push(std::mem::replace(&mut items, rest));
-    }
-    let made: Vec<Result<Made, TrainError>> = thread::scope(|scope| {
-        let start = |(place, part): (usize, Vec<T::Item>)| {
-            scope.spawn(move || {
-                let (device, share) = (&devices[place], how.share * part.len() as f64 / all);
-                let (at, how) = (Moment { device_index: place, ..at }, How { share, ..how });
-                on_device(task, &networks.clone().fork(device), part, at, how)
-            })
-        };
-        let threads: Vec<_> = parts.into_iter().enumerate().map(start).collect();
-        let ended = threads.into_iter().map(|thread| thread.join().unwrap_or_else(|e| resume_unwind(e)));
-        ended.collect()
-    });
-    let first = devices[0].clone().inner();
-    let mut total = Made { values: BTreeMap::new(), gradients: Some(Rows::new()) };
-    for made in made {
-        let made = made?;
-        for (name, value) in made.values {
-            *total.values.entry(name).or_default() += value;
-        }
-        total.gradients = match (total.gradients.take(), made.gradients) {
-            (Some(mut sum), Some(rows)) => {
-                let there = rows.into_iter().map(|(name, row)| (name, row.to_device(&first)));
-                gradients::add(&mut sum, there.collect());
-                Some(sum)
-            }
-            _ => None,
-        };
-    }
-    Ok(total)
+/// Samples of this rank's part of a batch.
+struct Loaded<I> {
+    items: Vec<I>,
+    /// Number of samples of the batch that lower ranks have.
+    first: usize,
+    /// Number of samples of the whole batch.
+    count: usize,
 }
 
-fn on_device<T: Task>(
-    task: &T,
-    networks: &Networks,
-    items: Vec<T::Item>,
-    at: Moment,
-    How { precision, scale, share }: How,
-) -> Result<Made, TrainError> {
-    let parts = task.losses(&lower(precision, networks), items, at)?;
-    if parts.is_empty() {
-        return Ok(Made { values: BTreeMap::new(), gradients: Some(Rows::new()) });
-    }
-    let read = host(Tensor::cat(parts.iter().map(|part| part.value.clone()).collect(), 0));
-    let (mut values, mut total) = (BTreeMap::new(), 0.0);
-    for (part, value) in parts.iter().zip(read) {
-        values.insert(part.name, share * f64::from(value));
-        total += part.weight * f64::from(value);
-    }
-    values.insert("loss", share * total);
-    if !total.is_finite() {
-        return Ok(Made { values, gradients: None });
-    }
-    let weighted = parts.into_iter().map(|part| part.value * (part.weight * share * scale)).collect();
-    let mut tracked = Tensor::cat(weighted, 0).sum().backward();
-    let mut rows = gradients::collect(networks, &mut tracked);
-    if scale != 1.0 {
-        rows.values_mut().for_each(|row| *row = row.clone() / scale);
-    }
-    Ok(Made { values, gradients: Some(rows) })
-}
-
-/// Batches of all passes.
+/// This rank's parts of the batches of all passes.
 struct Samples<'a, T: Task> {
     task: &'a T,
     config: &'a TrainConfig,
-    /// Number of batches of a pass.
-    per_pass: u64,
+    /// Number of samples of a pass.
+    in_pass: usize,
     /// The current pass, and the number of its next batch since the beginning of the run.
     open: Option<(Batches<T::Item>, u64)>,
 }
 
 impl<'a, T: Task> Samples<'a, T> {
     fn new(task: &'a T, config: &'a TrainConfig) -> Self {
-        let per_pass = task.data().pass(0).len().div_ceil(config.training.batch).max(1) as u64;
-        Self { task, config, per_pass, open: None }
+        Self { task, config, in_pass: task.data().pass(0).len(), open: None }
     }
 
     /// A batch by its number since the beginning of the run, or the reason why it cannot be loaded. Its content follows
     /// from the number alone.
-    fn get(&mut self, number: u64) -> Result<Vec<T::Item>, String> {
-        let (pass, place) = (number / self.per_pass, number % self.per_pass);
+    fn get(&mut self, number: u64, ranks: &Ranks) -> Result<Loaded<T::Item>, String> {
+        let t = &self.config.training;
+        let per_pass = self.in_pass.div_ceil(t.batch).max(1) as u64;
+        let (pass, place) = (number / per_pass, (number % per_pass) as usize);
         let mut open = self.open.take().filter(|(_, next)| *next == number && place > 0);
         let (batches, next) = open.get_or_insert_with(|| {
-            let t = &self.config.training;
             let loader = Loader::new(self.task.data().pass(pass), t.batch, t.workers, t.prefetch);
+            let loader = loader.part(ranks.rank(), ranks.size());
             let loader = if t.shuffle { loader.shuffled(t.seed) } else { loader };
-            (loader.batches(pass, place as usize), number)
+            (loader.batches(pass, place), number)
         });
         *next += 1;
         let made = batches.next();
         self.open = open;
-        made.ok_or("the data ended early")?.map_err(|e| e.to_string())
+        let items = made.ok_or("the data ended early")?.map_err(|e| e.to_string())?;
+        let count = t.batch.min(self.in_pass - place * t.batch);
+        Ok(Loaded { items, first: ranks.share(count).start, count })
     }
 }

@@ -15,6 +15,7 @@ pub mod optimizer;
 pub mod photometric;
 pub mod points;
 pub mod precision;
+pub mod ranks;
 pub mod run;
 pub mod schedule;
 pub mod stability;

@@ -71,8 +71,13 @@ fn mask_of(view: View, masks: &Tensor<4>) -> Option<Tensor<4>> {
 
 /// The predictor's window for photographs with these masks `[.., S, S]`.
 pub(crate) fn window(config: &Config, masks: &[f32], side: usize) -> Window {
+    Window::of_predictor(config, person(masks, side))
+}
+
+/// The box around the person in photographs with these masks `[.., S, S]`.
+pub(crate) fn person(masks: &[f32], side: usize) -> Option<Window> {
     let masks: Vec<bool> = masks.iter().map(|mask| *mask > 0.0).collect();
-    Window::of_predictor(config, masks.chunks_exact(side * side))
+    Window::around(masks.chunks_exact(side * side), side)
 }
 
 /// Predicted point maps of front and back `[B,2,3,S,S]` in [−1, 1]. Their masks `[B,2,S,S]` decide the window and
@@ -83,9 +88,21 @@ pub fn predict(
     images: Tensor<5>,
     masks: &Tensor<4>,
 ) -> Prediction {
-    let [b, _, channels, side, _] = images.dims();
+    let side = images.dims()[3];
     let window =
         if config.network.window { window(config, &host(masks.clone()), side) } else { Window::whole(side) };
+    predict_in(window, predictor, config, images, masks)
+}
+
+/// [`predict`] in the window of a larger batch.
+pub(crate) fn predict_in(
+    window: Window,
+    predictor: &PointPredictor,
+    config: &Config,
+    images: Tensor<5>,
+    masks: &Tensor<4>,
+) -> Prediction {
+    let [b, _, channels, side, _] = images.dims();
     // All fronts, then all backs.
     let photographs = images.swap_dims(0, 1).reshape([2 * b, channels, side, side]);
     let of_input = masks.clone().swap_dims(0, 1).reshape([2 * b, 1, side, side]);
@@ -99,7 +116,7 @@ pub fn predict(
 
 /// The losses of predicted maps of the first V views. `points` `[B,V,S,S,3]` are the true points in metres in the front
 /// camera's frame, and `valid` `[B,V,S,S]`, 0 or 1, marks the pixels that have one. Confidences must be probabilities. The means are over
-/// the pixels of all samples. `relief` asks for that loss.
+/// the pixels of a sample, and then over the samples. `relief` asks for that loss.
 pub fn losses(prediction: &Prediction, points: &Tensor<5>, valid: &Tensor<4>, relief: bool) -> Losses {
     let Prediction { window, maps } = prediction;
     let (b, h, w) = (points.dims()[0], window.rows.len(), window.columns.len());
@@ -130,10 +147,12 @@ pub fn losses(prediction: &Prediction, points: &Tensor<5>, valid: &Tensor<4>, re
     Losses { regression: sum(regression), confidence: sum(confidence), relief: relief.then(|| sum(reliefs)) }
 }
 
-/// Mean length of vectors `[B,h,w,3]` where `weight` `[B,h,w]` is 1; 0 if it is 1 nowhere.
+/// Mean length of vectors `[B,h,w,3]` where `weight` `[B,h,w]` is 1, 0 for samples where it is 1 nowhere; the mean over the samples.
 fn mean_length(vectors: Tensor<4>, weight: Tensor<3>) -> Tensor<1> {
     let length = vectors.square().sum_dim(3).clamp_min(MIN_SQUARE).sqrt().squeeze_dim::<3>(3);
-    (length * weight.clone()).sum() / weight.sum().clamp_min(1.0)
+    let [b, h, w] = weight.dims();
+    let sum = |values: Tensor<3>| values.reshape([b, h * w]).sum_dim(1);
+    (sum(length * weight.clone()) / sum(weight).clamp_min(1.0)).mean()
 }
 
 /// Mean error of differences between pixels: of the differences of errors `off` `[B,h,w,3]` between two pixels that are `inside`

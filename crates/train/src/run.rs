@@ -20,6 +20,7 @@ use crate::identity::Identity;
 use crate::learner::Learner;
 use crate::log::{self, Line, Log, PREVIEWS};
 use crate::networks::Networks;
+use crate::ranks::Ranks;
 use crate::task::{Task, Validation};
 
 /// Number of failed steps in a row after which a run ends.
@@ -43,8 +44,10 @@ pub const FILES: [&str; 6] = [BEST, LAST, CONFIG, CURVES, log::NAME, log::EVENTS
 pub struct Options<'a> {
     /// The run's folder. It must exist.
     pub folder: &'a Path,
-    /// Training devices, at least one, with gradients.
-    pub devices: &'a [Device],
+    /// The training device, with gradients.
+    pub device: &'a Device,
+    /// The processes of the training. The first one alone writes files.
+    pub ranks: &'a Ranks,
     /// Time after which the session ends.
     pub limit: Option<Duration>,
     /// Flag that ends the session.
@@ -132,11 +135,12 @@ pub fn rehearse<T: Task>(
     task: &T,
     config: &TrainConfig,
     networks: Networks,
-    devices: &[Device],
+    device: &Device,
+    ranks: &Ranks,
 ) -> Result<Rehearsal, TrainError> {
     /// First steps, which allocate memory and compile GPU kernels, and measured steps.
     const STEPS: [u32; 2] = [5, 5];
-    let mut learner = Learner::new(task, config, networks, devices);
+    let mut learner = Learner::new(task, config, networks, device, ranks);
     let mut start = Instant::now();
     let (mut made, mut failed) = (0, 0);
     while made < STEPS[0] + STEPS[1] {
@@ -156,7 +160,7 @@ pub fn rehearse<T: Task>(
     }
     let step = start.elapsed() / STEPS[1];
     let start = Instant::now();
-    let validation = task.validate(&learner.averaged())?.map(|_| start.elapsed());
+    let validation = task.validate(&learner.averaged(), ranks)?.map(|_| start.elapsed());
     Ok(Rehearsal { step, validation })
 }
 
@@ -165,7 +169,8 @@ struct Session<'a, T: Task> {
     options: &'a Options<'a>,
     watch: &'a mut dyn Watch,
     start: Instant,
-    log: Log,
+    /// The first rank's.
+    log: Option<Log>,
     identity: Identity,
     /// Why the last skipped step was skipped.
     skipped: Option<String>,
@@ -183,29 +188,33 @@ impl<'a, T: Task> Session<'a, T> {
         options: &'a Options<'a>,
         watch: &'a mut dyn Watch,
     ) -> Result<Self, TrainError> {
-        let mut learner = Learner::new(task, config, networks, options.devices);
+        let mut learner = Learner::new(task, config, networks, options.device, options.ranks);
         let state = options.folder.join(STATE);
         let identity = Identity::of(task, config)?;
-        let is_begun = state.exists();
+        // The first rank is about to write a state.
+        let is_begun = options.ranks.gather(&state.exists())[0];
         if is_begun {
-            let there = checkpoint::load(&state, &mut learner, &options.devices[0].clone().inner())?;
+            let there = checkpoint::load(&state, &mut learner, &options.device.clone().inner())?;
             if let Some(refusal) = identity.refusal(&there, options.force) {
                 return Err(FileError::unsuitable(&state, refusal).into());
             }
         }
+        learner.compare(&identity)?;
         // The config is written after the state was loaded, which proves that it fits the run.
         let path = options.folder.join(CONFIG);
         let text = config.to_toml();
-        if fs::read(&path).ok().as_deref() != Some(text.as_bytes()) {
+        let is_first = options.ranks.is_first();
+        if is_first && fs::read(&path).ok().as_deref() != Some(text.as_bytes()) {
             file::write_whole(&path, |out| out.write_all(text.as_bytes()))
                 .map_err(FileError::write(&path))?;
         }
         // From the first state on, the folder is known to be this run's.
-        if !is_begun {
+        if is_first && !is_begun {
             save_state(&state, &learner, &identity)?;
         }
-        let log = Log::open(options.folder, learner.progress.step)?;
-        let (before, now, step) = (log.seconds(), Instant::now(), learner.progress.step);
+        let log = is_first.then(|| Log::open(options.folder, learner.progress.step)).transpose()?;
+        let (before, now, step) =
+            (log.as_ref().map_or(0.0, Log::seconds), Instant::now(), learner.progress.step);
         Ok(Self {
             learner,
             options,
@@ -219,9 +228,11 @@ impl<'a, T: Task> Session<'a, T> {
         })
     }
 
+    /// Whether a rank has to stop.
     fn is_over(&self) -> bool {
-        self.options.stop.load(Ordering::Relaxed)
-            || self.options.limit.is_some_and(|limit| self.start.elapsed() >= limit)
+        let is_over = self.options.stop.load(Ordering::Relaxed)
+            || self.options.limit.is_some_and(|limit| self.start.elapsed() >= limit);
+        self.options.ranks.gather(&is_over).contains(&true)
     }
 
     fn seconds(&self) -> f64 {
@@ -295,12 +306,17 @@ impl<'a, T: Task> Session<'a, T> {
         values.insert("samples_per_second".to_owned(), rate * (t.batch * t.accumulate) as f64);
         let line = Line { step, seconds: self.seconds(), values };
         self.watch.step(&line, t.steps as u64, self.learner.progress.skipped);
-        Ok(self.log.add(line)?)
+        self.add(line)
+    }
+
+    fn add(&mut self, line: Line) -> Result<(), TrainError> {
+        Ok(self.log.as_mut().map_or(Ok(()), |log| log.add(line))?)
     }
 
     fn validate(&mut self) -> Result<(), TrainError> {
         let (networks, step) = (self.learner.averaged(), self.learner.progress.step);
-        let Some(validation) = self.learner.task.validate(&networks)? else { return Ok(()) };
+        let validation = self.learner.task.validate(&networks, self.options.ranks)?;
+        let Some(validation) = validation else { return Ok(()) };
         let beats = |best: u64| validation.score < f64::from_bits(best);
         if validation.score.is_finite() && self.learner.progress.best.is_none_or(|(_, best)| beats(best)) {
             self.write(&networks, BEST)?;
@@ -310,31 +326,36 @@ impl<'a, T: Task> Session<'a, T> {
         let score = ("validation/score".to_owned(), validation.score);
         // JSON has no numbers that are not finite.
         let values = named.chain([score]).filter(|(_, value)| value.is_finite()).collect();
-        self.log.add(Line { step, seconds: self.seconds(), values })?;
+        self.add(Line { step, seconds: self.seconds(), values })?;
         self.watch.validated(step, &validation);
         Ok(())
     }
 
     fn write(&self, networks: &Networks, name: &str) -> Result<(), TrainError> {
+        if self.log.is_none() {
+            return Ok(());
+        }
         let mut values = networks.checkpoint();
         values.extend(self.learner.task.frozen());
         Ok(weights::save(&self.learner.config.networks(), &values, &self.options.folder.join(name))?)
     }
 
     fn preview(&mut self) -> Result<(), TrainError> {
+        let Some(log) = &mut self.log else { return Ok(()) };
         let Some(sheet) = self.learner.task.preview(&self.learner.averaged())? else { return Ok(()) };
         let folder = self.options.folder.join(PREVIEWS);
         fs::create_dir_all(&folder).map_err(FileError::write(&folder))?;
         let path = folder.join(format!("{:07}.png", self.learner.progress.step));
         let png = preview::write_png(&path, &sheet)?;
-        Ok(self.log.add_preview(self.learner.progress.step, sheet.dimensions(), &png)?)
+        Ok(log.add_preview(self.learner.progress.step, sheet.dimensions(), &png)?)
     }
 
     /// Writes weights, state and curves. Weights are first, so that every state has its weights.
     fn save(&mut self) -> Result<(), TrainError> {
+        let Some(log) = &self.log else { return Ok(()) };
         self.write(&self.learner.averaged(), LAST)?;
         save_state(&self.options.folder.join(STATE), &self.learner, &self.identity)?;
-        let (path, svg) = (self.options.folder.join(CURVES), self.log.curves());
+        let (path, svg) = (self.options.folder.join(CURVES), log.curves());
         Ok(file::write_whole(&path, |out| out.write_all(svg.as_bytes())).map_err(FileError::write(&path))?)
     }
 }
@@ -345,11 +366,10 @@ fn save_state<T: Task>(path: &Path, learner: &Learner<T>, identity: &Identity) -
     Ok(checkpoint::save(path, learner, identity)?)
 }
 
-/// Runs `work` on the best thread for its devices. For the CPU it is one of rayon's threads, since other threads hand
-/// every operator over and wait. Other devices order work by the calling thread. Several devices have threads of their
-/// own, which would wait for rayon's.
-pub fn on_best_thread<R: Send>(devices: &[Device], work: impl FnOnce() -> R + Send) -> R {
-    if matches!(devices, [device] if device.clone().inner() == Device::flex()) {
+/// Runs `work` on the best thread for its device. For the CPU it is one of rayon's threads, since other threads hand
+/// every operator over and wait. Other devices order work by the calling thread.
+pub fn on_best_thread<R: Send>(device: &Device, work: impl FnOnce() -> R + Send) -> R {
+    if device.clone().inner() == Device::flex() {
         let mut result = None;
         rayon::scope(|_| result = Some(work()));
         result.expect("the scope runs it")

@@ -7,8 +7,10 @@ use burn::data::dataloader::batcher::Batcher;
 use burn::tensor::Device;
 use glam::Vec3;
 use image::RgbImage;
+use serde::{Deserialize, Serialize};
 use snapsnap_data::dataset::Folder;
 use snapsnap_data::sample::{Stage1, Stage1Batch, Stage1Batcher, Stage1Item};
+use snapsnap_net::Window;
 use snapsnap_net::config::Config;
 use snapsnap_net::network::{PointMap, View};
 use snapsnap_ops::host;
@@ -17,7 +19,8 @@ use crate::TrainError;
 use crate::config::{Stage1Config, TrainConfig};
 use crate::data::Data;
 use crate::networks::Networks;
-use crate::points::{Prediction, losses, predict};
+use crate::points::{Prediction, losses, person, predict_in};
+use crate::ranks::Ranks;
 use crate::task::{Moment, Part, Task, Validation};
 use snapsnap_eval::points::{Pair, normal_error, point_errors};
 use snapsnap_eval::preview::{grid, heat, picture};
@@ -35,20 +38,16 @@ pub struct PointTask {
     networks: Config,
     losses: Stage1Config,
     data: Data<Stage1Item>,
-    /// Training devices, with gradients.
-    devices: Vec<Device>,
+    /// With gradients.
+    device: Device,
 }
 
 impl PointTask {
-    /// A training on these data sets and devices. There must be at least one device, and devices must have gradients.
+    /// A training on these data sets and a device with gradients.
     ///
     /// # Errors
     /// [`TrainError`] if a data set cannot be used with this config.
-    pub fn new(
-        folders: &[Arc<Folder>],
-        config: &TrainConfig,
-        devices: &[Device],
-    ) -> Result<Self, TrainError> {
+    pub fn new(folders: &[Arc<Folder>], config: &TrainConfig, device: &Device) -> Result<Self, TrainError> {
         if config.network.second_layer && !config.samples.second_depth {
             let why = "it gives the true second surfaces";
             let message =
@@ -59,19 +58,22 @@ impl PointTask {
             networks: config.networks(),
             losses: config.stage1.clone(),
             data: Data::new(folders, config, &config.samples(), Stage1::new)?,
-            devices: devices.to_vec(),
+            device: device.clone(),
         })
     }
 
-    fn predict(&self, networks: &Networks, batch: &Stage1Batch) -> Prediction {
+    /// Predictions in the window around `extent`.
+    fn predict(&self, networks: &Networks, batch: &Stage1Batch, extent: Option<Window>) -> Prediction {
         let predictor = networks.predictor.as_ref().expect("stage 1 trains the predictor");
-        predict(predictor, &self.networks, batch.images.clone(), &batch.masks)
+        let window = Window::of_predictor(&self.networks, extent);
+        predict_in(window, predictor, &self.networks, batch.images.clone(), &batch.masks)
     }
 
     /// Predicted maps of a sample on the whole canvas.
     fn maps(&self, networks: &Networks, item: &Stage1Item) -> Vec<Map> {
-        let batch = Stage1Batcher.batch(vec![item.clone()], &self.devices[0].clone().inner());
-        let maps = self.predict(networks, &batch).pasted(&self.networks.network, &batch.masks);
+        let batch = Stage1Batcher.batch(vec![item.clone()], &self.device.clone().inner());
+        let maps = self.predict(networks, &batch, person(&item.masks, item.side));
+        let maps = maps.pasted(&self.networks.network, &batch.masks);
         let read = |(view, map): (View, PointMap)| (view as usize, host(map.points), host(map.conf));
         maps.into_iter().map(read).collect()
     }
@@ -89,28 +91,32 @@ impl Task for PointTask {
         &item.name
     }
 
+    fn extent(&self, items: &[Stage1Item]) -> Option<Window> {
+        let extents = items.iter().filter_map(|item| person(&item.masks, item.side));
+        extents.reduce(|all, extent| all.united(&extent))
+    }
+
     fn losses(
         &self,
         networks: &Networks,
         items: Vec<Stage1Item>,
         at: Moment,
     ) -> Result<Vec<Part>, TrainError> {
-        let batch = Stage1Batcher.batch(items, &self.devices[at.device_index]);
-        let prediction = self.predict(networks, &batch);
+        let batch = Stage1Batcher.batch(items, &self.device);
+        let prediction = self.predict(networks, &batch, at.extent);
         let relief = self.losses.relief_weight > 0.0;
         Ok(losses(&prediction, &batch.points, &batch.valid, relief).parts(&self.losses))
     }
 
-    fn validate(&self, networks: &Networks) -> Result<Option<Validation>, TrainError> {
+    fn validate(&self, networks: &Networks, ranks: &Ranks) -> Result<Option<Validation>, TrainError> {
         if self.data.count == 0 {
             return Ok(None);
         }
-        let mut errors = Errors::default();
-        for item in self.data.validation(self.data.count) {
-            let item = item?;
+        let all = self.data.validated(ranks, |errors: &mut Errors, item| {
             errors.add(&item, &self.maps(networks, &item), self.networks.network.conf_threshold);
-        }
-        Ok(Some(errors.validation()))
+            Ok(())
+        })?;
+        Ok(Some(all.iter().fold(Errors::default(), |sum, errors| sum.plus(errors)).validation()))
     }
 
     fn preview(&self, networks: &Networks) -> Result<Option<RgbImage>, TrainError> {
@@ -155,7 +161,7 @@ fn place_color(p: Vec3) -> [f32; 3] {
 }
 
 /// Distances between predicted and true points, as sums over people.
-#[derive(Default)]
+#[derive(Default, Serialize, Deserialize)]
 struct Errors {
     /// Per view: number of people, mean distances in metres, and mean distances without each person's mean shift.
     views: [[f64; 3]; 6],
@@ -189,6 +195,14 @@ impl Errors {
                 self.overlap[1] += f64::from(u8::from(seen || there));
             }
         }
+    }
+
+    /// The sums over both groups of people.
+    fn plus(mut self, other: &Self) -> Self {
+        let own = self.views.as_flattened_mut().iter_mut().chain(&mut self.normals).chain(&mut self.overlap);
+        let others = other.views.as_flattened().iter().chain(&other.normals).chain(&other.overlap);
+        own.zip(others).for_each(|(sum, value)| *sum += value);
+        self
     }
 
     fn validation(&self) -> Validation {

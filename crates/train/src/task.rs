@@ -4,10 +4,12 @@ use std::collections::BTreeMap;
 
 use burn::tensor::Tensor;
 use image::RgbImage;
+use snapsnap_net::Window;
 
 use crate::TrainError;
 use crate::data::Data;
 use crate::networks::Networks;
+use crate::ranks::Ranks;
 
 /// A part of a loss.
 #[derive(Debug, Clone)]
@@ -21,14 +23,16 @@ pub struct Part {
 }
 
 /// Place of a batch in the training.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Moment {
     /// Number of earlier steps.
     pub step: u64,
     /// Number of earlier batches of this step.
     pub batch: u64,
-    /// Index of the device among the training devices.
-    pub device_index: usize,
+    /// Number of samples of the batch that lower ranks have.
+    pub first: usize,
+    /// The box around the people of the whole batch, as [`Task::extent`] finds it.
+    pub extent: Option<Window>,
 }
 
 /// Result of a validation.
@@ -59,8 +63,13 @@ pub trait Task: Sync {
     /// Name of a sample: its data set, subject and view.
     fn name(item: &Self::Item) -> &str;
 
-    /// Parts of a batch's loss, computed on the device of `networks` and `at`. Empty if no sample of the batch shows a
-    /// person.
+    /// The box around the people in these samples' photographs, if the networks need it for a whole batch.
+    fn extent(&self, _items: &[Self::Item]) -> Option<Window> {
+        None
+    }
+
+    /// Parts of the loss of a batch, or of one rank's share of it. The loss of a whole batch is the mean of its shares' losses, weighted
+    /// with their numbers of samples. Empty if no sample shows a person.
     ///
     /// # Errors
     /// [`TrainError`] if the batch cannot be used.
@@ -72,11 +81,11 @@ pub trait Task: Sync {
     ) -> Result<Vec<Part>, TrainError>;
 
     /// Compares predictions for held-out people with the ground truth; `None` without such people. `networks` have no
-    /// gradients and are on the first device.
+    /// gradients. Ranks share the samples, and all get the same result.
     ///
     /// # Errors
     /// [`TrainError`] if a sample cannot be read.
-    fn validate(&self, _networks: &Networks) -> Result<Option<Validation>, TrainError> {
+    fn validate(&self, _networks: &Networks, _ranks: &Ranks) -> Result<Option<Validation>, TrainError> {
         Ok(None)
     }
 

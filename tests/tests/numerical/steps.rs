@@ -67,7 +67,8 @@ fn other_device() -> Option<Device> {
 fn loss<T: Task>(task: &T, networks: &Networks) -> Tensor<1> {
     let samples = task.data().pass(0);
     let items = vec![samples.get(0).expect("reads"), samples.get(1).expect("reads")];
-    let parts = task.losses(networks, items, Moment { step: 0, batch: 0, device_index: 0 }).expect("a loss");
+    let at = Moment { extent: task.extent(&items), ..Moment::default() };
+    let parts = task.losses(networks, items, at).expect("a loss");
     let weighted: Vec<Tensor<1>> = parts.into_iter().map(|part| part.value * part.weight).collect();
     Tensor::cat(weighted, 0).sum()
 }
@@ -149,7 +150,7 @@ fn a_step_of_stage_1_is_the_same_on_every_device() {
         let mut config = config();
         change(&mut config);
         let on = |device: &Device| {
-            let task = PointTask::new(from_ref(&folder), &config, from_ref(device)).expect("a task");
+            let task = PointTask::new(from_ref(&folder), &config, device).expect("a task");
             let predictor = Some(random_predictor(&config.networks(), 3, device));
             step(&task, Networks { predictor, regressors: Vec::new() })
         };
@@ -176,7 +177,7 @@ fn a_step_of_stage_2_is_the_same_on_every_device() {
         let on = |device: &Device| {
             let predictor = |device: &Device| random_predictor(&networks, 3, device);
             let frozen = predictor(&device.clone().inner());
-            let task = GaussianTask::new(from_ref(&folder), &config, Some(frozen), from_ref(device));
+            let task = GaussianTask::new(from_ref(&folder), &config, Some(frozen), device);
             let regressors = random_regressors(&published, 4, device);
             let predictor = joint.then(|| predictor(device));
             step(&task.expect("a task"), Networks { predictor, regressors })
@@ -197,7 +198,7 @@ fn sixteen_bits_have_the_same_gradients_but_for_rounding() {
     let (folder, config, device) = (people(temporary.path()), config(), device.autodiff());
     let predictor = Some(random_predictor(&config.networks(), 3, &device));
     let networks = Networks { predictor, regressors: Vec::new() };
-    let task = PointTask::new(from_ref(&folder), &config, from_ref(&device)).expect("a task");
+    let task = PointTask::new(from_ref(&folder), &config, &device).expect("a task");
     let made = |precision: Precision| {
         let loss = loss(&task, &lower(precision, &networks));
         let value = f64::from(loss.clone().into_scalar::<f32>());

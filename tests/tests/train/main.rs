@@ -2,6 +2,8 @@
 //! an interrupt or a full disk, and refusals.
 
 mod options;
+#[cfg(unix)]
+mod ranks;
 mod refusals;
 mod resume;
 mod runs;

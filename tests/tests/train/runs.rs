@@ -1,8 +1,8 @@
-//! Undisturbed runs, on one device and on two.
+//! Undisturbed runs.
 
 use std::fs;
 
-use snapsnap_tests::{refused, snapsnap, succeed};
+use snapsnap_tests::{snapsnap, succeed};
 
 use super::{logged, people, place, train};
 
@@ -65,45 +65,6 @@ fn both_stages_learn_and_write_weights_for_reconstructions() {
 }
 
 /// Two backends on the same processor stand for two GPUs.
-#[test]
-fn two_devices_share_batches_and_have_the_losses_of_one() {
-    let (temporary, config) = place();
-    let weights = temporary.path().join("start.safetensors");
-    for stage in [1, 2] {
-        let losses = |devices: &str| {
-            let run = temporary.path().join(format!("{stage}-{devices}"));
-            let mut command = snapsnap();
-            command
-                .arg(format!("train-stage{stage}"))
-                .arg("--config")
-                .arg(&config)
-                .arg("--data")
-                .arg(people());
-            command.args(["--device", devices, "--set", "training.steps=3", "--set", "training.batch=3"]);
-            // The random shifts of a step depend on the device's index.
-            command.args(["--set", "stage2.point_noise=0", "-o"]).arg(&run);
-            if stage == 2 {
-                command.arg("--weights").arg(&weights);
-            }
-            succeed(&mut command);
-            (logged(&run, "loss"), run.join("last.safetensors"))
-        };
-        let ((one, last), (two, _)) = (losses("cpu"), losses("cpu,ndarray"));
-        println!("stage {stage}: {one:?} {two:?}");
-        for ((step, one), (_, two)) in one.iter().zip(&two) {
-            // One device averages over all pixels, two devices over the means of each.
-            assert!((one - two).abs() < 0.05 * one, "stage {stage}, step {step}: {one} and {two}");
-        }
-        fs::copy(last, &weights).expect("copies");
-    }
-    let said = refused(train(1, &config, &temporary.path().join("x")).args(["--set", "training.batch=0"]));
-    assert!(said.contains("training.batch"), "{said}");
-    let mut command = snapsnap();
-    command.args(["train-stage1", "--device", "cpu,cpu,ndarray", "--config"]).arg(&config);
-    let said = refused(command.arg("--data").arg(people()).arg("-o").arg(temporary.path().join("y")));
-    assert!(said.contains("3 devices share a batch of 2"), "{said}");
-}
-
 #[test]
 fn a_rehearsal_writes_nothing_and_prints_the_time_of_the_run() {
     let (temporary, config) = place();

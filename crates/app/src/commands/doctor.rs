@@ -65,6 +65,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
             "version": env!("CARGO_PKG_VERSION"),
             "commit": env!("SNAPSNAP_COMMIT"),
             "compiled_in": device::compiled_in(),
+            "mpi": cfg!(feature = "mpi"),
             "threads": threads(),
             "bf16": unit_of_cpu(),
             "memory_bytes": memory,
@@ -80,6 +81,10 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let mut lines = vec![
         format!("snapsnap {}, commit {}", env!("CARGO_PKG_VERSION"), env!("SNAPSNAP_COMMIT")),
         format!("compiled in  {}", device::compiled_in().join(", ")),
+        format!(
+            "MPI          {}",
+            if cfg!(feature = "mpi") { "compiled in" } else { "not compiled in: build with --features mpi" }
+        ),
         format!("threads      {}", threads()),
         format!("bf16         {}", unit_of_cpu().unwrap_or("no instructions for it in this processor")),
         format!("memory       {}", gigabytes(memory)),

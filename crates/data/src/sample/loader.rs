@@ -1,6 +1,7 @@
 //! A data loader with bounded memory, whose order does not depend on the number of workers. (Burn's loader keeps up to
 //! 100 batches per iterator and mixes the orders of its workers.)
 
+use std::ops::Range;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, sync_channel};
@@ -19,6 +20,13 @@ pub struct Loader<I> {
     prefetch: usize,
     /// Seed of the order, if it is random. Every pass has its own order.
     shuffle: Option<u64>,
+    /// The part of every batch that is loaded, and the number of parts.
+    part: [usize; 2],
+}
+
+/// One of `parts` even shares of `count` things.
+pub fn share([part, parts]: [usize; 2], count: usize) -> Range<usize> {
+    part * count / parts..(part + 1) * count / parts
 }
 
 impl<I: 'static> Loader<I> {
@@ -29,7 +37,17 @@ impl<I: 'static> Loader<I> {
     /// If `batch` or `workers` is 0.
     pub fn new(dataset: impl Dataset<I> + 'static, batch: usize, workers: usize, prefetch: usize) -> Self {
         assert!(batch > 0 && workers > 0, "{batch} items by {workers} workers");
-        Self { dataset: Arc::new(dataset), batch, workers, prefetch, shuffle: None }
+        Self { dataset: Arc::new(dataset), batch, workers, prefetch, shuffle: None, part: [0, 1] }
+    }
+
+    /// The loader of one part of every batch, among so many parts.
+    ///
+    /// # Panics
+    /// If there is no such part.
+    pub fn part(mut self, part: usize, parts: usize) -> Self {
+        assert!(part < parts, "part {part} of {parts}");
+        self.part = [part, parts];
+        self
     }
 
     /// The loader with a random order, a new one in every pass.
@@ -59,13 +77,14 @@ impl<I: Send + Sync + 'static> Loader<I> {
         }
         order.drain(..(skipped * self.batch).min(order.len()));
         let order = Arc::new(order);
-        let (batch, count) = (self.batch, self.workers);
+        let (batch, count, part) = (self.batch, self.workers, self.part);
         let start = |worker: usize| {
             let (dataset, order) = (self.dataset.clone(), order.clone());
             // The prefetched batches are divided among the workers. Each worker holds one more, which it loads.
             let (sender, loaded) = sync_channel((self.prefetch + count - 1 - worker) / count);
             let work = move || {
                 for rows in order.chunks(batch).skip(worker).step_by(count) {
+                    let rows = &rows[share(part, rows.len())];
                     let panicked = |_| {
                         let message = format!("a loader's worker panicked, at samples {rows:?}");
                         Err(DatasetError::new(std::io::Error::other(message)))
@@ -155,7 +174,11 @@ mod tests {
     }
 
     fn order(batches: Batches<Held>) -> Vec<usize> {
-        batches.flat_map(|batch| batch.expect("whole")).map(|held| held.0).collect()
+        batches.flat_map(order_of).collect()
+    }
+
+    fn order_of(batch: Loaded<Held>) -> Vec<usize> {
+        batch.expect("whole").iter().map(|held| held.0).collect()
     }
 
     #[test]
@@ -173,6 +196,13 @@ mod tests {
         assert_eq!(order(rest), second[20..]);
         assert_eq!(loader(50, 2, None).0.batches(0, 13).count(), 0);
         assert_eq!([first.clone(), second.clone()], shuffled(3));
+        // Parts of batches of 4, the last of which has 2.
+        let parts = [0, 1, 2].map(|part| loader(50, 2, None).0.shuffled(7).part(part, 3).batches(0, 0));
+        let mut parts = parts.map(|batches| batches.map(|batch| order_of(batch)).collect::<Vec<_>>());
+        let joined: Vec<usize> = (0..13)
+            .flat_map(|batch| parts.each_mut().map(|part| std::mem::take(&mut part[batch])).concat())
+            .collect();
+        assert_eq!(joined, first);
         assert_ne!(first, second);
         let mut sorted = first;
         sorted.sort_unstable();

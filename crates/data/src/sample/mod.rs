@@ -24,7 +24,7 @@ use crate::dataset::{Arrangement, Folder, Layout, Split};
 use crate::photo::{Canvas, on_canvas, place};
 pub use augment::Augment;
 pub use handling::Handling;
-pub use loader::{Batches, Loader};
+pub use loader::{Batches, Loader, share};
 pub use rectified::Restoration;
 use snapsnap_base::FileError;
 use snapsnap_base::config::outside;

@@ -21,10 +21,12 @@ use crate::config::TrainConfig;
 use crate::data::Data;
 use crate::log::Line;
 use crate::networks::Networks;
+use crate::ranks::Ranks;
 use crate::run::{Options, Outcome, Watch, on_best_thread, train};
 use crate::stage1::PointTask;
 use crate::stage2::GaussianTask;
 use crate::task::{Moment, Part, Task, Validation};
+use snapsnap_net::Window;
 
 /// Stiff trainings, and one sample whose loss is not a number (docs/method.md, "Stability cases").
 pub(super) fn cases() -> Vec<Case> {
@@ -70,13 +72,20 @@ fn trained<T: Task>(
     task: &T,
     config: &TrainConfig,
     networks: Networks,
-    devices: &[Device],
+    device: &Device,
 ) -> Result<(Outcome, bool), TrainError> {
     let folder = temporary()?;
     let stop = AtomicBool::new(false);
-    let options = Options { folder: folder.path(), devices, limit: None, stop: &stop, force: false };
+    let options = Options {
+        folder: folder.path(),
+        device,
+        ranks: &Ranks::default(),
+        limit: None,
+        stop: &stop,
+        force: false,
+    };
     let mut watch = Silent { finite: true };
-    let outcome = on_best_thread(devices, || train(task, config, networks, &options, &mut watch))?;
+    let outcome = on_best_thread(device, || train(task, config, networks, &options, &mut watch))?;
     let weights = Source::open(&folder.path().join("last.safetensors"))?;
     for name in weights.tensors().keys() {
         watch.finite &= weights.read_f32(name)?.iter().all(|v| v.is_finite());
@@ -117,14 +126,14 @@ fn stiff(factor: f64) -> Result<Found, TrainError> {
     let (small, large) = (share("0002")?, share("0003")?);
     let rate = 1e-3 * factor;
     let config = config(&[format!("optimizer.rate={rate}"), format!("optimizer.muon.rate={rate}")]);
-    let (networks, device) = (config.networks(), [Device::flex().autodiff()]);
+    let (networks, device) = (config.networks(), Device::flex().autodiff());
     let predictor = |device: &Device| random_predictor(&networks, 3, device);
     let stage1 = PointTask::new(from_ref(&folder), &config, &device)?;
-    let fresh = Networks { predictor: Some(predictor(&device[0])), regressors: Vec::new() };
+    let fresh = Networks { predictor: Some(predictor(&device)), regressors: Vec::new() };
     let (one, one_finite) = trained(&stage1, &config, fresh, &device)?;
     let stage2 = GaussianTask::new(from_ref(&folder), &config, None, &device)?;
-    let regressors = random_regressors(&networks, 4, &device[0]);
-    let fresh = Networks { predictor: Some(predictor(&device[0])), regressors };
+    let regressors = random_regressors(&networks, 4, &device);
+    let fresh = Networks { predictor: Some(predictor(&device)), regressors };
     let (two, two_finite) = trained(&stage2, &config, fresh, &device)?;
     let note = format!(
         "{:.1} % and {:.1} % of the frame; {} and {} skipped",
@@ -155,14 +164,19 @@ impl Task for Poisoned {
         PointTask::name(item)
     }
 
+    fn extent(&self, items: &[Stage1Item]) -> Option<Window> {
+        self.0.extent(items)
+    }
+
     fn losses(
         &self,
         networks: &Networks,
         items: Vec<Stage1Item>,
         at: Moment,
     ) -> Result<Vec<Part>, TrainError> {
+        let is_poisoned = at.step == 3;
         let mut parts = self.0.losses(networks, items, at)?;
-        if at.step == 3 {
+        if is_poisoned {
             parts.iter_mut().for_each(|part| part.value = part.value.clone() * f64::NAN);
         }
         Ok(parts)
@@ -173,10 +187,9 @@ fn poisoned() -> Result<Found, TrainError> {
     let temporary = temporary()?;
     let folder = extreme_people(temporary.path())?;
     let config = config(&["training.steps=8".into()]);
-    let (networks, device) = (config.networks(), [Device::flex().autodiff()]);
+    let (networks, device) = (config.networks(), Device::flex().autodiff());
     let task = Poisoned(PointTask::new(from_ref(&folder), &config, &device)?);
-    let fresh =
-        Networks { predictor: Some(random_predictor(&networks, 3, &device[0])), regressors: Vec::new() };
+    let fresh = Networks { predictor: Some(random_predictor(&networks, 3, &device)), regressors: Vec::new() };
     let (outcome, all_finite) = trained(&task, &config, fresh, &device)?;
     Ok(Found { note: format!("{} of {} steps skipped", outcome.skipped, outcome.step), ..Found::default() }
         .must(outcome.skipped == 1, "not one step was skipped")

@@ -5,7 +5,6 @@ use std::collections::HashMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use sha2::{Digest, Sha256};
 use snapsnap_base::FileError;
@@ -29,37 +28,36 @@ const CHECKSUM: &str = "snapsnap.checksum";
 /// A predictor without gradients.
 pub(super) struct Frozen {
     pub networks: Networks,
-    /// The predictor in the training's precision, on each training device.
-    lowered: Vec<PointPredictor>,
+    /// The predictor in the training's precision.
+    lowered: PointPredictor,
     precision: Precision,
     /// Point maps on disk, if configured.
     maps: Option<Maps>,
 }
 
 impl Frozen {
-    /// `predictor` has no gradients and is on the first device.
-    pub fn new(config: &TrainConfig, predictor: PointPredictor, devices: &[Device]) -> Self {
+    /// `predictor` has no gradients.
+    pub fn new(config: &TrainConfig, predictor: PointPredictor) -> Self {
         let maps = config.stage2.point_map_cache.as_ref();
         let maps = maps.map(|folder| Maps::new(folder, &config.networks(), &predictor));
         let precision = config.precision();
         let networks = Networks { predictor: Some(predictor), regressors: Vec::new() };
         let lowered = lower(precision, &networks).predictor.expect("there is one");
-        let lowered = devices.iter().map(|device| lowered.clone().fork(&device.clone().inner())).collect();
         Self { networks, lowered, precision, maps }
     }
 
-    /// Predicts the points of a sample's photographs on `device`. `place` is the index of the training device in a
-    /// step, and `None` in a validation, which is in f32.
+    /// Predicts the points of a sample's photographs on `device`, in a step or in a validation, which is in f32.
     pub fn predict(
         &self,
         config: &Config,
         item: &Stage2Item,
-        place: Option<usize>,
+        is_step: bool,
         device: &Device,
     ) -> Result<Prediction, TrainError> {
-        let (predictor, precision) = match (place, &self.networks.predictor) {
-            (Some(place), _) => (&self.lowered[place], self.precision),
-            (None, predictor) => (predictor.as_ref().expect("set in `new`"), Precision::F32),
+        let (predictor, precision) = if is_step {
+            (&self.lowered, self.precision)
+        } else {
+            (self.networks.predictor.as_ref().expect("set in `new`"), Precision::F32)
         };
         let made = || of_sample(predictor, config, item, device);
         match &self.maps {

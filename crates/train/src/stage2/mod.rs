@@ -28,6 +28,7 @@ use crate::data::Data;
 use crate::networks::Networks;
 use crate::photometric::Photometric;
 use crate::points::{Prediction, losses as points_losses};
+use crate::ranks::Ranks;
 use crate::task::{Moment, Part, Task, Validation};
 use snapsnap_eval::preview::{grid, heat, picture};
 
@@ -50,20 +51,20 @@ pub struct GaussianTask {
     seed: u64,
     /// The predictor, unless it is trained as well.
     frozen: Option<Frozen>,
-    /// Perceptual distance on each training device, if configured.
-    lpips: Vec<Lpips>,
+    /// Perceptual distance, if configured.
+    lpips: Option<Lpips>,
     /// First step with the perceptual distance.
     lpips_from: u64,
     data: Data<Stage2Item>,
     /// Scores of the billboard baseline, computed once.
     billboard_scores: OnceLock<Scores>,
-    /// Training devices, each with autodiff.
-    devices: Vec<Device>,
+    /// With autodiff.
+    device: Device,
 }
 
 impl GaussianTask {
-    /// A training on these data sets and devices. There must be at least one device, and each must have autodiff.
-    /// `predictor` is the frozen predictor on the first device without autodiff, or `None` if it is trained as well.
+    /// A training on these data sets and a device with autodiff. `predictor` is the frozen predictor on the device without autodiff, or
+    /// `None` if it is trained as well.
     ///
     /// # Errors
     /// [`TrainError`] if a data set cannot be used with this config, or weights of LPIPS cannot be read.
@@ -71,18 +72,17 @@ impl GaussianTask {
         folders: &[Arc<Folder>],
         config: &TrainConfig,
         predictor: Option<PointPredictor>,
-        devices: &[Device],
+        device: &Device,
     ) -> Result<Self, TrainError> {
         let points = config.stage2.points_weight > 0.0;
         // Second surfaces are trained in stage 1 alone.
         let samples = SampleConfig { points, second_depth: false, ..config.samples() };
         let data = Data::new(folders, config, &samples, Stage2::new)?;
-        let (mut lpips, mut lpips_from) = (Vec::new(), 0);
+        let (mut lpips, mut lpips_from) = (None, 0);
         if let Some(LpipsConfig { weight, after, files }) = &config.stage2.lpips
             && *weight > 0.0
         {
-            let network = Lpips::load(files, &devices[0].clone().inner())?;
-            lpips = devices.iter().map(|device| network.to_device(device)).collect();
+            lpips = Some(Lpips::load(files, &device.clone().inner())?.to_device(device));
             lpips_from = (after * config.training.steps as f64).ceil() as u64;
         }
         Ok(Self {
@@ -90,33 +90,31 @@ impl GaussianTask {
             loss_config: config.stage2.clone(),
             stage1: config.stage1.clone(),
             seed: config.training.seed,
-            frozen: predictor.map(|predictor| Frozen::new(config, predictor, devices)),
+            frozen: predictor.map(|predictor| Frozen::new(config, predictor)),
             lpips,
             lpips_from,
             data,
             billboard_scores: OnceLock::new(),
-            devices: devices.to_vec(),
+            device: device.clone(),
         })
     }
 
-    /// Predicts the points of a sample's photographs with the trained or the frozen predictor, in a step on a training
-    /// device, or in a validation (`None`) on the first device without autodiff.
+    /// Predicts the points of a sample's photographs with the trained or the frozen predictor, in a step or in a validation.
     fn predict(
         &self,
         networks: &Networks,
         item: &Stage2Item,
-        training_device: Option<usize>,
+        is_step: bool,
     ) -> Result<Prediction, TrainError> {
-        let device = &self.devices[training_device.unwrap_or(0)];
-        let inner = device.clone().inner();
+        let inner = self.device.clone().inner();
         match (&networks.predictor, &self.frozen) {
             (Some(predictor), _) => {
-                let device = if training_device.is_some() { device } else { &inner };
+                let device = if is_step { &self.device } else { &inner };
                 Ok(of_sample(predictor, &self.config, item, device))
             }
             (None, frozen) => {
                 let frozen = frozen.as_ref().expect("a predictor that is not trained is frozen");
-                frozen.predict(&self.config, item, training_device, &inner)
+                frozen.predict(&self.config, item, is_step, &inner)
             }
         }
     }
@@ -128,7 +126,7 @@ impl GaussianTask {
         item: &Stage2Item,
         device: &Device,
     ) -> Result<Option<Gaussians>, TrainError> {
-        let prediction = self.predict(networks, item, None)?;
+        let prediction = self.predict(networks, item, false)?;
         Ok(gaussians(&self.config, networks, item, prediction, &Phase::new(false, 0), None, device))
     }
 
@@ -151,19 +149,17 @@ impl GaussianTask {
     /// Scores of the billboard baseline: both photographs as flat cut-outs in the plane through the person's axis. Its
     /// points are the ray anchors, which lie on that plane. The last layer of a regressor with a geometric start is zero,
     /// so that random weights leave each Gaussian in its pixel's colour. Confidences of 0 leave the sides out.
-    fn billboard(&self) -> Result<Scores, TrainError> {
+    fn billboard(&self, ranks: &Ranks) -> Result<Scores, TrainError> {
         if let Some(scores) = self.billboard_scores.get() {
             return Ok(*scores);
         }
-        let device = self.devices[0].clone().inner();
+        let device = self.device.clone().inner();
         let mut config = self.config.clone();
         config.mode.compat = false;
         config.network.on_rays = false;
         config.regressor.start = Some(RegressorStart::Geometric);
         let networks = Networks { predictor: None, regressors: random_regressors(&config, 0, &device) };
-        let mut sums = Scores::default();
-        for item in self.data.validation(self.data.count) {
-            let item = item?;
+        let all = self.data.validated(ranks, |sums: &mut Scores, item| {
             let window = Window::whole(item.side);
             let map = |view: View| {
                 let points = anchors(view, item.side, &window, &device);
@@ -172,9 +168,9 @@ impl GaussianTask {
             let prediction = Prediction { maps: View::ALL.map(map).to_vec(), window: window.clone() };
             let gaussians =
                 gaussians(&config, &networks, &item, prediction, &Phase::new(false, 0), None, &device);
-            sums.add(&item, self.shown(&item, gaussians, &device)?, &device)?;
-        }
-        Ok(*self.billboard_scores.get_or_init(|| sums.mean()))
+            Ok(sums.add(&item, self.shown(&item, gaussians, &device)?, &device)?)
+        })?;
+        Ok(*self.billboard_scores.get_or_init(|| Scores::mean(&all)))
     }
 
     /// Rendered pictures `[V,3,h,w]` and coverage `[V,h,w]`.
@@ -207,13 +203,13 @@ impl Task for GaussianTask {
         &self,
         networks: &Networks,
         items: Vec<Stage2Item>,
-        Moment { step, batch, device_index }: Moment,
+        Moment { step, batch, first, .. }: Moment,
     ) -> Result<Vec<Part>, TrainError> {
-        let (phase, device) = (Phase::new(self.loss_config.curriculum, step), &self.devices[device_index]);
-        let mut random = stream(&format!("stage2/{}/{step}/{batch}/{device_index}", self.seed));
+        let (phase, device) = (Phase::new(self.loss_config.curriculum, step), &self.device);
         let mut sums: BTreeMap<&'static str, (f64, Vec<Tensor<1>>)> = BTreeMap::new();
         let config = &self.loss_config;
-        for item in &items {
+        for (place, item) in items.iter().enumerate() {
+            let mut random = stream(&format!("stage2/{}/{step}/{batch}/{}", self.seed, first + place));
             let count = item.target_cameras.len();
             // While only the Gaussians of the sides are drawn, the target is one of the sides: the last two.
             let first = if phase.views.start == 2 { count - 2 } else { 0 };
@@ -225,7 +221,7 @@ impl Task for GaussianTask {
                 deviation * (0..3).map(|_| random.random_range(-1.0_f32..1.0)).sum::<f32>()
             };
             let noise = (deviation > 0.0).then_some(&mut noise as &mut dyn FnMut() -> f32);
-            let prediction = self.predict(networks, item, Some(device_index))?;
+            let prediction = self.predict(networks, item, true)?;
             let mut add = |name, weight: f64, value: Tensor<1>| {
                 sums.entry(name).or_insert((weight, Vec::new())).1.push(value);
             };
@@ -239,12 +235,12 @@ impl Task for GaussianTask {
                 add("points", config.points_weight, value.reduce(|a, b| a + b).expect("two parts"));
             }
             let made = gaussians(&self.config, networks, item, prediction, &phase, noise, device);
-            // A sample without a valid pixel counts in the points' loss alone; each part is a mean over the samples that have it.
+            // A sample without a valid pixel has no picture, and counts as one without an error.
             let Some(gaussians) = made else { continue };
             let cameras: Vec<Camera> = chosen.iter().map(|v| item.target_cameras[*v]).collect();
             let (image, coverage) = self.render(&gaussians, &cameras, item.background)?;
             let (target, mask) = targets(item, &chosen, device);
-            if let Some(lpips) = self.lpips.get(device_index).filter(|_| step >= self.lpips_from) {
+            if let Some(lpips) = self.lpips.as_ref().filter(|_| step >= self.lpips_from) {
                 let weight = config.lpips.as_ref().map_or(0.0, |lpips| lpips.weight);
                 add("lpips", weight, lpips.distance(image.clone(), target.clone()).mean());
             }
@@ -262,21 +258,22 @@ impl Task for GaussianTask {
                 add("anisotropy", config.anisotropy_weight, penalty);
             }
         }
-        let mean = |(name, (weight, values))| Part { name, weight, value: Tensor::cat(values, 0).mean() };
+        let samples = items.len() as f64;
+        let mean =
+            |(name, (weight, values))| Part { name, weight, value: Tensor::cat(values, 0).sum() / samples };
         Ok(sums.into_iter().map(mean).collect())
     }
 
-    fn validate(&self, networks: &Networks) -> Result<Option<Validation>, TrainError> {
+    fn validate(&self, networks: &Networks, ranks: &Ranks) -> Result<Option<Validation>, TrainError> {
         if self.data.count == 0 {
             return Ok(None);
         }
-        let device = self.devices[0].clone().inner();
-        let mut sums = Scores::default();
-        for item in self.data.validation(self.data.count) {
-            let item = item?;
-            sums.add(&item, self.shown(&item, self.whole(networks, &item, &device)?, &device)?, &device)?;
-        }
-        let (scores, billboard) = (sums.mean(), self.billboard()?);
+        let device = self.device.clone().inner();
+        let all = self.data.validated(ranks, |sums: &mut Scores, item| {
+            let shown = self.shown(&item, self.whole(networks, &item, &device)?, &device)?;
+            Ok(sums.add(&item, shown, &device)?)
+        })?;
+        let (scores, billboard) = (Scores::mean(&all), self.billboard(ranks)?);
         let figures = vec![
             ("psnr_masked", scores.masked),
             ("psnr_masked_sides", scores.sides),
@@ -289,7 +286,7 @@ impl Task for GaussianTask {
     }
 
     fn preview(&self, networks: &Networks) -> Result<Option<RgbImage>, TrainError> {
-        let device = self.devices[0].clone().inner();
+        let device = self.device.clone().inner();
         let mut rows = Vec::new();
         for item in self.data.validation(PREVIEWS) {
             let item = item?;

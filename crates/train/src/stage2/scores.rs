@@ -1,6 +1,7 @@
 //! Scores of rendered pictures.
 
 use burn::tensor::{Device, Tensor};
+use serde::{Deserialize, Serialize};
 use snapsnap_data::sample::Stage2Item;
 use snapsnap_eval::EvalError;
 use snapsnap_eval::pictures::Picture;
@@ -12,7 +13,7 @@ use super::scene::targets;
 use crate::photometric::Photometric;
 
 /// Scores of pictures, as sums or means over samples.
-#[derive(Debug, Clone, Copy, Default)]
+#[derive(Debug, Clone, Copy, Default, Serialize, Deserialize)]
 pub(super) struct Scores {
     samples: f64,
     /// PSNR in dB of whole pictures, of the person with a margin, and of the person in the two sides.
@@ -52,9 +53,17 @@ impl Scores {
         Ok(())
     }
 
-    pub fn mean(self) -> Self {
-        let [full, masked, sides, ssim] =
-            [self.full, self.masked, self.sides, self.ssim].map(|sum| sum / self.samples);
-        Self { samples: 1.0, full, masked, sides, ssim }
+    /// Means over the samples of all sums.
+    pub fn mean(all: &[Self]) -> Self {
+        let sum = |of: fn(&Self) -> f64| all.iter().map(of).sum::<f64>();
+        let samples = sum(|scores| scores.samples);
+        let mean = |of| sum(of) / samples;
+        Self {
+            samples: 1.0,
+            full: mean(|scores| scores.full),
+            masked: mean(|scores| scores.masked),
+            sides: mean(|scores| scores.sides),
+            ssim: mean(|scores| scores.ssim),
+        }
     }
 }

@@ -3,17 +3,24 @@
 mod folder;
 mod report;
 
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::slice::from_ref;
 use std::sync::Arc;
+use std::thread;
 use std::time::{Duration, Instant};
 
 use burn::tensor::Device;
 use clap::Args;
+use snapsnap_base::file;
 use snapsnap_data::dataset::{Folder, Layout};
+use snapsnap_net::config::Precision;
 use snapsnap_net::weights::schema::{self, Part};
 use snapsnap_net::weights::{WeightFile, random_predictor, random_regressors};
 use snapsnap_train::config::TrainConfig;
 use snapsnap_train::networks::Networks;
+use snapsnap_train::ranks::Ranks;
 use snapsnap_train::run::{self, BEST, LAST, Options, Outcome, STATE};
 use snapsnap_train::stage1::PointTask;
 use snapsnap_train::stage2::GaussianTask;
@@ -56,37 +63,73 @@ pub struct Arguments {
     /// Check config and data, make a few steps without writing anything, and print how long the run will take.
     #[arg(long)]
     dry_run: bool,
-    /// auto, cpu, ndarray, wgpu, vulkan, cuda or metal; wgpu:1 is the second adapter. Several devices, separated by
-    /// commas, share every batch.
+    /// auto, cpu, ndarray, wgpu, vulkan, cuda or metal; wgpu:1 is the second adapter. Several ranks of MPI on one machine take
+    /// the adapters in turn.
     #[arg(long, default_value = "auto")]
     device: String,
 }
 
-impl Arguments {
-    /// The folder of the run that is continued, if there is one.
-    fn begun(&self) -> Option<&Path> {
-        self.output.as_deref().filter(|run| self.resume && run.join(STATE).exists())
-    }
-}
+/// Exit code of a session that a signal ended before its run was finished: EX_TEMPFAIL of sysexits.h. --resume continues the run.
+const UNFINISHED: u8 = 75;
 
-/// A training with its data and devices.
+/// How much later than the first rank another one reports a failure.
+const LATER: Duration = Duration::from_secs(2);
+
+/// A training with its data and its device.
 struct Plan<'a> {
     arguments: &'a Arguments,
     config: TrainConfig,
     folders: Vec<Arc<Folder>>,
     /// With gradients.
-    devices: Vec<Device>,
+    device: Device,
+    ranks: &'a Ranks,
+    /// The folder of the run that is continued, if there is one.
+    begun: Option<&'a Path>,
 }
 
-pub fn stage1(arguments: &Arguments) -> Result<(), Failure> {
-    let plan = Plan::new(arguments)?;
-    let task = PointTask::new(&plan.folders, &plan.config, &plan.devices)?;
+pub fn stage1(arguments: &Arguments) -> Result<ExitCode, Failure> {
+    among_ranks(|ranks| points(arguments, ranks))
+}
+
+pub fn stage2(arguments: &Arguments) -> Result<ExitCode, Failure> {
+    among_ranks(|ranks| humans(arguments, ranks))
+}
+
+/// Runs `work` as one of the ranks of MPI, if a launcher started several. The failure of one ends all, with its message.
+fn among_ranks(work: impl FnOnce(&Ranks) -> Result<ExitCode, Failure>) -> Result<ExitCode, Failure> {
+    let ranks = Ranks::join().map_err(Failure::Input)?;
+    if ranks.size() == 1 {
+        return work(&ranks);
+    }
+    if !ranks.is_first() {
+        say::set_quiet(true);
+    }
+    // A panic must end the others as well, which would wait for this rank.
+    let done = catch_unwind(AssertUnwindSafe(|| work(&ranks)));
+    let failure = match done {
+        Ok(Ok(code)) => return Ok(code),
+        Ok(Err(failure)) => failure,
+        Err(_) => Failure::Internal("a bug in this program; its message is above".into()),
+    };
+    // What fails on all ranks is said once.
+    if !ranks.is_first() {
+        thread::sleep(LATER);
+    }
+    say::err(&format!("error: rank {} on {}: {failure}", ranks.rank(), ranks.host()));
+    file::remove_unfinished();
+    ranks.abort(failure.code());
+    Err(failure)
+}
+
+fn points(arguments: &Arguments, ranks: &Ranks) -> Result<ExitCode, Failure> {
+    let plan = Plan::new(arguments, ranks)?;
+    let task = PointTask::new(&plan.folders, &plan.config, &plan.device)?;
     plan.check_validation(task.validation_samples());
     plan.run(&task, |tracked| {
         let networks = plan.config.networks();
         // The state of a continued run contains its weights.
         let start = plan.config.training.weights.as_deref();
-        let predictor = match start.filter(|_| arguments.begun().is_none()) {
+        let predictor = match start.filter(|_| plan.begun.is_none()) {
             Some(path) => open(path, &plan.config)?.point_predictor(tracked)?,
             None => random_predictor(&networks, plan.config.training.seed, tracked),
         };
@@ -94,10 +137,10 @@ pub fn stage1(arguments: &Arguments) -> Result<(), Failure> {
     })
 }
 
-pub fn stage2(arguments: &Arguments) -> Result<(), Failure> {
-    let plan = Plan::new(arguments)?;
+fn humans(arguments: &Arguments, ranks: &Ranks) -> Result<ExitCode, Failure> {
+    let plan = Plan::new(arguments, ranks)?;
     // The latest weights of a continued run contain its point predictor. Before the first checkpoint there are none.
-    let latest = arguments.begun().map(|run| run.join(LAST)).filter(|latest| latest.exists());
+    let latest = plan.begun.map(|run| run.join(LAST)).filter(|latest| latest.exists());
     let Some(start) = latest.or_else(|| plan.config.training.weights.clone()) else {
         bail!(
             "stage 2 needs a trained point predictor: give --weights FILE, as train-stage1 writes it, or \
@@ -109,8 +152,8 @@ pub fn stage2(arguments: &Arguments) -> Result<(), Failure> {
         outside_data(maps, plan.folders.iter().map(|folder| folder.root()))?;
     }
     let joint = plan.config.stage2.points_weight > 0.0;
-    let frozen = (!joint).then(|| weights.point_predictor(&plan.devices[0].clone().inner())).transpose()?;
-    let task = GaussianTask::new(&plan.folders, &plan.config, frozen, &plan.devices)?;
+    let frozen = (!joint).then(|| weights.point_predictor(&plan.device.clone().inner())).transpose()?;
+    let task = GaussianTask::new(&plan.folders, &plan.config, frozen, &plan.device)?;
     plan.check_validation(task.validation_samples());
     plan.run(&task, |tracked| {
         let networks = plan.config.networks();
@@ -130,7 +173,7 @@ fn open(path: &Path, config: &TrainConfig) -> Result<WeightFile, Failure> {
 }
 
 impl<'a> Plan<'a> {
-    fn new(arguments: &'a Arguments) -> Result<Self, Failure> {
+    fn new(arguments: &'a Arguments, ranks: &'a Ranks) -> Result<Self, Failure> {
         if let Some(minutes) = arguments.minutes.filter(|minutes| !(*minutes > 0.0 && *minutes <= 1e6)) {
             bail!("--minutes {minutes}: must be more than 0 and at most a million");
         }
@@ -143,28 +186,35 @@ impl<'a> Plan<'a> {
         check_data(&config.data.folders)?;
         let folders = config.data.folders.iter().map(|path| Folder::open(path).map(Arc::new));
         let folders = folders.collect::<Result<_, _>>()?;
-        let devices = arguments.device.split(',').map(device::choose).collect::<Result<Vec<_>, _>>()?;
-        if devices.len() > config.training.batch {
-            let (names, count, batch) = (&arguments.device, devices.len(), config.training.batch);
-            bail!("--device {names}: {count} devices share a batch of {batch}: set training.batch higher");
+        let device = if ranks.size() == 1 {
+            device::choose(&arguments.device)?
+        } else {
+            device::choose_in_turn(&arguments.device, ranks.local())?
+        };
+        if ranks.size() > config.training.batch {
+            let (count, batch) = (ranks.size(), config.training.batch);
+            bail!("{count} ranks share a batch of {batch}: set training.batch higher");
         }
-        if memory::is_cpu(&devices[0]) {
+        if memory::is_cpu(&device) {
             memory::check("this training", least_memory(&config), "a smaller network or batch needs less")?;
         }
-        let precision = config.training.precision.of_training(&devices);
+        // All ranks compute in the format of the least of them.
+        let precision = config.training.precision.of_training(from_ref(&device));
+        let all = ranks.gather(&precision);
+        let precision = if all.contains(&Precision::F32) { Precision::F32 } else { all[0] };
         config.training.precision = precision.into();
-        for (name, device) in arguments.device.split(',').zip(&devices) {
-            if !device.supports_dtype(precision.dtype()) {
-                let precision = precision.name();
-                bail!("--device {name}: does not compute in {precision}: set training.precision to f32");
-            }
+        if !device.supports_dtype(precision.dtype()) {
+            let (name, precision) = (&arguments.device, precision.name());
+            bail!("--device {name}: does not compute in {precision}: set training.precision to f32");
         }
-        let tracked = |device: Device| match config.training.gradient_checkpointing {
+        let device = match config.training.gradient_checkpointing {
             true => device.autodiff().gradient_checkpointing(),
             false => device.autodiff(),
         };
-        let devices = devices.into_iter().map(tracked).collect();
-        Ok(Self { arguments, config, folders, devices })
+        // The first rank is about to write a state, which later ranks would find.
+        let begun = arguments.output.as_deref().filter(|run| arguments.resume && run.join(STATE).exists());
+        let begun = begun.filter(|_| ranks.gather(&begun.is_some())[0]);
+        Ok(Self { arguments, config, folders, device, ranks, begun })
     }
 
     fn check_validation(&self, samples: usize) {
@@ -180,34 +230,33 @@ impl<'a> Plan<'a> {
         &self,
         task: &T,
         networks: impl Fn(&Device) -> Result<Networks, Failure> + Sync,
-    ) -> Result<(), Failure> {
-        let tracked = &self.devices[0];
+    ) -> Result<ExitCode, Failure> {
+        let (tracked, ranks) = (&self.device, self.ranks);
         if self.arguments.dry_run {
-            return run::on_best_thread(&self.devices, || {
-                let rehearsal = run::rehearse(task, &self.config, networks(tracked)?, &self.devices)?;
+            return run::on_best_thread(tracked, || {
+                let rehearsal = run::rehearse(task, &self.config, networks(tracked)?, tracked, ranks)?;
                 report::rehearsed(&self.config, tracked, rehearsal);
-                Ok(())
+                Ok(ExitCode::SUCCESS)
             });
         }
         let path = self.arguments.output.as_deref().expect("required by clap");
-        let folder = RunFolder::open(path, self.arguments, &self.config, &self.folders)?;
+        let open = || RunFolder::open(path, self.arguments, &self.config, &self.folders);
+        let _folder = ranks.is_first().then(open).transpose()?;
         let limit = self.arguments.minutes.map(|minutes| Duration::from_secs_f64(60.0 * minutes));
         let stop = interrupt::patiently();
-        let options = Options {
-            folder: &folder.path,
-            devices: &self.devices,
-            limit,
-            stop,
-            force: self.arguments.force,
-        };
+        let options =
+            Options { folder: path, device: tracked, ranks, limit, stop, force: self.arguments.force };
         let mut reporter = Reporter::new(&self.config, limit);
         let start = Instant::now();
-        let outcome = run::on_best_thread(&self.devices, || {
-            Ok::<_, Failure>(run::train(task, &self.config, networks(tracked)?, &options, &mut reporter)?)
+        let outcome = run::on_best_thread(tracked, || {
+            let trained = run::train(task, &self.config, networks(tracked)?, &options, &mut reporter);
+            // Scripts of batch systems tell failures of a running job by one code.
+            trained.map_err(|e| if ranks.size() > 1 { Failure::Internal(e.to_string()) } else { e.into() })
         })?;
         drop(reporter);
-        self.summarise(T::STAGE, &folder.path, &outcome, start.elapsed());
-        Ok(())
+        self.summarise(T::STAGE, path, &outcome, start.elapsed());
+        let is_cut = !outcome.finished && ranks.gather(&interrupt::was_terminated()).contains(&true);
+        Ok(if is_cut { ExitCode::from(UNFINISHED) } else { ExitCode::SUCCESS })
     }
 
     /// Prints the outcome of a session and the next commands.

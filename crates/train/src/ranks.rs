@@ -1,0 +1,230 @@
+//! The processes of a training. Built with the feature `mpi` and started by `mpirun` or `srun`, each is a rank of MPI. Otherwise there
+//! is one. All ranks make the same calls in the same order.
+
+use std::ops::Range;
+
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use snapsnap_data::sample::share;
+
+/// Environment variables that launchers set: Open MPI's, PMIx', and those of MPICH and of Slurm's PMI-2.
+const LAUNCHERS: [&str; 3] = ["OMPI_COMM_WORLD_SIZE", "PMIX_RANK", "PMI_RANK"];
+
+/// The place of this process among those of its training.
+pub struct Ranks {
+    rank: usize,
+    size: usize,
+    /// Number of lower ranks on the same machine.
+    local: usize,
+    /// Name of the machine.
+    host: String,
+    /// Ends MPI when it is dropped.
+    #[cfg(feature = "mpi")]
+    _universe: Option<mpi::environment::Universe>,
+}
+
+impl Default for Ranks {
+    /// A process alone.
+    fn default() -> Self {
+        Self {
+            rank: 0,
+            size: 1,
+            local: 0,
+            host: String::new(),
+            #[cfg(feature = "mpi")]
+            _universe: None,
+        }
+    }
+}
+
+impl Ranks {
+    /// Joins the ranks of a launcher, or stays alone without one. MPI ends when the result is dropped, which all ranks have to do.
+    ///
+    /// # Errors
+    /// A message if a launcher started this process, and it cannot join the others.
+    pub fn join() -> Result<Self, String> {
+        match LAUNCHERS.into_iter().find(|name| std::env::var_os(name).is_some()) {
+            Some(launcher) => Self::join_launched(launcher),
+            None => Ok(Self::default()),
+        }
+    }
+
+    #[cfg(not(feature = "mpi"))]
+    fn join_launched(launcher: &str) -> Result<Self, String> {
+        if launcher == LAUNCHERS[0] && std::env::var(launcher).is_ok_and(|size| size == "1") {
+            return Ok(Self::default());
+        }
+        Err(format!(
+            "{launcher} is set, so MPI started this program, which was built without it: build with --features mpi"
+        ))
+    }
+
+    /// This process among all: 0 is the first.
+    pub fn rank(&self) -> usize {
+        self.rank
+    }
+
+    /// Number of processes.
+    pub fn size(&self) -> usize {
+        self.size
+    }
+
+    /// Number of lower ranks on the same machine.
+    pub fn local(&self) -> usize {
+        self.local
+    }
+
+    /// Name of the machine.
+    pub fn host(&self) -> &str {
+        &self.host
+    }
+
+    /// Whether this process writes the training's files and messages.
+    pub fn is_first(&self) -> bool {
+        self.rank == 0
+    }
+
+    /// This rank's share of `count` things. The shares of all ranks differ by one at most.
+    pub fn share(&self, count: usize) -> Range<usize> {
+        share([self.rank, self.size], count)
+    }
+
+    /// Every rank's value, by rank.
+    ///
+    /// # Panics
+    /// If a value does not have the same type on all ranks.
+    pub fn gather<T: Serialize + DeserializeOwned>(&self, value: &T) -> Vec<T> {
+        let text = serde_json::to_vec(value).expect("plain data");
+        let read = |bytes: &[u8]| serde_json::from_slice(bytes).expect("all ranks send the same type");
+        if self.size == 1 {
+            return vec![read(&text)];
+        }
+        self.exchange(&text).iter().map(|bytes| read(bytes)).collect()
+    }
+
+    /// Replaces `values` by their sums over all ranks, in the order of the ranks. All ranks get the same bytes.
+    pub fn sum(&self, values: &mut [f32]) {
+        if self.size > 1 {
+            self.sum_all(values);
+        }
+    }
+
+    #[cfg(not(feature = "mpi"))]
+    fn exchange(&self, _bytes: &[u8]) -> Vec<Vec<u8>> {
+        unreachable!("one rank")
+    }
+
+    #[cfg(not(feature = "mpi"))]
+    fn sum_all(&self, _values: &mut [f32]) {
+        unreachable!("one rank")
+    }
+
+    /// Ends all ranks with this exit code. Does nothing in a process alone.
+    #[cfg(not(feature = "mpi"))]
+    pub fn abort(&self, _code: u8) {}
+}
+
+#[cfg(feature = "mpi")]
+mod over_mpi {
+    use mpi::Threading;
+    use mpi::datatype::PartitionMut;
+    use mpi::environment::processor_name;
+    use mpi::topology::SimpleCommunicator;
+    use mpi::traits::*;
+
+    use super::Ranks;
+
+    fn world() -> SimpleCommunicator {
+        SimpleCommunicator::world()
+    }
+
+    impl Ranks {
+        pub(super) fn join_launched(launcher: &str) -> Result<Self, String> {
+            let cannot = |why: &str| format!("{launcher} is set, but MPI cannot be started: {why}");
+            // The training's thread is not always the one that starts MPI.
+            let joined = mpi::initialize_with_threading(Threading::Serialized);
+            let (universe, threading) = joined.ok_or_else(|| cannot("it was started before"))?;
+            if threading < Threading::Serialized {
+                return Err(cannot("it does not support threads"));
+            }
+            let world = world();
+            let [rank, size] = [world.rank(), world.size()].map(|number| number as usize);
+            let local = world.split_shared(world.rank()).rank() as usize;
+            let host = processor_name().unwrap_or_default();
+            Ok(Self { rank, size, local, host, _universe: Some(universe) })
+        }
+
+        pub(super) fn exchange(&self, bytes: &[u8]) -> Vec<Vec<u8>> {
+            let mut counts = vec![0_i32; self.size];
+            let own = i32::try_from(bytes.len()).expect("short texts");
+            world().all_gather_into(&own, &mut counts[..]);
+            let starts: Vec<i32> = counts
+                .iter()
+                .scan(0, |sum, count| {
+                    let start = *sum;
+                    *sum += count;
+                    Some(start)
+                })
+                .collect();
+            let mut all = vec![0_u8; counts.iter().sum::<i32>() as usize];
+            let mut parts = PartitionMut::new(&mut all[..], counts.as_slice(), starts.as_slice());
+            world().all_gather_varcount_into(bytes, &mut parts);
+            let part = |(start, count): (&i32, &i32)| all[*start as usize..(start + count) as usize].to_vec();
+            starts.iter().zip(&counts).map(part).collect()
+        }
+
+        /// Every rank adds up one part of the values, and sends the sum to all: each value travels twice, whatever the number of ranks.
+        pub(super) fn sum_all(&self, values: &mut [f32]) {
+            let part = values.len().div_ceil(self.size);
+            if part == 0 {
+                return;
+            }
+            let mut sent = values.to_vec();
+            sent.resize(part * self.size, 0.0);
+            let mut received = vec![0.0_f32; part * self.size];
+            world().all_to_all_into(&sent[..], &mut received[..]);
+            let (sum, others) = received.split_at_mut(part);
+            for other in others.chunks_exact(part) {
+                sum.iter_mut().zip(other).for_each(|(sum, value)| *sum += value);
+            }
+            world().all_gather_into(&*sum, &mut sent[..]);
+            values.copy_from_slice(&sent[..values.len()]);
+        }
+
+        /// Ends all ranks with this exit code. Does nothing in a process alone.
+        pub fn abort(&self, code: u8) {
+            if self.size > 1 {
+                world().abort(code.into());
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_process_alone_has_everything() {
+        let alone = Ranks::default();
+        assert!(alone.is_first() && alone.size() == 1 && alone.share(7) == (0..7));
+        assert_eq!(alone.gather(&vec![(1, "a".to_owned())]), [vec![(1, "a".to_owned())]]);
+        let mut values = [1.0, f32::NAN];
+        alone.sum(&mut values);
+        assert!(values[0] == 1.0 && values[1].is_nan());
+    }
+
+    #[test]
+    fn shares_are_even_and_whole() {
+        for (count, size) in [(4, 4), (5, 4), (3, 4), (0, 2), (17, 5)] {
+            let shares: Vec<_> =
+                (0..size).map(|rank| Ranks { rank, size, ..Ranks::default() }.share(count)).collect();
+            assert_eq!(
+                shares.iter().flat_map(Clone::clone).collect::<Vec<_>>(),
+                (0..count).collect::<Vec<_>>()
+            );
+            let lengths = || shares.iter().map(ExactSizeIterator::len);
+            assert!(lengths().max() <= lengths().min().map(|least| least + 1), "{shares:?}");
+        }
+    }
+}

@@ -1,0 +1,254 @@
+//! Trainings by several ranks of MPI: the losses of one process, equal bytes, and ends with one message. They need `mpirun`, and a
+//! program with the feature `mpi`.
+
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use snapsnap_tests::{snapsnap, succeed};
+
+use super::{copy_folder, logged, people, place, results, train, train_on};
+
+/// Whether ranks can be started; else the reason is printed, or an error with `SNAPSNAP_REQUIRE_MPI`.
+fn is_there() -> bool {
+    let mpirun = Command::new("mpirun").arg("--version").output().is_ok_and(|output| output.status.success());
+    let doctor = succeed(snapsnap().args(["doctor", "--json"]));
+    let report: serde_json::Value = serde_json::from_str(&doctor).expect("JSON");
+    let is_built = report["mpi"].as_bool().expect("a boolean");
+    let missing = match (mpirun, is_built) {
+        (true, true) => return true,
+        (false, _) => "there is no mpirun",
+        (_, false) => "the program was built without the feature mpi",
+    };
+    assert!(std::env::var_os("SNAPSNAP_REQUIRE_MPI").is_none(), "{missing}, but MPI is required");
+    println!("SKIPPED: {missing}");
+    false
+}
+
+/// The command on so many ranks, each with one thread.
+fn on_ranks(ranks: usize, command: &Command) -> Command {
+    let mut all = Command::new("mpirun");
+    all.args(["--allow-run-as-root", "--oversubscribe", "--bind-to", "none", "-n", &ranks.to_string()]);
+    all.arg(command.get_program()).args(command.get_args()).env("RAYON_NUM_THREADS", "1");
+    all
+}
+
+fn set(mut command: Command, keys: &[&str]) -> Command {
+    keys.iter().for_each(|key| {
+        command.args(["--set", key]);
+    });
+    command
+}
+
+fn said(output: &Output) -> String {
+    String::from_utf8_lossy(&[&output.stdout[..], &output.stderr].concat()).into_owned()
+}
+
+/// Messages of the program among those of `mpirun`.
+fn errors(output: &Output) -> Vec<String> {
+    said(output).lines().filter(|line| line.starts_with("error: ")).map(str::to_owned).collect()
+}
+
+#[test]
+fn ranks_have_the_losses_of_one_process_and_the_same_bytes_again() {
+    if !is_there() {
+        return;
+    }
+    let (temporary, config) = place();
+    let weights = temporary.path().join("start.safetensors");
+    // A batch of 4 of 3 people with 50 samples each, so that the last batch of a pass has 2.
+    // With the rates of the other tests, rounding errors grow tenfold every two steps of stage 2.
+    let rates = ["optimizer.rate=1e-3", "optimizer.muon.rate=1e-3"];
+    let keys = [&["training.steps=20", "training.batch=4", "samples.repeat=50"][..], &rates].concat();
+    for stage in [1, 2] {
+        let run = |name: &str, ranks: usize| {
+            let run = temporary.path().join(format!("{stage}-{name}"));
+            let mut command = set(train(stage, &config, &run), &keys);
+            if stage == 2 {
+                command.arg("--weights").arg(&weights);
+            }
+            if ranks > 1 {
+                command = on_ranks(ranks, &command);
+            }
+            succeed(&mut command);
+            run
+        };
+        let one = run("one", 1);
+        for ranks in [2, 4] {
+            let several = run(&ranks.to_string(), ranks);
+            let (expected, found) = (logged(&one, "loss"), logged(&several, "loss"));
+            assert_eq!((expected.len(), found.len()), (20, 20));
+            for ((step, expected), (_, found)) in expected.iter().zip(&found) {
+                assert!(
+                    (found / expected - 1.0).abs() < 1e-5,
+                    "stage {stage}, {ranks} ranks, step {step}: {found}, not {expected}"
+                );
+            }
+            for name in ["validation/points_mm", "validation/psnr_masked"] {
+                let scores = logged(&one, name).into_iter().zip(logged(&several, name));
+                scores.for_each(|((_, a), (_, b))| assert!((a / b - 1.0).abs() < 1e-3, "{name}: {a}, {b}"));
+            }
+            let again = run(&format!("{ranks}-again"), ranks);
+            assert!(results(&several) == results(&again), "stage {stage}: other bytes on {ranks} ranks");
+        }
+        fs::copy(one.join("last.safetensors"), &weights).expect("copies");
+    }
+}
+
+/// Kills of a rank end all ranks, and leave a state with which the run ends with the same bytes. `SNAPSNAP_TEST_KILLS` is their number.
+#[test]
+fn a_killed_rank_ends_all_and_the_run_goes_on() {
+    if !is_there() {
+        return;
+    }
+    let (temporary, config) = place();
+    let kills = std::env::var("SNAPSNAP_TEST_KILLS").ok().and_then(|kills| kills.parse().ok()).unwrap_or(3);
+    let command = |run: &Path| {
+        let command = train(1, &config, run);
+        on_ranks(2, &set(command, &["training.steps=120", "samples.repeat=50"]))
+    };
+    let undisturbed = temporary.path().join("undisturbed");
+    succeed(&mut command(&undisturbed));
+    let (killed, mut random) = (temporary.path().join("killed"), ChaCha8Rng::seed_from_u64(11));
+    let (mut made, mut longest) = (0, Duration::ZERO);
+    while made < kills {
+        let child = command(&killed).arg("--resume").stdout(Stdio::null()).stderr(Stdio::piped()).spawn();
+        let mut child = child.expect("starts");
+        std::thread::sleep(Duration::from_millis(random.random_range(400..2500)));
+        if child.try_wait().expect("waits").is_some() {
+            break;
+        }
+        // The program's processes are children of mpirun.
+        let ranks =
+            Command::new("pgrep").args(["-P", &child.id().to_string(), "snapsnap"]).output().expect("pgrep");
+        let ranks = String::from_utf8_lossy(&ranks.stdout).into_owned();
+        let ranks: Vec<&str> = ranks.split_whitespace().collect();
+        let Some(victim) = ranks.get(random.random_range(0..ranks.len().max(1))) else { continue };
+        Command::new("kill").args(["-KILL", victim]).status().expect("kill");
+        let start = Instant::now();
+        let output = child.wait_with_output().expect("ends");
+        longest = longest.max(start.elapsed());
+        // The run may have ended just before.
+        made += usize::from(!output.status.success());
+    }
+    println!("{made} ranks killed, the others ended within {longest:?}");
+    assert!(made > 0 && longest < Duration::from_secs(30), "{made} kills, {longest:?}");
+    succeed(command(&killed).arg("--resume"));
+    assert!(results(&undisturbed) == results(&killed), "other bytes after {made} kills");
+}
+
+#[test]
+fn signals_end_a_session_with_a_code_for_scripts_and_other_ranks_go_on() {
+    if !is_there() {
+        return;
+    }
+    let (temporary, config) = place();
+    let keys = ["training.steps=400", "training.batch=4", "samples.repeat=50", "training.validate_every=0"];
+    let command = |run: &Path| set(train(1, &config, run), &keys);
+    let whole = temporary.path().join("whole");
+    succeed(&mut command(&whole));
+    let run = temporary.path().join("run");
+    let mut made = Vec::new();
+    for (signal, ranks) in [("-TERM", 1), ("-USR1", 1), ("-USR1", 2)] {
+        let mut pieces = command(&run);
+        pieces.arg("--resume");
+        let mut pieces = if ranks > 1 { on_ranks(ranks, &pieces) } else { pieces };
+        let child = pieces.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("starts");
+        std::thread::sleep(Duration::from_millis(1500));
+        Command::new("kill").args([signal, &child.id().to_string()]).status().expect("kill");
+        let output = child.wait_with_output().expect("ends");
+        assert_eq!(output.status.code(), Some(75), "{signal}, {ranks} ranks: {}", said(&output));
+        let steps = said(&output)
+            .split("interrupted after ")
+            .nth(1)
+            .and_then(|rest| rest.split(' ').next()?.parse().ok());
+        made.push(steps.unwrap_or_else(|| panic!("{}", said(&output))));
+    }
+    succeed(command(&run).arg("--resume"));
+    let (expected, found) = (logged(&whole, "loss"), logged(&run, "loss"));
+    assert_eq!(expected.len(), found.len());
+    let [first, alone, together]: [usize; 3] = made.try_into().expect("three");
+    assert!(0 < first && first < alone && alone < together && together < 400, "{first} {alone} {together}");
+    assert!(expected[..alone] == found[..alone], "a process alone goes on with other losses");
+    // The samples are the same, and rounding alone differs. It grows with the steps.
+    for ((step, expected), (_, found)) in expected.iter().zip(&found).skip(alone).take(10) {
+        assert!((found / expected - 1.0).abs() < 1e-3, "step {step}: {found}, not {expected}");
+    }
+}
+
+#[test]
+fn failures_of_a_rank_end_all_with_one_message() {
+    if !is_there() {
+        return;
+    }
+    let (temporary, config) = place();
+    let run = |name: &str| temporary.path().join(name);
+    let start = Instant::now();
+    // Too many ranks, which all of them notice.
+    let output = on_ranks(3, &train(1, &config, &run("many"))).output().expect("runs");
+    let message = "3 ranks share a batch of 2: set training.batch higher";
+    assert_eq!(output.status.code(), Some(2), "{}", said(&output));
+    assert!(
+        matches!(&errors(&output)[..], [one] if one.contains("rank 0 on ") && one.ends_with(message)),
+        "{}",
+        said(&output)
+    );
+    // All pictures are broken: no step can be made.
+    let broken = run("broken");
+    copy_folder(people(), &broken);
+    let pictures = walk(&broken.join("train")).into_iter();
+    let pictures: Vec<_> = pictures.filter(|path| path.extension().is_some_and(|end| end == "png")).collect();
+    assert!(pictures.len() >= 12, "{pictures:?}");
+    pictures.iter().for_each(|picture| fs::write(picture, b"no picture").expect("writes"));
+    let output = on_ranks(2, &train_on(&broken, 1, &config, &run("stuck"))).output().expect("runs");
+    assert_eq!(output.status.code(), Some(1), "{}", said(&output));
+    assert!(matches!(&errors(&output)[..], [one] if one.contains("steps in a row")), "{}", said(&output));
+    // Ranks with other data.
+    let mut other = Command::new("mpirun");
+    other.args(["--allow-run-as-root", "--oversubscribe", "-n", "2", "sh", "-c"]);
+    other.arg("data=$1; shift; [ \"$OMPI_COMM_WORLD_RANK\" = 0 ] || set -- \"$@\" --set training.seed=9; exec \"$@\" --data \"$data\"");
+    let single = train(1, &config, &run("other"));
+    let output = other
+        .arg("sh")
+        .arg(people())
+        .arg(single.get_program())
+        .args(single.get_args())
+        .output()
+        .expect("runs");
+    assert_eq!(output.status.code(), Some(1), "{}", said(&output));
+    let errors_there = errors(&output);
+    assert!(
+        errors_there.iter().any(|error| error.contains("rank 1 on") && error.contains("training.seed")),
+        "{}",
+        said(&output)
+    );
+    // A full disk on the first rank, after a checkpoint.
+    let full = run("full");
+    succeed(&mut on_ranks(2, &set(train(1, &config, &full), &["training.steps=8"])));
+    let before = results(&full);
+    let mut shell = Command::new("sh");
+    shell.args(["-c", "trap '' XFSZ; ulimit -f 20; exec \"$@\"", "sh"]);
+    let mut single = train(1, &config, &full);
+    single.arg("--resume");
+    shell.arg(single.get_program()).args(single.get_args());
+    let output = on_ranks(2, &shell).output().expect("runs");
+    assert_eq!(output.status.code(), Some(1), "{}", said(&output));
+    assert!(
+        matches!(&errors(&output)[..], [one] if one.contains("rank 0 on ") && one.contains("cannot write")),
+        "{}",
+        said(&output)
+    );
+    assert!(results(&full) == before);
+    assert!(start.elapsed() < Duration::from_secs(120), "{:?}", start.elapsed());
+}
+
+/// All files below a folder.
+fn walk(folder: &Path) -> Vec<std::path::PathBuf> {
+    if !folder.is_dir() {
+        return vec![folder.to_owned()];
+    }
+    fs::read_dir(folder).expect("lists").flat_map(|entry| walk(&entry.expect("an entry").path())).collect()
+}
