@@ -17,6 +17,8 @@ use snapsnap_train::TrainError;
 pub enum Failure {
     /// An error that the user can correct: a path, a file's content, a config, a device.
     Input(String),
+    /// An output that cannot be written.
+    Write(String),
     /// Any other error.
     Internal(String),
 }
@@ -37,13 +39,14 @@ impl Failure {
 
     /// The operating system refused to write this file.
     pub fn cannot_write(path: &Path, e: &io::Error) -> Self {
-        Self::file(path, format_args!("cannot write: {e}"))
+        Self::Write(format!("{}: cannot write: {e}", path.display()))
     }
 
     /// The same message after the name of a file.
     pub fn about(self, path: &Path) -> Self {
         match self {
             Self::Input(message) => Self::file(path, message),
+            Self::Write(message) => Self::Write(format!("{}: {message}", path.display())),
             Self::Internal(message) => Self::Internal(format!("{}: {message}", path.display())),
         }
     }
@@ -51,7 +54,7 @@ impl Failure {
     /// The program's exit code.
     pub fn code(&self) -> u8 {
         match self {
-            Self::Input(_) => 2,
+            Self::Input(_) | Self::Write(_) => 2,
             Self::Internal(_) => 1,
         }
     }
@@ -60,7 +63,7 @@ impl Failure {
 impl fmt::Display for Failure {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::Input(message) | Self::Internal(message) => f.write_str(message),
+            Self::Input(message) | Self::Write(message) | Self::Internal(message) => f.write_str(message),
         }
     }
 }
@@ -75,11 +78,22 @@ macro_rules! input_error {
     };
 }
 
-input_error!(FileError, ConfigError, WeightsError);
+input_error!(ConfigError, WeightsError);
+
+impl From<FileError> for Failure {
+    fn from(e: FileError) -> Self {
+        if matches!(e, FileError::Write { .. }) {
+            Self::Write(e.to_string())
+        } else {
+            Self::Input(e.to_string())
+        }
+    }
+}
 
 impl From<SplatError> for Failure {
     fn from(e: SplatError) -> Self {
         match e {
+            SplatError::File(e) => e.into(),
             SplatError::Shape { .. } | SplatError::NotFinite { .. } => Self::Internal(e.to_string()),
             _ => Self::Input(e.to_string()),
         }

@@ -6,6 +6,7 @@
 // The page is part of the documentation only. A change of it does not rebuild the program.
 #![cfg_attr(doc, doc = "\n", doc = include_str!("../../../docs/architecture.md"))]
 
+mod batch;
 mod commands;
 mod cutouts;
 mod device;

@@ -201,7 +201,7 @@ impl From<Failure> for Answer {
     fn from(failure: Failure) -> Self {
         let status = match failure {
             Failure::Input(_) => StatusCode::UNPROCESSABLE_ENTITY,
-            Failure::Internal(_) => StatusCode::INTERNAL_SERVER_ERROR,
+            Failure::Write(_) | Failure::Internal(_) => StatusCode::INTERNAL_SERVER_ERROR,
         };
         text(status, &failure.to_string())
     }

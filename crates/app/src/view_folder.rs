@@ -12,7 +12,7 @@ use crate::output::{check_folder, make_folder, remove};
 use crate::pictures::write_png;
 
 /// Name of the file of cameras.
-const CAMERAS: &str = "cameras.json";
+pub const CAMERAS: &str = "cameras.json";
 
 /// An output folder of a number of views.
 pub struct ViewFolder {

@@ -243,6 +243,11 @@ impl Default for Shard {
 }
 
 impl Shard {
+    /// As in names of files: `0-of-4`.
+    pub fn name(self) -> String {
+        format!("{}-of-{}", self.index, self.count)
+    }
+
     /// Whether the subject with this index belongs to this shard.
     pub fn has(self, place: usize) -> bool {
         place % self.count == self.index

@@ -6,17 +6,22 @@ use clap::Args;
 use snapsnap_splat::scene::{Kind, Stored};
 
 use super::{check_kind, check_outputs};
+use crate::batch::{self, KindArgument, ShardArgument};
 use crate::failure::Failure;
 use crate::say;
 
 #[derive(Args)]
 pub struct Arguments {
-    /// File of Gaussians: PLY, SPZ, or GLB.
+    /// File of Gaussians: PLY, SPZ, or GLB; or a folder of such files.
     input: PathBuf,
-    /// Output file: .ply, .spz, .glb (KHR_gaussian_splatting) or .sog.
+    /// Output file: .ply, .spz, .glb (KHR_gaussian_splatting) or .sog; or a folder.
     output: PathBuf,
     #[command(flatten)]
     axes: AxesArguments,
+    #[command(flatten)]
+    kind: KindArgument,
+    #[command(flatten)]
+    shard: ShardArgument,
 }
 
 /// Axes of an output file of Gaussians.
@@ -46,7 +51,16 @@ impl AxesArguments {
 }
 
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
-    let Arguments { input, output, axes } = arguments;
+    let Arguments { input, output, axes, kind, shard } = arguments;
+    if input.is_dir() {
+        let file = |name: &str| output.join(format!("{name}.{}", kind.extension()));
+        axes.check(&file("x"))?;
+        return batch::each(input, output, shard, file, |path, name| {
+            check_outputs(&[&file(name)], &[path])?;
+            axes.write(&finite(path)?.0, &file(name))
+        });
+    }
+    kind.must_be_unused(shard, "is for a folder of many files")?;
     check_kind(output)?;
     axes.check(output)?;
     check_outputs(&[output], &[input])?;

@@ -10,7 +10,8 @@ use snapsnap_mesh::fuse::{Fused, Options, fuse};
 use snapsnap_splat::scene::{self, Loaded};
 
 use super::check_outputs;
-use crate::failure::Failure;
+use crate::batch::{self, ShardArgument};
+use crate::failure::{Failure, bail};
 use crate::progress::Progress;
 use crate::{device, memory, say};
 
@@ -27,13 +28,18 @@ const GLB_TEXTURE: u32 = 2048;
 /// Volume of a dropped piece, as a share of the body's, from which on it may be another person.
 const COMPARABLE: f64 = 0.1;
 
-#[derive(Args)]
+#[derive(Args, Clone)]
 pub struct Arguments {
-    /// File of Gaussians: PLY, SPZ or GLB.
+    /// File of Gaussians: PLY, SPZ or GLB; or a folder of such files.
     input: PathBuf,
-    /// Output file: .glb, .obj or .ply.
-    #[arg(short, long, value_name = "FILE")]
+    /// Output file: .glb, .obj or .ply; or a folder.
+    #[arg(short, long, value_name = "FILE|DIR")]
     output: PathBuf,
+    /// With a folder: kind of the meshes [default: glb].
+    #[arg(long, value_parser = ["glb", "obj", "ply"])]
+    kind: Option<String>,
+    #[command(flatten)]
+    shard: ShardArgument,
     #[command(flatten)]
     surface: SurfaceArguments,
     /// Also make meshes that take far longer than a person's.
@@ -48,7 +54,7 @@ pub struct Arguments {
 }
 
 /// Options of a surface.
-#[derive(Args)]
+#[derive(Args, Clone)]
 pub struct SurfaceArguments {
     /// Approximate number of triangles of the mesh; 0 keeps all [default: 100000].
     #[arg(long, value_name = "N")]
@@ -80,6 +86,23 @@ pub fn options(kind: Kind) -> Options {
 }
 
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
+    let Arguments { input, output, kind, shard, .. } = arguments;
+    if !input.is_dir() {
+        let given = [("--kind", kind.is_some()), ("--shard", shard.shard.is_some())];
+        if let Some((name, _)) = given.iter().find(|(_, given)| *given) {
+            bail!("{name}: is for a folder of many files");
+        }
+        return one(arguments);
+    }
+    let file = |name: &str| output.join(format!("{name}.{}", kind.as_deref().unwrap_or("glb")));
+    Target::new(&file("x"), &arguments.surface)?;
+    batch::each(input, output, shard, file, |path, name| {
+        one(&Arguments { input: path.to_owned(), output: file(name), ..arguments.clone() })
+    })
+}
+
+/// Makes one mesh.
+fn one(arguments: &Arguments) -> Result<(), Failure> {
     let since = Instant::now();
     let mut target = Target::new(&arguments.output, &arguments.surface)?;
     target.options.force = arguments.force;

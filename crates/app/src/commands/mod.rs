@@ -9,6 +9,7 @@ pub mod evaluate;
 pub mod fetch_weights;
 pub mod manuals;
 pub mod mesh;
+mod pairs;
 pub mod prepare;
 pub mod reconstruct;
 pub mod render;
@@ -113,6 +114,11 @@ pub fn place(path: &Path) -> PathBuf {
     let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let folder = folder.canonicalize().unwrap_or_else(|_| folder.to_owned());
     folder.join(path.file_name().unwrap_or_default())
+}
+
+/// Whether both paths lead to one existing folder.
+pub fn is_same_folder(a: &Path, b: &Path) -> bool {
+    matches!((a.canonicalize(), b.canonicalize()), (Ok(a), Ok(b)) if a == b)
 }
 
 /// Whether both paths lead to one existing regular file.

@@ -18,7 +18,8 @@ use snapsnap_splat::scene::Stored;
 
 use super::convert::AxesArguments;
 use super::mesh::{self, SurfaceArguments, Target};
-use super::{ConfigArguments, check_kind, check_outputs, is_same_file};
+use super::{ConfigArguments, check_kind, check_outputs, is_same_file, pairs};
+use crate::batch::{KindArgument, ShardArgument};
 use crate::failure::{Failure, bail};
 use crate::progress::Progress;
 use crate::turntable::Turntable;
@@ -29,12 +30,26 @@ use crate::{cutouts, device, dump, memory, output, say, weights};
 /// 4 of a plane of f32, 3 + 1 of the other photograph's colours and mask, and 2 to spare.
 const BYTES_PER_PIXEL: u64 = 18;
 
+/// The output of one person.
+const DEFAULT_OUTPUT: &str = "human.ply";
+
 #[derive(Args)]
 pub struct Arguments {
     /// Photograph of the front. Without an alpha channel or --masks, a network removes the background.
-    front: PathBuf,
+    #[arg(required_unless_present = "pairs")]
+    front: Option<PathBuf>,
     /// Photograph of the back.
-    back: PathBuf,
+    #[arg(required_unless_present = "pairs")]
+    back: Option<PathBuf>,
+    /// Many people: a table with the columns front, back and perhaps name, front_mask and back_mask, or a folder of NAME_front.jpg and
+    /// NAME_back.jpg. Their files NAME.ply go to the folder -o. People who are there already are left out. Pairs that fail are listed in
+    /// errors.csv.
+    #[arg(long, value_name = "CSV|DIR", conflicts_with_all = ["front", "back", "masks", "save_cutouts", "turntable", "mesh", "dump", "verbose"])]
+    pairs: Option<PathBuf>,
+    #[command(flatten)]
+    pub kind: KindArgument,
+    #[command(flatten)]
+    pub shard: ShardArgument,
     /// Masks of the two photographs (white: person).
     #[arg(long, num_args = 2, value_names = ["FRONT_MASK", "BACK_MASK"])]
     masks: Option<Vec<PathBuf>>,
@@ -48,19 +63,20 @@ pub struct Arguments {
     save_cutouts: Option<PathBuf>,
     /// Use the pictures as the canvas, without cropping, scaling and centring.
     #[arg(long)]
-    as_is: bool,
+    pub as_is: bool,
     /// Refuse photographs that seem to be wrong, instead of a warning.
     #[arg(long)]
-    strict: bool,
+    pub strict: bool,
     #[command(flatten)]
-    camera: CameraArguments,
+    pub camera: CameraArguments,
     #[command(flatten)]
-    model: ModelArguments,
-    /// File of Gaussians to write: .ply, .spz, .glb or .sog. The resolved config is written beside it.
-    #[arg(short, long, default_value = "human.ply")]
-    output: PathBuf,
+    pub model: ModelArguments,
+    /// File of Gaussians to write: .ply, .spz, .glb or .sog [default: human.ply]. The resolved config is written beside it. With --pairs,
+    /// a folder.
+    #[arg(short, long)]
+    pub output: Option<PathBuf>,
     #[command(flatten)]
-    axes: AxesArguments,
+    pub axes: AxesArguments,
     /// Also render the result all around: an animation, a sheet of eight views, or a folder of pictures.
     #[arg(long, value_name = "OUT.gif|OUT.png|DIR")]
     turntable: Option<PathBuf>,
@@ -75,6 +91,17 @@ pub struct Arguments {
     /// Print the modules that ran, the omitted ones with the reasons, and the time of each.
     #[arg(short, long)]
     verbose: bool,
+}
+
+impl Arguments {
+    /// What tells the person from the background.
+    pub fn cutting<'a>(&self, segmenter: &'a photo::Segmenter<'a>) -> Cutting<'a> {
+        match &*self.cutout {
+            "none" => Cutting::Given,
+            "network" => Cutting::All(segmenter),
+            _ => Cutting::Missing(segmenter),
+        }
+    }
 }
 
 /// The networks and what computes them.
@@ -165,7 +192,18 @@ fn in_words(precision: Precision, device: &Device) -> String {
 }
 
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
+    match (&arguments.pairs, &arguments.front, &arguments.back) {
+        (Some(pairs), ..) => pairs::run(arguments, pairs),
+        (None, Some(front), Some(back)) => one(arguments, [front, back]),
+        _ => unreachable!("clap requires both"),
+    }
+}
+
+/// Makes one person.
+fn one(arguments: &Arguments, paths: [&PathBuf; 2]) -> Result<(), Failure> {
     let start = Instant::now();
+    arguments.kind.must_be_unused(&arguments.shard, "is for many people, with --pairs")?;
+    let output = arguments.output.as_deref().unwrap_or(Path::new(DEFAULT_OUTPUT));
     let weights = arguments.model.open()?;
     let config = weights.config.clone();
     let mut times = vec![("opening weights", start.elapsed())];
@@ -181,8 +219,8 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let unplaced = unplaced(&config, arguments.as_is);
     arguments.camera.check(unplaced)?;
     let saved = arguments.save_cutouts.as_deref().map(cutouts::paths).transpose()?;
-    let config_path = check_paths(arguments, weights.path(), turntable.as_ref(), target.as_ref(), &saved)?;
-    let paths = [&arguments.front, &arguments.back];
+    let config_path =
+        check_paths(arguments, paths, output, weights.path(), turntable.as_ref(), target.as_ref(), &saved)?;
     paths.iter().try_for_each(|path| check_memory(path, picture::size(path)?))?;
     let placement = if arguments.as_is { Placement::AsIs } else { placement(&config) };
     let masks = arguments.masks.as_deref().unwrap_or_default();
@@ -190,11 +228,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let sources =
         [0, 1].map(|i| Source { mask: masks.get(i).map(PathBuf::as_path), ..Source::file(paths[i]) });
     let segmenter = weights::segmenter();
-    let cutting = match &*arguments.cutout {
-        "none" => Cutting::Given,
-        "network" => Cutting::All(&segmenter),
-        _ => Cutting::Missing(&segmenter),
-    };
+    let cutting = arguments.cutting(&segmenter);
     let focal = arguments.camera.focal();
     let Pair { canvases, cutouts, shots, doubts } =
         photo::load(sources, cutting, config.network.resolution, placement, focal)?;
@@ -242,7 +276,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
         world = person;
         plan.extend(["front", "back"].iter().zip(cameras).map(|(name, camera)| format!("{name}: {camera}")));
     }
-    arguments.axes.write(&Stored::of(&world)?, &arguments.output)?;
+    arguments.axes.write(&Stored::of(&world)?, output)?;
     if let Some(path) = &config_path {
         output::write(path, config.resolved().to_toml().as_bytes())?;
     }
@@ -258,16 +292,16 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     }
     if let Some(target) = &target {
         let since = Instant::now();
-        plan.push(mesh::describe(&target.write(&world.clone().into(), &arguments.output)?));
+        plan.push(mesh::describe(&target.write(&world.clone().into(), output)?));
         times.push(("mesh", since.elapsed()));
     }
-    let print = say::beside(&arguments.output);
+    let print = say::beside(output);
     if arguments.verbose {
         times.push(("total", start.elapsed()));
         report(print, &plan, &times);
     }
     if !say::is_quiet() {
-        print(&format!("{}: {} Gaussians", arguments.output.display(), result.gaussians.len()));
+        print(&format!("{}: {} Gaussians", output.display(), result.gaussians.len()));
     }
     Ok(())
 }
@@ -276,22 +310,24 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
 /// beside a pipe or a device, or over the given config.
 fn check_paths(
     arguments: &Arguments,
+    [front, back]: [&PathBuf; 2],
+    output: &Path,
     weights: &Path,
     turntable: Option<&Turntable>,
     mesh: Option<&Target>,
     saved: &Option<[PathBuf; 2]>,
 ) -> Result<Option<PathBuf>, Failure> {
-    let mut inputs: Vec<&Path> = vec![&arguments.front, &arguments.back, weights];
+    let mut inputs: Vec<&Path> = vec![front, back, weights];
     inputs.extend(arguments.masks.iter().flatten().map(PathBuf::as_path));
-    let mut config_path = arguments.output.clone().into_os_string();
+    let mut config_path = output.as_os_str().to_owned();
     config_path.push(".config.toml");
     let config_path = PathBuf::from(config_path);
     let given = arguments.model.config.config.as_deref();
     let is_given = given.is_some_and(|given| is_same_file(given, &config_path));
-    let config_path = (!is_given && !file::is_special(&arguments.output)).then_some(config_path);
+    let config_path = (!is_given && !file::is_special(output)).then_some(config_path);
     inputs.extend(given);
-    let outputs = [Some(&arguments.output), arguments.dump.as_ref(), config_path.as_ref()];
-    let mut outputs: Vec<&Path> = outputs.into_iter().flatten().map(PathBuf::as_path).collect();
+    let outputs = [Some(output), arguments.dump.as_deref(), config_path.as_deref()];
+    let mut outputs: Vec<&Path> = outputs.into_iter().flatten().collect();
     outputs.extend(mesh.map(Target::files).unwrap_or_default());
     // A missing folder has no files that could be in the way.
     outputs.extend(
@@ -304,8 +340,8 @@ fn check_paths(
     }
     outputs.extend(pictures.iter().map(PathBuf::as_path));
     check_outputs(&outputs, &inputs)?;
-    check_kind(&arguments.output)?;
-    arguments.axes.check(&arguments.output)?;
+    check_kind(output)?;
+    arguments.axes.check(output)?;
     Ok(config_path)
 }
 

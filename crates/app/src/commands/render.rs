@@ -16,10 +16,11 @@ use snapsnap_splat::{
 };
 
 use super::{check_outputs, one_of};
+use crate::batch::{self, ShardArgument};
 use crate::failure::{Failure, bail};
 use crate::pictures::{picture, read_back};
 use crate::progress::Progress;
-use crate::view_folder::ViewFolder;
+use crate::view_folder::{CAMERAS, ViewFolder};
 use crate::{device, say};
 
 /// Side of an orbit's pictures.
@@ -36,10 +37,10 @@ const PRESETS: [(&str, &str, Preset); 2] = [
     ("gsplat", "gsplat 1.5: largest α 0.999, near plane 0.01 m", Preset::Gsplat),
 ];
 
-#[derive(Args)]
+#[derive(Args, Clone)]
 #[command(group = clap::ArgGroup::new("views").required(true).args(["cameras", "orbit"]))]
 pub struct Arguments {
-    /// File of Gaussians: PLY, SPZ or GLB, SH degree 0 to 3.
+    /// File of Gaussians: PLY, SPZ or GLB, SH degree 0 to 3; or a folder of such files.
     ply: PathBuf,
     /// Cameras to render into.
     #[arg(long, value_name = "cameras.json")]
@@ -53,7 +54,8 @@ pub struct Arguments {
     /// Colour behind the Gaussians, each from 0 to 1.
     #[arg(long, value_name = "R,G,B", value_parser = color, default_value = "0,0,0")]
     background: [f32; 3],
-    /// Folder for 000.png, 001.png, … and cameras.json [default: renders, unless --raw is given].
+    /// Folder for 000.png, 001.png, … and cameras.json [default: renders, unless --raw is given]. Each of several files gets a folder in
+    /// it.
     #[arg(short, long, value_name = "DIR")]
     output: Option<PathBuf>,
     /// Also write colour, alpha and depth as f32 tensors.
@@ -74,9 +76,30 @@ pub struct Arguments {
     /// Print the numbers of omitted Gaussians with the reasons, and the time.
     #[arg(short, long)]
     verbose: bool,
+    #[command(flatten)]
+    shard: ShardArgument,
 }
 
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
+    if !arguments.ply.is_dir() {
+        if arguments.shard.shard.is_some() {
+            bail!("--shard: is for a folder of many files");
+        }
+        return one(arguments);
+    }
+    if arguments.raw.is_some() {
+        bail!("--raw: takes one file of Gaussians, {} is a folder", arguments.ply.display());
+    }
+    views(arguments)?;
+    let target = arguments.output.as_deref().unwrap_or(Path::new(DEFAULT_FOLDER));
+    let done = |name: &str| target.join(name).join(CAMERAS);
+    batch::each(&arguments.ply, target, &arguments.shard, done, |path, name| {
+        one(&Arguments { ply: path.to_owned(), output: Some(target.join(name)), ..arguments.clone() })
+    })
+}
+
+/// Renders one file.
+fn one(arguments: &Arguments) -> Result<(), Failure> {
     let views = views(arguments)?;
     if arguments.raw.is_some() {
         check_raw(&views)?;

@@ -1,0 +1,272 @@
+//! `snapsnap reconstruct --pairs`: many people. Weights are loaded once, and while the networks make one person, the next photographs are
+//! read and the last person is written.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::{Path, PathBuf};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::thread;
+
+use snapsnap_base::config::Schema;
+use snapsnap_data::photo::{self, Canvas, Cutting, Mapping, Pair, Placement, Shot, Source};
+use snapsnap_mesh::picture;
+use snapsnap_net::{Photograph, Reconstructor};
+use snapsnap_splat::scene::Stored;
+
+use super::reconstruct::{Arguments, check_memory, placement, unplaced};
+use crate::batch::{Batch, files};
+use crate::failure::{Failure, bail};
+use crate::progress::Progress;
+use crate::{output, say, weights};
+
+/// The config of all people in an output folder.
+const CONFIG: &str = "pairs.config.toml";
+/// Extensions of photographs.
+const PICTURES: [&str; 11] =
+    ["jpg", "jpeg", "png", "webp", "tif", "tiff", "bmp", "gif", "heic", "heif", "hif"];
+/// Longest name of a person in bytes.
+const LONGEST: usize = 200;
+
+/// Photographs of one person.
+#[derive(Debug, Clone, PartialEq)]
+struct Job {
+    name: String,
+    /// Front and back; or what is missing.
+    photographs: Result<[PathBuf; 2], String>,
+    masks: [Option<PathBuf>; 2],
+}
+
+/// Photographs of one person on their canvases.
+struct Placed {
+    photographs: [Photograph; 2],
+    shots: [(Shot, [u32; 2], Mapping); 2],
+    doubts: Vec<String>,
+}
+
+pub fn run(arguments: &Arguments, pairs: &Path) -> Result<(), Failure> {
+    let Some(folder) = &arguments.output else { bail!("--pairs: give a folder for the people with -o") };
+    let extension = arguments.kind.extension();
+    let file = |name: &str| folder.join(format!("{name}.{extension}"));
+    arguments.axes.check(&file("x"))?;
+    let jobs = if pairs.is_dir() { in_folder(pairs)? } else { in_list(pairs)? };
+    let opened = arguments.model.open()?;
+    let config = opened.config.clone();
+    arguments.camera.check(unplaced(&config, arguments.as_is))?;
+    let mut batch = Batch::new(folder, &arguments.shard, pairs)?;
+    let (path, settings) = (folder.join(CONFIG), config.resolved().to_toml());
+    if std::fs::read(&path).is_ok_and(|there| there != settings.as_bytes()) {
+        return Err(Failure::file(
+            &path,
+            "the people in this folder were made with other settings: give another folder",
+        ));
+    }
+    output::write(&path, settings.as_bytes())?;
+    let jobs = batch.missing(jobs, |job| file(&job.name));
+    if jobs.is_empty() {
+        return batch.end(0);
+    }
+    let device = arguments.model.device(&opened)?;
+    let (reconstructor, _) = arguments.model.load(&opened, &device)?;
+    let progress = Progress::steps(jobs.len(), "people");
+    let (to_networks, photographs) = sync_channel(1);
+    let (to_writer, people) = sync_channel(1);
+    let (to_list, ended) = sync_channel(jobs.len());
+    let (jobs, file) = (&jobs, &file);
+    thread::scope(|scope| {
+        let side = config.network.resolution;
+        let placement = if arguments.as_is { Placement::AsIs } else { placement(&config) };
+        scope.spawn(move || read_all(arguments, jobs, side, placement, &to_networks));
+        scope.spawn(move || write_all(arguments, file, people, &to_list));
+        let mut results = 0;
+        let mut count = |(name, result): (String, Result<(), Failure>)| {
+            results += 1;
+            progress.step(results, jobs.len(), "people");
+            result.or_else(|failure| batch.failed(&name, failure))
+        };
+        for (job, placed) in jobs.iter().zip(photographs) {
+            let person = placed.and_then(|placed| {
+                placed.doubts.iter().for_each(|doubt| say::note(&format!("{}: warning: {doubt}", job.name)));
+                unpanicked(|| make(arguments, &reconstructor, placed))
+            });
+            to_writer.send((job.name.clone(), person)).expect("the writer waits for the last person");
+            ended.try_iter().try_for_each(&mut count)?;
+        }
+        drop(to_writer);
+        ended.into_iter().try_for_each(count)
+    })?;
+    drop(progress);
+    batch.end(jobs.len())
+}
+
+/// Turns a panic, whose message is printed, into a failure of one person.
+fn unpanicked<T>(work: impl FnOnce() -> Result<T, Failure>) -> Result<T, Failure> {
+    let bug = |_| Err(Failure::Internal("a bug in this program; its message is above".into()));
+    catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(bug)
+}
+
+/// Reads all photographs, one person after another, until nobody wants the next one.
+fn read_all(
+    arguments: &Arguments,
+    jobs: &[Job],
+    side: usize,
+    placement: Placement,
+    to_networks: &SyncSender<Result<Placed, Failure>>,
+) {
+    let segmenter = weights::segmenter();
+    let cutting = arguments.cutting(&segmenter);
+    for job in jobs {
+        let placed = unpanicked(|| read(arguments, job, cutting, side, placement));
+        if to_networks.send(placed).is_err() {
+            return;
+        }
+    }
+}
+
+fn read(
+    arguments: &Arguments,
+    job: &Job,
+    cutting: Cutting,
+    side: usize,
+    placement: Placement,
+) -> Result<Placed, Failure> {
+    let paths = job.photographs.as_ref().map_err(|missing| Failure::Input(missing.clone()))?;
+    paths.iter().try_for_each(|path| check_memory(path, picture::size(path)?))?;
+    let sources = [0, 1].map(|i| Source { mask: job.masks[i].as_deref(), ..Source::file(&paths[i]) });
+    let Pair { canvases, cutouts, shots, doubts } =
+        photo::load(sources, cutting, side, placement, arguments.camera.focal())?;
+    if arguments.strict && !doubts.is_empty() {
+        bail!("{} (--strict)", doubts.join("; "));
+    }
+    let shots = [0, 1].map(|i| (shots[i], cutouts[i].0.dimensions().into(), canvases[i].mapping));
+    let photographs = canvases.map(|Canvas { rgb, mask, valid, .. }| Photograph { rgb, mask, valid });
+    Ok(Placed { photographs, shots, doubts })
+}
+
+/// The person of two photographs.
+fn make(arguments: &Arguments, reconstructor: &Reconstructor, placed: Placed) -> Result<Stored, Failure> {
+    let [front, back] = &placed.photographs;
+    let config = reconstructor.config();
+    let result = reconstructor.reconstruct(front, back, &|_| ());
+    if result.gaussians.is_empty() {
+        bail!("no Gaussian came out of these photographs");
+    }
+    let mut world = result.in_world(config);
+    if unplaced(config, arguments.as_is).is_none() {
+        world = arguments.camera.person(world, &result, placed.shots, config.network.resolution)?.0;
+    }
+    Ok(Stored::of(&world)?)
+}
+
+/// Writes all people.
+fn write_all(
+    arguments: &Arguments,
+    file: &impl Fn(&str) -> PathBuf,
+    people: Receiver<(String, Result<Stored, Failure>)>,
+    to_list: &SyncSender<(String, Result<(), Failure>)>,
+) {
+    for (name, person) in people {
+        let written = person.and_then(|stored| unpanicked(|| arguments.axes.write(&stored, &file(&name))));
+        // The list has room for all, and ends early only after an output that could not be written.
+        if to_list.send((name, written)).is_err() {
+            return;
+        }
+    }
+}
+
+/// The people of a table with the columns `front` and `back`, and perhaps `name`, `front_mask` and `back_mask`. Paths are relative to the
+/// table's folder.
+fn in_list(path: &Path) -> Result<Vec<Job>, Failure> {
+    let cannot = |e: csv::Error| Failure::file(path, e);
+    let folder = path.parent().unwrap_or(Path::new(""));
+    let mut table = csv::ReaderBuilder::new().trim(csv::Trim::All).from_path(path).map_err(cannot)?;
+    let columns: Vec<String> = table.headers().map_err(cannot)?.iter().map(str::to_owned).collect();
+    for (i, column) in columns.iter().enumerate() {
+        let is_known = ["name", "front", "back", "front_mask", "back_mask"].contains(&column.as_str());
+        if !is_known || columns[..i].contains(column) {
+            let message =
+                "the columns are front and back, and perhaps name, front_mask and back_mask, each once";
+            return Err(Failure::file(path, format_args!("column `{column}`: {message}")));
+        }
+    }
+    if let Some(missing) =
+        ["front", "back"].into_iter().find(|name| !columns.iter().any(|column| column == name))
+    {
+        return Err(Failure::file(path, format_args!("has no column `{missing}`")));
+    }
+    let mut jobs = Vec::new();
+    for row in table.records() {
+        let row = row.map_err(cannot)?;
+        let line = row.position().map_or(0, csv::Position::line);
+        let value = |name: &str| {
+            let place = columns.iter().position(|column| column == name)?;
+            row.get(place).filter(|value| !value.is_empty())
+        };
+        let wrong = |message: &str| Failure::file(path, format_args!("line {line}: {message}"));
+        let (Some(front), Some(back)) = (value("front"), value("back")) else {
+            return Err(wrong("needs a front and a back"));
+        };
+        let name = match value("name") {
+            Some(name) => name.to_owned(),
+            None => named_by(Path::new(front)).ok_or_else(|| wrong("needs a name"))?,
+        };
+        if name.len() > LONGEST
+            || name.starts_with('.')
+            || name.contains(|c: char| c.is_control() || "/\\:".contains(c))
+        {
+            return Err(wrong(&format!("`{name}` cannot be the name of a file")));
+        }
+        let masks = ["front_mask", "back_mask"].map(|name| value(name).map(|mask| folder.join(mask)));
+        jobs.push(Job { name, photographs: Ok([folder.join(front), folder.join(back)]), masks });
+    }
+    checked(path, jobs)
+}
+
+/// A person's name by the photograph of the front: `anna_front.jpg` shows anna.
+fn named_by(front: &Path) -> Option<String> {
+    let stem = front.file_stem()?.to_str()?;
+    let name = stem.strip_suffix("_front").unwrap_or(stem);
+    (!name.is_empty() && name != "front").then(|| name.to_owned())
+}
+
+/// The people of a folder with `NAME_front.jpg`, `NAME_back.jpg`, and perhaps `NAME_front_mask.png` and `NAME_back_mask.png`, of any kind of
+/// picture.
+fn in_folder(folder: &Path) -> Result<Vec<Job>, Failure> {
+    let mut found = BTreeMap::new();
+    for path in files(folder)? {
+        let extension = path.extension().and_then(|extension| extension.to_str()).map(str::to_lowercase);
+        let is_picture = extension.is_some_and(|extension| PICTURES.contains(&extension.as_str()));
+        let Some(stem) = path.file_stem().and_then(|stem| stem.to_str()).filter(|_| is_picture) else {
+            continue;
+        };
+        if let Some(other) = found.insert(stem.to_owned(), path.clone()) {
+            return Err(Failure::file(&path, format_args!("has the name of {}", other.display())));
+        }
+    }
+    let names: BTreeSet<&str> = found
+        .keys()
+        .filter_map(|stem| stem.strip_suffix("_front").or(stem.strip_suffix("_back")))
+        .filter(|name| !name.is_empty())
+        .collect();
+    let job = |name: &str| {
+        let picture = |end: &str| found.get(&format!("{name}_{end}")).cloned();
+        let photographs = match (picture("front"), picture("back")) {
+            (Some(front), Some(back)) => Ok([front, back]),
+            (None, _) => Err(format!("{}: has no {name}_front", folder.display())),
+            (_, None) => Err(format!("{}: has no {name}_back", folder.display())),
+        };
+        Job { name: name.to_owned(), photographs, masks: ["front_mask", "back_mask"].map(picture) }
+    };
+    checked(folder, names.into_iter().map(job).collect())
+}
+
+/// Refuses no people, and two people of one name, also where files do not tell upper from lower case.
+fn checked(path: &Path, jobs: Vec<Job>) -> Result<Vec<Job>, Failure> {
+    if jobs.is_empty() {
+        return Err(Failure::file(path, "has no pair of photographs"));
+    }
+    let mut names = BTreeSet::new();
+    match jobs.iter().find(|job| !names.insert(job.name.to_lowercase())) {
+        Some(job) => Err(Failure::file(path, format_args!("two pairs are called `{}`", job.name))),
+        None => Ok(jobs),
+    }
+}
