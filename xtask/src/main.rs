@@ -65,6 +65,14 @@ fn features() -> Option<&'static str> {
     None
 }
 
+/// Whether a file is the library, not one of its relatives such as `libclang-cpp`.
+fn is_libclang(name: &str) -> bool {
+    let rest = name.strip_prefix("libclang").unwrap_or("-");
+    rest.starts_with(".so")
+        || rest.starts_with(".dylib")
+        || rest.starts_with('-') && rest[1..].starts_with(|c: char| c.is_ascii_digit())
+}
+
 fn has_libclang() -> bool {
     let entries = |folder: &Path| {
         let entries = fs::read_dir(folder).into_iter().flatten().flatten();
@@ -72,8 +80,7 @@ fn has_libclang() -> bool {
     };
     let below = entries(Path::new("/usr/lib")).into_iter().flat_map(|folder| [folder.join("lib"), folder]);
     let mut folders = below.chain(["/usr/lib".into(), "/usr/lib64".into()]);
-    let is_it =
-        |path: &PathBuf| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with("libclang"));
+    let is_it = |path: &PathBuf| path.file_name().is_some_and(|name| is_libclang(&name.to_string_lossy()));
     env::var_os("LIBCLANG_PATH").is_some() || folders.any(|folder| entries(&folder).iter().any(is_it))
 }
 

@@ -126,6 +126,7 @@ impl From<TrainError> for Failure {
     fn from(e: TrainError) -> Self {
         match e {
             TrainError::Splat(e) => e.into(),
+            TrainError::File(e) | TrainError::Weights(WeightsError::File(e)) => e.into(),
             TrainError::Stuck { .. } => Self::Internal(e.to_string()),
             _ => Self::Input(e.to_string()),
         }

@@ -43,9 +43,7 @@ pub fn patiently() -> &'static AtomicBool {
     for signal in [signal_hook::consts::SIGTERM, signal_hook::consts::SIGUSR1] {
         for flag in [&TERMINATED, &STOP] {
             if let Err(e) = signal_hook::flag::register(signal, Arc::clone(flag)) {
-                say::err(&format!(
-                    "warning: signal {signal} will end the training without a checkpoint: {e}"
-                ));
+                say::err(&format!("warning: signal {signal} will not be heard: {e}"));
             }
         }
     }

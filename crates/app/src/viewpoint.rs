@@ -3,16 +3,15 @@
 use burn::tensor::{Tensor, TensorData};
 use clap::Args;
 use glam::Vec3;
-use snapsnap_data::photo::{FOCALS, Mapping, Shot, Viewpoint};
+use snapsnap_data::photo::{ELEVATIONS, FOCALS, Mapping, Shot, Viewpoint};
 use snapsnap_net::Reconstruction;
 use snapsnap_splat::Gaussians;
 
 use crate::failure::{Failure, bail};
 use crate::pictures::read_back;
 
-/// Distances and elevations beyond which a camera photographs nobody who stands upright.
+/// Distances beyond which a camera photographs nobody who stands upright.
 const DISTANCES: std::ops::RangeInclusive<f64> = 1.0..=30.0;
-const ELEVATIONS: std::ops::RangeInclusive<f64> = -45.0..=60.0;
 /// Height of a person whose height is not given, in metres.
 const USUAL: f64 = 1.72;
 /// Share of the Gaussians above and below a person's height, which may be outliers.
@@ -73,16 +72,18 @@ impl CameraArguments {
         let nominal = Viewpoint::default();
         let tall = self.height.unwrap_or(USUAL);
         let focal = shot.focal;
+        // That of a turned picture is a little shorter where the person would not fit into it.
+        let told = self.focal.or(focal).unwrap_or_default();
         let whence = if self.focal.is_some() { "--focal" } else { "the file" };
         let seen = focal.map(|focal| Viewpoint::distance(focal, picture, mapping, side));
         let (distance, how) = match (self.distance, focal, seen) {
             (Some(distance), ..) => (distance * height / tall, "--distance".to_owned()),
-            (None, Some(focal), Some(seen)) if DISTANCES.contains(&seen) => {
-                (seen, format!("{focal:.0} mm of 35 mm film, {whence}"))
+            (None, Some(_), Some(seen)) if DISTANCES.contains(&seen) => {
+                (seen, format!("{told:.0} mm of 35 mm film, {whence}"))
             }
-            (None, Some(focal), _) => (
+            (None, Some(_), _) => (
                 nominal.distance,
-                format!("nominal: {focal:.0} mm of 35 mm film, {whence}, does not fit a person of this size"),
+                format!("nominal: {told:.0} mm of 35 mm film, {whence}, does not fit a person of this size"),
             ),
             _ => (nominal.distance, "nominal: the focal length is unknown".to_owned()),
         };

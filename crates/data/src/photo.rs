@@ -14,6 +14,7 @@ mod turning;
 mod viewpoint;
 
 use std::borrow::Cow;
+use std::mem::replace;
 use std::path::Path;
 
 use image::{DynamicImage, GrayImage, RgbImage};
@@ -30,7 +31,7 @@ pub(crate) use placing::place;
 use placing::{Standing, placed, together};
 pub(crate) use planes::PlaneMap;
 use turning::Turn;
-pub use viewpoint::{FOCALS, Shot, Viewpoint};
+pub use viewpoint::{ELEVATIONS, FOCALS, Shot, Viewpoint};
 
 /// Least side of a photograph in pixels.
 const MIN_SIDE: u32 = 64;
@@ -114,9 +115,9 @@ pub struct Canvas {
 pub struct Pair {
     /// Front and back on their canvases.
     pub canvases: [Canvas; 2],
-    /// Colours and masks of front and back before their placement.
+    /// Colours and masks of front and back before they are turned and placed.
     pub cutouts: [(RgbImage, GrayImage); 2],
-    /// Their cameras, as far as they are known.
+    /// Their cameras, as far as they are known, after a turn.
     pub shots: [Shot; 2],
     /// Signs that they are not photographs as the networks need them, a sentence each: a mask that touches three borders, a
     /// person who is wider than high, equal pictures, silhouettes that do not fit one another.
@@ -148,12 +149,6 @@ pub fn load(
     }
     let mut front = Cutout::read(front, cutting, side, placement)?;
     let mut back = Cutout::read(back, cutting, side, placement)?;
-    if let Placement::Training { .. } = placement {
-        let common = together([&front.mask, &back.mask], [front.person, back.person]);
-        for (cutout, shot) in [&mut front, &mut back].into_iter().zip(&mut shots) {
-            cutout.turn(common, shot);
-        }
-    }
     if let Placement::Training { .. } = placement
         && let Some([r, g, b]) = match_back((&front.rgb, &front.mask), (&mut back.rgb, &back.mask))
     {
@@ -161,12 +156,21 @@ pub fn load(
             &format!(", made {r:.2}, {g:.2}, {b:.2} times as bright (red, green, blue) to match the front");
     }
     let doubts = doubts::doubts(&front, &back);
-    let common = match placement {
+    let together = |front: &Cutout, back: &Cutout| match placement {
         Placement::Training { .. } => together([&front.mask, &back.mask], [front.person, back.person]),
         _ => None,
     };
+    let mut unturned = [None, None];
+    if let Placement::Training { .. } = placement {
+        let common = together(&front, &back);
+        unturned = [front.turn(common, &mut shots[0]), back.turn(common, &mut shots[1])];
+    }
+    let common = together(&front, &back);
     let canvases = [front.canvas(common, side, placement)?, back.canvas(common, side, placement)?];
-    Ok(Pair { canvases, cutouts: [front, back].map(|cutout| (cutout.rgb, cutout.mask)), shots, doubts })
+    let [of_front, of_back] = unturned;
+    let cutouts = [(front, of_front), (back, of_back)]
+        .map(|(cutout, unturned)| unturned.unwrap_or((cutout.rgb, cutout.mask)));
+    Ok(Pair { canvases, cutouts, shots, doubts })
 }
 
 /// Colours and mask of one photograph, as [`load`] takes them for [`Placement::Training`].
@@ -271,14 +275,15 @@ impl<'a> Cutout<'a> {
     }
 
     /// Turns the photograph towards the middle of the person's box, or of the common box of both photographs. `shot` is then the turned
-    /// camera.
-    fn turn(&mut self, common: Option<Standing>, shot: &mut Shot) {
+    /// camera. Returns colours and mask before the turn.
+    fn turn(&mut self, common: Option<Standing>, shot: &mut Shot) -> Option<(RgbImage, GrayImage)> {
         let person = common.map_or(self.person, |standing| standing.person);
-        let Some(turn) = Turn::towards(person, self.rgb.dimensions().into(), *shot) else { return };
+        let turn = Turn::towards(person, self.rgb.dimensions().into(), *shot)?;
         let (rgb, mask) = turn.apply(&self.rgb, &self.mask);
-        let Some(person) = Rect::around(&mask, u8::MAX.div_ceil(2)) else { return };
-        (self.rgb, self.mask, self.person, *shot) = (rgb, mask, person, turn.shot);
+        self.person = Rect::around(&mask, u8::MAX.div_ceil(2))?;
+        *shot = turn.shot;
         self.source += &format!(", {}", turn.report());
+        Some((replace(&mut self.rgb, rgb), replace(&mut self.mask, mask)))
     }
 
     /// Places the photograph by the person's box, or by the common box of both photographs.

@@ -37,9 +37,9 @@ fn is_fast_in_bf16(device: &Device) -> bool {
 }
 
 impl PrecisionChoice {
-    /// The precision of a training: with `auto`, bf16 where all devices are faster in it.
-    pub fn of_training(self, devices: &[Device]) -> Precision {
-        let auto = if devices.iter().all(is_fast_in_bf16) { Precision::Bf16 } else { Precision::F32 };
+    /// The precision of a training: with `auto`, bf16 where the device is faster in it.
+    pub fn of_training(self, device: &Device) -> Precision {
+        let auto = if is_fast_in_bf16(device) { Precision::Bf16 } else { Precision::F32 };
         self.fixed().unwrap_or(auto)
     }
 

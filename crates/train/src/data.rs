@@ -73,7 +73,7 @@ impl<I: Clone + Send + Sync + 'static> Data<I> {
 
     /// Sums over all samples of the validation, of which each rank adds its share: one sum per rank, on all ranks. If a sample of
     /// any rank fails, all ranks get its error.
-    pub(crate) fn validated<S: Default + Serialize + DeserializeOwned>(
+    pub(crate) fn validated<S: Clone + Default + Serialize + DeserializeOwned>(
         &self,
         ranks: &Ranks,
         mut add: impl FnMut(&mut S, I) -> Result<(), TrainError>,
@@ -81,12 +81,8 @@ impl<I: Clone + Send + Sync + 'static> Data<I> {
         let mut sum = S::default();
         let mut share = ranks.share(self.count);
         let failed = share.try_for_each(|place| add(&mut sum, self.validated_item(place, self.count)?)).err();
-        let failures = ranks.gather(&failed.as_ref().map(ToString::to_string));
-        match (failed, failures.into_iter().flatten().next()) {
-            (Some(own), _) => Err(own),
-            (None, Some(other)) => Err(TrainError::Unsuitable(other)),
-            (None, None) => Ok(ranks.gather(&sum)),
-        }
+        ranks.agree(failed)?;
+        Ok(ranks.gather(&sum))
     }
 
     /// At most `count` samples of the validation, spread over all data sets.

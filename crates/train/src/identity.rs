@@ -61,8 +61,14 @@ impl Identity {
         Ok(Self { config, data: data.collect::<Result<_, _>>()?, predictor })
     }
 
-    /// Why a run with the identity `there` cannot be continued as this one, or not without `force`.
-    pub fn refusal(&self, there: &Self, force: bool) -> Option<String> {
+    /// What differs in the identity `there`.
+    pub fn differences(&self, there: &Self) -> Vec<String> {
+        let [harmful, harmless] = self.sorted(there);
+        harmful.into_iter().chain(harmless).collect()
+    }
+
+    /// What differs in the identity `there`: the networks, and all else.
+    fn sorted(&self, there: &Self) -> [Vec<String>; 2] {
         let mut harmful = Vec::new();
         let mut harmless = Vec::new();
         for (key, message) in differences(&there.config, &self.config) {
@@ -75,6 +81,12 @@ impl Identity {
         if there.predictor != self.predictor {
             harmless.push("the frozen point predictor has other weights".to_owned());
         }
+        [harmful, harmless]
+    }
+
+    /// Why a run with the identity `there` cannot be continued as this one, or not without `force`.
+    pub fn refusal(&self, there: &Self, force: bool) -> Option<String> {
+        let [harmful, harmless] = self.sorted(there);
         let message =
             |differences: &[String]| format!("is the state of another run: {}", differences.join("; "));
         match (harmful.is_empty(), harmless.is_empty() || force) {

@@ -95,7 +95,7 @@ impl<'a, T: Task> Learner<'a, T> {
         }
     }
 
-    /// Whether all ranks train the same networks on the same data.
+    /// Whether all ranks train the same networks on the same data, in the same number of steps.
     ///
     /// # Errors
     /// [`TrainError::Unsuitable`] if not.
@@ -107,13 +107,28 @@ impl<'a, T: Task> Learner<'a, T> {
         for values in self.networks.checkpoint().values() {
             values.iter().for_each(|value| hash.update(value.to_le_bytes()));
         }
-        let own = (identity.clone(), format!("{:x}", hash.finalize()), self.ranks.host().to_owned());
+        // Keys that a run may change, but not a rank.
+        let t = &self.config.training;
+        let times = [t.steps, t.validate_every, t.checkpoint_every, t.preview_every];
+        let own = (identity.clone(), times, format!("{:x}", hash.finalize()), self.ranks.host().to_owned());
         let all = self.ranks.gather(&own);
-        let other = all.iter().enumerate().find(|(_, other)| (&other.0, &other.1) != (&all[0].0, &all[0].1));
-        let Some((rank, (there, _, host))) = other else { return Ok(()) };
-        let why = all[0].0.refusal(there, false).unwrap_or_else(|| "other weights".to_owned());
-        let message = format!("rank {rank} on {host} does not have what rank 0 on {} has: {why}", all[0].2);
-        Err(TrainError::Unsuitable(message))
+        let (first, times, hash, host) = &all[0];
+        for (rank, (there, other_times, other_hash, other_host)) in all.iter().enumerate() {
+            let mut differences = first.differences(there);
+            if times != other_times {
+                differences.push("the numbers of steps differ".to_owned());
+            }
+            if differences.is_empty() && hash != other_hash {
+                differences.push("the weights differ: ranks need processors or cards of one kind".to_owned());
+            }
+            if !differences.is_empty() {
+                let differences = differences.join("; ");
+                let message =
+                    format!("rank {rank} on {other_host} is unlike rank 0 on {host}: {differences}");
+                return Err(TrainError::Unsuitable(message));
+            }
+        }
+        Ok(())
     }
 
     /// Makes one step. Returns its values for the log, or the reason why it was skipped. A skipped step counts as well.
@@ -152,23 +167,20 @@ impl<'a, T: Task> Learner<'a, T> {
             let extents = self.ranks.gather(&self.task.extent(&items)).into_iter().flatten();
             let extent = extents.reduce(|all, extent| all.united(&extent));
             let at = Moment { step, batch: batch as u64, first, extent };
-            let made = match self.losses(items, at, How { precision: self.config.precision(), scale, share })
-            {
+            let how = How { precision: self.config.precision(), scale, share };
+            let (made, failed) = match self.losses(items, at, how) {
                 // A scene that the rasteriser refuses costs the sample, not the run.
-                Err(TrainError::Splat(e)) => Err(e.to_string()),
-                made => match made? {
-                    Made { gradients: None, .. } => Err("the loss is not finite".to_owned()),
-                    Made { values, gradients: Some(gradients) } => {
-                        gradients::add(&mut sum, gradients);
-                        Ok(values
-                            .into_iter()
-                            .map(|(name, value)| (name.to_owned(), value.to_bits()))
-                            .collect())
-                    }
-                },
+                Err(TrainError::Splat(e)) => (Err(e.to_string()), None),
+                Err(e) => (Err(String::new()), Some(e)),
+                Ok(Made { gradients: None, .. }) => (Err("the loss is not finite".to_owned()), None),
+                Ok(Made { values, gradients: Some(gradients) }) => {
+                    gradients::add(&mut sum, gradients);
+                    let named = values.into_iter().map(|(name, value)| (name.to_owned(), value));
+                    (Ok(named.collect::<BTreeMap<_, _>>()), None)
+                }
             };
-            let made: Result<BTreeMap<String, u64>, Skipped> = made.map_err(|why| of_samples(&why, &names));
-            let everywhere = self.ranks.gather(&made);
+            self.ranks.agree(failed)?;
+            let everywhere = self.ranks.gather(&made.map_err(|why| of_samples(&why, &names)));
             let everywhere = match everywhere.into_iter().collect::<Result<Vec<_>, Skipped>>() {
                 Ok(everywhere) => everywhere,
                 Err(why) => return Ok(Err(why)),
@@ -178,8 +190,8 @@ impl<'a, T: Task> Learner<'a, T> {
                     self.everywhere("no pixel is part of a person, as the point predictor sees it", names)
                 ));
             }
-            for (name, bits) in everywhere.into_iter().flatten() {
-                *values.entry(name).or_default() += f64::from_bits(bits);
+            for (name, value) in everywhere.into_iter().flatten() {
+                *values.entry(name).or_default() += value;
             }
         }
         let sum = gradients::reduce(self.ranks, sum, &self.lengths, &self.device.clone().inner());

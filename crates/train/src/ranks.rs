@@ -7,8 +7,12 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use snapsnap_data::sample::share;
 
-/// Environment variables that launchers set: Open MPI's, PMIx', and those of MPICH and of Slurm's PMI-2.
+use crate::TrainError;
+
+/// Environment variables that launchers of MPI set: Open MPI's, PMIx', and those of MPICH and of Slurm's PMI-2.
 const LAUNCHERS: [&str; 3] = ["OMPI_COMM_WORLD_SIZE", "PMIX_RANK", "PMI_RANK"];
+/// Environment variables with the number of processes, the last one of `srun`.
+const SIZES: [&str; 3] = ["OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "SLURM_STEP_NUM_TASKS"];
 
 /// The place of this process among those of its training.
 pub struct Ranks {
@@ -41,19 +45,24 @@ impl Ranks {
     /// Joins the ranks of a launcher, or stays alone without one. MPI ends when the result is dropped, which all ranks have to do.
     ///
     /// # Errors
-    /// A message if a launcher started this process, and it cannot join the others.
+    /// A message if several processes were started, and this one cannot join the others.
     pub fn join() -> Result<Self, String> {
-        match LAUNCHERS.into_iter().find(|name| std::env::var_os(name).is_some()) {
-            Some(launcher) => Self::join_launched(launcher),
-            None => Ok(Self::default()),
+        let launched = SIZES.iter().find_map(|name| std::env::var(name).ok()?.parse::<usize>().ok());
+        let launcher = LAUNCHERS.into_iter().find(|name| std::env::var_os(name).is_some());
+        let joined = match launcher {
+            Some(launcher) if launched != Some(1) => Self::join_launched(launcher)?,
+            _ => Self::default(),
+        };
+        match launched {
+            Some(count) if count > 1 && joined.size == 1 => Err(format!(
+                "{count} processes were started, but MPI does not connect them: with srun, add --mpi=pmix or --mpi=pmi2"
+            )),
+            _ => Ok(joined),
         }
     }
 
     #[cfg(not(feature = "mpi"))]
     fn join_launched(launcher: &str) -> Result<Self, String> {
-        if launcher == LAUNCHERS[0] && std::env::var(launcher).is_ok_and(|size| size == "1") {
-            return Ok(Self::default());
-        }
         Err(format!(
             "{launcher} is set, so MPI started this program, which was built without it: build with --features mpi"
         ))
@@ -93,13 +102,34 @@ impl Ranks {
     ///
     /// # Panics
     /// If a value does not have the same type on all ranks.
-    pub fn gather<T: Serialize + DeserializeOwned>(&self, value: &T) -> Vec<T> {
-        let text = serde_json::to_vec(value).expect("plain data");
-        let read = |bytes: &[u8]| serde_json::from_slice(bytes).expect("all ranks send the same type");
+    pub fn gather<T: Clone + Serialize + DeserializeOwned>(&self, value: &T) -> Vec<T> {
         if self.size == 1 {
-            return vec![read(&text)];
+            return vec![value.clone()];
         }
-        self.exchange(&text).iter().map(|bytes| read(bytes)).collect()
+        // Unlike JSON it has infinite numbers.
+        let bytes = rmp_serde::to_vec(value).expect("plain data");
+        let read = |bytes: &Vec<u8>| rmp_serde::from_slice(bytes).expect("all ranks send the same type");
+        self.exchange(&bytes).iter().map(read).collect()
+    }
+
+    /// Ends all ranks' work if one of them failed: with its own error on that rank, and with a report of it on the others.
+    ///
+    /// # Errors
+    /// [`TrainError`] if any rank failed.
+    pub fn agree(&self, failed: Option<TrainError>) -> Result<(), TrainError> {
+        let own = failed.as_ref().map(|e| (e.to_string(), self.host.clone()));
+        let first =
+            self.gather(&own).into_iter().enumerate().find_map(|(rank, failure)| Some((rank, failure?)));
+        match (failed, first) {
+            (Some(own), _) => Err(own),
+            (None, Some((rank, (why, host)))) => Err(TrainError::Elsewhere { rank, host, why }),
+            (None, None) => Ok(()),
+        }
+    }
+
+    /// Waits until all ranks are here.
+    pub fn meet(&self) {
+        self.gather(&());
     }
 
     /// Replaces `values` by their sums over all ranks, in the order of the ranks. All ranks get the same bytes.
@@ -209,6 +239,14 @@ mod tests {
         let alone = Ranks::default();
         assert!(alone.is_first() && alone.size() == 1 && alone.share(7) == (0..7));
         assert_eq!(alone.gather(&vec![(1, "a".to_owned())]), [vec![(1, "a".to_owned())]]);
+        let message = rmp_serde::to_vec(&(f64::INFINITY, f64::NAN)).expect("plain data");
+        let (infinite, nan): (f64, f64) = rmp_serde::from_slice(&message).expect("what was sent");
+        assert!(infinite == f64::INFINITY && nan.is_nan());
+        assert!(alone.agree(None).is_ok());
+        assert!(matches!(
+            alone.agree(Some(TrainError::Unsuitable("x".into()))),
+            Err(TrainError::Unsuitable(_))
+        ));
         let mut values = [1.0, f32::NAN];
         alone.sum(&mut values);
         assert!(values[0] == 1.0 && values[1].is_nan());

@@ -243,7 +243,7 @@ impl<'a, T: Task> Session<'a, T> {
     fn step(&mut self) -> Result<(), TrainError> {
         let t = &self.learner.config.training;
         // A failed step leaves the learner unchanged, so that its state can be saved.
-        let made = self.learner.step().or_else(|failed| self.save().and(Err(failed)))?;
+        let made = self.learner.step().or_else(|failed| self.save_last().and(Err(failed)))?;
         let now = self.learner.progress.step;
         let due = |every: usize| every > 0 && now.is_multiple_of(every as u64);
         match made {
@@ -282,14 +282,21 @@ impl<'a, T: Task> Session<'a, T> {
         if is_last && shown.is_ok() {
             self.learner.progress.shown = self.learner.progress.step;
         }
-        self.save()?;
+        self.save_last()?;
         shown
+    }
+
+    /// Saves before the session ends. No rank ends before the first one has written.
+    fn save_last(&mut self) -> Result<(), TrainError> {
+        self.save()?;
+        self.options.ranks.meet();
+        Ok(())
     }
 
     /// Turns the error of a sample into a note. The validation or preview is lost, but the run continues.
     fn spared(&mut self, what: &str, shown: Result<(), TrainError>) -> Result<(), TrainError> {
         match shown {
-            Err(e @ (TrainError::Unsuitable(_) | TrainError::Splat(_))) => {
+            Err(e @ (TrainError::Unsuitable(_) | TrainError::Splat(_) | TrainError::Elsewhere { .. })) => {
                 let step = self.learner.progress.step;
                 self.watch.note(&format!("no {what} after step {step}: {e}"));
                 Ok(())
@@ -352,6 +359,7 @@ impl<'a, T: Task> Session<'a, T> {
 
     /// Writes weights, state and curves. Weights are first, so that every state has its weights.
     fn save(&mut self) -> Result<(), TrainError> {
+        self.learner.compare(&self.identity)?;
         let Some(log) = &self.log else { return Ok(()) };
         self.write(&self.learner.averaged(), LAST)?;
         save_state(&self.options.folder.join(STATE), &self.learner, &self.identity)?;

@@ -161,7 +161,7 @@ fn place_color(p: Vec3) -> [f32; 3] {
 }
 
 /// Distances between predicted and true points, as sums over people.
-#[derive(Default, Serialize, Deserialize)]
+#[derive(Clone, Default, Serialize, Deserialize)]
 struct Errors {
     /// Per view: number of people, mean distances in metres, and mean distances without each person's mean shift.
     views: [[f64; 3]; 6],

@@ -21,6 +21,7 @@ fn wrong_settings_weights_and_folders_are_refused_by_name() {
     wrong(&["--set", "training.batches=3"], &["unknown field", "batches"]);
     wrong(&["--set", "training.steps=0"], &["training.steps", "must be"]);
     wrong(&["--set", "training.clip=nan"], &["training.clip"]);
+    wrong(&["--set", "training.batch=0"], &["training.batch", "must be"]);
     wrong(&["--set", "optimizer.beta2=1.0"], &["optimizer.beta2"]);
     wrong(&["--set", "schedule.end=2"], &["schedule.end"]);
     wrong(&["--set", "network.resolution=128", "--set", "network.net_resolution=128"], &["64", "128"]);

@@ -64,7 +64,6 @@ fn both_stages_learn_and_write_weights_for_reconstructions() {
     assert!(fs::metadata(&ply).expect("a file").len() > 10_000);
 }
 
-/// Two backends on the same processor stand for two GPUs.
 #[test]
 fn a_rehearsal_writes_nothing_and_prints_the_time_of_the_run() {
     let (temporary, config) = place();

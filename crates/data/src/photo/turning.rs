@@ -6,7 +6,7 @@ use image::{GrayImage, Luma, Rgb, RgbImage};
 use rayon::prelude::*;
 
 use super::Rect;
-use super::viewpoint::{Shot, pixels};
+use super::viewpoint::{ELEVATIONS, Shot, pixels};
 
 /// Angle in degrees between the optical axis and the person's middle up to which a photograph stays as it is.
 const LEAST: f64 = 2.0;
@@ -39,7 +39,8 @@ impl Turn {
         if !(LEAST..=MOST).contains(&forward.z.acos().to_degrees()) {
             return None;
         }
-        let pitch = shot.pitch.unwrap_or(0.0).to_radians();
+        // A telephone that lies on a table photographs nobody who stands.
+        let pitch = shot.pitch.filter(|pitch| ELEVATIONS.contains(pitch)).unwrap_or(0.0).to_radians();
         let up = DVec3::new(0.0, -pitch.cos(), -pitch.sin());
         let right = forward.cross(up).normalize();
         let rotation = DMat3::from_cols(right, forward.cross(right), forward);
@@ -166,6 +167,10 @@ mod tests {
         assert!(Turn::towards(person, [600, 400], shot).is_none());
         let aside = Rect { x: 400, ..person };
         assert!(Turn::towards(aside, [600, 400], Shot::default()).is_none());
+        // A camera that looks straight down tells no upright direction: no roll.
+        let down = Turn::towards(aside, [600, 400], Shot { pitch: Some(85.0), ..shot })
+            .expect("is beside the middle");
+        assert!(down.rotation.row(1).x.abs() < 1e-9, "{}", down.rotation);
         // A person of the whole height stays inside.
         let tall = Rect { x: 300, y: 0, width: 300, height: 400 };
         let turn = Turn::towards(tall, [600, 400], shot).expect("is beside the middle");

@@ -11,6 +11,8 @@ use super::{Mapping, PlaneMap, Source};
 
 /// Focal lengths of lenses, in millimetres of 35 mm film.
 pub const FOCALS: std::ops::RangeInclusive<f64> = 8.0..=1200.0;
+/// Elevations in degrees beyond which a camera photographs nobody who stands upright.
+pub const ELEVATIONS: std::ops::RangeInclusive<f64> = -45.0..=60.0;
 /// Diagonal of a frame of 35 mm film, in millimetres.
 const FILM: f64 = 43.267;
 /// Side of the nominal canvas. Its number does not matter.

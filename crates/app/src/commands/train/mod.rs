@@ -6,7 +6,6 @@ mod report;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
-use std::slice::from_ref;
 use std::sync::Arc;
 use std::thread;
 use std::time::{Duration, Instant};
@@ -115,7 +114,10 @@ fn among_ranks(work: impl FnOnce(&Ranks) -> Result<ExitCode, Failure>) -> Result
     if !ranks.is_first() {
         thread::sleep(LATER);
     }
-    say::err(&format!("error: rank {} on {}: {failure}", ranks.rank(), ranks.host()));
+    let message = failure.to_string();
+    let is_named = message.starts_with("rank ");
+    let whose = if is_named { String::new() } else { format!("rank {} on {}: ", ranks.rank(), ranks.host()) };
+    say::err(&format!("error: {whose}{message}"));
     file::remove_unfinished();
     ranks.abort(failure.code());
     Err(failure)
@@ -195,11 +197,15 @@ impl<'a> Plan<'a> {
             let (count, batch) = (ranks.size(), config.training.batch);
             bail!("{count} ranks share a batch of {batch}: set training.batch higher");
         }
+        // Ranks on one machine share its memory.
+        let hosts = ranks.gather(&ranks.host().to_owned());
         if memory::is_cpu(&device) {
-            memory::check("this training", least_memory(&config), "a smaller network or batch needs less")?;
+            let neighbours = hosts.iter().filter(|host| *host == ranks.host()).count() as u64;
+            let needed = neighbours * least_memory(&config, ranks.size());
+            memory::check("this training", needed, "a smaller network or batch needs less")?;
         }
         // All ranks compute in the format of the least of them.
-        let precision = config.training.precision.of_training(from_ref(&device));
+        let precision = config.training.precision.of_training(&device);
         let all = ranks.gather(&precision);
         let precision = if all.contains(&Precision::F32) { Precision::F32 } else { all[0] };
         config.training.precision = precision.into();
@@ -212,8 +218,9 @@ impl<'a> Plan<'a> {
             false => device.autodiff(),
         };
         // The first rank is about to write a state, which later ranks would find.
-        let begun = arguments.output.as_deref().filter(|run| arguments.resume && run.join(STATE).exists());
-        let begun = begun.filter(|_| ranks.gather(&begun.is_some())[0]);
+        let output = arguments.output.as_deref();
+        let is_begun = arguments.resume && output.is_some_and(|run| run.join(STATE).exists());
+        let begun = output.filter(|_| ranks.gather(&is_begun)[0]);
         Ok(Self { arguments, config, folders, device, ranks, begun })
     }
 
@@ -235,7 +242,9 @@ impl<'a> Plan<'a> {
         if self.arguments.dry_run {
             return run::on_best_thread(tracked, || {
                 let rehearsal = run::rehearse(task, &self.config, networks(tracked)?, tracked, ranks)?;
-                report::rehearsed(&self.config, tracked, rehearsal);
+                if ranks.is_first() {
+                    report::rehearsed(&self.config, tracked, rehearsal);
+                }
                 Ok(ExitCode::SUCCESS)
             });
         }
@@ -250,8 +259,11 @@ impl<'a> Plan<'a> {
         let start = Instant::now();
         let outcome = run::on_best_thread(tracked, || {
             let trained = run::train(task, &self.config, networks(tracked)?, &options, &mut reporter);
-            // Scripts of batch systems tell failures of a running job by one code.
-            trained.map_err(|e| if ranks.size() > 1 { Failure::Internal(e.to_string()) } else { e.into() })
+            // With several ranks a full disk is a failure of the job.
+            trained.map_err(|e| match e.into() {
+                Failure::Write(message) if ranks.size() > 1 => Failure::Internal(message),
+                failure => failure,
+            })
         })?;
         drop(reporter);
         self.summarise(T::STAGE, path, &outcome, start.elapsed());
@@ -348,10 +360,10 @@ fn example(folder: &Folder) -> Option<[PathBuf; 2]> {
     Some([front, back].map(|view| folder.picture_path(split, &subject, view)))
 }
 
-/// Lower bound of a training's memory in bytes: weights, gradients, two moments and averages, samples, and the last
+/// Lower bound of the memory in bytes of one of several ranks of a training: weights, gradients, two moments and averages, samples, and the last
 /// layers of the heads. --dry-run measures the actual memory.
-fn least_memory(config: &TrainConfig) -> u64 {
-    let (n, batch) = (&config.network, config.training.batch as u64);
+fn least_memory(config: &TrainConfig, ranks: usize) -> u64 {
+    let (n, batch) = (&config.network, config.training.batch.div_ceil(ranks) as u64);
     let parameters = schema::parameters(&config.networks(), Part::PointPredictor) as u64;
     // Two photographs with masks and four point maps with masks, each as loaded and as used.
     let sample = 2 * (2 * 4 + 4 * 4) * n.resolution.pow(2) as u64;
