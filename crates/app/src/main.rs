@@ -81,7 +81,7 @@ enum Command {
     #[command(
         after_help = "Example: snapsnap reconstruct front.jpg back.jpg -o human.ply --turntable turn.gif -v"
     )]
-    Reconstruct(commands::reconstruct::Arguments),
+    Reconstruct(Box<commands::reconstruct::Arguments>),
     /// Render a file of Gaussians into pictures.
     #[command(after_help = "Example: snapsnap render human.ply --orbit 12 --size 1024x1024 -o renders")]
     Render(commands::render::Arguments),
