@@ -198,7 +198,7 @@ mod tests {
         assert_eq!([first.clone(), second.clone()], shuffled(3));
         // Parts of batches of 4, the last of which has 2.
         let parts = [0, 1, 2].map(|part| loader(50, 2, None).0.shuffled(7).part(part, 3).batches(0, 0));
-        let mut parts = parts.map(|batches| batches.map(|batch| order_of(batch)).collect::<Vec<_>>());
+        let mut parts = parts.map(|batches| batches.map(order_of).collect::<Vec<_>>());
         let joined: Vec<usize> = (0..13)
             .flat_map(|batch| parts.each_mut().map(|part| std::mem::take(&mut part[batch])).concat())
             .collect();
