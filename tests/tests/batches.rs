@@ -81,8 +81,10 @@ fn a_table_of_pairs_becomes_the_people_of_single_calls() {
         ["anna.ply", "bad.ply", "lost.ply", "other.ply", "pairs.config.toml", "turned.ply"]
     );
     // Others than before.
-    let said = refused(reconstruct(&table, &out).args(["--set", "regressor.margin=24"]));
-    assert!(said.contains("pairs.config.toml") && said.contains("other settings"), "{said}");
+    for options in [["--set", "regressor.margin=24"], ["--height", "1.8"]] {
+        let said = refused(reconstruct(&table, &out).args(options));
+        assert!(said.contains("pairs.config.toml") && said.contains("other settings"), "{options:?}: {said}");
+    }
 }
 
 #[test]
@@ -118,6 +120,7 @@ fn a_folder_of_pairs_is_shared_among_processes() {
     // Folders of Gaussians.
     let converted = temporary.path().join("converted");
     fs::write(out.join("broken.spz"), b"no splats").expect("written");
+    fs::write(out.join("._a.spz"), b"hidden").expect("written");
     let mut convert = snapsnap();
     let errors = failed(convert.arg("convert").arg(&out).arg(&converted), &converted.join("errors.csv"));
     assert!(errors.len() == 1 && errors[0][0] == "broken", "{errors:?}");
@@ -125,6 +128,13 @@ fn a_folder_of_pairs_is_shared_among_processes() {
     let single = temporary.path().join("single.ply");
     succeed(snapsnap().arg("convert").arg(out.join("c.spz")).arg(&single));
     assert!(fs::read(&single).expect("reads") == fs::read(converted.join("c.ply")).expect("reads"));
+    // Only what is missing is made.
+    fs::remove_file(converted.join("a.ply")).expect("removed");
+    fs::remove_file(out.join("broken.spz")).expect("removed");
+    fs::write(converted.join("b.ply"), b"kept").expect("written");
+    assert!(succeed(snapsnap().arg("convert").arg(&out).arg(&converted)).contains("1 made"));
+    assert_eq!(fs::read(converted.join("b.ply")).expect("reads"), b"kept");
+    fs::copy(converted.join("c.ply"), converted.join("b.ply")).expect("copied");
     fs::remove_file(converted.join("a.ply")).expect("removed");
     let pictures = temporary.path().join("pictures");
     let mut render = snapsnap();
@@ -134,6 +144,11 @@ fn a_folder_of_pairs_is_shared_among_processes() {
         .args(["--orbit", "2", "--size", "64x64", "--device", "cpu", "-o"])
         .arg(&pictures);
     succeed(&mut render);
+    fs::remove_file(pictures.join("b/cameras.json")).expect("removed");
+    assert!(succeed(&mut render).contains("1 made"));
+    let mut other = snapsnap();
+    other.arg("render").arg(&converted).args(["--orbit", "2", "--device", "cuda:9", "-o"]).arg(&pictures);
+    assert!(refused(&mut other).contains("cuda"));
     for name in ["b", "c"] {
         assert_eq!(names(&pictures.join(name)), ["000.png", "001.png", "cameras.json"]);
     }
@@ -165,6 +180,8 @@ fn wrong_batches_are_refused() {
         ("front,back\na,\n", "line 2: needs a front and a back"),
         ("front,back\nfront.png,back.png\n", "line 2: needs a name"),
         ("name,front,back\n../a,b,c\n", "`../a` cannot be the name"),
+        ("name,front,back\nCON,b,c\n", "`CON` cannot be the name"),
+        ("name,front,back\na,b,\"c\nd,e,f\n", "is a quotation mark missing?"),
         ("name,front,back\nx,b,c\nX,b,c\n", "two pairs are called `X`"),
     ] {
         let said = said(content);
@@ -172,20 +189,25 @@ fn wrong_batches_are_refused() {
     }
     fs::write(&table, b"front,back\n\xff\xfe,b\n").expect("written");
     assert!(refused(&mut reconstruct(&table, &out)).contains("pairs.csv"));
+    assert!(refused(&mut reconstruct(Path::new("/dev/zero"), &out)).contains("/dev/zero"));
     assert!(!out.exists(), "nothing was made");
-    let mut single = snapsnap();
-    let said = refused(single.args(["reconstruct", "a.png", "b.png", "--shard", "0/2"]));
-    assert!(said.contains("--shard") && said.contains("--pairs"), "{said}");
-    let said = refused(snapsnap().args(["reconstruct", "--pairs"]).arg(&table));
-    assert!(said.contains("give a folder"), "{said}");
-    let said = refused(snapsnap().args(["reconstruct", "a.png", "b.png", "--pairs"]).arg(&table));
-    assert!(said.contains("cannot be used with"), "{said}");
-    // The table is where the list of failures would be.
+    // A table is where the list of failures would be.
     fs::create_dir(&out).expect("made");
     let list = out.join("errors.csv");
     fs::write(&list, "front,back\nx_front.png,x_back.png\n").expect("written");
     let said = refused(&mut reconstruct(&list, &out));
-    assert!(said.contains("would be overwritten") && list.is_file(), "{said}");
+    assert!(said.contains("move it away") && list.is_file(), "{said}");
+    let mut single = snapsnap();
+    let said = refused(single.args(["reconstruct", "a.png", "b.png", "--shard", "0/2"]));
+    assert!(said.contains("--shard") && said.contains("--pairs"), "{said}");
+    // A failed start claims no folder.
+    fs::write(&table, "front,back\nx_front.png,x_back.png\n").expect("written");
+    let said = refused(reconstruct(&table, &out).args(["--faces", "100"]));
+    assert!(said.contains("--faces") && names(&out) == ["errors.csv"], "{said}");
+    let said = refused(snapsnap().args(["reconstruct", "--pairs"]).arg(&table));
+    assert!(said.contains("give a folder"), "{said}");
+    let said = refused(snapsnap().args(["reconstruct", "a.png", "b.png", "--pairs"]).arg(&table));
+    assert!(said.contains("cannot be used with"), "{said}");
     let said = refused(snapsnap().arg("convert").arg(folder).arg(folder));
     assert!(said.contains("folder of the inputs"), "{said}");
 }

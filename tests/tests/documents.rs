@@ -241,6 +241,7 @@ fn place() -> tempfile::TempDir {
             image::Luma([picture.get_pixel(x, y)[3]])
         });
         mask.save(to(&format!("{side}_mask.png"))).expect("saved");
+        picture.save(to(&format!("photographs/anna_{side}.png"))).expect("saved");
         image::DynamicImage::from(picture).into_rgb8().save(to(&format!("{side}.jpg"))).expect("saved");
     }
     for (name, from) in [("a.png", "45.png"), ("b.png", "135.png")] {
@@ -249,6 +250,8 @@ fn place() -> tempfile::TempDir {
     for name in ["stage1.pth", "stage2.pth"] {
         fs::copy(data("pipeline").join(name), to(name)).expect("copied");
     }
+    fs::write(to("pairs.csv"), "front,back\nphotographs/anna_front.png,photographs/anna_back.png\n")
+        .expect("written");
     fs::write(to("published.toml"), toml_config(&data("pipeline").join("config.json"))).expect("written");
     symlink(shared("makehuman"), to("path/to/makehuman/data")).expect("linked");
     symlink(shared("avatars"), to("path/to/avatars")).expect("linked");

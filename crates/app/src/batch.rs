@@ -2,18 +2,22 @@
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
+use std::io::Read;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
+use std::thread;
+use std::time::Duration;
 
 use clap::Args;
 use snapsnap_base::file;
 use snapsnap_data::prepare::Shard;
 use snapsnap_splat::scene::Kind;
 
-use crate::commands::{is_same_file, is_same_folder, one_of};
+use crate::commands::{is_same_folder, one_of};
 use crate::failure::{Failure, bail};
 use crate::output::{make_folder, remove};
 use crate::progress::Progress;
-use crate::say;
+use crate::{device, say};
 
 const KINDS: [(&str, &str, Kind); 4] = [
     ("ply", "3D Gaussian splatting PLY", Kind::Ply),
@@ -61,17 +65,32 @@ pub struct Batch {
     /// The list of what failed, from the first failure on.
     list: Option<csv::Writer<File>>,
     failed: usize,
+    /// Failures of the program in a row.
+    bugs: usize,
 }
 
+/// First line of a list of failures.
+const HEADER: &str = "name,error";
+/// Number of failures in a row, such as those of a lost card, after which a command ends.
+const MOST_BUGS: usize = 5;
+
 impl Batch {
-    /// Makes the folder, and removes the list of an earlier run of the same part, which must not be `input`.
-    pub fn new(folder: &Path, shard: &ShardArgument, input: &Path) -> Result<Self, Failure> {
+    /// Makes the folder, and removes the list of an earlier run of the same part. Refuses to remove another file.
+    pub fn new(folder: &Path, shard: &ShardArgument) -> Result<Self, Failure> {
         make_folder(folder)?;
-        let batch = Self { folder: folder.to_owned(), shard: shard.shard, list: None, failed: 0 };
-        if is_same_file(input, &batch.path()) {
-            return Err(Failure::file(input, "is an input of this command and would be overwritten"));
+        let batch = Self { folder: folder.to_owned(), shard: shard.shard, list: None, failed: 0, bugs: 0 };
+        let path = batch.path();
+        if path.symlink_metadata().is_ok() {
+            let mut start = [0; HEADER.len()];
+            let read = file::open(&path).and_then(|mut there| there.read_exact(&mut start));
+            if read.is_err() || start != *HEADER.as_bytes() {
+                return Err(Failure::file(
+                    &path,
+                    "would be replaced by the list of failures, and is none: move it away",
+                ));
+            }
+            remove(&path)?;
         }
-        remove(&batch.path())?;
         Ok(batch)
     }
 
@@ -88,33 +107,46 @@ impl Batch {
         let (there, missing): (Vec<T>, Vec<T>) =
             mine.map(|(_, job)| job).partition(|job| output(job).exists());
         if !there.is_empty() {
-            say::note(&format!("{} of {} are there already", there.len(), there.len() + missing.len()));
+            say::note(&format!(
+                "{} of {} are there already and stay as they are",
+                there.len(),
+                there.len() + missing.len()
+            ));
         }
         missing
     }
 
     /// Lists a failure. An output that cannot be written ends the command, since the next ones could not be written either.
     pub fn failed(&mut self, name: &str, failure: Failure) -> Result<(), Failure> {
-        if matches!(failure, Failure::Write(_)) {
-            return Err(failure);
-        }
         // The program is ending, which causes errors.
         if file::is_ending() {
-            std::thread::sleep(std::time::Duration::from_secs(60));
+            thread::sleep(Duration::from_secs(60));
+        }
+        if matches!(failure, Failure::Write(_)) {
+            return Err(failure);
         }
         let path = self.path();
         let wrong = |e: csv::Error| Failure::cannot_write(&path, &e.into());
         if self.list.is_none() {
             let mut list =
                 csv::Writer::from_writer(File::create(&path).map_err(|e| Failure::cannot_write(&path, &e))?);
-            list.write_record(["name", "error"]).map_err(wrong)?;
+            list.write_record(HEADER.split(',')).map_err(wrong)?;
             self.list = Some(list);
         }
         let list = self.list.as_mut().expect("was just opened");
-        list.write_record([name, &failure.to_string()]).map_err(wrong)?;
+        // A spreadsheet would take some names for formulas.
+        let is_formula = name.starts_with(['=', '+', '-', '@']);
+        let shown = format!("{}{}", if is_formula { "'" } else { "" }, say::printable(name));
+        list.write_record([shown, failure.to_string()]).map_err(wrong)?;
         list.flush().map_err(|e| Failure::cannot_write(&path, &e))?;
         self.failed += 1;
         say::err(&format!("{name}: {failure}"));
+        self.bugs = if matches!(failure, Failure::Internal(_)) { self.bugs + 1 } else { 0 };
+        if self.bugs == MOST_BUGS {
+            return Err(Failure::Internal(format!(
+                "{MOST_BUGS} failures of the program in a row: it ends here"
+            )));
+        }
         Ok(())
     }
 
@@ -124,28 +156,37 @@ impl Batch {
             say::info(&format!("{}: {count} made", self.folder.display()));
             return Ok(());
         }
-        let message = format!("{} of {count} failed; the others are there", self.failed);
+        let others = if self.failed < count { "; the others are there" } else { "" };
+        let message = format!("{} of {count} failed{others}", self.failed);
         Err(Failure::Internal(format!("{}: {message}", self.path().display())))
     }
 }
 
+/// Turns a panic, whose message is printed, into a failure of one input.
+pub fn unpanicked<T>(work: impl FnOnce() -> Result<T, Failure>) -> Result<T, Failure> {
+    let bug = |_| Err(Failure::Internal("a bug in this program; its message is above".into()));
+    catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(bug)
+}
+
 /// Runs `work` on every file of Gaussians in a folder, with its name without extension. Its result is `output(name)`, whose existence shows
-/// that it is done.
+/// that it is done. `device` is the name of the device that it takes.
 pub fn each(
     folder: &Path,
     target: &Path,
     shard: &ShardArgument,
+    device: Option<&str>,
     output: impl Fn(&str) -> PathBuf,
     work: impl Fn(&Path, &str) -> Result<(), Failure>,
 ) -> Result<(), Failure> {
+    device.map_or(Ok(()), |name| device::choose(name).map(drop))?;
     if is_same_folder(folder, target) {
         return Err(Failure::file(target, "is the folder of the inputs: give another one"));
     }
     let scenes: Vec<(String, PathBuf)> = scenes(folder)?.into_iter().collect();
-    let mut batch = Batch::new(target, shard, folder)?;
+    let mut batch = Batch::new(target, shard)?;
     let missing = batch.missing(scenes, |(name, _)| output(name));
     for (name, path) in Progress::over(missing.iter(), "files") {
-        if let Err(failure) = work(path, name) {
+        if let Err(failure) = unpanicked(|| work(path, name)) {
             batch.failed(name, failure)?;
         }
     }
@@ -155,14 +196,17 @@ pub fn each(
 /// The files of Gaussians in a folder, by name without extension.
 fn scenes(folder: &Path) -> Result<BTreeMap<String, PathBuf>, Failure> {
     let mut found = BTreeMap::new();
+    let mut names = BTreeMap::new();
     for path in files(folder)? {
-        let is_scene = Kind::named(&path).is_some_and(|kind| kind != Kind::Sog);
-        let Some(name) = path.file_stem().and_then(|name| name.to_str()).filter(|_| is_scene) else {
+        if Kind::named(&path).is_none_or(|kind| kind == Kind::Sog) {
             continue;
-        };
-        if let Some(other) = found.insert(name.to_owned(), path.clone()) {
+        }
+        let name = stem(&path)?;
+        // Some file systems do not tell upper from lower case.
+        if let Some(other) = names.insert(name.to_lowercase(), path.clone()) {
             return Err(Failure::file(&path, format_args!("has the name of {}", other.display())));
         }
+        found.insert(name, path);
     }
     if found.is_empty() {
         return Err(Failure::file(folder, "has no PLY, SPZ or GLB"));
@@ -170,10 +214,18 @@ fn scenes(folder: &Path) -> Result<BTreeMap<String, PathBuf>, Failure> {
     Ok(found)
 }
 
-/// The files in a folder.
+/// A file's name without extension.
+pub fn stem(path: &Path) -> Result<String, Failure> {
+    let name = path.file_stem().and_then(|name| name.to_str()).map(str::to_owned);
+    name.ok_or_else(|| Failure::file(path, "the name is not UTF-8, which names of many files must be"))
+}
+
+/// The files in a folder that are not hidden.
 pub fn files(folder: &Path) -> Result<Vec<PathBuf>, Failure> {
     let cannot = |e: std::io::Error| Failure::file(folder, format_args!("cannot read: {e}"));
     let entries = fs::read_dir(folder).map_err(cannot)?.map(|entry| entry.map(|entry| entry.path()));
     let entries = entries.collect::<Result<Vec<_>, _>>().map_err(cannot)?;
-    Ok(entries.into_iter().filter(|path| path.is_file()).collect())
+    let is_hidden =
+        |path: &Path| path.file_name().is_some_and(|name| name.as_encoded_bytes().starts_with(b"."));
+    Ok(entries.into_iter().filter(|path| path.is_file() && !is_hidden(path)).collect())
 }

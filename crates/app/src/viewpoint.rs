@@ -18,7 +18,7 @@ const USUAL: f64 = 1.72;
 const OUTSIDE: f64 = 0.0002;
 
 /// Options about the cameras and the person.
-#[derive(Args, Default)]
+#[derive(Args, Debug, Default)]
 pub struct CameraArguments {
     /// Height of the person in metres [default: that of the networks, about 1.7].
     #[arg(long, value_name = "METRES")]

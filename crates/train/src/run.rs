@@ -141,6 +141,7 @@ pub fn rehearse<T: Task>(
     /// First steps, which allocate memory and compile GPU kernels, and measured steps.
     const STEPS: [u32; 2] = [5, 5];
     let mut learner = Learner::new(task, config, networks, device, ranks);
+    learner.compare(&Identity::of(task, config)?)?;
     let mut start = Instant::now();
     let (mut made, mut failed) = (0, 0);
     while made < STEPS[0] + STEPS[1] {

@@ -25,7 +25,7 @@ pub struct Arguments {
 }
 
 /// Axes of an output file of Gaussians.
-#[derive(Args)]
+#[derive(Args, Debug)]
 pub struct AxesArguments {
     /// Write a PLY with y down, as SuperSplat and other viewers of INRIA's scenes expect it; every command of this program
     /// turns it back.
@@ -55,12 +55,14 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     if input.is_dir() {
         let file = |name: &str| output.join(format!("{name}.{}", kind.extension()));
         axes.check(&file("x"))?;
-        return batch::each(input, output, shard, file, |path, name| {
-            check_outputs(&[&file(name)], &[path])?;
-            axes.write(&finite(path)?.0, &file(name))
-        });
+        return batch::each(input, output, shard, None, file, |path, name| one(path, &file(name), axes));
     }
     kind.must_be_unused(shard, "is for a folder of many files")?;
+    one(input, output, axes)
+}
+
+/// Converts one file.
+fn one(input: &Path, output: &Path, axes: &AxesArguments) -> Result<(), Failure> {
     check_kind(output)?;
     axes.check(output)?;
     check_outputs(&[output], &[input])?;
@@ -77,7 +79,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     for loss in stored.losses(Kind::of(output)) {
         say(&format!("{}: {loss}", output.display()));
     }
-    let size = |path: &PathBuf| std::fs::metadata(path).map_or(0.0, |metadata| metadata.len() as f64 / 1e6);
+    let size = |path: &Path| std::fs::metadata(path).map_or(0.0, |metadata| metadata.len() as f64 / 1e6);
     say(&format!(
         "{}: {} Gaussians of SH degree {}, {:.1} MB instead of {:.1}",
         output.display(),

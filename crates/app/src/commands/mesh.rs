@@ -96,7 +96,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     }
     let file = |name: &str| output.join(format!("{name}.{}", kind.as_deref().unwrap_or("glb")));
     Target::new(&file("x"), &arguments.surface)?;
-    batch::each(input, output, shard, file, |path, name| {
+    batch::each(input, output, shard, Some(&arguments.device), file, |path, name| {
         one(&Arguments { input: path.to_owned(), output: file(name), ..arguments.clone() })
     })
 }

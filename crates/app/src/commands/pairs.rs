@@ -2,19 +2,19 @@
 //! read and the last person is written.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread;
 
 use snapsnap_base::config::Schema;
+use snapsnap_base::{FileError, file};
 use snapsnap_data::photo::{self, Canvas, Cutting, Mapping, Pair, Placement, Shot, Source};
 use snapsnap_mesh::picture;
 use snapsnap_net::{Photograph, Reconstructor};
 use snapsnap_splat::scene::Stored;
 
 use super::reconstruct::{Arguments, check_memory, placement, unplaced};
-use crate::batch::{Batch, files};
+use crate::batch::{Batch, files, stem, unpanicked};
 use crate::failure::{Failure, bail};
 use crate::progress::Progress;
 use crate::{output, say, weights};
@@ -24,6 +24,12 @@ const CONFIG: &str = "pairs.config.toml";
 /// Extensions of photographs.
 const PICTURES: [&str; 11] =
     ["jpg", "jpeg", "png", "webp", "tif", "tiff", "bmp", "gif", "heic", "heif", "hif"];
+/// Largest table and config in bytes.
+const LARGEST_TABLE: u64 = 256 << 20;
+const LARGEST_CONFIG: u64 = 1 << 20;
+/// Characters that Windows allows in no name, and names that are devices there.
+const FORBIDDEN: &str = "/\\:<>\"|?*";
+const DEVICES: [&str; 6] = ["con", "nul", "aux", "prn", "com1", "lpt1"];
 /// Longest name of a person in bytes.
 const LONGEST: usize = 200;
 
@@ -46,37 +52,40 @@ struct Placed {
 pub fn run(arguments: &Arguments, pairs: &Path) -> Result<(), Failure> {
     let Some(folder) = &arguments.output else { bail!("--pairs: give a folder for the people with -o") };
     let extension = arguments.kind.extension();
-    let file = |name: &str| folder.join(format!("{name}.{extension}"));
-    arguments.axes.check(&file("x"))?;
+    let of_person = |name: &str| folder.join(format!("{name}.{extension}"));
+    arguments.axes.check(&of_person("x"))?;
     let jobs = if pairs.is_dir() { in_folder(pairs)? } else { in_list(pairs)? };
     let opened = arguments.model.open()?;
     let config = opened.config.clone();
     arguments.camera.check(unplaced(&config, arguments.as_is))?;
-    let mut batch = Batch::new(folder, &arguments.shard, pairs)?;
-    let (path, settings) = (folder.join(CONFIG), config.resolved().to_toml());
-    if std::fs::read(&path).is_ok_and(|there| there != settings.as_bytes()) {
-        return Err(Failure::file(
-            &path,
-            "the people in this folder were made with other settings: give another folder",
-        ));
+    arguments.surface.must_be_unused::<()>("--pairs makes no meshes: snapsnap mesh takes their folder")?;
+    let device = arguments.model.device(&opened)?;
+    let (reconstructor, _) = arguments.model.load(&opened, &device)?;
+    let path = folder.join(CONFIG);
+    let settings = format!("# {}\n{}", arguments.of_people(opened.path()), config.resolved().to_toml());
+    if path.exists() {
+        let there = file::read(&path, LARGEST_CONFIG).map_err(FileError::read(&path))?;
+        if there != settings.as_bytes() {
+            let message = "the people in this folder were made with other settings: give another folder";
+            return Err(Failure::file(&path, message));
+        }
     }
-    output::write(&path, settings.as_bytes())?;
-    let jobs = batch.missing(jobs, |job| file(&job.name));
+    let mut batch = Batch::new(folder, &arguments.shard)?;
+    let jobs = batch.missing(jobs, |job| of_person(&job.name));
     if jobs.is_empty() {
         return batch.end(0);
     }
-    let device = arguments.model.device(&opened)?;
-    let (reconstructor, _) = arguments.model.load(&opened, &device)?;
+    output::write(&path, settings.as_bytes())?;
     let progress = Progress::steps(jobs.len(), "people");
     let (to_networks, photographs) = sync_channel(1);
     let (to_writer, people) = sync_channel(1);
     let (to_list, ended) = sync_channel(jobs.len());
-    let (jobs, file) = (&jobs, &file);
+    let (jobs, of_person) = (&jobs, &of_person);
     thread::scope(|scope| {
         let side = config.network.resolution;
         let placement = if arguments.as_is { Placement::AsIs } else { placement(&config) };
         scope.spawn(move || read_all(arguments, jobs, side, placement, &to_networks));
-        scope.spawn(move || write_all(arguments, file, people, &to_list));
+        scope.spawn(move || write_all(arguments, of_person, people, &to_list));
         let mut results = 0;
         let mut count = |(name, result): (String, Result<(), Failure>)| {
             results += 1;
@@ -96,12 +105,6 @@ pub fn run(arguments: &Arguments, pairs: &Path) -> Result<(), Failure> {
     })?;
     drop(progress);
     batch.end(jobs.len())
-}
-
-/// Turns a panic, whose message is printed, into a failure of one person.
-fn unpanicked<T>(work: impl FnOnce() -> Result<T, Failure>) -> Result<T, Failure> {
-    let bug = |_| Err(Failure::Internal("a bug in this program; its message is above".into()));
-    catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(bug)
 }
 
 /// Reads all photographs, one person after another, until nobody wants the next one.
@@ -160,12 +163,13 @@ fn make(arguments: &Arguments, reconstructor: &Reconstructor, placed: Placed) ->
 /// Writes all people.
 fn write_all(
     arguments: &Arguments,
-    file: &impl Fn(&str) -> PathBuf,
+    of_person: &impl Fn(&str) -> PathBuf,
     people: Receiver<(String, Result<Stored, Failure>)>,
     to_list: &SyncSender<(String, Result<(), Failure>)>,
 ) {
     for (name, person) in people {
-        let written = person.and_then(|stored| unpanicked(|| arguments.axes.write(&stored, &file(&name))));
+        let written =
+            person.and_then(|stored| unpanicked(|| arguments.axes.write(&stored, &of_person(&name))));
         // The list has room for all, and ends early only after an output that could not be written.
         if to_list.send((name, written)).is_err() {
             return;
@@ -178,7 +182,8 @@ fn write_all(
 fn in_list(path: &Path) -> Result<Vec<Job>, Failure> {
     let cannot = |e: csv::Error| Failure::file(path, e);
     let folder = path.parent().unwrap_or(Path::new(""));
-    let mut table = csv::ReaderBuilder::new().trim(csv::Trim::All).from_path(path).map_err(cannot)?;
+    let text = file::read_text(path, LARGEST_TABLE).map_err(FileError::read(path))?;
+    let mut table = csv::ReaderBuilder::new().trim(csv::Trim::All).from_reader(text.as_bytes());
     let columns: Vec<String> = table.headers().map_err(cannot)?.iter().map(str::to_owned).collect();
     for (i, column) in columns.iter().enumerate() {
         let is_known = ["name", "front", "back", "front_mask", "back_mask"].contains(&column.as_str());
@@ -202,6 +207,9 @@ fn in_list(path: &Path) -> Result<Vec<Job>, Failure> {
             row.get(place).filter(|value| !value.is_empty())
         };
         let wrong = |message: &str| Failure::file(path, format_args!("line {line}: {message}"));
+        if row.iter().any(|value| value.contains(char::is_control)) {
+            return Err(wrong("a value has a line break: is a quotation mark missing?"));
+        }
         let (Some(front), Some(back)) = (value("front"), value("back")) else {
             return Err(wrong("needs a front and a back"));
         };
@@ -209,9 +217,11 @@ fn in_list(path: &Path) -> Result<Vec<Job>, Failure> {
             Some(name) => name.to_owned(),
             None => named_by(Path::new(front)).ok_or_else(|| wrong("needs a name"))?,
         };
+        let is_forbidden = |c: char| FORBIDDEN.contains(c);
         if name.len() > LONGEST
             || name.starts_with('.')
-            || name.contains(|c: char| c.is_control() || "/\\:".contains(c))
+            || name.contains(is_forbidden)
+            || DEVICES.contains(&name.to_lowercase().as_str())
         {
             return Err(wrong(&format!("`{name}` cannot be the name of a file")));
         }
@@ -228,19 +238,30 @@ fn named_by(front: &Path) -> Option<String> {
     (!name.is_empty() && name != "front").then(|| name.to_owned())
 }
 
+/// Ends of the names of a person's pictures.
+const ENDS: [&str; 4] = ["_front", "_back", "_front_mask", "_back_mask"];
+
 /// The people of a folder with `NAME_front.jpg`, `NAME_back.jpg`, and perhaps `NAME_front_mask.png` and `NAME_back_mask.png`, of any kind of
 /// picture.
 fn in_folder(folder: &Path) -> Result<Vec<Job>, Failure> {
     let mut found = BTreeMap::new();
+    let mut others = 0;
     for path in files(folder)? {
         let extension = path.extension().and_then(|extension| extension.to_str()).map(str::to_lowercase);
-        let is_picture = extension.is_some_and(|extension| PICTURES.contains(&extension.as_str()));
-        let Some(stem) = path.file_stem().and_then(|stem| stem.to_str()).filter(|_| is_picture) else {
+        if !extension.is_some_and(|extension| PICTURES.contains(&extension.as_str())) {
             continue;
-        };
-        if let Some(other) = found.insert(stem.to_owned(), path.clone()) {
+        }
+        let stem = stem(&path)?;
+        if !ENDS.iter().any(|end| stem.ends_with(end)) {
+            others += 1;
+            continue;
+        }
+        if let Some(other) = found.insert(stem, path.clone()) {
             return Err(Failure::file(&path, format_args!("has the name of {}", other.display())));
         }
+    }
+    if others > 0 {
+        say::note(&format!("{}: {others} pictures are neither NAME_front nor NAME_back", folder.display()));
     }
     let names: BTreeSet<&str> = found
         .keys()

@@ -84,7 +84,7 @@ pub struct Arguments {
     #[arg(long, value_name = "OUT.glb|.obj|.ply")]
     mesh: Option<PathBuf>,
     #[command(flatten)]
-    surface: SurfaceArguments,
+    pub surface: SurfaceArguments,
     /// Also write every intermediate tensor.
     #[arg(long, value_name = "FILE.safetensors")]
     dump: Option<PathBuf>,
@@ -94,6 +94,13 @@ pub struct Arguments {
 }
 
 impl Arguments {
+    /// Options that decide what people of the same photographs become.
+    pub fn of_people(&self, weights: &Path) -> String {
+        let Self { cutout, as_is, camera, model, axes, .. } = self;
+        let precision = model.precision;
+        format!("weights {weights:?}, {precision:?}, cutout {cutout}, as is {as_is}, {axes:?}, {camera:?}")
+    }
+
     /// What tells the person from the background.
     pub fn cutting<'a>(&self, segmenter: &'a photo::Segmenter<'a>) -> Cutting<'a> {
         match &*self.cutout {

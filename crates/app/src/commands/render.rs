@@ -93,7 +93,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     views(arguments)?;
     let target = arguments.output.as_deref().unwrap_or(Path::new(DEFAULT_FOLDER));
     let done = |name: &str| target.join(name).join(CAMERAS);
-    batch::each(&arguments.ply, target, &arguments.shard, done, |path, name| {
+    batch::each(&arguments.ply, target, &arguments.shard, Some(&arguments.device), done, |path, name| {
         one(&Arguments { ply: path.to_owned(), output: Some(target.join(name)), ..arguments.clone() })
     })
 }
