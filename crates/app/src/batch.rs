@@ -14,7 +14,7 @@ use snapsnap_data::prepare::Shard;
 use snapsnap_splat::scene::Kind;
 
 use crate::commands::{is_same_folder, one_of};
-use crate::failure::{Failure, bail};
+use crate::failure::Failure;
 use crate::output::{make_folder, remove};
 use crate::progress::Progress;
 use crate::{device, say};
@@ -26,12 +26,22 @@ const KINDS: [(&str, &str, Kind); 4] = [
     ("sog", "PlayCanvas", Kind::Sog),
 ];
 
+/// Why options of a folder are refused for a file.
+pub const ONE: &str = "is for a folder of many files";
+
 /// The share of many inputs that one process makes.
 #[derive(Args, Default, Clone)]
 pub struct ShardArgument {
     /// With many inputs: make part I of N of them, from 0, so that several processes or machines share the work.
     #[arg(long, value_name = "I/N")]
     pub shard: Option<Shard>,
+}
+
+impl ShardArgument {
+    /// Refuses the option in a command with one input.
+    pub fn must_be_unused(&self, why: &str) -> Result<(), Failure> {
+        if self.shard.is_some() { Err(Failure::Input(format!("--shard: {why}"))) } else { Ok(()) }
+    }
 }
 
 /// The kind of the files of Gaussians.
@@ -49,12 +59,8 @@ impl KindArgument {
     }
 
     /// Refuses the option in a command with one input.
-    pub fn must_be_unused(&self, shard: &ShardArgument, why: &str) -> Result<(), Failure> {
-        match (self.kind.is_some(), shard.shard.is_some()) {
-            (true, _) => bail!("--kind: {why}"),
-            (_, true) => bail!("--shard: {why}"),
-            _ => Ok(()),
-        }
+    pub fn must_be_unused(&self, why: &str) -> Result<(), Failure> {
+        if self.kind.is_some() { Err(Failure::Input(format!("--kind: {why}"))) } else { Ok(()) }
     }
 }
 

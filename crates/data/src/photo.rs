@@ -19,7 +19,6 @@ use std::path::Path;
 
 use image::{DynamicImage, GrayImage, RgbImage};
 
-use crate::resize::bilinear;
 use snapsnap_base::FileError;
 use snapsnap_mesh::picture::{self, MAX_BYTES};
 
@@ -27,8 +26,8 @@ use exposure::match_back;
 use matting::matte;
 pub use matting::{FOUND, Segmenter};
 pub use placing::Mapping;
-pub(crate) use placing::place;
-use placing::{Standing, placed, together};
+use placing::{Standing, placed, placed_as_demo, together};
+pub(crate) use placing::{on_canvas, place};
 pub(crate) use planes::PlaneMap;
 use turning::Turn;
 pub use viewpoint::{ELEVATIONS, FOCALS, Shot, Viewpoint};
@@ -140,13 +139,13 @@ pub fn load(
     placement: Placement,
     focal: Option<f64>,
 ) -> Result<Pair, FileError> {
-    let mut shots = [front, back].map(|source| Shot::of(&source));
+    let [of_front, of_back] = [front, back].map(|source| Shot::of(&source));
     // Photographs of one person are taken with one camera.
-    let found =
-        Shot { focal: focal.or(shots[0].focal).or(shots[1].focal), pitch: shots[0].pitch.or(shots[1].pitch) };
-    for shot in &mut shots {
-        *shot = Shot { focal: focal.or(shot.focal).or(found.focal), pitch: shot.pitch.or(found.pitch) };
-    }
+    let both = |own: Shot, other: Shot| Shot {
+        focal: focal.or(own.focal).or(other.focal),
+        pitch: own.pitch.or(other.pitch),
+    };
+    let mut shots = [both(of_front, of_back), both(of_back, of_front)];
     let mut front = Cutout::read(front, cutting, side, placement)?;
     let mut back = Cutout::read(back, cutting, side, placement)?;
     if let Placement::Training { .. } = placement
@@ -156,16 +155,16 @@ pub fn load(
             &format!(", made {r:.2}, {g:.2}, {b:.2} times as bright (red, green, blue) to match the front");
     }
     let doubts = doubts::doubts(&front, &back);
-    let together = |front: &Cutout, back: &Cutout| match placement {
-        Placement::Training { .. } => together([&front.mask, &back.mask], [front.person, back.person]),
-        _ => None,
-    };
-    let mut unturned = [None, None];
+    let together =
+        |front: &Cutout, back: &Cutout| together([&front.mask, &back.mask], [front.person, back.person]);
+    let (mut common, mut unturned) = (None, [None, None]);
     if let Placement::Training { .. } = placement {
-        let common = together(&front, &back);
+        common = together(&front, &back);
         unturned = [front.turn(common, &mut shots[0]), back.turn(common, &mut shots[1])];
+        if unturned.iter().any(Option::is_some) {
+            common = together(&front, &back);
+        }
     }
-    let common = together(&front, &back);
     let canvases = [front.canvas(common, side, placement)?, back.canvas(common, side, placement)?];
     let [of_front, of_back] = unturned;
     let cutouts = [(front, of_front), (back, of_back)]
@@ -376,79 +375,6 @@ impl Rect {
         let bottom = (self.y + self.height).min(inner.y.saturating_add(inner.height).saturating_add(reach_y));
         Self { x, y, width: right - x, height: bottom - y }
     }
-}
-
-/// The picture without a resize (docs/method.md, "Photographs on the canvas").
-pub(crate) fn on_canvas(rgb: &RgbImage, mask: &GrayImage, report: String) -> Canvas {
-    let mask: Vec<f32> = mask.pixels().map(|p| unit(p[0])).collect();
-    let area = mask.len();
-    let mut values = vec![0.0; 3 * area];
-    for (i, pixel) in rgb.pixels().enumerate() {
-        for c in 0..3 {
-            values[c * area + i] = (2.0 * unit(pixel[c]) - 1.0) * mask[i];
-        }
-    }
-    let valid = mask.iter().map(|m| *m >= THRESHOLD).collect();
-    Canvas { rgb: values, mask, valid, mapping: Mapping::AS_IT_IS, report }
-}
-
-/// The placement of the published demo with its quirks. The box loses its last row and column, sampling is bilinear,
-/// colours are cut at half coverage instead of multiplied by it, and only pixels with a full mask are valid.
-fn placed_as_demo(
-    rgb: &RgbImage,
-    mask: &GrayImage,
-    person: Rect,
-    [height, side]: [usize; 2],
-    source: &str,
-) -> Canvas {
-    let person = Rect { width: (person.width - 1).max(1), height: (person.height - 1).max(1), ..person };
-    let height = ((height as f32 / REFERENCE_SIDE * side as f32).round() as usize).clamp(1, side);
-    let scaled = person.width as usize * height / person.height as usize;
-    // The demo fails on a person wider than its canvas. Here the person gets smaller.
-    let height =
-        if scaled > side { (person.height as usize * side / person.width as usize).max(1) } else { height };
-    let width = (scaled / 2 * 2).clamp(2.min(side), side / 2 * 2);
-    let (left, top) = ((side - width) / 2, (side - height) / 2);
-    let mapping = Mapping::of(person, [left, top], [width, height]);
-    let [r, g, b, m] = planes(rgb, mask, person, |color, _| unit(color), [height, width], bilinear);
-    let area = side * side;
-    let (mut values, mut on_canvas) = (vec![0.0; 3 * area], vec![0.0; area]);
-    for y in 0..height {
-        for x in 0..width {
-            let (from, to) = (y * width + x, (top + y) * side + left + x);
-            on_canvas[to] = m[from];
-            if m[from] >= THRESHOLD {
-                for (c, plane) in [&r, &g, &b].into_iter().enumerate() {
-                    values[c * area + to] = 2.0 * plane[from] - 1.0;
-                }
-            }
-        }
-    }
-    let valid = on_canvas.iter().map(|m| *m >= 1.0).collect();
-    let report =
-        format!("{source}, sampled to {width}×{height} at ({left}, {top}) of {side}×{side} as in the demo");
-    Canvas { rgb: values, mask: on_canvas, valid, mapping, report }
-}
-
-/// Red, green, blue and mask of the person's box, resized to `size` (rows, columns). `color` converts a colour and the
-/// mask's value. Planes are made one by one, since a plane in f32 takes as much memory as the picture.
-fn planes(
-    rgb: &RgbImage,
-    mask: &GrayImage,
-    person: Rect,
-    color: impl Fn(u8, u8) -> f32,
-    size: [usize; 2],
-    resize: fn(Vec<f32>, [usize; 2], [usize; 2]) -> Vec<f32>,
-) -> [Vec<f32>; 4] {
-    std::array::from_fn(|channel| {
-        let rows = person.y..person.y + person.height;
-        let places = rows.flat_map(|y| (person.x..person.x + person.width).map(move |x| (x, y)));
-        let value = |(x, y)| {
-            let m = mask.get_pixel(x, y)[0];
-            if channel == 3 { unit(m) } else { color(rgb.get_pixel(x, y)[channel], m) }
-        };
-        resize(places.map(value).collect(), [person.height as usize, person.width as usize], size)
-    })
 }
 
 fn unit(value: u8) -> f32 {

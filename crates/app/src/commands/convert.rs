@@ -57,7 +57,8 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
         axes.check(&file("x"))?;
         return batch::each(input, output, shard, None, file, |path, name| one(path, &file(name), axes));
     }
-    kind.must_be_unused(shard, "is for a folder of many files")?;
+    kind.must_be_unused(batch::ONE)?;
+    shard.must_be_unused(batch::ONE)?;
     one(input, output, axes)
 }
 

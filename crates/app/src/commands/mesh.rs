@@ -88,9 +88,9 @@ pub fn options(kind: Kind) -> Options {
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let Arguments { input, output, kind, shard, .. } = arguments;
     if !input.is_dir() {
-        let given = [("--kind", kind.is_some()), ("--shard", shard.shard.is_some())];
-        if let Some((name, _)) = given.iter().find(|(_, given)| *given) {
-            bail!("{name}: is for a folder of many files");
+        shard.must_be_unused(batch::ONE)?;
+        if kind.is_some() {
+            bail!("--kind: {}", batch::ONE);
         }
         return one(arguments);
     }

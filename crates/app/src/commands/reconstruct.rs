@@ -32,6 +32,8 @@ const BYTES_PER_PIXEL: u64 = 18;
 
 /// The output of one person.
 const DEFAULT_OUTPUT: &str = "human.ply";
+/// Why options of many people are refused for one.
+const ONE: &str = "is for many people, with --pairs";
 
 #[derive(Args)]
 pub struct Arguments {
@@ -209,7 +211,8 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
 /// Makes one person.
 fn one(arguments: &Arguments, paths: [&PathBuf; 2]) -> Result<(), Failure> {
     let start = Instant::now();
-    arguments.kind.must_be_unused(&arguments.shard, "is for many people, with --pairs")?;
+    arguments.kind.must_be_unused(ONE)?;
+    arguments.shard.must_be_unused(ONE)?;
     let output = arguments.output.as_deref().unwrap_or(Path::new(DEFAULT_OUTPUT));
     let weights = arguments.model.open()?;
     let config = weights.config.clone();

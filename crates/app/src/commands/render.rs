@@ -82,9 +82,7 @@ pub struct Arguments {
 
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     if !arguments.ply.is_dir() {
-        if arguments.shard.shard.is_some() {
-            bail!("--shard: is for a folder of many files");
-        }
+        arguments.shard.must_be_unused(batch::ONE)?;
         return one(arguments);
     }
     if arguments.raw.is_some() {

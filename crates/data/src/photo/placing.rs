@@ -1,11 +1,11 @@
-//! Placement of photographs at the training subjects' place and size, separately or together.
+//! Photographs on their canvases: as they are, as the demo places them, or at the training subjects' place and size, separately or together.
 
 use glam::DVec2;
 use image::{GenericImageView, GrayImage, RgbImage, imageops};
 
 use super::exposure::match_back;
-use super::{Canvas, REFERENCE_SIDE, Rect, THRESHOLD, planes, rim, unit};
-use crate::resize::lanczos3;
+use super::{Canvas, REFERENCE_SIDE, Rect, THRESHOLD, rim, unit};
+use crate::resize::{bilinear, lanczos3};
 
 /// Middle row of a training subject on a canvas of 1024. The subject covers rows 124.39 to 862.52
 /// (docs/method.md, "Cameras").
@@ -178,4 +178,77 @@ pub(super) fn placed(
         "{source}, scaled by {scale:.4}{limited} to {width}×{height} at ({left}, {top}) of {side}×{side}"
     );
     Canvas { rgb: values, mask: on_canvas, valid, mapping, report }
+}
+
+/// The picture without a resize (docs/method.md, "Photographs on the canvas").
+pub fn on_canvas(rgb: &RgbImage, mask: &GrayImage, report: String) -> Canvas {
+    let mask: Vec<f32> = mask.pixels().map(|p| unit(p[0])).collect();
+    let area = mask.len();
+    let mut values = vec![0.0; 3 * area];
+    for (i, pixel) in rgb.pixels().enumerate() {
+        for c in 0..3 {
+            values[c * area + i] = (2.0 * unit(pixel[c]) - 1.0) * mask[i];
+        }
+    }
+    let valid = mask.iter().map(|m| *m >= THRESHOLD).collect();
+    Canvas { rgb: values, mask, valid, mapping: Mapping::AS_IT_IS, report }
+}
+
+/// The placement of the published demo with its quirks. The box loses its last row and column, sampling is bilinear,
+/// colours are cut at half coverage instead of multiplied by it, and only pixels with a full mask are valid.
+pub(super) fn placed_as_demo(
+    rgb: &RgbImage,
+    mask: &GrayImage,
+    person: Rect,
+    [height, side]: [usize; 2],
+    source: &str,
+) -> Canvas {
+    let person = Rect { width: (person.width - 1).max(1), height: (person.height - 1).max(1), ..person };
+    let height = ((height as f32 / REFERENCE_SIDE * side as f32).round() as usize).clamp(1, side);
+    let scaled = person.width as usize * height / person.height as usize;
+    // The demo fails on a person wider than its canvas. Here the person gets smaller.
+    let height =
+        if scaled > side { (person.height as usize * side / person.width as usize).max(1) } else { height };
+    let width = (scaled / 2 * 2).clamp(2.min(side), side / 2 * 2);
+    let (left, top) = ((side - width) / 2, (side - height) / 2);
+    let mapping = Mapping::of(person, [left, top], [width, height]);
+    let [r, g, b, m] = planes(rgb, mask, person, |color, _| unit(color), [height, width], bilinear);
+    let area = side * side;
+    let (mut values, mut on_canvas) = (vec![0.0; 3 * area], vec![0.0; area]);
+    for y in 0..height {
+        for x in 0..width {
+            let (from, to) = (y * width + x, (top + y) * side + left + x);
+            on_canvas[to] = m[from];
+            if m[from] >= THRESHOLD {
+                for (c, plane) in [&r, &g, &b].into_iter().enumerate() {
+                    values[c * area + to] = 2.0 * plane[from] - 1.0;
+                }
+            }
+        }
+    }
+    let valid = on_canvas.iter().map(|m| *m >= 1.0).collect();
+    let report =
+        format!("{source}, sampled to {width}×{height} at ({left}, {top}) of {side}×{side} as in the demo");
+    Canvas { rgb: values, mask: on_canvas, valid, mapping, report }
+}
+
+/// Red, green, blue and mask of the person's box, resized to `size` (rows, columns). `color` converts a colour and the
+/// mask's value. Planes are made one by one, since a plane in f32 takes as much memory as the picture.
+fn planes(
+    rgb: &RgbImage,
+    mask: &GrayImage,
+    person: Rect,
+    color: impl Fn(u8, u8) -> f32,
+    size: [usize; 2],
+    resize: fn(Vec<f32>, [usize; 2], [usize; 2]) -> Vec<f32>,
+) -> [Vec<f32>; 4] {
+    std::array::from_fn(|channel| {
+        let rows = person.y..person.y + person.height;
+        let places = rows.flat_map(|y| (person.x..person.x + person.width).map(move |x| (x, y)));
+        let value = |(x, y)| {
+            let m = mask.get_pixel(x, y)[0];
+            if channel == 3 { unit(m) } else { color(rgb.get_pixel(x, y)[channel], m) }
+        };
+        resize(places.map(value).collect(), [person.height as usize, person.width as usize], size)
+    })
 }
