@@ -1,11 +1,12 @@
 """Time of the point predictor of the published size in PyTorch, to compare with `snapsnap reconstruct -v`.
 
 Random weights, inference mode, two photographs of 512x512 pixels. Encoder: 24 blocks of width 1024. Decoders: 2 x 12 blocks of
-width 768. Heads: four, layer_dims 96/192/384/768, feature_dim 256, last_dim 128. --bf16 means torch.autocast("cpu",
+width 768. Heads: four, layer_dims 96/192/384/768, feature_dim 256, last_dim 128. --bf16 means torch.autocast(DEVICE,
 torch.bfloat16) with images in channels-last order. The order of the 1x1 convolution and the enlargement in a fusion block is
-the published one (enlarge first); --commute swaps them as snapsnap does.
+the published one (enlarge first); --commute swaps them as snapsnap does. --device cuda measures an NVIDIA card, with --tf32 in
+PyTorch's lower precision of f32 products.
 
-    python docs/published_pytorch.py --threads 2 --runs 5 [--bf16] [--commute]
+    python docs/published_pytorch.py --threads 2 --runs 5 [--bf16] [--commute] [--device cuda [--tf32]]
 """
 
 import argparse
@@ -83,13 +84,24 @@ def main():
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--bf16", action="store_true")
     parser.add_argument("--commute", action="store_true")
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    parser.add_argument("--tf32", action="store_true")
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
     torch.manual_seed(1)
+    torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = arguments.tf32
+    torch.set_default_device(arguments.device)
+
+    def now():
+        if arguments.device == "cuda":
+            torch.cuda.synchronize()
+        return time.perf_counter()
+
     order = torch.channels_last if arguments.bf16 else torch.contiguous_format
+    digits = 1 if arguments.device == "cuda" else 0
     grid = (32, 32)
     table = step_pytorch.tables(*grid, 64)
-    with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=arguments.bf16):
+    with torch.inference_mode(), torch.autocast(arguments.device, torch.bfloat16, enabled=arguments.bf16):
         patches = nn.Conv2d(3, 1024, 16, 16)
         encoder, embed = blocks(1024, False, 24), nn.Linear(1024, 768)
         norm, last = nn.LayerNorm(1024, eps=1e-6), nn.LayerNorm(768, eps=1e-6)
@@ -97,27 +109,27 @@ def main():
         heads = [Head(arguments.commute).eval().to(memory_format=order) for _ in range(4)]
         images = torch.randn(2, 3, 512, 512).contiguous(memory_format=order)
         for run in range(arguments.runs):
-            times = [time.perf_counter()]
+            times = [now()]
             x = patches(images).flatten(2).transpose(1, 2)
             for block in encoder:
                 x = block(x, None, table)
             x = norm(x)
-            times.append(time.perf_counter())
+            times.append(now())
             pairs = [x.chunk(2)]
             pairs.append(tuple(embed(x) for x in pairs[0]))
             for first, second in zip(*decoders):
                 x, y = pairs[-1]
                 pairs.append((first(x, y, table), second(y, x, table)))
             pairs.append(tuple(last(x) for x in pairs.pop()))
-            times.append(time.perf_counter())
+            times.append(now())
             sides = [[pairs[i][side] for i in (0, 7, 10, 13)] for side in (0, 1)]
             fused = [(a + b) * 0.5 for a, b in zip(*sides)]
             for head, maps in zip(heads, (*sides, fused, fused)):
                 head([m.transpose(1, 2).unflatten(2, grid) for m in maps])
-            times.append(time.perf_counter())
+            times.append(now())
             parts = [1e3 * (b - a) for a, b in zip(times, times[1:])]
             names = ("encoder", "decoders", "heads (4)")
-            print(f"run {run}:", ", ".join(f"{n} {t:.0f}" for n, t in zip(names, parts)) + f", all {sum(parts):.0f} ms", flush=True)
+            print(f"run {run}:", ", ".join(f"{n} {t:.{digits}f}" for n, t in zip(names, parts)) + f", all {sum(parts):.{digits}f} ms", flush=True)
 
 
 if __name__ == "__main__":
