@@ -17,7 +17,7 @@ use crate::commands::{is_same_folder, one_of};
 use crate::failure::Failure;
 use crate::output::{make_folder, remove};
 use crate::progress::Progress;
-use crate::{device, say};
+use crate::say;
 
 const KINDS: [(&str, &str, Kind); 4] = [
     ("ply", "3D Gaussian splatting PLY", Kind::Ply),
@@ -175,16 +175,14 @@ pub fn unpanicked<T>(work: impl FnOnce() -> Result<T, Failure>) -> Result<T, Fai
 }
 
 /// Runs `work` on every file of Gaussians in a folder, with its name without extension. Its result is `output(name)`, whose existence shows
-/// that it is done. `device` is the name of the device that it takes.
+/// that it is done.
 pub fn each(
     folder: &Path,
     target: &Path,
     shard: &ShardArgument,
-    device: Option<&str>,
     output: impl Fn(&str) -> PathBuf,
     work: impl Fn(&Path, &str) -> Result<(), Failure>,
 ) -> Result<(), Failure> {
-    device.map_or(Ok(()), |name| device::choose(name).map(drop))?;
     if is_same_folder(folder, target) {
         return Err(Failure::file(target, "is the folder of the inputs: give another one"));
     }

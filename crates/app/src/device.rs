@@ -3,7 +3,6 @@
 use std::panic;
 use std::process::{Command, Stdio};
 use std::sync::OnceLock;
-use std::thread;
 
 use burn::tensor::{Device, DeviceKind, DeviceType};
 use serde::{Deserialize, Serialize};
@@ -49,6 +48,15 @@ pub fn choose(name: &str) -> Result<Device, Failure> {
     }
 }
 
+/// The device called `name` for one person: `auto` is the CPU. Each process compiles the kernels of a card anew, which takes
+/// longer than the CPU's whole work (docs/inference.md).
+///
+/// # Errors
+/// As [`choose`].
+pub fn choose_for_one(name: &str) -> Result<Device, Failure> {
+    choose(if name == "auto" { "cpu" } else { name })
+}
+
 /// The device called `name` for the process number `turn` of several on this machine: without an index, they take the cards in turn.
 ///
 /// # Errors
@@ -65,13 +73,6 @@ pub fn choose_in_turn(name: &str, turn: usize) -> Result<Device, Failure> {
     match cards.get(turn % cards.len().max(1)) {
         Some(card) => choose(&card.device()),
         None => Ok(device),
-    }
-}
-
-/// Lists the adapters on another thread if [`choose`] will need them for `name`; it takes a tenth of a second.
-pub fn begin_search(name: &str) {
-    if name == "auto" {
-        thread::spawn(adapters);
     }
 }
 

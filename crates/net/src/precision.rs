@@ -29,7 +29,7 @@ pub fn unit_of_cpu() -> Option<&'static str> {
     snapsnap_ops::half::unit().map(snapsnap_ops::half::Unit::name)
 }
 
-/// Whether products in bf16 are faster on this device: on the CPU, if its processor has them. GPUs were not measured.
+/// Whether products in bf16 are faster on this device: on the CPU, if its processor has them. Whether it is on GPUs is not known.
 fn is_fast_in_bf16(device: &Device) -> bool {
     let device = device.clone();
     let device = if device.is_autodiff() { device.inner() } else { device };

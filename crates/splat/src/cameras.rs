@@ -72,8 +72,15 @@ impl Entry {
 /// [`FileError`] if the file cannot be read or is no such list, or if nothing can be rendered into one of its cameras. It
 /// names the entry and the field.
 pub fn read(path: &Path) -> Result<Vec<Camera>, FileError> {
+    parse(path, &file::read_text(path, MAX_BYTES).map_err(FileError::read(path))?)
+}
+
+/// The cameras in `text`, which is the content of `path`.
+///
+/// # Errors
+/// As [`read`].
+pub fn parse(path: &Path, text: &str) -> Result<Vec<Camera>, FileError> {
     let wrong = |problem: String| FileError::unsuitable(path, problem);
-    let text = file::read_text(path, MAX_BYTES).map_err(FileError::read(path))?;
     // In two steps, so that an error can name the camera.
     let text = text.trim_start_matches('\u{feff}');
     let entries: Vec<Value> = serde_json::from_str(text).map_err(|e| wrong(quoted(&e.to_string())))?;

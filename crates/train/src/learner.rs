@@ -1,6 +1,7 @@
 //! Steps of a training: samples → loss → gradients → weights. This module writes no files.
 
 use std::collections::BTreeMap;
+use std::time::Instant;
 
 use burn::data::dataset::Dataset;
 use burn::tensor::{Device, Tensor};
@@ -194,7 +195,11 @@ impl<'a, T: Task> Learner<'a, T> {
                 *values.entry(name).or_default() += value;
             }
         }
+        let since = Instant::now();
         let sum = gradients::reduce(self.ranks, sum, &self.lengths, &self.device.clone().inner());
+        if self.ranks.size() > 1 {
+            values.insert("reduce_ms".to_owned(), 1e3 * since.elapsed().as_secs_f64());
+        }
         let norm = gradients::norm(&sum);
         let clipped = gradients::clip_factor(norm, t.clip);
         if let Some(scale) = &mut self.progress.loss_scale {

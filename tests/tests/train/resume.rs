@@ -10,7 +10,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use snapsnap_tests::{refused, snapsnap, succeed};
 
-use super::{logged, place, results, train};
+use super::{logged, people, place, results, train, train_on};
 
 /// Kills a training at random moments until it is done. Returns how often it was killed.
 fn killed_at_random(command: impl Fn() -> Command, random: &mut ChaCha8Rng, most: u32) -> u32 {
@@ -93,6 +93,32 @@ fn sessions_after_a_time_limit_or_an_interrupt_end_with_the_same_bytes() {
     let before = results(&whole);
     succeed(train(2, &config, &whole).arg("--resume"));
     assert!(results(&whole) == before);
+}
+
+/// A run goes on with its data set packed, as if nothing had happened.
+#[test]
+fn packed_people_give_the_bytes_of_their_folders() {
+    let (temporary, config) = place();
+    let packed = temporary.path().join("packed");
+    succeed(snapsnap().args(["prepare", "pack"]).arg(people()).arg("-o").arg(&packed));
+    let predictor = temporary.path().join("folders-1/last.safetensors");
+    for stage in [1, 2] {
+        let [folders, archives, mixed] =
+            ["folders", "archives", "mixed"].map(|name| temporary.path().join(format!("{name}-{stage}")));
+        let on = |data: &Path, run: &Path| {
+            let mut command = train_on(data, stage, &config, run);
+            if stage == 2 {
+                command.arg("--weights").arg(&predictor);
+            }
+            command
+        };
+        succeed(&mut on(people(), &folders));
+        succeed(&mut on(&packed, &archives));
+        assert!(results(&folders) == results(&archives), "stage {stage}: other bytes");
+        succeed(on(people(), &mixed).args(["--minutes", "0.001"]));
+        succeed(on(&packed, &mixed).arg("--resume"));
+        assert!(results(&folders) == results(&mixed), "stage {stage}: other bytes after a change");
+    }
 }
 
 /// A limit on the size of files imitates a full disk. The log fits, the checkpoint does not.

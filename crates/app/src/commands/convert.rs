@@ -55,7 +55,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     if input.is_dir() {
         let file = |name: &str| output.join(format!("{name}.{}", kind.extension()));
         axes.check(&file("x"))?;
-        return batch::each(input, output, shard, None, file, |path, name| one(path, &file(name), axes));
+        return batch::each(input, output, shard, file, |path, name| one(path, &file(name), axes));
     }
     kind.must_be_unused(batch::ONE)?;
     shard.must_be_unused(batch::ONE)?;

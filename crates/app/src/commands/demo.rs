@@ -62,7 +62,7 @@ pub struct Arguments {
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let start = Instant::now();
     let folder = ReportFolder::of(&arguments.output, FILES, &[])?;
-    let device = device::choose(&arguments.device)?;
+    let device = device::choose_for_one(&arguments.device)?;
     let progress = Progress::stages();
     progress.stage("photographs");
     let header = header(&device::describe(&device));

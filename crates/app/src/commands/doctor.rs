@@ -97,6 +97,9 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
         format!("{mark} {:<10} {} ({}{software}{memory})", found.name, found.adapter, found.backend)
     }));
     lines.push(format!("  --device auto takes {chosen}: {why}"));
+    if chosen != "cpu" {
+        lines.push("  and cpu for one person, which is done before a card's kernels are compiled".into());
+    }
     lines.push("weights".into());
     lines.extend(weights.iter().map(|w| match &w.state {
         Ok(text) => format!("  {}: sound, {text}", w.name),

@@ -92,24 +92,25 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
         if kind.is_some() {
             bail!("--kind: {}", batch::ONE);
         }
-        return one(arguments);
+        return one(arguments, &device::choose_for_one(&arguments.device)?);
     }
     let file = |name: &str| output.join(format!("{name}.{}", kind.as_deref().unwrap_or("glb")));
     Target::new(&file("x"), &arguments.surface)?;
-    batch::each(input, output, shard, Some(&arguments.device), file, |path, name| {
-        one(&Arguments { input: path.to_owned(), output: file(name), ..arguments.clone() })
+    let device = device::choose(&arguments.device)?;
+    batch::each(input, output, shard, file, |path, name| {
+        let one_of = Arguments { input: path.to_owned(), output: file(name), ..arguments.clone() };
+        one(&one_of, &device)
     })
 }
 
 /// Makes one mesh.
-fn one(arguments: &Arguments) -> Result<(), Failure> {
+fn one(arguments: &Arguments, device: &Device) -> Result<(), Failure> {
     let since = Instant::now();
     let mut target = Target::new(&arguments.output, &arguments.surface)?;
     target.options.force = arguments.force;
     check_outputs(&target.files(), &[&arguments.input])?;
-    let device = device::choose(&arguments.device)?;
-    let loaded = scene::read(&arguments.input, &device)?;
-    check_size(&loaded, &device).map_err(|e| e.about(&arguments.input))?;
+    let loaded = scene::read(&arguments.input, device)?;
+    check_size(&loaded, device).map_err(|e| e.about(&arguments.input))?;
     let fused = target.write(&loaded, &arguments.input)?;
     if arguments.verbose {
         say::out(&describe(&fused));

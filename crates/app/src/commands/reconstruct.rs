@@ -131,18 +131,24 @@ pub struct ModelArguments {
 }
 
 impl ModelArguments {
-    /// Opens the weights of both networks. `auto` looks for graphics cards meanwhile.
+    /// Opens the weights of both networks.
     pub fn open(&self) -> Result<WeightFile, Failure> {
         let weights = weights::open(self.weights.as_deref(), &self.config)?;
         weights.require(Part::PointPredictor)?;
         weights.require(Part::Regressor)?;
-        device::begin_search(&self.device);
         Ok(weights)
     }
 
-    /// The device, if the networks fit into its memory.
+    /// The device for many people, if the networks fit into its memory.
     pub fn device(&self, weights: &WeightFile) -> Result<Device, Failure> {
         let device = device::choose(&self.device)?;
+        memory::check_networks(weights, &device)?;
+        Ok(device)
+    }
+
+    /// The device for one person, if the networks fit into its memory.
+    fn device_for_one(&self, weights: &WeightFile) -> Result<Device, Failure> {
+        let device = device::choose_for_one(&self.device)?;
         memory::check_networks(weights, &device)?;
         Ok(device)
     }
@@ -253,7 +259,7 @@ fn one(arguments: &Arguments, paths: [&PathBuf; 2]) -> Result<(), Failure> {
     let shots = [0, 1].map(|i| (shots[i], cutouts[i].0.dimensions().into(), canvases[i].mapping));
     drop(cutouts);
     let since = Instant::now();
-    let device = arguments.model.device(&weights)?;
+    let device = arguments.model.device_for_one(&weights)?;
     timed("finding the device", since);
 
     let progress = Progress::stages();

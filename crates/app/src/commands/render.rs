@@ -83,7 +83,7 @@ pub struct Arguments {
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     if !arguments.ply.is_dir() {
         arguments.shard.must_be_unused(batch::ONE)?;
-        return one(arguments);
+        return one(arguments, &device::choose_for_one(&arguments.device)?);
     }
     if arguments.raw.is_some() {
         bail!("--raw: takes one file of Gaussians, {} is a folder", arguments.ply.display());
@@ -91,13 +91,15 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     views(arguments)?;
     let target = arguments.output.as_deref().unwrap_or(Path::new(DEFAULT_FOLDER));
     let done = |name: &str| target.join(name).join(CAMERAS);
-    batch::each(&arguments.ply, target, &arguments.shard, Some(&arguments.device), done, |path, name| {
-        one(&Arguments { ply: path.to_owned(), output: Some(target.join(name)), ..arguments.clone() })
+    let device = device::choose(&arguments.device)?;
+    batch::each(&arguments.ply, target, &arguments.shard, done, |path, name| {
+        let one_of = Arguments { ply: path.to_owned(), output: Some(target.join(name)), ..arguments.clone() };
+        one(&one_of, &device)
     })
 }
 
 /// Renders one file.
-fn one(arguments: &Arguments) -> Result<(), Failure> {
+fn one(arguments: &Arguments, device: &Device) -> Result<(), Failure> {
     let views = views(arguments)?;
     if arguments.raw.is_some() {
         check_raw(&views)?;
@@ -110,12 +112,11 @@ fn one(arguments: &Arguments) -> Result<(), Failure> {
     let folder =
         folder.map(|path| ViewFolder::new(path, views.len(), arguments.cameras.as_deref())).transpose()?;
     check_paths(arguments, folder.as_ref())?;
-    let device = device::choose(&arguments.device)?;
     let start = Instant::now();
-    let loaded = scene::read(&arguments.ply, &device)?;
+    let loaded = scene::read(&arguments.ply, device)?;
     let reading = start.elapsed();
     let background =
-        (arguments.background != [0.0; 3]).then(|| Tensor::<1>::from_floats(arguments.background, &device));
+        (arguments.background != [0.0; 3]).then(|| Tensor::<1>::from_floats(arguments.background, device));
     let options = RenderOptions {
         antialiased: arguments.antialiased,
         background,
@@ -162,7 +163,7 @@ fn one(arguments: &Arguments) -> Result<(), Failure> {
     let n = loaded.gaussians.len();
     let say = arguments.raw.as_deref().map_or(say::out as fn(&str), say::beside);
     if arguments.verbose {
-        report(say, n, &counts, &device);
+        report(say, n, &counts, device);
         let [reading, rendering] = [reading, rendering].map(|time| time.as_secs_f64() * 1e3);
         say(&format!("reading {reading:.1} ms, rendering and writing {rendering:.1} ms"));
     }

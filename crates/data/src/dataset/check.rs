@@ -79,11 +79,10 @@ fn orphans(folder: &Folder, split: Option<Split>, subjects: &[String]) -> Vec<St
     let mut problems = Vec::new();
     for kind in folder.kinds().iter().filter(|kind| **kind != "img") {
         let path = folder.split_path(split).join(kind);
-        for entry in fs::read_dir(&path).into_iter().flatten().flatten() {
-            let name = entry.file_name().to_string_lossy().into_owned();
+        for (name, _) in folder.names(&path).unwrap_or_default() {
             let subject = name.strip_suffix(".json").unwrap_or(&name).to_owned();
             if !subjects.contains(&subject) {
-                problems.push(format!("{}: its subject has no pictures", entry.path().display()));
+                problems.push(format!("{}: its subject has no pictures", path.join(name).display()));
             }
         }
     }
@@ -97,11 +96,10 @@ fn unexpected(folder: &Folder, split: Option<Split>, subject: &str) -> Vec<Strin
     let mut extra = BTreeSet::new();
     for kind in folder.kinds().iter().filter(|kind| **kind != "cameras") {
         let path = folder.path(split, kind, subject);
-        for entry in fs::read_dir(&path).into_iter().flatten().flatten() {
-            let name = entry.file_name().to_string_lossy().into_owned();
+        for (name, _) in folder.names(&path).unwrap_or_default() {
             let number: String = name.chars().take_while(char::is_ascii_digit).collect();
             if !number.parse().is_ok_and(|view: usize| view < views) {
-                extra.insert(format!("{}: belongs to none of the {views} views", entry.path().display()));
+                extra.insert(format!("{}: belongs to none of the {views} views", path.join(name).display()));
             }
         }
     }

@@ -165,6 +165,12 @@ pub fn read(path: &Path) -> Result<Description, FileError> {
     }
 }
 
+/// The text of `dataset.toml`.
+pub fn text(description: &Description) -> String {
+    let keys = toml::to_string(description).expect("the description has only TOML types");
+    format!("# Written by `snapsnap prepare`.\n{keys}")
+}
+
 /// Differences between two descriptions, key by key.
 pub fn differences(there: &Description, wanted: &Description) -> String {
     let messages = config::differences(&config::keys(there), &config::keys(wanted));

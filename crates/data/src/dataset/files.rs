@@ -1,6 +1,6 @@
 //! Single files of data sets.
 
-use std::io::{BufReader, Cursor, Read, Write};
+use std::io::{Cursor, Read, Write};
 use std::path::Path;
 
 use glam::{DMat3, DVec2, DVec3};
@@ -13,9 +13,9 @@ use snapsnap_splat::{Camera, RigidTransform};
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipArchive, ZipWriter};
 
-use super::MAX_RESOLUTION;
-use snapsnap_base::{FileError, file};
-use snapsnap_mesh::picture::{MAX_BYTES, decode, unreadable};
+use super::{MAX_RESOLUTION, Stored};
+use snapsnap_base::FileError;
+use snapsnap_mesh::picture::{MAX_BYTES, decode_bytes, unreadable};
 use snapsnap_mesh::view::View;
 
 /// Stored depths of the authors' layout are ⌊2¹⁵/z⌋ (docs/method.md, "Layouts").
@@ -120,8 +120,8 @@ fn holds_its_shape(npy: &[u8]) -> bool {
 type Depth = (Vec<f32>, [u32; 2]);
 
 /// Reads a file of [`write_inverse_depth`].
-pub fn read_inverse_depth(path: &Path) -> Result<Depth, FileError> {
-    let picture = decode(path, MAX_BYTES)?;
+pub fn read_inverse_depth(Stored { path, bytes }: &Stored) -> Result<Depth, FileError> {
+    let picture = decode_bytes(path, bytes, MAX_BYTES)?;
     if picture.color() != image::ColorType::L16 {
         let message = format!("is {:?}, expected 16-bit grey: inverse depth", picture.color());
         return Err(FileError::unsuitable(path, message));
@@ -148,10 +148,9 @@ pub fn write_depth(path: &Path, [height, width]: [usize; 2], depth: &[f32]) -> R
 }
 
 /// Reads a file of [`write_depth`].
-pub fn read_depth(path: &Path) -> Result<Depth, FileError> {
+pub fn read_depth(Stored { path, bytes }: &Stored) -> Result<Depth, FileError> {
     let wrong = |e: &dyn std::fmt::Display| FileError::unsuitable(path, format!("is no depth map: {e}"));
-    let mut archive = ZipArchive::new(BufReader::new(file::open(path).map_err(FileError::read(path))?))
-        .map_err(|e| wrong(&e))?;
+    let mut archive = ZipArchive::new(Cursor::new(bytes)).map_err(|e| wrong(&e))?;
     let entry = archive.by_name(&format!("{DEPTH}.npy")).map_err(|e| wrong(&e))?;
     let mut npy = Vec::new();
     // An entry longer than the largest depth map is cut off here and refused below.
@@ -184,32 +183,28 @@ pub fn write_camera(folder: &Path, view: usize, camera: &Camera) -> Result<(), F
     save("extrinsic", ndarray::arr2(&extrinsic))
 }
 
-/// Reads a file of [`write_camera`]. The authors' tools store some matrices in f32.
-pub fn read_camera(folder: &Path, view: usize, side: u32) -> Result<Camera, FileError> {
-    let load = |name: &str, shape: (usize, usize)| {
-        let path = folder.join(format!("{view}_{name}.npy"));
-        let mut bytes = Vec::new();
-        let cannot = FileError::read(&path);
-        file::open(&path).map_err(&cannot)?.take(4096).read_to_end(&mut bytes).map_err(cannot)?;
-        if !holds_its_shape(&bytes) {
+/// Reads the files of [`write_camera`]. The authors' tools store some matrices in f32.
+pub fn read_camera(intrinsic: &Stored, extrinsic: &Stored, side: u32) -> Result<Camera, FileError> {
+    let load = |Stored { path, bytes }: &Stored, shape: (usize, usize)| {
+        if !holds_its_shape(bytes) {
             let message = "is no matrix: its header announces more numbers than it contains";
-            return Err(FileError::unsuitable(&path, message));
+            return Err(FileError::unsuitable(path, message));
         }
         let matrix = Array2::<f64>::read_npy(bytes.as_slice())
             .or_else(|e| Array2::<f32>::read_npy(bytes.as_slice()).map(|m| m.mapv(f64::from)).map_err(|_| e));
-        let matrix = matrix.map_err(|e| FileError::unsuitable(&path, format!("is no matrix: {e}")))?;
+        let matrix = matrix.map_err(|e| FileError::unsuitable(path, format!("is no matrix: {e}")))?;
         if matrix.dim() != shape {
             let (rows, columns) = matrix.dim();
             let message = format!("is {rows}×{columns}, expected {}×{}", shape.0, shape.1);
-            return Err(FileError::unsuitable(&path, message));
+            return Err(FileError::unsuitable(path, message));
         }
         if let Some(value) = matrix.iter().find(|v| !v.is_finite()) {
-            return Err(FileError::unsuitable(&path, format!("holds {value}")));
+            return Err(FileError::unsuitable(path, format!("holds {value}")));
         }
         Ok(matrix)
     };
-    let k = load("intrinsic", (3, 3))?;
-    let e = load("extrinsic", (3, 4))?;
+    let k = load(intrinsic, (3, 3))?;
+    let e = load(extrinsic, (3, 4))?;
     let row = |row: usize| DVec3::new(e[[row, 0]], e[[row, 1]], e[[row, 2]]);
     let rotation = DMat3::from_cols(row(0), row(1), row(2)).transpose();
     Ok(Camera {

@@ -18,7 +18,7 @@ const MAX_DEPTH: usize = 3;
 
 impl Folder {
     /// A hash of the description and of the people to train on and to validate with: of the names, lengths, beginnings and ends of
-    /// their files.
+    /// their files. A packed data set has the same one as its folders.
     ///
     /// # Errors
     /// [`FileError::Read`] for a file or folder that cannot be read.
@@ -26,15 +26,23 @@ impl Folder {
         let mut files = Vec::new();
         for split in [Split::Train, Split::Val] {
             let folder = self.split_path(Some(split));
-            if folder.is_dir() {
+            if let Some(shards) = &self.shards {
+                files.extend(shards.files(self.below(&folder)).map(Path::to_owned));
+            } else if folder.is_dir() {
                 list(&folder, MAX_DEPTH, &mut files).map_err(FileError::read(&folder))?;
             }
         }
         files.sort_unstable();
         let hashes: Vec<_> = files
             .par_iter()
-            .map(|path| hash(path).map_err(FileError::read(path)))
-            .collect::<Result<_, _>>()?;
+            .map(|path| {
+                let (length, bytes) = match &self.shards {
+                    Some(shards) => shards.ends(path, ENDS)?,
+                    None => ends(path).map_err(FileError::read(path))?,
+                };
+                Ok(Sha256::new().chain_update(length.to_le_bytes()).chain_update(bytes).finalize())
+            })
+            .collect::<Result<_, FileError>>()?;
         let mut whole = Sha256::new();
         whole.update(toml::to_string(&self.description).expect("the description has only TOML types"));
         for (path, hash) in files.iter().zip(hashes) {
@@ -64,15 +72,13 @@ fn list(folder: &Path, depth: usize, files: &mut Vec<PathBuf>) -> io::Result<()>
     Ok(())
 }
 
-fn hash(path: &Path) -> io::Result<[u8; 32]> {
+/// Length, beginning and end of a file.
+fn ends(path: &Path) -> io::Result<(u64, Vec<u8>)> {
     let mut file: File = file::open(path)?;
     let length = file.metadata()?.len();
     let mut bytes = Vec::new();
     (&mut file).take(ENDS).read_to_end(&mut bytes)?;
     file.seek(SeekFrom::Start(length.saturating_sub(ENDS).max(ENDS)))?;
     file.take(ENDS).read_to_end(&mut bytes)?;
-    let mut hash = Sha256::new();
-    hash.update(length.to_le_bytes());
-    hash.update(bytes);
-    Ok(hash.finalize().into())
+    Ok((length, bytes))
 }

@@ -12,20 +12,24 @@
 //! ```
 //!
 //! A subject is added whole or not at all: it is written under another name, and its `img` folder, which marks a
-//! subject, is renamed last.
+//! subject, is renamed last. [`pack`] puts all files into tar archives, which are read as the folders are.
 
 mod agree;
 mod check;
 mod description;
 mod files;
 mod fingerprint;
+mod pack;
+mod shards;
 #[cfg(test)]
 mod tests;
 mod write;
 
 use std::fmt::Display;
 use std::fs;
+use std::io;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use glam::{DVec2, DVec3};
 use image::{DynamicImage, GrayImage, RgbImage};
@@ -35,8 +39,13 @@ use snapsnap_splat::{Camera, RigidTransform, cameras};
 pub use check::{Checked, check};
 use description::DESCRIPTION;
 pub use description::{Arrangement, Description, Drawn, Layout, MAX_RESOLUTION, MAX_VIEWS, Split};
-use snapsnap_mesh::picture::{self, MAX_BYTES, decode};
+pub use pack::{Packed, pack};
+use shards::Shards;
+use snapsnap_mesh::picture::{self, MAX_BYTES, decode_bytes};
 pub use write::Made;
+
+/// Largest file of a data set that is read.
+const MAX_FILE: u64 = 1 << 30;
 
 /// One stored view.
 #[derive(Debug, Clone)]
@@ -56,6 +65,15 @@ pub struct StoredView {
 pub struct Folder {
     root: PathBuf,
     description: Description,
+    /// The archives of a packed data set.
+    shards: Option<Arc<Shards>>,
+}
+
+/// A file that was read.
+struct Stored {
+    /// Its path for messages.
+    path: PathBuf,
+    bytes: Vec<u8>,
 }
 
 impl Folder {
@@ -67,7 +85,8 @@ impl Folder {
         let path = root.join(DESCRIPTION);
         if path.is_file() {
             let description = description::read(&path)?;
-            return Ok(Self { root: root.to_owned(), description });
+            let shards = Shards::open(root)?.map(Arc::new);
+            return Ok(Self { root: root.to_owned(), description, shards });
         }
         fs::read_dir(root).map(drop).map_err(FileError::read(root))?;
         let foreign = |message: &str| {
@@ -88,6 +107,7 @@ impl Folder {
                 source: "written by the authors' tools".into(),
                 drawn: None,
             },
+            shards: None,
         };
         let (split, subject) = folder
             .splits()
@@ -121,6 +141,12 @@ impl Folder {
             return Err(FileError::unsuitable(root, message));
         }
         fs::create_dir_all(root).map_err(FileError::write(root))?;
+        if root.join(shards::INDEX).exists() {
+            return Err(FileError::unsuitable(
+                root,
+                "is packed, and no subjects can be added; give another folder",
+            ));
+        }
         let path = root.join(DESCRIPTION);
         if path.exists() {
             let there = description::read(&path)?;
@@ -132,12 +158,11 @@ impl Folder {
                 return Err(FileError::unsuitable(&path, message));
             }
         } else {
-            let text = toml::to_string(&description).expect("the description has only TOML types");
-            let text = format!("# Written by `snapsnap prepare`.\n{text}");
-            file::write_whole(&path, |out| std::io::Write::write_all(out, text.as_bytes()))
+            let text = description::text(&description);
+            file::write_whole(&path, |out| io::Write::write_all(out, text.as_bytes()))
                 .map_err(FileError::write(&path))?;
         }
-        Ok(Self { root: root.to_owned(), description })
+        Ok(Self { root: root.to_owned(), description, shards: None })
     }
 
     /// The folder's path.
@@ -152,7 +177,13 @@ impl Folder {
 
     /// The splits of the data set; `None` is the root itself, as in the authors' test sets.
     pub fn splits(&self) -> Vec<Option<Split>> {
-        let there = |split: &Option<Split>| self.split_path(*split).join("img").is_dir();
+        let there = |split: &Option<Split>| {
+            let folder = self.split_path(*split).join("img");
+            match &self.shards {
+                Some(shards) => shards.files(self.below(&folder)).next().is_some(),
+                None => folder.is_dir(),
+            }
+        };
         std::iter::once(None).chain(Split::ALL.map(Some)).filter(there).collect()
     }
 
@@ -162,13 +193,37 @@ impl Folder {
     /// [`FileError::Read`] for a missing split.
     pub fn subjects(&self, split: Option<Split>) -> Result<Vec<String>, FileError> {
         let folder = self.split_path(split).join("img");
-        let entries = fs::read_dir(&folder).and_then(Iterator::collect::<Result<Vec<_>, _>>);
-        let entries = entries.map_err(FileError::read(&folder))?;
-        let folders = entries.iter().filter(|entry| entry.path().is_dir());
-        let names = folders.map(|entry| entry.file_name().to_string_lossy().into_owned());
-        let mut subjects: Vec<String> = names.filter(|name| !name.starts_with('.')).collect();
+        let names = self.names(&folder).map_err(FileError::read(&folder))?;
+        let folders = names.into_iter().filter(|(name, is_folder)| *is_folder && !name.starts_with('.'));
+        let mut subjects: Vec<String> = folders.map(|(name, _)| name).collect();
         subjects.sort_unstable();
         Ok(subjects)
+    }
+
+    /// Names in a folder of the data set, and whether they are folders.
+    fn names(&self, folder: &Path) -> io::Result<Vec<(String, bool)>> {
+        if let Some(shards) = &self.shards {
+            return Ok(shards.names(self.below(folder)));
+        }
+        let entry = |entry: io::Result<fs::DirEntry>| {
+            let entry = entry?;
+            Ok((entry.file_name().to_string_lossy().into_owned(), entry.path().is_dir()))
+        };
+        fs::read_dir(folder)?.map(entry).collect()
+    }
+
+    /// Reads the file of the data set that is at `path`, or that would be there without archives.
+    fn stored(&self, path: &Path) -> Result<Stored, FileError> {
+        let (path, bytes) = match &self.shards {
+            Some(shards) => shards.read(self.below(path))?,
+            None => (path.to_owned(), file::read(path, MAX_FILE).map_err(FileError::read(path))?),
+        };
+        Ok(Stored { path, bytes })
+    }
+
+    /// A path below the root.
+    fn below<'a>(&self, path: &'a Path) -> &'a Path {
+        path.strip_prefix(&self.root).unwrap_or(path)
     }
 
     /// Reads one view.
@@ -219,10 +274,11 @@ impl Folder {
             Layout::Authors => files::read_inverse_depth,
             Layout::Exact => files::read_depth,
         };
-        let (depth, [height, width]) = read(&path)?;
-        self.check_size(&path, (width, height), self.description.resolution)?;
+        let stored = self.stored(&path)?;
+        let (depth, [height, width]) = read(&stored)?;
+        self.check_size(&stored.path, (width, height), self.description.resolution)?;
         if let Some(z) = depth.iter().find(|z| !z.is_finite() || **z < 0.0) {
-            return Err(FileError::unsuitable(&path, format!("holds a depth of {z}")));
+            return Err(FileError::unsuitable(&stored.path, format!("holds a depth of {z}")));
         }
         Ok(depth)
     }
@@ -271,7 +327,8 @@ impl Folder {
     ) -> Result<DynamicImage, FileError> {
         let (suffix, times) = if high_resolution { ("_hr", 2) } else { ("", 1) };
         let path = self.picture_named(split, subject, format_args!("{view}{suffix}"));
-        let picture = decode(&path, MAX_BYTES)?;
+        let Stored { path, bytes } = self.stored(&path)?;
+        let picture = decode_bytes(&path, &bytes, MAX_BYTES)?;
         self.check_size(&path, (picture.width(), picture.height()), times * self.description.resolution)?;
         Ok(picture)
     }
@@ -279,7 +336,8 @@ impl Folder {
     /// The mask file of a view in the authors' layout.
     fn mask(&self, split: Option<Split>, subject: &str, view: usize) -> Result<GrayImage, FileError> {
         let path = self.path(split, "mask", subject).join(self.file_name("mask", view));
-        let mask = decode(&path, MAX_BYTES)?.into_luma8();
+        let Stored { path, bytes } = self.stored(&path)?;
+        let mask = decode_bytes(&path, &bytes, MAX_BYTES)?.into_luma8();
         self.check_size(&path, mask.dimensions(), self.description.resolution)?;
         Ok(mask)
     }
@@ -293,14 +351,17 @@ impl Folder {
         match self.description.layout {
             Layout::Authors => {
                 let folder = self.path(split, "parm", subject);
-                let camera = files::read_camera(&folder, view, side)?;
-                let path = folder.join(format!("{view}_intrinsic.npy"));
-                camera.check().map_err(|problem| FileError::unsuitable(&path, problem))?;
+                let matrix = |name: &str| self.stored(&folder.join(format!("{view}_{name}.npy")));
+                let intrinsic = matrix("intrinsic")?;
+                let camera = files::read_camera(&intrinsic, &matrix("extrinsic")?, side)?;
+                camera.check().map_err(|problem| FileError::unsuitable(&intrinsic.path, problem))?;
                 Ok(camera)
             }
             Layout::Exact => {
-                let path = self.path(split, "cameras", subject);
-                let cameras = cameras::read(&path)?;
+                let Stored { path, bytes } = self.stored(&self.path(split, "cameras", subject))?;
+                let text = std::str::from_utf8(&bytes)
+                    .map_err(|_| FileError::unsuitable(&path, "is no text (UTF-8)"))?;
+                let cameras = cameras::parse(&path, text)?;
                 let views = self.description.views;
                 if cameras.len() != views {
                     let message = format!("holds {} cameras, the data set has {views} views", cameras.len());

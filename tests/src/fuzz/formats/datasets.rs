@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use snapsnap_data::dataset::{Folder, Layout, Split};
+use snapsnap_data::dataset::{self, Folder, Layout, Split};
 use snapsnap_data::prepare::{DataConfig, Subject, ViewsConfig};
 
 use super::super::Format;
@@ -34,6 +34,18 @@ pub const FORMATS: &[Format] = &[
         sample: |folder| write(&folder.join("set_16_2"), Layout::Authors),
         changed: &["dataset.toml", ".jpg", ".png", ".npy"],
         command: "prepare check in/set_16_2",
+        ..CHECK
+    },
+    Format {
+        name: "data-set-packed",
+        sample: |folder| {
+            let temporary = tempfile::tempdir().expect("a folder");
+            write(temporary.path(), Layout::Exact);
+            let set = Folder::open(temporary.path()).expect("opens");
+            dataset::pack(&set, &folder.join("packed"), 1 << 20, |_, _| {}).expect("packs");
+        },
+        changed: &["dataset.toml", "index.csv", ".tar"],
+        command: "prepare check in/packed",
         ..CHECK
     },
 ];

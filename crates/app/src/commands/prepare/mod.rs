@@ -2,6 +2,7 @@
 
 mod check;
 mod generate;
+mod pack;
 mod preview;
 mod scan;
 
@@ -58,6 +59,9 @@ enum Kind {
     /// List the faults of a data set.
     #[command(after_help = "Example: snapsnap prepare check people/synth")]
     Check(check::Arguments),
+    /// Pack a data set into tar archives, which a training reads without unpacking them.
+    #[command(after_help = "Example: snapsnap prepare pack people/synth -o packed/synth")]
+    Pack(pack::Arguments),
 }
 
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
@@ -67,6 +71,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
         Kind::Makehuman(arguments) => generate::makehuman(arguments),
         Kind::Avatars(arguments) => generate::avatars(arguments),
         Kind::Check(arguments) => check::run(arguments),
+        Kind::Pack(arguments) => pack::run(arguments),
     }
 }
 
