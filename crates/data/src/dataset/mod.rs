@@ -12,7 +12,7 @@
 //! ```
 //!
 //! A subject is added whole or not at all: it is written under another name, and its `img` folder, which marks a
-//! subject, is renamed last. [`pack`] puts all files into tar archives, which are read as the folders are.
+//! subject, is renamed last. [`pack()`] puts all files into tar archives, which are read as the folders are.
 
 mod agree;
 mod check;
