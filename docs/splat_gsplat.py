@@ -1,9 +1,9 @@
 """Times of gsplat on the scenes of `cargo bench --workspace --bench splat`, to compare on the same NVIDIA card.
 
 The scene: N Gaussians on an ellipsoid with a person's height, one camera of the training orbit, a standard deviation of `sigma`
-pixels. Its random numbers are PyTorch's, so the number of intersections differs by less than one per cent. Each figure is the median of
-at least three runs after one warm-up, with the card synchronised before and after; the backward pass is that of a weighted sum
-of the picture.
+pixels. Its random numbers are PyTorch's. gsplat also counts tiles that only the box around a splat touches, so that it has more
+intersections. Each figure is the median of at least three runs after one warm-up, with the card synchronised before and after. The
+backward pass is that of a weighted sum of the picture.
 
     python docs/splat_gsplat.py [--n 400000] [--size 1024] [--views 1] [--sigma 1.0]
 """

@@ -48,8 +48,8 @@ pub fn choose(name: &str) -> Result<Device, Failure> {
     }
 }
 
-/// The device called `name` for one person: `auto` is the CPU. Each process compiles the kernels of a card anew, which takes
-/// longer than the CPU's whole work (docs/inference.md).
+/// The device called `name` for one person and small networks: `auto` is the CPU. Each process compiles the kernels of a card
+/// anew, which takes longer than the CPU's whole work (docs/inference.md).
 ///
 /// # Errors
 /// As [`choose`].

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::fs;
+use std::path::Path;
 
 use serde_json::Value;
 use snapsnap_tests::{refused, root, snapsnap, succeed};
@@ -30,6 +31,24 @@ fn aligned_models_have_smaller_errors_and_the_report_says_how_they_moved() {
     assert!(apart(&moved) < apart(&plain), "{} → {}", apart(&plain), apart(&moved));
     // Baselines stay.
     assert_eq!(moved["baselines"], plain["baselines"]);
+}
+
+#[test]
+fn a_packed_data_set_has_the_figures_of_its_folders() {
+    let temporary = tempfile::tempdir().expect("a folder");
+    let packed = temporary.path().join("packed");
+    succeed(snapsnap().args(["prepare", "pack"]).arg(people()).arg("-o").arg(&packed));
+    let run = |data: &Path| {
+        let report = temporary.path().join(if data == packed { "archives" } else { "folders" });
+        let mean = format!("baselines.mean=[{:?}]", data.display().to_string());
+        let set = ["--set", &mean, "--set", "metrics.mesh=false", "--set", "views.compared=[1]"];
+        succeed(&mut evaluate(data, &report, &set));
+        json(&report)
+    };
+    let (folders, archives) = (run(people()), run(&packed));
+    for key in ["protocols", "points_mm", "baselines", "left_out"] {
+        assert!(!folders[key].is_null() && folders[key] == archives[key], "{key}: {}", archives[key]);
+    }
 }
 
 #[test]

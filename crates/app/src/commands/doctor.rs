@@ -98,7 +98,10 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     }));
     lines.push(format!("  --device auto takes {chosen}: {why}"));
     if chosen != "cpu" {
-        lines.push("  and cpu for one person, which is done before a card's kernels are compiled".into());
+        lines.push(
+            "  and cpu for one person with small networks, which takes less time than a card's kernels"
+                .into(),
+        );
     }
     lines.push("weights".into());
     lines.extend(weights.iter().map(|w| match &w.state {

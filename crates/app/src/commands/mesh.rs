@@ -92,7 +92,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
         if kind.is_some() {
             bail!("--kind: {}", batch::ONE);
         }
-        return one(arguments, &device::choose_for_one(&arguments.device)?);
+        return one(arguments, &device::choose(&arguments.device)?);
     }
     let file = |name: &str| output.join(format!("{name}.{}", kind.as_deref().unwrap_or("glb")));
     Target::new(&file("x"), &arguments.surface)?;

@@ -148,7 +148,11 @@ impl ModelArguments {
 
     /// The device for one person, if the networks fit into its memory.
     fn device_for_one(&self, weights: &WeightFile) -> Result<Device, Failure> {
-        let device = device::choose_for_one(&self.device)?;
+        /// Parameters of networks that a CPU needs long for.
+        const MANY: u64 = 100_000_000;
+        let is_small = weights.parameters() < MANY;
+        let device =
+            if is_small { device::choose_for_one(&self.device) } else { device::choose(&self.device) }?;
         memory::check_networks(weights, &device)?;
         Ok(device)
     }

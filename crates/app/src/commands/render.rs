@@ -83,7 +83,7 @@ pub struct Arguments {
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     if !arguments.ply.is_dir() {
         arguments.shard.must_be_unused(batch::ONE)?;
-        return one(arguments, &device::choose_for_one(&arguments.device)?);
+        return one(arguments, &device::choose(&arguments.device)?);
     }
     if arguments.raw.is_some() {
         bail!("--raw: takes one file of Gaussians, {} is a folder", arguments.ply.display());

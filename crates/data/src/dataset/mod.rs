@@ -203,7 +203,8 @@ impl Folder {
     /// Names in a folder of the data set, and whether they are folders.
     fn names(&self, folder: &Path) -> io::Result<Vec<(String, bool)>> {
         if let Some(shards) = &self.shards {
-            return Ok(shards.names(self.below(folder)));
+            let names = shards.names(self.below(folder));
+            return if names.is_empty() { Err(io::ErrorKind::NotFound.into()) } else { Ok(names) };
         }
         let entry = |entry: io::Result<fs::DirEntry>| {
             let entry = entry?;
@@ -216,9 +217,16 @@ impl Folder {
     fn stored(&self, path: &Path) -> Result<Stored, FileError> {
         let (path, bytes) = match &self.shards {
             Some(shards) => shards.read(self.below(path))?,
-            None => (path.to_owned(), file::read(path, MAX_FILE).map_err(FileError::read(path))?),
+            None => (path.to_owned(), file::read(path, self.largest()).map_err(FileError::read(path))?),
         };
         Ok(Stored { path, bytes })
+    }
+
+    /// Bytes that a file may have: more than the cameras of all views, or 16 for each pixel of a picture of twice the side.
+    fn largest(&self) -> u64 {
+        let Description { resolution, views, .. } = self.description;
+        let (pixels, views) = (u64::from(resolution).pow(2), views as u64);
+        MAX_FILE.min((1 << 20) + 4096 * views + 64 * pixels)
     }
 
     /// A path below the root.

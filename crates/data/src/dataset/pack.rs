@@ -1,14 +1,18 @@
 //! Packing of data sets into tar archives.
 
-use std::fs::{self, File, TryLockError};
+use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
+use std::process;
 
 use snapsnap_base::{FileError, file, quoted};
 
 use super::description::{self, DESCRIPTION};
 use super::shards::{self, BLOCK, INDEX, Line};
 use super::{Folder, Split, Stored};
+
+/// The config of the preparation, which is kept.
+const SETTINGS: &str = "prepare.config.toml";
 
 /// What was packed.
 #[derive(Debug, Default, Clone, Copy, PartialEq, Eq)]
@@ -51,24 +55,16 @@ pub fn pack(
         Err(e) if e.kind() != io::ErrorKind::NotFound => return Err(FileError::read(output)(e)),
         _ => {}
     }
-    let parent = output.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    fs::create_dir_all(parent).map_err(FileError::write(parent))?;
+    let output = file::target_of(output);
     let name =
-        output.file_name().ok_or_else(|| FileError::unsuitable(output, "is no name of a new folder"))?;
-    let temporary = parent.join(format!(".{}.unfinished", name.to_string_lossy()));
-    // The system releases the lock of a killed run.
-    let mark = temporary.with_extension("lock");
-    let lock = File::create(&mark).map_err(FileError::write(&mark))?;
-    if matches!(lock.try_lock(), Err(TryLockError::WouldBlock)) {
-        return Err(FileError::unsuitable(output, "another run is packing into it"));
-    }
-    let mark = file::unfinished_file(&mark);
-    // Of a killed run.
-    let cleared = match fs::remove_dir_all(&temporary) {
-        Err(e) if e.kind() != io::ErrorKind::NotFound => Err(e),
-        _ => file::unfinished_folder(&temporary),
-    };
-    let guard = cleared.map_err(FileError::write(&temporary))?;
+        output.file_name().ok_or_else(|| FileError::unsuitable(&output, "is no name of a new folder"))?;
+    let parent = output.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let output = parent.join(name);
+    fs::create_dir_all(parent).map_err(FileError::write(parent))?;
+    // Several runs may pack into one folder at once: the first one to end is the one that counts.
+    let temporary = parent.join(format!(".{}.{}.unfinished", name.to_string_lossy(), process::id()));
+    let made = fs::create_dir(&temporary).and_then(|()| file::unfinished_folder(&temporary));
+    let guard = made.map_err(FileError::write(&temporary))?;
     let packed = Packer::new(folder, &temporary, size).and_then(|mut packer| {
         for (done, (split, subject)) in all.iter().enumerate() {
             progress(done, all.len());
@@ -79,13 +75,12 @@ pub fn pack(
     });
     let packed = packed.and_then(|packed| {
         // An empty folder is replaced.
-        let _ = fs::remove_dir(output);
-        fs::rename(&temporary, output).map_err(FileError::write(output))?;
+        let _ = fs::remove_dir(&output);
+        fs::rename(&temporary, &output).map_err(FileError::write(&output))?;
         Ok(packed)
     });
     let _ = fs::remove_dir_all(&temporary);
     drop(guard);
-    mark.remove();
     packed
 }
 
@@ -117,6 +112,10 @@ impl<'a> Packer<'a> {
     fn new(folder: &'a Folder, output: &'a Path, size: u64) -> Result<Self, FileError> {
         let path = output.join(DESCRIPTION);
         fs::write(&path, description::text(folder.description())).map_err(FileError::write(&path))?;
+        let settings = folder.root().join(SETTINGS);
+        if settings.is_file() {
+            fs::copy(&settings, output.join(SETTINGS)).map_err(FileError::write(&output.join(SETTINGS)))?;
+        }
         let index = csv::Writer::from_writer(create(&output.join(INDEX))?);
         Ok(Self { folder, output, size, index, open: None, next: 0, packed: Packed::default() })
     }
@@ -174,6 +173,11 @@ impl<'a> Packer<'a> {
 
     fn append(&mut self, member: &str, stored: &Stored) -> Result<(), FileError> {
         let open = self.open.as_mut().expect("opened by `add`");
+        let archive = open.path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        if shards::path_of(&archive, member).is_none() {
+            let message = format!("`{}` is no name in an archive", quoted(member));
+            return Err(FileError::unsuitable(&stored.path, message));
+        }
         let mut header = tar::Header::new_ustar();
         header.set_path(member).map_err(|e| {
             FileError::unsuitable(&stored.path, format!("`{}` is no name in an archive: {e}", quoted(member)))
@@ -183,7 +187,6 @@ impl<'a> Packer<'a> {
         header.set_cksum();
         open.out.append(&header, stored.bytes.as_slice()).map_err(FileError::write(&open.path))?;
         let length = stored.bytes.len() as u64;
-        let archive = open.path.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let line = Line { archive, file: member.to_owned(), offset: open.at + BLOCK, length };
         self.index
             .serialize(line)
@@ -209,7 +212,11 @@ impl<'a> Packer<'a> {
         self.close()?;
         let path = self.output.join(INDEX);
         let written = self.index.into_inner().map_err(|e| e.into_error());
-        written.and_then(|mut out| out.flush()).map_err(FileError::write(&path))?;
+        let synced = written.and_then(|mut out| {
+            out.flush()?;
+            out.get_ref().sync_all()
+        });
+        synced.map_err(FileError::write(&path))?;
         Ok(self.packed)
     }
 }

@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! ROOT/dataset.toml             the description
-//!     /index.csv                archive,file,offset,length: one line per file
+//!     /archives.csv             archive,file,offset,length: one line per file
 //!     /train-000000.tar, …      0000.img.0.png, 0000.depth.0.npz, …, 0000.cameras.json
 //! ```
 //!
@@ -10,20 +10,24 @@
 //! sample's key, and the rest its field. Archives of a set without splits begin with `all`.
 
 use std::collections::{BTreeMap, HashMap};
-use std::fs::File;
-use std::io::{self, Read, Seek, SeekFrom};
+use std::fs::{self, File};
+use std::io::{self, Read};
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, PoisonError};
+use std::sync::OnceLock;
 
 use serde::{Deserialize, Serialize};
 use snapsnap_base::{FileError, file, quoted};
 
-use super::Split;
+use super::{MAX_FILE, Split};
 
 /// Name of the index.
-pub const INDEX: &str = "index.csv";
+pub const INDEX: &str = "archives.csv";
 /// First word of archives of a set without splits.
 const WHOLE: &str = "all";
+/// Largest index that is read, in bytes: four million files.
+const MAX_INDEX: u64 = 256 << 20;
+/// Archives that stay open once they were read. Systems limit the number of open files.
+const KEPT_OPEN: usize = 256;
 /// Bytes of a tar header. Members begin at multiples of it.
 pub const BLOCK: u64 = 512;
 
@@ -51,27 +55,40 @@ pub fn member_name(kind: &str, subject: &str, name: &str) -> String {
     format!("{subject}.{kind}.{name}")
 }
 
-/// The path of a member in a data set of folders.
-fn path_of(archive: &str, member: &str) -> Option<PathBuf> {
+/// The split of an archive, with its folder's name, if this is an archive's name.
+fn folder_of(archive: &str) -> Option<&str> {
     let (split, number) = archive.strip_suffix(".tar")?.rsplit_once('-')?;
-    let is_split = split == WHOLE || Split::ALL.iter().any(|known| known.name() == split);
+    let is_number = !number.is_empty() && number.bytes().all(|b| b.is_ascii_digit());
+    let known = Split::ALL.into_iter().map(Split::name).find(|name| *name == split);
+    let folder = if split == WHOLE { Some("") } else { known };
+    folder.filter(|_| is_number)
+}
+
+/// The path of a member in a data set of folders.
+pub fn path_of(archive: &str, member: &str) -> Option<PathBuf> {
     let is_plain =
         |part: &str| !part.is_empty() && !part.starts_with('.') && !part.contains(['/', '\\', '\0']);
-    if !is_split || number.is_empty() || !number.bytes().all(|b| b.is_ascii_digit()) {
-        return None;
-    }
     let (subject, rest) = member.split_once('.')?;
     let (kind, name) = rest.split_once('.')?;
     if ![subject, kind, name].into_iter().all(is_plain) {
         return None;
     }
-    let root = Path::new(if split == WHOLE { "" } else { split });
-    let folder = root.join(kind);
+    let folder = Path::new(folder_of(archive)?).join(kind);
     Some(if kind == "cameras" {
         folder.join(format!("{subject}.{name}"))
     } else {
         folder.join(subject).join(name)
     })
+}
+
+/// Names of the archives in a folder, in order.
+fn archives_in(root: &Path) -> Result<Vec<String>, FileError> {
+    let entries =
+        fs::read_dir(root).and_then(Iterator::collect::<Result<Vec<_>, _>>).map_err(FileError::read(root))?;
+    let names = entries.into_iter().map(|entry| entry.file_name().to_string_lossy().into_owned());
+    let mut names: Vec<String> = names.filter(|name| folder_of(name).is_some()).collect();
+    names.sort_unstable();
+    Ok(names)
 }
 
 /// Place of a file.
@@ -86,7 +103,7 @@ struct Place {
 struct Archive {
     path: PathBuf,
     /// Opened when it is first read.
-    file: Mutex<Option<File>>,
+    file: OnceLock<File>,
 }
 
 /// The files of a packed data set.
@@ -99,50 +116,64 @@ pub struct Shards {
 }
 
 impl Shards {
-    /// Reads the index in `root`, if there is one.
+    /// Reads the index in `root`; `None` if there is none, and no archive.
     ///
     /// # Errors
     /// [`FileError`] for an index that is damaged or does not fit the archives, and for archives that are missing or cut.
     pub fn open(root: &Path) -> Result<Option<Self>, FileError> {
         let index = root.join(INDEX);
-        if !index.exists() {
+        let there = archives_in(root)?;
+        if there.is_empty() && !index.exists() {
             return Ok(None);
         }
-        let lines = csv::Reader::from_reader(file::open(&index).map_err(FileError::read(&index))?);
-        let (mut archives, mut files) = (Vec::<Archive>::new(), BTreeMap::new());
-        // Places of the archives in the list, and where their last members end.
-        let mut known: HashMap<String, (usize, u64)> = HashMap::new();
-        for (number, line) in lines.into_deserialize().enumerate() {
+        let source = file::open(&index).map_err(FileError::read(&index))?;
+        let size = source.metadata().map_err(FileError::read(&index))?.len();
+        if size > MAX_INDEX {
+            return Err(FileError::unsuitable(&index, format!("has {size} bytes, more than {MAX_INDEX}")));
+        }
+        let archives: Vec<Archive> =
+            there.iter().map(|name| Archive { path: root.join(name), file: OnceLock::new() }).collect();
+        let known: HashMap<&str, usize> = there.iter().enumerate().map(|(i, name)| (&**name, i)).collect();
+        // Where the last members of the archives end.
+        let mut ends = vec![0; archives.len()];
+        let mut files = BTreeMap::new();
+        for (number, line) in csv::Reader::from_reader(source.take(MAX_INDEX)).into_deserialize().enumerate()
+        {
             let wrong =
                 |problem: &str| FileError::unsuitable(&index, format!("line {}: {problem}", number + 2));
             let Line { archive, file, offset, length } = line.map_err(|e| wrong(&quoted(&e.to_string())))?;
             let path = path_of(&archive, &file).ok_or_else(|| {
                 wrong(&format!("`{}` in `{}` is no file of a data set", quoted(&file), quoted(&archive)))
             })?;
+            let Some(archive) = known.get(&*archive).copied() else {
+                return Err(wrong(&format!(
+                    "`archive` is {}, which is missing",
+                    root.join(archive).display()
+                )));
+            };
             if offset < BLOCK || !offset.is_multiple_of(BLOCK) {
                 return Err(wrong(&format!("`offset` is {offset}, must be a positive multiple of {BLOCK}")));
             }
+            if length > MAX_FILE {
+                return Err(wrong(&format!("`length` is {length}, more than {MAX_FILE}")));
+            }
             let end = offset.checked_add(length).and_then(|end| end.checked_next_multiple_of(BLOCK));
-            let end =
-                end.ok_or_else(|| wrong(&format!("`length` is {length}, more than a file can have")))?;
-            let (place, last) = known.entry(archive).or_insert_with_key(|name| {
-                archives.push(Archive { path: root.join(name), file: Mutex::default() });
-                (archives.len() - 1, 0)
-            });
-            *last = end.max(*last);
-            if files.insert(path, Place { archive: *place, offset, length }).is_some() {
+            let end = end.ok_or_else(|| wrong(&format!("`offset` is {offset}, beyond every file")))?;
+            ends[archive] = end.max(ends[archive]);
+            if files.insert(path, Place { archive, offset, length }).is_some() {
                 return Err(wrong(&format!("`{file}` is listed twice")));
             }
         }
-        for (place, last) in known.into_values() {
-            let path = &archives[place].path;
+        for (archive, end) in archives.iter().zip(ends) {
+            let path = &archive.path;
             let size =
                 file::open(path).and_then(|file| file.metadata()).map_err(FileError::read(path))?.len();
             // Two empty blocks end an archive.
-            let least = last.saturating_add(2 * BLOCK);
-            if size < least {
-                let message =
-                    format!("is cut off, or not the archive of {INDEX}: it has {size} bytes of {least}");
+            let expected = end.saturating_add(2 * BLOCK);
+            if size != expected {
+                let message = format!(
+                    "has {size} bytes, by {INDEX} {expected}: one of them is cut off or of another set"
+                );
                 return Err(FileError::unsuitable(path, message));
             }
         }
@@ -161,10 +192,9 @@ impl Shards {
     pub fn read(&self, path: &Path) -> Result<(PathBuf, Vec<u8>), FileError> {
         let place = self.place(path)?;
         let archive = &self.archives[place.archive].path;
-        let whole = self.part(place, 0, BLOCK + place.length)?;
         // The header is compared, so that archives of another packing are noticed.
-        let (header, content) = whole.split_at(BLOCK as usize);
-        let mut members = tar::Archive::new(header);
+        let header = self.part(place, 0, BLOCK)?;
+        let mut members = tar::Archive::new(&header[..]);
         let member = members.entries().ok().and_then(|mut entries| entries.next()?.ok());
         let found = member.map(|member| (member.path_bytes().into_owned(), member.header().size()));
         match found {
@@ -172,7 +202,7 @@ impl Shards {
                 let name = String::from_utf8_lossy(&name).into_owned();
                 let file = archive.file_name().unwrap_or_default().to_string_lossy();
                 if path_of(&file, &name).as_deref() == Some(path) {
-                    return Ok((archive.join(name), content.to_vec()));
+                    return Ok((archive.join(name), self.part(place, BLOCK, length)?));
                 }
             }
             _ => {}
@@ -183,21 +213,22 @@ impl Shards {
 
     /// Bytes of a member from `from` on, counted from its header.
     fn part(&self, place: Place, from: u64, count: u64) -> Result<Vec<u8>, FileError> {
-        let archive = &self.archives[place.archive];
-        let read = || -> io::Result<Vec<u8>> {
-            let mut opened = archive.file.lock().unwrap_or_else(PoisonError::into_inner);
-            let file = match opened.take() {
-                Some(file) => file,
-                None => file::open(&archive.path)?,
-            };
-            let file = opened.insert(file);
-            file.seek(SeekFrom::Start(place.offset - BLOCK + from))?;
-            // The archive may have become shorter since it was opened.
-            let mut bytes = Vec::new();
-            file.take(count).read_to_end(&mut bytes)?;
-            if bytes.len() as u64 == count { Ok(bytes) } else { Err(io::ErrorKind::UnexpectedEof.into()) }
+        let Archive { path, file } = &self.archives[place.archive];
+        let at = place.offset - BLOCK + from;
+        let read = || {
+            let mut bytes = vec![0; count as usize];
+            if let Some(file) = file.get() {
+                read_exact_at(file, &mut bytes, at)?;
+                return Ok(bytes);
+            }
+            let opened = file::open(path)?;
+            read_exact_at(&opened, &mut bytes, at)?;
+            if place.archive < KEPT_OPEN {
+                let _ = file.set(opened);
+            }
+            Ok(bytes)
         };
-        read().map_err(FileError::read(&archive.path))
+        read().map_err(FileError::read(path))
     }
 
     /// Length of a file, and its first and last `ends` bytes, as far as they do not overlap.
@@ -235,4 +266,24 @@ impl Shards {
         }
         names
     }
+}
+
+/// Reads without moving the file's position, which threads share.
+#[cfg(unix)]
+fn read_exact_at(file: &File, bytes: &mut [u8], at: u64) -> io::Result<()> {
+    std::os::unix::fs::FileExt::read_exact_at(file, bytes, at)
+}
+
+#[cfg(windows)]
+fn read_exact_at(file: &File, mut bytes: &mut [u8], mut at: u64) -> io::Result<()> {
+    while !bytes.is_empty() {
+        match std::os::windows::fs::FileExt::seek_read(file, bytes, at)? {
+            0 => return Err(io::ErrorKind::UnexpectedEof.into()),
+            count => {
+                bytes = &mut bytes[count..];
+                at += count as u64;
+            }
+        }
+    }
+    Ok(())
 }

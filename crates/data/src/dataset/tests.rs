@@ -397,16 +397,16 @@ fn broken_archives_and_indices_are_refused_by_name() {
     let (_temporary, _, packed) = packed(Layout::Exact);
     let root = packed.root();
     let refused = || Folder::open(root).expect_err("refused").to_string();
-    let (index, archive) = (root.join("index.csv"), root.join("train-000001.tar"));
+    let (index, archive) = (root.join("archives.csv"), root.join("train-000001.tar"));
     let (lines, bytes) = (fs::read_to_string(&index).expect("reads"), fs::read(&archive).expect("reads"));
 
     // Cut, absent, and the archive of another subject in its place.
     for cut in [1, 600, 2000] {
         fs::write(&archive, &bytes[..bytes.len() - cut]).expect("writes");
-        assert!(refused().contains("train-000001.tar: is cut off"), "{}", refused());
+        assert!(refused().contains("train-000001.tar: has "), "{}", refused());
     }
     fs::remove_file(&archive).expect("removes");
-    assert!(refused().contains("train-000001.tar: cannot read"), "{}", refused());
+    assert!(refused().contains("train-000001.tar, which is missing"), "{}", refused());
     fs::copy(root.join("train-000000.tar"), &archive).expect("copies");
     if let Ok(folder) = Folder::open(root) {
         let wrong = folder.view(TRAIN, "0001", 0).expect_err("refused").to_string();
@@ -430,31 +430,44 @@ fn broken_archives_and_indices_are_refused_by_name() {
     fs::write(&archive, &bytes).expect("writes");
 
     fs::write(&index, format!("{lines}train-000000.tar,0009.img.0.png,1048576,10\n")).expect("writes");
-    assert!(refused().contains("train-000000.tar: is cut off"), "{}", refused());
+    assert!(refused().contains("train-000000.tar: has "), "{}", refused());
     for (line, message) in [
         ("../../train-000000.tar,0000.img.0.png,512,10", "is no file of a data set"),
         ("train-000000.tar,0000.img.../x,512,10", "is no file of a data set"),
         ("train-000000.tar,0000,512,10", "is no file of a data set"),
         ("train-000000.tar,0009.img.0.png,0,10", "`offset` is 0"),
         ("train-000000.tar,0009.img.0.png,513,10", "`offset` is 513"),
-        ("train-000000.tar,0009.img.0.png,512,18446744073709551615", "more than a file can have"),
+        (
+            "train-000000.tar,0009.img.0.png,512,18446744073709551615",
+            "`length` is 18446744073709551615, more than",
+        ),
         ("train-000000.tar,0000.img.0.png,512,10", "is listed twice"),
         ("train-000000.tar,0009.img.0.png,512", "line "),
         ("train-000000.tar,0009.img.0.png,-1,10", "line "),
     ] {
         fs::write(&index, format!("{lines}{line}\n")).expect("writes");
         assert!(
-            refused().contains("index.csv: line ") && refused().contains(message),
+            refused().contains("archives.csv: line ") && refused().contains(message),
             "{line}: {}",
             refused()
         );
     }
+    // A cut index: at the end of an archive's lines, in the middle of them, of all of them; and none.
+    let count = |name: &str| lines.lines().filter(|line| line.starts_with(name)).count();
+    let all = lines.lines().count();
+    for kept in [all - count("val"), all - 1, 1] {
+        let first: Vec<&str> = lines.lines().take(kept).collect();
+        fs::write(&index, first.join("\n")).expect("writes");
+        assert!(refused().contains(".tar: has ") && refused().contains("by archives.csv"), "{}", refused());
+    }
+    fs::remove_file(&index).expect("removes");
+    assert!(refused().contains("archives.csv: cannot read"), "{}", refused());
     // A file that the index has not.
     let without: Vec<&str> = lines.lines().filter(|line| !line.contains("0001.depth.3.npz")).collect();
     fs::write(&index, without.join("\n")).expect("writes");
     let missing = check(root, |_, _| {}).expect("checks").problems;
     assert_eq!(missing.len(), 1, "{missing:?}");
-    assert!(missing[0].contains("index.csv: lists no train/depth/0001/3.npz"), "{missing:?}");
+    assert!(missing[0].contains("archives.csv: lists no train/depth/0001/3.npz"), "{missing:?}");
 }
 
 /// Position of a member in its archive.

@@ -127,7 +127,7 @@ impl People {
 
 /// A split of a data set without any change.
 pub fn test_of(folder: &Arc<Folder>, split: Option<Split>) -> Result<Test, EvalError> {
-    if let Some(split) = split.filter(|split| !folder.root().join(split.name()).is_dir()) {
+    if let Some(split) = split.filter(|split| !folder.splits().contains(&Some(*split))) {
         let message = format!("has no split `{split}`: change `data.split`");
         return Err(EvalError::File(FileError::unsuitable(folder.root(), message)));
     }

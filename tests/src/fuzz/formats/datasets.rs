@@ -44,7 +44,7 @@ pub const FORMATS: &[Format] = &[
             let set = Folder::open(temporary.path()).expect("opens");
             dataset::pack(&set, &folder.join("packed"), 1 << 20, |_, _| {}).expect("packs");
         },
-        changed: &["dataset.toml", "index.csv", ".tar"],
+        changed: &["dataset.toml", "archives.csv", ".tar"],
         command: "prepare check in/packed",
         ..CHECK
     },

@@ -357,7 +357,9 @@ fn example(folder: &Folder) -> Option<[PathBuf; 2]> {
         .find(|split| folder.subjects(*split).is_ok_and(|subjects| !subjects.is_empty()))?;
     let subject = folder.subjects(split).ok()?.into_iter().next()?;
     let [front, back, ..] = description.arrangement.four(0, description.views);
-    Some([front, back].map(|view| folder.picture_path(split, &subject, view)))
+    let pictures = [front, back].map(|view| folder.picture_path(split, &subject, view));
+    // Those of a packed data set are no files.
+    pictures.iter().all(|path| path.is_file()).then_some(pictures)
 }
 
 /// Lower bound of the memory in bytes of one of several ranks of a training: weights, gradients, two moments and averages, samples, and the last

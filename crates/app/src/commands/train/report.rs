@@ -63,7 +63,8 @@ impl Watch for Reporter {
         }
         let value = |name: &str| line.values.get(name).copied().unwrap_or_default();
         /// Values that are not parts of the loss.
-        const OTHERS: [&str; 5] = ["loss", "norm", "rate", "samples_per_second", "steps_per_second"];
+        const OTHERS: [&str; 6] =
+            ["loss", "norm", "rate", "reduce_ms", "samples_per_second", "steps_per_second"];
         let parts: Vec<String> = line
             .values
             .iter()
