@@ -141,6 +141,33 @@ fn tidy(folder: &Path) {
     }
 }
 
+/// Fills `buffer` from `offset` on, in bytes. Threads may read one file at once.
+///
+/// # Errors
+/// The operating system's refusal, or the end of the file before the buffer is full.
+#[cfg(unix)]
+pub fn read_exact_at(file: &File, buffer: &mut [u8], offset: u64) -> io::Result<()> {
+    std::os::unix::fs::FileExt::read_exact_at(file, buffer, offset)
+}
+
+/// Fills `buffer` from `offset` on, in bytes. Threads may read one file at once.
+///
+/// # Errors
+/// The operating system's refusal, or the end of the file before the buffer is full.
+#[cfg(windows)]
+pub fn read_exact_at(file: &File, mut buffer: &mut [u8], mut offset: u64) -> io::Result<()> {
+    while !buffer.is_empty() {
+        match std::os::windows::fs::FileExt::seek_read(file, buffer, offset)? {
+            0 => return Err(io::ErrorKind::UnexpectedEof.into()),
+            n => {
+                buffer = &mut buffer[n..];
+                offset += n as u64;
+            }
+        }
+    }
+    Ok(())
+}
+
 /// Writes `path` through `fill` into a temporary file beside it, which is renamed after success. A failure leaves the former
 /// file. The new file keeps the permissions of the former one; a write-protected file is refused. A symbolic link stays and
 /// its target is replaced. A pipe or a device is written in place, since renaming would replace it.

@@ -11,7 +11,7 @@
 
 use std::collections::{BTreeMap, HashMap};
 use std::fs::{self, File};
-use std::io::{self, Read};
+use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
@@ -55,7 +55,7 @@ pub fn member_name(kind: &str, subject: &str, name: &str) -> String {
     format!("{subject}.{kind}.{name}")
 }
 
-/// The split of an archive, with its folder's name, if this is an archive's name.
+/// The folder of an archive's split; `None` if this is no archive's name.
 fn folder_of(archive: &str) -> Option<&str> {
     let (split, number) = archive.strip_suffix(".tar")?.rsplit_once('-')?;
     let is_number = !number.is_empty() && number.bytes().all(|b| b.is_ascii_digit());
@@ -213,18 +213,18 @@ impl Shards {
 
     /// Bytes of a member from `from` on, counted from its header.
     fn part(&self, place: Place, from: u64, count: u64) -> Result<Vec<u8>, FileError> {
-        let Archive { path, file } = &self.archives[place.archive];
+        let Archive { path, file: kept } = &self.archives[place.archive];
         let at = place.offset - BLOCK + from;
         let read = || {
             let mut bytes = vec![0; count as usize];
-            if let Some(file) = file.get() {
-                read_exact_at(file, &mut bytes, at)?;
+            if let Some(kept) = kept.get() {
+                file::read_exact_at(kept, &mut bytes, at)?;
                 return Ok(bytes);
             }
             let opened = file::open(path)?;
-            read_exact_at(&opened, &mut bytes, at)?;
+            file::read_exact_at(&opened, &mut bytes, at)?;
             if place.archive < KEPT_OPEN {
-                let _ = file.set(opened);
+                let _ = kept.set(opened);
             }
             Ok(bytes)
         };
@@ -266,24 +266,4 @@ impl Shards {
         }
         names
     }
-}
-
-/// Reads without moving the file's position, which threads share.
-#[cfg(unix)]
-fn read_exact_at(file: &File, bytes: &mut [u8], at: u64) -> io::Result<()> {
-    std::os::unix::fs::FileExt::read_exact_at(file, bytes, at)
-}
-
-#[cfg(windows)]
-fn read_exact_at(file: &File, mut bytes: &mut [u8], mut at: u64) -> io::Result<()> {
-    while !bytes.is_empty() {
-        match std::os::windows::fs::FileExt::seek_read(file, bytes, at)? {
-            0 => return Err(io::ErrorKind::UnexpectedEof.into()),
-            count => {
-                bytes = &mut bytes[count..];
-                at += count as u64;
-            }
-        }
-    }
-    Ok(())
 }

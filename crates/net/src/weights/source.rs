@@ -288,29 +288,10 @@ fn read_values(file: &File, entry: &Entry, kind: Float) -> io::Result<Vec<f32>> 
         .enumerate()
         .map_init(Vec::new, |bytes, (chunk, values)| {
             bytes.resize(values.len() * kind.size(), 0);
-            read_at(file, bytes, entry.start + (chunk * CHUNK * kind.size()) as u64)?;
+            file::read_exact_at(file, bytes, entry.start + (chunk * CHUNK * kind.size()) as u64)?;
             kind.widen(bytes, values);
             Ok(())
         })
         .collect::<io::Result<()>>()?;
     Ok(values)
-}
-
-#[cfg(unix)]
-fn read_at(file: &File, buffer: &mut [u8], offset: u64) -> io::Result<()> {
-    std::os::unix::fs::FileExt::read_exact_at(file, buffer, offset)
-}
-
-#[cfg(windows)]
-fn read_at(file: &File, mut buffer: &mut [u8], mut offset: u64) -> io::Result<()> {
-    while !buffer.is_empty() {
-        match std::os::windows::fs::FileExt::seek_read(file, buffer, offset)? {
-            0 => return Err(io::ErrorKind::UnexpectedEof.into()),
-            n => {
-                buffer = &mut buffer[n..];
-                offset += n as u64;
-            }
-        }
-    }
-    Ok(())
 }
