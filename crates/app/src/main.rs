@@ -50,6 +50,15 @@ fn keep_pages() {
     }
 }
 
+/// Keeps compiled kernels of Vulkan in the user's cache, from one process to the next.
+#[cfg(feature = "vulkan")]
+fn keep_kernels() {
+    use cubecl::config::{CubeClRuntimeConfig, RuntimeConfig};
+    let mut config = CubeClRuntimeConfig::from_current_dir().override_from_env();
+    config.compilation.cache = true;
+    CubeClRuntimeConfig::try_set(config);
+}
+
 /// First steps for new users.
 const FIRST_STEPS: &str = "First steps:
   snapsnap demo                                            the sample pair: Gaussians, turntable, report
@@ -162,6 +171,8 @@ enum Command {
 
 fn main() -> ExitCode {
     keep_pages();
+    #[cfg(feature = "vulkan")]
+    keep_kernels();
     #[cfg(unix)]
     set_runtime_folder();
     // Panics of libraries on damaged files become errors, which are reported without this hook.

@@ -10,7 +10,7 @@ use burn::tensor::{FloatDType, Tensor};
 use crate::buffers::give;
 use crate::op::{self, Kept, Kernel};
 use crate::train::{Conv1x1, Conv3x3, Gradients, LayerNorm, Linear, Statistics, Unfolded, Wanted};
-use crate::{has_kernels, in_f32, is_half, is_trained_fast};
+use crate::{gpu, has_kernels, in_f32, is_half, is_trained_fast};
 
 /// `[B, N, inputs]` → `[B, N, outputs]`.
 pub fn linear(layer: &nn::Linear, x: Tensor<3>) -> Tensor<3> {
@@ -47,7 +47,18 @@ pub fn conv2d(layer: &Conv2d, x: Tensor<4>, rectified: bool) -> Tensor<4> {
     let ([batch, inputs, height, width], [outputs, _, rows, columns]) = (x.dims(), layer.weight.dims());
     let (weight, bias) = (layer.weight.val(), bias(&layer.bias));
     let half = is_half(&layer.weight);
-    let plain = layer.groups == 1 && layer.dilation == [1, 1] && has_kernels(&x);
+    let is_plain = layer.groups == 1 && layer.dilation == [1, 1];
+    if is_plain && rows == columns && gpu::is_trained_on(&x) {
+        let dtype = x.dtype();
+        let x = if rectified { relu(x) } else { x };
+        let y = gpu::convolve(x.cast(weight.dtype()), weight, layer.stride[0]);
+        return match bias {
+            Some(bias) => y + bias.reshape([1, outputs, 1, 1]),
+            None => y,
+        }
+        .cast(dtype);
+    }
+    let plain = is_plain && has_kernels(&x);
     match (plain, [rows, columns], layer.stride) {
         (true, [3, 3], [1, 1]) => {
             let sizes = Conv3x3 { batch, inputs, outputs, height, width, rectified, half };

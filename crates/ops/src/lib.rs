@@ -3,6 +3,7 @@
 
 pub mod buffers;
 pub mod conv;
+pub mod gpu;
 pub mod half;
 pub mod layers;
 mod math;
@@ -150,6 +151,13 @@ pub fn bilinear(x: Tensor<4>, size: [usize; 2], align_corners: bool) -> Tensor<4
     }
     let options = InterpolateOptions::new(InterpolateMode::Bilinear).with_align_corners(align_corners);
     interpolate(x, options.with_output_size(size))
+}
+
+/// Sums over the last dimension: `[A, B, N]` → `[A, B, 1]`, in two steps. On GPUs one thread adds up what a step joins.
+pub fn sum_last(x: Tensor<3>) -> Tensor<3> {
+    let [a, b, n] = x.dims();
+    let inner = (1..=n.isqrt()).rev().find(|inner| n % inner == 0).unwrap_or(1);
+    x.reshape([a, b, inner, n / inner]).sum_dim(3).reshape([a, b, inner]).sum_dim(2)
 }
 
 /// Values on the host, without a copy if the tensor is contiguous and has no other owner.

@@ -150,8 +150,8 @@ pub fn losses(prediction: &Prediction, points: &Tensor<5>, valid: &Tensor<4>, re
 /// Mean length of vectors `[B,h,w,3]` where `weight` `[B,h,w]` is 1, 0 for samples where it is 1 nowhere; the mean over the samples.
 fn mean_length(vectors: Tensor<4>, weight: Tensor<3>) -> Tensor<1> {
     let length = vectors.square().sum_dim(3).clamp_min(MIN_SQUARE).sqrt().squeeze_dim::<3>(3);
-    let [b, h, w] = weight.dims();
-    let sum = |values: Tensor<3>| values.reshape([b, h * w]).sum_dim(1);
+    // Not all at once: on GPUs one thread adds up what a step joins.
+    let sum = |values: Tensor<3>| values.sum_dim(2).sum_dim(1);
     (sum(length * weight.clone()) / sum(weight).clamp_min(1.0)).mean()
 }
 

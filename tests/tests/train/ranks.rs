@@ -112,10 +112,9 @@ fn a_killed_rank_ends_all_and_the_run_goes_on() {
     }
     let (temporary, config) = place();
     let kills = std::env::var("SNAPSNAP_TEST_KILLS").ok().and_then(|kills| kills.parse().ok()).unwrap_or(3);
-    let command = |run: &Path| {
-        let command = train(1, &config, run);
-        on_ranks(2, &set(command, &["training.steps=120", "samples.repeat=50"]))
-    };
+    // A kill comes after some 20 steps.
+    let steps = format!("training.steps={}", 40 * kills);
+    let command = |run: &Path| on_ranks(2, &set(train(1, &config, run), &[&steps, "samples.repeat=50"]));
     let undisturbed = temporary.path().join("undisturbed");
     succeed(&mut command(&undisturbed));
     let (killed, mut random) = (temporary.path().join("killed"), ChaCha8Rng::seed_from_u64(11));

@@ -12,6 +12,7 @@ use burn::module::Module;
 use burn::nn::PaddingConfig2d;
 use burn::nn::conv::{Conv2d, Conv2dConfig};
 use burn::tensor::{Device, Tensor};
+use snapsnap_ops::layers::conv2d;
 
 pub use crate::config::RECEPTIVE_RADIUS;
 pub use attributes::{Attributes, Geometry, Limits};
@@ -54,6 +55,6 @@ impl Regressor {
         if has_kernel && self.pred_unet.suits_cpu_kernel() {
             return kernel::regress(&self.pred_unet, &self.gs_conv, input, statistics);
         }
-        self.gs_conv.forward(self.pred_unet.forward(input, statistics)).permute([0, 2, 3, 1])
+        conv2d(&self.gs_conv, self.pred_unet.forward(input, statistics), false).permute([0, 2, 3, 1])
     }
 }

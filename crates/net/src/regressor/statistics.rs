@@ -2,6 +2,7 @@
 
 use burn::nn::GroupNorm;
 use burn::tensor::Tensor;
+use snapsnap_ops::sum_last;
 
 /// Means and reciprocal standard deviations of every group normalisation of one forward pass, in order of execution.
 ///
@@ -59,8 +60,9 @@ pub(crate) fn normalise(norm: &GroupNorm, x: Tensor<4>, statistics: &mut Statist
     let groups = norm.num_groups;
     let [mean, rstd] = statistics.layer(|| {
         let flat = x.clone().reshape([b, groups, c / groups * h * w]);
-        let mean = flat.clone().mean_dim(2);
-        let variance = (flat - mean.clone()).square().mean_dim(2);
+        let average = |x: Tensor<3>| sum_last(x) / (c / groups * h * w) as f64;
+        let mean = average(flat.clone());
+        let variance = average((flat - mean.clone()).square());
         [mean.squeeze_dim(2), (variance + norm.epsilon).sqrt().recip().squeeze_dim(2)]
     });
     let per_channel = |x: Tensor<2>| x.reshape([b, groups, 1]).repeat_dim(2, c / groups).reshape([b, c]);

@@ -7,6 +7,7 @@ use burn::nn::conv::{Conv2d, Conv2dConfig};
 use burn::nn::{GroupNorm, GroupNormConfig, PaddingConfig2d};
 use burn::tensor::activation::silu;
 use burn::tensor::{Device, Tensor};
+use snapsnap_ops::layers::conv2d;
 
 use super::statistics::{Statistics, normalise};
 use super::{FEATURES, INPUT_CHANNELS};
@@ -46,10 +47,10 @@ impl ResBlock {
     }
 
     fn forward(&self, x: Tensor<4>, statistics: &mut Statistics) -> Tensor<4> {
-        let h = self.conv1.forward(silu(normalise(&self.norm1, x.clone(), statistics)));
-        let h = self.conv2.forward(silu(normalise(&self.norm2, h, statistics)));
+        let h = conv2d(&self.conv1, silu(normalise(&self.norm1, x.clone(), statistics)), false);
+        let h = conv2d(&self.conv2, silu(normalise(&self.norm2, h, statistics)), false);
         let x = match &self.shortcut {
-            Some(shortcut) => shortcut.forward(x),
+            Some(shortcut) => conv2d(shortcut, x, false),
             None => x,
         };
         (h + x) * BRANCH_SCALE
@@ -123,7 +124,7 @@ impl UNet {
 
     /// `[B, 6, H, W]`, H and W multiples of 4 → `[B, 14, H, W]`.
     pub fn forward(&self, x: Tensor<4>, statistics: &mut Statistics) -> Tensor<4> {
-        let mut x = self.conv_in.forward(x);
+        let mut x = conv2d(&self.conv_in, x, false);
         let mut skips = vec![x.clone()];
         for block in &self.down_blocks {
             for net in &block.nets {
@@ -131,7 +132,7 @@ impl UNet {
                 skips.push(x.clone());
             }
             if let Some(downsample) = &block.downsample {
-                x = downsample.forward(x);
+                x = conv2d(downsample, x, false);
                 skips.push(x.clone());
             }
         }
@@ -144,10 +145,10 @@ impl UNet {
                 x = net.forward(Tensor::cat(vec![x, skip], 1), statistics);
             }
             if let Some(upsample) = &block.upsample {
-                x = upsample.forward(repeat_twice(x));
+                x = conv2d(upsample, repeat_twice(x), false);
             }
         }
-        self.conv_out.forward(silu(normalise(&self.norm_out, x, statistics)))
+        conv2d(&self.conv_out, silu(normalise(&self.norm_out, x, statistics)), false)
     }
 }
 

@@ -1,0 +1,220 @@
+#![allow(deprecated, reason = "NdArray is the CPU test backend")]
+
+//! Burn's convolution with another gradient of the weight, for GPUs. Burn's own, where kernels are not selected by trial, is
+//! a convolution with a kernel of the image's size: one thread per weight, and in it a loop over all pixels of all images.
+//! Here it is a product of matrices, `[D, pixels]` times `[pixels, taps · C]`.
+
+use burn::backend::autodiff::Autodiff;
+use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::CheckpointStrategy};
+use burn::backend::autodiff::grads::Gradients;
+use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
+use burn::backend::tensor::FloatTensor;
+use burn::backend::{Backend, Dispatch, ExtensionType, Flex, NdArray, TensorMetadata, backend_extension};
+use burn::tensor::ops::ConvOptions;
+use burn::tensor::{Shape, Slice, Tensor};
+use burn_cubecl::CubeBackend;
+
+/// Most pixels that one product of a weight's gradient adds up. Several products run at once, and their results are added.
+const PIXELS: usize = 2048;
+/// Most values that are unfolded at once: 128 MB, the least that a WebGPU binding holds.
+const VALUES: usize = 1 << 25;
+
+/// An image `[B, C, H, W]` and a weight `[D, C, K, K]`.
+#[derive(ExtensionType, Clone, Debug)]
+pub struct Operands<B: Backend> {
+    x: FloatTensor<B>,
+    weight: FloatTensor<B>,
+}
+
+/// An image `[B, D, H / stride, W / stride]`.
+#[derive(ExtensionType, Clone, Debug)]
+pub struct Image<B: Backend> {
+    image: FloatTensor<B>,
+}
+
+/// Backends with the operation.
+#[backend_extension(Cube, Flex, NdArray, Autodiff)]
+pub trait ConvolutionBackend: Backend {
+    /// A convolution with a margin of half a kernel of zeros.
+    fn convolve(#[extension_type] operands: Operands<Self>, stride: usize) -> Image<Self>;
+}
+
+macro_rules! untracked {
+    ($($backend:ty),+) => {
+        $(impl ConvolutionBackend for $backend {
+            fn convolve(operands: Operands<Self>, stride: usize) -> Image<Self> {
+                Image { image: forward::<Self>(operands, stride) }
+            }
+        })+
+    };
+}
+
+untracked!(CubeBackend, Flex, NdArray);
+
+#[derive(Debug)]
+struct ConvolutionBackward;
+
+impl<B: Backend> Backward<B, 2> for ConvolutionBackward {
+    type State = (Operands<B>, usize);
+
+    fn backward(self, ops: Ops<Self::State, 2>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
+        let upstream = grads.consume::<B>(&ops.node);
+        let (Operands { x, weight }, stride) = ops.state;
+        let [of_image, of_weight] = ops.parents;
+        if let Some(parent) = of_weight {
+            let gradient = weight_gradient::<B>(x.clone(), upstream.clone(), &weight.shape(), stride);
+            grads.register::<B>(parent.id, gradient);
+        }
+        if let Some(parent) = of_image {
+            let options = options(weight.shape()[2], stride);
+            grads.register::<B>(parent.id, B::conv2d_x_backward(x, weight, upstream, options));
+        }
+    }
+}
+
+impl<B: ConvolutionBackend, C: CheckpointStrategy> ConvolutionBackend for Autodiff<B, C> {
+    fn convolve(Operands { x, weight }: Operands<Self>, stride: usize) -> Image<Self> {
+        let nodes = [x.node(), weight.node()];
+        let operands = Operands::<B> { x: x.into_primitive(), weight: weight.into_primitive() };
+        let image = match ConvolutionBackward.prepare::<C>(nodes).compute_bound().stateful() {
+            OpsKind::Tracked(prepared) => {
+                let image = forward::<B>(operands.clone(), stride);
+                prepared.finish((operands, stride), image)
+            }
+            OpsKind::UnTracked(prepared) => prepared.finish(forward::<B>(operands, stride)),
+        };
+        Image { image }
+    }
+}
+
+/// Whether `x` is on a GPU and has gradients.
+pub fn is_trained_on<const D: usize>(x: &Tensor<D>) -> bool {
+    let device = x.device();
+    device.is_autodiff() && device.inner().identity().is_some()
+}
+
+/// The convolution of an image `[B, C, H, W]` with a weight `[D, C, K, K]`, K odd, and a margin of K / 2 zeros.
+pub fn convolve(x: Tensor<4>, weight: Tensor<4>, stride: usize) -> Tensor<4> {
+    let operands = Operands { x: x.into_dispatch(), weight: weight.into_dispatch() };
+    Tensor::from_dispatch(<Dispatch as ConvolutionBackend>::convolve(operands, stride).image)
+}
+
+fn forward<B: Backend>(Operands { x, weight }: Operands<B>, stride: usize) -> FloatTensor<B> {
+    let options = options(weight.shape()[2], stride);
+    B::conv2d(x, weight, None, options)
+}
+
+fn options(side: usize, stride: usize) -> ConvOptions<2> {
+    ConvOptions::new([stride; 2], [side / 2; 2], [1, 1], 1)
+}
+
+/// ∂L/∂ weight, of shape `[D, C, K, K]`.
+fn weight_gradient<B: Backend>(
+    x: FloatTensor<B>,
+    upstream: FloatTensor<B>,
+    shape: &Shape,
+    stride: usize,
+) -> FloatTensor<B> {
+    let [outputs, inputs, side, _] = shape.dims();
+    let [batch, _, height, width] = upstream.shape().dims();
+    let (image, upstream) = (with_margin::<B>(x, side / 2), B::float_permute(upstream, &[0, 2, 3, 1]));
+    let taps = side * side * inputs;
+    let band = (VALUES / (batch * width * taps)).clamp(1, height);
+    let of_band = |first: usize| {
+        let lines = band.min(height - first);
+        let rows = taps_of::<B>(&image, side, stride, [first, lines, width]);
+        let upstream = B::float_slice(upstream.clone(), &[full(), part(first, lines, 1), full(), full()]);
+        // Whole lines of one image are a product.
+        let joined = (1..=lines).rev().find(|n| lines % n == 0 && n * width <= PIXELS).unwrap_or(1);
+        let (products, pixels) = (batch * lines / joined, joined * width);
+        let rows = B::float_reshape(rows, Shape::new([products, pixels, taps]));
+        let upstream = B::float_reshape(upstream, Shape::new([products, pixels, outputs]));
+        B::float_sum_dim(B::float_matmul(B::float_swap_dims(upstream, 1, 2), rows), 0)
+    };
+    let sum = (0..height).step_by(band).map(of_band).reduce(B::float_add).expect("an image has lines");
+    B::float_permute(B::float_reshape(sum, Shape::new([outputs, side, side, inputs])), &[0, 3, 1, 2])
+}
+
+/// An image `[B, C, H, W]` as `[B, H, W, C]` in a margin of zeros.
+fn with_margin<B: Backend>(x: FloatTensor<B>, margin: usize) -> FloatTensor<B> {
+    let [batch, channels, height, width] = x.shape().dims();
+    let image = B::float_permute(x, &[0, 2, 3, 1]);
+    if margin == 0 {
+        return image;
+    }
+    let (device, dtype) = (image.device(), image.dtype().into());
+    let shape = Shape::new([batch, height + 2 * margin, width + 2 * margin, channels]);
+    let inner = [full(), part(margin, height, 1), part(margin, width, 1), full()];
+    B::float_slice_assign(B::float_zeros(shape, &device, dtype), &inner, image)
+}
+
+/// The pixels under the taps of a kernel, `[B, lines, columns, taps · C]`, of an image with a margin.
+fn taps_of<B: Backend>(
+    image: &FloatTensor<B>,
+    side: usize,
+    stride: usize,
+    [first, lines, columns]: [usize; 3],
+) -> FloatTensor<B> {
+    let tap = |tap: usize| {
+        let row = part(first * stride + tap / side, lines, stride);
+        B::float_slice(image.clone(), &[full(), row, part(tap % side, columns, stride), full()])
+    };
+    B::float_cat((0..side * side).map(tap).collect(), 3)
+}
+
+fn full() -> Slice {
+    Slice::from(..)
+}
+
+/// `count` indices from `start` on.
+fn part(start: usize, count: usize, step: usize) -> Slice {
+    Slice::new(start as isize, Some((start + (count - 1) * step + 1) as isize), step as isize)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::tests::uniform;
+    use burn::tensor::{Device, FloatDType, TensorData};
+
+    fn tensor(shape: [usize; 4], seed: u64) -> Tensor<4> {
+        let data = TensorData::new(uniform(shape.iter().product(), seed), shape);
+        Tensor::<4>::from_data(data, &Device::flex().autodiff()).cast(FloatDType::F64).require_grad()
+    }
+
+    fn values(x: Tensor<4>) -> Vec<f64> {
+        x.into_data().try_into_vec().expect("f64")
+    }
+
+    #[test]
+    fn convolutions_and_their_gradients_equal_burns() {
+        let cases = [
+            ([1, 1, 1, 1, 1], 3, 1),
+            ([2, 3, 5, 7, 9], 3, 1),
+            ([2, 5, 3, 8, 6], 3, 2),
+            ([1, 2, 4, 7, 5], 3, 2),
+            ([3, 4, 2, 5, 6], 1, 1),
+            ([1, 3, 2, 53, 61], 3, 1), // two parts, one line each: 53 is prime
+            ([2, 2, 2, 48, 90], 3, 1), // several lines to a part
+        ];
+        for (seed, ([batch, inputs, outputs, height, width], side, stride)) in (1..).step_by(3).zip(cases) {
+            let x = tensor([batch, inputs, height, width], seed);
+            let weight = tensor([outputs, inputs, side, side], seed + 1);
+            let results = [
+                convolve(x.clone(), weight.clone(), stride),
+                burn::tensor::module::conv2d(x.clone(), weight.clone(), None, options(side, stride)),
+            ];
+            let [ours, burns] = results.map(|y| {
+                let upstream = tensor(y.dims(), seed + 2);
+                let gradients = (y.clone() * upstream).sum().backward();
+                let of = |x: &Tensor<4>| values(x.grad(&gradients).expect("tracked"));
+                [values(y), of(&x), of(&weight)]
+            });
+            for (what, (ours, burns)) in ["result", "image", "weight"].iter().zip(ours.iter().zip(&burns)) {
+                assert_eq!(ours.len(), burns.len(), "{what}");
+                let error = ours.iter().zip(burns).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+                assert!(error < 1e-10, "{what} of {batch}×{inputs}→{outputs} at {height}×{width}: {error:e}");
+            }
+        }
+    }
+}
