@@ -1,5 +1,6 @@
-//! Operators that are slow on Burn's CPU backends. Each is one function with two implementations: kernels with their own
+//! Operators that are slow on Burn's backends. Each is one function with two implementations: kernels with their own
 //! gradients on Burn's `flex` device, and plain tensor code on every other device and in 16 bits. Tests compare the two.
+//! [`gpu`] has a gradient for GPUs.
 
 pub mod buffers;
 pub mod conv;
