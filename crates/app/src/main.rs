@@ -50,12 +50,16 @@ fn keep_pages() {
     }
 }
 
-/// Keeps compiled kernels of Vulkan in the user's cache, from one process to the next.
+/// Keeps compiled kernels of Vulkan in the user's cache, from one process to the next. Each version has its own: CubeCL
+/// knows kernels by name.
 #[cfg(feature = "vulkan")]
 fn keep_kernels() {
     use cubecl::config::{CubeClRuntimeConfig, RuntimeConfig};
     let mut config = CubeClRuntimeConfig::from_current_dir().override_from_env();
     config.compilation.cache = true;
+    if config.environment.name == cubecl::environment::DEFAULT {
+        config.environment.name = concat!("snapsnap-", env!("CARGO_PKG_VERSION")).into();
+    }
     CubeClRuntimeConfig::try_set(config);
 }
 

@@ -5,13 +5,14 @@
 //! Here it is a product of matrices, `[D, pixels]` times `[pixels, taps · C]`.
 
 use burn::backend::autodiff::Autodiff;
+use burn::backend::autodiff::NodeId;
 use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::CheckpointStrategy};
 use burn::backend::autodiff::grads::Gradients;
 use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
 use burn::backend::tensor::FloatTensor;
 use burn::backend::{Backend, Dispatch, ExtensionType, Flex, NdArray, TensorMetadata, backend_extension};
 use burn::tensor::ops::ConvOptions;
-use burn::tensor::{Shape, Slice, Tensor};
+use burn::tensor::{DType, FloatDType, Shape, Slice, Tensor};
 use burn_cubecl::CubeBackend;
 
 /// Most pixels that one product of a weight's gradient adds up. Several products run at once, and their results are added.
@@ -26,7 +27,7 @@ pub struct Operands<B: Backend> {
     weight: FloatTensor<B>,
 }
 
-/// An image `[B, D, H / stride, W / stride]`.
+/// An image `[B, D, ⌈H / stride⌉, ⌈W / stride⌉]`.
 #[derive(ExtensionType, Clone, Debug)]
 pub struct Image<B: Backend> {
     image: FloatTensor<B>,
@@ -55,14 +56,16 @@ untracked!(CubeBackend, Flex, NdArray);
 struct ConvolutionBackward;
 
 impl<B: Backend> Backward<B, 2> for ConvolutionBackward {
-    type State = (Operands<B>, usize);
+    /// Image, weight and stride.
+    type State = (NodeId, NodeId, usize);
 
-    fn backward(self, ops: Ops<Self::State, 2>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
+    fn backward(self, ops: Ops<Self::State, 2>, grads: &mut Gradients, checkpointer: &mut Checkpointer) {
         let upstream = grads.consume::<B>(&ops.node);
-        let (Operands { x, weight }, stride) = ops.state;
+        let (x, weight, stride) = ops.state;
+        let [x, weight] = [x, weight].map(|node| checkpointer.retrieve_node_output::<FloatTensor<B>>(node));
         let [of_image, of_weight] = ops.parents;
         if let Some(parent) = of_weight {
-            let gradient = weight_gradient::<B>(x.clone(), upstream.clone(), &weight.shape(), stride);
+            let gradient = weight_gradient::<B>(x.clone(), upstream.clone(), &weight.shape(), stride, VALUES);
             grads.register::<B>(parent.id, gradient);
         }
         if let Some(parent) = of_image {
@@ -74,14 +77,17 @@ impl<B: Backend> Backward<B, 2> for ConvolutionBackward {
 
 impl<B: ConvolutionBackend, C: CheckpointStrategy> ConvolutionBackend for Autodiff<B, C> {
     fn convolve(Operands { x, weight }: Operands<Self>, stride: usize) -> Image<Self> {
-        let nodes = [x.node(), weight.node()];
-        let operands = Operands::<B> { x: x.into_primitive(), weight: weight.into_primitive() };
-        let image = match ConvolutionBackward.prepare::<C>(nodes).compute_bound().stateful() {
-            OpsKind::Tracked(prepared) => {
-                let image = forward::<B>(operands.clone(), stride);
-                prepared.finish((operands, stride), image)
+        let prepared = ConvolutionBackward.prepare::<C>([x.node(), weight.node()]).compute_bound().stateful();
+        let image = match prepared {
+            OpsKind::Tracked(mut prepared) => {
+                let kept = (prepared.checkpoint(&x), prepared.checkpoint(&weight), stride);
+                let operands = Operands { x: x.into_primitive(), weight: weight.into_primitive() };
+                prepared.finish(kept, forward::<B>(operands, stride))
             }
-            OpsKind::UnTracked(prepared) => prepared.finish(forward::<B>(operands, stride)),
+            OpsKind::UnTracked(prepared) => {
+                let operands = Operands { x: x.into_primitive(), weight: weight.into_primitive() };
+                prepared.finish(forward::<B>(operands, stride))
+            }
         };
         Image { image }
     }
@@ -108,31 +114,48 @@ fn options(side: usize, stride: usize) -> ConvOptions<2> {
     ConvOptions::new([stride; 2], [side / 2; 2], [1, 1], 1)
 }
 
-/// ∂L/∂ weight, of shape `[D, C, K, K]`.
+/// ∂L/∂ weight, of shape `[D, C, K, K]`, with at most about `values` values in memory at once beside image and gradient.
 fn weight_gradient<B: Backend>(
     x: FloatTensor<B>,
     upstream: FloatTensor<B>,
     shape: &Shape,
     stride: usize,
+    values: usize,
 ) -> FloatTensor<B> {
     let [outputs, inputs, side, _] = shape.dims();
     let [batch, _, height, width] = upstream.shape().dims();
+    let (device, dtype) = (upstream.device(), upstream.dtype());
     let (image, upstream) = (with_margin::<B>(x, side / 2), B::float_permute(upstream, &[0, 2, 3, 1]));
     let taps = side * side * inputs;
-    let band = (VALUES / (batch * width * taps)).clamp(1, height);
-    let of_band = |first: usize| {
-        let lines = band.min(height - first);
+    // A product joins so many lines. A band is a multiple of them, or less.
+    let unit = (PIXELS / width).clamp(1, height);
+    let band = (values / (batch * width * taps)).clamp(1, height);
+    let band = if band > unit { band - band % unit } else { band };
+    // Taps of the pixels of one image, or its products.
+    let of_image = (band * width * taps).max(band.div_ceil(unit) * outputs * taps);
+    let images = (values / of_image).clamp(1, batch);
+    // Sums of many in 16 bits would lose theirs.
+    let wide = if matches!(dtype, DType::F16 | DType::BF16) { FloatDType::F32 } else { dtype.into() };
+    let mut sum = B::float_zeros(Shape::new([1, outputs, taps]), &device, wide);
+    for (start, first) in (0..batch)
+        .step_by(images)
+        .flat_map(|start| (0..height).step_by(band).map(move |first| (start, first)))
+    {
+        let (count, lines) = (images.min(batch - start), band.min(height - first));
+        let image = B::float_slice(image.clone(), &[part(start, count, 1), full(), full(), full()]);
         let rows = taps_of::<B>(&image, side, stride, [first, lines, width]);
-        let upstream = B::float_slice(upstream.clone(), &[full(), part(first, lines, 1), full(), full()]);
-        // Whole lines of one image are a product.
-        let joined = (1..=lines).rev().find(|n| lines % n == 0 && n * width <= PIXELS).unwrap_or(1);
-        let (products, pixels) = (batch * lines / joined, joined * width);
+        let place = [part(start, count, 1), part(first, lines, 1), full(), full()];
+        let upstream = B::float_slice(upstream.clone(), &place);
+        let all = count * lines;
+        let joined = (1..=all).rev().find(|n| all % n == 0 && n * width <= PIXELS).unwrap_or(1);
+        let [products, pixels] = [all / joined, joined * width];
         let rows = B::float_reshape(rows, Shape::new([products, pixels, taps]));
         let upstream = B::float_reshape(upstream, Shape::new([products, pixels, outputs]));
-        B::float_sum_dim(B::float_matmul(B::float_swap_dims(upstream, 1, 2), rows), 0)
-    };
-    let sum = (0..height).step_by(band).map(of_band).reduce(B::float_add).expect("an image has lines");
-    B::float_permute(B::float_reshape(sum, Shape::new([outputs, side, side, inputs])), &[0, 3, 1, 2])
+        let added = B::float_sum_dim(B::float_matmul(B::float_swap_dims(upstream, 1, 2), rows), 0);
+        sum = B::float_add(sum, B::float_cast(added, wide));
+    }
+    let sum = B::float_cast(B::float_reshape(sum, Shape::new([outputs, side, side, inputs])), dtype.into());
+    B::float_permute(sum, &[0, 3, 1, 2])
 }
 
 /// An image `[B, C, H, W]` as `[B, H, W, C]` in a margin of zeros.
@@ -175,7 +198,7 @@ fn part(start: usize, count: usize, step: usize) -> Slice {
 mod tests {
     use super::*;
     use crate::tests::uniform;
-    use burn::tensor::{Device, FloatDType, TensorData};
+    use burn::tensor::{Device, TensorData};
 
     fn tensor(shape: [usize; 4], seed: u64) -> Tensor<4> {
         let data = TensorData::new(uniform(shape.iter().product(), seed), shape);
@@ -194,8 +217,8 @@ mod tests {
             ([2, 5, 3, 8, 6], 3, 2),
             ([1, 2, 4, 7, 5], 3, 2),
             ([3, 4, 2, 5, 6], 1, 1),
-            ([1, 3, 2, 53, 61], 3, 1), // two parts, one line each: 53 is prime
-            ([2, 2, 2, 48, 90], 3, 1), // several lines to a part
+            ([1, 3, 2, 53, 61], 3, 1), // more lines than a product joins
+            ([2, 2, 2, 48, 90], 3, 1),
         ];
         for (seed, ([batch, inputs, outputs, height, width], side, stride)) in (1..).step_by(3).zip(cases) {
             let x = tensor([batch, inputs, height, width], seed);
@@ -214,6 +237,32 @@ mod tests {
                 assert_eq!(ours.len(), burns.len(), "{what}");
                 let error = ours.iter().zip(burns).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
                 assert!(error < 1e-10, "{what} of {batch}×{inputs}→{outputs} at {height}×{width}: {error:e}");
+            }
+        }
+    }
+
+    /// Bands of lines and parts of a batch, of which the last are smaller.
+    #[test]
+    fn parts_add_up() {
+        let shape = Shape::new([3, 2, 3, 3]);
+        for (height, width, stride) in [(53, 61, 1), (31, 90, 2), (9, 700, 1)] {
+            let device = Device::flex();
+            let random = |shape: [usize; 4], seed| {
+                let data = TensorData::new(uniform(shape.iter().product(), seed), shape);
+                Tensor::<4>::from_data(data, &device).cast(FloatDType::F64)
+            };
+            let x = random([3, 2, height, width], 1);
+            let upstream = random([3, 3, height.div_ceil(stride), width.div_ceil(stride)], 2);
+            let gradient = |limit: usize| {
+                let (x, upstream) = (x.clone().into_dispatch(), upstream.clone().into_dispatch());
+                let gradient = weight_gradient::<Dispatch>(x, upstream, &shape, stride, limit);
+                values(Tensor::from_dispatch(gradient))
+            };
+            let whole = gradient(usize::MAX);
+            for limit in [1, 20 * width * 18, 35 * width * 18, 2 * height * width * 18] {
+                let parts = gradient(limit);
+                let error = whole.iter().zip(&parts).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+                assert!(error < 1e-10, "{height}×{width}, at most {limit}: {error:e}");
             }
         }
     }

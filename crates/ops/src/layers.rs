@@ -42,16 +42,17 @@ pub fn layer_norm(layer: &nn::LayerNorm, epsilon: f64, x: Tensor<3>) -> Tensor<3
     run(sizes, shape, x, weight, Some(bias.val()))
 }
 
-/// A convolution of images `[B, C, H, W]`, or, where `rectified`, of max(x, 0).
+/// A convolution of images `[B, C, H, W]`, or, where `rectified`, of max(x, 0). The margin of zeros is half a kernel wide.
 pub fn conv2d(layer: &Conv2d, x: Tensor<4>, rectified: bool) -> Tensor<4> {
     let ([batch, inputs, height, width], [outputs, _, rows, columns]) = (x.dims(), layer.weight.dims());
     let (weight, bias) = (layer.weight.val(), bias(&layer.bias));
     let half = is_half(&layer.weight);
     let is_plain = layer.groups == 1 && layer.dilation == [1, 1];
-    if is_plain && rows == columns && gpu::is_trained_on(&x) {
+    let [down, across] = layer.stride;
+    if is_plain && rows == columns && rows % 2 == 1 && down == across && gpu::is_trained_on(&x) {
         let dtype = x.dtype();
         let x = if rectified { relu(x) } else { x };
-        let y = gpu::convolve(x.cast(weight.dtype()), weight, layer.stride[0]);
+        let y = gpu::convolve(x.cast(weight.dtype()), weight, down);
         return match bias {
             Some(bias) => y + bias.reshape([1, outputs, 1, 1]),
             None => y,
