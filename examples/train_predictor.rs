@@ -124,7 +124,8 @@ fn main() -> Result<(), Box<dyn Error>> {
         let loss = losses.regression + losses.confidence * 0.5;
         let rows = gradients::collect(&networks, &mut loss.backward());
         let factor = gradients::clip_factor(gradients::norm(&rows), 1.0).ok_or("a gradient is not finite")?;
-        networks = optimizer.step(schedule.share(step, steps), networks, rows, factor);
+        let rows = optimizer.step(schedule.share(step, steps), &networks, rows, factor);
+        networks = networks.with_rows(&rows);
     }
     if let Some(output) = output {
         save(&config, &networks.checkpoint(), &output)?;

@@ -108,11 +108,11 @@ impl Window {
     }
 
     /// Row-major positions within the window of the mask's set pixels.
-    pub fn indices(&self, mask: &[bool], side: usize) -> Vec<i64> {
+    pub fn indices(&self, mask: &[bool], side: usize) -> Vec<i32> {
         let inside = |row: usize| {
             let start = (row - self.rows.start) * self.columns.len();
             let line = &mask[row * side + self.columns.start..row * side + self.columns.end];
-            line.iter().enumerate().filter(|(_, set)| **set).map(move |(column, _)| (start + column) as i64)
+            line.iter().enumerate().filter(|(_, set)| **set).map(move |(column, _)| (start + column) as i32)
         };
         self.rows.clone().flat_map(inside).collect()
     }

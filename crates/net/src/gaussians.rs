@@ -5,6 +5,7 @@ use std::borrow::Cow;
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use glam::DVec3;
 use snapsnap_ops::host;
+use snapsnap_ops::rows::taken;
 use snapsnap_splat::{Camera, Gaussians, RigidTransform};
 
 use crate::config::{Config, NetworkConfig, RegressorConfig, RegressorStart, RotationFrame};
@@ -181,9 +182,7 @@ pub fn regress(
         if rows.is_empty() {
             continue;
         }
-        let n = rows.len();
-        let rows = Tensor::<1, Int>::from_data(TensorData::new(rows, [n]), &device);
-        let pick = |x: Tensor<4>, c: usize| x.narrow(0, i, 1).reshape([h * w, c]).select(0, rows.clone());
+        let pick = |x: Tensor<4>, c: usize| taken(x.narrow(0, i, 1).reshape([h * w, c]), &rows);
         let geometry = Geometry::is_needed(&config.regressor)
             .then(|| Geometry::new(view.image, &view.points, view.valid, side, limits));
         parts.push(Part {
@@ -205,11 +204,9 @@ pub fn geometric(views: &[Seen], device: &Device) -> Gaussians {
     let part = |view: &Seen| {
         let side = view.points.dims()[1];
         let rows = Window::whole(side).indices(view.valid, side);
-        let n = rows.len();
-        let rows = Tensor::<1, Int>::from_data(TensorData::new(rows, [n]), device);
         Part {
-            features: Tensor::zeros([n, FEATURES], device),
-            points: view.points.clone().reshape([side * side, 3]).select(0, rows),
+            features: Tensor::zeros([rows.len(), FEATURES], device),
+            points: taken(view.points.clone().reshape([side * side, 3]), &rows),
             geometry: Some(Geometry::new(view.image, &view.points, view.valid, side, limits)),
         }
     };

@@ -16,7 +16,7 @@ use burn::tensor::{DType, FloatDType, Shape, Slice, Tensor};
 use burn_cubecl::CubeBackend;
 
 /// Most pixels that one product of a weight's gradient adds up. Several products run at once, and their results are added.
-const PIXELS: usize = 2048;
+const PIXELS: usize = 512;
 /// Most values that are unfolded at once: 128 MB, the least that a WebGPU binding holds.
 const VALUES: usize = 1 << 25;
 

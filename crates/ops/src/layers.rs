@@ -1,5 +1,9 @@
 //! Layers of the networks as functions of Burn's modules: kernels with gradients of their own on `flex`, Burn's operators
 //! everywhere else.
+//!
+//! Parameters are expanded before they meet larger tensors, if gradients are computed on a GPU. The gradient of `expand` is a
+//! sum over one dimension after the other. That of Burn's operators is one sum over all of them, with one thread per
+//! parameter.
 
 use burn::module::Param;
 use burn::nn;
@@ -14,6 +18,13 @@ use crate::{gpu, has_kernels, in_f32, is_half, is_trained_fast};
 
 /// `[B, N, inputs]` → `[B, N, outputs]`.
 pub fn linear(layer: &nn::Linear, x: Tensor<3>) -> Tensor<3> {
+    if gpu::is_trained_on(&x) {
+        let y = burn::tensor::module::linear(x, layer.weight.val(), None);
+        return match bias(&layer.bias) {
+            Some(bias) => y.clone() + bias.unsqueeze::<3>().expand(y.dims()),
+            None => y,
+        };
+    }
     if !has_kernels(&x) {
         return layer.forward(x);
     }
@@ -34,12 +45,22 @@ fn linear_sizes(layer: &nn::Linear, x: &Tensor<3>) -> (Linear, [usize; 3]) {
 
 /// Layer normalisation of tokens `[B, N, C]`. `epsilon` is that of the layer, whose field is private.
 pub fn layer_norm(layer: &nn::LayerNorm, epsilon: f64, x: Tensor<3>) -> Tensor<3> {
+    let (weight, shape) = (layer.gamma.val(), x.dims());
+    if let Some(bias) = layer.beta.as_ref().filter(|_| gpu::is_trained_on(&x)) {
+        let affine = [weight, bias.val()].map(|parameter| parameter.unsqueeze::<3>().expand(shape));
+        return in_f32(x, |x| normalised(x, epsilon, affine));
+    }
     let Some(bias) = layer.beta.as_ref().filter(|_| is_trained_fast(&x)) else {
         return in_f32(x, |x| layer.forward(x));
     };
-    let (weight, shape) = (layer.gamma.val(), x.dims());
     let sizes = LayerNorm { channels: shape[2], epsilon: epsilon as f32 };
     run(sizes, shape, x, weight, Some(bias.val()))
+}
+
+fn normalised(x: Tensor<3>, epsilon: f64, [weight, bias]: [Tensor<3>; 2]) -> Tensor<3> {
+    let centred = x.clone() - x.mean_dim(2);
+    let variance = centred.clone().square().mean_dim(2);
+    centred / (variance + epsilon).sqrt() * weight + bias
 }
 
 /// A convolution of images `[B, C, H, W]`, or, where `rectified`, of max(x, 0). The margin of zeros is half a kernel wide.
@@ -54,7 +75,7 @@ pub fn conv2d(layer: &Conv2d, x: Tensor<4>, rectified: bool) -> Tensor<4> {
         let x = if rectified { relu(x) } else { x };
         let y = gpu::convolve(x.cast(weight.dtype()), weight, down);
         return match bias {
-            Some(bias) => y + bias.reshape([1, outputs, 1, 1]),
+            Some(bias) => y.clone() + bias.reshape([1, outputs, 1, 1]).expand(y.dims()),
             None => y,
         }
         .cast(dtype);

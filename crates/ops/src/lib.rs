@@ -1,6 +1,6 @@
 //! Operators that are slow on Burn's backends. Each is one function with two implementations: kernels with their own
 //! gradients on Burn's `flex` device, and plain tensor code on every other device and in 16 bits. Tests compare the two.
-//! [`gpu`] has a gradient for GPUs.
+//! [`gpu`] and [`rows`] have gradients for GPUs.
 
 pub mod buffers;
 pub mod conv;
@@ -13,6 +13,7 @@ pub mod op;
 pub mod orthogonal;
 mod resize;
 mod rope;
+pub mod rows;
 mod tracked;
 pub mod train;
 pub mod unet;
@@ -157,8 +158,26 @@ pub fn bilinear(x: Tensor<4>, size: [usize; 2], align_corners: bool) -> Tensor<4
 /// Sums over the last dimension: `[A, B, N]` → `[A, B, 1]`, in two steps. On GPUs one thread adds up what a step joins.
 pub fn sum_last(x: Tensor<3>) -> Tensor<3> {
     let [a, b, n] = x.dims();
-    let inner = (1..=n.isqrt()).rev().find(|inner| n % inner == 0).unwrap_or(1);
+    let inner = near_root(n);
     x.reshape([a, b, inner, n / inner]).sum_dim(3).reshape([a, b, inner]).sum_dim(2)
+}
+
+/// The reverse of [`sum_last`]: `[A, B, 1]` → `[A, B, N]`. Its gradient is computed in two steps.
+pub fn spread_last(x: Tensor<3>, n: usize) -> Tensor<3> {
+    let [a, b, _] = x.dims();
+    let inner = near_root(n);
+    x.reshape([a, b, 1, 1]).expand([a, b, inner, n / inner]).reshape([a, b, n])
+}
+
+/// The largest divisor of `n` that is not larger than its root.
+fn near_root(n: usize) -> usize {
+    (1..=n.isqrt()).rev().find(|inner| n % inner == 0).unwrap_or(1)
+}
+
+/// The mean of all values `[1]`, as [`sum_last`] adds them up.
+pub fn mean<const D: usize>(x: Tensor<D>) -> Tensor<1> {
+    let count = x.dims().iter().product();
+    sum_last(x.reshape([1, 1, count])).reshape([1]) / count as f64
 }
 
 /// Values on the host, without a copy if the tensor is contiguous and has no other owner.

@@ -1,5 +1,5 @@
 //! Operators of our own with gradients of their own, as one Burn backend extension. Code for Burn's backend
-//! interfaces is in this file and in `gpu`, since they change with every minor version of Burn.
+//! interfaces is in this file, in `gpu` and in `rows`, since they change with every minor version of Burn.
 
 use std::any::Any;
 use std::fmt::Debug;

@@ -46,3 +46,30 @@ fn linear_gelu_equals_its_composition() {
     let x = random([2, 19, 20], 3);
     assert_equal("gelu", super::linear_gelu(&layer, x.clone()), gelu(layer.forward(x)));
 }
+
+/// Also of a prime number of values, which has no two steps.
+#[test]
+fn sums_in_two_steps_and_their_gradients_equal_burns() {
+    let device = Device::flex().autodiff();
+    for n in [1, 6, 12, 13, 30] {
+        let tracked = |shape, seed| {
+            let data = random::<3>(shape, seed).into_data();
+            Tensor::<3>::from_data(data, &device).require_grad()
+        };
+        let (x, few) = (tracked([2, 3, n], 1), tracked([2, 3, 1], 2));
+        let results = [
+            [super::sum_last(x.clone()) * few.clone(), super::spread_last(few.clone(), n) * x.clone()],
+            [x.clone().sum_dim(2) * few.clone(), few.clone() * x.clone()],
+        ];
+        let [ours, burns] = results.map(|results| {
+            results.map(|y| {
+                let gradients = y.clone().square().sum().backward();
+                [&x, &few].map(|x| x.grad(&gradients).expect("tracked"))
+            })
+        });
+        for (ours, burns) in ours.into_iter().flatten().zip(burns.into_iter().flatten()) {
+            assert_equal(&format!("{n} values"), ours, burns);
+        }
+        assert_equal("mean", super::mean(x.clone().inner()), x.clone().inner().mean());
+    }
+}

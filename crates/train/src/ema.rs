@@ -36,7 +36,8 @@ impl Average {
 }
 
 fn blended(average: Tensor<1>, new: Tensor<1>, decay: f64) -> Tensor<1> {
-    let device = average.device();
+    let device = new.device();
+    let average = average.to_device(&device);
     if device != Device::flex() {
         return average * decay + new * (1.0 - decay);
     }

@@ -7,7 +7,7 @@ use burn::tensor::{Device, Gradients, Tensor};
 use snapsnap_net::weights::{NamedVisitor, Path};
 use snapsnap_ops::host;
 
-use crate::networks::{Networks, Rows, row};
+use crate::networks::{Networks, Rows, moved, row};
 use crate::ranks::Ranks;
 
 /// The gradients of all parameters that have one.
@@ -39,7 +39,8 @@ pub fn add(sum: &mut Rows, gradients: Rows) {
     }
 }
 
-/// Sums of all ranks' gradients, where a rank may lack some. The ranks have the same networks, with parameters of these lengths.
+/// Sums of all ranks' gradients on a device, where a rank may lack some. The ranks have the same networks, with parameters of
+/// these lengths.
 pub fn reduce(
     ranks: &Ranks,
     mut gradients: Rows,
@@ -49,7 +50,7 @@ pub fn reduce(
     /// Values that are summed at once.
     const BUCKET: usize = 1 << 22;
     if ranks.size() == 1 {
-        return gradients;
+        return moved(gradients, device);
     }
     let present: Vec<bool> = lengths.keys().map(|name| gradients.contains_key(name)).collect();
     let everywhere = ranks.gather(&present);

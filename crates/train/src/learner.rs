@@ -196,7 +196,8 @@ impl<'a, T: Task> Learner<'a, T> {
             }
         }
         let since = Instant::now();
-        let sum = gradients::reduce(self.ranks, sum, &self.lengths, &self.device.clone().inner());
+        let device = self.optimizer.device(self.device.clone().inner());
+        let sum = gradients::reduce(self.ranks, sum, &self.lengths, &device);
         if self.ranks.size() > 1 {
             values.insert("reduce_ms".to_owned(), 1e3 * since.elapsed().as_secs_f64());
         }
@@ -209,10 +210,10 @@ impl<'a, T: Task> Learner<'a, T> {
             return Ok(Err(self.everywhere("a gradient is not finite", names)));
         };
         let share = self.config.schedule.share(step as usize, t.steps);
-        let networks = std::mem::take(&mut self.networks);
-        self.networks = self.optimizer.step(share, networks, sum, factor);
+        let rows = self.optimizer.step(share, &self.networks, sum, factor);
+        self.networks = std::mem::take(&mut self.networks).with_rows(&rows);
         if let Some(average) = &mut self.average {
-            average.update(step, self.networks.rows());
+            average.update(step, rows);
         }
         values.insert("rate".to_owned(), share * self.config.optimizer.rate);
         values.insert("norm".to_owned(), norm);

@@ -94,7 +94,8 @@ impl Networks {
         self.parameters().into_iter().map(stored).collect()
     }
 
-    /// The same networks with the values in `rows`. Other parameters keep their values, and tracked ones stay tracked.
+    /// The same networks with the values in `rows`, which may be on another device. Other parameters keep their values, and
+    /// tracked ones stay tracked.
     pub fn with_rows(self, rows: &Rows) -> Self {
         struct Replace<'a>(&'a Rows);
         impl NamedMapper for Replace<'_> {
@@ -103,7 +104,8 @@ impl Networks {
                     return parameter;
                 };
                 let (id, old, mapper) = parameter.consume();
-                let values = row.clone().reshape(old.shape());
+                let device = old.clone().without_autodiff().device();
+                let values = row.clone().to_device(&device).reshape(old.shape());
                 let values = match old.gradient_checkpointing_strategy() {
                     Some(strategy) => values.autodiff().with_gradient_checkpointing_strategy(strategy),
                     None => values,
@@ -119,4 +121,20 @@ impl Networks {
 pub(crate) fn row(values: Vec<f32>, device: &Device) -> Tensor<1> {
     let count = values.len();
     Tensor::from_data(TensorData::new(values, [count]), device)
+}
+
+/// Rows on a device, in one transfer.
+pub(crate) fn moved(rows: Rows, device: &Device) -> Rows {
+    if rows.values().next().is_none_or(|first| first.device() == *device) {
+        return rows;
+    }
+    let (names, values): (Vec<String>, Vec<Tensor<1>>) = rows.into_iter().unzip();
+    let lengths: Vec<usize> = values.iter().map(|values| values.dims()[0]).collect();
+    let all = host(Tensor::cat(values, 0));
+    let mut rest = &all[..];
+    let one = |(name, length)| {
+        let values = rest.split_off(..length).expect("as many values as were joined");
+        (name, row(values.to_vec(), device))
+    };
+    names.into_iter().zip(lengths).map(one).collect()
 }

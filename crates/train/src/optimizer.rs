@@ -7,9 +7,9 @@ use burn::tensor::{Device, Tensor};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use snapsnap_ops::host;
-use snapsnap_ops::orthogonal::{COEFFICIENTS, MIN_NORM, STEPS, orthogonalised};
+use snapsnap_ops::orthogonal::orthogonalised;
 
-use crate::networks::{Networks, Parameter, Rows, row};
+use crate::networks::{Networks, Parameter, Rows, moved, row};
 
 /// Values per task of a step on the CPU.
 const PIECE: usize = 1 << 14;
@@ -120,41 +120,57 @@ fn is_hidden(name: &str, rank: usize) -> bool {
 }
 
 impl Optimizer {
-    /// One step of all parameters that have a gradient, at `share` of the highest rates. Gradients are multiplied by
-    /// `factor` first.
-    pub fn step(&mut self, share: f64, networks: Networks, mut gradients: Rows, factor: f64) -> Networks {
-        let work = networks.parameters().into_iter().filter_map(|parameter| {
-            let gradient = gradients.remove(&parameter.name)?;
-            let state = self.states.remove(&parameter.name);
-            Some((parameter, gradient, state))
+    /// The device of a step for networks on `device`. Muon's matrices are many and small: the cores of the host are faster.
+    pub(crate) fn device(&self, device: Device) -> Device {
+        if self.config.muon.is_some() { Device::flex() } else { device }
+    }
+
+    /// All values after one step of those that have a gradient, at `share` of the highest rates, on the device of a step.
+    /// Gradients are multiplied by `factor` first.
+    pub fn step(&mut self, share: f64, networks: &Networks, gradients: Rows, factor: f64) -> Rows {
+        let parameters = networks.parameters();
+        let Some(device) = parameters.first().map(|first| self.device(first.values.device())) else {
+            return Rows::new();
+        };
+        let values = parameters.iter().map(|parameter| (parameter.name.clone(), parameter.values.clone()));
+        let mut rows = moved(values.collect(), &device);
+        let mut gradients = moved(gradients, &device);
+        let work = parameters.into_iter().filter_map(|Parameter { name, shape, .. }| {
+            let gradient = gradients.remove(&name)?;
+            let (values, state) = (rows.remove(&name)?, self.states.remove(&name));
+            Some((name, shape, values, gradient, state))
         });
         let work: Vec<_> = work.collect();
-        let one = |(parameter, gradient, state)| self.step_one(share, parameter, gradient, factor, state);
+        let one = |(name, shape, values, gradient, state): (String, Vec<usize>, _, _, _)| {
+            let (values, state) = self.step_one(share, &name, &shape, values, gradient, factor, state);
+            (name, values, state)
+        };
         // Parameters are many and small. On the CPU, cores share them. Other devices order work by the calling thread.
-        let is_cpu = work.first().is_some_and(|(first, ..)| first.values.device() == Device::flex());
-        let done: Vec<_> = if is_cpu {
+        let done: Vec<_> = if device == Device::flex() {
             work.into_par_iter().with_max_len(1).map(one).collect()
         } else {
             work.into_iter().map(one).collect()
         };
-        let mut rows = Rows::new();
         for (name, values, state) in done {
             rows.insert(name.clone(), values);
             self.states.insert(name, state);
         }
-        networks.with_rows(&rows)
+        rows
     }
 
+    #[allow(clippy::too_many_arguments, reason = "a parameter and its step")]
     fn step_one(
         &self,
         share: f64,
-        Parameter { name, shape, values, .. }: Parameter,
+        name: &str,
+        shape: &[usize],
+        values: Tensor<1>,
         gradient: Tensor<1>,
         factor: f64,
         state: Option<State>,
-    ) -> (String, Tensor<1>, State) {
-        let (values, state) = match &self.config.muon {
-            Some(settings) if is_hidden(&name, shape.len()) => {
+    ) -> (Tensor<1>, State) {
+        match &self.config.muon {
+            Some(settings) if is_hidden(name, shape.len()) => {
                 let velocity = match state {
                     Some(State::Muon { velocity }) => Some(velocity),
                     _ => None,
@@ -168,8 +184,7 @@ impl Optimizer {
                 let decays = shape.len() >= 2 || self.config.decay_all;
                 self.adamw(share, decays, values, gradient, factor, state)
             }
-        };
-        (name, values, state)
+        }
     }
 
     /// AdamW (Loshchilov and Hutter). Burn's AdamW corrects the moments' bias in f32, so that its second step differs
@@ -264,7 +279,7 @@ impl Optimizer {
 }
 
 /// Muon (Jordan et al.): values and velocity after a step along the orthogonalised Nesterov momentum. The factor
-/// 0.2·√(longest side) makes the step as long as one of AdamW (Liu et al., "Muon is scalable").
+/// 0.2·√(longest side) makes the step as long as one of AdamW (Liu et al., "Muon is scalable"). On the host.
 fn muon(
     settings: &MuonSettings,
     share: f64,
@@ -278,16 +293,6 @@ fn muon(
     let rate = share * settings.rate;
     let kept = 1.0 - rate * settings.weight_decay;
     let pace = rate * 0.2 * (rows.max(columns) as f64).sqrt();
-    if device != Device::flex() {
-        let gradient = gradient * factor;
-        let velocity = match velocity {
-            Some(velocity) => velocity.to_device(&device) * momentum + gradient.clone(),
-            None => gradient.clone(),
-        };
-        let direction = velocity.clone() * momentum + gradient;
-        let update = orthogonalised_tensor(direction.reshape([rows, columns])).reshape([-1]);
-        return (values * kept - update * pace, velocity);
-    }
     let mut velocity = velocity.map_or_else(|| vec![0.0; rows * columns], host);
     let (mut values, mut direction) = (host(values), host(gradient));
     let [momentum, factor, kept, pace] = [momentum, factor, kept, pace].map(|value| value as f32);
@@ -301,21 +306,6 @@ fn muon(
     (row(values, &device), row(velocity, &device))
 }
 
-/// [`orthogonalised`] on any device.
-fn orthogonalised_tensor(x: Tensor<2>) -> Tensor<2> {
-    let [rows, columns] = x.dims();
-    if rows > columns {
-        return orthogonalised_tensor(x.transpose()).transpose();
-    }
-    let norm = x.clone().square().sum().sqrt().clamp_min(MIN_NORM).reshape([1, 1]);
-    let [a, b, c] = COEFFICIENTS;
-    (0..STEPS).fold(x / norm, |x, _| {
-        let gram = x.clone().matmul(x.clone().transpose());
-        let inner = gram.clone() * b + gram.clone().matmul(gram) * c;
-        x.clone() * a + inner.matmul(x)
-    })
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -323,8 +313,10 @@ mod tests {
     use burn::optim::momentum::MomentumConfig;
     use burn::optim::{AdjustLrFn, MuonConfig, Optimizer as _};
     use burn::tensor::Distribution;
+    use snapsnap_net::config::{Config, NetworkConfig};
+    use snapsnap_net::weights::random_predictor;
 
-    /// Both implementations agree with Burn's Muon, which takes matrices only.
+    /// Burn's Muon takes matrices only.
     #[test]
     fn muon_is_burns() {
         let settings = MuonSettings { rate: 0.01, momentum: 0.9, weight_decay: 0.02 };
@@ -334,11 +326,9 @@ mod tests {
             .with_weight_decay(Some(WeightDecayConfig { penalty: 0.02 }))
             .with_adjust_lr_fn(AdjustLrFn::MatchRmsAdamW)
             .build();
-        #[allow(deprecated, reason = "the second CPU implementation")]
-        let devices = [Device::flex(), Device::ndarray()];
-        for (device, size) in devices.iter().flat_map(|device| [[6, 10], [24, 7]].map(|size| (device, size)))
-        {
-            let random = || Tensor::<2>::random(size, Distribution::Normal(0.0, 1.0), device);
+        let device = Device::flex();
+        for size in [[6, 10], [24, 7]] {
+            let random = || Tensor::<2>::random(size, Distribution::Normal(0.0, 1.0), &device);
             let mut values = random();
             let (mut ours, mut velocity, mut theirs) = (values.clone().reshape([-1]), None, None);
             for _ in 0..3 {
@@ -350,8 +340,48 @@ mod tests {
             }
             let (ours, theirs) = (host(ours), host(values));
             let apart = ours.iter().zip(&theirs).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-            println!("{device:?}, {size:?}: {apart:e} apart");
-            assert!(apart <= 1e-6, "{device:?}, {size:?}: {apart:e}");
+            println!("{size:?}: {apart:e} apart");
+            assert!(apart <= 1e-6, "{size:?}: {apart:e}");
+        }
+    }
+
+    /// Networks of another device keep it, and Muon's steps are those of the host.
+    #[test]
+    fn steps_on_another_device_are_the_hosts() {
+        #[allow(deprecated, reason = "the second CPU implementation")]
+        let devices = [Device::flex(), Device::ndarray()];
+        let config = OptimizerConfig { muon: Some(MuonSettings::default()), ..OptimizerConfig::default() };
+        let [host, other] = devices.map(|device| {
+            let network = Config { network: small(), ..Config::default() };
+            let predictor = random_predictor(&network, 1, &device);
+            let mut networks = Networks { predictor: Some(predictor), regressors: Vec::new() };
+            let mut optimizer = config.init();
+            for step in 1..3 {
+                let gradients = networks.rows().into_iter().map(|(name, values)| (name, values * step));
+                let rows = optimizer.step(1.0, &networks, gradients.collect(), 0.5);
+                networks = networks.with_rows(&rows);
+            }
+            assert!(networks.rows().values().all(|values| values.device() == device));
+            networks.checkpoint()
+        });
+        assert!(host == other);
+    }
+
+    fn small() -> NetworkConfig {
+        let sizes = [4, 4, 8, 8];
+        NetworkConfig {
+            patch: 8,
+            enc_dim: 16,
+            enc_heads: 2,
+            enc_depth: 1,
+            dec_dim: 16,
+            dec_heads: 2,
+            dec_depth: 1,
+            layer_dims: sizes,
+            last_dim: 8,
+            resolution: 64,
+            net_resolution: 64,
+            ..NetworkConfig::default()
         }
     }
 }

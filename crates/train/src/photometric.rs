@@ -2,6 +2,7 @@
 
 use burn::tensor::Tensor;
 use snapsnap_eval::similarity::ssim_gaussian;
+use snapsnap_ops::mean;
 
 /// The parts of the loss, each `[1]`.
 #[derive(Debug, Clone)]
@@ -15,8 +16,8 @@ pub struct Photometric {
 impl Photometric {
     /// Compares pictures `[B,C,H,W]` with values in [0, 1].
     pub fn new(image: Tensor<4>, target: Tensor<4>) -> Self {
-        let l1 = (image.clone() - target.clone()).abs().mean();
-        Self { l1, ssim: ssim_gaussian(image, target).mean() }
+        let l1 = mean((image.clone() - target.clone()).abs());
+        Self { l1, ssim: mean(ssim_gaussian(image, target)) }
     }
 
     /// β·L1 + (1 − β)·(1 − SSIM).

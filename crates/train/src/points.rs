@@ -5,7 +5,7 @@ use burn::tensor::Tensor;
 use snapsnap_net::Window;
 use snapsnap_net::config::{Config, NetworkConfig};
 use snapsnap_net::network::{Input, PointMap, PointPredictor, View};
-use snapsnap_ops::host;
+use snapsnap_ops::{host, mean};
 
 use crate::config::Stage1Config;
 use crate::task::Part;
@@ -141,7 +141,7 @@ pub fn losses(prediction: &Prediction, points: &Tensor<5>, valid: &Tensor<4>, re
         let (sure, unsure) = (log(map.conf.clone()), log(1.0 - map.conf.clone()));
         let outside: Tensor<3> = 1.0 - inside.clone();
         let entropy = inside * sure + outside * unsure;
-        confidence.push(-entropy.mean());
+        confidence.push(-mean(entropy));
     }
     let sum = |parts: Vec<Tensor<1>>| Tensor::cat(parts, 0).sum();
     Losses { regression: sum(regression), confidence: sum(confidence), relief: relief.then(|| sum(reliefs)) }

@@ -79,8 +79,8 @@ fn step<T: Task>(task: &T, networks: Networks) -> (f64, Rows, Networks) {
     let value = f64::from(loss.clone().into_scalar::<f32>());
     let rows = gradients::collect(&networks, &mut loss.backward());
     let factor = gradients::clip_factor(gradients::norm(&rows), 1.0).expect("finite");
-    let networks = config().optimizer.init().step(1.0, networks, rows.clone(), factor);
-    (value, rows, networks)
+    let after = config().optimizer.init().step(1.0, &networks, rows.clone(), factor);
+    (value, rows, networks.with_rows(&after))
 }
 
 fn compare(stage: &str, on: impl Fn(&Device) -> (f64, Rows, Networks), device: &Device) {

@@ -124,7 +124,8 @@ fn follow(steps: usize) {
         let factor = gradients::clip_factor(norm, 1.0).expect("finite");
         let share = schedule.share(step, 20);
         assert!(off(1e-3 * share, rates[step]) < 1e-9, "step {step}: rate");
-        networks = optimizer.step(share, networks, rows, factor);
+        let rows = optimizer.step(share, &networks, rows, factor);
+        networks = networks.with_rows(&rows);
     }
     println!("losses: relative error {worst:.1e}");
     assert!(worst <= 5e-4, "losses: {worst:e}");

@@ -15,6 +15,7 @@ use crate::config::NetworkConfig;
 use crate::crop::Window;
 use snapsnap_ops::host;
 use snapsnap_ops::layers::conv2d;
+use snapsnap_ops::rows::taken;
 
 /// Channels of a photographed pixel's features on a side.
 const FEATURES: usize = 16;
@@ -79,8 +80,7 @@ impl Completion {
         let points = photographed.points.clone().reshape([b, 2 * h * w, 3]);
         let [there, inside] = [host(points.clone().detach()), host(photographed.masks.clone())];
         let seen = [View::Right, View::Left].map(|view| {
-            let rows =
-                Visible::new(view, self.side, photographed.window, [&there, &inside], b, &points.device());
+            let rows = Visible::new(view, self.side, photographed.window, [&there, &inside], b);
             Seen::new(view, self.side, photographed.window, (points.clone(), table.clone()), rows)
         });
         let images: Vec<Tensor<4>> = seen
@@ -92,7 +92,8 @@ impl Completion {
         let out = self.body.out(self.body.features(&levels));
         let out = [out.clone().narrow(0, 0, b), out.narrow(0, b, b).flip([3])];
         let raw = |layer: usize, seen: &Seen, out: &Tensor<4>| {
-            let known = seen.depths[layer].clone() / delta.clone().reshape([1, 1, 1, 1]);
+            let known = seen.depths[layer].clone();
+            let known = known.clone() / delta.clone().reshape([1; 4]).expand(known.dims());
             let beside = known + out.clone().narrow(1, 2 * layer, 1);
             let directions = seen.directions.clone().permute([0, 3, 1, 2]);
             Tensor::cat(vec![directions * beside, out.clone().narrow(1, 2 * layer + 1, 1)], 1)
@@ -152,8 +153,8 @@ impl Seen {
         let table = Tensor::cat(vec![table, Tensor::zeros([b, 1, c], &device)], 1).reshape([b * (n + 1), c]);
         let image = |x: Tensor<2>, c: usize| x.reshape([b, h, w, c]).permute([0, 3, 1, 2]);
         let [second, farthest] =
-            [rows.second, rows.farthest].map(|rows| image(table.clone().narrow(1, 0, 6).select(0, rows), 6));
-        let nearest = image(table.select(0, rows.nearest), c);
+            [rows.second, rows.farthest].map(|rows| image(taken(table.clone().narrow(1, 0, 6), &rows), 6));
+        let nearest = image(taken(table, &rows.nearest), c);
         let rays = Rays::new(view, side, window, &device);
         let anchors = rays.depths.permute([0, 3, 1, 2]);
         let is_there = |point: &Tensor<4>| point.clone().narrow(1, 4, 2).sum_dim(1);
@@ -292,8 +293,8 @@ mod tests {
         let (known, inside) = (host(person.points.clone()), host(person.masks.clone()));
         let points =
             Tensor::<3>::from_data(TensorData::new(known.clone(), [1, n, 3]), &device).require_grad();
-        let rows = Visible::new(View::Right, SIDE, &window, [&known, &inside], 1, &device);
-        let shown: Vec<i64> = rows.nearest.clone().into_data().convert::<i64>().try_into_vec().expect("rows");
+        let rows = Visible::new(View::Right, SIDE, &window, [&known, &inside], 1);
+        let shown = rows.nearest.clone();
         let table = Tensor::cat(
             vec![Tensor::zeros([1, n, 3], &device), Tensor::ones([1, n, 2 + FEATURES], &device)],
             2,
@@ -304,7 +305,7 @@ mod tests {
         let gradient = host(points.grad(&gradients).expect("a gradient"));
         let axis = nominal(View::Right, SIDE).1.rotation.row(2).as_vec3().to_array();
         for (i, gradient) in gradient.chunks_exact(3).enumerate() {
-            let expected = if shown.contains(&(i as i64)) { axis } else { [0.0; 3] };
+            let expected = if shown.contains(&(i as i32)) { axis } else { [0.0; 3] };
             assert!((0..3).all(|c| (gradient[c] - expected[c]).abs() < 1e-5), "{i}: {gradient:?}");
         }
     }

@@ -206,6 +206,11 @@ impl PointPredictor {
         self.scale.val()
     }
 
+    /// Expanded, so that δ's gradient is a sum over one dimension after the other, not over all at once.
+    fn times_delta(&self, x: Tensor<4>) -> Tensor<4> {
+        x.clone() * self.delta().reshape([1; 4]).expand(x.dims())
+    }
+
     /// Enlarges a map `factor` times, from the network's pixels to those of the canvas, and multiplies its points by δ
     /// (docs/method.md, "Enlargement and delta").
     ///
@@ -236,7 +241,7 @@ impl PointPredictor {
             }
             _ => plain,
         };
-        let points = points.permute([0, 2, 3, 1]) * self.delta().reshape([1, 1, 1, 1]);
+        let points = self.times_delta(points.permute([0, 2, 3, 1]));
         let conf = up(map.conf.reshape([b, 1, h, w])).reshape([b, size[0], size[1]]);
         PointMap { points, conf }
     }
@@ -361,7 +366,7 @@ impl PointPredictor {
         let seen = Tensor::stack::<5>(vec![front, back.flip([3])], 1);
         let points = maps.iter().map(|(view, map)| {
             let anchors = anchors(*view, config.net_resolution, &window, &map.points.device());
-            map.points.clone() * self.delta().reshape([1, 1, 1, 1]) + anchors
+            self.times_delta(map.points.clone()) + anchors
         });
         let photographed = Photographed {
             points: Tensor::stack(points.collect(), 1),

@@ -1,6 +1,6 @@
 //! The points of both photographs as the camera of an unseen side sees them (docs/method.md, "Completed sides").
 
-use burn::tensor::{Device, Int, Tensor, TensorData};
+use burn::tensor::Tensor;
 use glam::DVec3;
 
 use super::View;
@@ -13,9 +13,9 @@ const APART: f64 = 0.05;
 /// For every pixel of a side, the nearest of N points, the nearest of those that are [`APART`] behind it, and the farthest:
 /// `[B·h·w]` rows of tables of N + 1 rows for each sample. The last row means that there is none.
 pub struct Visible {
-    pub nearest: Tensor<1, Int>,
-    pub second: Tensor<1, Int>,
-    pub farthest: Tensor<1, Int>,
+    pub nearest: Vec<i32>,
+    pub second: Vec<i32>,
+    pub farthest: Vec<i32>,
 }
 
 impl Visible {
@@ -27,13 +27,12 @@ impl Visible {
         window: &Window,
         [points, inside]: [&[f32]; 2],
         batch: usize,
-        device: &Device,
     ) -> Self {
         let (camera, to_side) = nominal(view, side);
         let (n, w) = (inside.len() / batch, window.columns.len());
         let area = window.rows.len() * w;
-        let none = |sample: usize| (sample * (n + 1) + n) as i64;
-        let mut found: [Vec<i64>; 3] = Default::default();
+        let none = |sample: usize| (sample * (n + 1) + n) as i32;
+        let mut found: [Vec<i32>; 3] = Default::default();
         for (sample, (points, inside)) in points.chunks_exact(3 * n).zip(inside.chunks_exact(n)).enumerate() {
             let seen = |(i, point): (usize, &[f32])| {
                 let p = to_side.apply(DVec3::new(point[0].into(), point[1].into(), point[2].into()));
@@ -44,10 +43,10 @@ impl Visible {
                     return None;
                 }
                 let pixel = (row - window.rows.start) * w + column - window.columns.start;
-                Some((pixel, p.z, (sample * (n + 1) + i) as i64))
+                Some((pixel, p.z, (sample * (n + 1) + i) as i32))
             };
             let of_person = points.chunks_exact(3).enumerate().filter(|(i, _)| inside[*i] >= 0.5);
-            let seen: Vec<(usize, f64, i64)> = of_person.filter_map(seen).collect();
+            let seen: Vec<(usize, f64, i32)> = of_person.filter_map(seen).collect();
             // The first of all points with the smallest distance beyond `from`.
             let nearest = |from: &dyn Fn(usize) -> f64, distance: fn(f64) -> f64| {
                 let mut best = vec![(f64::INFINITY, none(sample)); area];
@@ -65,8 +64,7 @@ impl Visible {
                 rows.extend(best.iter().map(|(_, row)| row));
             }
         }
-        let [nearest, second, farthest] =
-            found.map(|rows| Tensor::from_data(TensorData::new(rows, [batch * area]), device));
+        let [nearest, second, farthest] = found;
         Self { nearest, second, farthest }
     }
 }
@@ -82,6 +80,7 @@ pub fn depths(view: View, points: Tensor<3>) -> Tensor<3> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use burn::tensor::{Device, TensorData};
     use glam::DVec2;
     use snapsnap_ops::host;
 
@@ -122,10 +121,8 @@ mod tests {
             inside[3] = 0.2;
             let twice = [points.clone(), points.clone()].concat();
             let both = [inside, inside].concat();
-            let visible = Visible::new(view, SIDE, &window, [&twice, &both], 2, &device);
-            let rows =
-                |x: Tensor<1, Int>| x.into_data().convert::<i64>().try_into_vec::<i64>().expect("rows");
-            let [nearest, second, farthest] = [visible.nearest, visible.second, visible.farthest].map(rows);
+            let visible = Visible::new(view, SIDE, &window, [&twice, &both], 2);
+            let Visible { nearest, second, farthest } = visible;
             let found = nearest.iter().zip(second).zip(farthest).map(|((a, b), c)| [*a, b, c]);
             let (area, pixel) = (48 * 32, (30 - 8) * 32 + 20 - 16);
             for (i, found) in found.enumerate() {

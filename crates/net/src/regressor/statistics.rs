@@ -2,7 +2,7 @@
 
 use burn::nn::GroupNorm;
 use burn::tensor::Tensor;
-use snapsnap_ops::sum_last;
+use snapsnap_ops::{spread_last, sum_last};
 
 /// Means and reciprocal standard deviations of every group normalisation of one forward pass, in order of execution.
 ///
@@ -59,10 +59,11 @@ pub(crate) fn normalise(norm: &GroupNorm, x: Tensor<4>, statistics: &mut Statist
     let [b, c, h, w] = x.dims();
     let groups = norm.num_groups;
     let [mean, rstd] = statistics.layer(|| {
-        let flat = x.clone().reshape([b, groups, c / groups * h * w]);
-        let average = |x: Tensor<3>| sum_last(x) / (c / groups * h * w) as f64;
+        let n = c / groups * h * w;
+        let flat = x.clone().reshape([b, groups, n]);
+        let average = |x: Tensor<3>| sum_last(x) / n as f64;
         let mean = average(flat.clone());
-        let variance = average((flat - mean.clone()).square());
+        let variance = average((flat - spread_last(mean.clone(), n)).square());
         [mean.squeeze_dim(2), (variance + norm.epsilon).sqrt().recip().squeeze_dim(2)]
     });
     let per_channel = |x: Tensor<2>| x.reshape([b, groups, 1]).repeat_dim(2, c / groups).reshape([b, c]);
@@ -71,5 +72,7 @@ pub(crate) fn normalise(norm: &GroupNorm, x: Tensor<4>, statistics: &mut Statist
     };
     let scale = per_channel(rstd) * affine(&norm.gamma);
     let shift = affine(&norm.beta) - per_channel(mean) * scale.clone();
-    x * scale.reshape([b, c, 1, 1]) + shift.reshape([b, c, 1, 1])
+    // Expanded, so that gradients are sums over one dimension after the other, not over all at once.
+    let [scale, shift] = [scale, shift].map(|x| x.reshape([b, c, 1, 1]).expand([b, c, h, w]));
+    x * scale + shift
 }

@@ -175,7 +175,8 @@ fn zero_gradients(device: &Device) -> Found {
     for _ in 0..STEPS {
         let rows = trained.rows();
         let zeros: Rows = names.iter().map(|name| (name.clone(), rows[name].zeros_like())).collect();
-        trained = optimizer.step(1.0, trained, zeros, 1.0);
+        let rows = optimizer.step(1.0, &trained, zeros, 1.0);
+        trained = trained.with_rows(&rows);
     }
     let (after, mut worst, mut all) = (trained.rows(), 0.0_f64, true);
     for name in &names {

@@ -19,7 +19,7 @@ use snapsnap_net::Window;
 use snapsnap_net::config::{Config, RegressorStart};
 use snapsnap_net::network::{PointMap, PointPredictor, View, anchors};
 use snapsnap_net::weights::random_regressors;
-use snapsnap_ops::host;
+use snapsnap_ops::{host, mean};
 use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
 
 use crate::TrainError;
@@ -248,10 +248,10 @@ impl Task for GaussianTask {
             add("l1", config.l1_share, photometric.l1);
             add("dissimilarity", 1.0 - config.l1_share, 1.0 - photometric.ssim);
             if config.alpha_weight > 0.0 {
-                add("alpha", config.alpha_weight, (coverage - mask).abs().mean());
+                add("alpha", config.alpha_weight, mean((coverage - mask).abs()));
             }
             if phase.scale_weight > 0.0 {
-                add("scale", phase.scale_weight, gaussians.scales.clone().mean());
+                add("scale", phase.scale_weight, mean(gaussians.scales.clone()));
             }
             if config.anisotropy_weight > 0.0 {
                 let penalty = anisotropy_penalty(&gaussians.scales, config.anisotropy_limit);

@@ -8,7 +8,7 @@ use snapsnap_net::Window;
 use snapsnap_net::config::Config;
 use snapsnap_net::gaussians::{Chosen, Seen, assemble, photograph_colors, placed, regress, side_images};
 use snapsnap_net::network::View;
-use snapsnap_ops::host;
+use snapsnap_ops::{host, mean};
 use snapsnap_splat::Gaussians;
 
 use crate::networks::Networks;
@@ -143,7 +143,7 @@ pub(super) fn targets(item: &Stage2Item, views: &[usize], device: &Device) -> (T
 pub fn anisotropy_penalty(scales: &Tensor<2>, limit: f64) -> Tensor<1> {
     let logs = scales.clone().clamp_min(1e-12).log();
     let ratio = logs.clone().max_dim(1) - logs.min_dim(1);
-    (ratio - limit.ln()).clamp_min(0.0).mean()
+    mean((ratio - limit.ln()).clamp_min(0.0))
 }
 
 #[cfg(test)]
