@@ -1,31 +1,32 @@
 #!/usr/bin/env bash
-# Trains the default weights: bash configs/default/train.sh MAKEHUMAN_DATA, in the repository's root. An interrupted training continues
-# when it is started again.
+# Trains networks like those of the default weights: bash configs/default/train.sh MAKEHUMAN_DATA AVATARS, in the repository's root. An
+# interrupted training continues when it is started again. docs/weights.md says where the default weights' own training differed.
 set -eu
-makehuman=$1
-# people FOLDER SPLIT SEED SYNTHETIC MAKEHUMAN OPTION…
+makehuman=$1 avatars=$2
+# people FOLDER SPLIT SEED COUNT OPTION…: people of each of the three makers.
 people() {
-  folder=people/$1 split=$2 seed=$3 synthetic=$4 made=$5
-  shift 5
-  cargo xtask prepare synth --split "$split" --subjects "$synthetic" --seed "$seed" "$@" -o "$folder/synth"
-  cargo xtask prepare makehuman "$makehuman" --split "$split" --subjects "$made" --seed "$((seed + 1))" "$@" -o "$folder/makehuman"
+  folder=people/$1
+  made() { cargo xtask prepare "$@" --set 'light.kind="random"' --set views.second_depth=true; }
+  options="--split $2 --seed $3 --subjects $4 ${*:5}"
+  made synth $options -o "$folder/synth"
+  made makehuman "$makehuman" $options -o "$folder/makehuman"
+  # Avatars that cannot be read are skipped, with exit code 2.
+  made avatars "$avatars" $options -o "$folder/avatars" || [ $? = 2 ]
 }
-own="--config configs/data/default.toml"
-people default train 101 967 910 $own
-people default val 101 16 16 $own
-# Other people, with smaller deviations of the cameras.
-less="--config configs/data/small.toml --set views.arrangement=groups --set views.front_within_degrees=30"
-people small train 1 300 300 $less
-people small val 1 24 24 $less
+for cameras in default phone; do
+  people $cameras train 901 220 --config configs/data/$cameras.toml
+  people $cameras val 901 24 --config configs/data/$cameras.toml
+done
 # A few people in views of the size of photographs.
-people large train 103 45 40 $own --set views.resolution=1024
-people large val 103 4 4 $own --set views.resolution=1024
-data="people/default/synth people/default/makehuman people/small/synth people/small/makehuman"
-cargo xtask train-stage1 --config configs/default/stage1.toml --data $data --resume -o runs/default-points
-# Stage 1 once more, with a high initial rate.
-cargo xtask train-stage1 --config configs/default/stage1.toml --data $data --weights runs/default-points/best.safetensors \
-  --set training.steps=12_000 --set optimizer.rate=6e-4 --set optimizer.muon.rate=9e-4 --resume -o runs/default-again
-cargo xtask train-stage2 --config configs/default/stage2.toml --data $data --weights runs/default-again/best.safetensors --resume -o runs/default-both
-cargo xtask train-stage2 --config configs/default/regressor.toml --data people/large/synth people/large/makehuman \
-  --weights runs/default-both/best.safetensors --resume -o runs/default
+people large train 903 30 --config configs/data/default.toml --set views.resolution=1024
+people large val 903 4 --config configs/data/default.toml --set views.resolution=1024
+data="people/default/synth people/default/makehuman people/default/avatars people/phone/synth people/phone/makehuman people/phone/avatars"
+cargo xtask train-stage1 --config configs/default/phone.toml --data $data --resume -o runs/default-points
+completed() {
+  cargo xtask train-stage2 --set 'network.sides="completed"' --set network.second_layer=true --set samples.second_depth=true \
+    --set 'regressor.least_opacities=[0.95, 0.0]' --resume "$@"
+}
+completed --config configs/default/stage2.toml --data $data --weights runs/default-points/best.safetensors -o runs/default-both
+completed --config configs/default/regressor.toml --data people/large/synth people/large/makehuman people/large/avatars \
+  --weights runs/default-both/best.safetensors -o runs/default
 cargo xtask import-weights runs/default/best.safetensors --half -o default.safetensors
