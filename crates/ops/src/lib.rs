@@ -171,7 +171,7 @@ pub fn spread_last(x: Tensor<3>, n: usize) -> Tensor<3> {
 
 /// The largest divisor of `n` that is not larger than its root.
 fn near_root(n: usize) -> usize {
-    (1..=n.isqrt()).rev().find(|inner| n % inner == 0).unwrap_or(1)
+    (1..=n.isqrt()).rev().find(|inner| n.is_multiple_of(*inner)).unwrap_or(1)
 }
 
 /// The mean of all values `[1]`, as [`sum_last`] adds them up.

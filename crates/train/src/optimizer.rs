@@ -313,7 +313,6 @@ mod tests {
     use burn::optim::momentum::MomentumConfig;
     use burn::optim::{AdjustLrFn, MuonConfig, Optimizer as _};
     use burn::tensor::Distribution;
-    use snapsnap_net::config::{Config, NetworkConfig};
     use snapsnap_net::weights::random_predictor;
 
     /// Burn's Muon takes matrices only.
@@ -352,8 +351,7 @@ mod tests {
         let devices = [Device::flex(), Device::ndarray()];
         let config = OptimizerConfig { muon: Some(MuonSettings::default()), ..OptimizerConfig::default() };
         let [host, other] = devices.map(|device| {
-            let network = Config { network: small(), ..Config::default() };
-            let predictor = random_predictor(&network, 1, &device);
+            let predictor = random_predictor(&crate::stability::config(&[]).networks(), 1, &device);
             let mut networks = Networks { predictor: Some(predictor), regressors: Vec::new() };
             let mut optimizer = config.init();
             for step in 1..3 {
@@ -365,23 +363,5 @@ mod tests {
             networks.checkpoint()
         });
         assert!(host == other);
-    }
-
-    fn small() -> NetworkConfig {
-        let sizes = [4, 4, 8, 8];
-        NetworkConfig {
-            patch: 8,
-            enc_dim: 16,
-            enc_heads: 2,
-            enc_depth: 1,
-            dec_dim: 16,
-            dec_heads: 2,
-            dec_depth: 1,
-            layer_dims: sizes,
-            last_dim: 8,
-            resolution: 64,
-            net_resolution: 64,
-            ..NetworkConfig::default()
-        }
     }
 }

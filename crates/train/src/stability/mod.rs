@@ -248,7 +248,7 @@ fn ends_of_the_rate() -> Found {
     Found { value: Some(worst), ..Found::default() }.must(sound, "a rate is negative, too high or not finite")
 }
 
-fn config(overrides: &[String]) -> TrainConfig {
+pub(crate) fn config(overrides: &[String]) -> TrainConfig {
     let overrides = [&SETTINGS.map(String::from)[..], overrides].concat();
     TrainConfig::from_toml(SMALL, "the small networks", &overrides).expect("a config")
 }
