@@ -3,11 +3,11 @@
 use crate::multiply::{Multiply, Right};
 
 /// Coefficients of a step, of x, x³ and x⁵: those of Muon's authors, which bring singular values to between 0.7 and 1.2.
-pub const COEFFICIENTS: [f32; 3] = [3.4445, -4.775, 2.0315];
+const COEFFICIENTS: [f32; 3] = [3.4445, -4.775, 2.0315];
 /// How many steps there are.
-pub const STEPS: usize = 5;
+const STEPS: usize = 5;
 /// Smaller norms are taken for this.
-pub const MIN_NORM: f32 = 1e-7;
+const MIN_NORM: f32 = 1e-7;
 
 /// A matrix `[rows, columns]` with its singular values brought close to 1 by Newton-Schulz steps. On one thread: matrices
 /// are many, and small.

@@ -120,7 +120,8 @@ fn is_hidden(name: &str, rank: usize) -> bool {
 }
 
 impl Optimizer {
-    /// The device of a step for networks on `device`. Muon's matrices are many and small: the cores of the host are faster.
+    /// The device of a step for networks on `device`. With Muon it is the host: matrices are many and small, and each would be
+    /// dozens of kernels on a GPU.
     pub(crate) fn device(&self, device: Device) -> Device {
         if self.config.muon.is_some() { Device::flex() } else { device }
     }
