@@ -32,11 +32,16 @@ const CENTRE: Vec3 = Vec3::new(0.05, 0.9, -0.03);
 
 /// The ellipsoid, and a speck that flies beside it.
 fn written(path: &Path) {
-    written_around(path, CENTRE);
+    written_around(path, CENTRE, 1.0);
 }
 
-fn written_around(path: &Path, centre: Vec3) {
+/// The part of the ellipsoid below this share of its half height, and the speck.
+fn written_around(path: &Path, centre: Vec3, height: f32) {
     let (mut means, mut colors) = shell(20_000, HALF, centre);
+    // From top to bottom.
+    let above = 3 * means.as_chunks::<3>().0.iter().take_while(|p| p[1] - centre.y > height * HALF.y).count();
+    means.drain(..above);
+    colors.drain(..above);
     let (speck, its) = shell(40, Vec3::splat(0.015), centre + Vec3::new(0.32, 0.3, 0.0));
     means.extend(speck);
     colors.extend(its);
@@ -93,7 +98,7 @@ fn a_shell_becomes_one_closed_surface_of_its_size_and_colours_in_every_kind_of_f
     // The last in the coordinates of a survey, where f32 has steps of a millimetre.
     let far = Vec3::new(9_000.0, 120.0, -11_000.0);
     for (name, centre) in [("a.glb", CENTRE), ("a.obj", CENTRE), ("mesh.ply", far)] {
-        written_around(&path("human.ply"), centre);
+        written_around(&path("human.ply"), centre, 1.0);
         let mut command = snapsnap();
         command.arg("mesh").arg(path("human.ply")).arg("-o").arg(path(name));
         // Twelve thousand triangles of a GLB have a texture otherwise, and an OBJ of colours needs no material beside it.
@@ -116,6 +121,27 @@ fn a_shell_becomes_one_closed_surface_of_its_size_and_colours_in_every_kind_of_f
             assert!(above.abs() < 0.03 || (*color - expected).length() < 0.08, "{name}: {p} is {color}");
         }
     }
+}
+
+/// Level cameras do not see the crown of a head.
+#[test]
+fn a_hole_at_the_top_is_closed_and_the_inside_stays_solid() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let path = |name: &str| temporary.path().join(name);
+    let height = 0.7;
+    written_around(&path("human.ply"), CENTRE, height);
+    let mut command = snapsnap();
+    command.arg("mesh").arg(path("human.ply")).arg("-o").arg(path("mesh.ply"));
+    succeed(command.args(["--faces", "0", "--device", "cpu"]));
+    let mesh = import::read(&path("mesh.ply")).expect("a mesh");
+    check_closed(&mesh);
+    let highest = mesh.positions.iter().map(|p| p.y - CENTRE.y).fold(f32::MIN, f32::max);
+    assert!((highest - height * HALF.y).abs() < 0.03, "{highest}");
+    let whole = 4.0 / 3.0 * std::f64::consts::PI * f64::from(HALF.x * HALF.y * HALF.z);
+    // The ellipsoid without its cap.
+    let expected = whole * (1.0 - (1.0 - f64::from(height)).powi(2) * (2.0 + f64::from(height)) / 4.0);
+    let found = volume(&mesh);
+    assert!((found / expected - 1.0).abs() < 0.06, "{found} m³ instead of {expected}");
 }
 
 #[test]
@@ -224,7 +250,7 @@ fn bodies_of_every_size_and_place_keep_their_shape() {
     let temporary = tempfile::tempdir().expect("temporary folder");
     let path = |name: &str| temporary.path().join(name);
     let far = Vec3::new(9_000.0, 120.0, -11_000.0);
-    written_around(&path("far.ply"), far);
+    written_around(&path("far.ply"), far, 1.0);
     for name in ["far.obj", "mesh.ply", "far.glb"] {
         let made = mesh_of(
             &path("far.ply"),

@@ -36,6 +36,8 @@ const SIDE: u32 = 640;
 const TEXTURE_SIDE: u32 = 1600;
 /// Largest distance from the surface that the field contains, in cubes.
 const TRUNCATION: f32 = 4.0;
+/// Largest distance between the inner and the outer side of one surface, in cubes.
+const THICKNESS: f32 = 2.0;
 /// Fewest views through a place that is outside. Gaps between the shells of front, back and sides are visible from few
 /// directions, the surroundings of a body from many.
 const FREE_VIEWS: u8 = 3;
@@ -160,13 +162,15 @@ pub fn fuse(scene: &Loaded, options: Options, stage: &dyn Fn(&str)) -> Result<Fu
     let most = if options.force { u64::MAX } else { MAX_INTERSECTIONS };
     let views: Result<Vec<View>, SplatError> =
         cameras.map(|camera| View::new(&scene, camera, radius, most)).collect();
-    let views = views.map_err(|e| match e {
+    let mut views = views.map_err(|e| match e {
         SplatError::TooManyIntersections { found, limit } if limit == most => {
             let millions = found / 1_000_000;
             FuseError::Long(format!("a view of it has {millions} million pairs of a splat and a tile"))
         }
         e => e.into(),
     })?;
+
+    views::distrust_inner_sides(&mut views, THICKNESS * cell);
 
     stage("distance field");
     let mut grid = Grid { origin: -0.5 * size - margin, cell, counts, values: Vec::new() };

@@ -2,6 +2,7 @@
 
 use burn::tensor::Tensor;
 use glam::{DAffine3, DMat3, DMat4, DVec2, DVec3, Mat4, Vec3};
+use rayon::prelude::*;
 use snapsnap_splat::scene::Loaded;
 use snapsnap_splat::{Camera, RenderOptions, RigidTransform, SplatError, render};
 
@@ -14,18 +15,21 @@ const DISTANCE: f64 = 4.0;
 pub const COVERED: f32 = 0.5;
 /// Least cosine between a surface's normal and the ray. The pixels of flatter surfaces mix surfaces behind one another.
 const FLATTEST: f32 = 0.15;
+/// Side in pixels of the squares that are visible from inside as a whole or not at all.
+const SQUARE: usize = 2;
+/// Views of the other side of a surface for each view of this one, weighted by cosines, beyond which the other side is the outer one.
+const OTHER_SIDE: f32 = 2.0;
 
 /// View of one camera.
 pub struct View {
+    camera: Camera,
     /// Centre of the camera, world metres.
     centre: Vec3,
-    /// Side of the picture in pixels.
-    side: u32,
     /// From the world to pixels times depth, and depth.
     projection: Mat4,
     /// Metres along the optical axis; 0 at pixels without a surface.
     depth: Vec<f32>,
-    /// Cosine between the surface's normal and the ray; 0 where it is unknown or the surface too flat.
+    /// Cosine between the surface's normal and the ray; 0 where it is unknown, the surface too flat or seen from inside.
     facing: Vec<f32>,
     /// Red, green and blue in [0, 1], divided by the coverage.
     color: Vec<Vec3>,
@@ -77,25 +81,53 @@ impl View {
             depth.iter().zip(&alpha).map(|(z, a)| if *a > COVERED { z / a } else { 0.0 }).collect();
         let color = color.as_chunks::<3>().0.iter().zip(&alpha);
         let color = color.map(|(c, a)| Vec3::from_array(*c) / a.max(COVERED)).collect();
-        let facing = facing(&depth, &camera);
-        Ok(Self {
+        let mut view = Self {
             centre: camera.centre().as_vec3(),
-            side: camera.width,
             projection: projection(&camera),
+            facing: vec![0.0; depth.len()],
+            camera,
             depth,
-            facing,
             color,
-        })
+        };
+        view.facing = (0..view.depth.len())
+            .map(|pixel| {
+                let Some((place, normal)) = view.patch(pixel) else { return 0.0 };
+                let cosine = -normal.dot(place.normalize_or_zero());
+                if cosine < FLATTEST { 0.0 } else { cosine }
+            })
+            .collect();
+        Ok(view)
+    }
+
+    /// Place of the surface in a pixel and its normal towards the camera, metres in the camera's frame. `None` at the border of the
+    /// picture and of the surface.
+    fn patch(&self, pixel: usize) -> Option<(Vec3, Vec3)> {
+        let side = self.camera.width as usize;
+        let (x, y) = (pixel % side, pixel / side);
+        if x == 0 || y == 0 || x + 1 == side || y + 1 == side {
+            return None;
+        }
+        let point = |x: usize, y: usize| {
+            let z = self.depth[y * side + x];
+            let Camera { principal_point, focal, .. } = self.camera;
+            let at = (DVec2::new(x as f64 + 0.5, y as f64 + 0.5) - principal_point) / focal;
+            (z > 0.0).then(|| z * at.as_vec2().extend(1.0))
+        };
+        let place = point(x, y)?;
+        let across = point(x + 1, y)? - point(x - 1, y)?;
+        let down = point(x, y + 1)? - point(x, y - 1)?;
+        let normal = across.cross(down).normalize_or_zero();
+        Some((place, if normal.dot(place) > 0.0 { -normal } else { normal }))
     }
 
     /// The pixel and the depth of a place.
     fn pixel(&self, place: Vec3) -> Option<(usize, f32)> {
         let p = self.projection.transform_point3(place);
         let (x, y) = (p.x / p.z, p.y / p.z);
-        let side = self.side as f32;
+        let side = self.camera.width as f32;
         let within = p.z > 0.0 && x >= 0.0 && y >= 0.0 && x < side && y < side;
         // The conversion of numbers from 0 on rounds down.
-        within.then(|| (y as usize * self.side as usize + x as usize, p.z))
+        within.then(|| (y as usize * self.camera.width as usize + x as usize, p.z))
     }
 
     /// Distance in metres along the optical axis from a place to the surface behind it, and the cosine between the surface's
@@ -135,25 +167,39 @@ fn projection(camera: &Camera) -> Mat4 {
     DMat4::from(projection).as_mat4()
 }
 
-/// Cosines between the rays and the normals of a depth map.
-fn facing(depth: &[f32], camera: &Camera) -> Vec<f32> {
-    let side = camera.width as usize;
-    let point = |x: usize, y: usize| {
-        let z = depth[y * side + x];
-        let at = (DVec2::new(x as f64 + 0.5, y as f64 + 0.5) - camera.principal_point) / camera.focal;
-        (z > 0.0).then(|| z * at.as_vec2().extend(1.0))
-    };
-    let mut facing = vec![0.0; depth.len()];
-    for y in 1..side - 1 {
-        for x in 1..side - 1 {
-            let around = [point(x - 1, y), point(x + 1, y), point(x, y - 1), point(x, y + 1), point(x, y)];
-            let [Some(left), Some(right), Some(up), Some(down), Some(here)] = around else { continue };
-            let normal = (right - left).cross(down - up).normalize_or_zero();
-            let cosine = normal.dot(here.normalize_or_zero()).abs();
-            facing[y * side + x] = if cosine < FLATTEST { 0.0 } else { cosine };
+/// Marks pixels that show the inner side of a surface as not to be trusted. Level cameras do not see the top of a head. Through the hole
+/// there a camera above sees the far wall from inside, and what lies before that wall is not outside. The side that more views show is the
+/// outer one. `reach` is the largest distance between the two sides of one surface, metres.
+pub fn distrust_inner_sides(views: &mut [View], reach: f32) {
+    let inner = |view: &View, pixel: usize| {
+        let (place, normal) = view.patch(pixel)?;
+        let to_world = view.camera.world_to_camera.rotation.transpose().as_mat3();
+        let (place, normal) = (view.centre + to_world * place, to_world * normal);
+        let (mut this, mut other) = (0.0, 0.0);
+        for from in views.iter() {
+            if from.color(place, reach).is_some() {
+                let cosine = -normal.dot(from.towards(place));
+                *(if cosine > 0.0 { &mut this } else { &mut other }) += cosine.abs();
+            }
         }
+        Some(other > OTHER_SIDE * this)
+    };
+    let squares = |view: &View| {
+        let side = view.camera.width as usize;
+        let corners = (0..side).step_by(SQUARE).flat_map(|y| (0..side).step_by(SQUARE).map(move |x| (x, y)));
+        let square = |(x, y): (usize, usize)| {
+            let rows = y..(y + SQUARE).min(side);
+            let pixels = rows.flat_map(move |y| (x..(x + SQUARE).min(side)).map(move |x| y * side + x));
+            let is_inner = |pixel| inner(view, pixel) == Some(true);
+            let known = pixels.clone().find(|pixel| view.facing[*pixel] > 0.0);
+            known.is_some_and(is_inner).then_some(pixels)
+        };
+        corners.filter_map(square).flatten().collect()
+    };
+    let marked: Vec<Vec<usize>> = views.par_iter().map(squares).collect();
+    for (view, pixels) in views.iter_mut().zip(marked) {
+        pixels.into_iter().for_each(|pixel| view.facing[pixel] = 0.0);
     }
-    facing
 }
 
 /// The values of a tensor.
