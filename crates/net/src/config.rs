@@ -18,6 +18,9 @@ pub use modes::{
 /// up to 3 more because an enlarged pixel lies beside its source. Rounded up to a multiple of 4.
 pub const RECEPTIVE_RADIUS: usize = 100;
 
+/// `network.pair_degrees` of a front and a back.
+pub const OPPOSITE: f64 = 180.0;
+
 /// The config of the networks.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -118,6 +121,10 @@ pub struct NetworkConfig {
     /// beyond lie between two surfaces and are left out. Unset: all points are kept.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub steepest: Option<f32>,
+    /// Degrees that the camera of the second photograph stands around the person from the first one's, counter-clockwise as seen from
+    /// above. 180: front and back. Others are for scenes of several known cameras, and have no unseen sides.
+    #[serde(skip_serializing_if = "is_opposite")]
+    pub pair_degrees: f64,
     /// Whether a transformer's tokens without a person in either photograph are left out.
     pub drop_empty: bool,
 }
@@ -161,9 +168,14 @@ impl Default for NetworkConfig {
             on_rays: false,
             hull_margin: None,
             steepest: None,
+            pair_degrees: OPPOSITE,
             drop_empty: false,
         }
     }
+}
+
+fn is_opposite(degrees: &f64) -> bool {
+    *degrees == OPPOSITE
 }
 
 impl NetworkConfig {

@@ -244,7 +244,12 @@ impl TrainConfig {
 
     /// The samples' config, with the height of people from the section `[mode]`.
     pub fn samples(&self) -> SampleConfig {
-        SampleConfig { person_height: self.networks().person_height(), ..self.samples.clone() }
+        let Config { network, .. } = self.networks();
+        SampleConfig {
+            person_height: self.networks().person_height(),
+            pair_degrees: network.pair_degrees,
+            ..self.samples.clone()
+        }
     }
 
     fn problem(&self) -> Option<(String, String)> {

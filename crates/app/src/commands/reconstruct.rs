@@ -9,7 +9,7 @@ use snapsnap_base::config::Schema;
 use snapsnap_base::file;
 use snapsnap_data::photo::{self, Canvas, Cutting, Pair, Placement, Source};
 use snapsnap_mesh::picture;
-use snapsnap_net::config::{Config, WorldFrame};
+use snapsnap_net::config::{Config, OPPOSITE, WorldFrame};
 use snapsnap_net::precision::{Precision, PrecisionChoice, unit_of_cpu};
 use snapsnap_net::weights::WeightFile;
 use snapsnap_net::weights::schema::Part;
@@ -159,6 +159,13 @@ impl ModelArguments {
 
     /// Loads the networks.
     pub fn load(&self, weights: &WeightFile, device: &Device) -> Result<(Reconstructor, Precision), Failure> {
+        let degrees = weights.config.network.pair_degrees;
+        if degrees != OPPOSITE {
+            bail!(
+                "{}: `network.pair_degrees` is {degrees}: these networks are for several known cameras                  (`views.inputs` of `evaluate`), not for a front and a back",
+                weights.path().display()
+            );
+        }
         let precision = self.precision.of_weights(&weights.config, device);
         if !device.supports_dtype(precision.dtype()) {
             bail!("--device {}: does not compute in {}", self.device, precision.name());

@@ -20,7 +20,7 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use snapsnap_splat::Camera;
 
-use crate::dataset::{Arrangement, Folder, Layout, Split};
+use crate::dataset::{Arrangement, Description, Folder, Layout, Split};
 use crate::photo::{Canvas, on_canvas, place};
 pub use augment::Augment;
 pub use handling::Handling;
@@ -33,6 +33,8 @@ pub use stage1::{Stage1, Stage1Batch, Stage1Batcher, Stage1Item};
 pub use stage2::{Stage2, Stage2Item};
 pub use test_set::{Test, TestItem};
 
+/// Degrees between front and back.
+const OPPOSITE: f64 = 180.0;
 /// Least coverage of a pixel of the person, in 8 bits.
 const INSIDE: u8 = 128;
 
@@ -68,6 +70,9 @@ pub struct SampleConfig {
     /// Height of a placed person in pixels of a canvas of 1024: `mode.person_height`.
     #[serde(skip)]
     pub person_height: usize,
+    /// Degrees between the two photographs' cameras: `network.pair_degrees`.
+    #[serde(skip)]
+    pub pair_degrees: f64,
     /// Seed of everything that is random.
     pub seed: u64,
     /// Changes to the two input photographs.
@@ -88,6 +93,7 @@ impl Default for SampleConfig {
             placed_share: 0.0,
             upright: false,
             person_height: 739,
+            pair_degrees: OPPOSITE,
             seed: 1,
             augment: Augment::default(),
         }
@@ -120,6 +126,17 @@ impl SampleConfig {
         ];
         if let Some((key, message, _)) = beside_compat.into_iter().find(|(.., wrong)| self.compat && *wrong) {
             return Some((key.into(), format!("{message} beside `compat = true`")));
+        }
+        // Samples of neighbours are those of known cameras.
+        let beside_neighbours = [
+            ("placed_share", "must be 0", self.placed_share > 0.0),
+            ("upright", "must be false", self.upright),
+            ("augment.flip", "must be false", self.augment.flip),
+        ];
+        let is_pair = self.pair_degrees == OPPOSITE;
+        if let Some((key, message, _)) = beside_neighbours.into_iter().find(|(.., wrong)| !is_pair && *wrong)
+        {
+            return Some((key.into(), format!("{message} unless `network.pair_degrees` is 180")));
         }
         self.augment.problem().map(|(key, message)| (format!("augment.{key}"), message))
     }
@@ -195,6 +212,15 @@ impl Source {
         if config.second_depth && !folder.description().second_depth {
             return Err(wrong("has no second surfaces, which `second_depth` needs".into()));
         }
+        if config.pair_degrees != OPPOSITE {
+            let steps = config.pair_degrees * views as f64 / 360.0;
+            if folder.description().arrangement != Arrangement::Ring || steps.fract() != 0.0 {
+                let degrees = config.pair_degrees;
+                return Err(wrong(format!(
+                    "`network.pair_degrees` needs a ring of views with two that are {degrees}° apart"
+                )));
+            }
+        }
         let subjects = folder.subjects(split)?;
         if subjects.is_empty() {
             return Err(wrong("has no subject in this split".into()));
@@ -225,6 +251,16 @@ impl Source {
             return random.random_range(0..count);
         }
         (count + random.random_range(0..=2 * reach) - reach) % count
+    }
+
+    /// Front, back, and the sides at +90° and +270°. The back is a neighbour with other `pair_degrees`.
+    fn order(&self, front: usize) -> [usize; 4] {
+        let Description { arrangement, views, .. } = *self.folder.description();
+        let mut order = arrangement.four(front, views);
+        if self.config.pair_degrees != OPPOSITE {
+            order[1] = (front + (self.config.pair_degrees * views as f64 / 360.0) as usize) % views;
+        }
+        order
     }
 
     /// The camera that unprojects depths: the exact camera, or, with `compat`, the stored one as in the published code.

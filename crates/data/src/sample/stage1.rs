@@ -77,10 +77,8 @@ impl Stage1Item {
 
     fn new(source: &Source, index: usize) -> Result<Self, FileError> {
         let (subject, mut random) = source.subject(1, index);
-        let count = source.folder.description().views;
         let first = source.front(&mut random);
-        // Front, back, and the sides at +90° and +270°.
-        let order = source.folder.description().arrangement.four(first, count);
+        let order = source.order(first);
         let side = source.folder.description().resolution as usize;
         let is_placed = source.is_placed(&mut random);
         let Four { images, masks, points, valid, second, .. } =

@@ -73,7 +73,7 @@ impl Stage2Item {
         let description = folder.description();
         let count = description.views;
         let first = if config.compat { 0 } else { source.front(&mut random) };
-        let order = description.arrangement.four(first, count);
+        let order = source.order(first);
         let [front, back, right, left] = order;
         let camera = |view: usize| folder.camera(*split, subject, view).map(|stored| source.camera(&stored));
         let mut cameras = [camera(front)?, camera(back)?, camera(right)?, camera(left)?];

@@ -5,14 +5,14 @@ use std::time::{Duration, Instant};
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use snapsnap_data::photo::Mapping;
 use snapsnap_data::sample::{Handling, Restoration, TestItem};
-use snapsnap_net::config::PrecisionChoice;
+use snapsnap_net::config::{OPPOSITE, PrecisionChoice};
 use snapsnap_net::gaussians::placed;
 use snapsnap_net::weights::{WeightFile, WeightsError};
 use snapsnap_net::{Reconstruction, Reconstructor};
 use snapsnap_ops::host;
 use snapsnap_splat::Gaussians;
 
-use super::person::photograph;
+use super::person::{degrees, photograph};
 use crate::EvalError;
 use crate::variant::Variant;
 
@@ -72,6 +72,19 @@ impl Model {
         self.reconstructor.config().network.resolution
     }
 
+    /// Refuses cameras `found` degrees apart for networks of neighbours.
+    fn check_pair(&self, found: f64) -> Result<(), EvalError> {
+        /// Largest deviation of a known camera, degrees.
+        const MOST: f64 = 0.5;
+        let expected = self.reconstructor.config().network.pair_degrees;
+        if expected != OPPOSITE && (found - expected).abs() > MOST {
+            return Err(EvalError::Empty(format!(
+                "`views.inputs` are {found:.1}° apart, but `network.pair_degrees` of the weights is {expected}"
+            )));
+        }
+        Ok(())
+    }
+
     /// Gaussians of a person seen from the views `inputs`. With more than two photographs, each and the next around the
     /// circle form a pair, in the frame of the known camera of its first one.
     ///
@@ -88,6 +101,8 @@ impl Model {
             let pair = [&photographs[first], &photographs[(first + 1) % inputs.len()]];
             let mut made = self.reconstructor.reconstruct(pair[0], pair[1], &|_| ());
             let camera = &item.cameras[inputs[first]];
+            let second = &item.cameras[inputs[(first + 1) % inputs.len()]];
+            self.check_pair(degrees(second, camera))?;
             let mut to_world = camera.world_to_camera.inverse();
             let mut scale = 1.0;
             let is_placed = item.mappings[first] != Mapping::AS_IT_IS;

@@ -5,8 +5,8 @@ use snapsnap_base::config::outside;
 use crate::weights::schema::{self, TensorSpec};
 
 use super::{
-    Anchor, Body, Config, Downsample, HeadKind, RegressorColor, RegressorStart, RotationFrame, Schema, Sides,
-    Upsample, WorldFrame,
+    Anchor, Body, Config, Downsample, HeadKind, OPPOSITE, RegressorColor, RegressorStart, RotationFrame,
+    Schema, Sides, Upsample, WorldFrame,
 };
 
 /// Largest number of parameters: seven times the published size, 16 GB of f32.
@@ -99,6 +99,15 @@ impl Config {
             let needed = "`network.sides = \"completed\"` and `network.side_heads = true`";
             return refuse("network.second_layer", format!("needs {needed}"));
         }
+        if let Some((key, message)) = outside([("network.pair_degrees", n.pair_degrees, 1.0..=359.0)]) {
+            return refuse(key, message);
+        }
+        // Mirrored, the second photograph would stand on the other side.
+        let opposite = [("side_heads", n.side_heads), ("mirror", n.mirror), ("both_ways", n.both_ways)];
+        if let Some((key, _)) = opposite.iter().find(|(_, set)| *set && n.pair_degrees != OPPOSITE) {
+            let message = format!("must be 180 beside `network.{key} = true`");
+            return refuse("network.pair_degrees", message);
+        }
         if !n.net_resolution.is_multiple_of(n.patch) {
             let message = format!("{} is no multiple of the patch {}", n.net_resolution, n.patch);
             return refuse("network.net_resolution", message);
@@ -176,6 +185,7 @@ impl Config {
             ("network.ray_channels", !self.network.ray_channels, "false"),
             ("network.mirror", !self.network.mirror, "false"),
             ("network.sides", self.network.sides == Sides::Predicted, "\"predicted\""),
+            ("network.pair_degrees", self.network.pair_degrees == OPPOSITE, "180"),
             ("network.second_layer", !self.network.second_layer, "false"),
             ("network.both_ways", !self.network.both_ways, "false"),
             ("network.on_rays", !self.network.on_rays, "false"),

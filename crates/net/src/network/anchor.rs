@@ -8,19 +8,20 @@ use snapsnap_splat::{Camera, RigidTransform};
 use super::View;
 use crate::crop::Window;
 
-/// Yaw of a view's nominal camera, degrees.
-fn yaw(view: View) -> f64 {
+/// Yaw of a view's nominal camera, degrees. The second photograph's is `pair_degrees`.
+fn yaw(view: View, pair_degrees: f64) -> f64 {
     match view {
         View::Front => 0.0,
         View::Right | View::RightSecond => 90.0,
-        View::Back => 180.0,
+        View::Back => pair_degrees,
         View::Left | View::LeftSecond => 270.0,
     }
 }
 
 /// A view's nominal camera of a canvas of `side`² pixels, and the motion from the front camera's frame to its own.
-pub(super) fn nominal(view: View, side: usize) -> (Camera, RigidTransform) {
-    let [front, camera] = [0.0, yaw(view)].map(|yaw| Camera::orbit_at_yaw_degrees(yaw, side as u32));
+pub(super) fn nominal(view: View, pair_degrees: f64, side: usize) -> (Camera, RigidTransform) {
+    let [front, camera] =
+        [0.0, yaw(view, pair_degrees)].map(|yaw| Camera::orbit_at_yaw_degrees(yaw, side as u32));
     (camera, front.world_to_camera.inverse().then(&camera.world_to_camera))
 }
 
@@ -35,8 +36,8 @@ pub(super) struct Rays {
 }
 
 impl Rays {
-    pub(super) fn new(view: View, side: usize, window: &Window, device: &Device) -> Self {
-        let (camera, from_front) = nominal(view, side);
+    pub(super) fn new(view: View, pair_degrees: f64, side: usize, window: &Window, device: &Device) -> Self {
+        let (camera, from_front) = nominal(view, pair_degrees, side);
         let to_front = from_front.inverse();
         let centre = camera.centre();
         // The axis is the world's y; towards the camera, level.
@@ -63,9 +64,10 @@ impl Rays {
     }
 }
 
-/// The anchors of a view's pixels in a window of a canvas of `side`² pixels, `[1, h, w, 3]` metres, front camera's frame.
-pub fn anchors(view: View, side: usize, window: &Window, device: &Device) -> Tensor<4> {
-    let Rays { directions, depths, centre } = Rays::new(view, side, window, device);
+/// The anchors of a view's pixels in a window of a canvas of `side`² pixels, `[1, h, w, 3]` metres, front camera's frame. The second
+/// photograph was taken `pair_degrees` around the person from the first.
+pub fn anchors(view: View, pair_degrees: f64, side: usize, window: &Window, device: &Device) -> Tensor<4> {
+    let Rays { directions, depths, centre } = Rays::new(view, pair_degrees, side, window, device);
     directions * depths + centre
 }
 
@@ -78,15 +80,17 @@ mod tests {
     fn anchors_lie_on_their_rays_and_on_the_planes_through_the_axis() {
         let (side, device) = (64, Device::flex());
         let front = Camera::orbit_at_yaw_degrees(0.0, side as u32);
+        let slanted = DVec3::new(72_f64.to_radians().sin(), 0.0, 72_f64.to_radians().cos());
         for (view, yaw, normal) in [
             (View::Front, 0.0, DVec3::Z),
             (View::Back, 180.0, DVec3::Z),
+            (View::Back, 72.0, slanted),
             (View::Right, 90.0, DVec3::X),
             (View::Left, 270.0, DVec3::X),
         ] {
             let window = Window { rows: 8..56, columns: 16..40 };
             let values: Vec<f32> =
-                anchors(view, side, &window, &device).into_data().try_into_vec().expect("f32");
+                anchors(view, yaw, side, &window, &device).into_data().try_into_vec().expect("f32");
             let camera = Camera::orbit_at_yaw_degrees(yaw, side as u32);
             let inverse = front.world_to_camera.inverse();
             for (i, p) in values.chunks_exact(3).enumerate() {

@@ -11,7 +11,7 @@ use super::anchor::Rays;
 use super::convolution::{UNet, UNetSizes};
 use super::dpt::conv1x1;
 use super::shells::{Visible, depths};
-use crate::config::NetworkConfig;
+use crate::config::{NetworkConfig, OPPOSITE};
 use crate::crop::Window;
 use snapsnap_ops::host;
 use snapsnap_ops::layers::conv2d;
@@ -155,7 +155,7 @@ impl Seen {
         let [second, farthest] =
             [rows.second, rows.farthest].map(|rows| image(taken(table.clone().narrow(1, 0, 6), &rows), 6));
         let nearest = image(taken(table, &rows.nearest), c);
-        let rays = Rays::new(view, side, window, &device);
+        let rays = Rays::new(view, OPPOSITE, side, window, &device);
         let anchors = rays.depths.permute([0, 3, 1, 2]);
         let is_there = |point: &Tensor<4>| point.clone().narrow(1, 4, 2).sum_dim(1);
         let beside = |point: &Tensor<4>| (point.clone().narrow(1, 0, 1) - anchors.clone()) * is_there(point);
@@ -231,7 +231,7 @@ mod tests {
             let away = if view == View::Front { -1.0 } else { 1.0 };
             let off = (noise([1, h, w, 1], view as u32 + 1) + 1.2) * (0.05 * away);
             let z = Tensor::<1>::from_floats([0.0, 0.0, 1.0], &device).reshape([1, 1, 1, 3]);
-            anchors(view, SIDE, window, &device) + off * z
+            anchors(view, OPPOSITE, SIDE, window, &device) + off * z
         });
         Photographed {
             points: Tensor::stack(points.to_vec(), 1),
@@ -303,7 +303,7 @@ mod tests {
         let seen = Seen::new(View::Right, SIDE, &window, (points.clone(), table * 0.5), rows);
         let gradients = seen.depths[0].clone().sum().backward();
         let gradient = host(points.grad(&gradients).expect("a gradient"));
-        let axis = nominal(View::Right, SIDE).1.rotation.row(2).as_vec3().to_array();
+        let axis = nominal(View::Right, OPPOSITE, SIDE).1.rotation.row(2).as_vec3().to_array();
         for (i, gradient) in gradient.chunks_exact(3).enumerate() {
             let expected = if shown.contains(&(i as i32)) { axis } else { [0.0; 3] };
             assert!((0..3).all(|c| (gradient[c] - expected[c]).abs() < 1e-5), "{i}: {gradient:?}");
@@ -347,8 +347,8 @@ mod tests {
                 let known: Vec<f32> = maps[..2].iter().flat_map(|(_, map)| of(map)).collect();
                 let mut covered = [0; 4];
                 for ((view, map), covered) in maps[2..].iter().zip(&mut covered) {
-                    let anchors = host(anchors(*view, SIDE, &window, &Device::flex()));
-                    let (camera, to_side) = nominal(*view, SIDE);
+                    let anchors = host(anchors(*view, OPPOSITE, SIDE, &window, &Device::flex()));
+                    let (camera, to_side) = nominal(*view, OPPOSITE, SIDE);
                     for (point, anchor) in of(map).chunks_exact(3).zip(anchors.chunks_exact(3)) {
                         let apart = |p: &[f32]| (0..3).map(|c| (p[c] - point[c]).powi(2)).sum::<f32>().sqrt();
                         if apart(anchor) < 1e-5 {

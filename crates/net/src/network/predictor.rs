@@ -40,7 +40,7 @@ impl PointMap {
         let Self { mut points, conf } = self;
         let side = config.resolution;
         if let Some(mask) = mask.filter(|_| config.on_rays) {
-            points = on_rays(view, side, window, points, mask);
+            points = on_rays(view, config.pair_degrees, side, window, points, mask);
         }
         if *window == Window::whole(side) {
             return Self { points, conf };
@@ -253,7 +253,8 @@ impl PointPredictor {
         match config.anchor {
             Anchor::None => map,
             Anchor::Ray => {
-                let anchors = anchors(view, config.resolution, window, &map.points.device());
+                let anchors =
+                    anchors(view, config.pair_degrees, config.resolution, window, &map.points.device());
                 PointMap { points: map.points + anchors, ..map }
             }
         }
@@ -365,7 +366,8 @@ impl PointPredictor {
         let [front, back] = [0, images.dims()[0] / 2].map(|from| images.clone().narrow(0, from, b));
         let seen = Tensor::stack::<5>(vec![front, back.flip([3])], 1);
         let points = maps.iter().map(|(view, map)| {
-            let anchors = anchors(*view, config.net_resolution, &window, &map.points.device());
+            let anchors =
+                anchors(*view, config.pair_degrees, config.net_resolution, &window, &map.points.device());
             self.times_delta(map.points.clone()) + anchors
         });
         let photographed = Photographed {

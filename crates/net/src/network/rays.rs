@@ -6,12 +6,22 @@ use snapsnap_ops::host;
 use snapsnap_splat::{Camera, RigidTransform};
 
 use super::View;
+use super::anchor::nominal;
+use crate::config::OPPOSITE;
 use crate::crop::Window;
 
 /// Points `[B, h, w, 3]` of a photograph's `window` of a canvas of `side`² pixels, metres in the front camera's frame, moved
 /// onto their pixels' rays; their depths stay. The front's rays are those of the frame. The back's camera is nearly
-/// opposite; its pose is fitted to the points inside the `mask` `[B, 1, S, S]`, without a gradient.
-pub fn on_rays(view: View, side: usize, window: &Window, points: Tensor<4>, mask: &Tensor<4>) -> Tensor<4> {
+/// opposite; its pose is fitted to the points inside the `mask` `[B, 1, S, S]`, without a gradient. The camera of a neighbour,
+/// `pair_degrees` around the person, is known.
+pub fn on_rays(
+    view: View,
+    pair_degrees: f64,
+    side: usize,
+    window: &Window,
+    points: Tensor<4>,
+    mask: &Tensor<4>,
+) -> Tensor<4> {
     let ([b, h, w, _], device) = (points.dims(), points.device());
     let camera = Camera::orbit_at_yaw_degrees(0.0, side as u32);
     let rays: Vec<DVec2> = window
@@ -29,6 +39,9 @@ pub fn on_rays(view: View, side: usize, window: &Window, points: Tensor<4>, mask
     }
     let (there, seen) = (host(points.clone().detach()), host(window.cut(mask.clone())));
     let poses = there.chunks_exact(3 * h * w).zip(seen.chunks_exact(h * w)).map(|(points, mask)| {
+        if pair_degrees != OPPOSITE {
+            return nominal(View::Back, pair_degrees, side).1;
+        }
         let step = (side / FITTED_SIDE).max(1);
         let grid = (0..h).step_by(step).flat_map(|row| (0..w).step_by(step).map(move |c| row * w + c));
         let pairs = grid
@@ -149,7 +162,12 @@ mod tests {
     /// A person's back in a window of a camera that differs by `motion` from the nominal one: points `[h, w, 3]` in the front
     /// camera's frame, metres.
     fn back(window: &Window, motion: &RigidTransform) -> (Vec<f32>, RigidTransform) {
-        let [front, back] = [0.0, 180.0].map(|yaw| Camera::orbit_at_yaw_degrees(yaw, SIDE as u32));
+        second(OPPOSITE, window, motion)
+    }
+
+    /// The same for the camera `degrees` around the person.
+    fn second(degrees: f64, window: &Window, motion: &RigidTransform) -> (Vec<f32>, RigidTransform) {
+        let [front, back] = [0.0, degrees].map(|yaw| Camera::orbit_at_yaw_degrees(yaw, SIDE as u32));
         let pose = front.world_to_camera.inverse().then(&back.world_to_camera).then(motion);
         let mut points = Vec::new();
         for row in window.rows.clone() {
@@ -171,11 +189,11 @@ mod tests {
         RigidTransform { rotation, translation: middle - rotation * middle + DVec3::new(0.01, -0.02, 0.03) }
     }
 
-    fn moved(view: View, window: &Window, points: Vec<f32>) -> Vec<f32> {
+    fn moved(view: View, pair_degrees: f64, window: &Window, points: Vec<f32>) -> Vec<f32> {
         let device = Device::flex();
         let dims = [1, window.rows.len(), window.columns.len(), 3];
         let points = Tensor::<4>::from_data(TensorData::new(points, dims), &device);
-        host(on_rays(view, SIDE, window, points, &Tensor::ones([1, 1, SIDE, SIDE], &device)))
+        host(on_rays(view, pair_degrees, SIDE, window, points, &Tensor::ones([1, 1, SIDE, SIDE], &device)))
     }
 
     fn farthest(a: &[f32], b: &[f32]) -> f32 {
@@ -187,7 +205,7 @@ mod tests {
         let window = Window { rows: 8..56, columns: 16..40 };
         let camera = Camera::orbit_at_yaw_degrees(0.0, SIDE as u32);
         let points: Vec<f32> = (0..48 * 24).flat_map(|i| [0.3, -0.2, 1.5 + 0.001 * i as f32]).collect();
-        for (i, p) in moved(View::Front, &window, points).chunks_exact(3).enumerate() {
+        for (i, p) in moved(View::Front, OPPOSITE, &window, points).chunks_exact(3).enumerate() {
             assert_eq!(p[2], 1.5 + 0.001 * i as f32);
             let p = DVec3::from([p[0], p[1], p[2]].map(f64::from));
             let pixel = camera.focal * p.truncate() / p.z + camera.principal_point;
@@ -202,7 +220,7 @@ mod tests {
         let window = Window { rows: 8..56, columns: 16..48 };
         for (motion, tolerance) in [(RigidTransform::IDENTITY, 1e-6), (strayed(), 4e-4)] {
             let (points, pose) = back(&window, &motion);
-            assert!(farthest(&moved(View::Back, &window, points.clone()), &points) < tolerance);
+            assert!(farthest(&moved(View::Back, OPPOSITE, &window, points.clone()), &points) < tolerance);
             let mut random = 1_u32;
             let mut noise = || {
                 random = random.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
@@ -215,9 +233,23 @@ mod tests {
             });
             let across: Vec<f32> = across.collect();
             assert!(farthest(&across, &points) > 0.018);
-            let mended = farthest(&moved(View::Back, &window, across), &points);
+            let mended = farthest(&moved(View::Back, OPPOSITE, &window, across), &points);
             assert!(mended < 2e-3, "{mended} m");
         }
+    }
+
+    /// Its camera is not fitted: points stay on the rays of the nominal one.
+    #[test]
+    fn points_of_a_neighbour_are_moved_onto_the_rays_of_its_known_camera() {
+        let (window, degrees) = (Window { rows: 8..56, columns: 16..48 }, 72.0);
+        let (points, pose) = second(degrees, &window, &RigidTransform::IDENTITY);
+        assert!(farthest(&moved(View::Back, degrees, &window, points.clone()), &points) < 1e-6);
+        let across = pose.inverse().rotation * DVec3::new(0.02, -0.01, 0.0);
+        let shifted: Vec<f32> = points
+            .chunks_exact(3)
+            .flat_map(|p| [0, 1, 2].map(|axis| p[axis] + across[axis] as f32))
+            .collect();
+        assert!(farthest(&moved(View::Back, degrees, &window, shifted), &points) < 1e-6);
     }
 
     #[test]

@@ -5,6 +5,7 @@ use glam::DVec3;
 
 use super::View;
 use super::anchor::nominal;
+use crate::config::OPPOSITE;
 use crate::crop::Window;
 
 /// A point that lies so far behind the nearest, in metres, is of another limb.
@@ -28,7 +29,7 @@ impl Visible {
         [points, inside]: [&[f32]; 2],
         batch: usize,
     ) -> Self {
-        let (camera, to_side) = nominal(view, side);
+        let (camera, to_side) = nominal(view, OPPOSITE, side);
         let (n, w) = (inside.len() / batch, window.columns.len());
         let area = window.rows.len() * w;
         let none = |sample: usize| (sample * (n + 1) + n) as i32;
@@ -71,7 +72,7 @@ impl Visible {
 
 /// Depths `[B, N, 1]` of points `[B, N, 3]` (metres, front camera's frame) from the camera of `view`.
 pub fn depths(view: View, points: Tensor<3>) -> Tensor<3> {
-    let (_, to_side) = nominal(view, 1);
+    let (_, to_side) = nominal(view, OPPOSITE, 1);
     let axis = to_side.rotation.row(2).as_vec3().to_array();
     let axis = Tensor::<3>::from_data([[axis]], &points.device());
     (points * axis).sum_dim(2) + to_side.translation.z
@@ -88,7 +89,7 @@ mod tests {
 
     /// Points in the front camera's frame that the camera of `view` sees at these pixels and depths.
     fn seen(view: View, places: &[(f64, f64, f64)]) -> Vec<f32> {
-        let (camera, to_side) = nominal(view, SIDE);
+        let (camera, to_side) = nominal(view, OPPOSITE, SIDE);
         let back = to_side.inverse();
         let point = |&(column, row, depth): &(f64, f64, f64)| {
             let ray = (DVec2::new(column, row) - camera.principal_point) / camera.focal;

@@ -162,7 +162,7 @@ impl GaussianTask {
         let all = self.data.validated(ranks, |sums: &mut Scores, item| {
             let window = Window::whole(item.side);
             let map = |view: View| {
-                let points = anchors(view, item.side, &window, &device);
+                let points = anchors(view, self.config.network.pair_degrees, item.side, &window, &device);
                 (view, PointMap { conf: Tensor::zeros([1, item.side, item.side], &device), points })
             };
             let prediction = Prediction { maps: View::ALL.map(map).to_vec(), window: window.clone() };
