@@ -175,6 +175,43 @@ fn five_photographs_have_no_unseen_sides() {
     assert!(text.contains("| model | 2 | 6 |"), "{text}");
 }
 
+/// Their networks are for known cameras alone, at the angle of their training.
+#[test]
+fn networks_of_neighbours_are_refused_for_other_photographs() {
+    let temporary = tempfile::tempdir().expect("a folder");
+    let path = |name: &str| temporary.path().join(name).display().to_string();
+    let opposite =
+        ["side_heads=false", "sides=\"predicted\"", "second_layer=false", "mirror=false", "both_ways=false"];
+    let sets: Vec<String> = opposite
+        .iter()
+        .chain(&["pair_degrees=90"])
+        .flat_map(|key| ["--set".into(), format!("network.{key}")])
+        .collect();
+    let mut command = snapsnap();
+    command.arg("import-weights").arg(root().join("assets/weights/default.safetensors")).args(&sets);
+    let said = succeed(command.args(["-o", &path("neighbours.safetensors")]));
+    assert!(said.contains("tensors of the unseen sides are left out"), "{said}");
+    let weights = path("neighbours.safetensors");
+    let run = |name: &str, inputs: &str| {
+        let set = format!("views.inputs={inputs}");
+        let set = ["--weights", &weights, "--set", &set, "--set", "views.compared=[1]"];
+        evaluate(people(), &temporary.path().join(name), &set)
+    };
+    // Eight views.
+    succeed(&mut run("quarters", "[0, 2, 4, 6]"));
+    let (status, said) = ended(&mut run("others", "[0, 3, 6]"));
+    assert_ne!(status, Some(0));
+    assert!(
+        said.contains("135.0° apart") && said.contains("`network.pair_degrees` of the weights is 90"),
+        "{said}"
+    );
+    let mut command = snapsnap();
+    let photographs = ["front.png", "back.png"].map(|name| root().join("assets/sample").join(name));
+    command.arg("reconstruct").args(photographs).args(["--weights", &weights, "-o", &path("human.ply")]);
+    assert!(refused(&mut command).contains("`network.pair_degrees` is 90"));
+    assert!(!temporary.path().join("human.ply").exists());
+}
+
 /// Changed photographs change the figures of their ablation. Placed ones have no errors of points.
 #[test]
 fn photographs_are_changed_by_ablations() {

@@ -78,7 +78,8 @@ fn canonical(key: &str) -> String {
 /// Reads checkpoints of the authors, DUSt3R or CroCo, checks every tensor against `config` and writes one weight file.
 ///
 /// Each of the two parts (point predictor, regressor) must be complete or wholly absent, except that files without δ,
-/// without side heads or without any heads, as DUSt3R's and CroCo's are, get those from the config and the seed.
+/// without side heads or without any heads, as DUSt3R's and CroCo's are, get those from the config and the seed. Without
+/// `network.side_heads`, the tensors of the unseen sides are left out.
 ///
 /// # Errors
 /// [`WeightsError`]; `to` is then left as it was.
@@ -95,6 +96,16 @@ pub fn import(
     let mut problems = Vec::new();
     let mut found = collect(&sources, &mut problems, &mut report)?;
     copy_decoder(&mut found, &mut report);
+    if !config.network.side_heads {
+        let all = found.len();
+        found.retain(|name, _| !is_of_sides(name));
+        if found.len() < all {
+            let count = all - found.len();
+            report.notes.push(format!(
+                "{count} tensors of the unseen sides are left out: `network.side_heads` is false"
+            ));
+        }
+    }
     let parts = parts_of(found.keys());
     let specs: Vec<_> = schema::tensors(config).into_iter().filter(|t| parts.contains(&t.part)).collect();
     if specs.is_empty() {
@@ -114,6 +125,14 @@ pub fn import(
     report.tensors = specs.len();
     report.parameters = specs.iter().map(TensorSpec::elements).sum();
     Ok(report)
+}
+
+/// Whether the tensor belongs to the unseen sides alone.
+fn is_of_sides(name: &str) -> bool {
+    let of_unet = |tail: &str| tail.starts_with("side_") || tail.starts_with("completion.");
+    name.starts_with(SIDE)
+        || [3, 4].iter().any(|k| name.starts_with(&head(*k)))
+        || name.strip_prefix(UNET).is_some_and(of_unet)
 }
 
 /// The key of head `k`'s tensors up to their own names.

@@ -230,6 +230,39 @@ fn stage_one_is_loaded_in_batches() {
     assert_eq!(shapes, [[4, 4, 64, 64, 3], [2, 4, 64, 64, 3]]);
 }
 
+/// The second photograph is the neighbour's, and its points are that view's, in the frame of the first.
+/// Faces that a camera sees from the side have larger errors.
+#[test]
+fn samples_of_neighbours_have_the_photograph_around_the_person() {
+    let (_temporary, folder) = data_set(&block(), Layout::Exact, 64, 20, false, 1);
+    let config = SampleConfig { pair_degrees: 72.0, augment: Augment::none(), ..SampleConfig::default() };
+    let (area, mut fronts) = (64 * 64, std::collections::HashSet::new());
+    let stage = stage1(&folder, config);
+    for index in 0..6 {
+        let item = stage.sample(index).expect("reads");
+        let (_, view) = item.name.rsplit_once(' ').expect("the front's view");
+        let yaw = 18.0 * view.parse::<f64>().expect("a number");
+        fronts.insert(view.to_owned());
+        let [front, neighbour] = [yaw, yaw + 72.0].map(|yaw| Camera::orbit_at_yaw_degrees(yaw, 64));
+        let to_neighbour = front.world_to_camera.inverse().then(&neighbour.world_to_camera);
+        let mut seen = 0;
+        for (pixel, p) in points_of(&item.points[3 * area..6 * area]).enumerate() {
+            if item.valid[area + pixel] > 0.0 {
+                let world = front.world_to_camera.inverse().apply(p.as_dvec3()).as_vec3();
+                assert!(off_block(world) < 2e-4, "{world}: {}", off_block(world));
+                let p = to_neighbour.apply(p.as_dvec3());
+                let at = neighbour.focal * p.truncate() / p.z + neighbour.principal_point;
+                let centre = DVec2::new((pixel % 64) as f64 + 0.5, (pixel / 64) as f64 + 0.5);
+                assert!((at - centre).length() < 1e-3, "{at} {centre}");
+                assert!(item.masks[area + pixel] > 0.0);
+                seen += 1;
+            }
+        }
+        assert!(seen > 300, "{seen}");
+    }
+    assert!(fronts.len() > 1);
+}
+
 #[test]
 fn contradictions_are_refused() {
     let (_temporary, folder) = data_set(&rectangle().0, Layout::Exact, 16, 6, false, 1);
@@ -246,6 +279,14 @@ fn contradictions_are_refused() {
         Stage2::new(folder, TRAIN, config).map(drop).expect_err("refused").to_string()
     };
     assert!(refusal(Layout::Exact, false).contains("`high_resolution` needs"));
+    let (_temporary, folder) = data_set(&rectangle().0, Layout::Exact, 16, 8, false, 1);
+    let neighbours = SampleConfig { pair_degrees: 72.0, augment: Augment::none(), ..SampleConfig::default() };
+    let message = |config: SampleConfig| {
+        Stage1::new(folder.clone(), TRAIN, config).map(drop).expect_err("refused").to_string()
+    };
+    assert!(message(neighbours.clone()).contains("two that are 72° apart"));
+    let placed = SampleConfig { placed_share: 0.3, ..neighbours };
+    assert!(message(placed).contains("`placed_share`: must be 0 unless `network.pair_degrees` is 180"));
     assert!(refusal(Layout::Authors, true).contains("no masks at twice the side"));
 }
 
