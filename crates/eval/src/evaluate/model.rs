@@ -118,6 +118,12 @@ impl Model {
                 made.gaussians = restoration.person(made.gaussians.clone(), made.photographed());
                 (scale, to_world) = (restoration.scale, restoration.front.world_to_camera.inverse());
             }
+            if count > 1 && made.lost == 0 {
+                // The second photograph is the first one of the next pair.
+                let [first, _] = made.photographed();
+                made.gaussians = first_rows(made.gaussians, first);
+                made.valid.truncate(1);
+            }
             let gaussians = self.thinned(&made, side).scaled(scale);
             parts.push(placed(self.reconstructor.config(), gaussians, &to_world));
             lost += made.lost;
@@ -177,6 +183,18 @@ impl Model {
             opacities: gaussians.opacities.select(0, keep.clone()),
             colors: rows(gaussians.colors),
         }
+    }
+}
+
+fn first_rows(gaussians: Gaussians, count: usize) -> Gaussians {
+    let Gaussians { means, rotations, scales, opacities, colors } = gaussians;
+    let rows = |of: Tensor<2>| of.narrow(0, 0, count);
+    Gaussians {
+        means: rows(means),
+        rotations: rows(rotations),
+        scales: rows(scales),
+        opacities: opacities.narrow(0, 0, count),
+        colors: rows(colors),
     }
 }
 
