@@ -162,7 +162,8 @@ impl ModelArguments {
         let degrees = weights.config.network.pair_degrees;
         if degrees != OPPOSITE {
             bail!(
-                "{}: `network.pair_degrees` is {degrees}: these networks are for several known cameras                  (`views.inputs` of `evaluate`), not for a front and a back",
+                "{}: `network.pair_degrees` is {degrees}: these networks are for several known cameras \
+                 (`views.inputs` of `evaluate`), not for a front and a back",
                 weights.path().display()
             );
         }

@@ -86,7 +86,7 @@ impl Model {
     }
 
     /// Gaussians of a person seen from the views `inputs`. With more than two photographs, each and the next around the
-    /// circle form a pair, in the frame of the known camera of its first one.
+    /// circle form a pair, of which the first one's Gaussians are kept, in the frame of its known camera.
     ///
     /// # Errors
     /// [`EvalError::Empty`] if no Gaussian came out.
@@ -99,10 +99,9 @@ impl Model {
         let (mut modules, mut plan) = (Vec::<(&'static str, Duration)>::new(), Vec::new());
         for first in 0..count {
             let pair = [&photographs[first], &photographs[(first + 1) % inputs.len()]];
-            let mut made = self.reconstructor.reconstruct(pair[0], pair[1], &|_| ());
             let camera = &item.cameras[inputs[first]];
-            let second = &item.cameras[inputs[(first + 1) % inputs.len()]];
-            self.check_pair(degrees(second, camera))?;
+            self.check_pair(degrees(&item.cameras[inputs[(first + 1) % inputs.len()]], camera))?;
+            let mut made = self.reconstructor.reconstruct(pair[0], pair[1], &|_| ());
             let mut to_world = camera.world_to_camera.inverse();
             let mut scale = 1.0;
             let is_placed = item.mappings[first] != Mapping::AS_IT_IS;
@@ -186,6 +185,7 @@ impl Model {
     }
 }
 
+/// The first `count` Gaussians.
 fn first_rows(gaussians: Gaussians, count: usize) -> Gaussians {
     let Gaussians { means, rotations, scales, opacities, colors } = gaussians;
     let rows = |of: Tensor<2>| of.narrow(0, 0, count);
