@@ -242,12 +242,11 @@ impl TrainConfig {
         self.training.precision.fixed().unwrap_or(Precision::F32)
     }
 
-    /// The samples' config, with the height of people from the section `[mode]`.
+    /// The samples' config, with what the sections `[mode]` and `[network]` say of photographs.
     pub fn samples(&self) -> SampleConfig {
-        let Config { network, .. } = self.networks();
         SampleConfig {
             person_height: self.networks().person_height(),
-            pair_degrees: network.pair_degrees,
+            pair_degrees: self.network.pair_degrees,
             ..self.samples.clone()
         }
     }

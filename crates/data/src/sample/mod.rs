@@ -213,7 +213,7 @@ impl Source {
             return Err(wrong("has no second surfaces, which `second_depth` needs".into()));
         }
         if config.pair_degrees != OPPOSITE {
-            let steps = config.pair_degrees * views as f64 / 360.0;
+            let steps = between(config.pair_degrees, views);
             if folder.description().arrangement != Arrangement::Ring || steps.fract() != 0.0 {
                 let degrees = config.pair_degrees;
                 return Err(wrong(format!(
@@ -258,7 +258,7 @@ impl Source {
         let Description { arrangement, views, .. } = *self.folder.description();
         let mut order = arrangement.four(front, views);
         if self.config.pair_degrees != OPPOSITE {
-            order[1] = (front + (self.config.pair_degrees * views as f64 / 360.0) as usize) % views;
+            order[1] = (front + between(self.config.pair_degrees, views) as usize) % views;
         }
         order
     }
@@ -313,6 +313,11 @@ impl Source {
         let rig = self.folder.description().drawn.as_ref().map(|drawn| &drawn.jitter.rig);
         rig.is_some_and(|rig| rig.distance > 0.0 || rig.focal > 0.0) || random.random::<f32>() < share
     }
+}
+
+/// Views of a ring of `views` from one to that `degrees` further around.
+fn between(degrees: f64, views: usize) -> f64 {
+    degrees * views as f64 / 360.0
 }
 
 /// Photographs of a person as the networks' input. They are placed on their canvas like a user's, with a person of
