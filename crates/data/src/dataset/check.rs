@@ -7,8 +7,9 @@ use std::path::Path;
 use rayon::prelude::*;
 
 use super::agree::{LEAST_SIDE, Seen, disagreements};
+use super::views::split_alpha;
 use super::write::UNFINISHED;
-use super::{Arrangement, Description, Folder, Layout, Split, split_alpha};
+use super::{Arrangement, Description, Folder, Layout, Split};
 use snapsnap_base::FileError;
 
 /// Largest share of the person without depth. Scans have gaps narrower than a pixel.
