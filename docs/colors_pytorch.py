@@ -58,9 +58,9 @@ def slope(points, valid, axis):
     return np.where(a & b, after + before, np.where(a, after, np.where(b, before, 0)))
 
 
-def load(folder, split, size, views):
+def load(folder, split, size, views, makers=("synth", "makehuman", "avatars")):
     kept = []
-    for maker in ("synth", "makehuman", "avatars"):
+    for maker in makers:
         for path in sorted((folder / maker / split / "cameras").glob("*.json")):
             cameras = json.loads(path.read_text())
             for view in views:
@@ -86,16 +86,16 @@ def body(depth, mask):
 
 
 class Net(torch.nn.Module):
-    """A U-shaped network of five levels."""
+    """A U-shaped network of five levels. (B,planes,H,W) -> (B,outputs,H,W)."""
 
-    def __init__(self, planes, widths=(8, 16, 32, 64, 96)):
+    def __init__(self, planes, widths=(8, 16, 32, 64, 96), outputs=1):
         super().__init__()
         block = lambda a, b: torch.nn.Sequential(
             torch.nn.Conv2d(a, b, 3, padding=1), torch.nn.GroupNorm(8, b), torch.nn.GELU(),
             torch.nn.Conv2d(b, b, 3, padding=1), torch.nn.GroupNorm(8, b), torch.nn.GELU())
         self.down = torch.nn.ModuleList([block(a, b) for a, b in zip((planes, *widths), widths)])
         self.up = torch.nn.ModuleList([block(a + b, b) for a, b in zip(widths[1:], widths)])
-        self.last = torch.nn.Conv2d(widths[0], 1, 1)
+        self.last = torch.nn.Conv2d(widths[0], outputs, 1)
 
     def forward(self, x):
         kept = []
@@ -104,7 +104,7 @@ class Net(torch.nn.Module):
             kept.append(x)
         for level in reversed(range(len(self.up))):
             x = self.up[level](torch.cat([F.interpolate(x, scale_factor=2.0, mode="nearest"), kept[level]], 1))
-        return self.last(x)[:, 0]
+        return self.last(x)
 
 
 def shade(normals, random):
@@ -158,7 +158,7 @@ def study(kind, options, train, held_out):
     def predict(model, color, mask, _, normals, coarse, place):
         x = inputs(kind, color.float(), mask, normals.float(), coarse.float(), place, random)
         with torch.autocast("cpu", torch.bfloat16):
-            return model(x.contiguous(memory_format=torch.channels_last)).float()
+            return model(x.contiguous(memory_format=torch.channels_last))[:, 0].float()
 
     start, steps, share = time.process_time(), 0, 0.0
     while share < 1:
@@ -204,4 +204,5 @@ def main():
         study(kind, options, train, held_out)
 
 
-main()
+if __name__ == "__main__":
+    main()

@@ -52,6 +52,11 @@ pub fn device_name() -> String {
     std::env::var("SNAPSNAP_TEST_DEVICE").unwrap_or_else(|_| "flex".into())
 }
 
+/// Whether tests run on a GPU's kernels.
+pub fn is_on_gpu() -> bool {
+    matches!(device_name().as_str(), "wgpu" | "vulkan")
+}
+
 /// The device that tests run on, or `None`, with a printed note, if the machine has no adapter for it.
 ///
 /// `wgpu` takes any adapter, also a software one. `cargo xtask test` runs the suite on each device.

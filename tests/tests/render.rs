@@ -5,9 +5,10 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use burn::tensor::{Device, Tensor};
-use snapsnap_splat::{Camera, Gaussians, RenderOptions, cameras, render, scene, sh};
+use glam::{DVec3, Vec3};
+use snapsnap_splat::{Camera, Gaussians, Orbit, RenderOptions, cameras, render, scene, sh};
 use snapsnap_tests::ply::{Format, cloud, ply_bytes};
-use snapsnap_tests::{Numbers, refused, snapsnap, succeed, values};
+use snapsnap_tests::{Numbers, refused, root, snapsnap, succeed, values};
 
 struct Place(tempfile::TempDir);
 
@@ -347,5 +348,42 @@ fn cameras_files_are_the_fixtures_format() {
     let text = fs::read_to_string(place.path("c.json")).expect("read");
     for key in ["width", "height", "fx", "fy", "cx", "cy", "world_to_camera"] {
         assert!(text.contains(&format!("\"{key}\"")), "{key}: {text}");
+    }
+}
+
+/// Nobody looks into the head of a person made of the sample pair.
+#[test]
+fn a_head_is_closed_from_above() {
+    let place = Place::new();
+    let pictures = ["front.png", "back.png"].map(|name| root().join("assets/sample").join(name));
+    let mut command = snapsnap();
+    command.current_dir(place.0.path()).arg("reconstruct").args(pictures);
+    succeed(command.args(["-o", "human.ply", "--device", "cpu"]));
+    let gaussians = scene::read(&place.path("human.ply"), &Device::flex()).expect("Gaussians").gaussians;
+
+    let means: Vec<DVec3> = values(gaussians.means.clone())
+        .as_chunks::<3>()
+        .0
+        .iter()
+        .map(|p| Vec3::from_array(*p).as_dvec3())
+        .collect();
+    let top = means.iter().fold(0.0, |top: f64, p| top.max(p.y));
+    let head: Vec<&DVec3> = means.iter().filter(|p| p.y > top - 0.15).collect();
+    let middle = head.iter().copied().sum::<DVec3>() / head.len() as f64;
+    // From a metre above, a pixel of the middle shows 4 mm.
+    let centre = DVec3::new(middle.x, top, middle.z);
+    let camera = Orbit { pitch_degrees: 90.0, radius: 1.0, centre, ..Orbit::default() }.camera(300);
+    let options = RenderOptions { depth: true, ..RenderOptions::inria() };
+    let seen = render(&gaussians, &[camera], &options).expect("a picture");
+    let (alpha, depth) = (values(seen.alpha), values(seen.depth.expect("depth")));
+    let [column, row] = camera.principal_point.to_array().map(|at| at as usize);
+    // A disc of 10 cm: hair ends a few centimetres lower there.
+    for (y, x) in (0..26).flat_map(|y| (0..26).map(move |x| (y, x))) {
+        if (x as f64 - 13.0).hypot(y as f64 - 13.0) < 12.5 {
+            let i = (row + y - 13) * 300 + column + x - 13;
+            assert!(alpha[i] > 0.9, "{x} {y}: alpha {}", alpha[i]);
+            let below = depth[i] / alpha[i] - 1.0;
+            assert!(below < 0.08, "{x} {y}: {below} m below the top");
+        }
     }
 }

@@ -121,6 +121,9 @@ pub struct NetworkConfig {
     /// beyond lie between two surfaces and are left out. Unset: all points are kept.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub steepest: Option<f32>,
+    /// Whether Gaussians close the top of head and shoulders between front and back, where there are sides.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub closed_top: bool,
     /// Degrees that the camera of the second photograph stands around the person from the first one's, counter-clockwise as seen from
     /// above. 180: front and back. Others are for scenes of several known cameras, and have no unseen sides.
     #[serde(skip_serializing_if = "is_opposite")]
@@ -168,6 +171,7 @@ impl Default for NetworkConfig {
             on_rays: false,
             hull_margin: None,
             steepest: None,
+            closed_top: false,
             pair_degrees: OPPOSITE,
             drop_empty: false,
         }

@@ -75,16 +75,16 @@ impl Chosen {
         let mut between = 0;
         if let Some(steepest) = config.steepest {
             for (view, points) in valid.iter_mut().zip(points.chunks_exact(3 * area)) {
-                between += leave_out_steep(view, points, side, steepest);
+                between += without_steep(view, points, side, steepest);
             }
         }
         Self { valid, lost, outside, between }
     }
 }
 
-/// Leaves out the pixels of a view whose points `[S, S, 3]`, metres, are further from a neighbour's than `steepest` times the
+/// Takes away the valid pixels of a view whose points `[S, S, 3]`, metres, are further from a neighbour's than `steepest` times the
 /// width of a pixel at the person's distance. Returns their number.
-fn leave_out_steep(valid: &mut [bool], points: &[f32], side: usize, steepest: f32) -> usize {
+pub(crate) fn without_steep(valid: &mut [bool], points: &[f32], side: usize, steepest: f32) -> usize {
     let nominal = Camera::orbit_at_yaw_degrees(0.0, side as u32);
     let pixel = (nominal.centre() * DVec3::new(1.0, 0.0, 1.0)).length() / nominal.focal.x;
     let farthest = (steepest * pixel as f32).powi(2);
@@ -201,17 +201,20 @@ pub fn geometric(views: &[Seen], device: &Device) -> Gaussians {
     let regressor = RegressorConfig { start: Some(RegressorStart::Geometric), ..RegressorConfig::default() };
     let limits = Limits::of(&regressor, 0);
     let config = Config { regressor, ..Config::default() };
-    let part = |view: &Seen| {
-        let side = view.points.dims()[1];
-        let rows = Window::whole(side).indices(view.valid, side);
-        Part {
-            features: Tensor::zeros([rows.len(), FEATURES], device),
-            points: taken(view.points.clone().reshape([side * side, 3]), &rows),
-            geometry: Some(Geometry::new(view.image, &view.points, view.valid, side, limits)),
-        }
-    };
-    let parts = views.iter().filter(|view| view.valid.contains(&true)).map(part).collect();
+    let parts = views.iter().filter(|view| view.valid.contains(&true));
+    let parts = parts.map(|view| uncorrected(view, limits)).collect();
     assemble(&config, parts, device).0
+}
+
+/// The part of a view to which no regressor adds anything.
+pub fn uncorrected(view: &Seen, limits: Limits) -> Part {
+    let side = view.points.dims()[1];
+    let rows = Window::whole(side).indices(view.valid, side);
+    Part {
+        features: Tensor::zeros([rows.len(), FEATURES], &view.points.device()),
+        points: taken(view.points.clone().reshape([side * side, 3]), &rows),
+        geometry: Some(Geometry::new(view.image, &view.points, view.valid, side, limits)),
+    }
 }
 
 /// Activates and joins the parts: Gaussians in the front camera's frame, and the number of those left out because they
@@ -285,7 +288,7 @@ mod tests {
         for (steepest, step) in [(3.0, true), (4.0, false)] {
             let mut valid = vec![true; 64];
             valid[3] = false;
-            let lost = leave_out_steep(&mut valid, &points, side, steepest);
+            let lost = without_steep(&mut valid, &points, side, steepest);
             let kept = |i: usize| i != 3 && !(step && i > 7 && matches!(i % side, 3 | 4));
             assert_eq!(valid, (0..64).map(kept).collect::<Vec<_>>());
             assert_eq!(lost, if step { 14 } else { 0 });

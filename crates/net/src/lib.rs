@@ -13,6 +13,7 @@ mod reconstruct;
 pub mod regressor;
 pub mod resample;
 pub mod sides;
+mod top;
 pub mod u2net;
 pub mod weights;
 

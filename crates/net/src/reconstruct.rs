@@ -9,11 +9,14 @@ use snapsnap_splat::{Camera, Gaussians, RigidTransform};
 
 use crate::config::{Config, Downsample, WorldFrame};
 use crate::crop::Window;
-use crate::gaussians::{Chosen, Seen, assemble, photograph_colors, placed, regress, side_images};
+use crate::gaussians::{
+    Chosen, Part, Seen, assemble, photograph_colors, placed, regress, side_images, uncorrected,
+};
 use crate::network::{Input, PointMap, PointPredictor, View};
 use crate::precision::Precision;
-use crate::regressor::Regressor;
+use crate::regressor::{Limits, Regressor};
 use crate::sides::EMPTY;
+use crate::top::Top;
 use crate::weights::{WeightFile, WeightsError};
 
 /// One photograph on its square canvas of `resolution` pixels; row-major, side S.
@@ -37,7 +40,7 @@ pub struct Reconstruction {
     pub valid: Vec<Vec<bool>>,
     /// Pseudo images of the sides' maps `[3, S, S]` in [−1, 1], −1 where there is no point.
     pub side_images: Vec<Vec<f32>>,
-    /// The Gaussians, view after view, row-major, in the front camera's frame.
+    /// The Gaussians, view after view, row-major, in the front camera's frame; then those that close the top.
     pub gaussians: Gaussians,
     /// Pixels and Gaussians that were left out because they were not finite.
     pub lost: usize,
@@ -209,7 +212,11 @@ impl Run<'_> {
             let points: Vec<f32> = points.iter().map(|v| if v.is_finite() { *v } else { 0.0 }).collect();
             Tensor::from_data(TensorData::new(points, maps.points.dims()), &self.model.device)
         };
-        let gaussians = self.gaussians(colors, &side_images, &usable, &valid);
+        let mut parts = self.regressed(colors, &side_images, &usable, &valid);
+        if self.model.config.network.closed_top && views.len() > 2 {
+            parts.extend(self.timed("top", |run| run.top(colors, &points, &valid)));
+        }
+        let gaussians = self.assembled(parts);
         let (plan, times) = (std::mem::take(&mut self.plan), std::mem::take(&mut self.times));
         Reconstruction { views, maps, valid, side_images, gaussians, lost: lost + self.lost, plan, times }
     }
@@ -281,14 +288,14 @@ impl Run<'_> {
         )
     }
 
-    /// Gaussians of all valid pixels, view after view.
-    fn gaussians(
+    /// Features of all valid pixels, view after view.
+    fn regressed(
         &mut self,
         colors: [&[f32]; 2],
         side_images: &[Vec<f32>],
         points: &Tensor<4>,
         valid: &[Vec<bool>],
-    ) -> Gaussians {
+    ) -> Vec<Part> {
         let images: Vec<&[f32]> = colors.into_iter().chain(side_images.iter().map(Vec::as_slice)).collect();
         let mut parts = Vec::new();
         for (pair, what) in ["regressor (front, back)", "regressor (sides)", "regressor (second surfaces)"]
@@ -325,6 +332,22 @@ impl Run<'_> {
             });
             parts.extend(part);
         }
+        parts
+    }
+
+    /// The surface between the upper edges of front and back.
+    fn top(&mut self, colors: [&[f32]; 2], points: &[f32], valid: &[Vec<bool>]) -> Option<Part> {
+        let (side, config) = (self.side, &self.model.config);
+        let points = [0, 1].map(|view| &points[view * 3 * side * side..][..3 * side * side]);
+        let top = Top::new(colors, points, [&valid[0], &valid[1]], side)?;
+        self.plan
+            .push(format!("top: {} Gaussians between the upper edges of front and back", count(&top.valid)));
+        let points = Tensor::from_data(TensorData::new(top.points, [1, side, side, 3]), &self.model.device);
+        let view = Seen { image: &top.image, points, valid: &top.valid };
+        Some(uncorrected(&view, Limits::of(&config.regressor, 0)))
+    }
+
+    fn assembled(&mut self, parts: Vec<Part>) -> Gaussians {
         self.timed("activations", |run| {
             let (gaussians, lost) = assemble(&run.model.config, parts, &run.model.device);
             run.plan.push(format!("{} Gaussians", gaussians.len()));

@@ -6,7 +6,7 @@ use burn::tensor::activation::sigmoid;
 use burn::tensor::{Device, Tensor, TensorData};
 use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
 use snapsnap_tests::scenes::{HostScene, Random};
-use snapsnap_tests::{device, device_name, values};
+use snapsnap_tests::{device, is_on_gpu, values};
 
 const SIZE: u32 = 64;
 const STEPS: usize = 500;
@@ -106,7 +106,7 @@ fn random_gaussians_are_fitted_to_a_scene() {
     println!("unseen view: {before:.2} dB before, {after:.2} dB after {STEPS} steps");
     assert!(before < 20.0, "nothing to learn: {before} dB");
     assert!(after > 30.0, "{after} dB");
-    if device_name() == "wgpu" {
+    if is_on_gpu() {
         let (expected, _, cpu) = fit(&Device::flex());
         let worst = losses.iter().zip(&expected).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
         let relative = losses.iter().zip(&expected).map(|(a, b)| (a / b - 1.0).abs()).fold(0.0, f32::max);

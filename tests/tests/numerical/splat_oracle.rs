@@ -4,7 +4,7 @@ use burn::tensor::{Tensor, TensorData};
 use snapsnap_splat::reference::{self, Cutoff, Scene};
 use snapsnap_splat::{Camera, RenderOptions, cameras, sh};
 use snapsnap_tests::scenes::{HostScene, Random, forward_camera, random_scene, random_upstream};
-use snapsnap_tests::{Numbers, device, device_name, fixture, values};
+use snapsnap_tests::{Numbers, device, device_name, fixture, is_on_gpu, values};
 
 use crate::distance;
 
@@ -387,7 +387,7 @@ fn harmonics_are_differentiable() {
     let camera = Camera::orbit_at_yaw_degrees(30.0, 16);
     let mut random = Random(61);
     // Every shape is tuned anew on a GPU: one degree is enough there.
-    let all: &[usize] = if device_name() == "wgpu" { &[16] } else { &[1, 4, 9, 16] };
+    let all: &[usize] = if is_on_gpu() { &[16] } else { &[1, 4, 9, 16] };
     for &k in all {
         let n = 3;
         let coefficients: Vec<f32> = (0..n * k * 3).map(|_| random.between(-0.1, 0.2)).collect();

@@ -164,10 +164,10 @@ impl Model {
         }
         let pixels: Vec<usize> =
             made.valid.iter().flat_map(|valid| (0..valid.len()).filter(|i| valid[*i])).collect();
-        // If Gaussians were lost, the pixels of the others are unknown.
-        let on_grid = |row: usize| match pixels.len() == gaussians.len() {
-            true => [pixels[row] / side, pixels[row] % side].iter().all(|at| at.is_multiple_of(stride)),
-            false => row.is_multiple_of(stride * stride),
+        // The last Gaussians may close the top, and belong to no pixel. If some were lost, no pixel is known.
+        let on_grid = |row: usize| match pixels.get(row).filter(|_| made.lost == 0) {
+            Some(pixel) => [pixel / side, pixel % side].iter().all(|at| at.is_multiple_of(stride)),
+            None => row.is_multiple_of(stride * stride),
         };
         let opacities = host(gaussians.opacities.clone());
         let keep = (0..gaussians.len()).filter(|row| on_grid(*row) && opacities[*row] >= min_opacity);

@@ -120,6 +120,10 @@ impl Config {
             let message = "must be at least 1 (as on a surface that faces the camera)";
             return refuse("network.steepest", message.into());
         }
+        if n.closed_top && r.start() != RegressorStart::Geometric {
+            let needed = "`regressor.start = \"geometric\"`: no network makes its Gaussians";
+            return refuse("network.closed_top", format!("needs {needed}"));
+        }
         if n.conf_threshold.is_nan() {
             return refuse("network.conf_threshold", "is not a number".into());
         }
@@ -191,6 +195,7 @@ impl Config {
             ("network.on_rays", !self.network.on_rays, "false"),
             ("network.hull_margin", self.network.hull_margin.is_none(), "unset"),
             ("network.steepest", self.network.steepest.is_none(), "unset"),
+            ("network.closed_top", !self.network.closed_top, "false"),
             ("network.drop_empty", !self.network.drop_empty, "false"),
             ("regressor.start", self.regressor.start() == RegressorStart::Published, "\"published\""),
             ("regressor.color", self.regressor.color() == RegressorColor::Free, "\"free\""),

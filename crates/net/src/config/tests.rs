@@ -82,6 +82,16 @@ fn least_opacities_are_those_of_a_geometric_start() {
 }
 
 #[test]
+fn a_closed_top_needs_gaussians_without_a_regressor() {
+    let closed = "[network]\nclosed_top = true\n";
+    assert!(Config::from_toml(closed, "x", &["regressor.start=geometric".to_owned()]).is_ok());
+    let message = refusal(closed, &[]);
+    assert!(message.contains("network.closed_top") && message.contains("regressor.start"), "{message}");
+    let message = refusal(closed, &["regressor.start=geometric", "mode.compat=true"]);
+    assert!(message.contains("network.closed_top"), "{message}");
+}
+
+#[test]
 fn a_fix_beside_compat_is_a_contradiction() {
     let message = refusal("[mode]\ncompat = true\ndownsample = \"area\"\n", &[]);
     assert!(message.contains("mode.downsample") && message.contains("nearest"), "{message}");
