@@ -214,7 +214,7 @@ impl Run<'_> {
         };
         let mut parts = self.regressed(colors, &side_images, &usable, &valid);
         if self.model.config.network.closed_top && views.len() > 2 {
-            parts.extend(self.timed("top", |run| run.top(colors, &points, &valid)));
+            parts.extend(self.timed("closed top", |run| run.top(colors, &points, &valid)));
         }
         let gaussians = self.assembled(parts);
         let (plan, times) = (std::mem::take(&mut self.plan), std::mem::take(&mut self.times));
@@ -340,8 +340,10 @@ impl Run<'_> {
         let (side, config) = (self.side, &self.model.config);
         let points = [0, 1].map(|view| &points[view * 3 * side * side..][..3 * side * side]);
         let top = Top::new(colors, points, [&valid[0], &valid[1]], side)?;
-        self.plan
-            .push(format!("top: {} Gaussians between the upper edges of front and back", count(&top.valid)));
+        self.plan.push(format!(
+            "closed top: {} Gaussians between the upper edges of front and back",
+            count(&top.valid)
+        ));
         let points = Tensor::from_data(TensorData::new(top.points, [1, side, side, 3]), &self.model.device);
         let view = Seen { image: &top.image, points, valid: &top.valid };
         Some(uncorrected(&view, Limits::of(&config.regressor, 0)))
