@@ -1,4 +1,4 @@
-"""How the error of a photograph's points falls with training, with network size and with what the network is shown
+"""How the error of a photograph's depth falls with training, with network size and with what the network is shown
 (docs/notes/people.md): one network in PyTorch, on a GPU or a CPU.
 
     python docs/scaling_pytorch.py people/makers --inputs photographs --width 4 --minutes 5 --device cuda
@@ -17,7 +17,6 @@ Learning rates are constant and fall to 1 % within the last fifth of the time. E
 """
 
 import argparse, concurrent.futures, multiprocessing, pathlib, time
-import numpy as np
 import torch
 import torch.nn.functional as F
 from colors_pytorch import Net, load
@@ -51,7 +50,7 @@ def mirrored(x, which):
 
 
 def error(model, kind, data, precision):
-    """Mean error over all photographs, mm, of points that are put on their rays."""
+    """Mean error of the depth over all photographs, mm."""
     _, mask, depth, _ = data
     total = 0.0
     gains = [torch.ones(1, 1, 1, 1, device=mask.device)] * 2

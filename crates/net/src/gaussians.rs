@@ -82,12 +82,16 @@ impl Chosen {
     }
 }
 
+/// Width in metres of a pixel of the nominal cameras at the person's distance, on a canvas of `side`² pixels.
+pub(crate) fn pixel_width(side: usize) -> f32 {
+    let nominal = Camera::orbit_at_yaw_degrees(0.0, side as u32);
+    ((nominal.centre() * DVec3::new(1.0, 0.0, 1.0)).length() / nominal.focal.x) as f32
+}
+
 /// Takes away the valid pixels of a view whose points `[S, S, 3]`, metres, are further from a neighbour's than `steepest` times the
 /// width of a pixel at the person's distance. Returns their number.
 pub(crate) fn without_steep(valid: &mut [bool], points: &[f32], side: usize, steepest: f32) -> usize {
-    let nominal = Camera::orbit_at_yaw_degrees(0.0, side as u32);
-    let pixel = (nominal.centre() * DVec3::new(1.0, 0.0, 1.0)).length() / nominal.focal.x;
-    let farthest = (steepest * pixel as f32).powi(2);
+    let farthest = (steepest * pixel_width(side)).powi(2);
     let squared = |i: usize, j: usize| -> f32 {
         (0..3).map(|axis| (points[3 * i + axis] - points[3 * j + axis]).powi(2)).sum()
     };

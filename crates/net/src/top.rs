@@ -3,13 +3,13 @@
 use glam::{DVec3, Vec3};
 use snapsnap_splat::Camera;
 
-use crate::gaussians::without_steep;
+use crate::gaussians::{pixel_width, without_steep};
 
 /// Farthest two edges may be apart, metres: a head with hair is not longer.
 const LONGEST: f32 = 0.35;
 /// Largest difference in height of two edges that belong to one surface, metres.
 const STEP: f32 = 0.05;
-/// Steepest slope of the surface from column to column; a steeper one is seen from the sides.
+/// Most pixel widths between neighbours, as of `network.steepest`. A steeper surface is seen from the sides.
 const STEEPEST: f32 = 4.0;
 
 /// The surface between the upper edges of front and back, as a map like that of a view: column for column of the front's
@@ -35,8 +35,8 @@ impl Top {
     /// The surface of a person whose front and back have the colours `[3, S, S]`, the points `[S, S, 3]` and the valid pixels
     /// `[S, S]`. `None` if there is no pixel to add.
     pub fn new(colors: [&[f32]; 2], points: [&[f32]; 2], valid: [&[bool]; 2], side: usize) -> Option<Self> {
+        let pixel = pixel_width(side);
         let nominal = Camera::orbit_at_yaw_degrees(0.0, side as u32);
-        let pixel = ((nominal.centre() * DVec3::new(1.0, 0.0, 1.0)).length() / nominal.focal.x) as f32;
         let up = (nominal.world_to_camera.rotation * DVec3::Y).as_vec3();
         let [front, mut back] = [0, 1].map(|view| edges(colors[view], points[view], valid[view], side));
         back.sort_by(|(_, a), (_, b)| a.point.x.total_cmp(&b.point.x));
