@@ -12,7 +12,8 @@ use snapsnap_net::weights::{
 };
 use snapsnap_tests::{FIXTURE_VALUES, data, fixture, root};
 
-const OPTIONS: ImportOptions = ImportOptions { side_heads: SideHeads::Seed, seed: 3, float: Float::F32 };
+const OPTIONS: ImportOptions =
+    ImportOptions { fill: None, side_heads: SideHeads::Seed, seed: 3, float: Float::F32 };
 
 fn tiny() -> Config {
     Config::from_file(&root().join("configs/tiny.toml"), &[]).expect("tiny.toml")
@@ -136,7 +137,7 @@ fn a_dust3r_file_gets_delta_and_side_heads_and_says_so() {
     dust3r.insert("mask_token".into(), (Dtype::F32, vec![1], vec![0; 4]));
     write(&dust3r, &from);
     let with = |side_heads| {
-        let options = ImportOptions { side_heads, seed: 5, float: Float::F32 };
+        let options = ImportOptions { fill: None, side_heads, seed: 5, float: Float::F32 };
         let report =
             import(std::slice::from_ref(&from), &place.config, options, &to, &|_, _| ()).expect("imports");
         (read(&to), report.notes.join("\n"))
@@ -174,6 +175,65 @@ fn a_croco_file_gives_both_decoders_and_no_heads() {
     let notes = notes.join("\n");
     assert!(notes.contains("dec_blocks2") && notes.contains("head 1 is in no file"), "{notes}");
     assert!(notes.contains("prediction_head.bias"), "{notes}");
+}
+
+#[test]
+fn another_file_gives_the_tensors_that_are_in_none_of_the_first() {
+    let place = Workplace::new();
+    let [part, all, to] = ["part", "ours", "to"].map(|name| place.path(&format!("{name}.safetensors")));
+    let mut tensors = read(&all);
+    let own = |name: &str| name.contains("enc_blocks") || name == "scale";
+    tensors.retain(|name, _| own(name));
+    for (_, _, bytes) in tensors.values_mut() {
+        bytes.chunks_exact_mut(4).for_each(|value| value.copy_from_slice(&0.25_f32.to_le_bytes()));
+    }
+    write(&tensors, &part);
+    let with = |fill| {
+        let options = ImportOptions { fill, ..OPTIONS };
+        import(std::slice::from_ref(&part), &place.config, options, &to, &|_, _| ())
+    };
+    assert!(with(None).expect_err("a part").to_string().contains("missing: dust3r.dec_blocks"));
+    assert!(!to.exists());
+    let report = with(Some(all.as_path())).expect("imports");
+    let (expected, got) = (read(&all), read(&to));
+    assert_eq!(report.tensors, got.len());
+    let given = |name: &String| if own(name) { &tensors[name] } else { &expected[name] };
+    assert!(got.iter().all(|(name, tensor)| tensor == given(name)));
+    assert!(got.keys().any(|name| own(name)) && got.keys().any(|name| !own(name)));
+    let count = expected.len() - tensors.len();
+    assert!(
+        report.notes.join("\n").contains(&format!("ours.safetensors: {count} tensors")),
+        "{:?}",
+        report.notes
+    );
+    assert!(with(Some(&place.path("absent"))).is_err());
+}
+
+/// A training with normals begins from weights without them, and the other way round.
+#[test]
+fn the_layer_of_normals_is_drawn_or_left_out() {
+    let place = tempfile::tempdir().expect("temporary folder");
+    let at = |name: &str| place.path().join(name);
+    let config = |normals: bool| {
+        let lines = "[network]\nbody = \"convolution\"\npatch = 8\nlayer_dims = [8, 8, 8, 8]\nenc_dim = 8\nenc_depth = 1\n\
+                     enc_heads = 1\nmlp_ratio = 1\nlast_dim = 8\nside_heads = false\n";
+        Config::from_toml(lines, "x", &[format!("network.normals={normals}")]).expect("valid")
+    };
+    let import = |from: &str, normals: bool, to: &str| {
+        let report = import(&[at(from)], &config(normals), OPTIONS, &at(to), &|_, _| ()).expect("imports");
+        report.notes.join("\n")
+    };
+    init(&config(false), 1, &at("without"), &|_, _| ()).expect("writes");
+    let notes = import("without", true, "with");
+    assert!(notes.contains("unet.normals.weight is in no file: drawn from seed 3"), "{notes}");
+    assert!(notes.contains("unet.normals.bias"), "{notes}");
+    let (with, without) = (read(&at("with")), read(&at("without")));
+    assert_eq!(with["unet.normals.weight"].1, [6, 8, 1, 1]);
+    assert_eq!(with.len(), without.len() + 2);
+    assert!(WeightFile::open(&at("with"), Some(config(false))).is_err());
+    let notes = import("with", false, "again");
+    assert!(notes.contains("2 tensors of the normals are left out"), "{notes}");
+    assert_eq!(read(&at("again")), without);
 }
 
 #[test]

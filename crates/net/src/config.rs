@@ -80,6 +80,10 @@ pub struct NetworkConfig {
     pub side_dims: [usize; 4],
     /// Whether completed sides have the second surface that faces their cameras, too, such as the flank behind an arm.
     pub second_layer: bool,
+    /// Whether the network also predicts the normals of the photographs' surfaces. Stage 1 learns them beside the points; nothing
+    /// else uses them.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub normals: bool,
     /// Fusion of the tokens of the two photographs into those of the unseen sides.
     pub fusion: Fusion,
     /// Activation of the confidence channel.
@@ -154,6 +158,7 @@ impl Default for NetworkConfig {
             sides: Sides::Predicted,
             side_dims: [32, 48, 64, 96],
             second_layer: false,
+            normals: false,
             fusion: Fusion::Mean,
             conf_mode: ConfMode::Sigmoid,
             resolution: 1024,

@@ -112,6 +112,8 @@ pub struct Stage1Config {
     pub confidence_weight: f64,
     /// Weight of the mean error of differences between pixels that are 1, 2, 4 and 8 apart.
     pub relief_weight: f64,
+    /// With `network.normals`: weight of the mean error of the normals.
+    pub normals_weight: f64,
 }
 
 /// The section `[stage2]`.
@@ -187,7 +189,7 @@ impl Default for TrainingConfig {
 
 impl Default for Stage1Config {
     fn default() -> Self {
-        Self { confidence_weight: 0.5, relief_weight: 0.0 }
+        Self { confidence_weight: 0.5, relief_weight: 0.0, normals_weight: 0.05 }
     }
 }
 
@@ -266,6 +268,7 @@ impl TrainConfig {
             ("training.ema_decay", t.ema_decay, 0.0..=0.999_999),
             ("stage1.confidence_weight", self.stage1.confidence_weight, 0.0..=1e6),
             ("stage1.relief_weight", self.stage1.relief_weight, 0.0..=1e6),
+            ("stage1.normals_weight", self.stage1.normals_weight, 0.0..=1e6),
             ("stage2.l1_share", two.l1_share, 0.0..=1.0),
             ("stage2.alpha_weight", two.alpha_weight, 0.0..=1e6),
             ("stage2.anisotropy_weight", two.anisotropy_weight, 0.0..=1e6),

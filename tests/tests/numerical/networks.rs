@@ -33,7 +33,7 @@ fn config(folder: &Path) -> Config {
 
 fn predictor(folder: &Path, config: &Config, device: &Device) -> PointPredictor {
     let file = tempfile::NamedTempFile::new().expect("temporary file");
-    let options = ImportOptions { side_heads: SideHeads::Seed, seed: 0, float: Float::F32 };
+    let options = ImportOptions { fill: None, side_heads: SideHeads::Seed, seed: 0, float: Float::F32 };
     let names = ["weights.safetensors", "stage1.pth"];
     let weights =
         names.map(|name| folder.join(name)).into_iter().find(|path| path.exists()).expect("weights");
@@ -110,7 +110,7 @@ fn gaussian_regressor_and_its_activations() {
     let folder = fixture("unet");
     let Some(device) = device() else { return };
     let file = tempfile::NamedTempFile::new().expect("temporary file");
-    let options = ImportOptions { side_heads: SideHeads::Seed, seed: 0, float: Float::F32 };
+    let options = ImportOptions { fill: None, side_heads: SideHeads::Seed, seed: 0, float: Float::F32 };
     import(&[folder.join("weights.safetensors")], &Config::default(), options, file.path(), &|_, _| ())
         .expect("import");
     let regressors =

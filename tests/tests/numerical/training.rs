@@ -29,7 +29,7 @@ fn predictor(device: &Device) -> (Config, Networks) {
     let folder = tempfile::tempdir().expect("temporary folder");
     let config = Config::from_toml(CONFIG, "the fixture's config", &[]).expect("a config");
     let path = folder.path().join("weights.safetensors");
-    let options = ImportOptions { side_heads: SideHeads::Seed, seed: 0, float: Float::F32 };
+    let options = ImportOptions { fill: None, side_heads: SideHeads::Seed, seed: 0, float: Float::F32 };
     import(&[data("pipeline/stage1.pth")], &config, options, &path, &|_, _| ()).expect("imports");
     let weights = WeightFile::open(&path, None).expect("opens");
     let predictor = weights.point_predictor(&device.clone().autodiff()).expect("loads");

@@ -37,6 +37,9 @@ pub struct ImportArguments {
     /// this program.
     #[arg(required = true)]
     sources: Vec<PathBuf>,
+    /// Checkpoint that gives the tensors which are in none of the others.
+    #[arg(long, value_name = "FILE")]
+    fill: Option<PathBuf>,
     #[command(flatten)]
     config: ConfigArguments,
     /// Source of the right and left heads if no checkpoint contains them.
@@ -74,12 +77,18 @@ pub fn init(InitArguments { config, seed, output }: &InitArguments) -> Result<()
 }
 
 pub fn import(arguments: &ImportArguments) -> Result<(), Failure> {
-    let ImportArguments { sources, output, .. } = arguments;
+    let ImportArguments { sources, fill, output, .. } = arguments;
     let config = import_config(arguments)?;
-    let inputs: Vec<&Path> = sources.iter().chain(&arguments.config.config).map(PathBuf::as_path).collect();
+    let inputs: Vec<&Path> =
+        sources.iter().chain(fill).chain(&arguments.config.config).map(PathBuf::as_path).collect();
     check_outputs(&[output], &inputs)?;
     let float = if arguments.half { Float::F16 } else { Float::F32 };
-    let options = ImportOptions { side_heads: arguments.side_heads, seed: arguments.seed, float };
+    let options = ImportOptions {
+        fill: fill.as_deref(),
+        side_heads: arguments.side_heads,
+        seed: arguments.seed,
+        float,
+    };
     let progress = Progress::bytes();
     let advance = |done, total| progress.advance(done, total);
     let report = weights::import(sources, &config, options, output, &advance)?;

@@ -99,6 +99,9 @@ impl Config {
             let needed = "`network.sides = \"completed\"` and `network.side_heads = true`";
             return refuse("network.second_layer", format!("needs {needed}"));
         }
+        if n.normals && is_transformer {
+            return refuse("network.normals", "needs `network.body = \"convolution\"`".into());
+        }
         if let Some((key, message)) = outside([("network.pair_degrees", n.pair_degrees, 1.0..=359.0)]) {
             return refuse(key, message);
         }

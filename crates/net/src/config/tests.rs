@@ -58,6 +58,14 @@ fn completed_sides_need_what_they_are_made_of() {
 }
 
 #[test]
+fn normals_are_those_of_a_convolution() {
+    let set = |more: &str| refusal("", &["network.normals=true", more]);
+    assert!(set("network.body=transformer").contains("network.normals"));
+    let both = ["network.normals=true", "network.body=convolution", "network.patch=8"].map(str::to_owned);
+    assert!(Config::from_toml("", "x", &both).expect("valid").network.normals);
+}
+
+#[test]
 fn limits_of_colours_are_shares_of_the_range_of_corrected_colours() {
     let residual = "[regressor]\nstart = \"geometric\"\n";
     let set = |limits: &str| format!("regressor.color_limits={limits}");

@@ -90,8 +90,13 @@ impl Decoder {
 
     /// Features → `[B, outputs, h, w]`.
     fn out(&self, features: Tensor<4>) -> Tensor<4> {
-        conv2d(&self.conv_out, as_weight(features, &self.conv_out.weight), true)
+        out(&self.conv_out, features)
     }
+}
+
+/// Features → the output of a last layer, in its precision.
+fn out(layer: &Conv2d, features: Tensor<4>) -> Tensor<4> {
+    conv2d(layer, as_weight(features, &layer.weight), true)
 }
 
 /// Input of the decoders.
@@ -186,6 +191,8 @@ impl UNet {
 #[derive(Module, Debug)]
 pub struct PointUNet {
     body: UNet,
+    /// From features to the normals of both photographs.
+    normals: Option<Conv2d>,
     side_attention: Option<Attention>,
     side_decoder: Option<Decoder>,
     completion: Option<Completion>,
@@ -209,6 +216,7 @@ impl PointUNet {
         let has = |sides: Sides| c.side_heads && c.sides == sides;
         Self {
             body: UNet::new(c, &sizes, device),
+            normals: c.normals.then(|| conv1x1(c.last_dim, 6, device)),
             side_attention: has(Sides::Predicted).then(attention),
             side_decoder: has(Sides::Predicted).then(|| Decoder::new(widths, c.last_dim, 8, device)),
             completion: has(Sides::Completed).then(|| Completion::new(c, device)),
@@ -221,9 +229,9 @@ impl PointUNet {
         Self { side_attention: None, side_decoder: None, completion: None, ..self }
     }
 
-    /// Whether the layer of this name gives the raw points.
+    /// Whether the layer of this name gives the raw points or the normals.
     pub(super) fn is_last_layer(name: &str) -> bool {
-        name.ends_with("decoder.conv_out")
+        name.ends_with("decoder.conv_out") || name.ends_with("unet.normals")
     }
 
     /// Whether it has the unseen sides.
@@ -251,6 +259,11 @@ impl PointUNet {
         self.pair(self.body.out(features))
     }
 
+    /// Normals `[B, 3, H, W]` of the front and the back from their features; `None` without their layer.
+    pub(super) fn normals(&self, features: Tensor<4>) -> Option<[Tensor<4>; 2]> {
+        self.normals.as_ref().map(|layer| self.pair(out(layer, features)))
+    }
+
     /// Raw x, y, z, confidence `[B, 4, H, W]` of the right and the left; `None` without predicted sides.
     pub fn sides(&self, Levels { images, tokens }: &Levels) -> Option<[Tensor<4>; 2]> {
         let (attention, decoder) = (self.side_attention.as_ref()?, self.side_decoder.as_ref()?);
@@ -266,6 +279,7 @@ impl PointUNet {
     fn pair(&self, x: Tensor<4>) -> [Tensor<4>; 2] {
         let ([_, _, h, w], stride) = (x.dims(), self.config.patch >> (LEVELS - 1));
         let x = if stride > 1 { bilinear(x, [stride * h, stride * w], false) } else { x };
-        [x.clone().narrow(1, 0, 4), x.narrow(1, 4, 4)]
+        let each = x.dims()[1] / 2;
+        [x.clone().narrow(1, 0, each), x.narrow(1, each, each)]
     }
 }

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::slice;
 
 use super::WeightsError;
 use super::file::{Progress, mismatch, parts_of, write};
@@ -12,7 +13,9 @@ use crate::config::Config;
 
 /// Choices an import leaves to the user.
 #[derive(Debug, Clone, Copy)]
-pub struct ImportOptions {
+pub struct ImportOptions<'a> {
+    /// A checkpoint that gives the tensors which are in none of the others.
+    pub fill: Option<&'a Path>,
     /// Where side heads come from when the checkpoints have none.
     pub side_heads: SideHeads,
     /// Seed of random values.
@@ -79,7 +82,8 @@ fn canonical(key: &str) -> String {
 ///
 /// Each of the two parts (point predictor, regressor) must be complete or wholly absent, except that files without δ,
 /// without side heads or without any heads, as DUSt3R's and CroCo's are, get those from the config and the seed. Without
-/// `network.side_heads`, the tensors of the unseen sides are left out.
+/// `network.side_heads`, the tensors of the unseen sides are left out; `network.normals` decides likewise on the layer of the normals,
+/// which comes from the seed if no file has it. Where both `from` and `options.fill` have a tensor, it is that of `from`.
 ///
 /// # Errors
 /// [`WeightsError`]; `to` is then left as it was.
@@ -90,20 +94,30 @@ pub fn import(
     to: &Path,
     progress: Progress,
 ) -> Result<ImportReport, WeightsError> {
-    let sources = from.iter().map(|path| Source::open(path)).collect::<Result<Vec<_>, _>>()?;
-    let origin = from.iter().map(|p| p.display().to_string()).collect::<Vec<_>>().join(", ");
+    let open = |path| Source::open(path);
+    let sources = from.iter().map(|path| open(path)).collect::<Result<Vec<_>, _>>()?;
+    let fill = options.fill.map(open).transpose()?;
+    let paths = from.iter().map(PathBuf::as_path).chain(options.fill);
+    let origin = paths.map(|path| path.display().to_string()).collect::<Vec<_>>().join(", ");
     let mut report = ImportReport::default();
     let mut problems = Vec::new();
     let mut found = collect(&sources, &mut problems, &mut report)?;
+    if let Some(fill) = &fill {
+        let mut others = collect(slice::from_ref(fill), &mut problems, &mut report)?;
+        others.retain(|name, _| !found.contains_key(name));
+        report.notes.push(format!("{}: {} tensors", fill.path().display(), others.len()));
+        found.append(&mut others);
+    }
     copy_decoder(&mut found, &mut report);
-    if !config.network.side_heads {
+    let left_out: [(bool, fn(&str) -> bool, &str); 2] = [
+        (config.network.side_heads, is_of_sides, "unseen sides are left out: `network.side_heads`"),
+        (config.network.normals, is_of_normals, "normals are left out: `network.normals`"),
+    ];
+    for (_, is_of, what) in left_out.iter().filter(|(is_wanted, ..)| !is_wanted) {
         let all = found.len();
-        found.retain(|name, _| !is_of_sides(name));
+        found.retain(|name, _| !is_of(name));
         if found.len() < all {
-            let count = all - found.len();
-            report.notes.push(format!(
-                "{count} tensors of the unseen sides are left out: `network.side_heads` is false"
-            ));
+            report.notes.push(format!("{} tensors of the {what} is false", all - found.len()));
         }
     }
     let parts = parts_of(found.keys());
@@ -135,6 +149,11 @@ fn is_of_sides(name: &str) -> bool {
         || name.strip_prefix(UNET).is_some_and(of_unet)
 }
 
+/// Whether the tensor belongs to the photographs' normals.
+fn is_of_normals(name: &str) -> bool {
+    name.strip_prefix(UNET).is_some_and(|tail| tail.starts_with("normals."))
+}
+
 /// The key of head `k`'s tensors up to their own names.
 fn head(k: usize) -> String {
     format!("{DUST3R}downstream_head{k}.")
@@ -144,7 +163,7 @@ fn head(k: usize) -> String {
 fn plan<'a>(
     specs: &[TensorSpec],
     mut found: Found<'a>,
-    options: ImportOptions,
+    options: ImportOptions<'_>,
     problems: &mut Vec<String>,
     report: &mut ImportReport,
 ) -> Vec<Origin<'a>> {
@@ -186,6 +205,10 @@ fn plan<'a>(
             (None, Some(_)) => Origin::Drawn,
             (None, None) if spec.name == SCALE => {
                 report.notes.push("δ (`scale`) is in no file: `network.delta` of the config".into());
+                Origin::Drawn
+            }
+            (None, None) if is_of_normals(&spec.name) => {
+                report.notes.push(format!("{} is in no file: drawn from seed {}", spec.name, options.seed));
                 Origin::Drawn
             }
             (None, None) => {

@@ -188,5 +188,5 @@ fn read(path: &Path, views: &[View], window: Window, device: &Device) -> Option<
         (*view, PointMap { points, conf })
     };
     let maps = views.iter().map(map).collect();
-    Some(Prediction { window, maps })
+    Some(Prediction { window, maps, normals: None })
 }

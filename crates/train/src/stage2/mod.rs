@@ -165,7 +165,8 @@ impl GaussianTask {
                 let points = anchors(view, self.config.network.pair_degrees, item.side, &window, &device);
                 (view, PointMap { conf: Tensor::zeros([1, item.side, item.side], &device), points })
             };
-            let prediction = Prediction { maps: View::ALL.map(map).to_vec(), window: window.clone() };
+            let prediction =
+                Prediction { maps: View::ALL.map(map).to_vec(), window: window.clone(), normals: None };
             let gaussians =
                 gaussians(&config, &networks, &item, prediction, &Phase::new(false, 0), None, &device);
             Ok(sums.add(&item, self.shown(&item, gaussians, &device)?, &device)?)
