@@ -164,7 +164,7 @@ fn automatic_precision_is_that_of_the_processor() {
     assert!(said("f32").contains("precision: f32\n") && said("bf16").contains("precision: bf16, by "));
 }
 
-/// Completed sides with their second surfaces, from the data to the Gaussians.
+/// Completed sides with their second surfaces, beside normals, from the data to the Gaussians.
 #[test]
 fn second_surfaces_of_completed_sides_are_trained_and_become_gaussians() {
     let (temporary, config) = place();
@@ -175,7 +175,7 @@ fn second_surfaces_of_completed_sides_are_trained_and_become_gaussians() {
         command.args(["views.count=4", "--set=views.resolution=64", "--set=views.second_depth=true", "-o"]);
         succeed(command.arg(&data));
     }
-    const KEYS: [&str; 8] = [
+    const KEYS: [&str; 9] = [
         "network.body=convolution",
         "network.patch=8",
         "network.mask_channel=true",
@@ -183,6 +183,7 @@ fn second_surfaces_of_completed_sides_are_trained_and_become_gaussians() {
         "network.sides=completed",
         "network.second_layer=true",
         "network.side_dims=[4,4,8,8]",
+        "network.normals=true",
         "network.conf_threshold=0.01",
     ];
     let keys = KEYS.map(|key| format!("--set={key}"));
@@ -200,6 +201,9 @@ fn second_surfaces_of_completed_sides_are_trained_and_become_gaussians() {
         let (_, error) = *logged(&one, name).last().expect("a validation");
         assert!(error > 1.0 && error < 2000.0, "{name}: {error}");
     }
+    // The error of a normal of length 0 is 1 in each photograph.
+    let (_, error) = *logged(&one, "normals").last().expect("a step");
+    assert!(error > 0.1 && error < 2.5, "{error}");
     succeed(with(2, &data, &two).arg("--weights").arg(one.join("last.safetensors")));
     let view = |view: u32| data.join(format!("val/img/0000/{view}.png"));
     let mut command = snapsnap();
