@@ -202,7 +202,7 @@ fn another_file_gives_the_tensors_that_are_in_none_of_the_first() {
     assert!(got.keys().any(|name| own(name)) && got.keys().any(|name| !own(name)));
     let count = expected.len() - tensors.len();
     assert!(
-        report.notes.join("\n").contains(&format!("ours.safetensors: {count} tensors")),
+        report.notes.join("\n").contains(&format!("{count} tensors are in none of the others: from ")),
         "{:?}",
         report.notes
     );
@@ -219,10 +219,11 @@ fn the_layer_of_normals_is_drawn_or_left_out() {
                      enc_heads = 1\nmlp_ratio = 1\nlast_dim = 8\nside_heads = false\n";
         Config::from_toml(lines, "x", &[format!("network.normals={normals}")]).expect("valid")
     };
-    let import = |from: &str, normals: bool, to: &str| {
-        let report = import(&[at(from)], &config(normals), OPTIONS, &at(to), &|_, _| ()).expect("imports");
-        report.notes.join("\n")
+    let import_to = |from: &str, normals: bool, to: &str| {
+        import(&[at(from)], &config(normals), OPTIONS, &at(to), &|_, _| ())
     };
+    let import =
+        |from: &str, normals: bool, to: &str| import_to(from, normals, to).expect("imports").notes.join("\n");
     init(&config(false), 1, &at("without"), &|_, _| ()).expect("writes");
     let notes = import("without", true, "with");
     assert!(notes.contains("unet.normals.weight is in no file: drawn from seed 3"), "{notes}");
@@ -231,6 +232,12 @@ fn the_layer_of_normals_is_drawn_or_left_out() {
     assert_eq!(with["unet.normals.weight"].1, [6, 8, 1, 1]);
     assert_eq!(with.len(), without.len() + 2);
     assert!(WeightFile::open(&at("with"), Some(config(false))).is_err());
+    // A file that should have both tensors is damaged.
+    let mut damaged = with.clone();
+    damaged.remove("unet.normals.bias");
+    write(&damaged, &at("damaged"));
+    let into = |from: &str| import_to(from, true, "never").expect_err("is damaged").to_string();
+    assert!(into("damaged").contains("missing: unet.normals.bias"));
     let notes = import("with", false, "again");
     assert!(notes.contains("2 tensors of the normals are left out"), "{notes}");
     assert_eq!(read(&at("again")), without);

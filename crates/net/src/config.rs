@@ -80,8 +80,7 @@ pub struct NetworkConfig {
     pub side_dims: [usize; 4],
     /// Whether completed sides have the second surface that faces their cameras, too, such as the flank behind an arm.
     pub second_layer: bool,
-    /// Whether the network also predicts the normals of the photographs' surfaces. Stage 1 learns them beside the points; nothing
-    /// else uses them.
+    /// Whether the network also predicts the normals of the photographs' surfaces. Only the losses of stage 1 use them.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub normals: bool,
     /// Fusion of the tokens of the two photographs into those of the unseen sides.

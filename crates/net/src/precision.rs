@@ -109,7 +109,8 @@ mod tests {
         config.network.head = HeadKind::Linear;
         assert_eq!(in_f32(&config), of_heads("proj"));
         (config.network.body, config.network.patch) = (Body::Convolution, 8);
-        let decoders = ["unet.decoder.conv_out.weight", "unet.side_decoder.conv_out.weight"];
-        assert_eq!(in_f32(&config), decoders);
+        config.network.normals = true;
+        let last = ["unet.decoder.conv_out", "unet.normals", "unet.side_decoder.conv_out"];
+        assert_eq!(in_f32(&config), last.map(|name| format!("{name}.weight")));
     }
 }

@@ -54,7 +54,7 @@ pub struct Prediction {
     pub window: Window,
     /// `[B,h,w,3]` and `[B,h,w]` of every view.
     pub maps: Vec<(View, PointMap)>,
-    /// Normals `[B,3,h,w]` of front and back at the network's resolution, with `network.normals`.
+    /// Normals `[B,3,h',w']` of front and back in the network's pixels, with `network.normals`.
     pub normals: Option<[Tensor<4>; 2]>,
 }
 
@@ -132,7 +132,7 @@ pub fn losses(prediction: &Prediction, points: &Tensor<5>, valid: &Tensor<4>, re
     let mut regression = Vec::new();
     let mut confidence = Vec::new();
     let mut reliefs = Vec::new();
-    let mut angles = Vec::new();
+    let mut of_normals = Vec::new();
     for (view, map) in maps.iter().filter(|(view, _)| (*view as usize) < points.dims()[1]) {
         let row = *view as usize;
         let inside = window.cut(valid.clone().narrow(1, row, 1)).reshape([b, h, w]);
@@ -143,7 +143,7 @@ pub fn losses(prediction: &Prediction, points: &Tensor<5>, valid: &Tensor<4>, re
         let nowhere = there.clone().bool_not().unsqueeze_dim::<4>(3).expand([b, h, w, 3]);
         if let Some(normals) = normals.as_ref().and_then(|normals| normals.get(row)) {
             let truth = truth.clone().mask_fill(nowhere.clone(), 0.0);
-            angles.push(normals_error(normals, truth, &inside, side));
+            of_normals.push(normals_error(normals, truth, &inside, side));
         }
         let off = (map.points.clone() - truth).mask_fill(nowhere, 0.0);
         if relief {
@@ -162,7 +162,7 @@ pub fn losses(prediction: &Prediction, points: &Tensor<5>, valid: &Tensor<4>, re
         regression: sum(regression),
         confidence: sum(confidence),
         relief: relief.then(|| sum(reliefs)),
-        normals: normals.is_some().then(|| sum(angles)),
+        normals: normals.is_some().then(|| sum(of_normals)),
     }
 }
 

@@ -9,11 +9,12 @@ use snapsnap_tests::{device, is_software, relative_error, values};
 
 use crate::properties::{assert_different, assert_same, config, noise, photograph, weights};
 
-const CONVOLUTION: [&str; 4] = [
+const CONVOLUTION: [&str; 5] = [
     "network.body=convolution",
     "network.dec_depth=1",
     "network.mask_channel=true",
     "network.ray_channels=true",
+    "network.normals=true",
 ];
 
 /// The device, unless it is a software adapter: compiling kernels takes minutes there, and keys act alike on every device.
@@ -35,6 +36,11 @@ fn maps(net: &PointPredictor, input: Input) -> Vec<(View, Vec<f32>)> {
     let window = Window::whole(input.images.dims()[2]);
     let maps = net.forward(input, &window).into_iter();
     maps.map(|(view, map)| (view, [values(map.points), values(map.conf)].concat())).collect()
+}
+
+/// Normals `[B, 3, h, w]` of front and back, for a body that has them.
+fn normals(net: &PointPredictor, input: Input) -> Vec<Tensor<4>> {
+    net.normals(&net.decode(net.encode(input))).into_iter().flatten().collect()
 }
 
 fn whole(config: &Config, images: Tensor<4>) -> Input {
@@ -107,6 +113,13 @@ fn a_mirrored_back_is_the_back_of_a_mirrored_photograph() {
         other.images = other.images.slice_assign([0..2, 4..5, 0..h, 0..w], rays);
         assert_same("input", &values(seen.images.clone()), &values(other.images.clone()));
         let net = |config: &Config| random_predictor(config, 5, &device);
+        let (a, b) = (normals(&net(&mirrored), seen.clone()), normals(&net(&plain), other.clone()));
+        assert_eq!(a.len(), if body.len() == CONVOLUTION.len() { 2 } else { 0 });
+        if let ([front, back], [of_front, of_back]) = (&a[..], &b[..]) {
+            assert_same("normals", &values(front.clone()), &values(of_front.clone()));
+            assert_same("normals", &values(back.clone()), &values(of_back.clone().flip([3])));
+            assert_different("normals", &values(front.clone()), &values(back.clone()));
+        }
         let (a, b) = (net(&mirrored).forward(seen, &window), net(&plain).forward(other, &window));
         for ((view, a), (_, b)) in a.into_iter().zip(b) {
             let b = if view == View::Back { b.points.flip([2]) } else { b.points };
@@ -131,6 +144,14 @@ fn predictions_of_both_ways_are_symmetric() {
             let input = Input::new(config, seen(&colors), seen(&masks), &window);
             random_predictor(config, 5, &device).forward(input, &window)
         };
+        let [of_both, of_one] = [&both, &one].map(|config| {
+            let input = Input::new(config, colors.clone(), masks.clone(), &window);
+            normals(&random_predictor(config, 5, &device), input)
+        });
+        for (both, one) in of_both.into_iter().zip(of_one) {
+            assert_eq!(both.dims(), one.dims());
+            assert!(relative_error(&values(both), &values(one)) < 1e-6);
+        }
         let mirrored = |map: &PointMap| {
             let [b, h, w, _] = map.points.dims();
             let points = map.points.clone().flip([2]);

@@ -196,14 +196,14 @@ fn second_surfaces_of_completed_sides_are_trained_and_become_gaussians() {
     assert!(said.contains("samples.second_depth"), "{said}");
     let said = refused(&mut with(1, people(), &one));
     assert!(said.contains("second surfaces"), "{said}");
-    succeed(&mut with(1, &data, &one));
+    succeed(with(1, &data, &one).arg("--set=training.steps=80"));
     for name in ["validation/right_second_mm", "validation/left_second_mm"] {
         let (_, error) = *logged(&one, name).last().expect("a validation");
         assert!(error > 1.0 && error < 2000.0, "{name}: {error}");
     }
-    // The error of a normal of length 0 is 1 in each photograph.
+    // Normals of length 0 have an error of 1 in each photograph.
     let (_, error) = *logged(&one, "normals").last().expect("a step");
-    assert!(error > 0.1 && error < 2.5, "{error}");
+    assert!(error > 0.1 && error < 1.8, "{error}");
     succeed(with(2, &data, &two).arg("--weights").arg(one.join("last.safetensors")));
     let view = |view: u32| data.join(format!("val/img/0000/{view}.png"));
     let mut command = snapsnap();

@@ -103,11 +103,11 @@ pub fn import(arguments: &ImportArguments) -> Result<(), Failure> {
 
 /// The config of --config, or the one stored in a source, or the published size. The published weights of that size need
 /// `compat`.
-fn import_config(ImportArguments { sources, config, .. }: &ImportArguments) -> Result<Config, Failure> {
+fn import_config(ImportArguments { sources, fill, config, .. }: &ImportArguments) -> Result<Config, Failure> {
     if config.config.is_none() {
         // A pickle contains no config.
         let is_safetensors = |path: &&PathBuf| path.extension().is_some_and(|e| e == "safetensors");
-        for path in sources.iter().filter(is_safetensors) {
+        for path in sources.iter().chain(fill).filter(is_safetensors) {
             if let Some(stored) = weights::stored_config(path)? {
                 let origin = format!("{} (metadata)", path.display());
                 return Ok(Config::from_toml(&stored.to_toml(), &origin, &config.set)?);

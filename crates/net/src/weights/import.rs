@@ -52,6 +52,13 @@ enum Origin<'a> {
     Drawn,
 }
 
+/// What may be absent from the checkpoints.
+#[derive(Clone, Copy)]
+struct Lacking {
+    heads: bool,
+    normals: bool,
+}
+
 /// Keys of the authors' files that neither inference nor training uses.
 fn is_ignored(key: &str) -> bool {
     key == "mask_token" || key.starts_with("prediction_head.")
@@ -102,13 +109,21 @@ pub fn import(
     let mut report = ImportReport::default();
     let mut problems = Vec::new();
     let mut found = collect(&sources, &mut problems, &mut report)?;
-    if let Some(fill) = &fill {
-        let mut others = collect(slice::from_ref(fill), &mut problems, &mut report)?;
-        others.retain(|name, _| !found.contains_key(name));
-        report.notes.push(format!("{}: {} tensors", fill.path().display(), others.len()));
-        found.append(&mut others);
-    }
     copy_decoder(&mut found, &mut report);
+    let promise_normals = sources.iter().map(|source| match source.metadata.contains_key(CONFIG_KEY) {
+        true => source.config().map(|config| config.network.normals),
+        false => Ok(false),
+    });
+    let has_normals = promise_normals.collect::<Result<Vec<_>, _>>()?.contains(&true);
+    // DUSt3R's files lack δ and the side heads, CroCo's all heads; Snap-Snap's are complete, or damaged.
+    let mut lacking = Lacking { heads: !found.contains_key(SCALE), normals: !has_normals };
+    if let Some(fill) = &fill {
+        let others = collect(slice::from_ref(fill), &mut problems, &mut report)?;
+        for (name, place) in others {
+            found.entry(name).or_insert(place);
+        }
+    }
+    lacking.normals &= !found.keys().any(|name| is_of_normals(name));
     let left_out: [(bool, fn(&str) -> bool, &str); 2] = [
         (config.network.side_heads, is_of_sides, "unseen sides are left out: `network.side_heads`"),
         (config.network.normals, is_of_normals, "normals are left out: `network.normals`"),
@@ -125,7 +140,13 @@ pub fn import(
     if specs.is_empty() {
         problems.push("no tensor of a point predictor or a regressor".into());
     }
-    let plan = plan(&specs, found, options, &mut problems, &mut report);
+    if let Some(fill) = &fill {
+        let count = found.values().filter(|(source, _)| std::ptr::eq(*source, fill)).count();
+        report
+            .notes
+            .push(format!("{count} tensors are in none of the others: from {}", fill.path().display()));
+    }
+    let plan = plan(&specs, found, (options, lacking), &mut problems, &mut report);
     if !problems.is_empty() {
         return Err(WeightsError::Tensors { origin, problems });
     }
@@ -163,15 +184,13 @@ fn head(k: usize) -> String {
 fn plan<'a>(
     specs: &[TensorSpec],
     mut found: Found<'a>,
-    options: ImportOptions<'_>,
+    (options, lacking): (ImportOptions<'_>, Lacking),
     problems: &mut Vec<String>,
     report: &mut ImportReport,
 ) -> Vec<Origin<'a>> {
-    // DUSt3R's files lack δ and the side heads, CroCo's all heads; Snap-Snap's are complete, or damaged.
-    let complete = found.contains_key(SCALE);
     let wanted = |k: &usize| specs.iter().any(|spec| spec.name.starts_with(&head(*k)));
     let given = |k: &usize| found.keys().any(|key| key.starts_with(&head(*k)));
-    let absent: Vec<usize> = (1..=4).filter(|k| !complete && wanted(k) && !given(k)).collect();
+    let absent: Vec<usize> = (1..=4).filter(|k| lacking.heads && wanted(k) && !given(k)).collect();
     for &k in &absent {
         report.notes.push(match options.side_heads {
             SideHeads::Copy if k > 2 && !absent.contains(&(k - 2)) => {
@@ -207,7 +226,7 @@ fn plan<'a>(
                 report.notes.push("δ (`scale`) is in no file: `network.delta` of the config".into());
                 Origin::Drawn
             }
-            (None, None) if is_of_normals(&spec.name) => {
+            (None, None) if lacking.normals && is_of_normals(&spec.name) => {
                 report.notes.push(format!("{} is in no file: drawn from seed {}", spec.name, options.seed));
                 Origin::Drawn
             }

@@ -233,7 +233,7 @@ impl Task for GaussianTask {
                 let relief = self.stage1.relief_weight > 0.0;
                 let parts = points_losses(&prediction, &points, &valid, relief).parts(&self.stage1);
                 let value = parts.into_iter().map(|part| part.value * part.weight);
-                add("points", config.points_weight, value.reduce(|a, b| a + b).expect("two parts"));
+                add("points", config.points_weight, value.reduce(|a, b| a + b).expect("there are points"));
             }
             let made = gaussians(&self.config, networks, item, prediction, &phase, noise, device);
             // A sample without a valid pixel has no picture, and counts as one without an error.
