@@ -110,11 +110,7 @@ pub fn import(
     let mut problems = Vec::new();
     let mut found = collect(&sources, &mut problems, &mut report)?;
     copy_decoder(&mut found, &mut report);
-    let promise_normals = sources.iter().map(|source| match source.metadata.contains_key(CONFIG_KEY) {
-        true => source.config().map(|config| config.network.normals),
-        false => Ok(false),
-    });
-    let has_normals = promise_normals.collect::<Result<Vec<_>, _>>()?.contains(&true);
+    let has_normals = sources.iter().any(|source| source.config().is_ok_and(|config| config.network.normals));
     // DUSt3R's files lack δ and the side heads, CroCo's all heads; Snap-Snap's are complete, or damaged.
     let mut lacking = Lacking { heads: !found.contains_key(SCALE), normals: !has_normals };
     if let Some(fill) = &fill {
