@@ -100,6 +100,22 @@ fn silhouettes_that_do_not_fit_are_noticed() {
     assert!(said.contains("silhouettes"), "{said}");
 }
 
+/// An arm that is nearer to the camera in one photograph is wider there: the boxes of this person are 677 and 563 of 1024 pixels wide.
+#[test]
+fn an_outstretched_arm_raises_no_doubt() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let mut prepare = snapsnap();
+    prepare.args(["prepare", "synth", "--subjects", "1", "--seed", "77021", "--split", "test", "--config"]);
+    prepare.arg(root().join("configs/data/evaluation.toml")).args(["--set", "views.count=4"]);
+    succeed(prepare.args(["--set", "views.resolution=256", "-o"]).arg(temporary.path().join("people")));
+    let view = |view: u32| temporary.path().join(format!("people/test/img/0000/{view}.png"));
+    let said = strict(temporary.path(), &[view(0), view(1)], &[]);
+    assert!(said.contains("silhouettes"), "{said}");
+    let mut command = reconstruct(temporary.path(), &[view(0), view(2)]);
+    let said = succeed(command.args(["--strict", "--set", "network.resolution=256"]));
+    assert!(!said.contains("warning"), "{said}");
+}
+
 /// The person's box decides the scale. A few pixels in a corner do not widen it.
 #[test]
 fn a_distant_speck_of_the_mask_changes_nothing() {

@@ -11,16 +11,18 @@ const TOUCHED: f32 = 0.05;
 const BORDERS: usize = 3;
 /// Largest width of a person as a share of the height. Outstretched arms reach about 1.
 const WIDEST: f32 = 1.2;
-/// Least overlap (intersection over union) of the front's silhouette and the mirrored back's, each scaled to its own box. Photographs
-/// of one pose have 0.8 and more.
-const OVERLAP: f32 = 0.55;
+/// Least overlap (intersection over union) of the front's silhouette and the mirrored back's, scaled to one height. Right pairs have 0.63 and
+/// more (docs/notes/photographs.md).
+const OVERLAP: f32 = 0.6;
 /// Rows of the face below the top of the person's box, and columns on either side of the head's middle, as shares of the height.
 const FACE: [f32; 2] = [0.03, 0.11];
 const HALF_FACE: f32 = 0.03;
 /// Difference of the shares of skin-coloured pixels from which the pictures may be swapped.
 const SWAPPED: f32 = 0.5;
-/// Side of the grid on which silhouettes and colours are compared.
+/// Side of the grid on which silhouettes and colours are compared, in cells.
 const GRID: u32 = 64;
+/// Columns of a silhouette's grid, which is wider than outstretched arms.
+const COLUMNS: i64 = 2 * GRID as i64;
 /// Largest mean difference of colours, of 255, between two files of one picture.
 const EQUAL: f32 = 2.0;
 
@@ -89,18 +91,44 @@ fn grid() -> impl Iterator<Item = (u32, u32)> {
     (0..GRID).flat_map(|y| (0..GRID).map(move |x| (x, y)))
 }
 
+/// Intersection over union of the front's silhouette and the mirrored back's, each scaled to its own height, where they overlap most. Their
+/// widths may differ: a hand is wider apart on the side where it is nearer to the camera.
 fn overlap(front: &Cutout, back: &Cutout) -> f32 {
-    let inside = |one: &Cutout, x: u32, y: u32, mirrored: bool| {
-        let (x, y) = place(one.person, x, y, mirrored);
-        one.mask.get_pixel(x, y)[0] >= PERSON
+    let (front, back) = (silhouette(front, false), silhouette(back, true));
+    let farthest = i64::from(GRID / 2);
+    let at_shift = |shift: i64| {
+        let (mut both, mut any) = (0_u32, 0_u32);
+        for (a, b) in front.iter().zip(&back) {
+            for column in -farthest..COLUMNS + farthest {
+                let is_in = |row: &[bool], column: i64| {
+                    usize::try_from(column)
+                        .ok()
+                        .and_then(|column| row.get(column))
+                        .is_some_and(|inside| *inside)
+                };
+                let (a, b) = (is_in(a, column), is_in(b, column - shift));
+                both += u32::from(a && b);
+                any += u32::from(a || b);
+            }
+        }
+        both as f32 / any.max(1) as f32
     };
-    let (mut both, mut any) = (0_u32, 0_u32);
-    for (x, y) in grid() {
-        let (a, b) = (inside(front, x, y, false), inside(back, x, y, true));
-        both += u32::from(a && b);
-        any += u32::from(a || b);
-    }
-    both as f32 / any.max(1) as f32
+    (-farthest..=farthest).map(at_shift).fold(0.0, f32::max)
+}
+
+/// Rows of a silhouette, mirrored or not, in cells of a part of the person's height, around the middle of the person's box.
+fn silhouette(one: &Cutout, mirrored: bool) -> Vec<Vec<bool>> {
+    let Rect { x, y, width, height } = one.person;
+    let (height, grid) = (i64::from(height), i64::from(GRID));
+    let middle = i64::from(x) + i64::from(width) / 2;
+    let inside = |row: i64, column: i64| {
+        let column = if mirrored { COLUMNS - 1 - column } else { column };
+        let across = middle + (2 * column + 1 - COLUMNS) * height / (2 * grid);
+        let down = i64::from(y) + (2 * row + 1) * height / (2 * grid);
+        let place = u32::try_from(across).ok().zip(u32::try_from(down).ok());
+        place.and_then(|(x, y)| one.mask.get_pixel_checked(x, y)).is_some_and(|mask| mask[0] >= PERSON)
+    };
+    (0..grid).map(|row| (0..COLUMNS).map(|column| inside(row, column)).collect()).collect()
 }
 
 /// Whether the person has the same colours in both pictures, or in one and the mirror image of the other.
