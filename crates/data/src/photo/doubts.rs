@@ -91,8 +91,8 @@ fn grid() -> impl Iterator<Item = (u32, u32)> {
     (0..GRID).flat_map(|y| (0..GRID).map(move |x| (x, y)))
 }
 
-/// Intersection over union of the front's silhouette and the mirrored back's, each scaled to its own height, where they overlap most. Their
-/// widths may differ: a hand is wider apart on the side where it is nearer to the camera.
+/// Intersection over union of the front's silhouette and the mirrored back's, scaled to one height and shifted to where they overlap most.
+/// Their widths may differ: an arm looks longer in the photograph in which it is nearer to the camera.
 fn overlap(front: &Cutout, back: &Cutout) -> f32 {
     let (front, back) = (silhouette(front, false), silhouette(back, true));
     let farthest = i64::from(GRID / 2);
@@ -116,7 +116,7 @@ fn overlap(front: &Cutout, back: &Cutout) -> f32 {
     (-farthest..=farthest).map(at_shift).fold(0.0, f32::max)
 }
 
-/// Rows of a silhouette, mirrored or not, in cells of a part of the person's height, around the middle of the person's box.
+/// Rows of a silhouette, mirrored or not, in cells of 1/64 of the person's height, around the middle of the person's box.
 fn silhouette(one: &Cutout, mirrored: bool) -> Vec<Vec<bool>> {
     let Rect { x, y, width, height } = one.person;
     let (height, grid) = (i64::from(height), i64::from(GRID));

@@ -120,16 +120,11 @@ pub fn import(
         }
     }
     lacking.normals &= !found.keys().any(|name| is_of_normals(name));
-    let left_out: [(bool, fn(&str) -> bool, &str); 2] = [
-        (config.network.side_heads, is_of_sides, "unseen sides are left out: `network.side_heads`"),
-        (config.network.normals, is_of_normals, "normals are left out: `network.normals`"),
-    ];
-    for (_, is_of, what) in left_out.iter().filter(|(is_wanted, ..)| !is_wanted) {
-        let all = found.len();
-        found.retain(|name, _| !is_of(name));
-        if found.len() < all {
-            report.notes.push(format!("{} tensors of the {what} is false", all - found.len()));
-        }
+    if !config.network.side_heads {
+        leave_out(&mut found, is_of_sides, "unseen sides are left out: `network.side_heads`", &mut report);
+    }
+    if !config.network.normals {
+        leave_out(&mut found, is_of_normals, "normals are left out: `network.normals`", &mut report);
     }
     let parts = parts_of(found.keys());
     let specs: Vec<_> = schema::tensors(config).into_iter().filter(|t| parts.contains(&t.part)).collect();
@@ -138,9 +133,8 @@ pub fn import(
     }
     if let Some(fill) = &fill {
         let count = found.values().filter(|(source, _)| std::ptr::eq(*source, fill)).count();
-        report
-            .notes
-            .push(format!("{count} tensors are in none of the others: from {}", fill.path().display()));
+        let path = fill.path().display();
+        report.notes.push(format!("{count} tensors are in none of the others: from {path}"));
     }
     let plan = plan(&specs, found, (options, lacking), &mut problems, &mut report);
     if !problems.is_empty() {
@@ -156,6 +150,15 @@ pub fn import(
     report.tensors = specs.len();
     report.parameters = specs.iter().map(TensorSpec::elements).sum();
     Ok(report)
+}
+
+/// Removes tensors that the config has no layers for.
+fn leave_out(found: &mut Found, is_of: fn(&str) -> bool, what: &str, report: &mut ImportReport) {
+    let all = found.len();
+    found.retain(|name, _| !is_of(name));
+    if found.len() < all {
+        report.notes.push(format!("{} tensors of the {what} is false", all - found.len()));
+    }
 }
 
 /// Whether the tensor belongs to the unseen sides alone.
