@@ -101,9 +101,8 @@ pub fn import(
     to: &Path,
     progress: Progress,
 ) -> Result<ImportReport, WeightsError> {
-    let open = |path| Source::open(path);
-    let sources = from.iter().map(|path| open(path)).collect::<Result<Vec<_>, _>>()?;
-    let fill = options.fill.map(open).transpose()?;
+    let sources = from.iter().map(|path| Source::open(path)).collect::<Result<Vec<_>, _>>()?;
+    let fill = options.fill.map(Source::open).transpose()?;
     let paths = from.iter().map(PathBuf::as_path).chain(options.fill);
     let origin = paths.map(|path| path.display().to_string()).collect::<Vec<_>>().join(", ");
     let mut report = ImportReport::default();
