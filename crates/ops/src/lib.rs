@@ -7,6 +7,7 @@ pub mod conv;
 pub mod gpu;
 pub mod half;
 pub mod layers;
+mod lengths;
 mod math;
 mod multiply;
 pub mod op;
@@ -31,6 +32,7 @@ use burn::tensor::module::{attention, interpolate};
 use burn::tensor::ops::{InterpolateMode, InterpolateOptions};
 use burn::tensor::{DType, Device, FloatDType, Tensor, TensorData};
 
+pub use lengths::mean_lengths;
 pub use rope::Rope;
 use snapsnap_base::bilinear::{Tap, taps};
 use train::{Attention, Tokens};

@@ -247,6 +247,7 @@ impl TrainConfig {
     /// The samples' config, with what the sections `[mode]` and `[network]` say of photographs.
     pub fn samples(&self) -> SampleConfig {
         SampleConfig {
+            sides: self.network.side_heads,
             person_height: self.networks().person_height(),
             pair_degrees: self.network.pair_degrees,
             ..self.samples.clone()

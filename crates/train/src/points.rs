@@ -6,12 +6,12 @@ use snapsnap_eval::points::longest_side;
 use snapsnap_net::Window;
 use snapsnap_net::config::{Config, NetworkConfig};
 use snapsnap_net::network::{Input, PointMap, PointPredictor, View};
-use snapsnap_ops::{bilinear, host, mean};
+use snapsnap_ops::{bilinear, host, mean, mean_lengths};
 
 use crate::config::Stage1Config;
 use crate::task::Part;
 
-/// Least square of a distance with a gradient. The direction of a smaller error is noise.
+/// Least square of an edge's or a normal's length.
 const MIN_SQUARE: f64 = 1e-24;
 /// Distances in pixels between which the relief is compared.
 const SPACINGS: [usize; 4] = [1, 2, 4, 8];
@@ -136,20 +136,19 @@ pub fn losses(prediction: &Prediction, points: &Tensor<5>, valid: &Tensor<4>, re
     for (view, map) in maps.iter().filter(|(view, _)| (*view as usize) < points.dims()[1]) {
         let row = *view as usize;
         let inside = window.cut(valid.clone().narrow(1, row, 1)).reshape([b, h, w]);
-        let there = inside.clone().greater_elem(0.5);
         let truth = points.clone().narrow(1, row, 1).narrow(2, window.rows.start, h);
         let truth = truth.narrow(3, window.columns.start, w).reshape([b, h, w, 3]);
-        // Invalid points may be 10⁸ metres or NaN. They must not reach the gradient.
-        let nowhere = there.clone().bool_not().unsqueeze_dim::<4>(3).expand([b, h, w, 3]);
         if let Some(normals) = normals.as_ref().and_then(|normals| normals.get(row)) {
-            let truth = truth.clone().mask_fill(nowhere.clone(), 0.0);
-            of_normals.push(normals_error(normals, truth, &inside, side));
+            of_normals.push(normals_error(normals, &truth, &inside, side));
         }
-        let off = (map.points.clone() - truth).mask_fill(nowhere, 0.0);
-        if relief {
-            reliefs.push(relief_error(&off, &inside));
+        // Invalid points may be 10⁸ metres or NaN. They do not reach the gradient, since they are not inside.
+        let off = map.points.clone() - truth;
+        let offsets = if relief { offsets(h, w) } else { vec![[0, 0]] };
+        let lengths = mean_lengths(off, inside.clone(), &offsets);
+        if offsets.len() > 1 {
+            reliefs.push(lengths.clone().narrow(1, 1, offsets.len() - 1).mean());
         }
-        regression.push(mean_length(off, inside.clone()));
+        regression.push(lengths.narrow(1, 0, 1).mean());
 
         let log = |p: Tensor<3>| p.clamp_min(MIN_PROBABILITY).log();
         let (sure, unsure) = (log(map.conf.clone()), log(1.0 - map.conf.clone()));
@@ -166,10 +165,10 @@ pub fn losses(prediction: &Prediction, points: &Tensor<5>, valid: &Tensor<4>, re
     }
 }
 
-/// Mean length of the difference between predicted `normals` `[B,3,h',w']`, enlarged, and those of the true points `[B,h,w,3]`, which are
-/// 0 where they are not `inside` `[B,h,w]`, on a canvas of `side` pixels. A true normal is that of the triangle of a pixel and its
+/// Mean length of the difference between predicted `normals` `[B,3,h',w']`, enlarged, and those of the true points `[B,h,w,3]` that are
+/// `inside` `[B,h,w]`, on a canvas of `side` pixels. A true normal is that of the triangle of a pixel and its
 /// neighbours on the right and below.
-fn normals_error(normals: &Tensor<4>, truth: Tensor<4>, inside: &Tensor<3>, side: usize) -> Tensor<1> {
+fn normals_error(normals: &Tensor<4>, truth: &Tensor<4>, inside: &Tensor<3>, side: usize) -> Tensor<1> {
     let [_, h, w, _] = truth.dims();
     let at = |row, column| truth.clone().narrow(1, row, h - 1).narrow(2, column, w - 1);
     let (right, below) = (at(0, 1) - at(0, 0), at(1, 0) - at(0, 0));
@@ -184,30 +183,13 @@ fn normals_error(normals: &Tensor<4>, truth: Tensor<4>, inside: &Tensor<3>, side
     let is_enlarged = normals.dims()[2..] == [h, w];
     let predicted = if is_enlarged { normals.clone() } else { bilinear(normals.clone(), [h, w], false) };
     let predicted = predicted.permute([0, 2, 3, 1]).narrow(1, 0, h - 1).narrow(2, 0, w - 1);
-    mean_length(predicted - normal.clone() / length(normal), weight)
+    mean_lengths(predicted - normal.clone() / length(normal), weight, &[[0, 0]]).mean()
 }
 
-/// Mean length of vectors `[B,h,w,3]` where `weight` `[B,h,w]` is 1, 0 for samples where it is 1 nowhere; the mean over the samples.
-fn mean_length(vectors: Tensor<4>, weight: Tensor<3>) -> Tensor<1> {
-    let length = vectors.square().sum_dim(3).clamp_min(MIN_SQUARE).sqrt().squeeze_dim::<3>(3);
-    // Not all at once: on GPUs one thread adds up what a step joins.
-    let sum = |values: Tensor<3>| values.sum_dim(2).sum_dim(1);
-    (sum(length * weight.clone()) / sum(weight).clamp_min(1.0)).mean()
-}
-
-/// Mean error of differences between pixels: of the differences of errors `off` `[B,h,w,3]` between two pixels that are `inside`
-/// `[B,h,w]`, [`SPACINGS`] apart in a row or a column, each spacing and direction alike.
-fn relief_error(off: &Tensor<4>, inside: &Tensor<3>) -> Tensor<1> {
-    let mut errors = Vec::new();
-    for spacing in SPACINGS {
-        for axis in [1, 2] {
-            let Some(rest) = off.dims()[axis].checked_sub(spacing).filter(|rest| *rest > 0) else { continue };
-            let between = off.clone().narrow(axis, spacing, rest) - off.clone().narrow(axis, 0, rest);
-            let both = inside.clone().narrow(axis, spacing, rest) * inside.clone().narrow(axis, 0, rest);
-            errors.push(mean_length(between, both));
-        }
-    }
-    Tensor::cat(errors, 0).mean()
+/// What the losses measure: the errors themselves, and their differences between two pixels that are [`SPACINGS`] apart in a row or a column.
+fn offsets(h: usize, w: usize) -> Vec<[usize; 2]> {
+    let apart = SPACINGS.into_iter().flat_map(|spacing| [[spacing, 0], [0, spacing]]);
+    [[0, 0]].into_iter().chain(apart.filter(|[down, across]| *down < h && *across < w)).collect()
 }
 
 #[cfg(test)]
@@ -226,7 +208,10 @@ mod tests {
                 places().map(|(row, column)| f32::from(u8::from(is_inside(row, column)))).collect();
             let off = Tensor::<4>::from_data(TensorData::new(off, [1, h, w, 3]), &Device::flex());
             let inside = Tensor::<3>::from_data(TensorData::new(inside, [1, h, w]), &Device::flex());
-            f64::from(relief_error(&off, &inside).into_scalar::<f32>())
+            let offsets = offsets(h, w);
+            assert_eq!(offsets.len(), 9);
+            let lengths = mean_lengths(off, inside, &offsets);
+            f64::from(lengths.narrow(1, 1, 8).mean().into_scalar::<f32>())
         };
         // The least length of a difference is 1e-12.
         assert!(error(&|_, _| [0.3, -0.2, 0.7], &|_, _| true) < 1e-11);
@@ -260,7 +245,7 @@ mod tests {
         let error = |normal: [f32; 3], truth: Tensor<4>, inside: &Tensor<3>| {
             let normals = Tensor::<1>::from_floats(normal, &Device::flex()).reshape([1, 3, 1, 1]);
             let normals = normals.expand([1, 3, h / 2, w / 2]);
-            f64::from(normals_error(&normals, truth, inside, 1024).into_scalar::<f32>())
+            f64::from(normals_error(&normals, &truth, inside, 1024).into_scalar::<f32>())
         };
         let (sin, cos) = 30.0_f32.to_radians().sin_cos();
         assert!(error([sin, 0.0, -cos], wall(1.0, 0.0), &inside) < 1e-5);

@@ -67,6 +67,9 @@ pub struct SampleConfig {
     /// those of nominal cameras that would see the same pixels of an upright person. In stage 2, people are restored before they
     /// are rendered.
     pub upright: bool,
+    /// Whether samples contain the points of right and left. Networks without heads for the sides need none.
+    #[serde(skip)]
+    pub sides: bool,
     /// Height of a placed person in pixels of a canvas of 1024: `mode.person_height`.
     #[serde(skip)]
     pub person_height: usize,
@@ -92,6 +95,7 @@ impl Default for SampleConfig {
             second_depth: false,
             placed_share: 0.0,
             upright: false,
+            sides: true,
             person_height: 739,
             pair_degrees: OPPOSITE,
             seed: 1,

@@ -24,10 +24,10 @@ pub(super) struct Four {
     pub images: Vec<f32>,
     /// `[2,H,W]` share of the person in the input masks; with `compat` 1 or 0.
     pub masks: Vec<f32>,
-    /// `[4,H,W,3]` in metres in the front's frame, and their validity `[4,H,W]`.
+    /// `[4,H,W,3]` in metres in the front's frame, and their validity `[4,H,W]`. Without sides there are two instead of four.
     pub points: Vec<f32>,
     pub valid: Vec<f32>,
-    /// `[2,H,W,3]` and `[2,H,W]`: the same of the second surfaces of right and left. Empty without
+    /// `[2,H,W,3]` and `[2,H,W]`: the same of the second surfaces of right and left. Empty without sides or without
     /// `samples.second_depth`.
     pub second: Points,
     /// The front camera. The points times `scale` are in its frame: it moves with placed points.
@@ -68,6 +68,8 @@ impl Source {
             }?;
             Ok(StoredView { camera: self.camera(&stored.camera), ..stored })
         };
+        let has_sides = self.config.sides;
+        let order = &order[..if has_sides { 4 } else { 2 }];
         let views: Vec<_> = order.iter().enumerate().map(view).collect::<Result<_, FileError>>()?;
         let second = |i: usize| {
             let depth = self.folder.second_depth(self.split, subject, order[i])?;
@@ -78,7 +80,8 @@ impl Source {
                 camera: views[i].camera,
             })
         };
-        let seconds = if self.config.second_depth { vec![second(2)?, second(3)?] } else { Vec::new() };
+        let seconds =
+            if has_sides && self.config.second_depth { vec![second(2)?, second(3)?] } else { Vec::new() };
         let photographs =
             self.photographs([0, 1].map(|i| (&views[i].color, &views[i].mask)), is_placed, random);
         let (mut front, mut scale, mut restoration) = (views[0].camera, 1.0, None);

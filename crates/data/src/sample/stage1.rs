@@ -26,9 +26,9 @@ pub struct Stage1Item {
     pub images: Vec<f32>,
     /// `[2,H,W]` share of the person in the input masks; with `compat` 1 or 0.
     pub masks: Vec<f32>,
-    /// `[4,H,W,3]` points of front, back, right and left, in metres in the front camera's frame.
+    /// `[4,H,W,3]` points of front, back, right and left, in metres in the front camera's frame; `[2,H,W,3]` without sides.
     pub points: Vec<f32>,
-    /// `[4,H,W]` 1 for pixels that have a point, 0 for others.
+    /// `[4,H,W]` or `[2,H,W]`: 1 for pixels that have a point, 0 for others.
     pub valid: Vec<f32>,
     /// `[2,H,W,3]` points of the second surfaces that face the cameras of right and left, as `points`. Empty without
     /// `samples.second_depth`.
@@ -44,7 +44,7 @@ pub struct Stage1Batch {
     pub images: Tensor<5>,
     /// `[B,2,H,W]`.
     pub masks: Tensor<4>,
-    /// `[B,V,H,W,3]`: V is 4, or 6 with the second surfaces of right and left.
+    /// `[B,V,H,W,3]`: V is 4, 6 with the second surfaces of right and left, or 2 without sides.
     pub points: Tensor<5>,
     /// `[B,V,H,W]`.
     pub valid: Tensor<4>,
@@ -65,7 +65,7 @@ impl Stage1 {
 
 impl Stage1Item {
     /// True points `[H,W,3]` of a view and which pixels have one `[H,W]`. Views are in the order of the heads; 4 and 5 are the
-    /// second surfaces of right and left. `None` for second surfaces that the sample does not contain.
+    /// second surfaces of right and left. `None` for views that the sample does not contain.
     pub fn truth(&self, view: usize) -> Option<(&[f32], &[f32])> {
         let area = self.side * self.side;
         let (points, valid, row) = match view {
@@ -120,7 +120,8 @@ pub struct Stage1Batcher;
 impl Batcher<Stage1Item, Stage1Batch> for Stage1Batcher {
     fn batch(&self, items: Vec<Stage1Item>, device: &Device) -> Stage1Batch {
         let (b, side) = (items.len(), items.first().map_or(0, |item| item.side));
-        let views = 4 + items.first().map_or(0, |item| item.second_valid.len() / (side * side));
+        let values = items.first().map_or(0, |item| item.valid.len() + item.second_valid.len());
+        let views = values / (side * side).max(1);
         let none: &[f32] = &[];
         Stage1Batch {
             images: stacked(&items, |item| [&item.images, none], [b, 2, 3, side, side], device),
@@ -143,6 +144,7 @@ fn stacked<const D: usize>(
     shape: [usize; D],
     device: &Device,
 ) -> Tensor<D> {
-    let values: Vec<f32> = items.iter().flat_map(|item| of(item).concat()).collect();
+    let parts: Vec<&[f32]> = items.iter().flat_map(of).collect();
+    let values = parts.concat();
     Tensor::from_data(TensorData::new(values, shape), device)
 }

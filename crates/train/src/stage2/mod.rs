@@ -228,8 +228,9 @@ impl Task for GaussianTask {
             };
             if networks.predictor.is_some() {
                 let (side, points, valid) = (item.side, item.points.clone(), item.valid.clone());
-                let points = Tensor::from_data(TensorData::new(points, [1, 4, side, side, 3]), device);
-                let valid = Tensor::from_data(TensorData::new(valid, [1, 4, side, side]), device);
+                let views = valid.len() / (side * side);
+                let points = Tensor::from_data(TensorData::new(points, [1, views, side, side, 3]), device);
+                let valid = Tensor::from_data(TensorData::new(valid, [1, views, side, side]), device);
                 let relief = self.stage1.relief_weight > 0.0;
                 let parts = points_losses(&prediction, &points, &valid, relief).parts(&self.stage1);
                 let value = parts.into_iter().map(|part| part.value * part.weight);

@@ -82,6 +82,33 @@ fn samples_carry_the_flank_behind_an_arm() {
     }
 }
 
+/// Networks without heads for the sides get the same photographs and the same points of them, and nothing else is read.
+#[test]
+fn samples_without_sides_are_those_with_sides_without_them() {
+    let side = 64;
+    let mut config = DataConfig::default();
+    (config.views.count, config.views.resolution) = (4, side as u32);
+    config.views.second_depth = true;
+    let (_temporary, folder) = made(&config, &armed(), 1);
+    let area = (side * side) as usize;
+    for (placed_share, upright) in [(0.0, false), (1.0, false), (1.0, true)] {
+        let augment = Augment { flip: true, ..Augment::default() };
+        let with =
+            SampleConfig { second_depth: true, placed_share, upright, augment, ..SampleConfig::default() };
+        let without = stage1(&folder, SampleConfig { sides: false, ..with.clone() });
+        let with = stage1(&folder, with);
+        for index in 0..8 {
+            let [with, without] = [&with, &without].map(|samples| samples.sample(index).expect("reads"));
+            assert_eq!((&without.images, &without.masks), (&with.images, &with.masks));
+            assert_eq!(without.points, with.points[..6 * area]);
+            assert_eq!(without.valid, with.valid[..2 * area]);
+            assert!(without.second_points.is_empty() && without.truth(2).is_none());
+            let batch = Stage1Batcher.batch(vec![without], &Device::flex());
+            assert_eq!(batch.points.dims(), [1, 2, side as usize, side as usize, 3]);
+        }
+    }
+}
+
 /// Second surfaces follow the four views in batches, sample by sample.
 #[test]
 fn batches_have_second_surfaces_after_the_views() {

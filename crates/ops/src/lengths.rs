@@ -1,0 +1,200 @@
+//! Mean lengths of an image's vectors and of their differences between pixels, with one gradient for all of them. Burn's
+//! operators hold a dozen images for each.
+
+use burn::tensor::Tensor;
+use rayon::prelude::*;
+
+use crate::has_kernels;
+use crate::op::{self, Kept, Kernel};
+
+/// Least square of a length with a gradient. The direction of a shorter vector is noise.
+const MIN_SQUARE: f64 = 1e-24;
+
+/// For every offset (rows, columns) the mean length of the differences between vectors `[B,H,W,3]` of two pixels that are so far apart. Offset
+/// (0, 0) stands for the vectors themselves. Only pairs whose pixels both have the `weight` `[B,H,W]` 1 count. The weight of all other pixels
+/// must be 0, and their vectors may be anything, also NaN. The result is `[B, offsets]`, 0 where no pair counts.
+pub fn mean_lengths(vectors: Tensor<4>, weight: Tensor<3>, offsets: &[[usize; 2]]) -> Tensor<2> {
+    let [batch, height, width, _] = vectors.dims();
+    if !has_kernels(&vectors) {
+        return plain(vectors, &weight, offsets);
+    }
+    let kernel = MeanLengths { batch, height, width, offsets: offsets.to_vec() };
+    op::run(kernel, vectors, Some(weight), None::<Tensor<1>>)
+}
+
+pub(crate) fn plain(vectors: Tensor<4>, weight: &Tensor<3>, offsets: &[[usize; 2]]) -> Tensor<2> {
+    let [_, height, width, _] = vectors.dims();
+    let nowhere = weight.clone().lower_equal_elem(0.0).unsqueeze_dim::<4>(3).expand(vectors.dims());
+    let vectors = vectors.mask_fill(nowhere, 0.0);
+    let mean = |&[down, across]: &[usize; 2]| {
+        let (rows, columns) = (height - down, width - across);
+        let vector = |from: [usize; 2]| vectors.clone().narrow(1, from[0], rows).narrow(2, from[1], columns);
+        let weight = |from: [usize; 2]| weight.clone().narrow(1, from[0], rows).narrow(2, from[1], columns);
+        let (vectors, weight) = match [down, across] {
+            [0, 0] => (vector([0, 0]), weight([0, 0])),
+            offset => (vector(offset) - vector([0, 0]), weight(offset) * weight([0, 0])),
+        };
+        let length = vectors.square().sum_dim(3).clamp_min(MIN_SQUARE).sqrt().squeeze_dim::<3>(3);
+        // Not all at once: on GPUs one thread adds up what a step joins.
+        let sum = |values: Tensor<3>| values.sum_dim(2).sum_dim(1).squeeze_dim::<2>(2);
+        sum(length * weight.clone()) / sum(weight).clamp_min(1.0)
+    };
+    Tensor::cat(offsets.iter().map(mean).collect(), 1)
+}
+
+#[derive(Debug)]
+struct MeanLengths {
+    batch: usize,
+    height: usize,
+    width: usize,
+    offsets: Vec<[usize; 2]>,
+}
+
+impl MeanLengths {
+    /// Calls `each` for every pair of an offset in one row of a sample, with the index of its first pixel in the sample, that of its second
+    /// pixel, and the difference. Vectors themselves have equal indices.
+    #[inline(always)]
+    fn pairs(
+        &self,
+        vectors: &[f32],
+        weight: &[f32],
+        [down, across]: [usize; 2],
+        row: usize,
+        mut each: impl FnMut(usize, usize, [f32; 3]),
+    ) {
+        if row + down >= self.height || across >= self.width {
+            return;
+        }
+        let apart = down * self.width + across;
+        let first = row * self.width;
+        for pixel in first..first + self.width - across {
+            let other = pixel + apart;
+            if weight[pixel] > 0.0 && weight[other] > 0.0 {
+                let at = |pixel: usize| [0, 1, 2].map(|axis| vectors[3 * pixel + axis]);
+                let ([x, y, z], from) = (at(other), if apart == 0 { [0.0; 3] } else { at(pixel) });
+                each(pixel, other, [x - from[0], y - from[1], z - from[2]]);
+            }
+        }
+    }
+
+    fn area(&self) -> usize {
+        self.height * self.width
+    }
+}
+
+impl Kernel for MeanLengths {
+    fn shape(&self) -> Vec<usize> {
+        vec![self.batch, self.offsets.len()]
+    }
+
+    fn forward(&self, [vectors, weight, _]: [&[f32]; 3], keep: bool) -> (Vec<f32>, Kept) {
+        let (area, count) = (self.area(), self.offsets.len());
+        // Sums of lengths and numbers of pairs, row by row.
+        let mut rows = vec![[0.0_f64; 2]; self.batch * self.height * count];
+        rows.par_chunks_exact_mut(count).enumerate().for_each(|(line, sums)| {
+            let (sample, row) = (line / self.height, line % self.height);
+            let (vectors, weight) = (&vectors[3 * sample * area..], &weight[sample * area..]);
+            for (offset, sum) in self.offsets.iter().zip(sums) {
+                self.pairs(vectors, weight, *offset, row, |_, _, vector| {
+                    sum[0] += square(vector).max(MIN_SQUARE).sqrt();
+                    sum[1] += 1.0;
+                });
+            }
+        });
+        let mut sums = vec![[0.0; 2]; self.batch * count];
+        for (rows, sums) in rows.chunks_exact(self.height * count).zip(sums.chunks_exact_mut(count)) {
+            for row in rows.chunks_exact(count) {
+                row.iter().zip(&mut *sums).for_each(|(part, sum)| (0..2).for_each(|i| sum[i] += part[i]));
+            }
+        }
+        let means = sums.iter().map(|[length, pairs]| (length / pairs.max(1.0)) as f32).collect();
+        let pairs: Vec<f64> = sums.into_iter().map(|[_, pairs]| pairs).collect();
+        (means, keep.then(|| Box::new(pairs) as _))
+    }
+
+    fn backward(
+        &self,
+        [vectors, weight, _]: [&[f32]; 3],
+        kept: Kept,
+        upstream: &[f32],
+        [wanted, ..]: [bool; 3],
+    ) -> [Option<Vec<f32>>; 3] {
+        if !wanted {
+            return [None, None, None];
+        }
+        let (area, count) = (self.area(), self.offsets.len());
+        let pairs = kept.and_then(|kept| kept.downcast::<Vec<f64>>().ok()).expect("kept by the forward pass");
+        let mut gradient = vec![0.0; 3 * self.batch * area];
+        gradient.par_chunks_exact_mut(3 * area).enumerate().for_each(|(sample, gradient)| {
+            let (vectors, weight) = (&vectors[3 * sample * area..], &weight[sample * area..]);
+            for (i, offset) in self.offsets.iter().enumerate() {
+                let at = sample * count + i;
+                let share = f64::from(upstream[at]) / pairs[at].max(1.0);
+                for row in 0..self.height {
+                    self.pairs(vectors, weight, *offset, row, |pixel, other, vector| {
+                        let square = square(vector);
+                        if square < MIN_SQUARE {
+                            return;
+                        }
+                        let factor = (share / square.sqrt()) as f32;
+                        for (axis, value) in vector.into_iter().enumerate() {
+                            gradient[3 * other + axis] += factor * value;
+                            if other != pixel {
+                                gradient[3 * pixel + axis] -= factor * value;
+                            }
+                        }
+                    });
+                }
+            }
+        });
+        [Some(gradient), None, None]
+    }
+}
+
+fn square(vector: [f32; 3]) -> f64 {
+    vector.map(|x| f64::from(x).powi(2)).iter().sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use burn::tensor::{Device, TensorData};
+
+    use super::*;
+    use crate::tests::{assert_equal, random, uniform};
+
+    /// Values and gradients, with NaN where the weight is 0 and a vector of length 0.
+    #[test]
+    fn mean_lengths_and_their_gradients_equal_their_composition() {
+        let shape @ [batch, height, width, _] = [3, 7, 11, 3];
+        let area = height * width;
+        let offsets = [[0, 0], [1, 0], [0, 1], [4, 0], [0, 8], [2, 3]];
+        let mut weight: Vec<f32> =
+            uniform(batch * area, 1).iter().map(|x| f32::from(u8::from(*x > -0.5))).collect();
+        // The last sample has no pixel.
+        weight[2 * area..].fill(0.0);
+        weight[5] = 1.0;
+        let mut values = uniform(3 * batch * area, 2);
+        for (vector, weight) in values.chunks_exact_mut(3).zip(&weight) {
+            if *weight == 0.0 {
+                vector.fill(f32::NAN);
+            }
+        }
+        values[15..18].fill(0.0);
+        let device = Device::flex().autodiff();
+        let weight = Tensor::<3>::from_data(TensorData::new(weight, [batch, height, width]), &device);
+        let upstream = Tensor::<2>::from_data(random::<2>([batch, offsets.len()], 3).into_data(), &device);
+        let run = |of: &dyn Fn(Tensor<4>) -> Tensor<2>| {
+            let vectors =
+                Tensor::<4>::from_data(TensorData::new(values.clone(), shape), &device).require_grad();
+            let means = of(vectors.clone());
+            let gradients = (means.clone() * upstream.clone()).sum().backward();
+            (means.inner(), vectors.grad(&gradients).expect("tracked"))
+        };
+        let ours = run(&|vectors| mean_lengths(vectors, weight.clone(), &offsets));
+        let composed = run(&|vectors| plain(vectors, &weight, &offsets));
+        let last = ours.0.clone().narrow(0, 2, 1).abs().sum().into_scalar::<f32>();
+        assert_eq!(last, 0.0);
+        assert_equal("means", ours.0, composed.0);
+        assert_equal("gradients", ours.1, composed.1);
+    }
+}
