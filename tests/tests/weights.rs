@@ -8,7 +8,8 @@ use safetensors::tensor::TensorView;
 use snapsnap_base::config::Schema;
 use snapsnap_net::config::Config;
 use snapsnap_net::weights::{
-    Float, ImportOptions, SideHeads, Source, WeightFile, WeightsError, export, import, init, schema,
+    CONFIG_KEY, Float, ImportOptions, SideHeads, Source, WeightFile, WeightsError, export, import, init,
+    schema,
 };
 use snapsnap_tests::{FIXTURE_VALUES, data, fixture, root};
 
@@ -35,10 +36,16 @@ fn shape(entry: &snapsnap_net::weights::Entry) -> Vec<usize> {
 }
 
 fn write(tensors: &Tensors, path: &Path) {
+    write_beside(tensors, None, path);
+}
+
+/// A checkpoint, with or without a config in its metadata.
+fn write_beside(tensors: &Tensors, config: Option<&Config>, path: &Path) {
     let views = tensors.iter().map(|(name, (dtype, shape, bytes))| {
         (name.as_str(), TensorView::new(*dtype, shape.clone(), bytes).expect("consistent"))
     });
-    std::fs::write(path, safetensors::serialize(views, None).expect("valid")).expect("written");
+    let metadata = config.map(|config| HashMap::from([(CONFIG_KEY.into(), config.to_toml())]));
+    std::fs::write(path, safetensors::serialize(views, metadata).expect("valid")).expect("written");
 }
 
 /// A temporary folder with random tiny weights in it.
@@ -238,6 +245,13 @@ fn the_layer_of_normals_is_drawn_or_left_out() {
     write(&damaged, &at("damaged"));
     let into = |from: &str| import_to(from, true, "never").expect_err("is damaged").to_string();
     assert!(into("damaged").contains("missing: unet.normals.bias"));
+    damaged.remove("unet.normals.weight");
+    write_beside(&damaged, Some(&config(true)), &at("promised"));
+    let problems = into("promised");
+    assert!(
+        ["weight", "bias"].iter().all(|end| problems.contains(&format!("missing: unet.normals.{end}"))),
+        "{problems}"
+    );
     let notes = import("with", false, "again");
     assert!(notes.contains("2 tensors of the normals are left out"), "{notes}");
     assert_eq!(read(&at("again")), without);

@@ -77,7 +77,7 @@ impl<'a, T: Task> Learner<'a, T> {
             task,
             config,
             average: (share > 0.0).then(|| Average::new(share, networks.rows())),
-            optimizer: config.optimizer.init().with_half(config.precision() == Precision::Bf16),
+            optimizer: config.optimizer.init(),
             lengths: lengths.collect(),
             networks,
             progress: Progress { stage: T::STAGE, ..Progress::default() },

@@ -91,7 +91,7 @@ impl OptimizerConfig {
 
     /// An optimiser before its first step.
     pub fn init(&self) -> Optimizer {
-        Optimizer { config: self.clone(), half: false, states: BTreeMap::new() }
+        Optimizer { config: self.clone(), states: BTreeMap::new() }
     }
 }
 
@@ -106,7 +106,6 @@ pub(crate) enum State {
 /// An optimiser with its state.
 pub struct Optimizer {
     config: OptimizerConfig,
-    half: bool,
     states: BTreeMap<String, State>,
 }
 
@@ -126,11 +125,6 @@ impl Optimizer {
     /// dozens of kernels on a GPU.
     pub(crate) fn device(&self, device: Device) -> Device {
         if self.config.muon.is_some() { Device::flex() } else { device }
-    }
-
-    /// With `half`, Muon's products are in bf16 where the processor can.
-    pub fn with_half(self, half: bool) -> Self {
-        Self { half, ..self }
     }
 
     /// All values after one step of those that have a gradient, at `share` of the highest rates, on the device of a step.
@@ -185,8 +179,7 @@ impl Optimizer {
                 };
                 // Kernels `[out, in, k, k]` become matrices `[out, in·k·k]`.
                 let size = [shape[0], shape[1..].iter().product()];
-                let step = MuonStep { settings, share, factor, half: self.half };
-                let (values, velocity) = step.of(values, gradient, velocity, size);
+                let (values, velocity) = muon(settings, share, values, gradient, factor, velocity, size);
                 (values, State::Muon { velocity })
             }
             _ => {
@@ -287,44 +280,32 @@ impl Optimizer {
     }
 }
 
-/// A step of Muon (Jordan et al.) along the orthogonalised Nesterov momentum. The factor 0.2·√(longest side) makes the step as
-/// long as one of AdamW (Liu et al., "Muon is scalable"). On the host.
-struct MuonStep<'a> {
-    settings: &'a MuonSettings,
-    /// Of the highest rate.
+/// Muon (Jordan et al.): values and velocity after a step along the orthogonalised Nesterov momentum. The factor
+/// 0.2·√(longest side) makes the step as long as one of AdamW (Liu et al., "Muon is scalable"). On the host.
+fn muon(
+    settings: &MuonSettings,
     share: f64,
-    /// Gradients are multiplied by it.
+    values: Tensor<1>,
+    gradient: Tensor<1>,
     factor: f64,
-    /// Products in bf16.
-    half: bool,
-}
-
-impl MuonStep<'_> {
-    /// Values and velocity after the step.
-    fn of(
-        &self,
-        values: Tensor<1>,
-        gradient: Tensor<1>,
-        velocity: Option<Tensor<1>>,
-        [rows, columns]: [usize; 2],
-    ) -> (Tensor<1>, Tensor<1>) {
-        let Self { settings, share, factor, half } = *self;
-        let (device, momentum) = (values.device(), settings.momentum);
-        let rate = share * settings.rate;
-        let kept = 1.0 - rate * settings.weight_decay;
-        let pace = rate * 0.2 * (rows.max(columns) as f64).sqrt();
-        let mut velocity = velocity.map_or_else(|| vec![0.0; rows * columns], host);
-        let (mut values, mut direction) = (host(values), host(gradient));
-        let [momentum, factor, kept, pace] = [momentum, factor, kept, pace].map(|value| value as f32);
-        for (velocity, gradient) in velocity.iter_mut().zip(&mut direction) {
-            *gradient *= factor;
-            *velocity = *velocity * momentum + *gradient;
-            *gradient += *velocity * momentum;
-        }
-        let update = orthogonalised(direction, [rows, columns], half);
-        values.iter_mut().zip(update).for_each(|(value, update)| *value = *value * kept - update * pace);
-        (row(values, &device), row(velocity, &device))
+    velocity: Option<Tensor<1>>,
+    [rows, columns]: [usize; 2],
+) -> (Tensor<1>, Tensor<1>) {
+    let (device, momentum) = (values.device(), settings.momentum);
+    let rate = share * settings.rate;
+    let kept = 1.0 - rate * settings.weight_decay;
+    let pace = rate * 0.2 * (rows.max(columns) as f64).sqrt();
+    let mut velocity = velocity.map_or_else(|| vec![0.0; rows * columns], host);
+    let (mut values, mut direction) = (host(values), host(gradient));
+    let [momentum, factor, kept, pace] = [momentum, factor, kept, pace].map(|value| value as f32);
+    for (velocity, gradient) in velocity.iter_mut().zip(&mut direction) {
+        *gradient *= factor;
+        *velocity = *velocity * momentum + *gradient;
+        *gradient += *velocity * momentum;
     }
+    let update = orthogonalised(direction, [rows, columns]);
+    values.iter_mut().zip(update).for_each(|(value, update)| *value = *value * kept - update * pace);
+    (row(values, &device), row(velocity, &device))
 }
 
 #[cfg(test)]
@@ -369,8 +350,7 @@ mod tests {
                 let gradient = random();
                 let (new, state) = burns.step(0.01, values, gradient.clone(), theirs);
                 (values, theirs) = (new, state);
-                let step = MuonStep { settings: &settings, share: 1.0, factor: 1.0, half: false };
-                let (new, state) = step.of(ours, gradient.reshape([-1]), velocity, size);
+                let (new, state) = muon(&settings, 1.0, ours, gradient.reshape([-1]), 1.0, velocity, size);
                 (ours, velocity) = (new, Some(state));
             }
             let (ours, theirs) = (host(ours), host(values));

@@ -95,25 +95,16 @@ fn grid() -> impl Iterator<Item = (u32, u32)> {
 /// Their widths may differ: an arm looks longer in the photograph in which it is nearer to the camera.
 fn overlap(front: &Cutout, back: &Cutout) -> f32 {
     let (front, back) = (silhouette(front, false), silhouette(back, true));
-    let farthest = i64::from(GRID / 2);
-    let at_shift = |shift: i64| {
-        let (mut both, mut any) = (0_u32, 0_u32);
-        for (a, b) in front.iter().zip(&back) {
-            for column in -farthest..COLUMNS + farthest {
-                let is_in = |row: &[bool], column: i64| {
-                    usize::try_from(column)
-                        .ok()
-                        .and_then(|column| row.get(column))
-                        .is_some_and(|inside| *inside)
-                };
-                let (a, b) = (is_in(a, column), is_in(b, column - shift));
-                both += u32::from(a && b);
-                any += u32::from(a || b);
-            }
-        }
-        both as f32 / any.max(1) as f32
+    let common = |shift: usize| {
+        let count = |a: &[bool], b: &[bool]| a.iter().skip(shift).zip(b).filter(|(a, b)| **a && **b).count();
+        let rows = || front.iter().zip(&back);
+        // To either side.
+        let counts = [rows().map(|(a, b)| count(a, b)).sum(), rows().map(|(a, b)| count(b, a)).sum()];
+        counts.into_iter().fold(0, usize::max)
     };
-    (-farthest..=farthest).map(at_shift).fold(0.0, f32::max)
+    let most = (0..=GRID as usize / 2).map(common).fold(0, usize::max);
+    let [front, back] = [front, back].map(|rows| rows.iter().flatten().filter(|inside| **inside).count());
+    most as f32 / (front + back - most).max(1) as f32
 }
 
 /// Rows of a silhouette, mirrored or not, in cells of 1/64 of the person's height, around the middle of the person's box.
