@@ -12,9 +12,15 @@ const MIN_SQUARE: f64 = 1e-24;
 
 /// For every offset (rows, columns) the mean length of the differences between vectors `[B,H,W,3]` of two pixels that are so far apart. Offset
 /// (0, 0) stands for the vectors themselves. Only pairs whose pixels both have the `weight` `[B,H,W]` 1 count. The weight of all other pixels
-/// must be 0, and their vectors may be anything, also NaN. The result is `[B, offsets]`, 0 where no pair counts.
+/// must be 0, and their vectors may be anything, also NaN. The result is `[B, offsets]`, 0 where no pair counts. Every offset must be smaller than
+/// the image.
 pub fn mean_lengths(vectors: Tensor<4>, weight: Tensor<3>, offsets: &[[usize; 2]]) -> Tensor<2> {
-    let [batch, height, width, _] = vectors.dims();
+    let [batch, height, width, channels] = vectors.dims();
+    assert!(channels == 3 && weight.dims() == [batch, height, width], "one weight per vector of three");
+    assert!(
+        offsets.iter().all(|[down, across]| *down < height && *across < width),
+        "offsets reach beyond the image"
+    );
     if !has_kernels(&vectors) {
         return plain(vectors, &weight, offsets);
     }
@@ -62,7 +68,7 @@ impl MeanLengths {
         row: usize,
         mut each: impl FnMut(usize, usize, [f32; 3]),
     ) {
-        if row + down >= self.height || across >= self.width {
+        if row + down >= self.height {
             return;
         }
         let apart = down * self.width + across;
@@ -96,7 +102,9 @@ impl Kernel for MeanLengths {
             let (vectors, weight) = (&vectors[3 * sample * area..], &weight[sample * area..]);
             for (offset, sum) in self.offsets.iter().zip(sums) {
                 self.pairs(vectors, weight, *offset, row, |_, _, vector| {
-                    sum[0] += square(vector).max(MIN_SQUARE).sqrt();
+                    let square = square(vector);
+                    // NaN stays, unlike in `f64::max`.
+                    sum[0] += if square < MIN_SQUARE { MIN_SQUARE } else { square }.sqrt();
                     sum[1] += 1.0;
                 });
             }
@@ -157,14 +165,14 @@ fn square(vector: [f32; 3]) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use burn::tensor::{Device, TensorData};
+    use burn::tensor::{Device, FloatDType, TensorData};
 
     use super::*;
     use crate::tests::{assert_equal, random, uniform};
 
     /// Values and gradients, with NaN where the weight is 0 and a vector of length 0.
     #[test]
-    fn mean_lengths_and_their_gradients_equal_their_composition() {
+    fn mean_lengths_and_their_gradients_equal_their_composition_in_f64() {
         let shape @ [batch, height, width, _] = [3, 7, 11, 3];
         let area = height * width;
         let offsets = [[0, 0], [1, 0], [0, 1], [4, 0], [0, 8], [2, 3]];
@@ -181,20 +189,32 @@ mod tests {
         }
         values[15..18].fill(0.0);
         let device = Device::flex().autodiff();
-        let weight = Tensor::<3>::from_data(TensorData::new(weight, [batch, height, width]), &device);
-        let upstream = Tensor::<2>::from_data(random::<2>([batch, offsets.len()], 3).into_data(), &device);
-        let run = |of: &dyn Fn(Tensor<4>) -> Tensor<2>| {
-            let vectors =
-                Tensor::<4>::from_data(TensorData::new(values.clone(), shape), &device).require_grad();
-            let means = of(vectors.clone());
-            let gradients = (means.clone() * upstream.clone()).sum().backward();
-            (means.inner(), vectors.grad(&gradients).expect("tracked"))
+        let run = |float: FloatDType, of: &dyn Fn(Tensor<4>, Tensor<3>) -> Tensor<2>| {
+            let tracked = TensorData::new(values.clone(), shape);
+            let vectors = Tensor::<4>::from_data(tracked, &device).cast(float).require_grad();
+            let weight = TensorData::new(weight.clone(), [batch, height, width]);
+            let means = of(vectors.clone(), Tensor::<3>::from_data(weight, &device).cast(float));
+            let upstream = random::<2>([batch, offsets.len()], 3).into_data();
+            let upstream = Tensor::<2>::from_data(upstream, &device).cast(float);
+            let gradients = (means.clone() * upstream).sum().backward();
+            let gradient = vectors.grad(&gradients).expect("tracked");
+            (means.inner().cast(FloatDType::F32), gradient.cast(FloatDType::F32))
         };
-        let ours = run(&|vectors| mean_lengths(vectors, weight.clone(), &offsets));
-        let composed = run(&|vectors| plain(vectors, &weight, &offsets));
+        let ours = run(FloatDType::F32, &|vectors, weight| mean_lengths(vectors, weight, &offsets));
+        let in_f64 = run(FloatDType::F64, &|vectors, weight| plain(vectors, &weight, &offsets));
         let last = ours.0.clone().narrow(0, 2, 1).abs().sum().into_scalar::<f32>();
         assert_eq!(last, 0.0);
-        assert_equal("means", ours.0, composed.0);
-        assert_equal("gradients", ours.1, composed.1);
+        assert_equal("means", ours.0, in_f64.0);
+        assert_equal("gradients", ours.1, in_f64.1);
+    }
+
+    /// A prediction that is not a number makes a loss that is none, so that the step is skipped.
+    #[test]
+    fn nan_that_counts_stays() {
+        let vectors = Tensor::<4>::full([1, 2, 2, 3], f32::NAN, &Device::flex());
+        let weight = Tensor::ones([1, 2, 2], &Device::flex());
+        let mean = mean_lengths(vectors.clone(), weight.clone(), &[[0, 0]]).into_scalar::<f32>();
+        let composed = plain(vectors, &weight, &[[0, 0]]).into_scalar::<f32>();
+        assert!(mean.is_nan() && composed.is_nan(), "{mean} {composed}");
     }
 }

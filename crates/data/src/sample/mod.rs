@@ -53,10 +53,10 @@ pub struct SampleConfig {
     pub random_targets: usize,
     /// Stage 2: whether targets have twice the side. The data set must contain such views.
     pub high_resolution: bool,
-    /// Stage 2: whether samples contain the points of four views for stage 1's loss: `stage2.points_weight`.
+    /// Stage 2: whether samples contain the points of all views for stage 1's loss: `stage2.points_weight`.
     #[serde(skip)]
     pub points: bool,
-    /// Stage 1: whether samples contain the second surface that faces each side camera, such as the flank behind an
+    /// Stage 1: whether samples with sides contain the second surface that faces each side camera, such as the flank behind an
     /// arm. The data set must contain it: `views.second_depth`.
     pub second_depth: bool,
     /// Share of the samples whose photographs are placed on their canvas like a user's photographs. Their points are
@@ -213,7 +213,7 @@ impl Source {
         if config.high_resolution && !folder.description().high_resolution {
             return Err(wrong("has no views at twice the side, which `high_resolution` needs".into()));
         }
-        if config.second_depth && !folder.description().second_depth {
+        if config.sides && config.second_depth && !folder.description().second_depth {
             return Err(wrong("has no second surfaces, which `second_depth` needs".into()));
         }
         if config.pair_degrees != OPPOSITE {

@@ -18,7 +18,7 @@ const COMPAT_FAR: f32 = 1e8;
 /// Iterations of the search for a side pixel's depth.
 pub(super) const LOOKUPS: usize = 3;
 
-/// Two photographs and the points of four views.
+/// Two photographs and the points of four views, or of two without sides.
 pub(super) struct Four {
     /// `[2,3,H,W]` front and back in [−1, 1] times the mask.
     pub images: Vec<f32>,
@@ -52,7 +52,7 @@ impl Four {
 }
 
 impl Source {
-    /// Front, back, right and left of a subject.
+    /// Front, back, and, with sides, right and left of a subject.
     pub(super) fn four(
         &self,
         subject: &str,

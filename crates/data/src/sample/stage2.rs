@@ -31,10 +31,10 @@ pub struct Stage2Item {
     pub scale: f64,
     /// Moves upright people to where the photographs' cameras saw them, before they are scaled.
     pub restoration: Option<Restoration>,
-    /// `[4,H,W,3]` points of these views, in metres in the front camera's frame; rectified if people are upright; empty without
-    /// `points` of the config.
+    /// `[4,H,W,3]` points of these views, in metres in the front camera's frame, `[2,H,W,3]` without sides; rectified if people are upright;
+    /// empty without `points` of the config.
     pub points: Vec<f32>,
-    /// `[4,H,W]` 1 for pixels that have a point, 0 for others; empty like `points`.
+    /// `[4,H,W]` or `[2,H,W]`: 1 for pixels that have a point, 0 for others; empty like `points`.
     pub valid: Vec<f32>,
     /// h and w.
     pub target_side: usize,
