@@ -1,5 +1,5 @@
-//! Mean lengths of an image's vectors and of their differences between pixels, with one gradient for all of them. Burn's
-//! operators hold a dozen images for each.
+//! Mean lengths of an image's vectors and of their differences between pixels, in one operator. Composed of Burn's, each of them keeps a
+//! dozen images for its gradient.
 
 use burn::tensor::Tensor;
 use rayon::prelude::*;
@@ -28,7 +28,8 @@ pub fn mean_lengths(vectors: Tensor<4>, weight: Tensor<3>, offsets: &[[usize; 2]
     op::run(kernel, vectors, Some(weight), None::<Tensor<1>>)
 }
 
-pub(crate) fn plain(vectors: Tensor<4>, weight: &Tensor<3>, offsets: &[[usize; 2]]) -> Tensor<2> {
+/// The same in Burn's operators.
+fn plain(vectors: Tensor<4>, weight: &Tensor<3>, offsets: &[[usize; 2]]) -> Tensor<2> {
     let [_, height, width, _] = vectors.dims();
     let nowhere = weight.clone().lower_equal_elem(0.0).unsqueeze_dim::<4>(3).expand(vectors.dims());
     let vectors = vectors.mask_fill(nowhere, 0.0);
@@ -104,7 +105,8 @@ impl Kernel for MeanLengths {
                 self.pairs(vectors, weight, *offset, row, |_, _, vector| {
                     let square = square(vector);
                     // NaN stays, unlike in `f64::max`.
-                    sum[0] += if square < MIN_SQUARE { MIN_SQUARE } else { square }.sqrt();
+                    let square = if square < MIN_SQUARE { MIN_SQUARE } else { square };
+                    sum[0] += square.sqrt();
                     sum[1] += 1.0;
                 });
             }

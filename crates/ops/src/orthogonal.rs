@@ -8,8 +8,8 @@ const COEFFICIENTS: [f32; 3] = [3.4445, -4.775, 2.0315];
 const STEPS: usize = 5;
 /// Smaller norms are taken for this.
 const MIN_NORM: f32 = 1e-7;
-/// Smaller values are taken for 0. Beside a norm of 1 they are below f32's rounding, and the products of a few would be subnormal, with which
-/// processors are ten times slower. Gradients of few directions are full of them.
+/// Smaller values are taken for 0. Beside a norm of 1 they are below f32's rounding. Products of a few of them would be subnormal numbers,
+/// with which processors multiply several times slower. Gradients of few directions are full of them.
 const NEGLIGIBLE: f32 = 1e-10;
 
 /// A matrix `[rows, columns]` with its singular values brought close to 1 by Newton-Schulz steps. On one thread: matrices
