@@ -4,7 +4,7 @@
 
 Minutes are those of the processor, all threads together.
 
-The folder holds `prepare`'s data sets synth, makehuman and avatars (configs/default/makers.sh makes them). Each front and back photograph
+The folder holds `prepare`'s data sets synth, makehuman and avatars (configs/studies/makers.sh makes them). Each front and back photograph
 is a sample by itself. The network predicts its relief: the depth without the coarse body, which is the mean depth of cells of 14 cm,
 interpolated between them. It trains on windows of 128 pixels. Its input is the outline, the pixel's place, the coarse body, and:
 

@@ -3,7 +3,7 @@
 
     python docs/scaling_pytorch.py people/makers --inputs photographs --width 4 --minutes 5 --device cuda
 
-The folder holds `prepare`'s data sets synth, makehuman and avatars (configs/default/makers.sh makes them). A sample is a pair of photographs,
+The folder holds `prepare`'s data sets synth, makehuman and avatars (configs/studies/makers.sh makes them). A sample is a pair of photographs,
 front and back, at 128². The network predicts each pixel's depth, measured from the upright plane through the body's axis. It receives both
 outlines, the pixel's place, which of the two photographs it is, and:
 

@@ -21,12 +21,9 @@ done
 people large train 903 30 --config configs/data/default.toml --set views.resolution=1024
 people large val 903 4 --config configs/data/default.toml --set views.resolution=1024
 data="people/default/synth people/default/makehuman people/default/avatars people/phone/synth people/phone/makehuman people/phone/avatars"
-cargo xtask train-stage1 --config configs/default/phone.toml --data $data --resume -o runs/default-points
-completed() {
-  cargo xtask train-stage2 --set 'network.sides="completed"' --set network.second_layer=true --set samples.second_depth=true \
-    --set 'regressor.least_opacities=[0.95, 0.0]' --resume "$@"
-}
-completed --config configs/default/stage2.toml --data $data --weights runs/default-points/best.safetensors -o runs/default-both
-completed --config configs/default/regressor.toml --data people/large/synth people/large/makehuman people/large/avatars \
-  --weights runs/default-both/best.safetensors -o runs/default
+cargo xtask train-stage1 --config configs/default/stage1.toml --data $data --resume -o runs/default-points
+cargo xtask train-stage2 --config configs/default/stage2.toml --data $data --weights runs/default-points/best.safetensors --resume \
+  -o runs/default-both
+cargo xtask train-stage2 --config configs/default/regressor.toml --data people/large/synth people/large/makehuman people/large/avatars \
+  --weights runs/default-both/best.safetensors --resume -o runs/default
 cargo xtask import-weights runs/default/best.safetensors --half -o default.safetensors

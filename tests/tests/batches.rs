@@ -85,6 +85,16 @@ fn a_table_of_pairs_becomes_the_people_of_single_calls() {
         let said = refused(reconstruct(&table, &out).args(options));
         assert!(said.contains("pairs.config.toml") && said.contains("other settings"), "{options:?}: {said}");
     }
+    // The same weights in another place are the same, and others in the same place are others.
+    let weights = temporary.path().join("weights.safetensors");
+    let mut bytes = fs::read(root().join("assets/weights/default.safetensors")).expect("reads");
+    fs::write(&weights, &bytes).expect("written");
+    let again = || succeed(reconstruct(&table, &out).arg("--weights").arg(&weights));
+    assert!(again().contains("0 made"));
+    *bytes.last_mut().expect("bytes") ^= 1;
+    fs::write(&weights, &bytes).expect("written");
+    let said = refused(reconstruct(&table, &out).arg("--weights").arg(&weights));
+    assert!(said.contains("other settings"), "{said}");
 }
 
 #[test]

@@ -3,7 +3,9 @@
 use std::fs;
 
 use image::{GenericImageView, ImageFormat};
-use snapsnap_net::weights::{Source, WeightFile};
+use snapsnap_base::config::Schema;
+use snapsnap_net::config::RegressorConfig;
+use snapsnap_net::weights::{Source, WeightFile, save};
 use snapsnap_splat::scene;
 use snapsnap_tests::{refused, root, snapsnap, succeed};
 
@@ -90,6 +92,46 @@ fn the_default_weights_are_whole_small_and_of_a_config_that_is_kept() {
     for (name, entry) in Source::open(&path).expect("weights").tensors() {
         assert_eq!(entry.dtype, "f16", "{name}");
     }
+}
+
+/// A trained point predictor gets the regressor of another file, with the config in which that was trained.
+#[test]
+fn a_filled_regressor_keeps_its_config() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let path = |name: &str| temporary.path().join(name);
+    let import = |from: &str, more: &[&str], to: &str| {
+        let mut command = snapsnap();
+        command
+            .current_dir(temporary.path())
+            .arg("import-weights")
+            .arg(path(from))
+            .args(more)
+            .arg("-o")
+            .arg(to);
+        succeed(&mut command);
+        WeightFile::open(&path(to), None).expect("weights").config
+    };
+    fs::copy(root().join("assets/weights/default.safetensors"), path("both")).expect("copies");
+    // Stage 1 writes the predictor alone, beside a regressor's config that no training has used.
+    let (source, both) = (
+        Source::open(&path("both")).expect("weights"),
+        WeightFile::open(&path("both"), None).expect("weights"),
+    );
+    let mut config = both.config.clone();
+    (config.network.closed_top, config.network.steepest) = (false, Some(5.0));
+    config.regressor = RegressorConfig::default();
+    let predictors =
+        source.tensors().keys().filter(|name| !name.contains("pred_unet.") && !name.contains("gs_conv."));
+    let values = predictors.map(|name| (name.clone(), source.read_f32(name).expect("values"))).collect();
+    save(&config, &values, &path("points.safetensors")).expect("written");
+    fs::rename(path("both"), path("both.safetensors")).expect("renames");
+    let filled = import("points.safetensors", &["--fill", "both.safetensors"], "filled.safetensors");
+    assert_eq!(filled.regressor, both.config.regressor);
+    assert_eq!((filled.network, filled.mode), (config.network, config.mode));
+    // The config of the command line is taken whole.
+    fs::write(path("own.toml"), both.config.to_toml()).expect("written");
+    let more = ["--fill", "both.safetensors", "--config", "own.toml", "--set", "regressor.margin=24"];
+    assert_eq!(import("points.safetensors", &more, "own.safetensors").regressor.margin, Some(24));
 }
 
 #[test]

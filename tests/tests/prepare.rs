@@ -93,6 +93,22 @@ fn shards_and_reruns_give_what_one_run_gives() {
 
     let message = refused(synth(&shared, "4").args(["--set", "views.resolution=32"]));
     assert!(message.contains("dataset.toml") && message.contains("another data set"), "{message}");
+    // Settings of the cameras that `dataset.toml` does not have.
+    let before = files(&shared);
+    for key in ["views.pitch", "views.distance"] {
+        let message = refused(synth(&shared, "5").args(["--set", &format!("{key}=2.0")]));
+        assert!(
+            message.contains("prepare.config.toml") && message.contains(&format!("`{key}`")),
+            "{message}"
+        );
+    }
+    let mut given = prepare("synth");
+    given
+        .args(["--subjects", "5", "--seed", "3", "--set", "views.pitch=2", "-o"])
+        .arg(&shared)
+        .arg("--config");
+    assert!(refused(given.arg(shared.join("prepare.config.toml"))).contains("`views.pitch`"));
+    assert!(files(&shared) == before);
 }
 
 /// A killed run leaves complete subjects only, and the next run makes the others.

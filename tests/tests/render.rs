@@ -273,6 +273,12 @@ fn no_input_and_no_other_output_is_overwritten() {
     let cameras = fs::read(place.path("d/cameras.json")).expect("cameras");
     succeed(&mut place.render(&["a.ply", "--cameras", "d/cameras.json", "-o", "d"]));
     assert!(fs::read(place.path("d/cameras.json")).expect("cameras") == cameras);
+    // They would not describe pictures of another size.
+    let mut command = place.render(&["a.ply", "--cameras", "d/cameras.json", "-o", "d"]);
+    let picture = fs::read(place.path("d/000.png")).expect("a picture");
+    let message = refused(command.args(["--size", "32x32"]));
+    assert!(message.contains("d/cameras.json") && message.contains("another folder"), "{message}");
+    assert!(fs::read(place.path("d/000.png")).expect("a picture") == picture);
 }
 
 /// What goes into a pipe is the tensors and nothing else.

@@ -30,6 +30,11 @@ impl ViewFolder {
         Ok(Self { path: path.to_owned(), views, keeps_cameras })
     }
 
+    /// Whether the folder's cameras are those that the command was given.
+    pub fn keeps_cameras(&self) -> bool {
+        self.keeps_cameras
+    }
+
     /// Names of the files that will be written.
     fn names(&self) -> impl Iterator<Item = String> {
         let cameras = (!self.keeps_cameras).then(|| CAMERAS.to_owned());

@@ -1,10 +1,13 @@
 //! The weights of a command.
 
 use std::cell::OnceCell;
+use std::io::{self, Read};
 use std::path::Path;
 
 use burn::tensor::Device;
+use sha2::{Digest, Sha256};
 use snapsnap_base::config::Schema;
+use snapsnap_base::{FileError, file};
 use snapsnap_data::photo::FOUND;
 use snapsnap_net::config::Config;
 use snapsnap_net::u2net::{SIDE, U2Net};
@@ -36,6 +39,24 @@ pub fn segmenter() -> impl Fn(&[f32]) -> Vec<f32> {
         };
         loaded.get_or_init(load).forward(rgb, &device)
     }
+}
+
+/// The SHA-256 of a weight file, or of the default weights.
+pub fn sum_of(weights: &WeightFile) -> Result<String, Failure> {
+    let path = weights.path();
+    let sum = if path == Path::new(DEFAULT_NAME) {
+        sha256(&mut &DEFAULT[..])
+    } else {
+        file::open(path).and_then(|mut file| sha256(&mut file))
+    };
+    Ok(sum.map_err(FileError::read(path))?)
+}
+
+/// SHA-256 of what is left to read, in hexadecimal digits.
+pub fn sha256(from: &mut impl Read) -> io::Result<String> {
+    let mut hasher = Sha256::new();
+    io::copy(from, &mut hasher)?;
+    Ok(hasher.finalize().iter().map(|byte| format!("{byte:02x}")).collect())
 }
 
 /// Opens a weight file, or `weights.safetensors` in a folder, or without a path the default weights. --config and --set override the

@@ -28,9 +28,9 @@ pub fn orthogonalised(matrix: Vec<f32>, [rows, columns]: [usize; 2]) -> Vec<f32>
     let norm = matrix.iter().map(|x| f64::from(*x).powi(2)).sum::<f64>().sqrt() as f32;
     let scale = norm.max(MIN_NORM).recip();
     let x: Vec<f32> = matrix.iter().map(|v| rounded(v * scale)).collect();
-    let [mut gram, mut correction, mut product, mut all] = [(); 4].map(|()| vec![0.0; m * m]);
+    let [mut gram, mut correction, mut next, mut all] = [(); 4].map(|()| vec![0.0; m * m]);
     let [a, b, c] = COEFFICIENTS;
-    let square = |lhs: &[f32], rhs: &[f32], out: &mut [f32]| {
+    let product = |lhs: &[f32], rhs: &[f32], out: &mut [f32]| {
         Multiply { size: [m, m, m], lhs: (lhs, [1, m]), rhs: &Right::Plain((rhs, [1, m])), add: false }
             .write(out, m);
     };
@@ -40,15 +40,12 @@ pub fn orthogonalised(matrix: Vec<f32>, [rows, columns]: [usize; 2]) -> Vec<f32>
     // The product of all Q begins with 1.
     all.iter_mut().step_by(m + 1).for_each(|diagonal| *diagonal = 1.0);
     for step in 1..=STEPS {
-        square(&gram, &gram, &mut correction);
+        product(&gram, &gram, &mut correction);
         correction.iter_mut().zip(&gram).for_each(|(s, g)| *s = rounded(b * g + c * *s));
         for (matrix, times) in [(&mut all, 1), (&mut gram, if step < STEPS { 2 } else { 0 })] {
             for _ in 0..times {
-                square(&correction, matrix, &mut product);
-                matrix
-                    .iter_mut()
-                    .zip(&product)
-                    .for_each(|(value, product)| *value = rounded(a * *value + product));
+                product(&correction, matrix, &mut next);
+                matrix.iter_mut().zip(&next).for_each(|(value, next)| *value = rounded(a * *value + next));
             }
         }
     }

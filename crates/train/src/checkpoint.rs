@@ -70,6 +70,7 @@ pub(crate) fn load<T: Task>(
     }
     let read = |name: &String| Ok((name.clone(), source.read_f32(name)?));
     let mut rows = source.tensors().keys().map(read).collect::<Result<BTreeMap<_, _>, WeightsError>>()?;
+    let has_averages = rows.keys().any(|key| key.starts_with("average/"));
     let shapes = learner.networks.shapes();
     for (key, values) in &rows {
         let shape = key.split_once('/').and_then(|(_, name)| shapes.get(name));
@@ -90,7 +91,8 @@ pub(crate) fn load<T: Task>(
     };
     let weights = take("weight")?;
     if let Some(average) = &mut learner.average {
-        average.rows = take("average")?;
+        // A run that had no averages begins them with its weights, as a new run does.
+        average.rows = if has_averages { take("average")? } else { weights.clone() };
     }
     learner.networks = std::mem::take(&mut learner.networks).with_rows(&weights);
     learner.optimizer.restore(&learner.networks, &mut rows, &progress.times, device);

@@ -340,7 +340,7 @@ mod tests {
 
     #[test]
     fn all_configs_make_sense_and_both_stages_are_of_the_same_predictor() {
-        for size in ["tiny", "small", "full", "default"] {
+        for size in ["tiny", "small", "full", "studies", "default"] {
             let [one, two] = [1, 2].map(|stage| read(&format!("{size}/stage{stage}")));
             assert_eq!(one.network, two.network, "{size}");
             assert_eq!(one.mode, two.mode, "{size}");

@@ -29,6 +29,10 @@ const FREE: [&str; 12] = [
 /// Sections of the networks. A state of other networks cannot be used.
 const NETWORKS: [&str; 3] = ["network.", "regressor.", "mode."];
 
+/// Keys that decide what a validation measures, besides the data; those of a section if they end with a full stop.
+const VALIDATION: [&str; 4] =
+    ["samples.", "training.precision", "training.validate_on", "training.validation_samples"];
+
 /// What a run trains on what.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub(crate) struct Identity {
@@ -82,6 +86,14 @@ impl Identity {
             harmless.push("the frozen point predictor has other weights".to_owned());
         }
         [harmful, harmless]
+    }
+
+    /// Whether scores of validations do not compare with those of the identity `there`.
+    pub fn validates_otherwise(&self, there: &Self) -> bool {
+        let decides =
+            |key: &str| VALIDATION.iter().any(|of| key == *of || of.ends_with('.') && key.starts_with(of));
+        let is_other = differences(&there.config, &self.config).iter().any(|(key, _)| decides(key));
+        is_other || there.data != self.data || there.predictor != self.predictor
     }
 
     /// Why a run with the identity `there` cannot be continued as this one, or not without `force`.

@@ -199,6 +199,10 @@ impl<'a, T: Task> Session<'a, T> {
             if let Some(refusal) = identity.refusal(&there, options.force) {
                 return Err(FileError::unsuitable(&state, refusal).into());
             }
+            // Scores of other samples do not compare.
+            if identity.validates_otherwise(&there) && learner.progress.best.take().is_some() {
+                watch.note("validations differ from those before: the best of them counts no longer");
+            }
         }
         learner.compare(&identity)?;
         // The config is written after the state was loaded, which proves that it fits the run.

@@ -69,6 +69,39 @@ fn scans_are_the_truth_where_they_are_given() {
     assert!((0.3..0.5).contains(&figure("chamfer")), "{found}");
 }
 
+/// People of two data sets have the same names. Their meshes are in folders of the data sets' names.
+#[test]
+fn meshes_of_two_data_sets_are_told_apart() {
+    let temporary = tempfile::tempdir().expect("a folder");
+    let (meshes, report) = (temporary.path().join("meshes"), temporary.path().join("report"));
+    let other = super::copied(temporary.path());
+    let set = people().file_name().expect("a name");
+    fs::create_dir_all(meshes.join(set)).expect("a folder");
+    let scan = fs::read_to_string(people().join("scans/test/0001/0001.obj")).expect("the saved scan");
+    let scan: String =
+        scan.lines().filter(|line| !line.contains("mtl")).flat_map(|line| [line, "\n"]).collect();
+    // One that belongs to neither.
+    fs::write(meshes.join("0001.obj"), &scan).expect("writes");
+    let run = || {
+        let mut command = snapsnap();
+        command
+            .args(["--quiet", "evaluate", "--config"])
+            .arg(snapsnap_tests::root().join("configs/eval.toml"));
+        command.arg("--data").arg(people()).arg(&other).arg("--mesh-dir").arg(&meshes);
+        ended(command.arg("-o").arg(&report))
+    };
+    let (code, said) = run();
+    assert!(code.is_some_and(|code| code != 0) && said.contains("has no mesh people/0001.obj"), "{said}");
+    fs::write(meshes.join(set).join("0001.obj"), &scan).expect("writes");
+    let (code, said) = run();
+    assert_eq!(code, Some(1), "{said}");
+    let found = json(&report);
+    let name = format!("{}/0001", set.display());
+    assert_eq!(found["subjects"].as_array().map(Vec::len), Some(1), "{found}");
+    assert_eq!((&found["subjects"][0]["name"], found["people"].as_u64()), (&name.into(), Some(1)), "{found}");
+    assert_eq!(found["left_out"].as_array().map(Vec::len), Some(3), "{found}");
+}
+
 /// The mesh of a reconstruction is about as near to the ground truth as its Gaussians, except for closed parts such as
 /// the bottom of a skirt.
 #[test]

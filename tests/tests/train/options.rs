@@ -164,6 +164,29 @@ fn automatic_precision_is_that_of_the_processor() {
     assert!(said("f32").contains("precision: f32\n") && said("bf16").contains("precision: bf16, by "));
 }
 
+/// A run keeps the precision in which it began, on whatever processor it goes on.
+#[test]
+fn automatic_precision_of_a_run_is_that_of_its_beginning() {
+    let (temporary, config) = place();
+    for (i, [own, other]) in [["f32", "bf16"], ["bf16", "f32"]].into_iter().enumerate() {
+        let run = temporary.path().join(own);
+        let with = |precision: &str, steps: u32| {
+            let mut command = train(1, &config, &run);
+            command.arg("--resume").arg(format!("--set=training.precision={precision}"));
+            command.arg(format!("--set=training.steps={steps}"));
+            command
+        };
+        let written = || fs::read_to_string(run.join("config.toml")).expect("a config");
+        succeed(&mut with(own, 2));
+        succeed(&mut with("auto", 3));
+        assert!(written().contains(&format!("\nprecision = \"{own}\"")), "{i}: {}", written());
+        let said = refused(&mut with(other, 4));
+        assert!(said.contains("`training.precision`") && said.contains("--force"), "{said}");
+        succeed(with(other, 4).arg("--force"));
+        assert!(written().contains(&format!("\nprecision = \"{other}\"")), "{i}: {}", written());
+    }
+}
+
 /// Completed sides with their second surfaces, beside normals, from the data to the Gaussians.
 #[test]
 fn second_surfaces_of_completed_sides_are_trained_and_become_gaussians() {

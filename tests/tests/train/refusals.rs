@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::Path;
 
-use snapsnap_tests::{fill_weights, refused, succeed};
+use snapsnap_tests::{fill_weights, refused, snapsnap, succeed};
 
 use super::{copy_folder, people, place, results, train, train_on};
 
@@ -46,6 +46,18 @@ fn wrong_settings_weights_and_folders_are_refused_by_name() {
     assert!(said.contains("other [network]"), "{said}");
     let said = refused(train(2, &config, &run).args(["--resume"]));
     assert!(said.contains("stage 1"), "{said}");
+    // Tensors of the same shapes that mean something else.
+    let other = temporary.path().join("meaning");
+    for (key, named) in
+        [("network.rope_base=50", "`network.rope_base`"), ("network.mirror=true", "`network.mirror`")]
+    {
+        for stage in [1, 2] {
+            let mut command = train(stage, &config, &other);
+            let said = refused(command.args(["--set", key, "--weights"]).arg(run.join("last.safetensors")));
+            assert!(said.contains("last.safetensors") && said.contains(named), "{said}");
+        }
+    }
+    assert!(!other.exists());
     assert!(results(&run) == before);
     let said = refused(train(1, &config, &run.join("other")).args(["--set", "training.batch=4096"]).args([
         "--set",
@@ -127,7 +139,7 @@ fn a_run_is_continued_only_as_itself() {
         command.args(["--resume", "--set=training.steps=3"]).args(arguments);
         command
     };
-    for key in ["training.seed=9", "training.batch=1", "optimizer.rate=1e-5"] {
+    for key in ["training.seed=9", "training.batch=1", "optimizer.rate=1e-5", "training.ema_decay=0"] {
         let said = refused(&mut resumed(people(), &["--set", key]));
         let name = key.split('=').next().expect("a key");
         assert!(said.contains(name) && said.contains("--force"), "{said}");
@@ -152,6 +164,50 @@ fn a_run_is_continued_only_as_itself() {
     succeed(&mut resumed(people(), &["--force"]));
 }
 
+/// A run without averaged weights begins them with --force.
+#[test]
+fn averages_begin_with_the_weights() {
+    let (temporary, config) = place();
+    let run = temporary.path().join("run");
+    succeed(train(1, &config, &run).args(["--set=training.steps=2", "--set=training.ema_decay=0"]));
+    let resumed = || {
+        let mut command = train(1, &config, &run);
+        command.args(["--resume", "--set=training.steps=4"]);
+        command
+    };
+    let before = results(&run);
+    let said = refused(&mut resumed());
+    assert!(said.contains("`training.ema_decay`") && said.contains("--force"), "{said}");
+    assert!(results(&run) == before);
+    succeed(resumed().arg("--force"));
+    succeed(resumed().arg("--set=training.steps=5"));
+}
+
+/// Scores on easier people do not keep the weights of later ones from being the best.
+#[test]
+fn the_best_validation_is_of_the_present_people() {
+    let (temporary, config) = place();
+    let [run, far] = ["run", "far"].map(|name| temporary.path().join(name));
+    for split in ["train", "val"] {
+        let mut command = snapsnap();
+        command.args(["prepare", "synth", "--seed=5", "--subjects=1", "--split", split]);
+        command.args(["--set=views.count=4", "--set=views.resolution=64", "--set=views.distance=2", "-o"]);
+        succeed(command.arg(&far));
+    }
+    succeed(&mut train(1, &config, &run));
+    let before = results(&run);
+    let mut command = train_on(&far, 1, &config, &run);
+    let output = command.args(["--resume", "--force", "--set=training.steps=44"]).output().expect("runs");
+    let [out, err] = [output.stdout, output.stderr].map(|said| String::from_utf8_lossy(&said).into_owned());
+    assert!(output.status.success() && err.contains("counts no longer"), "{err}");
+    assert!(out.contains("after step 44"), "{out}");
+    assert!(results(&run)[1] != before[1], "the former best weights");
+    // A change of the length alone keeps it.
+    let mut command = train_on(&far, 1, &config, &run);
+    let output = command.args(["--resume", "--set=training.steps=45"]).output().expect("runs");
+    assert!(!String::from_utf8_lossy(&output.stderr).contains("counts no longer"));
+}
+
 #[test]
 fn stage_2_continues_with_its_own_predictor_only() {
     let (temporary, config) = place();
@@ -163,8 +219,24 @@ fn stage_2_continues_with_its_own_predictor_only() {
     let run = temporary.path().join("run");
     let weights = |i: usize| starts[i].join("last.safetensors");
     succeed(train(2, &config, &run).arg("--set=training.steps=2").arg("--weights").arg(weights(0)));
-    fs::copy(weights(1), run.join("last.safetensors")).expect("copies");
-    let said = refused(train(2, &config, &run).args(["--resume", "--set=training.steps=3"]));
+    let resumed = |steps: u32, i: usize| {
+        let mut command = train(2, &config, &run);
+        command.arg("--resume").arg(format!("--set=training.steps={steps}")).arg("--weights").arg(weights(i));
+        command
+    };
+    succeed(&mut resumed(3, 0));
+    let said = refused(&mut resumed(4, 1));
+    assert!(
+        said.contains("the frozen point predictor has other weights") && said.contains("--force"),
+        "{said}"
+    );
+    succeed(resumed(4, 1).arg("--force"));
+    // From now on the run's predictor is the second one.
+    refused(&mut resumed(5, 0));
+    succeed(train(2, &config, &run).args(["--resume", "--set=training.steps=5"]));
+    succeed(&mut resumed(6, 1));
+    fs::copy(weights(0), run.join("last.safetensors")).expect("copies");
+    let said = refused(train(2, &config, &run).args(["--resume", "--set=training.steps=7"]));
     assert!(said.contains("the frozen point predictor has other weights"), "{said}");
 }
 

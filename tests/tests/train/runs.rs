@@ -45,6 +45,8 @@ fn both_stages_learn_and_write_weights_for_reconstructions() {
     for part in [weights.display().to_string(), people().display().to_string()] {
         assert!(command.contains(&part), "{command}");
     }
+    // No config of stage 2 lies beside that of stage 1.
+    assert!(command.contains("--config STAGE2.toml"), "{command}");
     let said = succeed(train(2, &config, &two).arg("--weights").arg(&weights));
     let command = next(&said);
     assert!(!command.contains("FRONT"), "{command}");

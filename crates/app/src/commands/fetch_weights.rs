@@ -6,7 +6,6 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::{Args, ValueEnum};
-use sha2::{Digest, Sha256};
 use snapsnap_base::{FileError, file};
 use snapsnap_eval::lpips;
 use ureq::Agent;
@@ -16,6 +15,7 @@ use crate::failure::{Failure, bail};
 use crate::output::make_folder;
 use crate::progress::Progress;
 use crate::say;
+use crate::weights::sha256;
 
 /// Attempts in a row without new bytes after which the download fails.
 const ATTEMPTS: u32 = 4;
@@ -149,7 +149,7 @@ fn check_existing(item: &Item, path: &Path) -> Result<(), Failure> {
     let unreadable = |e| Failure::file(path, format!("is there, and cannot be read: {e}"));
     let mut file = file::open(path).map_err(unreadable)?;
     if file.metadata().is_ok_and(|m| m.len() == item.bytes)
-        && sum_of(&mut file).map_err(unreadable)? == item.sha256
+        && sha256(&mut file).map_err(unreadable)? == item.sha256
     {
         return Ok(());
     }
@@ -235,7 +235,7 @@ impl From<io::Error> for Broken {
 /// Checks the size and the sum of a written file.
 fn check_sum(item: &Item, origin: &str, file: &mut File) -> Result<(), Broken> {
     file.rewind()?;
-    let (found, length) = (sum_of(file)?, file.metadata()?.len());
+    let (found, length) = (sha256(file)?, file.metadata()?.len());
     if found == item.sha256 && length == item.bytes {
         return Ok(());
     }
@@ -243,13 +243,6 @@ fn check_sum(item: &Item, origin: &str, file: &mut File) -> Result<(), Broken> {
         "{origin}: what came is not {}: {length} bytes with SHA-256 {found}; nothing was kept",
         item.file
     )))
-}
-
-/// SHA-256 of the rest of a file, in hexadecimal digits.
-fn sum_of(file: &mut File) -> io::Result<String> {
-    let mut hasher = Sha256::new();
-    io::copy(file, &mut hasher)?;
-    Ok(hasher.finalize().iter().map(|byte| format!("{byte:02x}")).collect())
 }
 
 /// Copies until the source ends or there is one byte too many. `at` bytes are there already.

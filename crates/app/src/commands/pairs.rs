@@ -62,7 +62,8 @@ pub fn run(arguments: &Arguments, pairs: &Path) -> Result<(), Failure> {
     let device = arguments.model.device(&opened)?;
     let (reconstructor, _) = arguments.model.load(&opened, &device)?;
     let path = folder.join(CONFIG);
-    let settings = format!("# {}\n{}", arguments.of_people(opened.path()), config.resolved().to_toml());
+    let settings =
+        format!("# {}\n{}", arguments.of_people(&weights::sum_of(&opened)?), config.resolved().to_toml());
     if path.exists() {
         let there = file::read(&path, LARGEST_CONFIG).map_err(FileError::read(&path))?;
         if there != settings.as_bytes() {

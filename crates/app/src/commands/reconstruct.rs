@@ -97,10 +97,10 @@ pub struct Arguments {
 
 impl Arguments {
     /// Options that decide what people of the same photographs become.
-    pub fn of_people(&self, weights: &Path) -> String {
+    pub fn of_people(&self, weights: &str) -> String {
         let Self { cutout, as_is, camera, model, axes, .. } = self;
         let precision = model.precision;
-        format!("weights {weights:?}, {precision:?}, cutout {cutout}, as is {as_is}, {axes:?}, {camera:?}")
+        format!("weights {weights}, {precision:?}, cutout {cutout}, as is {as_is}, {axes:?}, {camera:?}")
     }
 
     /// What tells the person from the background.

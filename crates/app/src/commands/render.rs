@@ -112,6 +112,16 @@ fn one(arguments: &Arguments, device: &Device) -> Result<(), Failure> {
     let folder =
         folder.map(|path| ViewFolder::new(path, views.len(), arguments.cameras.as_deref())).transpose()?;
     check_paths(arguments, folder.as_ref())?;
+    if let (Some(path), Some([width, height])) = (&arguments.cameras, arguments.size)
+        && folder.as_ref().is_some_and(ViewFolder::keeps_cameras)
+        && cameras::read(path)? != views
+    {
+        bail!(
+            "--size {width}x{height}: {} describes the pictures beside it, which would have another size: give \
+             another folder",
+            path.display()
+        );
+    }
     let start = Instant::now();
     let loaded = scene::read(&arguments.ply, device)?;
     let reading = start.elapsed();

@@ -101,17 +101,16 @@ pub fn import(arguments: &ImportArguments) -> Result<(), Failure> {
     Ok(())
 }
 
-/// The config of --config, or the one stored in a source, or the published size. The published weights of that size need
+/// The config of --config, or the one stored in the files, or the published size. The published weights of that size need
 /// `compat`.
 fn import_config(ImportArguments { sources, fill, config, .. }: &ImportArguments) -> Result<Config, Failure> {
     if config.config.is_none() {
         // A pickle contains no config.
-        let is_safetensors = |path: &&PathBuf| path.extension().is_some_and(|e| e == "safetensors");
-        for path in sources.iter().chain(fill).filter(is_safetensors) {
-            if let Some(stored) = weights::stored_config(path)? {
-                let origin = format!("{} (metadata)", path.display());
-                return Ok(Config::from_toml(&stored.to_toml(), &origin, &config.set)?);
-            }
+        let is_safetensors = |path: &&Path| path.extension().is_some_and(|e| e == "safetensors");
+        let files = sources.iter().chain(fill).map(PathBuf::as_path).filter(is_safetensors);
+        if let Some(stored) = weights::stored_config(files.clone())? {
+            let origin = files.map(|path| path.display().to_string()).collect::<Vec<_>>().join(", ");
+            return Ok(Config::from_toml(&stored.to_toml(), &format!("{origin} (metadata)"), &config.set)?);
         }
     }
     config.resolve((PUBLISHED, "[mode]\ncompat = true\n"))

@@ -13,6 +13,10 @@ use super::{Folder, Split, Stored};
 
 /// The config of the preparation, which is kept.
 const SETTINGS: &str = "prepare.config.toml";
+/// How the name of a folder in the making ends.
+const UNFINISHED: &str = ".unfinished";
+/// How the name of its lock goes on.
+const LOCK: &str = ".lock";
 
 /// What was packed.
 #[derive(Debug, Default, Clone, Copy, PartialEq, Eq)]
@@ -61,10 +65,24 @@ pub fn pack(
     let parent = output.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let output = parent.join(name);
     fs::create_dir_all(parent).map_err(FileError::write(parent))?;
+    let prefix = format!(".{}.", name.to_string_lossy());
+    tidy(parent, &prefix);
     // Several runs may pack into one folder at once: the first one to end is the one that counts.
-    let temporary = parent.join(format!(".{}.{}.unfinished", name.to_string_lossy(), process::id()));
+    let temporary = parent.join(format!("{prefix}{}{UNFINISHED}", process::id()));
+    // The system releases the lock of a killed run. Some file systems have none.
+    let mark = parent.join(format!("{prefix}{}{UNFINISHED}{LOCK}", process::id()));
+    let lock = File::create(&mark).map_err(FileError::write(&mark))?;
+    let _ = lock.try_lock();
+    let mark = file::unfinished_file(&mark);
     let made = fs::create_dir(&temporary).and_then(|()| file::unfinished_folder(&temporary));
-    let guard = made.map_err(FileError::write(&temporary))?;
+    let made = made.map_err(FileError::write(&temporary));
+    let guard = match made {
+        Ok(guard) => guard,
+        Err(e) => {
+            mark.remove();
+            return Err(e);
+        }
+    };
     let packed = Packer::new(folder, &temporary, size).and_then(|mut packer| {
         for (done, (split, subject)) in all.iter().enumerate() {
             progress(done, all.len());
@@ -81,7 +99,22 @@ pub fn pack(
     });
     let _ = fs::remove_dir_all(&temporary);
     drop(guard);
+    mark.remove();
     packed
+}
+
+/// Removes the folders that killed runs have left in `parent`, by their locks. Those of runs in progress stay.
+fn tidy(parent: &Path, prefix: &str) {
+    for mark in fs::read_dir(parent).into_iter().flatten().flatten().map(|entry| entry.path()) {
+        let name = mark.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let left =
+            name.strip_prefix(prefix).and_then(|rest| rest.strip_suffix(LOCK)?.strip_suffix(UNFINISHED));
+        let is_mark = left.is_some_and(|process| process.parse::<u32>().is_ok());
+        if is_mark && File::open(&mark).is_ok_and(|lock| lock.try_lock().is_ok()) {
+            let _ = fs::remove_dir_all(mark.with_extension(""));
+            let _ = fs::remove_file(&mark);
+        }
+    }
 }
 
 /// An archive in the making.

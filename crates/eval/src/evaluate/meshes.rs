@@ -45,8 +45,8 @@ pub struct MeshFigures {
     pub aligned: Option<[f64; 3]>,
 }
 
-/// Compares the meshes NAME.obj, .ply or .glb in a folder with the ground truth. `progress` is called with the number
-/// of finished people and their total.
+/// Compares the meshes NAME.obj, .ply or .glb in a folder with the ground truth, or, with several data sets, SET/NAME.… of each.
+/// `progress` is called with the number of finished people and their total.
 pub fn evaluate_meshes(
     config: &EvalConfig,
     sets: &[People],
@@ -58,7 +58,16 @@ pub fn evaluate_meshes(
     let people = sets.iter().flat_map(|set| set.chosen().iter().map(move |row| (set, *row)));
     for (done, (people, row)) in people.enumerate() {
         let name = name_of(sets, people, row);
-        match one(config, people, row, &name, folder) {
+        let own = people.test().name(row);
+        // In files, people of one name are told apart by the names of their data sets.
+        let is_in = |set: &&People| set.chosen().iter().any(|row| set.test().name(*row) == own);
+        let is_alone = sets.iter().filter(is_in).count() == 1;
+        let names: Vec<&str> = (!Path::new(&name).is_absolute())
+            .then_some(&*name)
+            .into_iter()
+            .chain(is_alone.then_some(own))
+            .collect();
+        match one(config, people, row, (&name, &names), folder) {
             Ok(found) => figures.push(found),
             Err(e) => left_out.push(LeftOut::new(name, e)),
         }
@@ -72,14 +81,13 @@ fn one(
     config: &EvalConfig,
     people: &People,
     row: usize,
-    name: &str,
+    (name, in_files): (&str, &[&str]),
     folder: &Path,
 ) -> Result<MeshFigures, EvalError> {
-    let subject = people.test().name(row);
-    let mut mesh = import::read(&find(folder, subject)?)?;
+    let mut mesh = import::read(&find(folder, in_files)?)?;
     let seen = truth_of(people, row)?;
     let scan = |scans: &PathBuf| -> Result<Mesh, EvalError> {
-        let path = find(scans, subject)?;
+        let path = find(scans, in_files)?;
         let mut scan = import::read(&path)?;
         // The scan gets the pose that `prepare` gave it. Test people are not moved sideways.
         normalise(&mut scan, Collection::Other, None::<&mut ChaCha8Rng>)
@@ -115,14 +123,22 @@ fn one(
     })
 }
 
-fn find(folder: &Path, name: &str) -> Result<PathBuf, EvalError> {
-    // Collections of scans have a folder for each scan.
-    let folders = [folder.to_owned(), folder.join(name)];
-    let files =
-        folders.iter().flat_map(|folder| EXTENSIONS.map(|ending| folder.join(format!("{name}.{ending}"))));
-    let found = { files }.find(|file| file.is_file());
+/// The mesh of a person in a folder, under the first of the names that has one.
+fn find(folder: &Path, names: &[&str]) -> Result<PathBuf, EvalError> {
+    let files = names.iter().flat_map(|name| {
+        // Collections of scans have a folder for each scan.
+        let in_folder = format!("{name}/{}", name.rsplit('/').next().unwrap_or(name));
+        [(*name).to_owned(), in_folder]
+            .into_iter()
+            .flat_map(|stem| EXTENSIONS.map(|end| format!("{stem}.{end}")))
+    });
+    let found = files.map(|file| folder.join(file)).find(|file| file.is_file());
     found.ok_or_else(|| {
-        let message = format!("has no mesh {name}.obj, .ply or .glb, nor {name}/{name}.…");
+        let message =
+            names.first().map_or("cannot tell people of two data sets of one name apart".into(), |name| {
+                let last = name.rsplit('/').next().unwrap_or(name);
+                format!("has no mesh {name}.obj, .ply or .glb, nor {name}/{last}.…")
+            });
         EvalError::File(FileError::unsuitable(folder, message))
     })
 }

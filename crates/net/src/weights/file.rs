@@ -20,6 +20,15 @@ pub type Progress<'a> = &'a dyn Fn(u64, u64);
 
 /// Largest number of keys that a message names.
 const MAX_DIFFERENCES: usize = 3;
+/// Keys that change what tensors mean, but not which there are. A regressor has `start` and `color` as well.
+const MEANINGS: [&str; 6] = [
+    "network.anchor",
+    "network.conf_mode",
+    "network.fusion",
+    "network.mirror",
+    "network.pair_degrees",
+    "network.rope_base",
+];
 /// Values per task: a second-level cache holds them.
 const CHUNK: usize = 1 << 16;
 
@@ -192,13 +201,28 @@ impl WeightFile {
         // `mode` changes no tensor.
         let own: Vec<_> = own.into_iter().filter(|(key, _)| !key.starts_with("mode.")).collect();
         if !own.is_empty() {
-            let shown: Vec<String> =
-                own.into_iter().take(MAX_DIFFERENCES).map(|(_, message)| message).collect();
-            let message = format!("not the weights of the configured networks: {}", shown.join(", "));
-            return Err(FileError::unsuitable(path, message).into());
+            return Err(of_others(path, own));
         }
         let origin = path.display().to_string();
         Err(WeightsError::Tensors { origin, problems })
+    }
+
+    /// Refuses weights whose file contains a config in which the same tensors mean something else, such as points without the
+    /// anchors of this config. A file without a config passes.
+    ///
+    /// # Errors
+    /// [`WeightsError::File`] that names the keys.
+    pub fn require_meaning(&self) -> Result<(), WeightsError> {
+        let Ok(own) = self.source.config() else { return Ok(()) };
+        let mut differing = differences(&keys(&own), &keys(&self.config));
+        let regressors =
+            [&own, &self.config].map(|config| (config.regressor.start(), config.regressor.color()));
+        let is_other_regressor = self.require(Part::Regressor).is_ok() && regressors[0] != regressors[1];
+        differing.retain(|(key, _)| {
+            let is_of_regressor = ["regressor.start", "regressor.color"].contains(&key.as_str());
+            MEANINGS.contains(&key.as_str()) || is_other_regressor && is_of_regressor
+        });
+        if differing.is_empty() { Ok(()) } else { Err(of_others(self.path(), differing)) }
     }
 
     /// Reads every tensor, one at a time.
@@ -246,6 +270,14 @@ impl WeightFile {
         };
         Err(FileError::unsuitable(self.path(), message).into())
     }
+}
+
+/// The refusal of weights with these differences from the config.
+fn of_others(path: &Path, differences: Vec<(String, String)>) -> WeightsError {
+    let shown: Vec<String> =
+        differences.into_iter().take(MAX_DIFFERENCES).map(|(_, message)| message).collect();
+    let message = format!("not the weights of the configured networks: {}", shown.join(", "));
+    FileError::unsuitable(path, message).into()
 }
 
 /// The parts that a set of keys belongs to.

@@ -7,7 +7,7 @@ use std::slice;
 use super::WeightsError;
 use super::file::{Progress, mismatch, parts_of, write};
 use super::init::{SideHeads, draw};
-use super::schema::{self, DUST3R, SCALE, SIDE, TensorSpec, UNET};
+use super::schema::{self, DUST3R, Part, SCALE, SIDE, TensorSpec, UNET};
 use super::source::{CONFIG_KEY, Float, Source, is_readable};
 use crate::config::Config;
 
@@ -24,13 +24,25 @@ pub struct ImportOptions<'a> {
     pub float: Float,
 }
 
-/// The config in the metadata of a weight file; `None` for other checkpoints.
+/// The config in the metadata of weight files, each section from the first file that has a config and tensors of this part: the
+/// regressor's from one with a regressor, the others from one with a point predictor. `None` if no file has a config. Sections without
+/// such a file are those of the first config.
 ///
 /// # Errors
 /// [`WeightsError`] for a file that is no checkpoint, or whose config is refused.
-pub fn stored_config(path: &Path) -> Result<Option<Config>, WeightsError> {
-    let source = Source::open(path)?;
-    source.metadata.contains_key(CONFIG_KEY).then(|| source.config()).transpose()
+pub fn stored_config<'a>(paths: impl Iterator<Item = &'a Path>) -> Result<Option<Config>, WeightsError> {
+    let mut stored = Vec::new();
+    for path in paths {
+        let source = Source::open(path)?;
+        if source.metadata.contains_key(CONFIG_KEY) {
+            stored.push((source.config()?, parts_of(source.tensors().keys())));
+        }
+    }
+    let of = |part: Part| stored.iter().find(|(_, parts)| parts.contains(&part)).or(stored.first());
+    let (Some((points, _)), Some((gaussians, _))) = (of(Part::PointPredictor), of(Part::Regressor)) else {
+        return Ok(None);
+    };
+    Ok(Some(Config { regressor: gaussians.regressor.clone(), ..points.clone() }))
 }
 
 /// Report of an import.

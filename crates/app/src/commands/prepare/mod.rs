@@ -12,7 +12,7 @@ use std::time::Duration;
 
 use clap::{Args, Subcommand};
 use snapsnap_base::FileError;
-use snapsnap_base::config::Schema;
+use snapsnap_base::config::{Schema, differences, keys};
 use snapsnap_base::file;
 use snapsnap_base::random::stream;
 use snapsnap_data::dataset::{Folder, Made, Split};
@@ -171,6 +171,18 @@ fn make(
     }
     let folder = Folder::create(&common.output, config.description(source))?;
     let (path, resolved) = (common.output.join(CONFIG), config.to_toml());
+    // The cameras of people that are there already are those of this config; `dataset.toml` does not have all of them.
+    if let Ok(there) = DataConfig::from_file(&path, &[]) {
+        let differing = differences(&keys(&there), &keys(&config));
+        if !differing.is_empty() {
+            let differing: Vec<String> = differing.into_iter().map(|(_, message)| message).collect();
+            let message = format!(
+                "is of people made with other settings: {}; give another folder",
+                differing.join(", ")
+            );
+            return Err(Failure::file(&path, message));
+        }
+    }
     let given = common.config.as_deref().is_some_and(|given| is_same_file(given, &path));
     if !given && fs::read(&path).ok().as_deref() != Some(resolved.as_bytes()) {
         output::write(&path, resolved.as_bytes())?;

@@ -83,7 +83,10 @@ impl RunFolder {
             if !arguments.resume {
                 return Err(wrong("contains a run: add --resume to continue it, or give another folder"));
             }
-            if TrainConfig::from_file(&path.join(CONFIG), &[])?.networks() != config.networks() {
+            // Another precision has the same layers; the state tells it apart.
+            let mut there = TrainConfig::from_file(&path.join(CONFIG), &[])?;
+            there.training.precision = config.training.precision;
+            if there.networks() != config.networks() {
                 return Err(wrong(
                     "was begun with other [network], [regressor] or [mode] sections (its config.toml): give \
                      another folder",

@@ -12,6 +12,7 @@ use std::time::{Duration, Instant};
 
 use burn::tensor::Device;
 use clap::Args;
+use snapsnap_base::config::Schema;
 use snapsnap_base::file;
 use snapsnap_data::dataset::{Folder, Layout};
 use snapsnap_net::config::Precision;
@@ -20,7 +21,7 @@ use snapsnap_net::weights::{WeightFile, random_predictor, random_regressors};
 use snapsnap_train::config::TrainConfig;
 use snapsnap_train::networks::Networks;
 use snapsnap_train::ranks::Ranks;
-use snapsnap_train::run::{self, BEST, LAST, Options, Outcome, STATE};
+use snapsnap_train::run::{self, BEST, CONFIG, LAST, Options, Outcome, STATE};
 use snapsnap_train::stage1::PointTask;
 use snapsnap_train::stage2::GaussianTask;
 use snapsnap_train::task::Task;
@@ -141,8 +142,10 @@ fn points(arguments: &Arguments, ranks: &Ranks) -> Result<ExitCode, Failure> {
 
 fn humans(arguments: &Arguments, ranks: &Ranks) -> Result<ExitCode, Failure> {
     let plan = Plan::new(arguments, ranks)?;
-    // The latest weights of a continued run contain its point predictor. Before the first checkpoint there are none.
-    let latest = plan.begun.map(|run| run.join(LAST)).filter(|latest| latest.exists());
+    // The latest weights of a continued run contain its point predictor. Before the first checkpoint there are none. Weights of the
+    // command line are compared with those of the run's state.
+    let begun = plan.begun.filter(|_| arguments.weights.is_none());
+    let latest = begun.map(|run| run.join(LAST)).filter(|latest| latest.exists());
     let Some(start) = latest.or_else(|| plan.config.training.weights.clone()) else {
         bail!(
             "stage 2 needs a trained point predictor: give --weights FILE, as train-stage1 writes it, or \
@@ -171,7 +174,9 @@ fn humans(arguments: &Arguments, ranks: &Ranks) -> Result<ExitCode, Failure> {
 
 /// Opens the weights to begin with. They must fit the config.
 fn open(path: &Path, config: &TrainConfig) -> Result<WeightFile, Failure> {
-    Ok(WeightFile::open(path, Some(config.networks()))?)
+    let weights = WeightFile::open(path, Some(config.networks()))?;
+    weights.require_meaning()?;
+    Ok(weights)
 }
 
 impl<'a> Plan<'a> {
@@ -204,6 +209,14 @@ impl<'a> Plan<'a> {
             let needed = neighbours * least_memory(&config, ranks.size());
             memory::check("this training", needed, "a smaller network or batch needs less")?;
         }
+        // The first rank is about to write a state, which later ranks would find.
+        let output = arguments.output.as_deref();
+        let is_begun = arguments.resume && output.is_some_and(|run| run.join(STATE).exists());
+        let begun = output.filter(|_| ranks.gather(&is_begun)[0]);
+        // `auto` of a run that is continued is what it was when the run began, on whatever processor that was.
+        if let (Some(run), None) = (begun, config.training.precision.fixed()) {
+            config.training.precision = TrainConfig::from_file(&run.join(CONFIG), &[])?.training.precision;
+        }
         // All ranks compute in the format of the least of them.
         let precision = config.training.precision.of_training(&device);
         let all = ranks.gather(&precision);
@@ -217,10 +230,6 @@ impl<'a> Plan<'a> {
             true => device.autodiff().gradient_checkpointing(),
             false => device.autodiff(),
         };
-        // The first rank is about to write a state, which later ranks would find.
-        let output = arguments.output.as_deref();
-        let is_begun = arguments.resume && output.is_some_and(|run| run.join(STATE).exists());
-        let begun = output.filter(|_| ranks.gather(&is_begun)[0]);
         Ok(Self { arguments, config, folders, device, ranks, begun })
     }
 
@@ -303,7 +312,7 @@ impl<'a> Plan<'a> {
         let next = match stage {
             1 => {
                 let config = self.arguments.config.as_deref().and_then(stage2_config);
-                let config = config.map_or("configs/default/stage2.toml".into(), |path| quoted(&path));
+                let config = config.map_or("STAGE2.toml".into(), |path| quoted(&path));
                 let data: Vec<String> = self.folders.iter().map(|folder| quoted(folder.root())).collect();
                 let data = data.join(" ");
                 let out = quoted(&folder.with_file_name(format!("{}-stage2", name(folder))));

@@ -170,3 +170,25 @@ fn a_subject_without_a_file_or_with_a_full_stop_is_not_packed() {
         fs::read_dir(temporary.path()).expect("lists").map(|e| e.expect("entry").path()).collect();
     assert_eq!(left, [folder.root()], "nothing is left of it");
 }
+
+/// What a killed run has left is removed, and what another run still writes is not.
+#[test]
+fn what_killed_runs_have_left_is_removed() {
+    let (temporary, folder) = small(Layout::Exact);
+    let at = |name: &str| temporary.path().join(name);
+    for left in [".packed.1", ".packed.2", ".packed.mine", ".other.1"] {
+        fs::create_dir(at(&format!("{left}.unfinished"))).expect("makes");
+        fs::write(at(&format!("{left}.unfinished/archives.csv")), "half").expect("writes");
+        fs::write(at(&format!("{left}.unfinished.lock")), "").expect("writes");
+    }
+    let lock = fs::File::open(at(".packed.2.unfinished.lock")).expect("opens");
+    lock.lock().expect("locks");
+    pack(&folder, &at("packed"), 1 << 30, |_, _| {}).expect("packs");
+    let entries = fs::read_dir(temporary.path()).expect("lists").map(|e| e.expect("entry").file_name());
+    let mut names: Vec<_> = entries.map(|name| name.into_string().expect("UTF-8")).collect();
+    names.retain(|name| name.starts_with('.'));
+    names.sort();
+    let kept = [".other.1", ".packed.2", ".packed.mine"];
+    let kept = kept.map(|name| [format!("{name}.unfinished"), format!("{name}.unfinished.lock")]);
+    assert_eq!(names, kept.concat());
+}

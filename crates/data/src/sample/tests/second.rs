@@ -1,9 +1,13 @@
 //! Second surfaces of side views.
 
+use burn::tensor::TensorData;
+
 use super::*;
 use crate::prepare::DataConfig;
 use crate::testing::made;
 use snapsnap_mesh::mesh::{Face, Mesh};
+use std::sync::Arc;
+use tempfile::TempDir;
 
 /// A block with a slab beside its right side, as an arm hangs beside a flank: the slab's half size is a part of the
 /// block's.
@@ -18,6 +22,13 @@ fn armed() -> Mesh {
     mesh
 }
 
+/// A data set of one person, the armed block, in four views with second depths.
+fn data_of_armed(resolution: u32) -> (TempDir, Arc<Folder>) {
+    let mut config = DataConfig::default();
+    (config.views.count, config.views.resolution, config.views.second_depth) = (4, resolution, true);
+    made(&config, &armed(), 1)
+}
+
 /// The points of a map that has one.
 fn there(points: &[f32], valid: &[f32], map: usize, side: usize) -> Vec<Vec3> {
     let (points, valid) = (&points[3 * map * side * side..], &valid[map * side * side..][..side * side]);
@@ -27,10 +38,7 @@ fn there(points: &[f32], valid: &[f32], map: usize, side: usize) -> Vec<Vec3> {
 #[test]
 fn samples_carry_the_flank_behind_an_arm() {
     let side = 128;
-    let mut config = DataConfig::default();
-    (config.views.count, config.views.resolution) = (4, side as u32);
-    config.views.second_depth = true;
-    let (_temporary, folder) = made(&config, &armed(), 1);
+    let (_temporary, folder) = data_of_armed(side as u32);
     let samples = SampleConfig {
         second_depth: true,
         front_within_degrees: 0.0,
@@ -86,10 +94,7 @@ fn samples_carry_the_flank_behind_an_arm() {
 #[test]
 fn samples_without_sides_are_those_with_sides_without_them() {
     let side = 64;
-    let mut config = DataConfig::default();
-    (config.views.count, config.views.resolution) = (4, side as u32);
-    config.views.second_depth = true;
-    let (_temporary, folder) = made(&config, &armed(), 1);
+    let (_temporary, folder) = data_of_armed(side);
     let area = (side * side) as usize;
     for (placed_share, upright) in [(0.0, false), (1.0, false), (1.0, true)] {
         let augment = Augment { flip: true, ..Augment::default() };
@@ -112,10 +117,7 @@ fn samples_without_sides_are_those_with_sides_without_them() {
 /// Second surfaces follow the four views in batches, sample by sample.
 #[test]
 fn batches_have_second_surfaces_after_the_views() {
-    let mut config = DataConfig::default();
-    (config.views.count, config.views.resolution) = (4, 64);
-    config.views.second_depth = true;
-    let (_temporary, folder) = made(&config, &armed(), 1);
+    let (_temporary, folder) = data_of_armed(64);
     let samples = SampleConfig { second_depth: true, ..SampleConfig::default() };
     let mut items: Vec<_> =
         (0..8).map(|i| stage1(&folder, samples.clone()).sample(i).expect("reads")).collect();
@@ -123,22 +125,12 @@ fn batches_have_second_surfaces_after_the_views() {
     items.truncate(2);
     let batch = Stage1Batcher.batch(items.clone(), &Device::flex());
     assert_eq!((batch.points.dims(), batch.valid.dims()), ([2, 6, 64, 64, 3], [2, 6, 64, 64]));
+    let values = |data: TensorData| data.try_into_vec::<f32>().expect("f32");
     for (sample, item) in items.iter().enumerate() {
         for view in 0..6 {
-            let points: Vec<f32> = batch
-                .points
-                .clone()
-                .slice([sample..sample + 1, view..view + 1])
-                .into_data()
-                .try_into_vec()
-                .expect("f32");
-            let valid: Vec<f32> = batch
-                .valid
-                .clone()
-                .slice([sample..sample + 1, view..view + 1])
-                .into_data()
-                .try_into_vec()
-                .expect("f32");
+            let at = [sample..sample + 1, view..view + 1];
+            let points = values(batch.points.clone().slice(at.clone()).into_data());
+            let valid = values(batch.valid.clone().slice(at).into_data());
             assert!(item.truth(view) == Some((&points, &valid)), "sample {sample}, view {view}");
         }
     }

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Leave one maker out (docs/notes/people.md): bash configs/default/makers.sh MAKEHUMAN_DATA AVATARS, in the repository's root. It trains
+# Leave one maker out (docs/notes/people.md): bash configs/studies/makers.sh MAKEHUMAN_DATA AVATARS, in the repository's root. It trains
 # stage 1 on people of all three makers, and without each of them, and judges each network on held-out people of every maker.
 # ROWS="all no-synth" trains these rows only, STEPS=1000 makes them shorter. An interrupted run continues when it is started again.
 set -eu
@@ -16,7 +16,7 @@ people() {
 people synth
 people makehuman "$makehuman"
 people avatars "$avatars"
-train() { cargo xtask train-stage1 --config configs/default/stage1.toml --resume "$@" --set training.preview_every=0; }
+train() { cargo xtask train-stage1 --config configs/studies/stage1.toml --resume "$@" --set training.preview_every=0; }
 # row NAME STEPS MAKER…: the training on these makers, and one step without effect on each maker for its validation. STEPS are those of a
 # training of 2000.
 row() {

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Effect of each part of the default networks, and of their size (docs/notes/weights.md): bash configs/default/sweep.sh MAKEHUMAN_DATA, in
+# Effect of each part of the default networks, and of their size (docs/notes/weights.md): bash configs/studies/sweep.sh MAKEHUMAN_DATA, in
 # the repository's root. ROWS="base small" trains these rows only. An interrupted sweep continues when it is started again.
 set -eu
 makehuman=$1
@@ -22,10 +22,10 @@ row() {
   name=$1 data="people/sweep/$2/synth people/sweep/$2/makehuman"
   wanted "$name" || return 0
   shift 2
-  cargo xtask train-stage1 --config configs/default/stage1.toml --data $data --set training.steps=400 --set training.ema_decay=0.99 \
+  cargo xtask train-stage1 --config configs/studies/stage1.toml --data $data --set training.steps=400 --set training.ema_decay=0.99 \
     --set training.log_every=20 --set training.validate_every=100 --set training.validation_samples=32 "$@" --resume -o "runs/sweep/$name"
   case $name in no-* | plain | rings) return 0 ;; esac
-  cargo xtask train-stage2 --config configs/default/stage2.toml --data $data --weights "runs/sweep/$name/best.safetensors" \
+  cargo xtask train-stage2 --config configs/studies/stage2.toml --data $data --weights "runs/sweep/$name/best.safetensors" \
     "$@" --set training.steps=1 --set training.validation_samples=1 --resume -o "runs/sweep/$name/both"
 }
 row base groups
@@ -54,7 +54,7 @@ regressor() {
   name=$1
   wanted "$name" || return 0
   shift
-  cargo xtask train-stage2 --config configs/default/stage2.toml --data people/sweep/groups/synth people/sweep/groups/makehuman \
+  cargo xtask train-stage2 --config configs/studies/stage2.toml --data people/sweep/groups/synth people/sweep/groups/makehuman \
     --weights runs/sweep/base/best.safetensors --set training.steps=150 --set training.validate_every=75 \
     --set training.validation_samples=16 "$@" --resume -o "runs/sweep/$name"
 }
@@ -63,5 +63,5 @@ regressor free-start --set 'regressor.start="published"'
 regressor free-color --set 'regressor.color="free"'
 regressor grey-rims --set regressor.straight_color=false
 if wanted bench; then
-  cargo xtask bench --config configs/default/sweep.toml -o reports/sweep
+  cargo xtask bench --config configs/studies/sweep.toml -o reports/sweep
 fi

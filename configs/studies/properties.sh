@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Leave one property of the training people out (docs/notes/people.md): bash configs/default/properties.sh MAKEHUMAN_DATA AVATARS, in the
+# Leave one property of the training people out (docs/notes/people.md): bash configs/studies/properties.sh MAKEHUMAN_DATA AVATARS, in the
 # repository's root. It trains stage 1 on people of `makehuman` and `avatars` without the property, and judges it on held-out people of
 # every maker with all properties. ROWS="all light" trains these rows only. An interrupted run continues when it is started again.
 set -eu
@@ -21,7 +21,7 @@ for split in "val 40" "train 1"; do
   cargo xtask prepare synth --split "${split% *}" --subjects "${split#* }" --seed 43 $phone -o $folder/held/synth
 done
 train() {
-  cargo xtask train-stage1 --config configs/default/stage1.toml --resume "$@" --set samples.placed_share=1.0 --set training.preview_every=0
+  cargo xtask train-stage1 --config configs/studies/stage1.toml --resume "$@" --set samples.placed_share=1.0 --set training.preview_every=0
 }
 # row NAME OPTION…
 row() {
