@@ -29,9 +29,10 @@ const FREE: [&str; 12] = [
 /// Sections of the networks. A state of other networks cannot be used.
 const NETWORKS: [&str; 3] = ["network.", "regressor.", "mode."];
 
-/// Keys that decide what a validation measures, besides the data; those of a section if they end with a full stop.
-const VALIDATION: [&str; 4] =
-    ["samples.", "training.precision", "training.validate_on", "training.validation_samples"];
+/// Beginnings of the keys that decide what a validation measures, besides the data.
+const VALIDATION: [&str; 3] = ["samples.", "training.validate_on", "training.validation_samples"];
+/// Beginnings of those among them that training samples alone have.
+const TRAINING_ALONE: [&str; 3] = ["samples.augment.", "samples.repeat", "samples.seed"];
 
 /// What a run trains on what.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
@@ -90,9 +91,10 @@ impl Identity {
 
     /// Whether scores of validations do not compare with those of the identity `there`.
     pub fn validates_otherwise(&self, there: &Self) -> bool {
-        let decides =
-            |key: &str| VALIDATION.iter().any(|of| key == *of || of.ends_with('.') && key.starts_with(of));
-        let is_other = differences(&there.config, &self.config).iter().any(|(key, _)| decides(key));
+        let is_of = |key: &str, all: [&str; 3]| all.iter().any(|start| key.starts_with(start));
+        let is_other = differences(&there.config, &self.config)
+            .iter()
+            .any(|(key, _)| is_of(key, VALIDATION) && !is_of(key, TRAINING_ALONE));
         is_other || there.data != self.data || there.predictor != self.predictor
     }
 

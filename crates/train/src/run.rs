@@ -199,8 +199,9 @@ impl<'a, T: Task> Session<'a, T> {
             if let Some(refusal) = identity.refusal(&there, options.force) {
                 return Err(FileError::unsuitable(&state, refusal).into());
             }
-            // Scores of other samples do not compare.
-            if identity.validates_otherwise(&there) && learner.progress.best.take().is_some() {
+            // Scores of other samples do not compare. A finished run keeps its best weights.
+            let goes_on = learner.progress.step < config.training.steps as u64;
+            if goes_on && identity.validates_otherwise(&there) && learner.progress.best.take().is_some() {
                 watch.note("validations differ from those before: the best of them counts no longer");
             }
         }

@@ -100,6 +100,18 @@ fn meshes_of_two_data_sets_are_told_apart() {
     assert_eq!(found["subjects"].as_array().map(Vec::len), Some(1), "{found}");
     assert_eq!((&found["subjects"][0]["name"], found["people"].as_u64()), (&name.into(), Some(1)), "{found}");
     assert_eq!(found["left_out"].as_array().map(Vec::len), Some(3), "{found}");
+    // Sets of one name have that of the folder around them as well, however they were typed.
+    let around = temporary.path().join("around");
+    fs::create_dir_all(meshes.join("around/people")).expect("a folder");
+    fs::create_dir(&around).expect("a folder");
+    super::copied(&around);
+    fs::write(meshes.join("around/people/0001.obj"), &scan).expect("writes");
+    let mut command = snapsnap();
+    command.current_dir(&around).args(["--quiet", "evaluate", "--config"]);
+    command.arg(snapsnap_tests::root().join("configs/eval.toml")).args(["--data", "people"]).arg(&other);
+    let (code, said) = ended(command.arg("--mesh-dir").arg(&meshes).arg("-o").arg(&report));
+    assert_eq!(code, Some(1), "{said}");
+    assert_eq!(json(&report)["subjects"][0]["name"], "around/people/0001");
 }
 
 /// The mesh of a reconstruction is about as near to the ground truth as its Gaussians, except for closed parts such as

@@ -2,7 +2,7 @@
 
 use std::fs;
 
-use snapsnap_tests::{snapsnap, succeed};
+use snapsnap_tests::{refused, snapsnap, succeed};
 
 use super::{logged, people, place, train};
 
@@ -56,6 +56,18 @@ fn both_stages_learn_and_write_weights_for_reconstructions() {
     succeed(shell.arg(command.replacen("snapsnap", &program.to_string_lossy(), 1)));
     assert!(temporary.path().join("turn.png").is_file());
     assert_eq!(logged(&two, "validation/psnr_masked").len(), 4);
+
+    // Stage 1 reads nothing of a regressor, whatever that was trained for. Stage 2 does.
+    let other = [
+        "--set=training.steps=1",
+        "--set=schedule.warm_up=0",
+        "--set=regressor.start=published",
+        "--weights",
+    ];
+    let both = two.join("last.safetensors");
+    succeed(train(1, &config, &temporary.path().join("three")).args(other).arg(&both));
+    let said = refused(train(2, &config, &temporary.path().join("four")).args(other).arg(&both));
+    assert!(said.contains("`regressor.start`") && said.contains("`import-weights --set`"), "{said}");
 
     // The file of stage 2 contains both networks.
     let view = |view: u32| people().join(format!("val/img/0000/{view}.png"));

@@ -35,7 +35,7 @@ use std::sync::Arc;
 use snapsnap_base::{FileError, file};
 
 pub use check::{Checked, check};
-use description::DESCRIPTION;
+pub use description::DESCRIPTION;
 pub use description::{Arrangement, Description, Drawn, Layout, MAX_RESOLUTION, MAX_VIEWS, Split};
 pub use pack::{Packed, pack};
 use shards::Shards;

@@ -62,12 +62,8 @@ pub fn evaluate_meshes(
         // In files, people of one name are told apart by the names of their data sets.
         let is_in = |set: &&People| set.chosen().iter().any(|row| set.test().name(*row) == own);
         let is_alone = sets.iter().filter(is_in).count() == 1;
-        let names: Vec<&str> = (!Path::new(&name).is_absolute())
-            .then_some(&*name)
-            .into_iter()
-            .chain(is_alone.then_some(own))
-            .collect();
-        match one(config, people, row, (&name, &names), folder) {
+        let names: Vec<&str> = [&*name].into_iter().chain(is_alone.then_some(own)).collect();
+        match one(config, people, row, &names, folder) {
             Ok(found) => figures.push(found),
             Err(e) => left_out.push(LeftOut::new(name, e)),
         }
@@ -81,13 +77,13 @@ fn one(
     config: &EvalConfig,
     people: &People,
     row: usize,
-    (name, in_files): (&str, &[&str]),
+    names: &[&str],
     folder: &Path,
 ) -> Result<MeshFigures, EvalError> {
-    let mut mesh = import::read(&find(folder, in_files)?)?;
+    let mut mesh = import::read(&find(folder, names)?)?;
     let seen = truth_of(people, row)?;
     let scan = |scans: &PathBuf| -> Result<Mesh, EvalError> {
-        let path = find(scans, in_files)?;
+        let path = find(scans, names)?;
         let mut scan = import::read(&path)?;
         // The scan gets the pose that `prepare` gave it. Test people are not moved sideways.
         normalise(&mut scan, Collection::Other, None::<&mut ChaCha8Rng>)
@@ -112,7 +108,7 @@ fn one(
     let apart = chamfer(&surface, &truth)?;
     let to_scan = scan.map(|scan| point_to_surface(&surface, &scan)).transpose()?;
     Ok(MeshFigures {
-        name: name.to_owned(),
+        name: names[0].to_owned(),
         to_truth: 1e2 * apart.forward,
         from_truth: 1e2 * apart.backward,
         chamfer: 1e2 * apart.mean(),
@@ -134,11 +130,8 @@ fn find(folder: &Path, names: &[&str]) -> Result<PathBuf, EvalError> {
     });
     let found = files.map(|file| folder.join(file)).find(|file| file.is_file());
     found.ok_or_else(|| {
-        let message =
-            names.first().map_or("cannot tell people of two data sets of one name apart".into(), |name| {
-                let last = name.rsplit('/').next().unwrap_or(name);
-                format!("has no mesh {name}.obj, .ply or .glb, nor {name}/{last}.…")
-            });
+        let last = names[0].rsplit('/').next().unwrap_or(names[0]);
+        let message = format!("has no mesh {0}.obj, .ply or .glb, nor {0}/{last}.…", names[0]);
         EvalError::File(FileError::unsuitable(folder, message))
     })
 }

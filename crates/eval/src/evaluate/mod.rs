@@ -9,6 +9,7 @@ mod sides;
 mod surface;
 
 use std::collections::BTreeMap;
+use std::path::Component;
 use std::time::Duration;
 
 use image::RgbImage;
@@ -181,16 +182,18 @@ fn name_of(sets: &[People], people: &People, row: usize) -> String {
     if sets.len() < 2 {
         return name.to_owned();
     }
-    let called = |set: &People| {
+    let parts = |set: &People| {
         let root = set.folder().root();
         let root = root.canonicalize().unwrap_or_else(|_| root.to_owned());
-        root.file_name().unwrap_or_default().to_string_lossy().into_owned()
+        let parts = root.components().filter(|part| matches!(part, Component::Normal(_)));
+        parts.map(|part| part.as_os_str().to_string_lossy().into_owned()).collect::<Vec<_>>()
     };
-    let own = called(people);
-    match sets.iter().filter(|set| called(set) == own).count() {
-        1 => format!("{own}/{name}"),
-        _ => format!("{}/{name}", people.folder().root().display()),
-    }
+    // As many of the folders around it as tell the set apart.
+    let (own, all) = (parts(people), sets.iter().map(parts).collect::<Vec<_>>());
+    let called = |count: usize| &own[own.len() - count..];
+    let is_own = |count: &usize| all.iter().filter(|other| other.ends_with(called(*count))).count() == 1;
+    let count = (1..own.len()).find(is_own).unwrap_or(own.len());
+    format!("{}/{name}", called(count).join("/"))
 }
 
 /// A person and the contestants.

@@ -20,15 +20,21 @@ pub type Progress<'a> = &'a dyn Fn(u64, u64);
 
 /// Largest number of keys that a message names.
 const MAX_DIFFERENCES: usize = 3;
-/// Keys that change what tensors mean, but not which there are. A regressor has `start` and `color` as well.
-const MEANINGS: [&str; 6] = [
+/// Keys that change what the point predictor's tensors mean, but not which there are.
+const POINTS: [&str; 9] = [
     "network.anchor",
     "network.conf_mode",
+    "network.dec_heads",
+    "network.enc_heads",
     "network.fusion",
+    "network.hooks",
     "network.mirror",
     "network.pair_degrees",
     "network.rope_base",
 ];
+/// The same of the regressor.
+const GAUSSIANS: [&str; 4] =
+    ["mode.rotation_frame", "regressor.color", "regressor.groups", "regressor.start"];
 /// Values per task: a second-level cache holds them.
 const CHUNK: usize = 1 << 16;
 
@@ -207,22 +213,24 @@ impl WeightFile {
         Err(WeightsError::Tensors { origin, problems })
     }
 
-    /// Refuses weights whose file contains a config in which the same tensors mean something else, such as points without the
-    /// anchors of this config. A file without a config passes.
+    /// Refuses weights whose file contains a config in which the tensors of this part mean something else, such as points without
+    /// the anchors of this config. A file without a config or without this part passes.
     ///
     /// # Errors
     /// [`WeightsError::File`] that names the keys.
-    pub fn require_meaning(&self) -> Result<(), WeightsError> {
-        let Ok(own) = self.source.config() else { return Ok(()) };
-        let mut differing = differences(&keys(&own), &keys(&self.config));
-        let regressors =
-            [&own, &self.config].map(|config| (config.regressor.start(), config.regressor.color()));
-        let is_other_regressor = self.require(Part::Regressor).is_ok() && regressors[0] != regressors[1];
-        differing.retain(|(key, _)| {
-            let is_of_regressor = ["regressor.start", "regressor.color"].contains(&key.as_str());
-            MEANINGS.contains(&key.as_str()) || is_other_regressor && is_of_regressor
+    pub fn require_meaning(&self, part: Part) -> Result<(), WeightsError> {
+        let (Ok(own), Ok(())) = (self.source.config(), self.require(part)) else { return Ok(()) };
+        let mut differing = differences(&keys(&own.resolved()), &keys(&self.config.resolved()));
+        differing.retain(|(key, _)| match part {
+            Part::PointPredictor => POINTS.contains(&key.as_str()),
+            Part::Regressor => GAUSSIANS.contains(&key.as_str()),
         });
-        if differing.is_empty() { Ok(()) } else { Err(of_others(self.path(), differing)) }
+        if differing.is_empty() {
+            return Ok(());
+        }
+        differing.truncate(MAX_DIFFERENCES - 1);
+        differing.push((String::new(), "`import-weights --set` writes them for other keys".into()));
+        Err(of_others(self.path(), differing))
     }
 
     /// Reads every tensor, one at a time.

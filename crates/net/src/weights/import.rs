@@ -24,25 +24,22 @@ pub struct ImportOptions<'a> {
     pub float: Float,
 }
 
-/// The config in the metadata of weight files, each section from the first file that has a config and tensors of this part: the
-/// regressor's from one with a regressor, the others from one with a point predictor. `None` if no file has a config. Sections without
-/// such a file are those of the first config.
+/// The config in the metadata of weight files: `[regressor]` of the first file with a config and a regressor, the rest of the first one
+/// with a config and a point predictor. What no such file has is of the first config. `None` if no file has a config.
 ///
 /// # Errors
 /// [`WeightsError`] for a file that is no checkpoint, or whose config is refused.
 pub fn stored_config<'a>(paths: impl Iterator<Item = &'a Path>) -> Result<Option<Config>, WeightsError> {
-    let mut stored = Vec::new();
-    for path in paths {
-        let source = Source::open(path)?;
-        if source.metadata.contains_key(CONFIG_KEY) {
-            stored.push((source.config()?, parts_of(source.tensors().keys())));
-        }
-    }
-    let of = |part: Part| stored.iter().find(|(_, parts)| parts.contains(&part)).or(stored.first());
-    let (Some((points, _)), Some((gaussians, _))) = (of(Part::PointPredictor), of(Part::Regressor)) else {
+    let sources = paths.map(Source::open).collect::<Result<Vec<_>, _>>()?;
+    let stored: Vec<_> = sources.iter().filter(|source| source.metadata.contains_key(CONFIG_KEY)).collect();
+    let of = |part: Part| {
+        let has = |source: &&&Source| parts_of(source.tensors().keys()).contains(&part);
+        stored.iter().find(has).or(stored.first())
+    };
+    let (Some(points), Some(gaussians)) = (of(Part::PointPredictor), of(Part::Regressor)) else {
         return Ok(None);
     };
-    Ok(Some(Config { regressor: gaussians.regressor.clone(), ..points.clone() }))
+    Ok(Some(Config { regressor: gaussians.config()?.regressor, ..points.config()? }))
 }
 
 /// Report of an import.

@@ -15,7 +15,7 @@ use snapsnap_base::FileError;
 use snapsnap_base::config::{Schema, differences, keys};
 use snapsnap_base::file;
 use snapsnap_base::random::stream;
-use snapsnap_data::dataset::{Folder, Made, Split};
+use snapsnap_data::dataset::{DESCRIPTION, Folder, Made, Split};
 use snapsnap_data::prepare::{DataConfig, Shard, Subject};
 use snapsnap_data::scan::{Collection, normalise};
 use snapsnap_mesh::mesh::Mesh;
@@ -169,10 +169,11 @@ fn make(
     if let Some(sheet) = &common.preview {
         check_preview(sheet, common, inputs)?;
     }
+    let is_begun = common.output.join(DESCRIPTION).exists();
     let folder = Folder::create(&common.output, config.description(source))?;
     let (path, resolved) = (common.output.join(CONFIG), config.to_toml());
     // The cameras of people that are there already are those of this config; `dataset.toml` does not have all of them.
-    if let Ok(there) = DataConfig::from_file(&path, &[]) {
+    if let (true, Ok(there)) = (is_begun, DataConfig::from_file(&path, &[])) {
         let differing = differences(&keys(&there), &keys(&config));
         if !differing.is_empty() {
             let differing: Vec<String> = differing.into_iter().map(|(_, message)| message).collect();

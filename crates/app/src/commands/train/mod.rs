@@ -125,7 +125,8 @@ fn among_ranks(work: impl FnOnce(&Ranks) -> Result<ExitCode, Failure>) -> Result
 }
 
 fn points(arguments: &Arguments, ranks: &Ranks) -> Result<ExitCode, Failure> {
-    let plan = Plan::new(arguments, ranks)?;
+    let mut plan = Plan::new(arguments, ranks)?;
+    plan.keep_start()?;
     let task = PointTask::new(&plan.folders, &plan.config, &plan.device)?;
     plan.check_validation(task.validation_samples());
     plan.run(&task, |tracked| {
@@ -133,7 +134,7 @@ fn points(arguments: &Arguments, ranks: &Ranks) -> Result<ExitCode, Failure> {
         // The state of a continued run contains its weights.
         let start = plan.config.training.weights.as_deref();
         let predictor = match start.filter(|_| plan.begun.is_none()) {
-            Some(path) => open(path, &plan.config)?.point_predictor(tracked)?,
+            Some(path) => open(path, &plan.config, &[Part::PointPredictor])?.point_predictor(tracked)?,
             None => random_predictor(&networks, plan.config.training.seed, tracked),
         };
         Ok(Networks { predictor: Some(predictor), regressors: Vec::new() })
@@ -141,10 +142,14 @@ fn points(arguments: &Arguments, ranks: &Ranks) -> Result<ExitCode, Failure> {
 }
 
 fn humans(arguments: &Arguments, ranks: &Ranks) -> Result<ExitCode, Failure> {
-    let plan = Plan::new(arguments, ranks)?;
-    // The latest weights of a continued run contain its point predictor. Before the first checkpoint there are none. Weights of the
-    // command line are compared with those of the run's state.
-    let begun = plan.begun.filter(|_| arguments.weights.is_none());
+    let mut plan = Plan::new(arguments, ranks)?;
+    let joint = plan.config.stage2.points_weight > 0.0;
+    if joint {
+        plan.keep_start()?;
+    }
+    // The latest weights of a continued run contain its point predictor. Before the first checkpoint there are none. A frozen one of the
+    // command line is compared with that of the run's state.
+    let begun = plan.begun.filter(|_| joint || arguments.weights.is_none());
     let latest = begun.map(|run| run.join(LAST)).filter(|latest| latest.exists());
     let Some(start) = latest.or_else(|| plan.config.training.weights.clone()) else {
         bail!(
@@ -152,11 +157,10 @@ fn humans(arguments: &Arguments, ranks: &Ranks) -> Result<ExitCode, Failure> {
              training.weights in the config"
         );
     };
-    let weights = open(&start, &plan.config)?;
+    let weights = open(&start, &plan.config, &[Part::PointPredictor, Part::Regressor])?;
     if let Some(maps) = &plan.config.stage2.point_map_cache {
         outside_data(maps, plan.folders.iter().map(|folder| folder.root()))?;
     }
-    let joint = plan.config.stage2.points_weight > 0.0;
     let frozen = (!joint).then(|| weights.point_predictor(&plan.device.clone().inner())).transpose()?;
     let task = GaussianTask::new(&plan.folders, &plan.config, frozen, &plan.device)?;
     plan.check_validation(task.validation_samples());
@@ -172,10 +176,10 @@ fn humans(arguments: &Arguments, ranks: &Ranks) -> Result<ExitCode, Failure> {
     })
 }
 
-/// Opens the weights to begin with. They must fit the config.
-fn open(path: &Path, config: &TrainConfig) -> Result<WeightFile, Failure> {
+/// Opens the weights to begin with. They must fit the config, and the parts that are used must have been trained for it.
+fn open(path: &Path, config: &TrainConfig, used: &[Part]) -> Result<WeightFile, Failure> {
     let weights = WeightFile::open(path, Some(config.networks()))?;
-    weights.require_meaning()?;
+    used.iter().try_for_each(|part| weights.require_meaning(*part))?;
     Ok(weights)
 }
 
@@ -231,6 +235,18 @@ impl<'a> Plan<'a> {
             false => device.autodiff(),
         };
         Ok(Self { arguments, config, folders, device, ranks, begun })
+    }
+
+    /// A continued run whose networks are all in its state does not read the weights of the command line. Its config keeps those
+    /// that it began with.
+    fn keep_start(&mut self) -> Result<(), Failure> {
+        let Some(run) = self.begun else { return Ok(()) };
+        let there = TrainConfig::from_file(&run.join(CONFIG), &[])?.training.weights;
+        let given = std::mem::replace(&mut self.config.training.weights, there);
+        if self.arguments.weights.is_some() && given != self.config.training.weights {
+            say::note("note: --weights is not read: the run goes on from its own state");
+        }
+        Ok(())
     }
 
     fn check_validation(&self, samples: usize) {
