@@ -145,7 +145,7 @@ fn what_is_not_the_published_file_is_not_kept() {
         let (address, _) = server(move |_, first| ranged(&body, first, usize::MAX));
         let temporary = tempfile::tempdir().expect("a folder");
         let said = refused(&mut fetch(&address, temporary.path()));
-        assert!(said.contains("what came is not") && said.contains("nothing was kept"), "{said}");
+        assert!(said.contains("the content is not that of") && said.contains("nothing was kept"), "{said}");
         assert_eq!(fs::read_dir(temporary.path()).expect("a folder").count(), 0);
     }
 }

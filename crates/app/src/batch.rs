@@ -92,7 +92,7 @@ impl Batch {
             if read.is_err() || start != *HEADER.as_bytes() {
                 return Err(Failure::file(
                     &path,
-                    "would be replaced by the list of failures, and is none: move it away",
+                    "would be replaced by the list of failures, but is another file: move it away",
                 ));
             }
             remove(&path)?;
@@ -114,7 +114,7 @@ impl Batch {
             mine.map(|(_, job)| job).partition(|job| output(job).exists());
         if !there.is_empty() {
             say::note(&format!(
-                "{} of {} are there already and stay as they are",
+                "{} of {} outputs exist already and are kept",
                 there.len(),
                 there.len() + missing.len()
             ));
@@ -149,9 +149,7 @@ impl Batch {
         say::err(&format!("{name}: {failure}"));
         self.bugs = if matches!(failure, Failure::Internal(_)) { self.bugs + 1 } else { 0 };
         if self.bugs == MOST_BUGS {
-            return Err(Failure::Internal(format!(
-                "{MOST_BUGS} failures of the program in a row: it ends here"
-            )));
+            return Err(Failure::Internal(format!("stopped after {MOST_BUGS} internal errors in a row")));
         }
         Ok(())
     }
@@ -208,7 +206,10 @@ fn scenes(folder: &Path) -> Result<BTreeMap<String, PathBuf>, Failure> {
         let name = stem(&path)?;
         // Some file systems do not tell upper from lower case.
         if let Some(other) = names.insert(name.to_lowercase(), path.clone()) {
-            return Err(Failure::file(&path, format_args!("has the name of {}", other.display())));
+            return Err(Failure::file(
+                &path,
+                format_args!("has the same name as {}: rename one of them", other.display()),
+            ));
         }
         found.insert(name, path);
     }
@@ -221,7 +222,7 @@ fn scenes(folder: &Path) -> Result<BTreeMap<String, PathBuf>, Failure> {
 /// A file's name without extension.
 pub fn stem(path: &Path) -> Result<String, Failure> {
     let name = path.file_stem().and_then(|name| name.to_str()).map(str::to_owned);
-    name.ok_or_else(|| Failure::file(path, "the name is not UTF-8, which names of many files must be"))
+    name.ok_or_else(|| Failure::file(path, "its name is not UTF-8: rename the file"))
 }
 
 /// The files in a folder that are not hidden.

@@ -234,7 +234,7 @@ fn nth(name: &str, kind: DeviceType, index: Option<usize>) -> Result<Device, Fai
     let found = devices.len();
     if found == 0 {
         let message =
-            "no adapter answers; is there a card, and is its driver installed (Vulkan, not OpenGL)?";
+            "no graphics adapter found; is there a GPU, and is its driver installed (Vulkan, not OpenGL)?";
         return Err(unknown(name, message));
     }
     let device = match index {
@@ -246,7 +246,7 @@ fn nth(name: &str, kind: DeviceType, index: Option<usize>) -> Result<Device, Fai
     let device = device.ok_or_else(|| unknown(name, &format!("there are {found}, numbered from 0")))?;
     if name.starts_with("vulkan") && !is_card(device) {
         // Mesa's software adapter aborts the program on the first kernel.
-        let message = format!("{} does not bear SPIR-V kernels: use wgpu", describe(device));
+        let message = format!("{} cannot run SPIR-V kernels: use wgpu", describe(device));
         return Err(unknown(name, &message));
     }
     Ok(device.clone())
@@ -262,5 +262,5 @@ fn unknown(name: &str, why: &str) -> Failure {
         let software = if adapter.is_card { "" } else { ", software" };
         format!("{} ({}{software})", adapter.device(), adapter.name)
     }));
-    Failure::Input(format!("--device {name}: {why}. Here there are: {}", there.join(", ")))
+    Failure::Input(format!("--device {name}: {why}. Available devices: {}", there.join(", ")))
 }

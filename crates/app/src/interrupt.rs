@@ -23,7 +23,7 @@ pub fn listen() {
     let handler = ctrlc::set_handler(|| {
         if PATIENT.load(Ordering::Relaxed) && !SIGNALLED.swap(true, Ordering::Relaxed) {
             STOP.store(true, Ordering::Relaxed);
-            say::note("stopping after this step; once more ends it at once");
+            say::note("stopping after this step; a second signal stops at once");
             return;
         }
         file::remove_unfinished();
@@ -43,7 +43,7 @@ pub fn patiently() -> &'static AtomicBool {
     for signal in [signal_hook::consts::SIGTERM, signal_hook::consts::SIGUSR1] {
         for flag in [&TERMINATED, &STOP] {
             if let Err(e) = signal_hook::flag::register(signal, Arc::clone(flag)) {
-                say::err(&format!("warning: signal {signal} will not be heard: {e}"));
+                say::err(&format!("warning: signal {signal} cannot be handled: {e}"));
             }
         }
     }

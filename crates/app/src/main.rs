@@ -98,7 +98,7 @@ enum Command {
     /// Render a file of Gaussians into pictures.
     #[command(after_help = "Example: snapsnap render human.ply --orbit 12 --size 1024x1024 -o renders")]
     Render(commands::render::Arguments),
-    /// Make people of photographs in the browser: cut out, correct, reconstruct, look, download.
+    /// Reconstruct people from photographs in the browser: remove backgrounds, correct masks, view and download.
     #[command(after_help = "Example: snapsnap studio --open")]
     Studio(commands::studio::Arguments),
     /// Show a file of Gaussians in the browser.

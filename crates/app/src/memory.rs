@@ -16,8 +16,9 @@ pub fn check(what: &str, needed: u64, mend: &str) -> Result<(), Failure> {
         return Ok(());
     }
     let [needed, there] = [needed, there].map(|bytes| bytes as f64 / 1e9);
-    let message =
-        format!("{what} needs {needed:.1} GB of memory, this process can have {there:.1} GB: {mend}");
+    let message = format!(
+        "{what} needs {needed:.1} GB of memory, but this process can have only {there:.1} GB: {mend}"
+    );
     Err(Failure::Input(message))
 }
 

@@ -13,8 +13,8 @@ pub const FOLDER: &str = "weights";
 
 #[derive(Args)]
 pub struct Arguments {
-    /// Folder with the published weights of AlexNet and LPIPS, as `cargo xtask fetch-weights` makes it, or weight files
-    /// of your own [default: weights].
+    /// Folder with the published weights of AlexNet and LPIPS (`snapsnap fetch-weights alexnet lpips`), or your own weight files
+    /// [default: weights].
     #[arg(long = "lpips", value_name = "DIR|FILE", num_args = 1..)]
     pub files: Vec<PathBuf>,
 }

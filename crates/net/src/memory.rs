@@ -5,13 +5,13 @@ use crate::config::Config;
 /// Bytes of an f32.
 const F32: u64 = 4;
 /// Bytes per pixel of the canvas for a person of the training subjects' height, with unseen sides: photographs, point maps on the device and on the host, side images, the regressor's planes of 16 channels and the
-/// Gaussians; measured (docs/inference.md). The double is needed if every pixel of every view becomes a Gaussian.
+/// Gaussians; measured (docs/inference.md). Twice as much is needed if every pixel of every view becomes a Gaussian.
 const PER_PIXEL: u64 = 500;
 /// Memory that depends neither on size nor on weights: code, buffers of the threads.
 const BASE: u64 = 200 << 20;
 
 impl Config {
-    /// Bytes that [`crate::Reconstructor::reconstruct`] needs for a standing person, weights of so many parameters included.
+    /// Bytes that [`crate::Reconstructor::reconstruct`] needs for a standing person, with weights of this number of parameters.
     pub fn memory_needed(&self, parameters: u64) -> u64 {
         let n = &self.network;
         let area = |side: usize| (side as u64).saturating_mul(side as u64);

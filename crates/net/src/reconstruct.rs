@@ -51,8 +51,8 @@ pub struct Reconstruction {
 }
 
 impl Reconstruction {
-    /// Number of the first Gaussians that are pixels of the front and of the back. If Gaussians were lost, nobody knows whose the others
-    /// are: 0.
+    /// Number of the first Gaussians that are pixels of the front and of the back; 0 if Gaussians were left out, since those of the
+    /// others are not known then.
     pub fn photographed(&self) -> [usize; 2] {
         let count = |valid: &Vec<bool>| valid.iter().filter(|valid| **valid).count();
         if self.lost > 0 { [0, 0] } else { [0, 1].map(|view| self.valid.get(view).map_or(0, count)) }

@@ -127,14 +127,14 @@ fn weight_gradient<B: Backend>(
     let (device, dtype) = (upstream.device(), upstream.dtype());
     let (image, upstream) = (with_margin::<B>(x, side / 2), B::float_permute(upstream, &[0, 2, 3, 1]));
     let taps = side * side * inputs;
-    // A product joins so many lines. A band is a multiple of them, or less.
+    // `unit` is the number of lines in one product. A band is a multiple of it, or less.
     let unit = (PIXELS / width).clamp(1, height);
     let band = (values / (batch * width * taps)).clamp(1, height);
     let band = if band > unit { band - band % unit } else { band };
     // Taps of the pixels of one image, or its products.
     let of_image = (band * width * taps).max(band.div_ceil(unit) * outputs * taps);
     let images = (values / of_image).clamp(1, batch);
-    // Sums of many in 16 bits would lose theirs.
+    // A sum of many values in 16 bits would lose digits.
     let wide = if matches!(dtype, DType::F16 | DType::BF16) { FloatDType::F32 } else { dtype.into() };
     let mut sum = B::float_zeros(Shape::new([1, outputs, taps]), &device, wide);
     for (start, first) in (0..batch)

@@ -1,5 +1,5 @@
-//! Mean lengths of an image's vectors and of their differences between pixels, in one operator. Composed of Burn's, each of them keeps a
-//! dozen images for its gradient.
+//! Mean lengths of an image's vectors and of their differences between pixels, in one operator. Composed of Burn's
+//! operators, each of them would keep a dozen images for its gradient.
 
 use burn::tensor::Tensor;
 use rayon::prelude::*;

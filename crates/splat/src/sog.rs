@@ -30,7 +30,7 @@ pub(crate) fn check(stored: &Stored) -> Result<(), String> {
         return Err("a SOG has one Gaussian at least".into());
     }
     if stored.columns.iter().flatten().any(|value| value.abs() > LARGEST) {
-        return Err(format!("a value beyond {LARGEST:e} is none of a SOG"));
+        return Err(format!("a SOG cannot have values beyond {LARGEST:e}"));
     }
     if stored.len() > MAX_SIDE * MAX_SIDE {
         return Err(format!("{} Gaussians; a SOG has {} at most", stored.len(), MAX_SIDE * MAX_SIDE));
@@ -42,7 +42,7 @@ pub(crate) fn check(stored: &Stored) -> Result<(), String> {
 pub(crate) fn losses(stored: &Stored) -> Vec<String> {
     let degree = stored.degree();
     (degree > 0)
-        .then(|| format!("SH of degree {degree} became degree 0, as of all SOG files of this program"))
+        .then(|| format!("SH of degree {degree} became degree 0, as in every SOG of this program"))
         .into_iter()
         .collect()
 }

@@ -59,7 +59,7 @@ pub(crate) fn read(input: impl Read, length: u64) -> Result<Stored, Problem> {
         return Err(format!("SH of degree {degree}; an SPZ has 0 to 4").into());
     };
     if bits > 24 {
-        return Err(format!("coordinates with {bits} bits behind the point, which have 24 in all").into());
+        return Err(format!("coordinates with {bits} fractional bits; 24 are possible").into());
     }
     let size = if version == VERSION { 4 } else { 3 };
     let centre = if version == 1 { 6 } else { 9 };
@@ -67,7 +67,7 @@ pub(crate) fn read(input: impl Read, length: u64) -> Result<Stored, Problem> {
     if content > MAX_CONTENT && content / MAX_RATIO > length {
         let ratio = content / length.max(1);
         let message = format!(
-            "{n} Gaussians in {length} bytes: the content is {ratio} times as large as the file, as of no real scene"
+            "{n} Gaussians in {length} bytes: the content is {ratio} times as large as the file, which no real scene reaches"
         );
         return Err(message.into());
     }

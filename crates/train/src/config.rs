@@ -288,16 +288,15 @@ impl TrainConfig {
         }
         if two.curriculum && !self.network.side_heads {
             let message =
-                "must be false beside `network.side_heads = false`: the curriculum begins with the sides";
+                "must be false with `network.side_heads = false`: the curriculum begins with the sides";
             return refuse("stage2.curriculum", message);
         }
         if two.points_weight > 0.0 && two.point_noise > 0.0 {
-            let message =
-                "must be 0 beside `stage2.points_weight`: a predictor in training has errors of its own";
+            let message = "must be 0 with `stage2.points_weight` above 0: a predictor in training has errors of its own";
             return refuse("stage2.point_noise", message);
         }
         if two.points_weight > 0.0 && two.curriculum {
-            let message = "must be 0 beside `stage2.curriculum = true`, which renders parts of a person";
+            let message = "must be 0 with `stage2.curriculum = true`, which renders parts of a person";
             return refuse("stage2.points_weight", message);
         }
         if lpips.is_some_and(|lpips| lpips.files.is_empty()) {

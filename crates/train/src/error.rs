@@ -34,7 +34,7 @@ pub enum TrainError {
         why: String,
     },
     /// Too many failed steps in a row.
-    #[error("{count} steps in a row could not be made, the last one, {step}, because {why}")]
+    #[error("{count} steps in a row could not be made; the last was step {step}: {why}")]
     Stuck {
         /// Steps in a row.
         count: u64,

@@ -105,7 +105,7 @@ impl Identity {
             |differences: &[String]| format!("is the state of another run: {}", differences.join("; "));
         match (harmful.is_empty(), harmless.is_empty() || force) {
             (true, true) => None,
-            (true, false) => Some(format!("{}. --force continues it all the same", message(&harmless))),
+            (true, false) => Some(format!("{}. Add --force to continue it anyway", message(&harmless))),
             (false, _) => Some(message(&harmful)),
         }
     }

@@ -125,7 +125,7 @@ impl<'a, T: Task> Learner<'a, T> {
             if !differences.is_empty() {
                 let differences = differences.join("; ");
                 let message =
-                    format!("rank {rank} on {other_host} is unlike rank 0 on {host}: {differences}");
+                    format!("rank {rank} on {other_host} differs from rank 0 on {host}: {differences}");
                 return Err(TrainError::Unsuitable(message));
             }
         }
@@ -187,9 +187,7 @@ impl<'a, T: Task> Learner<'a, T> {
                 Err(why) => return Ok(Err(why)),
             };
             if everywhere.iter().all(BTreeMap::is_empty) {
-                return Ok(Err(
-                    self.everywhere("no pixel is part of a person, as the point predictor sees it", names)
-                ));
+                return Ok(Err(self.everywhere("the point predictor finds no pixel of a person", names)));
             }
             for (name, value) in everywhere.into_iter().flatten() {
                 *values.entry(name).or_default() += value;

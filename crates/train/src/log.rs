@@ -71,7 +71,7 @@ impl Log {
             events.add(line.step, &line.values).map_err(FileError::write(&events_path))?;
         }
         for (at, path) in previews(&folder.join(PREVIEWS), step) {
-            // Whoever removed or damaged one does not stop the run.
+            // A missing or damaged preview does not stop the run.
             if let (Ok(size), Ok(png)) = (image::image_dimensions(&path), std::fs::read(&path)) {
                 events.add_picture(at, PREVIEW, size, &png).map_err(FileError::write(&events_path))?;
             }

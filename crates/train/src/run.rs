@@ -106,7 +106,7 @@ pub fn train<T: Task>(
     let progress = &session.learner.progress;
     // Nothing was learned.
     if progress.step >= steps && progress.skipped == progress.step {
-        let why = session.skipped.take().unwrap_or_else(|| "of an earlier session's errors".into());
+        let why = session.skipped.take().unwrap_or_else(|| "errors of an earlier session".into());
         return Err(TrainError::Stuck { count: progress.skipped, step: progress.step - 1, why });
     }
     Ok(Outcome {
@@ -202,7 +202,7 @@ impl<'a, T: Task> Session<'a, T> {
             // Scores of other samples do not compare. A finished run keeps its best weights.
             let goes_on = learner.progress.step < config.training.steps as u64;
             if goes_on && identity.validates_otherwise(&there) && learner.progress.best.take().is_some() {
-                watch.note("validations differ from those before: the best of them counts no longer");
+                watch.note("validations measure something else now: the best one so far counts no longer");
             }
         }
         learner.compare(&identity)?;

@@ -374,7 +374,7 @@ fn wrong_evaluations_are_refused_with_the_reason() {
     wrong(&["--set", "ablations.model.sides=false"], &["`model`", "another meaning"]);
     wrong(&["--set", "ablations.a.tune=\"all\""], &["ablations.a.tune", "only settings of"]);
     wrong(&["--set", "ablations.a.stride=0"], &["ablations.a.stride", "1 to 64"]);
-    wrong(&["--set", "model.devices=[\"cpu\", \"cpu\"]"], &["on cpu", "twice"]);
+    wrong(&["--set", "model.devices=[\"cpu\", \"cpu\"]"], &["on cpu", "two ablations or devices"]);
     wrong(&["--set", "report.people=9"], &["report.people"]);
     wrong(&["--set", "views.supersampling=3"], &["views.supersampling"]);
     wrong(&["--set", "metrics.protocols=[]"], &["metrics.protocols"]);
@@ -384,7 +384,7 @@ fn wrong_evaluations_are_refused_with_the_reason() {
     wrong(&["--set", "data.split=\"none\""], &["img", "cannot read"]);
     wrong(&["--set", "photographs.cut=2"], &["photographs", "`cut` is 2, must be 0 to 0.9"]);
     wrong(&["--set", "ablations.a.photographs={mask=\"wide\"}"], &["mask", "f32"]);
-    wrong(&["--device", "abacus"], &["abacus", "Here there are"]);
+    wrong(&["--device", "abacus"], &["abacus", "Available devices"]);
     wrong(&["--lpips", "nowhere.pth"], &["nowhere.pth"]);
     wrong(&["--align", "nowhere"], &["--align", "similarity"]);
     wrong(&["--set", "metrics.align=\"nowhere\""], &["unknown variant `nowhere`", "`similarity`"]);

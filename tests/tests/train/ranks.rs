@@ -206,7 +206,7 @@ fn failures_of_a_rank_end_all_with_one_message() {
     let start = Instant::now();
     // Too many ranks, which all of them notice.
     let output = on_ranks(3, &train(1, &config, &run("many"))).output().expect("runs");
-    let message = "3 ranks share a batch of 2: set training.batch higher";
+    let message = "`training.batch` is 2, must be at least 3, the number of ranks";
     assert_eq!(output.status.code(), Some(2), "{}", said(&output));
     assert!(
         matches!(&errors(&output)[..], [one] if one.contains("rank 0 on ") && one.ends_with(message)),

@@ -31,7 +31,7 @@ pub struct Arguments {
     /// Data set with people to compare [default: the first of data.folders in the config].
     #[arg(long, value_name = "DATASET")]
     data: Option<PathBuf>,
-    /// Weights of all settings without weights [default: model.weights of the config].
+    /// Weights of every setting that names none [default: model.weights of the config].
     #[arg(long, value_name = "FILE|DIR")]
     weights: Option<PathBuf>,
     /// Folders of trainings whose validations become a curve.

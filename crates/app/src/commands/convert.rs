@@ -27,8 +27,8 @@ pub struct Arguments {
 /// Axes of an output file of Gaussians.
 #[derive(Args, Debug)]
 pub struct AxesArguments {
-    /// Write a PLY with y down, as SuperSplat and other viewers of INRIA's scenes expect it; every command of this program
-    /// turns it back.
+    /// Write a PLY with y down, as SuperSplat and other viewers of INRIA's scenes expect it. Every command of this program
+    /// recognises such a file.
     #[arg(long)]
     y_down: bool,
 }

@@ -99,7 +99,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     lines.push(format!("  --device auto takes {chosen}: {why}"));
     if chosen != "cpu" {
         lines.push(
-            "  and cpu for one person with small networks, which takes less time than a card's kernels"
+            "  for one person and small networks it takes cpu, which is faster than compiling a GPU's kernels"
                 .into(),
         );
     }
@@ -130,11 +130,11 @@ fn broken(weights: &[Weights]) -> Result<(), Failure> {
 /// The name of the device that `--device auto` takes, and the reason.
 fn chosen(devices: &[Found]) -> (String, &'static str) {
     match devices.iter().find(|found| found.card) {
-        Some(found) => (found.name.clone(), "the first real GPU that answers"),
+        Some(found) => (found.name.clone(), "the first hardware GPU found"),
         None if devices.iter().any(|found| found.software) => {
-            ("cpu".into(), "no real GPU answers, and software adapters are slower than the CPU itself")
+            ("cpu".into(), "no hardware GPU found, and software adapters are slower than the CPU")
         }
-        None => ("cpu".into(), "no GPU answers"),
+        None => ("cpu".into(), "no GPU found"),
     }
 }
 
@@ -172,7 +172,7 @@ fn missing(devices: &[Found], weights: &[Weights], memory: u64) -> Vec<Missing> 
             "a card needs its Vulkan driver (Debian, Ubuntu: apt-get install libvulkan1 mesa-vulkan-drivers, or NVIDIA's own); \
              no card is necessary: the CPU takes about a second"
         };
-        add("no real GPU answers", mend);
+        add("no hardware GPU found", mend);
     }
     if memory < COMFORTABLE {
         add(

@@ -46,7 +46,7 @@ pub struct Arguments {
     /// Other weights, which are compared with the model person by person.
     #[arg(long, value_name = "FILE|DIR")]
     against: Option<PathBuf>,
-    /// Also evaluate the model on other photographs: grey gives every pixel of the person their mean colour, so that only
+    /// Also evaluate the model on changed photographs. grey: every pixel of the person gets the person's mean colour, so that only
     /// the outline is left.
     #[arg(long, value_parser = one_of(INPUTS), value_name = "KIND", conflicts_with = "mesh_dir")]
     inputs: Option<bool>,

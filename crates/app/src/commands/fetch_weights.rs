@@ -178,7 +178,7 @@ fn download(item: &Item, address: &str, path: &Path) -> Result<(), Failure> {
     let part = path.with_file_name(format!("{}.part", item.file));
     // A file of another kind with that name is left alone.
     if part.symlink_metadata().is_ok_and(|there| !there.is_file() || is_shared(&there)) {
-        let message = "is no unfinished download: a link, or no regular file; move it away";
+        let message = "is no unfinished download, but a link or a special file: move it away";
         return Err(Failure::file(&part, message));
     }
     let cannot_write = |e: io::Error| Failure::cannot_write(&part, &e);
@@ -240,7 +240,7 @@ fn check_sum(item: &Item, origin: &str, file: &mut File) -> Result<(), Broken> {
         return Ok(());
     }
     Err(Broken::Refused(format!(
-        "{origin}: what came is not {}: {length} bytes with SHA-256 {found}; nothing was kept",
+        "{origin}: the content is not that of {}: {length} bytes with SHA-256 {found}; nothing was kept",
         item.file
     )))
 }
@@ -306,7 +306,8 @@ fn fill(
             if after == 0 {
                 let _ = fs::remove_file(part);
             }
-            let kept = format!("{after} of {} bytes are kept and gone on from next time", item.bytes);
+            let kept =
+                format!("{after} of {} bytes are kept; the next attempt continues from there", item.bytes);
             return Err(Failure::Internal(format!("{address}: {why}; {kept}")));
         }
         std::thread::sleep(Duration::from_millis(200 << fruitless));

@@ -258,7 +258,10 @@ fn in_folder(folder: &Path) -> Result<Vec<Job>, Failure> {
             continue;
         }
         if let Some(other) = found.insert(stem, path.clone()) {
-            return Err(Failure::file(&path, format_args!("has the name of {}", other.display())));
+            return Err(Failure::file(
+                &path,
+                format_args!("has the same name as {}: rename one of them", other.display()),
+            ));
         }
     }
     if others > 0 {

@@ -55,18 +55,18 @@ pub struct Arguments {
     /// Masks of the two photographs (white: person).
     #[arg(long, num_args = 2, value_names = ["FRONT_MASK", "BACK_MASK"])]
     masks: Option<Vec<PathBuf>>,
-    /// Who removes the background: auto: the network where neither an alpha channel nor --masks does; network: the network, whatever
-    /// the alpha channels say; none: alpha channels and --masks alone.
+    /// Background removal. auto: by the network, for photographs without an alpha channel and --masks; network: always by the network,
+    /// alpha channels are ignored; none: by alpha channels and --masks alone.
     #[arg(long, value_name = "auto|network|none", default_value = "auto", value_parser = ["auto", "network", "none"])]
     cutout: String,
-    /// Also write the photographs as they are placed: without background, at most 4096 pixels long if the network removed it, the
-    /// back's colours matched to the front's. The files are front.png and back.png.
+    /// Also write the photographs without background, before they are placed on the canvas, as front.png and back.png. The back's
+    /// colours are matched to the front's. They are at most 4096 pixels long if the network removed the background.
     #[arg(long, value_name = "DIR")]
     save_cutouts: Option<PathBuf>,
     /// Use the pictures as the canvas, without cropping, scaling and centring.
     #[arg(long)]
     pub as_is: bool,
-    /// Refuse photographs that seem to be wrong, instead of a warning.
+    /// End with an error instead of a warning if the photographs look wrong.
     #[arg(long)]
     pub strict: bool,
     #[command(flatten)]
@@ -124,8 +124,8 @@ pub struct ModelArguments {
     /// auto, cpu, ndarray, wgpu, vulkan, cuda or metal; wgpu:1 is the second adapter.
     #[arg(long, default_value = "auto")]
     device: String,
-    /// Products of the point predictor: f32, bf16, or auto: bf16 on a CPU with instructions for it, if the weights were
-    /// trained so.
+    /// Numbers in the point predictor's matrix products: f32, bf16, or auto: bf16 if the weights were trained in bf16 and the CPU
+    /// has instructions for it, else f32.
     #[arg(long, value_name = "auto|f32|bf16", default_value = "auto", value_parser = precision)]
     precision: PrecisionChoice,
 }
@@ -214,7 +214,7 @@ fn in_words(precision: Precision, device: &Device) -> String {
     }
     format!(
         "{name}, by {}",
-        unit_of_cpu().unwrap_or("products in f32 of rounded weights: this processor has no others")
+        unit_of_cpu().unwrap_or("f32 products of rounded weights: this processor has no bf16 instructions")
     )
 }
 

@@ -64,7 +64,7 @@ pub struct Arguments {
     /// Constants of the rasteriser.
     #[arg(long, value_parser = one_of(PRESETS), default_value = "inria")]
     preset: Preset,
-    /// Keep the weight of splats smaller than a pixel.
+    /// Antialiasing: splats that are enlarged to the size of a pixel become fainter in return.
     #[arg(long)]
     antialiased: bool,
     /// Also render pictures that take very long.

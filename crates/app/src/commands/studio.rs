@@ -188,7 +188,7 @@ impl Studio<'_> {
         let people = self.people.lock().unwrap_or_else(PoisonError::into_inner);
         let found = people.iter().find(|(other, _)| other == name).map(|(_, stored)| stored.clone());
         drop(people);
-        let message = format!("this person is no longer in memory, which has the last {KEPT}: make it again");
+        let message = format!("this person is no longer in memory (the last {KEPT} are kept): make it again");
         let stored = found.ok_or_else(|| text(StatusCode::NOT_FOUND, &message))?;
         let is_long = download.is_long();
         let content = if is_long && request.method == "HEAD" {

@@ -37,7 +37,7 @@ pub struct ImportArguments {
     /// this program.
     #[arg(required = true)]
     sources: Vec<PathBuf>,
-    /// Checkpoint that gives the tensors which are in none of the others.
+    /// Checkpoint for the tensors that no other checkpoint contains.
     #[arg(long, value_name = "FILE")]
     fill: Option<PathBuf>,
     #[command(flatten)]
@@ -48,7 +48,7 @@ pub struct ImportArguments {
     /// Seed of the tensors that no checkpoint has.
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Write 16 bits per value: half the size, each value to the nearest of them.
+    /// Write f16 instead of f32: half the size. Values are rounded to the nearest.
     #[arg(long)]
     half: bool,
     /// Weight file to write.

@@ -156,7 +156,7 @@ impl<'a> Packer<'a> {
     fn add(&mut self, split: Option<Split>, subject: &str) -> Result<(), FileError> {
         if subject.contains('.') {
             let folder = self.folder.path(split, "img", subject);
-            let message = "a full stop in the name ends WebDataset's key: rename the subject's folders";
+            let message = "a full stop in a subject's name is not possible in WebDataset's archives: rename the subject's folders";
             return Err(FileError::unsuitable(&folder, message));
         }
         if self.open.as_ref().is_some_and(|open| open.split != split) {

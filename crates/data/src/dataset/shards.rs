@@ -172,7 +172,7 @@ impl Shards {
             let expected = end.saturating_add(2 * BLOCK);
             if size != expected {
                 let message = format!(
-                    "has {size} bytes, by {INDEX} {expected}: one of them is cut off or of another set"
+                    "has {size} bytes, by {INDEX} {expected}: one of the two files is truncated or of another data set"
                 );
                 return Err(FileError::unsuitable(path, message));
             }

@@ -27,7 +27,8 @@ const LONGEST: u32 = 4096;
 const FILTERED: u32 = 640;
 const RADIUS: usize = 4;
 const EPSILON: f32 = 1e-4;
-/// Least probability in a gap of the person that is none, such as a shadow below the chin. Between an arm and the body it is far lower.
+/// A gap in the person is filled if no probability in it is lower: it is a shadow, such as that below the chin. Between an arm and the
+/// body it is far lower.
 const NO_GAP: f32 = 0.2;
 /// Least coverage of a pixel that is no part of a gap.
 const WHOLE: f32 = 0.95;
@@ -202,7 +203,7 @@ fn unit(pixel: &Rgb<u8>) -> Vec3 {
     Vec3::from_array(pixel.0.map(f32::from)) / 255.0
 }
 
-/// Pixels of gaps in the person that are none.
+/// Pixels of gaps that belong to the person.
 fn no_gaps(alpha: &[f32], p: &[f32], width: usize) -> Vec<usize> {
     let is_open: Vec<bool> = alpha.iter().map(|a| *a < WHOLE).collect();
     let Pieces { of, pieces } = pieces(&is_open, width as u32);

@@ -1,4 +1,4 @@
-//! Points that keep their distance ahead of the body's axis while another camera sees their pixel.
+//! Moves points from the rays of one camera to those of another, at the same distance in front of the body's axis.
 
 use burn::tensor::Tensor;
 use glam::{DMat3, DVec3};

@@ -37,7 +37,7 @@ pub(super) fn clean(rgb: &mut RgbImage, mask: &mut GrayImage) -> usize {
     let reach = (REACH * person.height).div_ceil(HEIGHT).clamp(1, MAX_REACH);
     let Some(rim) = Rim::new(mask, person, reach as i8) else { return 0 };
     let colors = Colors::new(&rim, rgb);
-    // A background of exactly one colour may stand for none. The outline then has to show it.
+    // A background of exactly one colour may be no background, as in a cut-out. Then the colour of the outline is tried.
     let shown = if colors.is_flat { None } else { colors.shares(&rim, &colors.outside) };
     let shares = shown.or_else(|| {
         let uniform = vec![colors.uniform(&rim)?; colors.own.len()];
@@ -49,7 +49,7 @@ pub(super) fn clean(rgb: &mut RgbImage, mask: &mut GrayImage) -> usize {
     for (i, share) in shares.into_iter().enumerate().filter(|(_, share)| *share > MIXED.0) {
         let (x, y) = rim.place(rim.pixels[i]);
         let value = &mut mask.get_pixel_mut(x, y).0[0];
-        // A soft pixel of the mask says itself how much of the person is in it.
+        // The mask's own value is an upper limit of the person's share.
         *value = if share < MIXED.1 { (*value).min((255.0 * (1.0 - share)).round() as u8) } else { 0 };
         is_gone[rim.pixels[i]] = *value < INSIDE;
         lost += usize::from(*value < INSIDE);

@@ -39,7 +39,7 @@ impl Turn {
         if !(LEAST..=MOST).contains(&forward.z.acos().to_degrees()) {
             return None;
         }
-        // A telephone that lies on a table photographs nobody who stands.
+        // No photograph of a standing person has another pitch.
         let pitch = shot.pitch.filter(|pitch| ELEVATIONS.contains(pitch)).unwrap_or(0.0).to_radians();
         let up = DVec3::new(0.0, -pitch.cos(), -pitch.sin());
         let right = forward.cross(up).normalize();

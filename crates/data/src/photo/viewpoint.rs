@@ -17,7 +17,7 @@ pub const ELEVATIONS: std::ops::RangeInclusive<f64> = -45.0..=60.0;
 const FILM: f64 = 43.267;
 /// Side of the nominal canvas. Its number does not matter.
 const SIDE: u32 = 1024;
-/// First bytes of Apple's maker note, and its entry with the acceleration that the telephone felt.
+/// First bytes of Apple's maker note, and its entry with the measured acceleration.
 const APPLE: &[u8] = b"Apple iOS\0";
 const ACCELERATION: u16 = 8;
 
@@ -51,8 +51,8 @@ impl Shot {
             Some(Value::Undefined(bytes, _)) if !is_selfie => acceleration(bytes),
             _ => None,
         };
-        // Seen from the front, x points left, y down and z into the telephone, as the camera at its back looks. What it feels is opposite
-        // to gravity.
+        // Seen from the front, x points left, y down and z into the telephone, as the camera at its back looks. The acceleration is
+        // opposite to gravity.
         let pitch = note
             .filter(|up| (0.8..1.2).contains(&up.length()))
             .map(|up| (-up.z / up.length()).asin().to_degrees());

@@ -129,7 +129,7 @@ impl SampleConfig {
             ("upright", "must be false", self.upright),
         ];
         if let Some((key, message, _)) = beside_compat.into_iter().find(|(.., wrong)| self.compat && *wrong) {
-            return Some((key.into(), format!("{message} beside `compat = true`")));
+            return Some((key.into(), format!("{message} with `compat = true`")));
         }
         // Samples of neighbours are those of known cameras.
         let beside_neighbours = [

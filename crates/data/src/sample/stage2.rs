@@ -57,7 +57,7 @@ impl Stage2 {
         let authors = folder.description().layout == Layout::Authors;
         if authors && config.high_resolution && config.augment.background_color {
             let message =
-                "has no masks at twice the side, which `background_color` needs beside `high_resolution`";
+                "has no masks at twice the side, which `background_color` needs with `high_resolution`";
             return Err(FileError::unsuitable(folder.root(), message));
         }
         // Only stage 1 has second surfaces.

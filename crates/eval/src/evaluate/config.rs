@@ -277,13 +277,19 @@ impl EvalConfig {
         let mut names: Vec<String> = ablations.keys().cloned().chain(devices).collect();
         names.sort_unstable();
         if let Some(name) = names.iter().find(|name| TAKEN.contains(&name.as_str())) {
-            return Some(("ablations", format!("`{name}` has another meaning in reports")));
+            return Some((
+                "ablations",
+                format!("`{name}` has another meaning in reports: choose another name"),
+            ));
         }
         if let Some(pair) = names.windows(2).find(|pair| pair[0] == pair[1]) {
-            return Some(("ablations", format!("`{}` is there twice, as an ablation or a device", pair[0])));
+            return Some(("ablations", format!("`{}` is the name of two ablations or devices", pair[0])));
         }
         if names.iter().chain(self.groups.keys()).any(|name| name.contains(char::is_control)) {
-            return Some(("ablations", "the name of one, or of a group, has control characters".into()));
+            return Some((
+                "ablations",
+                "the name of an ablation, a device or a group has control characters".into(),
+            ));
         }
         if let Some((key, message)) = self.photographs.problem() {
             return Some(("photographs", format!("`{key}` {message}")));

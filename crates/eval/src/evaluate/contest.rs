@@ -200,7 +200,9 @@ fn aligned(
     let centres = means.as_chunks().0.iter().zip(opacities);
     let centres: Vec<[f32; 3]> = centres.filter(|(_, own)| *own >= opaque).map(|(p, _)| *p).collect();
     if centres.is_empty() {
-        let message = format!("no Gaussian has an opacity of {opaque}: there is nothing to align");
+        let message = format!(
+            "no Gaussian has an opacity of {opaque} or more (`metrics.opaque`): there is nothing to align"
+        );
         return Err(EvalError::Empty(message));
     }
     let centres = thinned(&centres, ALIGNED);

@@ -163,7 +163,7 @@ pub(crate) fn missing(config: &EvalConfig, sets: &[People]) -> Vec<LeftOut> {
         !sets.iter().any(|set| set.chosen().iter().any(|row| set.test().name(*row) == name.as_str()))
     };
     let missing = config.data.only.iter().filter(is_missing);
-    let why = "data.only: no data set has this person, or not among its first ones";
+    let why = "data.only: no data set has this person, or not among its first `data.subjects`";
     let mut left_out: Vec<LeftOut> = missing.map(|name| LeftOut::new(name, why)).collect();
     if left_out.is_empty() && sets.iter().all(|set| set.chosen().is_empty()) {
         left_out.push(LeftOut::new("everything", "the data sets have no people"));

@@ -70,10 +70,10 @@ pub enum FuseError {
     #[error("no surface: fewer than {0} Gaussians are finite and opaque")]
     Nothing(usize),
     /// Gaussians without a body.
-    #[error("no surface: nothing that the Gaussians show is solid from any side")]
+    #[error("no surface: the Gaussians enclose no solid body")]
     Hollow,
     /// Too few Gaussians for the size of the body, or too large ones.
-    #[error("no surface: the Gaussians are too large for the shape that their centres have")]
+    #[error("no surface: the Gaussians are too large beside the distances between their centres")]
     Coarse,
     /// Too much work.
     #[error("{0}: this would take longer than {LONG} s on a few cores")]

@@ -76,7 +76,10 @@ impl Config {
             return refuse("network.patch", format!("is {}; the DPT head has patches of 16 pixels", n.patch));
         }
         if !is_transformer && ![8, 16].contains(&n.patch) {
-            return refuse("network.patch", format!("is {}, a convolution has 8 or 16", n.patch));
+            return refuse(
+                "network.patch",
+                format!("is {}, must be 8 or 16 with `network.body = \"convolution\"`", n.patch),
+            );
         }
         if !is_transformer && n.drop_empty {
             return refuse("network.drop_empty", "must be false: a convolution has no tokens to drop".into());
@@ -93,7 +96,7 @@ impl Config {
         if let Some((key, _, needed)) =
             completed.into_iter().find(|(_, holds, _)| n.sides == Sides::Completed && !holds)
         {
-            return refuse(key, format!("must be {needed} beside `network.sides = \"completed\"`"));
+            return refuse(key, format!("must be {needed} with `network.sides = \"completed\"`"));
         }
         if n.second_layer && (n.sides != Sides::Completed || !n.side_heads) {
             let needed = "`network.sides = \"completed\"` and `network.side_heads = true`";
@@ -108,7 +111,7 @@ impl Config {
         // Mirrored, the second photograph would stand on the other side.
         let opposite = [("side_heads", n.side_heads), ("mirror", n.mirror), ("both_ways", n.both_ways)];
         if let Some((key, _)) = opposite.iter().find(|(_, set)| *set && n.pair_degrees != OPPOSITE) {
-            let message = format!("must be 180 beside `network.{key} = true`");
+            let message = format!("must be 180 with `network.{key} = true`");
             return refuse("network.pair_degrees", message);
         }
         if !n.net_resolution.is_multiple_of(n.patch) {
@@ -124,7 +127,7 @@ impl Config {
             return refuse("network.steepest", message.into());
         }
         if n.closed_top && r.start() != RegressorStart::Geometric {
-            let needed = "`regressor.start = \"geometric\"`: no network makes its Gaussians";
+            let needed = "`regressor.start = \"geometric\"`: the regressor does not make these Gaussians";
             return refuse("network.closed_top", format!("needs {needed}"));
         }
         if n.conf_threshold.is_nan() {
@@ -178,7 +181,7 @@ impl Config {
             return (self.rotation_frame() == RotationFrame::Camera
                 && self.world_frame() == WorldFrame::Mirrored)
                 .then(|| {
-                    let message = "\"mirrored\" is a reflection, which no quaternion can follow: set \
+                    let message = "\"mirrored\" is a reflection, which quaternions cannot represent: set \
                                    `mode.rotation_frame = \"world\"` or `mode.world_frame = \"upright\"`";
                     ("mode.world_frame", message.into())
                 });

@@ -138,7 +138,7 @@ impl UNet {
     pub(super) fn new(config: &NetworkConfig, sizes: &UNetSizes, device: &Device) -> Self {
         let UNetSizes { inputs, outputs, widths, blocks: [dim, depth, heads] } = *sizes;
         let coarsest = widths[LEVELS - 1];
-        // The finest pixel is so many of the input's.
+        // Pixels of the input per finest pixel, along an axis.
         let stride = config.patch >> (LEVELS - 1);
         Self {
             conv_in: conv3x3(inputs, widths[0], stride, true, device),

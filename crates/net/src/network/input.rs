@@ -19,8 +19,8 @@ pub struct Input {
 }
 
 impl Input {
-    /// Of photographs `[2·B, 3, S, S]` on their canvas, all fronts, then all backs, and their masks `[2·B, 1, S, S]`, the
-    /// window of `config`.
+    /// The input for the `window` of photographs `[2·B, 3, S, S]` on their canvases, all fronts, then all backs, and of their masks
+    /// `[2·B, 1, S, S]`.
     pub fn new(config: &Config, photographs: Tensor<4>, masks: Tensor<4>, window: &Window) -> Self {
         let n = &config.network;
         let small = |x: Tensor<4>| {

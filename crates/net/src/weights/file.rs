@@ -202,7 +202,7 @@ impl WeightFile {
         if problems.is_empty() {
             return Ok(Self { source, config });
         }
-        // Weights of other networks say so themselves.
+        // If the file's own config differs, its keys say more than the tensors.
         let own = source.config().map(|own| differences(&keys(&own), &keys(&config))).unwrap_or_default();
         // `mode` changes no tensor.
         let own: Vec<_> = own.into_iter().filter(|(key, _)| !key.starts_with("mode.")).collect();
@@ -229,7 +229,7 @@ impl WeightFile {
             return Ok(());
         }
         differing.truncate(MAX_DIFFERENCES - 1);
-        differing.push((String::new(), "`import-weights --set` writes them for other keys".into()));
+        differing.push((String::new(), "`import-weights --set` writes such a file for other keys".into()));
         Err(of_others(self.path(), differing))
     }
 

@@ -31,7 +31,7 @@ pub const PAIRS: usize = 16;
 pub const BLOCK: usize = 2 * PAIRS;
 /// Columns of a panel.
 pub const PANEL: usize = 32;
-/// A kernel reads up to so many rows of the left factor beyond its last one.
+/// Largest number of rows that a kernel reads beyond the last one of the left factor.
 pub const SLACK: usize = 32;
 
 /// One row of the left factor in one block of k.

@@ -13,7 +13,7 @@ use crate::buffers::{give, take};
 use crate::wide::GROUP;
 use crate::wide::transforms::{Block, Inputs, POINTS, TILE, lines};
 
-/// At most so many parts: enough for the cores of a desktop computer.
+/// Largest number of parts: enough for the cores of a desktop computer.
 const PARTS: usize = 16;
 /// Tiles per part at least, so that the parts' sums are no more data than their transformed tiles.
 const PART_TILES: usize = 96;

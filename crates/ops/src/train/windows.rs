@@ -1,7 +1,7 @@
 //! 3×3 convolutions with padding 1 in bf16, with stride 1 or 2: products with the windows of the image where they lie.
 //!
 //! Pixels are the columns of the right factor and pairs of channels its rows, so that planes need no transposition on the
-//! way in or out, and a tap is a place to begin. The gradient of the input is the same with the roles of inputs and
+//! way in or out, and a tap only shifts the first window. The gradient of the input is the same with the roles of inputs and
 //! outputs exchanged; with stride 2, each of the four kinds of pixels (even or odd row, even or odd column) meets one, two
 //! or four taps. The gradient of the weight sums over pixels, so that there pairs of pixels are the inner dimension.
 

@@ -116,7 +116,7 @@ pub(super) fn gaussians(
     }
     let person = match &item.restoration {
         Some(restoration) => {
-            // Lost Gaussians leave open whose pixels the others are.
+            // If Gaussians were left out, the photographs of the others are not known.
             let is_known = lost == 0 && phase.views.start == 0;
             let count = |view: usize| valid[view].iter().filter(|valid| is_known && **valid).count();
             restoration.person(gaussians, [count(0), count(1)])

@@ -57,7 +57,7 @@ pub struct Arguments {
     /// Continue the run in this folder, or begin it.
     #[arg(long)]
     resume: bool,
-    /// With --resume: continue the run even if settings, data sets or the frozen predictor are no longer those of its state.
+    /// With --resume: continue the run even if settings, data sets or the frozen predictor have changed since its last state.
     #[arg(long, requires = "resume")]
     force: bool,
     /// Check config and data, make a few steps without writing anything, and print how long the run will take.
@@ -204,14 +204,14 @@ impl<'a> Plan<'a> {
         };
         if ranks.size() > config.training.batch {
             let (count, batch) = (ranks.size(), config.training.batch);
-            bail!("{count} ranks share a batch of {batch}: set training.batch higher");
+            bail!("`training.batch` is {batch}, must be at least {count}, the number of ranks");
         }
         // Ranks on one machine share its memory.
         let hosts = ranks.gather(&ranks.host().to_owned());
         if memory::is_cpu(&device) {
             let neighbours = hosts.iter().filter(|host| *host == ranks.host()).count() as u64;
             let needed = neighbours * least_memory(&config, ranks.size());
-            memory::check("this training", needed, "a smaller network or batch needs less")?;
+            memory::check("this training", needed, "a smaller network or training.batch needs less")?;
         }
         // The first rank is about to write a state, which later ranks would find.
         let output = arguments.output.as_deref();

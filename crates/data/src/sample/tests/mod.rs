@@ -270,7 +270,7 @@ fn contradictions_are_refused() {
         Stage1::new(folder.clone(), TRAIN, config).map(drop).expect_err("refused").to_string()
     };
     let compat = SampleConfig { compat: true, ..SampleConfig::default() };
-    assert!(message(compat).contains("`augment`: must be off beside `compat = true`"));
+    assert!(message(compat).contains("`augment`: must be off with `compat = true`"));
     assert!(message(SampleConfig { repeat: 0, ..SampleConfig::default() }).contains("`repeat`"));
     assert!(message(SampleConfig::default()).contains("6 views"));
     let refusal = |layout: Layout, high: bool| {
