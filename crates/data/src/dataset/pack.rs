@@ -9,6 +9,7 @@ use snapsnap_base::{FileError, file, quoted};
 
 use super::description::{self, DESCRIPTION};
 use super::shards::{self, BLOCK, INDEX, Line};
+use super::write::remove_left;
 use super::{Folder, Split, Stored};
 
 /// The config of the preparation, which is kept.
@@ -76,29 +77,23 @@ pub fn pack(
     let mark = file::unfinished_file(&mark);
     let made = fs::create_dir(&temporary).and_then(|()| file::unfinished_folder(&temporary));
     let made = made.map_err(FileError::write(&temporary));
-    let guard = match made {
-        Ok(guard) => guard,
-        Err(e) => {
-            mark.remove();
-            return Err(e);
-        }
-    };
-    let packed = Packer::new(folder, &temporary, size).and_then(|mut packer| {
-        for (done, (split, subject)) in all.iter().enumerate() {
-            progress(done, all.len());
-            packer.add(*split, subject)?;
-        }
-        progress(all.len(), all.len());
-        packer.finish()
+    let packed = made.and_then(|guard| {
+        let packed = Packer::new(folder, &temporary, size).and_then(|mut packer| {
+            for (done, (split, subject)) in all.iter().enumerate() {
+                progress(done, all.len());
+                packer.add(*split, subject)?;
+            }
+            progress(all.len(), all.len());
+            let packed = packer.finish()?;
+            // An empty folder is replaced.
+            let _ = fs::remove_dir(&output);
+            fs::rename(&temporary, &output).map_err(FileError::write(&output))?;
+            Ok(packed)
+        });
+        let _ = fs::remove_dir_all(&temporary);
+        drop(guard);
+        packed
     });
-    let packed = packed.and_then(|packed| {
-        // An empty folder is replaced.
-        let _ = fs::remove_dir(&output);
-        fs::rename(&temporary, &output).map_err(FileError::write(&output))?;
-        Ok(packed)
-    });
-    let _ = fs::remove_dir_all(&temporary);
-    drop(guard);
     mark.remove();
     packed
 }
@@ -109,10 +104,8 @@ fn tidy(parent: &Path, prefix: &str) {
         let name = mark.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let left =
             name.strip_prefix(prefix).and_then(|rest| rest.strip_suffix(LOCK)?.strip_suffix(UNFINISHED));
-        let is_mark = left.is_some_and(|process| process.parse::<u32>().is_ok());
-        if is_mark && File::open(&mark).is_ok_and(|lock| lock.try_lock().is_ok()) {
-            let _ = fs::remove_dir_all(mark.with_extension(""));
-            let _ = fs::remove_file(&mark);
+        if left.is_some_and(|process| process.parse::<u32>().is_ok()) {
+            remove_left(&mark);
         }
     }
 }

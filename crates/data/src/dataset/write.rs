@@ -23,6 +23,17 @@ pub enum Made {
     Elsewhere,
 }
 
+/// Removes the folder of a killed run and its lock, which is called like the folder, with the extension `lock`. Those of a run in progress
+/// stay.
+pub(super) fn remove_left(mark: &Path) {
+    let Ok(lock) = fs::File::open(mark) else { return };
+    // A run in progress holds its lock. This one is held until the folder is removed.
+    if lock.try_lock().is_ok() {
+        let _ = fs::remove_dir_all(mark.with_extension(""));
+        let _ = fs::remove_file(mark);
+    }
+}
+
 impl Folder {
     /// Whether the subject is complete: every kind of file, up to the last view.
     pub fn has(&self, split: Split, subject: &str) -> bool {
@@ -99,12 +110,8 @@ impl Folder {
     pub fn tidy(&self) {
         let unfinished = self.root.join(UNFINISHED);
         for mark in fs::read_dir(&unfinished).into_iter().flatten().flatten().map(|entry| entry.path()) {
-            let is_mark = mark.extension().is_some_and(|extension| extension == "lock");
-            let Ok(lock) = fs::File::open(&mark) else { continue };
-            // A run in progress holds its lock. This one is held until the folder is removed.
-            if is_mark && lock.try_lock().is_ok() {
-                let _ = fs::remove_dir_all(mark.with_extension(""));
-                let _ = fs::remove_file(&mark);
+            if mark.extension().is_some_and(|extension| extension == "lock") {
+                remove_left(&mark);
             }
         }
         let _ = fs::remove_dir(unfinished);

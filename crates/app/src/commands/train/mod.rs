@@ -83,8 +83,8 @@ struct Plan<'a> {
     /// With gradients.
     device: Device,
     ranks: &'a Ranks,
-    /// The folder of the run that is continued, if there is one.
-    begun: Option<&'a Path>,
+    /// The folder of the run that is continued, with its config.
+    begun: Option<(&'a Path, TrainConfig)>,
 }
 
 pub fn stage1(arguments: &Arguments) -> Result<ExitCode, Failure> {
@@ -126,7 +126,7 @@ fn among_ranks(work: impl FnOnce(&Ranks) -> Result<ExitCode, Failure>) -> Result
 
 fn points(arguments: &Arguments, ranks: &Ranks) -> Result<ExitCode, Failure> {
     let mut plan = Plan::new(arguments, ranks)?;
-    plan.keep_start()?;
+    plan.keep_start();
     let task = PointTask::new(&plan.folders, &plan.config, &plan.device)?;
     plan.check_validation(task.validation_samples());
     plan.run(&task, |tracked| {
@@ -145,12 +145,12 @@ fn humans(arguments: &Arguments, ranks: &Ranks) -> Result<ExitCode, Failure> {
     let mut plan = Plan::new(arguments, ranks)?;
     let joint = plan.config.stage2.points_weight > 0.0;
     if joint {
-        plan.keep_start()?;
+        plan.keep_start();
     }
     // The latest weights of a continued run contain its point predictor. Before the first checkpoint there are none. A frozen one of the
     // command line is compared with that of the run's state.
-    let begun = plan.begun.filter(|_| joint || arguments.weights.is_none());
-    let latest = begun.map(|run| run.join(LAST)).filter(|latest| latest.exists());
+    let begun = plan.begun.as_ref().filter(|_| joint || arguments.weights.is_none());
+    let latest = begun.map(|(run, _)| run.join(LAST)).filter(|latest| latest.exists());
     let Some(start) = latest.or_else(|| plan.config.training.weights.clone()) else {
         bail!(
             "stage 2 needs a trained point predictor: give --weights FILE, as train-stage1 writes it, or \
@@ -217,9 +217,11 @@ impl<'a> Plan<'a> {
         let output = arguments.output.as_deref();
         let is_begun = arguments.resume && output.is_some_and(|run| run.join(STATE).exists());
         let begun = output.filter(|_| ranks.gather(&is_begun)[0]);
+        let begun = begun.map(|run| Ok::<_, Failure>((run, TrainConfig::from_file(&run.join(CONFIG), &[])?)));
+        let begun = begun.transpose()?;
         // `auto` of a run that is continued is what it was when the run began, on whatever processor that was.
-        if let (Some(run), None) = (begun, config.training.precision.fixed()) {
-            config.training.precision = TrainConfig::from_file(&run.join(CONFIG), &[])?.training.precision;
+        if let (Some((_, there)), None) = (&begun, config.training.precision.fixed()) {
+            config.training.precision = there.training.precision;
         }
         // All ranks compute in the format of the least of them.
         let precision = config.training.precision.of_training(&device);
@@ -239,14 +241,13 @@ impl<'a> Plan<'a> {
 
     /// A continued run whose networks are all in its state does not read the weights of the command line. Its config keeps those
     /// that it began with.
-    fn keep_start(&mut self) -> Result<(), Failure> {
-        let Some(run) = self.begun else { return Ok(()) };
-        let there = TrainConfig::from_file(&run.join(CONFIG), &[])?.training.weights;
-        let given = std::mem::replace(&mut self.config.training.weights, there);
-        if self.arguments.weights.is_some() && given != self.config.training.weights {
+    fn keep_start(&mut self) {
+        let Some((_, there)) = &self.begun else { return };
+        let own = &mut self.config.training.weights;
+        if self.arguments.weights.is_some() && *own != there.training.weights {
             say::note("note: --weights is not read: the run goes on from its own state");
         }
-        Ok(())
+        own.clone_from(&there.training.weights);
     }
 
     fn check_validation(&self, samples: usize) {
