@@ -26,7 +26,7 @@ row() {
     --set training.log_every=20 --set training.validate_every=100 --set training.validation_samples=32 "$@" --resume -o "runs/sweep/$name"
   case $name in no-* | plain | rings) return 0 ;; esac
   cargo xtask train-stage2 --config configs/studies/stage2.toml --data $data --weights "runs/sweep/$name/best.safetensors" \
-    "$@" --set training.steps=1 --set training.validation_samples=1 --resume -o "runs/sweep/$name/both"
+    "$@" --set training.steps=1 --set schedule.warm_up=0 --set training.validation_samples=1 --resume -o "runs/sweep/$name/both"
 }
 row base groups
 row no-mask groups --set network.mask_channel=false

@@ -4,7 +4,7 @@ use std::fs;
 
 use image::{GenericImageView, ImageFormat};
 use snapsnap_base::config::Schema;
-use snapsnap_net::config::RegressorConfig;
+use snapsnap_net::config::{RegressorConfig, RotationFrame};
 use snapsnap_net::weights::{Source, WeightFile, save};
 use snapsnap_splat::scene;
 use snapsnap_tests::{refused, root, snapsnap, succeed};
@@ -119,6 +119,7 @@ fn a_filled_regressor_keeps_its_config() {
     );
     let mut config = both.config.clone();
     (config.network.closed_top, config.network.steepest) = (false, Some(5.0));
+    config.mode.rotation_frame = Some(RotationFrame::World);
     config.regressor = RegressorConfig::default();
     let predictors =
         source.tensors().keys().filter(|name| !name.contains("pred_unet.") && !name.contains("gs_conv."));
@@ -127,7 +128,9 @@ fn a_filled_regressor_keeps_its_config() {
     fs::rename(path("both"), path("both.safetensors")).expect("renames");
     let filled = import("points.safetensors", &["--fill", "both.safetensors"], "filled.safetensors");
     assert_eq!(filled.regressor, both.config.regressor);
-    assert_eq!((filled.network, filled.mode), (config.network, config.mode));
+    // The frame of the rotations belongs to the regressor.
+    assert_eq!(filled.rotation_frame(), both.config.rotation_frame());
+    assert_eq!(filled.network, config.network);
     // The config of the command line is taken whole.
     fs::write(path("own.toml"), both.config.to_toml()).expect("written");
     let more = ["--fill", "both.safetensors", "--config", "own.toml", "--set", "regressor.margin=24"];

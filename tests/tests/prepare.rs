@@ -116,6 +116,15 @@ fn shards_and_reruns_give_what_one_run_gives() {
     let mut given = prepare("synth");
     given.args(["--subjects", "1", "--set", "views.pitch=2", "-o"]).arg(&new).arg("--config");
     succeed(given.arg(new.join("prepare.config.toml")));
+    // A data set without people is of no settings yet.
+    let empty = temporary.path().join("empty");
+    fs::create_dir(&empty).expect("made");
+    for name in ["dataset.toml", "prepare.config.toml"] {
+        fs::copy(shared.join(name), empty.join(name)).expect("copied");
+    }
+    succeed(synth(&empty, "1").args(["--set", "views.pitch=2"]));
+    let written = fs::read_to_string(empty.join("prepare.config.toml")).expect("written");
+    assert!(written.contains("pitch = 2.0"), "{written}");
 }
 
 /// A killed run leaves complete subjects only, and the next run makes the others.

@@ -1,4 +1,4 @@
-//! Failures of commands: bad input (exit code 2) or other errors (exit code 1).
+//! Failures of commands: bad input or an output that cannot be written (exit code 2), or other errors (exit code 1).
 
 use std::fmt;
 use std::io;

@@ -1,4 +1,4 @@
-//! Ctrl-C and termination signals. Most commands end at once, without temporary files. A training saves its state first.
+//! Ctrl-C and termination signals. Most commands remove their temporary files and end. A training saves its state first.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, LazyLock};

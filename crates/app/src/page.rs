@@ -1,4 +1,4 @@
-//! The page of `view` and `studio` (crates/app/viewer), and what both servers refuse and answer alike.
+//! The page of `view` and `studio` (crates/app/viewer), and the refusals and answers of both servers.
 
 use std::collections::HashMap;
 use std::io;

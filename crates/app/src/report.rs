@@ -1,4 +1,4 @@
-//! Folders of reports, their headers, and the errors of incomplete ones.
+//! Folders and headers of reports, and the errors of incomplete reports.
 
 use std::cell::RefCell;
 use std::fs;

@@ -1,4 +1,4 @@
-//! Messages on stdout and stderr. Control characters in names and contents of files are escaped, since a terminal would obey
+//! Messages on stdout and stderr. Control characters in names and contents of files are escaped, since a terminal would interpret
 //! them. Only [`lines`], [`json`] and [`result`] can fail.
 
 use std::io::{ErrorKind, Write};

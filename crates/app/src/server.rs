@@ -1,5 +1,5 @@
 //! A small web server for local clients, with one request per connection. The time of a connection and the memory of all uploads are
-//! bounded. Contents are shared by all connections.
+//! bounded. All connections share one copy of a file.
 
 use std::io::{self, Read, Write};
 use std::net::{Shutdown, TcpListener, TcpStream};

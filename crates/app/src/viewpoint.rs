@@ -1,4 +1,4 @@
-//! The cameras of a user's photographs, from their files and from options, and what they change about the person.
+//! The cameras of a user's photographs, from files and options, and the correction of the person for these cameras.
 
 use burn::tensor::{Tensor, TensorData};
 use clap::Args;

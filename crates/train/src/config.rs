@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 use snapsnap_base::config::outside;
+use snapsnap_data::dataset::Split;
 use snapsnap_data::sample::SampleConfig;
 use snapsnap_eval::lpips::MIN_SIDE;
 use snapsnap_net::config::{
@@ -102,6 +103,16 @@ pub enum ValidationSplit {
     Val,
     /// People of the training set, to test whether they can be learned at all.
     Train,
+}
+
+impl ValidationSplit {
+    /// The split of a data set.
+    pub fn split(self) -> Split {
+        match self {
+            Self::Val => Split::Val,
+            Self::Train => Split::Train,
+        }
+    }
 }
 
 /// The section `[stage1]`.

@@ -11,7 +11,7 @@ use snapsnap_data::dataset::{Folder, Split};
 use snapsnap_data::sample::{Augment, SampleConfig, Stage};
 
 use crate::TrainError;
-use crate::config::{TrainConfig, ValidationSplit};
+use crate::config::TrainConfig;
 use crate::ranks::Ranks;
 
 /// The samples of a training and of its validations, from all data sets.
@@ -42,10 +42,7 @@ impl<I: Clone + Send + Sync + 'static> Data<I> {
             }
             training.push(new(folder.clone(), Some(Split::Train), samples.clone())?);
         }
-        let wanted = Some(match config.training.validate_on {
-            ValidationSplit::Val => Split::Val,
-            ValidationSplit::Train => Split::Train,
-        });
+        let wanted = Some(config.training.validate_on.split());
         let wished = config.training.validation_samples;
         let (mut there, mut people) = (Vec::new(), 0);
         for folder in folders.iter().filter(|folder| wished > 0 && folder.splits().contains(&wanted)) {

@@ -1,10 +1,12 @@
-//! The identity of a run: what its state belongs to. A run that is continued with something else is refused.
+//! The identity of a run: its settings, data and frozen predictor. A run is not continued with others.
 
 use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
+use snapsnap_base::FileError;
 use snapsnap_base::config::{differences, keys};
+use snapsnap_data::dataset::Split::{self, Train, Val};
 
 use crate::TrainError;
 use crate::config::TrainConfig;
@@ -41,6 +43,9 @@ pub(crate) struct Identity {
     config: BTreeMap<String, String>,
     /// Fingerprints of the data sets.
     data: Vec<String>,
+    /// Fingerprints of the people of the validations. Earlier states have none.
+    #[serde(default)]
+    validated: Vec<String>,
     /// Hash of the frozen point predictor.
     predictor: Option<String>,
 }
@@ -51,9 +56,13 @@ impl Identity {
     /// # Errors
     /// [`TrainError::File`] if a file of a data set cannot be read.
     pub fn of<T: Task>(task: &T, config: &TrainConfig) -> Result<Self, TrainError> {
-        let mut config = keys(config);
-        config.retain(|key, _| !FREE.contains(&key.as_str()));
-        let data = task.data().folders.iter().map(|folder| folder.fingerprint());
+        let validated = config.training.validate_on.split();
+        let mut own = keys(config);
+        own.retain(|key, _| !FREE.contains(&key.as_str()));
+        let folders = &task.data().folders;
+        let fingerprints = |splits: &[Split]| {
+            folders.iter().map(|folder| folder.fingerprint(splits)).collect::<Result<_, FileError>>()
+        };
         let frozen = task.frozen();
         let predictor = (!frozen.is_empty()).then(|| {
             let mut hash = Sha256::new();
@@ -63,7 +72,8 @@ impl Identity {
             }
             format!("{:x}", hash.finalize())
         });
-        Ok(Self { config, data: data.collect::<Result<_, _>>()?, predictor })
+        let (data, validated) = (fingerprints(&[Train, Val])?, fingerprints(&[validated])?);
+        Ok(Self { config: own, data, validated, predictor })
     }
 
     /// What differs in the identity `there`.
@@ -95,7 +105,11 @@ impl Identity {
         let is_other = differences(&there.config, &self.config)
             .iter()
             .any(|(key, _)| is_of(key, VALIDATION) && !is_of(key, TRAINING_ALONE));
-        is_other || there.data != self.data || there.predictor != self.predictor
+        let has_others = match there.validated.is_empty() {
+            true => there.data != self.data,
+            false => there.validated != self.validated,
+        };
+        is_other || has_others || there.predictor != self.predictor
     }
 
     /// Why a run with the identity `there` cannot be continued as this one, or not without `force`.

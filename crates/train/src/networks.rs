@@ -1,4 +1,4 @@
-//! The networks of a training: the point predictor, the regressors, or both, with one set of names.
+//! The networks that are trained: the point predictor, the regressors, or both. Names are those of the checkpoints.
 
 use std::collections::BTreeMap;
 

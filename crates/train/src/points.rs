@@ -1,4 +1,4 @@
-//! Stage 1: distances of predicted points from the true ones, and the entropy of the confidences
+//! Stage 1: distances of predicted points from the true ones, and the cross-entropy of the confidences
 //! (docs/method.md, "Losses of stage 1").
 
 use burn::tensor::Tensor;

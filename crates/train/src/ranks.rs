@@ -1,5 +1,5 @@
-//! The processes of a training. Built with the feature `mpi` and started by `mpirun` or `srun`, each is a rank of MPI. Otherwise there
-//! is one. All ranks make the same calls in the same order.
+//! The processes of a training. With the feature `mpi`, under `mpirun` or `srun`, each is a rank of MPI. Otherwise there is one process.
+//! All ranks make the same calls in the same order.
 
 use std::ops::Range;
 

@@ -194,6 +194,7 @@ impl<'a, T: Task> Session<'a, T> {
         let identity = Identity::of(task, config)?;
         // The first rank is about to write a state.
         let is_begun = options.ranks.gather(&state.exists())[0];
+        let mut is_changed = false;
         if is_begun {
             let there = checkpoint::load(&state, &mut learner, &options.device.clone().inner())?;
             if let Some(refusal) = identity.refusal(&there, options.force) {
@@ -204,12 +205,18 @@ impl<'a, T: Task> Session<'a, T> {
             if goes_on && identity.validates_otherwise(&there) && learner.progress.best.take().is_some() {
                 watch.note("validations measure something else now: the best one so far counts no longer");
             }
+            is_changed = goes_on && identity != there;
         }
         learner.compare(&identity)?;
+        let is_first = options.ranks.is_first();
+        // A frozen predictor is read from the latest weights.
+        if is_first && is_changed {
+            write_weights(&learner, &learner.averaged(), &options.folder.join(LAST))?;
+            save_state(&state, &learner, &identity)?;
+        }
         // The config is written after the state was loaded, which proves that it fits the run.
         let path = options.folder.join(CONFIG);
         let text = config.to_toml();
-        let is_first = options.ranks.is_first();
         if is_first && fs::read(&path).ok().as_deref() != Some(text.as_bytes()) {
             file::write_whole(&path, |out| out.write_all(text.as_bytes()))
                 .map_err(FileError::write(&path))?;
@@ -348,9 +355,7 @@ impl<'a, T: Task> Session<'a, T> {
         if self.log.is_none() {
             return Ok(());
         }
-        let mut values = networks.checkpoint();
-        values.extend(self.learner.task.frozen());
-        Ok(weights::save(&self.learner.config.networks(), &values, &self.options.folder.join(name))?)
+        write_weights(&self.learner, networks, &self.options.folder.join(name))
     }
 
     fn preview(&mut self) -> Result<(), TrainError> {
@@ -372,6 +377,13 @@ impl<'a, T: Task> Session<'a, T> {
         let (path, svg) = (self.options.folder.join(CURVES), log.curves());
         Ok(file::write_whole(&path, |out| out.write_all(svg.as_bytes())).map_err(FileError::write(&path))?)
     }
+}
+
+/// Writes `networks` and the frozen predictor.
+fn write_weights<T: Task>(learner: &Learner<T>, networks: &Networks, path: &Path) -> Result<(), TrainError> {
+    let mut values = networks.checkpoint();
+    values.extend(learner.task.frozen());
+    Ok(weights::save(&learner.config.networks(), &values, path)?)
 }
 
 fn save_state<T: Task>(path: &Path, learner: &Learner<T>, identity: &Identity) -> Result<(), TrainError> {

@@ -1,4 +1,4 @@
-//! Stage 1: the point predictor is trained on the true points of four views
+//! Stage 1: the point predictor is trained on the true points of its views
 //! (docs/method.md, "Losses of stage 1").
 
 use std::sync::Arc;

@@ -1,7 +1,8 @@
 //! Refused settings, weights and folders.
 
-use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+use std::{fs, thread};
 
 use snapsnap_net::weights::Source;
 use snapsnap_tests::{fill_weights, refused, snapsnap, succeed};
@@ -131,6 +132,18 @@ fn a_refused_start_leaves_no_folder() {
     assert!(!temporary.path().join("a").exists());
 }
 
+/// A copy of the people, with another pixel in a picture of the training.
+fn changed_people(folder: &Path) -> PathBuf {
+    let copy = folder.join("copy");
+    copy_folder(people(), &copy);
+    let subject = fs::read_dir(copy.join("train/img")).expect("lists").next().expect("one").expect("entry");
+    let picture = subject.path().join("0.png");
+    let mut pixels = image::open(&picture).expect("reads").to_rgba8();
+    pixels.get_pixel_mut(30, 30).0[0] ^= 1;
+    pixels.save(&picture).expect("writes");
+    copy
+}
+
 #[test]
 fn a_run_is_continued_only_as_itself() {
     let (temporary, config) = place();
@@ -149,14 +162,7 @@ fn a_run_is_continued_only_as_itself() {
         assert!(results(&run) == before);
     }
     // A copy of the data set is the same. A copy with another picture is not.
-    let copy = temporary.path().join("copy");
-    copy_folder(people(), &copy);
-    let subject = fs::read_dir(copy.join("train/img")).expect("lists").next().expect("one").expect("entry");
-    let picture = subject.path().join("0.png");
-    let mut pixels = image::open(&picture).expect("reads").to_rgba8();
-    pixels.get_pixel_mut(30, 30).0[0] ^= 1;
-    pixels.save(&picture).expect("writes");
-    let said = refused(&mut resumed(&copy, &[]));
+    let said = refused(&mut resumed(&changed_people(temporary.path()), &[]));
     assert!(said.contains("the data sets have other content"), "{said}");
     // Another run's state.
     let other = temporary.path().join("other");
@@ -223,7 +229,7 @@ fn the_best_validation_is_of_the_present_people() {
     copy_folder(&run, &ruined);
     let ruinous =
         ["--set=optimizer.rate=1", "--set=optimizer.muon.rate=1", "--set=samples.augment.exposure=0.1"];
-    let mut command = train(1, &config, &ruined);
+    let mut command = train_on(&changed_people(temporary.path()), 1, &config, &ruined);
     let after = succeed(command.args(["--resume", "--force", "--set=training.steps=47"]).args(ruinous));
     assert!(best(&said).is_some() && best(&after) == best(&said), "{said} {after}");
     assert!(results(&ruined)[1] == before[1]);
@@ -257,8 +263,17 @@ fn stage_2_continues_with_its_own_predictor_only() {
         said.contains("the frozen point predictor has other weights") && said.contains("--force"),
         "{said}"
     );
-    succeed(resumed(4, 1).arg("--force"));
-    // From now on the run's predictor is the second one.
+    // From the first moment on, the run's predictor is the second one.
+    let mut killed = resumed(1_000_000, 1);
+    let mut killed = killed.args(["--force", "--set=training.checkpoint_every=0"]).spawn().expect("starts");
+    let written = || fs::read_to_string(run.join("config.toml")).expect("a config");
+    let begun = Instant::now();
+    while !written().contains(&format!("{:?}", weights(1).display().to_string())) {
+        assert!(begun.elapsed() < Duration::from_secs(60) && killed.try_wait().expect("asks").is_none());
+        thread::sleep(Duration::from_millis(5));
+    }
+    killed.kill().expect("kills");
+    killed.wait().expect("ends");
     refused(&mut resumed(5, 0));
     succeed(train(2, &config, &run).args(["--resume", "--set=training.steps=5"]));
     succeed(&mut resumed(6, 1));
@@ -286,6 +301,10 @@ fn stage_2_continues_with_its_own_predictor_only() {
     fs::copy(weights(0), run.join("last.safetensors")).expect("copies");
     let said = refused(train(2, &config, &run).args(["--resume", "--set=training.steps=7"]));
     assert!(said.contains("the frozen point predictor has other weights"), "{said}");
+    // Neither the weights that it began with nor the latest ones are needed.
+    fs::remove_file(weights(0)).expect("removed");
+    fs::remove_file(joint.join("last.safetensors")).expect("removed");
+    succeed(&mut trained("--set=training.steps=4", &weights(1)));
 }
 
 /// Weights of 1e30 make every loss infinite: no step is made, and nothing is recommended.

@@ -1,5 +1,5 @@
-//! `snapsnap reconstruct --pairs`: many people. Weights are loaded once, and while the networks make one person, the next photographs are
-//! read and the last person is written.
+//! `snapsnap reconstruct --pairs`: many people. Weights are loaded once, and while the networks process one person, the next one is read and the
+//! previous one is written.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};

@@ -17,15 +17,15 @@ const ENDS: u64 = 4096;
 const MAX_DEPTH: usize = 3;
 
 impl Folder {
-    /// A hash of the description and of the people to train on and to validate with: of the names, lengths, beginnings and ends of
-    /// their files. A packed data set has the same one as its folders.
+    /// A hash of the description and of the people of `splits`: of the names, lengths, beginnings and ends of their files. A packed data
+    /// set has the same one as its folders.
     ///
     /// # Errors
     /// [`FileError::Read`] for a file or folder that cannot be read.
-    pub fn fingerprint(&self) -> Result<String, FileError> {
+    pub fn fingerprint(&self, splits: &[Split]) -> Result<String, FileError> {
         let mut files = Vec::new();
-        for split in [Split::Train, Split::Val] {
-            let folder = self.split_path(Some(split));
+        for split in splits {
+            let folder = self.split_path(Some(*split));
             if let Some(shards) = &self.shards {
                 files.extend(shards.files(self.below(&folder)).map(Path::to_owned));
             } else if folder.is_dir() {

@@ -250,8 +250,8 @@ fn patch(shown: &Gaussians, camera: &Camera, side: u32) -> Camera {
 /// Share of the time. Smaller differences are noise.
 const FASTER: f64 = 0.03;
 
-/// For each variant, the index of the best variant that dominates it: with clearly better pictures (the paired interval
-/// over people is above 0) in no more time, or with equally good ones in clearly less time. Time is that of a
+/// For each variant, the index of the best variant that dominates it: with better pictures (the paired interval over
+/// people is above 0) in at most 3 % more time, or with equally good ones in at least 3 % less. Time is that of a
 /// reconstruction and a view. Scenes, tuned Gaussians and different people are not compared.
 pub fn dominated(measured: &[Measured]) -> Vec<Option<usize>> {
     let names = |m: &Measured| m.people.iter().map(|person| person.name.clone()).collect::<Vec<_>>();

@@ -1,4 +1,4 @@
-//! Alignment of reconstructions that are not in the world frame, by iterated closest points (Besl & McKay 1992).
+//! Alignment of reconstructions that are not in the world frame, by iterative closest point (Besl & McKay 1992).
 
 use glam::{DMat3, DQuat, DVec3};
 use serde::{Deserialize, Serialize};

@@ -24,8 +24,9 @@ pub struct ImportOptions<'a> {
     pub float: Float,
 }
 
-/// The config in the metadata of weight files: `[regressor]` of the first file with a config and a regressor, the rest of the first one
-/// with a config and a point predictor. What no such file has is of the first config. `None` if no file has a config.
+/// The config in the metadata of weight files: `[regressor]`, `mode.rotation_frame` and `mode.crop` of the first file with a config and a
+/// regressor, the rest of the first one with a config and a point predictor. What no such file has is of the first config. `None` if no
+/// file has a config.
 ///
 /// # Errors
 /// [`WeightsError`] for a file that is no checkpoint, or whose config is refused.
@@ -39,7 +40,15 @@ pub fn stored_config<'a>(paths: impl Iterator<Item = &'a Path>) -> Result<Option
     let (Some(points), Some(gaussians)) = (of(Part::PointPredictor), of(Part::Regressor)) else {
         return Ok(None);
     };
-    Ok(Some(Config { regressor: gaussians.config()?.regressor, ..points.config()? }))
+    let (mut config, gaussians) = (points.config()?, gaussians.config()?);
+    // Keys stay unset where that means the same.
+    if config.rotation_frame() != gaussians.rotation_frame() {
+        config.mode.rotation_frame = Some(gaussians.rotation_frame());
+    }
+    if config.crop() != gaussians.crop() {
+        config.mode.crop = Some(gaussians.crop());
+    }
+    Ok(Some(Config { regressor: gaussians.regressor, ..config }))
 }
 
 /// Report of an import.

@@ -15,7 +15,7 @@ use snapsnap_base::FileError;
 use snapsnap_base::config::{Schema, differences, keys};
 use snapsnap_base::file;
 use snapsnap_base::random::stream;
-use snapsnap_data::dataset::{DESCRIPTION, Folder, Made, Split};
+use snapsnap_data::dataset::{Folder, Made, Split};
 use snapsnap_data::prepare::{DataConfig, Shard, Subject};
 use snapsnap_data::scan::{Collection, normalise};
 use snapsnap_mesh::mesh::Mesh;
@@ -169,8 +169,9 @@ fn make(
     if let Some(sheet) = &common.preview {
         check_preview(sheet, common, inputs)?;
     }
-    let is_begun = common.output.join(DESCRIPTION).exists();
     let folder = Folder::create(&common.output, config.description(source))?;
+    let is_begun =
+        folder.splits().into_iter().any(|split| folder.subjects(split).is_ok_and(|all| !all.is_empty()));
     let (path, resolved) = (common.output.join(CONFIG), config.to_toml());
     // The cameras of people that are there already are those of this config; `dataset.toml` does not have all of them.
     if let (true, Ok(there)) = (is_begun, DataConfig::from_file(&path, &[])) {

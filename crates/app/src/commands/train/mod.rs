@@ -147,32 +147,37 @@ fn humans(arguments: &Arguments, ranks: &Ranks) -> Result<ExitCode, Failure> {
     if joint {
         plan.keep_start();
     }
-    // The latest weights of a continued run contain its point predictor. Before the first checkpoint there are none. A frozen one of the
+    // The latest weights of a continued run contain its frozen predictor. Before the first checkpoint there are none. A predictor of the
     // command line is compared with that of the run's state.
-    let begun = plan.begun.as_ref().filter(|_| joint || arguments.weights.is_none());
+    let begun = plan.begun.as_ref().filter(|_| arguments.weights.is_none());
     let latest = begun.map(|(run, _)| run.join(LAST)).filter(|latest| latest.exists());
-    let Some(start) = latest.or_else(|| plan.config.training.weights.clone()) else {
-        bail!(
+    let weights = match latest.or_else(|| plan.config.training.weights.clone()) {
+        // The state of a continued joint run contains both networks.
+        _ if joint && plan.begun.is_some() => None,
+        Some(start) => Some(open(&start, &plan.config, &[Part::PointPredictor, Part::Regressor])?),
+        None => bail!(
             "stage 2 needs a trained point predictor: give --weights FILE, as train-stage1 writes it, or \
              training.weights in the config"
-        );
+        ),
     };
-    let weights = open(&start, &plan.config, &[Part::PointPredictor, Part::Regressor])?;
     if let Some(maps) = &plan.config.stage2.point_map_cache {
         outside_data(maps, plan.folders.iter().map(|folder| folder.root()))?;
     }
-    let frozen = (!joint).then(|| weights.point_predictor(&plan.device.clone().inner())).transpose()?;
+    let frozen = weights.as_ref().filter(|_| !joint);
+    let frozen = frozen.map(|weights| weights.point_predictor(&plan.device.clone().inner())).transpose()?;
     let task = GaussianTask::new(&plan.folders, &plan.config, frozen, &plan.device)?;
     plan.check_validation(task.validation_samples());
     plan.run(&task, |tracked| {
-        let networks = plan.config.networks();
-        let regressors = if weights.require(Part::Regressor).is_ok() {
-            weights.regressors(tracked)?
-        } else {
-            random_regressors(&networks, plan.config.training.seed, tracked)
+        let (networks, seed) = (plan.config.networks(), plan.config.training.seed);
+        let regressors = match weights.as_ref().filter(|weights| weights.require(Part::Regressor).is_ok()) {
+            Some(weights) => weights.regressors(tracked)?,
+            None => random_regressors(&networks, seed, tracked),
         };
-        let predictor = joint.then(|| weights.point_predictor(tracked)).transpose()?;
-        Ok(Networks { predictor, regressors })
+        let predictor = joint.then(|| match &weights {
+            Some(weights) => weights.point_predictor(tracked),
+            None => Ok(random_predictor(&networks, seed, tracked)),
+        });
+        Ok(Networks { predictor: predictor.transpose()?, regressors })
     })
 }
 
