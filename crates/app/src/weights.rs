@@ -8,7 +8,7 @@ use burn::tensor::Device;
 use sha2::{Digest, Sha256};
 use snapsnap_base::config::Schema;
 use snapsnap_base::{FileError, file};
-use snapsnap_data::photo::FOUND;
+use snapsnap_data::photo::SEGMENTER_SIDE;
 use snapsnap_net::config::Config;
 use snapsnap_net::u2net::{SIDE, U2Net};
 use snapsnap_net::weights::{Source, WeightFile};
@@ -26,7 +26,7 @@ const U2NET: &[u8] = include_bytes!("../../../assets/weights/u2netp.safetensors"
 pub const DEFAULT_NAME: &str = "the default weights";
 
 // The photographs are resized for the network.
-const _: () = assert!(FOUND == SIDE);
+const _: () = assert!(SEGMENTER_SIDE == SIDE);
 
 /// The network that finds a person's pixels, from 0 to 1, on the CPU: it is small, and a GPU's kernels would take longer to compile.
 pub fn segmenter() -> impl Fn(&[f32]) -> Vec<f32> {

@@ -66,7 +66,7 @@ impl Jitter {
         ])
     }
 
-    /// Sum of both deviations.
+    /// Sum of both deviations of what has a limit. Yaw and roll have none, and are 0.
     pub(crate) fn plus(&self, other: &Self) -> Self {
         Self {
             yaw: 0.0,

@@ -24,7 +24,7 @@ use snapsnap_mesh::picture::{self, MAX_BYTES};
 
 use exposure::match_back;
 use matting::matte;
-pub use matting::{FOUND, Segmenter};
+pub use matting::{SEGMENTER_SIDE, Segmenter};
 pub use placing::Mapping;
 use placing::{Standing, placed, placed_as_demo, together};
 pub(crate) use placing::{on_canvas, place};

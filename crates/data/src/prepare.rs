@@ -214,7 +214,7 @@ pub struct Subject<'a> {
     pub split: Split,
     /// Its name in the data set.
     pub name: &'a str,
-    /// Its name among all data sets, which seeds the random deviations of its cameras.
+    /// Its name among all data sets, which seeds its light and the random deviations of its cameras.
     pub identity: &'a str,
     /// Direction in which it faces, around y.
     pub yaw_degrees: f64,

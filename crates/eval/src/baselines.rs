@@ -8,7 +8,7 @@ use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 use snapsnap_data::dataset::{Arrangement, Folder, Split};
 use snapsnap_net::config::Config;
-use snapsnap_net::gaussians::{Seen, geometric, placed, side_images};
+use snapsnap_net::gaussians::{CanvasView, geometric, placed, side_images};
 use snapsnap_ops::{bilinear, host};
 use snapsnap_splat::{Camera, Gaussians};
 
@@ -31,7 +31,7 @@ pub fn billboard(
 ) -> Gaussians {
     let part = |((image, valid), camera): ((&Vec<f32>, &Vec<bool>), &Camera)| {
         let points = Tensor::from_data(TensorData::new(upright(camera, side), [1, side, side, 3]), device);
-        in_world(geometric(&[Seen { image, points, valid }], device), camera)
+        in_world(geometric(&[CanvasView { image, points, valid }], device), camera)
     };
     joined(photographs.iter().zip(valid).zip(cameras).map(part).collect())
 }
@@ -68,11 +68,11 @@ pub fn true_points(
     };
     let seen = |((image, valid), points): ((_, _), &[f32])| {
         let points = TensorData::new(points.to_vec(), [1, side, side, 3]);
-        Seen { image, points: Tensor::from_data(points, device), valid }
+        CanvasView { image, points: Tensor::from_data(points, device), valid }
     };
     let images = photographs.iter().chain(&sides).map(Vec::as_slice);
     let with_masks = images.zip(valid.iter().map(Vec::as_slice));
-    let views: Vec<Seen> = with_masks.zip(points.chunks_exact(3 * side * side)).map(seen).collect();
+    let views: Vec<CanvasView> = with_masks.zip(points.chunks_exact(3 * side * side)).map(seen).collect();
     in_world(geometric(&views, device), camera)
 }
 
@@ -141,7 +141,7 @@ impl MeanPictures {
     /// The mean picture of a view at a size.
     ///
     /// # Errors
-    /// Never; a picture's values are checked.
+    /// Those of [`Picture::new`]. Means of pictures have none.
     pub fn picture(&self, view: usize, side: usize) -> Result<Picture, EvalError> {
         let planes = planes(self.views[view].clone(), 3, self.side);
         let planes = if side == self.side { planes } else { bilinear(planes, [side, side], false) };

@@ -9,7 +9,7 @@ use image::RgbImage;
 /// A triangle mesh. [`Mesh::check`] refuses indices out of range and numbers that are not finite.
 #[derive(Debug, Clone, Default)]
 pub struct Mesh {
-    /// World positions, metres, y up.
+    /// Positions, y up: metres from the world's origin, if its maker says nothing else.
     pub positions: Vec<Vec3>,
     /// Colour of each position in [0, 1]; empty where materials give the colour.
     pub colors: Vec<Vec3>,

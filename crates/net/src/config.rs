@@ -290,7 +290,7 @@ pub struct ModeConfig {
     /// World frame of the PLY.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub world_frame: Option<WorldFrame>,
-    /// Whether the regressor receives only the person's box, with the margin of its receptive field. Its group norms then
+    /// Whether the regressor receives only the person's box and `regressor.margin` around it. Its group norms then
     /// measure less background, which changes the results of weights trained on the whole canvas (docs/inference.md).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub crop: Option<bool>,

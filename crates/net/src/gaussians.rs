@@ -15,7 +15,7 @@ use crate::regressor::{Attributes, FEATURES, Geometry, Limits, Regressor, Statis
 use crate::sides::{Cloud, EMPTY, is_finite};
 
 /// One view on its square canvas of side S.
-pub struct Seen<'a> {
+pub struct CanvasView<'a> {
     /// `[3, S, S]` colours in [−1, 1], a photograph's or a side's pseudo image.
     pub image: &'a [f32],
     /// `[1, S, S, 3]` metres, front camera's frame; tracked if the predictor is trained too.
@@ -162,7 +162,7 @@ pub fn regress(
     network: &Regressor,
     config: &Config,
     pair: usize,
-    views: &[Seen],
+    views: &[CanvasView],
     window: &Window,
 ) -> Vec<Part> {
     let limits = Limits::of(&config.regressor, pair);
@@ -201,7 +201,7 @@ pub fn regress(
 /// Gaussians of the geometry alone, without a regressor, front camera's frame. Every valid point of some views becomes
 /// a round Gaussian of its pixel's colour. σ is 0.3 times the distance of its neighbours
 /// (docs/method.md, "Geometric start").
-pub fn geometric(views: &[Seen], device: &Device) -> Gaussians {
+pub fn geometric(views: &[CanvasView], device: &Device) -> Gaussians {
     let regressor = RegressorConfig { start: Some(RegressorStart::Geometric), ..RegressorConfig::default() };
     let limits = Limits::of(&regressor, 0);
     let config = Config { regressor, ..Config::default() };
@@ -211,7 +211,7 @@ pub fn geometric(views: &[Seen], device: &Device) -> Gaussians {
 }
 
 /// The part of a view to which no regressor adds anything.
-pub fn uncorrected(view: &Seen, limits: Limits) -> Part {
+pub fn uncorrected(view: &CanvasView, limits: Limits) -> Part {
     let side = view.points.dims()[1];
     let rows = Window::whole(side).indices(view.valid, side);
     Part {
@@ -221,8 +221,8 @@ pub fn uncorrected(view: &Seen, limits: Limits) -> Part {
     }
 }
 
-/// Activates and joins the parts: Gaussians in the front camera's frame, and the number of those left out because they
-/// are not finite.
+/// Activates and joins the parts: Gaussians in the front camera's frame, and the number of those left out because a
+/// feature is not finite or a centre lies beyond 1e30 m.
 pub fn assemble(config: &Config, parts: Vec<Part>, device: &Device) -> (Gaussians, usize) {
     /// Coordinates beyond this could overflow on their way to the world frame.
     const FARTHEST: f32 = 1e30;
@@ -318,7 +318,7 @@ mod tests {
         let points = Tensor::from_data(TensorData::new(points, [1, side, side, 3]), &device) * 0.007;
         let valid = vec![true; side * side];
         for (pair, limit) in [(0, 0.03), (1, 0.2), (2, 0.2)] {
-            let view = || Seen { image: &image, points: points.clone(), valid: &valid };
+            let view = || CanvasView { image: &image, points: points.clone(), valid: &valid };
             let parts = regress(network, &config, pair, &[view(), view()], &Window::whole(side));
             let (gaussians, _) = assemble(&config, parts, &device);
             let colors = host(gaussians.colors);

@@ -44,7 +44,7 @@ impl Hull {
     }
 }
 
-/// Where a mask `[H, W]` of this width is set within `margin` pixels, to the sides and up and down.
+/// A mask `[H, W]` of `width` columns, dilated by a square of 2·`margin` + 1 pixels.
 pub fn dilated(mask: &[bool], width: usize, margin: usize) -> Vec<bool> {
     let rows = mask.len() / width.max(1);
     let across = spread(mask, [rows, width], [width, 1], margin);

@@ -4,7 +4,7 @@ use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::tensor::Tensor;
 
 /// The place of a traversal in a module, as the checkpoint's key.
-pub struct Path<'a> {
+pub struct ParameterPath<'a> {
     prefix: &'a str,
     /// Component of the key and container type, per open module.
     open: Vec<(String, String)>,
@@ -27,7 +27,7 @@ fn component(name: &str, container: &str) -> String {
     }
 }
 
-impl Path<'_> {
+impl ParameterPath<'_> {
     fn enter(&mut self, name: &str, container: &str) {
         self.open.push((component(name, container), container.to_owned()));
     }
@@ -53,24 +53,24 @@ impl Path<'_> {
 /// A visitor of a module's parameters, by name.
 pub trait NamedVisitor {
     /// One parameter.
-    fn visit<const D: usize>(&mut self, path: &Path, parameter: &Param<Tensor<D>>);
+    fn visit<const D: usize>(&mut self, path: &ParameterPath, parameter: &Param<Tensor<D>>);
 }
 
 /// A mapper of a module's parameters, by name.
 pub trait NamedMapper {
     /// The new parameter in the place of `parameter`.
-    fn map<const D: usize>(&mut self, path: &Path, parameter: Param<Tensor<D>>) -> Param<Tensor<D>>;
+    fn map<const D: usize>(&mut self, path: &ParameterPath, parameter: Param<Tensor<D>>) -> Param<Tensor<D>>;
 }
 
 /// A traversal as Burn calls it.
 struct Traversal<'a, T> {
-    path: Path<'a>,
+    path: ParameterPath<'a>,
     inner: &'a mut T,
 }
 
 impl<'a, T> Traversal<'a, T> {
     fn new(prefix: &'a str, inner: &'a mut T) -> Self {
-        Self { path: Path { prefix, open: Vec::new() }, inner }
+        Self { path: ParameterPath { prefix, open: Vec::new() }, inner }
     }
 }
 

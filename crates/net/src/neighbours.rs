@@ -74,15 +74,16 @@ struct Work {
 }
 
 impl Neighbours {
-    /// Orders finite points; `None` without any.
+    /// Orders the finite points; `None` without any. Rows count all points that are given.
     ///
     /// # Panics
     /// With more points than `u32` can number.
     pub fn new(points: &[[f32; 3]]) -> Option<Self> {
-        if points.is_empty() {
+        let placed = arranged(points);
+        if placed.is_empty() {
             return None;
         }
-        let leaves: Vec<Leaf> = arranged(points).par_chunks(LANES).map(Leaf::new).collect();
+        let leaves: Vec<Leaf> = placed.par_chunks(LANES).map(Leaf::new).collect();
         let mut boxes = vec![Bounds::NOTHING; 2 * leaves.len() - 1];
         enclose(&leaves, &mut boxes);
         Some(Self { leaves, boxes })

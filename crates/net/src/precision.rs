@@ -9,7 +9,7 @@ use burn::tensor::{Device, FloatDType, Tensor};
 
 use crate::config::Config;
 pub use crate::config::{Precision, PrecisionChoice};
-use crate::names::{NamedMapper, Path, map_named};
+use crate::names::{NamedMapper, ParameterPath, map_named};
 use crate::network::PointPredictor;
 
 impl Precision {
@@ -24,7 +24,7 @@ impl Precision {
     }
 }
 
-/// What computes products in bf16 on this processor, by name.
+/// What computes products in bf16 on this processor, by name; `None` if it has no instructions for them.
 pub fn unit_of_cpu() -> Option<&'static str> {
     snapsnap_ops::half::unit().map(snapsnap_ops::half::Unit::name)
 }
@@ -58,7 +58,7 @@ struct Lower {
 }
 
 impl NamedMapper for Lower {
-    fn map<const D: usize>(&mut self, path: &Path, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
+    fn map<const D: usize>(&mut self, path: &ParameterPath, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
         let name = path.name();
         let layer = name.rsplit_once('.').map_or("", |(layer, _)| layer);
         let is_layer =
@@ -83,7 +83,7 @@ mod tests {
     fn in_f32(config: &Config) -> Vec<String> {
         struct Collect(Vec<String>);
         impl NamedVisitor for Collect {
-            fn visit<const D: usize>(&mut self, path: &Path, parameter: &Param<Tensor<D>>) {
+            fn visit<const D: usize>(&mut self, path: &ParameterPath, parameter: &Param<Tensor<D>>) {
                 if D > 1 && parameter.val().dtype() == DType::F32 {
                     self.0.push(path.name());
                 }

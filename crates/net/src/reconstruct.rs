@@ -10,7 +10,7 @@ use snapsnap_splat::{Camera, Gaussians, RigidTransform};
 use crate::config::{Config, Downsample, WorldFrame};
 use crate::crop::Window;
 use crate::gaussians::{
-    Chosen, Part, Seen, assemble, photograph_colors, placed, regress, side_images, uncorrected,
+    CanvasView, Chosen, Part, assemble, photograph_colors, placed, regress, side_images, uncorrected,
 };
 use crate::network::{Input, PointMap, PointPredictor, View};
 use crate::precision::Precision;
@@ -42,8 +42,10 @@ pub struct Reconstruction {
     pub side_images: Vec<Vec<f32>>,
     /// The Gaussians, view after view, row-major, in the front camera's frame; then those that close the top.
     pub gaussians: Gaussians,
-    /// Pixels and Gaussians that were left out because they were not finite.
+    /// Pixels and Gaussians that were left out because they were not finite, or farther away than 1e30 m.
     pub lost: usize,
+    /// The Gaussians among them.
+    pub lost_gaussians: usize,
     /// Steps that ran, and steps that were left out, with reasons.
     pub plan: Vec<String>,
     /// Time per module, the device synchronised before and after each.
@@ -51,11 +53,15 @@ pub struct Reconstruction {
 }
 
 impl Reconstruction {
-    /// Number of the first Gaussians that are pixels of the front and of the back; 0 if Gaussians were left out, since those of the
-    /// others are not known then.
+    /// How many of the first Gaussians are pixels of the front, and how many after them of the back. `[0, 0]` if Gaussians were left
+    /// out, since the pixels of the others are not known then.
     pub fn photographed(&self) -> [usize; 2] {
         let count = |valid: &Vec<bool>| valid.iter().filter(|valid| **valid).count();
-        if self.lost > 0 { [0, 0] } else { [0, 1].map(|view| self.valid.get(view).map_or(0, count)) }
+        if self.lost_gaussians > 0 {
+            [0, 0]
+        } else {
+            [0, 1].map(|view| self.valid.get(view).map_or(0, count))
+        }
     }
 
     /// The Gaussians in the configured world frame.
@@ -85,7 +91,7 @@ pub struct Reconstructor {
 }
 
 impl Reconstructor {
-    /// Loads both parts of `weights`; `config` may change modes but not sizes.
+    /// Loads both parts of `weights`, with the config with which the file was opened.
     ///
     /// # Errors
     /// [`WeightsError`] if a part is absent or a value is not finite.
@@ -141,7 +147,8 @@ impl Reconstructor {
                 "{name} photograph on a canvas of {side}²"
             );
         }
-        let mut run = Run { model: self, stage, side, lost: 0, plan: Vec::new(), times: Vec::new() };
+        let mut run =
+            Run { model: self, stage, side, lost_gaussians: 0, plan: Vec::new(), times: Vec::new() };
         run.reconstruct([front, back])
     }
 }
@@ -151,7 +158,7 @@ struct Run<'a> {
     stage: &'a dyn Fn(&'static str),
     side: usize,
     /// Gaussians that are not finite.
-    lost: usize,
+    lost_gaussians: usize,
     plan: Vec<String>,
     times: Vec<(&'static str, Duration)>,
 }
@@ -218,7 +225,8 @@ impl Run<'_> {
         }
         let gaussians = self.assembled(parts);
         let (plan, times) = (std::mem::take(&mut self.plan), std::mem::take(&mut self.times));
-        Reconstruction { views, maps, valid, side_images, gaussians, lost: lost + self.lost, plan, times }
+        let (lost, lost_gaussians) = (lost + self.lost_gaussians, self.lost_gaussians);
+        Reconstruction { views, maps, valid, side_images, gaussians, lost, lost_gaussians, plan, times }
     }
 
     /// Point maps of all views on the canvas `[views, S, S]`, in metres.
@@ -322,7 +330,7 @@ impl Run<'_> {
             let part = self.timed(what, |run| {
                 let views: Vec<_> = pair_views
                     .clone()
-                    .map(|v| Seen {
+                    .map(|v| CanvasView {
                         image: images[v],
                         points: points.clone().narrow(0, v, 1),
                         valid: &valid[v],
@@ -345,7 +353,7 @@ impl Run<'_> {
             count(&top.valid)
         ));
         let points = Tensor::from_data(TensorData::new(top.points, [1, side, side, 3]), &self.model.device);
-        let view = Seen { image: &top.image, points, valid: &top.valid };
+        let view = CanvasView { image: &top.image, points, valid: &top.valid };
         Some(uncorrected(&view, Limits::of(&config.regressor, 0)))
     }
 
@@ -353,7 +361,7 @@ impl Run<'_> {
         self.timed("activations", |run| {
             let (gaussians, lost) = assemble(&run.model.config, parts, &run.model.device);
             run.plan.push(format!("{} Gaussians", gaussians.len()));
-            run.lost = lost;
+            run.lost_gaussians = lost;
             if lost > 0 {
                 run.plan.push(format!("{lost} Gaussians left out: their attributes are not finite"));
             }

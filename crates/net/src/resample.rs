@@ -6,7 +6,7 @@ use burn::tensor::ops::AvgPoolOptions;
 
 use crate::config::Downsample;
 
-/// Shrinks `[B, C, H, W]` by the whole number `factor`.
+/// Shrinks `[B, C, H, W]` by `factor`, a divisor of H and W.
 pub fn shrink(x: Tensor<4>, factor: usize, method: Downsample) -> Tensor<4> {
     if factor == 1 {
         return x;

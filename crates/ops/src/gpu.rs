@@ -94,7 +94,7 @@ impl<B: ConvolutionBackend, C: CheckpointStrategy> ConvolutionBackend for Autodi
 }
 
 /// Whether `x` is on a GPU and has gradients.
-pub fn is_trained_on<const D: usize>(x: &Tensor<D>) -> bool {
+pub fn is_tracked_on_gpu<const D: usize>(x: &Tensor<D>) -> bool {
     let device = x.device();
     device.is_autodiff() && device.inner().identity().is_some()
 }

@@ -14,11 +14,11 @@ use burn::tensor::{FloatDType, Tensor};
 use crate::buffers::give;
 use crate::op::{self, Kept, Kernel};
 use crate::train::{Conv1x1, Conv3x3, Gradients, LayerNorm, Linear, Statistics, Unfolded, Wanted};
-use crate::{gpu, has_kernels, in_f32, is_half, is_trained_fast};
+use crate::{gpu, has_kernels, in_f32, is_bf16, is_trained_fast};
 
 /// `[B, N, inputs]` → `[B, N, outputs]`.
 pub fn linear(layer: &nn::Linear, x: Tensor<3>) -> Tensor<3> {
-    if gpu::is_trained_on(&x) {
+    if gpu::is_tracked_on_gpu(&x) {
         let y = burn::tensor::module::linear(x, layer.weight.val(), None);
         return match bias(&layer.bias) {
             Some(bias) => y.clone() + bias.unsqueeze::<3>().expand(y.dims()),
@@ -39,14 +39,14 @@ pub(crate) fn linear_gelu(layer: &nn::Linear, x: Tensor<3>) -> Tensor<3> {
 }
 
 fn linear_sizes(layer: &nn::Linear, x: &Tensor<3>) -> (Linear, [usize; 3]) {
-    let ([b, n, _], [inputs, outputs], half) = (x.dims(), layer.weight.dims(), is_half(&layer.weight));
+    let ([b, n, _], [inputs, outputs], half) = (x.dims(), layer.weight.dims(), is_bf16(&layer.weight));
     (Linear { rows: b * n, inputs, outputs, transposed: false, half }, [b, n, outputs])
 }
 
 /// Layer normalisation of tokens `[B, N, C]`. `epsilon` is that of the layer, whose field is private.
 pub fn layer_norm(layer: &nn::LayerNorm, epsilon: f64, x: Tensor<3>) -> Tensor<3> {
     let (weight, shape) = (layer.gamma.val(), x.dims());
-    if let Some(bias) = layer.beta.as_ref().filter(|_| gpu::is_trained_on(&x)) {
+    if let Some(bias) = layer.beta.as_ref().filter(|_| gpu::is_tracked_on_gpu(&x)) {
         let affine = [weight, bias.val()].map(|parameter| parameter.unsqueeze::<3>().expand(shape));
         return in_f32(x, |x| normalised(x, epsilon, affine));
     }
@@ -63,14 +63,15 @@ fn normalised(x: Tensor<3>, epsilon: f64, [weight, bias]: [Tensor<3>; 2]) -> Ten
     centred / (variance + epsilon).sqrt() * weight + bias
 }
 
-/// A convolution of images `[B, C, H, W]`, or, where `rectified`, of max(x, 0). The margin of zeros is half a kernel wide.
+/// A convolution of images `[B, C, H, W]`, or, where `rectified`, of max(x, 0). Layers without dilation and groups must have a padding of half
+/// a kernel.
 pub fn conv2d(layer: &Conv2d, x: Tensor<4>, rectified: bool) -> Tensor<4> {
     let ([batch, inputs, height, width], [outputs, _, rows, columns]) = (x.dims(), layer.weight.dims());
     let (weight, bias) = (layer.weight.val(), bias(&layer.bias));
-    let half = is_half(&layer.weight);
+    let half = is_bf16(&layer.weight);
     let is_plain = layer.groups == 1 && layer.dilation == [1, 1];
     let [down, across] = layer.stride;
-    if is_plain && rows == columns && rows % 2 == 1 && down == across && gpu::is_trained_on(&x) {
+    if is_plain && rows == columns && rows % 2 == 1 && down == across && gpu::is_tracked_on_gpu(&x) {
         let dtype = x.dtype();
         let x = if rectified { relu(x) } else { x };
         let y = gpu::convolve(x.cast(weight.dtype()), weight, down);
@@ -114,7 +115,7 @@ pub fn enlarge(layer: &ConvTranspose2d, x: Tensor<4>) -> Tensor<4> {
     let weight: Tensor<2> = layer.weight.val().reshape([inputs, squares]).transpose();
     let bias =
         layer.bias.as_ref().map(|bias| bias.val().reshape([outputs, 1]).repeat_dim(1, s * s).flatten(0, 1));
-    let (pixels, half) = (height * width, is_half(&layer.weight));
+    let (pixels, half) = (height * width, is_bf16(&layer.weight));
     let sizes = Conv1x1 { batch, inputs, outputs: squares, pixels, rectified: false, half };
     run(sizes, [batch, outputs, s, s, height, width], x, weight, bias).permute([0, 1, 4, 2, 5, 3]).reshape([
         batch,
@@ -134,7 +135,7 @@ pub fn patches(layer: &Conv2d, x: Tensor<4>) -> Tensor<3> {
     assert_eq!(layer.stride, [side; 2], "the kernel is as large as the stride");
     let (rows, columns, inputs) = (height / side, width / side, channels * side * side);
     let patches = x.reshape([batch, channels, rows, side, columns, side]).permute([0, 2, 4, 1, 3, 5]);
-    let half = is_half(&layer.weight);
+    let half = is_bf16(&layer.weight);
     let sizes = Linear { rows: batch * rows * columns, inputs, outputs, transposed: true, half };
     let x: Tensor<2> = patches.reshape([sizes.rows, inputs]);
     run(sizes, [batch, rows * columns, outputs], x, layer.weight.val(), bias(&layer.bias))

@@ -60,19 +60,19 @@ pub fn as_weight<const D: usize, const W: usize>(x: Tensor<D>, weight: &Param<Te
 }
 
 /// Whether a layer's weight is bf16: its products are, too.
-pub fn is_half<const D: usize>(weight: &Param<Tensor<D>>) -> bool {
+pub fn is_bf16<const D: usize>(weight: &Param<Tensor<D>>) -> bool {
     weight.val().dtype() == DType::BF16
 }
 
 /// Runs `compute` in f32 for tensors of 16 bits: norms, rotations.
 pub fn in_f32<const D: usize>(x: Tensor<D>, compute: impl FnOnce(Tensor<D>) -> Tensor<D>) -> Tensor<D> {
     let dtype = x.dtype();
-    let is_half = matches!(dtype, DType::F16 | DType::BF16);
-    if is_half { compute(x.cast(FloatDType::F32)).cast(dtype) } else { compute(x) }
+    let is_narrow = matches!(dtype, DType::F16 | DType::BF16);
+    if is_narrow { compute(x.cast(FloatDType::F32)).cast(dtype) } else { compute(x) }
 }
 
 /// softmax(rope(q) · rope(k)ᵀ / √head_dim) · v, heads side by side in the channels: `q` `[B, N, C]`, `k` and `v`
-/// `[B, M, C]` → `[B, N, C]`; both sides share one grid, hence one table.
+/// `[B, M, C]` → `[B, N, C]`; both sides share one grid, hence one table. With `half`, products are in bf16 on CPUs with instructions for it.
 pub fn rotary_attention(
     q: Tensor<3>,
     k: Tensor<3>,

@@ -27,7 +27,7 @@ pub fn orthogonalised(matrix: Vec<f32>, [rows, columns]: [usize; 2]) -> Vec<f32>
     let strides = if is_tall { [m, 1] } else { [1, n] };
     let norm = matrix.iter().map(|x| f64::from(*x).powi(2)).sum::<f64>().sqrt() as f32;
     let scale = norm.max(MIN_NORM).recip();
-    let x: Vec<f32> = matrix.iter().map(|v| rounded(v * scale)).collect();
+    let x: Vec<f32> = matrix.iter().map(|v| flushed(v * scale)).collect();
     let [mut gram, mut correction, mut next, mut all] = [(); 4].map(|()| vec![0.0; m * m]);
     let [a, b, c] = COEFFICIENTS;
     let product = |lhs: &[f32], rhs: &[f32], out: &mut [f32]| {
@@ -36,16 +36,16 @@ pub fn orthogonalised(matrix: Vec<f32>, [rows, columns]: [usize; 2]) -> Vec<f32>
     };
     let transposed = Right::Plain((&x, [strides[1], strides[0]]));
     Multiply { size: [m, m, n], lhs: (&x, strides), rhs: &transposed, add: false }.write(&mut gram, m);
-    gram.iter_mut().for_each(|value| *value = rounded(*value));
+    gram.iter_mut().for_each(|value| *value = flushed(*value));
     // The product of all Q begins with 1.
     all.iter_mut().step_by(m + 1).for_each(|diagonal| *diagonal = 1.0);
     for step in 1..=STEPS {
         product(&gram, &gram, &mut correction);
-        correction.iter_mut().zip(&gram).for_each(|(s, g)| *s = rounded(b * g + c * *s));
+        correction.iter_mut().zip(&gram).for_each(|(s, g)| *s = flushed(b * g + c * *s));
         for (matrix, times) in [(&mut all, 1), (&mut gram, if step < STEPS { 2 } else { 0 })] {
             for _ in 0..times {
                 product(&correction, matrix, &mut next);
-                matrix.iter_mut().zip(&next).for_each(|(value, next)| *value = rounded(a * *value + next));
+                matrix.iter_mut().zip(&next).for_each(|(value, next)| *value = flushed(a * *value + next));
             }
         }
     }
@@ -61,8 +61,8 @@ pub fn orthogonalised(matrix: Vec<f32>, [rows, columns]: [usize; 2]) -> Vec<f32>
     out
 }
 
-/// Without [`NEGLIGIBLE`] values.
-fn rounded(value: f32) -> f32 {
+/// 0 for a [`NEGLIGIBLE`] value.
+fn flushed(value: f32) -> f32 {
     if value.abs() < NEGLIGIBLE { 0.0 } else { value }
 }
 

@@ -14,7 +14,7 @@ use burn::backend::{Backend, Dispatch, ExtensionType, Flex, NdArray, TensorMetad
 use burn::tensor::{Device, Int, Shape, Tensor, TensorData};
 use burn_cubecl::CubeBackend;
 
-use crate::gpu::is_trained_on;
+use crate::gpu::is_tracked_on_gpu;
 
 /// A table `[N, C]`, or rows of it.
 #[derive(ExtensionType, Clone, Debug)]
@@ -86,7 +86,7 @@ impl<B: RowsBackend, C: CheckpointStrategy> RowsBackend for Autodiff<B, C> {
 /// The `rows` `[M, C]` of a table `[N, C]`. A row may be taken more than once only if it is constant: on GPUs its gradient is
 /// that of the last one.
 pub fn taken(table: Tensor<2>, rows: &[i32]) -> Tensor<2> {
-    if is_trained_on(&table) {
+    if is_tracked_on_gpu(&table) {
         return taken_once(table, rows);
     }
     table.clone().select(0, indices(rows, &table.device()))

@@ -16,7 +16,7 @@ pub struct Gaussians {
     pub scales: Tensor<2>,
     /// Opacities `[N]` in [0, 1].
     pub opacities: Tensor<1>,
-    /// Colours `[N,3]` (red, green, blue) in [0, 1].
+    /// Colours `[N,3]` (red, green, blue), 0 black, 1 white; they may lie beyond.
     pub colors: Tensor<2>,
 }
 
@@ -77,7 +77,7 @@ impl Gaussians {
         self
     }
 
-    /// The whole set so many times as large, seen from the origin.
+    /// Scales the whole set by `factor` about the origin.
     pub fn scaled(mut self, factor: f64) -> Self {
         self.means = self.means * factor;
         self.scales = self.scales * factor;
@@ -100,7 +100,7 @@ impl Gaussians {
     }
 }
 
-/// Points `[N,3]` times a matrix, plus a translation.
+/// M·p + t for each row p of `points` `[N,3]`.
 pub fn affine(points: Tensor<2>, matrix: &DMat3, translation: DVec3) -> Tensor<2> {
     // Row vectors: (M·p)ᵀ = pᵀ·Mᵀ, and glam's columns are the rows of Mᵀ.
     let rows = matrix.to_cols_array_2d().map(|column| column.map(|v| v as f32));

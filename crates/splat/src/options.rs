@@ -13,12 +13,12 @@ pub const MIN_TRANSMITTANCE: f32 = 1e-4;
 /// Options of a render. Start from a preset and change fields.
 #[derive(Debug, Clone)]
 pub struct RenderOptions {
-    /// Largest α of a single splat, in (0, 1). Bounds 1/(1 − α) in the gradient.
+    /// Largest α of a single splat, above 0 and below 1 − [`MIN_TRANSMITTANCE`]. Bounds 1/(1 − α) in the gradient.
     pub max_alpha: f32,
     /// Added to both diagonal entries of the projected covariance, in square pixels: a splat never gets thinner than
-    /// a pixel's own footprint.
+    /// a pixel's own footprint. Above 0, at most 1e6.
     pub blur: f32,
-    /// Gaussians whose centre is at this camera depth (metres) or nearer are left out.
+    /// Gaussians whose centre is at this camera depth (metres, above 0) or nearer are left out.
     pub near: f32,
     /// Multiply opacity by √(det Σ'_raw / det Σ'), which keeps the total weight of a splat that the blur enlarges.
     pub antialiased: bool,
@@ -26,8 +26,8 @@ pub struct RenderOptions {
     pub depth: bool,
     /// Colour `[3]` behind the Gaussians; differentiable. `None` is black and costs nothing.
     pub background: Option<Tensor<1>>,
-    /// Largest number of pairs of a splat and a 16×16 tile in one view, on which the time of a render depends. More are refused
-    /// before any of them is drawn.
+    /// Largest number of pairs of a splat and a 16×16 tile, on which the time of a render depends: in each view on the CPU, in the mean
+    /// over the views on a GPU. More are refused before any of them is drawn.
     pub max_intersections: u64,
 }
 

@@ -76,7 +76,7 @@ impl Stored {
     /// Writes the kind of file of `path`'s extension, whole or not at all.
     ///
     /// # Errors
-    /// [`SplatError::NotFinite`]; [`SplatError::File`] for values that an SPZ cannot hold, or if the file cannot be written.
+    /// [`SplatError::NotFinite`]; [`SplatError::File`] for what an SPZ, GLB or SOG cannot hold, or if the file cannot be written.
     /// `path` is then left as it was.
     pub fn write(&self, path: &Path) -> Result<(), SplatError> {
         let kind = Kind::of(path);

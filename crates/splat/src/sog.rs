@@ -75,7 +75,7 @@ pub(crate) fn write(stored: &Stored, out: &mut impl Write) -> io::Result<()> {
     // The quaternion of the turn, k, times (w, x, y, z).
     let quaternion = |i: usize| {
         let [w, x, y, z] = [3, 4, 5, 6].map(|column| stored.columns[column][i]);
-        smallest_three([-z, -y, x, w])
+        pack_smallest_three([-z, -y, x, w])
     };
     let color = |i: usize| {
         let [r, g, b] = code(&colors, 11, i);
@@ -135,7 +135,7 @@ fn picture(order: &[u32], [width, height]: [usize; 2], of: &dyn Fn(usize) -> [u8
 }
 
 /// A quaternion (w, x, y, z) without its largest component, in the steps of bytes.
-fn smallest_three(q: [f32; 4]) -> [u8; 4] {
+fn pack_smallest_three(q: [f32; 4]) -> [u8; 4] {
     let q = q.map(f64::from);
     let length = q.iter().map(|v| v * v).sum::<f64>().sqrt();
     let q = if length > 0.0 { q.map(|v| (v / length) as f32) } else { [1.0, 0.0, 0.0, 0.0] };

@@ -99,7 +99,7 @@ pub(crate) fn read(input: impl Read, length: u64) -> Result<Stored, Problem> {
     let mut quaternions = [(); 4].map(|()| Vec::with_capacity(n));
     for packed in rotations.chunks_exact(size) {
         let q = match *packed {
-            [a, b, c, d] => smallest_three(u32::from_le_bytes([a, b, c, d])),
+            [a, b, c, d] => unpack_smallest_three(u32::from_le_bytes([a, b, c, d])),
             _ => first_three([packed[0], packed[1], packed[2]]),
         };
         quaternions.iter_mut().zip(q).for_each(|(column, value)| column.push(value));
@@ -211,7 +211,7 @@ pub(crate) fn write(stored: &Stored, out: &mut impl Write) -> io::Result<()> {
     rows(11..14, &each(|v| 255.0 * (v * COLOR_SCALE + 0.5)))?;
     rows(7..10, &each(|v| 16.0 * (v + 10.0)))?;
     rows(3..7, &|row, block| {
-        block.extend_from_slice(&packed([row[0], row[1], row[2], row[3]]).to_le_bytes());
+        block.extend_from_slice(&pack_smallest_three([row[0], row[1], row[2], row[3]]).to_le_bytes());
     })?;
     let bands = stored.coefficients - 1;
     rows(14..14 + 3 * bands, &|row, block| {
@@ -288,7 +288,7 @@ const COMPONENT: u32 = (1 << 9) - 1;
 
 /// A quaternion (w, x, y, z) of version 3: the index of the largest of (x, y, z, w), and signs and sizes of the others
 /// over √½.
-fn smallest_three(mut packed: u32) -> [f32; 4] {
+fn unpack_smallest_three(mut packed: u32) -> [f32; 4] {
     let largest = (packed >> 30) as usize;
     let mut q = [0.0_f32; 4];
     let mut sum = 0.0;
@@ -302,8 +302,8 @@ fn smallest_three(mut packed: u32) -> [f32; 4] {
     [q[3], q[0], q[1], q[2]]
 }
 
-/// The inverse of [`smallest_three`], of a quaternion of any length; one of length 0 is no rotation.
-fn packed(wxyz: [f32; 4]) -> u32 {
+/// The inverse of [`unpack_smallest_three`], of a quaternion of any length; one of length 0 is no rotation.
+fn pack_smallest_three(wxyz: [f32; 4]) -> u32 {
     let length = wxyz.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
     let [w, x, y, z] =
         if length > 0.0 { wxyz.map(|v| (f64::from(v) / length) as f32) } else { [1.0, 0.0, 0.0, 0.0] };

@@ -15,7 +15,7 @@ use snapsnap_base::config::Schema;
 use snapsnap_net::network::{Grid, Input, PointPredictor};
 use snapsnap_net::precision::Precision;
 use snapsnap_net::regressor::Statistics;
-use snapsnap_net::weights::{NamedVisitor, Path, random_predictor, random_regressors, visit_named};
+use snapsnap_net::weights::{NamedVisitor, ParameterPath, random_predictor, random_regressors, visit_named};
 use snapsnap_train::config::TrainConfig;
 
 #[global_allocator]
@@ -59,7 +59,7 @@ fn main() {
 fn frozen(predictor: PointPredictor, trained: &[&str]) -> PointPredictor {
     struct Frozen<'a>(&'a [&'a str], Vec<ParamId>);
     impl NamedVisitor for Frozen<'_> {
-        fn visit<const D: usize>(&mut self, path: &Path, parameter: &Param<Tensor<D>>) {
+        fn visit<const D: usize>(&mut self, path: &ParameterPath, parameter: &Param<Tensor<D>>) {
             let name = path.name();
             if !self.0.iter().any(|part| name.starts_with(part)) {
                 self.1.push(parameter.id);

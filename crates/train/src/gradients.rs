@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use burn::module::Param;
 use burn::tensor::{Device, Gradients, Tensor};
-use snapsnap_net::weights::{NamedVisitor, Path};
+use snapsnap_net::weights::{NamedVisitor, ParameterPath};
 use snapsnap_ops::host;
 
 use crate::networks::{Networks, Rows, moved, row};
@@ -17,7 +17,7 @@ pub fn collect(networks: &Networks, gradients: &mut Gradients) -> Rows {
         rows: Rows,
     }
     impl NamedVisitor for Collect<'_> {
-        fn visit<const D: usize>(&mut self, path: &Path, parameter: &Param<Tensor<D>>) {
+        fn visit<const D: usize>(&mut self, path: &ParameterPath, parameter: &Param<Tensor<D>>) {
             if let Some(gradient) = parameter.val().grad_remove(self.gradients) {
                 self.rows.insert(path.name(), gradient.reshape([-1]));
             }

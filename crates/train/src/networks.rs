@@ -7,7 +7,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use snapsnap_net::network::PointPredictor;
 use snapsnap_net::regressor::Regressor;
 use snapsnap_net::weights::schema::SIDE;
-use snapsnap_net::weights::{NamedMapper, NamedVisitor, Path, map_named, visit_named};
+use snapsnap_net::weights::{NamedMapper, NamedVisitor, ParameterPath, map_named, visit_named};
 use snapsnap_ops::host;
 
 /// Networks whose parameters are trained.
@@ -62,7 +62,7 @@ impl Networks {
     pub(crate) fn parameters(&self) -> Vec<Parameter> {
         struct Collect(Vec<Parameter>);
         impl NamedVisitor for Collect {
-            fn visit<const D: usize>(&mut self, path: &Path, parameter: &Param<Tensor<D>>) {
+            fn visit<const D: usize>(&mut self, path: &ParameterPath, parameter: &Param<Tensor<D>>) {
                 let values = parameter.val().without_autodiff();
                 let shape = values.dims().to_vec();
                 let values = values.reshape([-1]);
@@ -99,7 +99,11 @@ impl Networks {
     pub fn with_rows(self, rows: &Rows) -> Self {
         struct Replace<'a>(&'a Rows);
         impl NamedMapper for Replace<'_> {
-            fn map<const D: usize>(&mut self, path: &Path, parameter: Param<Tensor<D>>) -> Param<Tensor<D>> {
+            fn map<const D: usize>(
+                &mut self,
+                path: &ParameterPath,
+                parameter: Param<Tensor<D>>,
+            ) -> Param<Tensor<D>> {
                 let Some(row) = self.0.get(&path.name()) else {
                     return parameter;
                 };

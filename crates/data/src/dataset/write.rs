@@ -49,12 +49,13 @@ impl Folder {
         })
     }
 
-    /// Adds a subject from the source `origin`. `draw` renders the view of each of `cameras` (pixel centres at +½, side
-    /// of the set). The subject appears when all files are written. Several runs may write into one data set at once.
+    /// Adds a subject from the source `origin`. `cameras` have the set's side and pixel centres. `draw` renders the view of each, with
+    /// pixel centres at +½; with `high_resolution` also at twice the side. The subject appears when all files are written. Several runs may
+    /// write into one data set at once.
     ///
     /// # Errors
-    /// [`FileError::Write`]; [`FileError::Unsuitable`] for an empty view, or, in the authors' layout, for a depth below
-    /// half a metre.
+    /// [`FileError::Write`]; [`FileError::Unsuitable`] for a name that is no file name, an empty view, or, in the authors' layout, a depth
+    /// of half a metre or less.
     ///
     /// # Panics
     /// If the number or the size of the cameras differs from the set's views.

@@ -6,16 +6,18 @@ use super::{Cutout, Rect};
 
 /// Mask value from which a pixel belongs to the person.
 const PERSON: u8 = 128;
-/// Share of a border from which the mask touches it, and number of borders that no person touches.
+/// Share of a border from which the mask touches it.
 const TOUCHED: f32 = 0.05;
+/// Number of borders that no person touches.
 const BORDERS: usize = 3;
 /// Largest width of a person as a share of the height. Outstretched arms reach about 1.
 const WIDEST: f32 = 1.2;
 /// Least overlap (intersection over union) of the front's silhouette and the mirrored back's, scaled to one height. Right pairs have 0.63 and
 /// more (docs/notes/photographs.md).
 const OVERLAP: f32 = 0.6;
-/// Rows of the face below the top of the person's box, and columns on either side of the head's middle, as shares of the height.
+/// Rows of the face below the top of the person's box, as shares of the height.
 const FACE: [f32; 2] = [0.03, 0.11];
+/// Columns of the face on either side of the head's middle, as a share of the height.
 const HALF_FACE: f32 = 0.03;
 /// Difference of the shares of skin-coloured pixels from which the pictures may be swapped.
 const SWAPPED: f32 = 0.5;

@@ -6,10 +6,11 @@ use image::{GrayImage, Rgb, RgbImage};
 
 use super::Rect;
 
-/// Width of the rim in pixels for a person of [`HEIGHT`] pixels, and its limit in pixels of the photograph. Masks that are too large
-/// by two thirds of it are corrected.
+/// Width of the rim in pixels for a person of [`HEIGHT`] pixels. Masks that are too large by two thirds of it are corrected.
 const REACH: u32 = 6;
+/// Height of the person that [`REACH`] refers to, in pixels.
 const HEIGHT: u32 = 739;
+/// Largest width of the rim, in pixels of the photograph.
 const MAX_REACH: u32 = 64;
 /// Least distance of the colours of person and background at which they are told apart. Channels are 0 to 1.
 const DISTINCT: f32 = 0.12;
@@ -21,14 +22,15 @@ const SHOWN: f32 = 0.4;
 const OFF_LINE: (f32, f32) = (0.35, 0.03);
 /// Up to this share of the background, a pixel is the person's; from the second on, it is the background's.
 const MIXED: (f32, f32) = (0.1, 0.9);
-/// Distance of colours that count as one, and the least share of the outline that has its median colour if it has but one.
+/// Distance of colours that count as one.
 const ALIKE: f32 = 0.08;
+/// Least share of the outline that has its median colour, if it has but one.
 const UNIFORM: f32 = 0.6;
 /// Largest share of the person behind the outline that may have that colour as well.
 const WORN: f32 = 0.3;
 /// Mask value from which a pixel is the person's.
 const INSIDE: u8 = 128;
-/// An outline longer than this, in pixels and as a share of the person's box, is no person's.
+/// An outline longer than both the first, in pixels, and the box's area divided by the second is no person's.
 const LONGEST: (usize, usize) = (50_000, 20);
 
 /// Takes the background out of the rim of `mask` and of the colours there. Returns the number of pixels that left the mask.

@@ -3,8 +3,9 @@
 use image::imageops::{self, FilterType};
 use image::{GrayImage, Luma};
 
-/// Value of a pixel without a stroke, and how far browsers that add noise to pictures may be from it.
+/// Value of a pixel without a stroke.
 const UNTOUCHED: u8 = 128;
+/// How far browsers that add noise to pictures may be from it.
 const NOISE: u8 = 8;
 
 /// Lays strokes of any size over a mask: white keeps, black removes, [`UNTOUCHED`] changes nothing, and values between are soft edges.

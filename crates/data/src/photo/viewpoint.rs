@@ -100,14 +100,15 @@ impl Default for Viewpoint {
 }
 
 impl Viewpoint {
-    /// The distance from which a lens sees a person of this size: `focal` is in millimetres of 35 mm film, `picture` the photograph's
+    /// The distance in metres from which a lens sees a person of this size: `focal` is in millimetres of 35 mm film, `picture` the photograph's
     /// width and height, and `mapping` its map to a canvas of `side` pixels.
     pub fn distance(focal: f64, picture: [u32; 2], mapping: &Mapping, side: usize) -> f64 {
         let Orbit { focal: nominal, radius, .. } = Orbit::default();
         radius * pixels(focal, picture) * mapping.scale.y / (nominal * side as f64)
     }
 
-    /// How far a camera whose optical axis looks down by `pitch` degrees looks down at the body's middle.
+    /// How far, in degrees, a camera whose optical axis looks down by `pitch` degrees looks down at the body's middle. The other arguments
+    /// are those of [`Self::distance`].
     pub fn elevation(pitch: f64, focal: f64, picture: [u32; 2], mapping: &Mapping, side: usize) -> f64 {
         let principal = Orbit::default().camera(side as u32).principal_point;
         let below = mapping.source(principal).y - f64::from(picture[1]) / 2.0;

@@ -48,17 +48,17 @@ impl Handling {
         .or_else(|| outside(background))
     }
 
-    /// The changed photograph number `place` of a person, and its mask.
+    /// The changed photograph number `index` of a person, and its mask.
     pub(super) fn apply(
         &self,
-        place: usize,
+        index: usize,
         mut color: RgbImage,
         mut mask: GrayImage,
     ) -> (RgbImage, GrayImage) {
         if self.grey {
             flatten(&mut color, &mask);
         }
-        let stops = if place == 0 { 0.5 * self.exposure } else { self.back_exposure - 0.5 * self.exposure };
+        let stops = if index == 0 { 0.5 * self.exposure } else { self.back_exposure - 0.5 * self.exposure };
         if stops != 0.0 {
             let gain = stops.exp2();
             color.iter_mut().for_each(|v| *v = (f32::from(*v) * gain).round().min(255.0) as u8);
@@ -76,7 +76,7 @@ impl Handling {
         }
         if let Some(person) = Rect::around(&mask, 1).filter(|_| self.cut > 0.0) {
             let cut = (self.cut * person.width as f32).round() as u32;
-            let from = if place == 0 { person.x } else { person.x + person.width - cut };
+            let from = if index == 0 { person.x } else { person.x + person.width - cut };
             for (x, _, pixel) in mask.enumerate_pixels_mut() {
                 if (from..from + cut).contains(&x) {
                     pixel.0 = [0];

@@ -217,7 +217,7 @@ impl Source {
             return Err(wrong("has no second surfaces, which `second_depth` needs".into()));
         }
         if config.pair_degrees != OPPOSITE {
-            let steps = between(config.pair_degrees, views);
+            let steps = steps_of(config.pair_degrees, views);
             if folder.description().arrangement != Arrangement::Ring || steps.fract() != 0.0 {
                 let degrees = config.pair_degrees;
                 return Err(wrong(format!(
@@ -262,7 +262,7 @@ impl Source {
         let Description { arrangement, views, .. } = *self.folder.description();
         let mut order = arrangement.four(front, views);
         if self.config.pair_degrees != OPPOSITE {
-            order[1] = (front + between(self.config.pair_degrees, views) as usize) % views;
+            order[1] = (front + steps_of(self.config.pair_degrees, views) as usize) % views;
         }
         order
     }
@@ -319,8 +319,8 @@ impl Source {
     }
 }
 
-/// Views of a ring of `views` from one to that `degrees` further around.
-fn between(degrees: f64, views: usize) -> f64 {
+/// Steps of a ring of `views` that span `degrees`; a fraction if no view is there.
+fn steps_of(degrees: f64, views: usize) -> f64 {
     degrees * views as f64 / 360.0
 }
 

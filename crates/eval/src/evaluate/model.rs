@@ -86,7 +86,8 @@ impl Model {
     }
 
     /// Gaussians of a person seen from the views `inputs`. With more than two photographs, each and the next around the
-    /// circle form a pair, of which the first one's Gaussians are kept, in the frame of its known camera.
+    /// circle form a pair, of which the first one's Gaussians are kept (both photographs' if some were left out), in the frame of its
+    /// known camera.
     ///
     /// # Errors
     /// [`EvalError::Empty`] if no Gaussian came out.
@@ -117,7 +118,7 @@ impl Model {
                 made.gaussians = restoration.person(made.gaussians.clone(), made.photographed());
                 (scale, to_world) = (restoration.scale, restoration.front.world_to_camera.inverse());
             }
-            if count > 1 && made.lost == 0 {
+            if count > 1 && made.lost_gaussians == 0 {
                 // The second photograph is the first one of the next pair.
                 let [first, _] = made.photographed();
                 made.gaussians = first_rows(made.gaussians, first);
@@ -165,7 +166,7 @@ impl Model {
         let pixels: Vec<usize> =
             made.valid.iter().flat_map(|valid| (0..valid.len()).filter(|i| valid[*i])).collect();
         // The last Gaussians may close the top, and belong to no pixel. If some were lost, no pixel is known.
-        let on_grid = |row: usize| match pixels.get(row).filter(|_| made.lost == 0) {
+        let on_grid = |row: usize| match pixels.get(row).filter(|_| made.lost_gaussians == 0) {
             Some(pixel) => [pixel / side, pixel % side].iter().all(|at| at.is_multiple_of(stride)),
             None => row.is_multiple_of(stride * stride),
         };

@@ -125,7 +125,10 @@ impl People {
     }
 }
 
-/// A split of a data set without any change.
+/// The test samples of a split, with unchanged photographs.
+///
+/// # Errors
+/// [`EvalError::File`] without such a split.
 pub fn test_of(folder: &Arc<Folder>, split: Option<Split>) -> Result<Test, EvalError> {
     if let Some(split) = split.filter(|split| !folder.splits().contains(&Some(*split))) {
         let message = format!("has no split `{split}`: change `data.split`");
@@ -180,6 +183,9 @@ pub type Points = (Vec<f32>, Vec<f32>);
 /// Ground-truth points of some views on a canvas of `side` pixels: `[V,S,S,3]` metres in the first view's frame, and
 /// their mask `[V,S,S]`. A pixel of the canvas has the mean of its points, if at least half of it has points. `None` if
 /// `side` is no whole part of the stored side.
+///
+/// # Errors
+/// [`EvalError`] for a file of a view that cannot be read.
 pub fn points(
     test: &Test,
     row: usize,

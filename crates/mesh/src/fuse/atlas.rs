@@ -24,7 +24,7 @@ const IN_VAIN: usize = 10;
 pub struct Texel {
     /// Index into the texture, row by row.
     pub at: u32,
-    /// World metres.
+    /// In the units of [`super::Placing`].
     pub place: Vec3,
     /// Unit vector outwards.
     pub normal: Vec3,

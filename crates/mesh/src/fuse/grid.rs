@@ -8,9 +8,9 @@ use rayon::prelude::*;
 /// Signed distances at the corners of cubes, negative inside. The corners on the border are outside.
 #[derive(Debug, Clone)]
 pub struct Grid {
-    /// Place of the first corner, world metres.
+    /// Place of the first corner, in the units of [`super::Placing`].
     pub origin: Vec3,
-    /// Edge of a cube, metres.
+    /// Edge of a cube, in the same units.
     pub cell: f32,
     /// Corners along x, y and z.
     pub counts: USizeVec3,

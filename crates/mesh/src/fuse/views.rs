@@ -23,11 +23,11 @@ const OTHER_SIDE: f32 = 2.0;
 /// View of one camera.
 pub struct View {
     camera: Camera,
-    /// Centre of the camera, world metres.
+    /// Centre of the camera, in the units of [`super::Placing`], as all lengths here.
     centre: Vec3,
     /// From the world to pixels times depth, and depth.
     projection: Mat4,
-    /// Metres along the optical axis; 0 at pixels without a surface.
+    /// Length along the optical axis; 0 at pixels without a surface.
     depth: Vec<f32>,
     /// Cosine between the surface's normal and the ray; 0 where it is unknown, the surface too flat or seen from inside.
     facing: Vec<f32>,

@@ -76,10 +76,10 @@ choices! {
 
     /// Reference of the regressor's output (docs/method.md, "Attributes").
     RegressorStart {
-        /// Fixed: at zero output a Gaussian has a size of 0.7 mm, opacity ½ and grey colour.
+        /// Fixed: at zero output a Gaussian has a size of 0.7 mm and opacity ½.
         Published,
         /// The point map and the picture: at zero output a Gaussian is round, as large as its point's distance from its
-        /// neighbours asks, opaque, and has the pixel's colour.
+        /// neighbours asks, and has an opacity of 0.9 or more.
         Geometric,
     }
 
@@ -133,7 +133,7 @@ choices! {
         Bf16,
         /// As `Precision::F16`.
         F16,
-        /// In training, bf16 on a CPU with instructions for it, else f32.
+        /// On a CPU with instructions for bf16: bf16 in a training, the weights' own precision in a reconstruction. Elsewhere f32.
         Auto,
     }
 }

@@ -119,6 +119,14 @@ fn where_all_distances_overflow_the_first_point_is_nearest() {
 }
 
 #[test]
+fn points_that_are_not_finite_are_no_neighbours() {
+    let far = [f32::NAN, f32::INFINITY].map(|x| [x, 0.0, 0.0]);
+    assert!(Neighbours::new(&[]).is_none() && Neighbours::new(&far).is_none());
+    let all = [far[0], [5.0; 3], far[1], [1.0; 3]];
+    assert_eq!(Neighbours::new(&all).expect("two points").nearest(&[[0.0; 3], [4.0; 3]]), [3, 1]);
+}
+
+#[test]
 fn queries_that_are_not_finite_get_the_first_point_and_cost_nothing() {
     let neighbours = Neighbours::new(&ball(1000, 24)).expect("points");
     let mut queries = vec![[f32::NAN, 0.0, 0.0], [0.0, f32::INFINITY, 0.0], [f32::NEG_INFINITY; 3]];

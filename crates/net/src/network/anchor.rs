@@ -27,7 +27,7 @@ pub(super) fn nominal(view: View, pair_degrees: f64, side: usize) -> (Camera, Ri
 
 /// The rays of a view's pixels in a window of a canvas of `side`² pixels.
 pub(super) struct Rays {
-    /// Directions in the front camera's frame `[1, h, w, 3]`, as long as a metre of depth.
+    /// Directions in the front camera's frame `[1, h, w, 3]`, scaled to a depth of 1 in the view's camera.
     pub directions: Tensor<4>,
     /// Depths of the anchors `[1, h, w, 1]`, metres.
     pub depths: Tensor<4>,

@@ -6,7 +6,7 @@ use burn::nn::{Linear, LinearConfig};
 use burn::tensor::{Device, Tensor};
 
 use snapsnap_ops::layers::linear;
-use snapsnap_ops::{Rope, is_half, rotary_attention, rotary_self_attention};
+use snapsnap_ops::{Rope, is_bf16, rotary_attention, rotary_self_attention};
 
 /// Self-attention; `qkv`'s output rows are all queries, all keys, all values.
 #[derive(Module, Debug)]
@@ -29,7 +29,7 @@ impl SelfAttention {
     pub(crate) fn forward(&self, x: Tensor<3>, rope: &Rope) -> Tensor<3> {
         linear(
             &self.proj,
-            rotary_self_attention(linear(&self.qkv, x), rope, self.heads, is_half(&self.proj.weight)),
+            rotary_self_attention(linear(&self.qkv, x), rope, self.heads, is_bf16(&self.proj.weight)),
         )
     }
 }
@@ -53,6 +53,6 @@ impl CrossAttention {
     /// Queries `x` `[B, N, dim]`, memory `y` `[B, M, dim]` → `[B, N, dim]`.
     pub(crate) fn forward(&self, x: Tensor<3>, y: Tensor<3>, rope: &Rope) -> Tensor<3> {
         let (q, k, v) = (linear(&self.projq, x), linear(&self.projk, y.clone()), linear(&self.projv, y));
-        linear(&self.proj, rotary_attention(q, k, v, rope, self.heads, is_half(&self.proj.weight)))
+        linear(&self.proj, rotary_attention(q, k, v, rope, self.heads, is_bf16(&self.proj.weight)))
     }
 }

@@ -81,7 +81,7 @@ impl Completion {
         let [there, inside] = [host(points.clone().detach()), host(photographed.masks.clone())];
         let seen = [View::Right, View::Left].map(|view| {
             let rows = Visible::new(view, self.side, photographed.window, [&there, &inside], b);
-            Seen::new(view, self.side, photographed.window, (points.clone(), table.clone()), rows)
+            SideInput::new(view, self.side, photographed.window, (points.clone(), table.clone()), rows)
         });
         let images: Vec<Tensor<4>> = seen
             .iter()
@@ -91,7 +91,7 @@ impl Completion {
         let levels = self.body.encode(Tensor::cat(images, 0), Some(self.row_means(photographed.levels)));
         let out = self.body.out(self.body.features(&levels));
         let out = [out.clone().narrow(0, 0, b), out.narrow(0, b, b).flip([3])];
-        let raw = |layer: usize, seen: &Seen, out: &Tensor<4>| {
+        let raw = |layer: usize, seen: &SideInput, out: &Tensor<4>| {
             let known = seen.depths[layer].clone();
             let known = known.clone() / delta.clone().reshape([1; 4]).expand(known.dims());
             let beside = known + out.clone().narrow(1, 2 * layer, 1);
@@ -128,16 +128,16 @@ impl Completion {
 }
 
 /// The points of both photographs in the picture of a side.
-struct Seen {
+struct SideInput {
     /// Input of the network `[B, INPUTS, h, w]`.
     image: Tensor<4>,
     /// Depths of the nearest and of a second point beside the anchor `[B, 1, h, w]`, metres; 0 where there is no point.
     depths: [Tensor<4>; 2],
-    /// Directions of the rays `[1, h, w, 3]`, as long as a metre of depth.
+    /// Directions of the rays `[1, h, w, 3]`, scaled to a depth of 1 in the view's camera.
     directions: Tensor<4>,
 }
 
-impl Seen {
+impl SideInput {
     /// Of `points` `[B, N, 3]` and the table of their channels.
     fn new(
         view: View,
@@ -182,7 +182,7 @@ mod tests {
 
     use super::*;
     use crate::config::{Body, Config};
-    use crate::names::{NamedMapper, Path, map_named};
+    use crate::names::{NamedMapper, ParameterPath, map_named};
     use crate::network::anchor::nominal;
     use crate::network::{Input, PointMap, anchors};
     use crate::weights::random_predictor;
@@ -300,7 +300,7 @@ mod tests {
             2,
         );
         // Two channels tell which photograph a point is of; here each counts a half.
-        let seen = Seen::new(View::Right, SIDE, &window, (points.clone(), table * 0.5), rows);
+        let seen = SideInput::new(View::Right, SIDE, &window, (points.clone(), table * 0.5), rows);
         let gradients = seen.depths[0].clone().sum().backward();
         let gradient = host(points.grad(&gradients).expect("a gradient"));
         let axis = nominal(View::Right, OPPOSITE, SIDE).1.rotation.row(2).as_vec3().to_array();
@@ -314,7 +314,11 @@ mod tests {
     fn uncorrected(both_ways: bool, b: usize) -> Vec<(View, Vec<f32>)> {
         struct Nothing;
         impl NamedMapper for Nothing {
-            fn map<const D: usize>(&mut self, path: &Path, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
+            fn map<const D: usize>(
+                &mut self,
+                path: &ParameterPath,
+                param: Param<Tensor<D>>,
+            ) -> Param<Tensor<D>> {
                 match path.name().contains("completion.decoder.conv_out") {
                     true => param.map(|values| values.zeros_like()),
                     false => param,

@@ -34,7 +34,7 @@ pub enum View {
 }
 
 impl View {
-    /// All views in the order of the heads, of the fixtures and of the concatenated Gaussians.
+    /// All views without second surfaces, in the order of the heads, of the fixtures and of the concatenated Gaussians.
     pub const ALL: [Self; 4] = [Self::Front, Self::Back, Self::Right, Self::Left];
     /// The same, followed by the second surfaces of the sides (`network.second_layer`).
     pub const WITH_SECOND: [Self; 6] =

@@ -75,9 +75,9 @@ fn opposite_camera(pairs: &[(DVec3, DVec2)]) -> RigidTransform {
     const STEPS: usize = 3;
     /// Standard deviations of the prior: rad around the person's middle, and metres.
     const PRIOR: [f64; 6] = [0.07, 0.07, 0.04, 0.05, 0.05, 0.1];
-    /// Number of independent points that all points together count as, since errors of neighbours are alike, and the error
-    /// of each relative to its distance.
+    /// Number of independent points that all points together count as, since errors of neighbours are alike.
     const COUNT: f64 = 100.0;
+    /// Error of each, relative to its distance.
     const ERROR: f64 = 2e-3;
     /// Largest deviation in standard deviations. Points of an untrained network may ask for more.
     const MOST: f64 = 3.0;

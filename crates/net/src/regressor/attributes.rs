@@ -16,7 +16,7 @@ pub struct Attributes {
     pub scale: Tensor<2>,
     /// Unit quaternions `[N, 4]` (w, x, y, z).
     pub rotation: Tensor<2>,
-    /// `[N, 3]` in [−1, 1].
+    /// `[N, 3]`, −1 black, 1 white. Corrected colours of pixels may lie beyond.
     pub color: Tensor<2>,
     /// Offsets from the point map `[N, 3]`, metres, front camera's axes.
     pub offset: Tensor<2>,

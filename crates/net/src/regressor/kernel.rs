@@ -12,7 +12,7 @@ use snapsnap_ops::unet::{FEATURES, Network, Saved};
 
 use super::statistics::Statistics;
 use super::unet::UNet;
-use crate::names::{NamedVisitor, Path, visit_named};
+use crate::names::{NamedVisitor, ParameterPath, visit_named};
 
 /// One pass of the network.
 #[derive(Debug)]
@@ -78,7 +78,7 @@ fn flat(unet: &UNet, last: &Conv2d) -> (Network, Tensor<1>) {
         values: HashMap<String, Tensor<1>>,
     }
     impl NamedVisitor for Collect {
-        fn visit<const D: usize>(&mut self, path: &Path, parameter: &Param<Tensor<D>>) {
+        fn visit<const D: usize>(&mut self, path: &ParameterPath, parameter: &Param<Tensor<D>>) {
             let (name, values) = (path.name(), parameter.val());
             self.shapes.insert(name.clone(), values.dims().to_vec());
             self.values.insert(name, values.reshape([-1]));

@@ -9,7 +9,7 @@ use rand::{RngCore, SeedableRng};
 
 use super::{FEATURES, Regressor, Statistics};
 use crate::config::Config;
-use crate::weights::{NamedVisitor, Path, random_regressors, visit_named};
+use crate::weights::{NamedVisitor, ParameterPath, random_regressors, visit_named};
 
 /// Relative L2 error of features. Both sum some hundred terms; rounding in f32 stays below a few 1e-6.
 const FEATURE: f64 = 5e-6;
@@ -66,7 +66,7 @@ fn error(got: &[f64], expected: &[f64]) -> f64 {
 fn gradients(regressor: &Regressor, gradients: &Gradients) -> BTreeMap<String, Vec<f64>> {
     struct Collect<'a>(&'a Gradients, BTreeMap<String, Vec<f64>>);
     impl NamedVisitor for Collect<'_> {
-        fn visit<const D: usize>(&mut self, path: &Path, parameter: &Param<Tensor<D>>) {
+        fn visit<const D: usize>(&mut self, path: &ParameterPath, parameter: &Param<Tensor<D>>) {
             let gradient = parameter.val().grad(self.0).expect("every parameter counts");
             self.1.insert(path.name(), values(gradient));
         }

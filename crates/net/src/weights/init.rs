@@ -29,7 +29,7 @@ pub(super) fn draw(spec: &TensorSpec, seed: u64) -> Vec<f32> {
         Init::Uniform(bound) => {
             let mut random = ChaCha8Rng::seed_from_u64(seed);
             random.set_stream(fnv1a(&spec.name));
-            // 24 random bits are every f32 of the form k·2⁻²⁴; centred, so that the mean is 0.
+            // 24 random bits, centred by ½ so that the mean is 0.
             let unit = |bits: u32| ((bits >> 8) as f32 + 0.5) * (1.0 / 8_388_608.0) - 1.0;
             (0..spec.elements()).map(|_| unit(random.next_u32()) * bound).collect()
         }

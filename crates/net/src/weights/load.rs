@@ -10,7 +10,7 @@ use super::file::{WeightFile, not_finite};
 use super::init::draw;
 use super::schema::{self, Part, SIDE, TensorSpec};
 use crate::config::Config;
-use crate::names::{NamedMapper, Path, map_named};
+use crate::names::{NamedMapper, ParameterPath, map_named};
 use crate::network::PointPredictor;
 use crate::regressor::Regressor;
 
@@ -111,7 +111,7 @@ impl Loader<'_> {
 }
 
 impl NamedMapper for Loader<'_> {
-    fn map<const D: usize>(&mut self, path: &Path, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
+    fn map<const D: usize>(&mut self, path: &ParameterPath, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
         let (name, expected) = (path.name(), param.lazy_shape());
         let Some(tensor) = self.read::<D>(&name) else {
             return param;

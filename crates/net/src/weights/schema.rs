@@ -5,7 +5,7 @@ use burn::module::{Module, Param};
 use burn::tensor::{Device, Tensor};
 
 use crate::config::{Config, RegressorStart};
-use crate::names::{NamedVisitor, Path, visit_named};
+use crate::names::{NamedVisitor, ParameterPath, visit_named};
 use crate::network::PointPredictor;
 use crate::regressor::Regressor;
 
@@ -96,7 +96,7 @@ struct List {
 }
 
 impl NamedVisitor for List {
-    fn visit<const D: usize>(&mut self, path: &Path, param: &Param<Tensor<D>>) {
+    fn visit<const D: usize>(&mut self, path: &ParameterPath, param: &Param<Tensor<D>>) {
         let (name, mut shape) = (path.name(), param.lazy_shape().to_vec());
         if path.is_transposed() {
             shape.reverse();

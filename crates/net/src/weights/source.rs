@@ -30,7 +30,7 @@ pub struct Source {
 /// Description of one tensor in the file.
 #[derive(Debug, Clone)]
 pub struct Entry {
-    /// Element type, PyTorch's name in lower case (`f32`, `bf16`, `i64` …).
+    /// Element type, that of safetensors in lower case (`f32`, `bf16`, `i64` …).
     pub dtype: String,
     /// Extents, outermost first.
     pub shape: Vec<usize>,

@@ -257,7 +257,7 @@ fn rotary_attention_equals_burns() {
         let run = |pairs: &Pairs, q: Tensor<3>| {
             let (k, v) = (pairs.keys.val(), pairs.values.val());
             if crate::is_trained_fast(&q) {
-                let half = crate::is_half(&pairs.keys);
+                let half = crate::is_bf16(&pairs.keys);
                 let [k, v] = [k, v].map(|x| x.cast(FloatDType::F32));
                 return rotary_attention(q, k, v, &ropes[0], heads, half);
             }

@@ -12,15 +12,15 @@ pub const MAX_SIDE: u32 = 32_768;
 /// Numbers of visible and of culled Gaussians, summed over the views of a render.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Counts {
-    /// Gaussians that reach at least one pixel's footprint.
+    /// Gaussians that reach the centre of at least one pixel.
     pub visible: u64,
     /// Depth t_z at most `near`.
     pub near: u64,
-    /// No pixel within reach.
+    /// No pixel's centre within reach.
     pub outside: u64,
     /// Opacity (after antialiasing) below 1/255.
     pub transparent: u64,
-    /// A quaternion of length 0, or a projected position or covariance beyond ±1e18.
+    /// A quaternion shorter than 1e-6, a projected position or covariance beyond ±1e18, or a covariance whose determinant is not positive.
     pub degenerate: u64,
     /// A parameter that is NaN, infinite, or beyond ±1e18.
     pub invalid: u64,

@@ -118,7 +118,7 @@ fn quaternions_of_any_length_and_sign_keep_their_rotation() {
     for q in [[1.0, 0.0, 0.0, 0.0], [-3.0, 0.1, -0.2, 0.4], [0.0, -0.5, 0.5, 1e-6], [0.0; 4]] {
         let length = q.iter().map(|v: &f32| v * v).sum::<f32>().sqrt();
         let expected = if length > 0.0 { q.map(|v| v / length) } else { [1.0, 0.0, 0.0, 0.0] };
-        let found = smallest_three(packed(q));
+        let found = unpack_smallest_three(pack_smallest_three(q));
         let cosine: f32 = found.iter().zip(expected).map(|(a, b)| a * b).sum();
         assert!(cosine.abs() > 0.999_99, "{q:?}: {found:?}");
     }

@@ -6,7 +6,9 @@ use burn::tensor::{Device, Tensor, TensorData};
 use snapsnap_data::sample::Stage2Item;
 use snapsnap_net::Window;
 use snapsnap_net::config::Config;
-use snapsnap_net::gaussians::{Chosen, Seen, assemble, photograph_colors, placed, regress, side_images};
+use snapsnap_net::gaussians::{
+    CanvasView, Chosen, assemble, photograph_colors, placed, regress, side_images,
+};
 use snapsnap_net::network::View;
 use snapsnap_ops::{host, mean};
 use snapsnap_splat::Gaussians;
@@ -102,7 +104,11 @@ pub(super) fn gaussians(
             if config.crop() { person.padded(config.regressor.margin(), side) } else { Window::whole(side) };
         let regressor = &networks.regressors[pair.min(networks.regressors.len() - 1)];
         let seen: Vec<_> = (first..first + 2)
-            .map(|v| Seen { image: images[v], points: points.clone().narrow(0, v, 1), valid: &valid[v] })
+            .map(|v| CanvasView {
+                image: images[v],
+                points: points.clone().narrow(0, v, 1),
+                valid: &valid[v],
+            })
             .collect();
         parts.extend(regress(regressor, config, pair, &seen, &window));
     }

@@ -10,12 +10,12 @@ use crate::SplatError;
 /// Splats per task.
 const CHUNK: usize = 4096;
 
-/// Largest number of entries of all lists: 4 GB, and as much again while they are made …
+/// Largest number of entries of all lists: 2 GiB, and as much again while they are made …
 const MAX_ENTRIES: u64 = 1 << 29;
 /// … and with gradients, whose records take 40 bytes per entry.
 const MAX_KEPT: u64 = 1 << 28;
 
-/// One list of splats per tile, back to back in one array, tiles row by row.
+/// One list of splats per tile, one after the other in one array, tiles row by row.
 #[derive(Debug, Default)]
 pub struct Lists {
     /// Splat of each entry.

@@ -61,7 +61,7 @@ pub struct State {
     last: CubeTensor,
 }
 
-/// One list of splats per tile and view, back to back.
+/// One list of splats per tile and view, one after the other.
 #[derive(Debug, Clone)]
 struct Lists {
     /// Splat of each entry.
