@@ -14,14 +14,23 @@ people() {
   made avatars "$avatars" $options -o "$folder/avatars" || [ $? = 2 ]
 }
 for cameras in default phone; do
-  people $cameras train 901 220 --config configs/data/$cameras.toml
+  people $cameras train 901 500 --config configs/data/$cameras.toml
   people $cameras val 901 24 --config configs/data/$cameras.toml
 done
 # A few people in views of the size of photographs.
 people large train 903 30 --config configs/data/default.toml --set views.resolution=1024
 people large val 903 4 --config configs/data/default.toml --set views.resolution=1024
 data="people/default/synth people/default/makehuman people/default/avatars people/phone/synth people/phone/makehuman people/phone/avatars"
-cargo xtask train-stage1 --config configs/default/stage1.toml --data $data --resume -o runs/default-points
+cargo xtask train-stage1 --config configs/default/photographs.toml --data $data --resume -o runs/default-photographs
+# The network of the sides begins with random weights.
+if [ ! -e runs/default-points ]; then
+  network=(--config configs/studies/network.toml --set 'network.sides="completed"' --set network.second_layer=true)
+  cargo xtask init-weights "${network[@]}" -o runs/default-random.safetensors
+  cargo xtask import-weights runs/default-photographs/best.safetensors --fill runs/default-random.safetensors "${network[@]}" \
+    -o runs/default-start.safetensors
+fi
+cargo xtask train-stage1 --config configs/default/stage1.toml --data $data --weights runs/default-start.safetensors --resume \
+  -o runs/default-points
 cargo xtask train-stage2 --config configs/default/stage2.toml --data $data --weights runs/default-points/best.safetensors --resume \
   -o runs/default-both
 cargo xtask train-stage2 --config configs/default/regressor.toml --data people/large/synth people/large/makehuman people/large/avatars \

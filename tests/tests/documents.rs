@@ -169,8 +169,9 @@ fn less(words: &[String]) -> Words {
             ] {
                 more.extend(["--set", key]);
             }
-            // Its schedule ends with a fall.
-            if words.iter().any(|word| word == "configs/default/stage1.toml") {
+            // Their schedules end with a fall.
+            let fall = ["configs/default/photographs.toml", "configs/default/stage1.toml"];
+            if words.iter().any(|word| fall.contains(&word.as_str())) {
                 more.extend(["--set", "schedule.fall=0"]);
             }
         }
