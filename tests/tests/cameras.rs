@@ -129,13 +129,15 @@ fn a_known_lens_turns_pictures_towards_the_person() {
     assert_eq!(said.matches("turned towards the person by 1").count(), 2, "{said}");
     let (said, unknown) = reconstruct(folder, &aside, &[]);
     assert!(!said.contains("turned"), "{said}");
+    // Without the outermost hundredths: the ends of fingers are a few points.
     let size = |points: &[[f32; 3]], axis: usize| {
-        let [low, high] = range(points.iter().map(|p| p[axis]));
-        high - low
+        let mut places: Vec<f32> = points.iter().map(|p| p[axis]).collect();
+        places.sort_by(f32::total_cmp);
+        places[places.len() * 99 / 100] - places[places.len() / 100]
     };
     let shape = |points: &[[f32; 3]]| size(points, 0) / size(points, 1);
     let [ahead, turned, unknown] = [&ahead, &turned, &unknown].map(|points| shape(points));
-    assert!((turned / ahead - 1.0).abs() < 0.015, "{turned} {ahead}");
+    assert!((turned / ahead - 1.0).abs() < 0.01, "{turned} {ahead}");
     assert!((0.025..0.08).contains(&(unknown / ahead - 1.0)), "{unknown} {ahead}");
 }
 
