@@ -42,7 +42,7 @@ pub const FORMATS: &[Format] = &[
     // A mesh takes seconds, hence few cases.
     Format {
         name: "gaussians-mesh",
-        sample: |folder| put(folder, "h.ply", balls(globe(400), 0.12_f32.ln())),
+        sample: |folder| put(folder, "h.ply", balls(column(60), 0.08_f32.ln())),
         command: "mesh in/h.ply --faces 500 --device cpu -o out.ply",
         file: Some("out.ply"),
         whole: |folder| match import::read(&folder.join("out.ply")) {
@@ -93,13 +93,13 @@ pub const FORMATS: &[Format] = &[
     },
 ];
 
-/// Places on a ball of one metre.
-fn globe(n: u16) -> impl ExactSizeIterator<Item = [f32; 3]> {
+/// Places on an upright ellipsoid of 2 by 0.24 metres, whose mesh takes a third of the time of a ball's.
+fn column(n: u16) -> impl ExactSizeIterator<Item = [f32; 3]> {
     (0..n).map(move |i| {
         let y = 1.0 - 2.0 * (f32::from(i) + 0.5) / f32::from(n);
         let (sin, cos) = (2.4 * f32::from(i)).sin_cos();
         let radius = (1.0 - y * y).sqrt();
-        [radius * cos, y, radius * sin]
+        [0.12 * radius * cos, y, 0.12 * radius * sin]
     })
 }
 
