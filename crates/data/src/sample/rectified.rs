@@ -1,6 +1,7 @@
-//! Rectified points: those of an upright person whom the nominal cameras would photograph alike (docs/method.md, "Upright targets"). A photograph does not show its camera's elevation and distance. A pixel, with knowledge
-//! about people, shows how far in front of the body's axis its surface lies. Each point therefore keeps its distance ahead
-//! of the axis, and moves to the nominal camera's ray of its pixel.
+//! Rectified points: those of an upright person whom the nominal cameras would photograph alike (docs/method.md, "Upright targets"). A
+//! photograph does not show its camera's elevation and distance. A pixel, with knowledge about people, shows how far in front of the
+//! body's axis its surface lies. Each point therefore keeps its distance ahead of the axis, and moves to the nominal camera's ray of
+//! its pixel.
 
 use burn::tensor::Tensor;
 use glam::{DMat3, DVec2, DVec3};
