@@ -120,6 +120,10 @@ pub struct NetworkConfig {
     /// beyond are left out. Unset: all points are kept.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub hull_margin: Option<usize>,
+    /// Largest way in metres by which a point of an unseen side moves along its line of sight, away from its camera, until it lies
+    /// inside both silhouettes. Unset: 0.1 with [`Self::hull_margin`], else 0.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub hull_reach: Option<f64>,
     /// Largest distance of a pixel's point from its neighbours', relative to that on a surface that faces the camera. Points
     /// beyond lie between two surfaces and are left out. Unset: all points are kept.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -174,6 +178,7 @@ impl Default for NetworkConfig {
             both_ways: false,
             on_rays: false,
             hull_margin: None,
+            hull_reach: None,
             steepest: None,
             closed_top: false,
             pair_degrees: OPPOSITE,
@@ -190,6 +195,11 @@ impl NetworkConfig {
     /// Channels of a photograph for the network: colours, and the channels that the config adds.
     pub fn input_channels(&self) -> usize {
         3 + usize::from(self.mask_channel) + 2 * usize::from(self.ray_channels)
+    }
+
+    /// Largest way in metres by which a point of an unseen side moves into the silhouettes.
+    pub fn hull_reach(&self) -> f64 {
+        self.hull_reach.unwrap_or(if self.hull_margin.is_some() { 0.1 } else { 0.0 })
     }
 
     /// Channels of the four token maps that feed the DPT branches.

@@ -1,7 +1,12 @@
 //! The visual hull of the two photographs. Points outside of a silhouette are not on the person.
 
 use glam::DVec3;
+use rayon::prelude::*;
 use snapsnap_splat::{Camera, RigidTransform};
+
+use crate::config::{NetworkConfig, OPPOSITE};
+use crate::gaussians::pixel_width;
+use crate::network::{View, nominal};
 
 /// The space inside the masks of the two photographs, for the nominal front and back cameras.
 pub struct Hull {
@@ -42,6 +47,50 @@ impl Hull {
                 && mask[place.y as usize * self.side + place.x as usize]
         })
     }
+
+    /// The first place inside the hull on the way of a point outside of it, straight away from `centre` by at most `reach`, all in
+    /// metres in the front camera's frame. `None` for a point inside, and if the way does not lead inside.
+    fn entered(&self, point: [f32; 3], centre: DVec3, reach: f64) -> Option<[f32; 3]> {
+        if self.contains(point) {
+            return None;
+        }
+        let point = DVec3::from(point.map(f64::from));
+        let way = (point - centre).try_normalize()?;
+        let step = 0.5 * f64::from(pixel_width(self.side));
+        (1..=(reach / step) as usize)
+            .map(|steps| (point + steps as f64 * step * way).as_vec3().to_array())
+            .find(|place| self.contains(*place))
+    }
+}
+
+/// Moves the points of the sides that lie outside of the photographs' silhouettes along their lines of sight until they are inside
+/// (docs/method.md, "Points inside the silhouettes"). `masks` `[S, S]` are those of the photographs, `points` `[V, S, S, 3]` in metres in
+/// the front camera's frame, and `conf` `[V, S, S]` the confidences: pixels that become no Gaussians stay. Returns the number of points
+/// that moved.
+pub fn carve(config: &NetworkConfig, masks: [&[bool]; 2], points: &mut [f32], conf: &[f32]) -> usize {
+    let (side, area) = (config.resolution, config.resolution * config.resolution);
+    let reach = config.hull_reach();
+    if reach == 0.0 || conf.len() <= 2 * area {
+        return 0;
+    }
+    let hull = Hull::new(masks, side, 0);
+    let views = points.chunks_exact_mut(3 * area).zip(conf.chunks_exact(area)).zip(View::WITH_SECOND);
+    views
+        .skip(2)
+        .map(|((points, conf), view)| {
+            let centre = nominal(view, OPPOSITE, side).1.inverse().translation;
+            let moved = points.par_chunks_exact_mut(3).zip(conf).map(|(point, conf)| {
+                let place = (*conf > config.conf_threshold)
+                    .then(|| hull.entered([point[0], point[1], point[2]], centre, reach))
+                    .flatten();
+                if let Some(place) = place {
+                    point.copy_from_slice(&place);
+                }
+                usize::from(place.is_some())
+            });
+            moved.sum::<usize>()
+        })
+        .sum()
 }
 
 /// A mask `[H, W]` of `width` columns, dilated by a square of 2·`margin` + 1 pixels.
@@ -75,6 +124,55 @@ fn spread(inside: &[bool], [lines, length]: [usize; 2], strides: [usize; 2], mar
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// The person is the left half of the front photograph, hence x < 0. The right's camera stands at x = +2 and sees points at
+    /// x = 0.1 outside.
+    #[test]
+    fn points_of_sides_move_along_their_lines_of_sight_into_the_silhouettes() {
+        let (side, area) = (64, 64 * 64);
+        let left_half: Vec<bool> = (0..area).map(|i| i % side < side / 2).collect();
+        let all = vec![true; area];
+        let masks = [&left_half[..], &all];
+        let mut config = NetworkConfig { resolution: side, ..NetworkConfig::default() };
+        let outside = [0.1, 0.2, 2.1];
+        let far = [0.5, 0.2, 2.1];
+        let inside = [-0.1, 0.2, 2.1];
+        // Of each view: outside, inside, too far outside, not finite, and outside of low confidence.
+        let mut given = vec![0.0; 4 * 3 * area];
+        let mut conf = vec![0.0; 4 * area];
+        for view in 0..4 {
+            let rows = [outside, inside, far, [f32::NAN, 0.2, 2.1], outside];
+            given[3 * area * view..][..15].copy_from_slice(rows.as_flattened());
+            conf[area * view..][..4].fill(1.0);
+        }
+        let carved = |config: &NetworkConfig| {
+            let mut points = given.clone();
+            let count = carve(config, masks, &mut points, &conf);
+            (points, count)
+        };
+        let bits = |points: &[f32]| points.iter().map(|v| v.to_bits()).collect::<Vec<_>>();
+        assert_eq!(carved(&config).1, 0, "without hull_margin");
+        config.hull_margin = Some(8);
+        config.hull_reach = Some(0.0);
+        assert_eq!(carved(&config).1, 0);
+        config.hull_reach = Some(0.2);
+        let (points, count) = carved(&config);
+        // The left's camera looks towards +x: its points only move further outside.
+        assert_eq!(count, 1);
+        let at = 3 * area * View::Right as usize;
+        let moved = [points[at], points[at + 1], points[at + 2]];
+        let step = 0.5 * pixel_width(side);
+        assert!(moved[0] <= 0.0 && moved[0] > -1.1 * step, "{moved:?}");
+        let centre = nominal(View::Right, OPPOSITE, side).1.inverse().translation;
+        let [from, to] = [outside, moved].map(|p| DVec3::from(p.map(f64::from)) - centre);
+        assert!(from.normalize().distance(to.normalize()) < 1e-6, "{centre} {moved:?}");
+        let mut expected = given.clone();
+        expected[at..at + 3].copy_from_slice(&moved);
+        assert_eq!(bits(&points), bits(&expected), "nothing else moves");
+        config.hull_reach = None;
+        let (points, count) = carved(&config);
+        assert!(count == 0 && bits(&points) == bits(&given), "the way into the half is longer than 0.1 m");
+    }
 
     /// Against the definition, pixel by pixel.
     #[test]

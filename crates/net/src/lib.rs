@@ -18,6 +18,6 @@ pub mod u2net;
 pub mod weights;
 
 pub use crop::Window;
-pub use hull::dilated;
+pub use hull::{carve, dilated};
 pub use neighbours::Neighbours;
 pub use reconstruct::{Photograph, Reconstruction, Reconstructor};

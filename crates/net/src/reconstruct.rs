@@ -12,6 +12,7 @@ use crate::crop::Window;
 use crate::gaussians::{
     CanvasView, Chosen, Part, assemble, photograph_colors, placed, regress, side_images, uncorrected,
 };
+use crate::hull::carve;
 use crate::network::{Input, PointMap, PointPredictor, View};
 use crate::precision::Precision;
 use crate::regressor::{Limits, Regressor};
@@ -175,12 +176,19 @@ impl Run<'_> {
     }
 
     fn reconstruct(&mut self, photos: [&Photograph; 2]) -> Reconstruction {
-        let maps = self.point_maps(photos);
+        let mut maps = self.point_maps(photos);
         let views: Vec<View> = self.model.predictor.views().to_vec();
-        let (points, conf) =
+        let (mut points, conf) =
             self.timed("reading back", |_| (host(maps.points.clone()), host(maps.conf.clone())));
         let area = self.side * self.side;
         let masks = photos.map(|photo| photo.valid.as_slice());
+        let carved =
+            self.timed("silhouettes", |run| carve(&run.model.config.network, masks, &mut points, &conf));
+        if carved > 0 {
+            self.plan.push(format!("{carved} pixels of the sides moved into the silhouettes"));
+            let data = TensorData::new(points.clone(), maps.points.dims());
+            maps.points = Tensor::from_data(data, &self.model.device);
+        }
         let Chosen { valid, lost, outside, between } =
             Chosen::new(&self.model.config.network, masks, &points, &conf);
         for (view, mask) in views.iter().zip(&valid) {

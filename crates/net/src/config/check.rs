@@ -122,6 +122,9 @@ impl Config {
             let rule = format!("a multiple of `network.net_resolution` ({}) and of 4", n.net_resolution);
             return refuse("network.resolution", format!("is {}, must be {rule}", n.resolution));
         }
+        if n.hull_reach.is_some_and(|reach| !(0.0..=1.0).contains(&reach)) {
+            return refuse("network.hull_reach", "must be between 0 and 1 (metres)".into());
+        }
         if n.steepest.is_some_and(|steepest| steepest.is_nan() || steepest < 1.0) {
             let message = "must be at least 1 (as on a surface that faces the camera)";
             return refuse("network.steepest", message.into());
@@ -200,6 +203,7 @@ impl Config {
             ("network.both_ways", !self.network.both_ways, "false"),
             ("network.on_rays", !self.network.on_rays, "false"),
             ("network.hull_margin", self.network.hull_margin.is_none(), "unset"),
+            ("network.hull_reach", self.network.hull_reach.is_none(), "unset"),
             ("network.steepest", self.network.steepest.is_none(), "unset"),
             ("network.closed_top", !self.network.closed_top, "false"),
             ("network.drop_empty", !self.network.drop_empty, "false"),

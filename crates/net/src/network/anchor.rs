@@ -19,7 +19,7 @@ fn yaw(view: View, pair_degrees: f64) -> f64 {
 }
 
 /// A view's nominal camera of a canvas of `side`² pixels, and the motion from the front camera's frame to its own.
-pub(super) fn nominal(view: View, pair_degrees: f64, side: usize) -> (Camera, RigidTransform) {
+pub(crate) fn nominal(view: View, pair_degrees: f64, side: usize) -> (Camera, RigidTransform) {
     let [front, camera] =
         [0.0, yaw(view, pair_degrees)].map(|yaw| Camera::orbit_at_yaw_degrees(yaw, side as u32));
     (camera, front.world_to_camera.inverse().then(&camera.world_to_camera))

@@ -4,12 +4,12 @@ use std::ops::Range;
 
 use burn::tensor::{Device, Tensor, TensorData};
 use snapsnap_data::sample::Stage2Item;
-use snapsnap_net::Window;
 use snapsnap_net::config::Config;
 use snapsnap_net::gaussians::{
     CanvasView, Chosen, assemble, photograph_colors, placed, regress, side_images,
 };
 use snapsnap_net::network::View;
+use snapsnap_net::{Window, carve};
 use snapsnap_ops::{host, mean};
 use snapsnap_splat::Gaussians;
 
@@ -79,7 +79,10 @@ pub(super) fn gaussians(
     let masks = [0, 1].map(|view| {
         item.masks[view * area..(view + 1) * area].iter().map(|share| *share > 0.5).collect::<Vec<_>>()
     });
-    let valid = Chosen::new(&config.network, [&masks[0], &masks[1]], &points, &conf).valid;
+    let masks = [&*masks[0], &*masks[1]];
+    let predicted = networks.predictor.is_some().then(|| points.clone());
+    carve(&config.network, masks, &mut points, &conf);
+    let valid = Chosen::new(&config.network, masks, &points, &conf).valid;
     let photos = [0, 1].map(|view| {
         let rgb = &item.images[3 * view * area..3 * (view + 1) * area];
         photograph_colors(&config.regressor, rgb, &item.masks[view * area..(view + 1) * area])
@@ -87,9 +90,13 @@ pub(super) fn gaussians(
     let photos = [&*photos[0], &*photos[1]];
     let sides = if views > 2 { side_images(photos, &points, &valid) } else { Vec::new() };
     let images: Vec<&[f32]> = photos.into_iter().chain(sides.iter().map(Vec::as_slice)).collect();
-    let points = if networks.predictor.is_some() {
-        // Gradients of the pictures reach a predictor that is trained.
-        Tensor::cat(maps, 0)
+    let points = if let Some(predicted) = predicted {
+        // Gradients of the pictures reach a predictor that is trained; points that moved into the silhouettes keep their shift.
+        let shift =
+            |(now, before): (&f32, &f32)| if now == before || now.is_nan() { 0.0 } else { now - before };
+        let shifts: Vec<f32> = points.iter().zip(&predicted).map(shift).collect();
+        let shifts = Tensor::<4>::from_data(TensorData::new(shifts, [views, side, side, 3]), device);
+        Tensor::cat(maps, 0) + shifts
     } else {
         // An overflow would spoil the normalisation of the whole view.
         points.iter_mut().filter(|v| !v.is_finite()).for_each(|v| *v = 0.0);
