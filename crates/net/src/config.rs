@@ -121,7 +121,7 @@ pub struct NetworkConfig {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub hull_margin: Option<usize>,
     /// Largest way in metres by which a point of an unseen side moves along its line of sight, away from its camera, until it lies
-    /// inside both silhouettes. Unset: 0.1 with [`Self::hull_margin`], else 0.
+    /// inside both silhouettes. Unset: 0.05 with [`Self::hull_margin`], else 0.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub hull_reach: Option<f64>,
     /// Largest distance of a pixel's point from its neighbours', relative to that on a surface that faces the camera. Points
@@ -199,7 +199,7 @@ impl NetworkConfig {
 
     /// Largest way in metres by which a point of an unseen side moves into the silhouettes.
     pub fn hull_reach(&self) -> f64 {
-        self.hull_reach.unwrap_or(if self.hull_margin.is_some() { 0.1 } else { 0.0 })
+        self.hull_reach.unwrap_or(if self.hull_margin.is_some() { 0.05 } else { 0.0 })
     }
 
     /// Channels of the four token maps that feed the DPT branches.

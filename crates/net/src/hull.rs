@@ -171,7 +171,7 @@ mod tests {
         assert_eq!(bits(&points), bits(&expected), "nothing else moves");
         config.hull_reach = None;
         let (points, count) = carved(&config);
-        assert!(count == 0 && bits(&points) == bits(&given), "the way into the half is longer than 0.1 m");
+        assert!(count == 0 && bits(&points) == bits(&given), "the way into the half is longer than 0.05 m");
     }
 
     /// Against the definition, pixel by pixel.

@@ -91,12 +91,8 @@ pub(super) fn gaussians(
     let sides = if views > 2 { side_images(photos, &points, &valid) } else { Vec::new() };
     let images: Vec<&[f32]> = photos.into_iter().chain(sides.iter().map(Vec::as_slice)).collect();
     let points = if let Some(predicted) = predicted {
-        // Gradients of the pictures reach a predictor that is trained; points that moved into the silhouettes keep their shift.
-        let shift =
-            |(now, before): (&f32, &f32)| if now == before || now.is_nan() { 0.0 } else { now - before };
-        let shifts: Vec<f32> = points.iter().zip(&predicted).map(shift).collect();
-        let shifts = Tensor::<4>::from_data(TensorData::new(shifts, [views, side, side, 3]), device);
-        Tensor::cat(maps, 0) + shifts
+        // Gradients of the pictures reach a predictor that is trained.
+        shifted(Tensor::cat(maps, 0), &predicted, &points)
     } else {
         // An overflow would spoil the normalisation of the whole view.
         points.iter_mut().filter(|v| !v.is_finite()).for_each(|v| *v = 0.0);
@@ -139,6 +135,16 @@ pub(super) fn gaussians(
     Some(placed(config, person.scaled(item.scale), &to_world))
 }
 
+/// Points `[V,S,S,3]` whose values `before` have become those of `now`; their gradient stays.
+fn shifted(points: Tensor<4>, before: &[f32], now: &[f32]) -> Tensor<4> {
+    // The difference of values that are not finite, which do not change, would be NaN.
+    let shift = |(before, now): (&f32, &f32)| if now.is_finite() { now - before } else { 0.0 };
+    let shifts: Vec<f32> = before.iter().zip(now).map(shift).collect();
+    let shifts = TensorData::new(shifts, points.dims());
+    let device = points.device();
+    points + Tensor::from_data(shifts, &device)
+}
+
 /// Target pictures `[V,3,h,w]` and masks `[V,h,w]` of the views with these indices.
 pub(super) fn targets(item: &Stage2Item, views: &[usize], device: &Device) -> (Tensor<4>, Tensor<3>) {
     let (side, count) = (item.target_side, views.len());
@@ -172,6 +178,19 @@ mod tests {
         assert_eq!(phase(4000), Phase { views: 0..4, scale_weight: 0.0, one_view: true });
         assert_eq!(phase(10_000), Phase { views: 0..4, scale_weight: 0.0, one_view: false });
         assert_eq!(Phase::new(false, 0), phase(10_000));
+    }
+
+    #[test]
+    fn a_shift_changes_points_and_not_their_gradients() {
+        let device = Device::flex().autodiff();
+        let (before, now) = ([1.0, 2.0, 3.0, f32::INFINITY], [1.0, 2.5, -3.0, f32::INFINITY]);
+        let points = Tensor::<4>::from_data(TensorData::new(before.to_vec(), [1, 2, 2, 1]), &device);
+        let points = points.require_grad();
+        let moved = shifted(points.clone(), &before, &now);
+        assert_eq!(host(moved.clone()), now);
+        let weights = Tensor::from_data(TensorData::new(vec![1.0_f32, 2.0, 3.0, 0.0], [1, 2, 2, 1]), &device);
+        let gradient = points.grad(&(moved * weights).sum().backward()).expect("a tracked tensor");
+        assert_eq!(host(gradient), [1.0, 2.0, 3.0, 0.0]);
     }
 
     #[test]
