@@ -8,6 +8,9 @@ use crate::config::{NetworkConfig, OPPOSITE};
 use crate::gaussians::pixel_width;
 use crate::network::{View, nominal};
 
+/// Most steps of a point on its way into the silhouettes, which bounds the time on large canvases.
+const MOST_STEPS: f64 = 100.0;
+
 /// The space inside the masks of the two photographs, for the nominal front and back cameras.
 pub struct Hull {
     side: usize,
@@ -56,7 +59,7 @@ impl Hull {
         }
         let point = DVec3::from(point.map(f64::from));
         let way = (point - centre).try_normalize()?;
-        let step = 0.5 * f64::from(pixel_width(self.side));
+        let step = (0.5 * f64::from(pixel_width(self.side))).max(reach / MOST_STEPS);
         (1..=(reach / step) as usize)
             .map(|steps| (point + steps as f64 * step * way).as_vec3().to_array())
             .find(|place| self.contains(*place))
