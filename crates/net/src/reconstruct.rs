@@ -182,12 +182,18 @@ impl Run<'_> {
             self.timed("reading back", |_| (host(maps.points.clone()), host(maps.conf.clone())));
         let area = self.side * self.side;
         let masks = photos.map(|photo| photo.valid.as_slice());
-        let carved =
-            self.timed("silhouettes", |run| carve(&run.model.config.network, masks, &mut points, &conf));
-        if carved > 0 {
-            self.plan.push(format!("{carved} pixels of the sides moved into the silhouettes"));
-            let data = TensorData::new(points.clone(), maps.points.dims());
-            maps.points = Tensor::from_data(data, &self.model.device);
+        if views.len() > 2 && self.model.config.network.hull_reach() > 0.0 {
+            let carved = self.timed("silhouettes", |run| {
+                let carved = carve(&run.model.config.network, masks, &mut points, &conf);
+                if carved > 0 {
+                    let data = TensorData::new(points.clone(), maps.points.dims());
+                    maps.points = Tensor::from_data(data, &run.model.device);
+                }
+                carved
+            });
+            if carved > 0 {
+                self.plan.push(format!("{carved} pixels of the sides moved into the silhouettes"));
+            }
         }
         let Chosen { valid, lost, outside, between } =
             Chosen::new(&self.model.config.network, masks, &points, &conf);

@@ -80,7 +80,8 @@ pub(super) fn gaussians(
         item.masks[view * area..(view + 1) * area].iter().map(|share| *share > 0.5).collect::<Vec<_>>()
     });
     let masks = [&*masks[0], &*masks[1]];
-    let predicted = networks.predictor.is_some().then(|| points.clone());
+    let can_move = views > 2 && config.network.hull_reach() > 0.0;
+    let predicted = (can_move && networks.predictor.is_some()).then(|| points.clone());
     carve(&config.network, masks, &mut points, &conf);
     let valid = Chosen::new(&config.network, masks, &points, &conf).valid;
     let photos = [0, 1].map(|view| {
@@ -90,9 +91,13 @@ pub(super) fn gaussians(
     let photos = [&*photos[0], &*photos[1]];
     let sides = if views > 2 { side_images(photos, &points, &valid) } else { Vec::new() };
     let images: Vec<&[f32]> = photos.into_iter().chain(sides.iter().map(Vec::as_slice)).collect();
-    let points = if let Some(predicted) = predicted {
+    let points = if networks.predictor.is_some() {
         // Gradients of the pictures reach a predictor that is trained.
-        shifted(Tensor::cat(maps, 0), &predicted, &points)
+        let maps = Tensor::cat(maps, 0);
+        match predicted {
+            Some(predicted) => shifted(maps, &predicted, &points),
+            None => maps,
+        }
     } else {
         // An overflow would spoil the normalisation of the whole view.
         points.iter_mut().filter(|v| !v.is_finite()).for_each(|v| *v = 0.0);
