@@ -310,10 +310,12 @@ pub struct ModeConfig {
 }
 
 impl Config {
-    /// The same config with all keys set that follow `mode.compat` if unset.
+    /// The same config with all keys set that follow another key if unset, such as those of `mode.compat`.
     pub fn resolved(&self) -> Self {
         let mut config = self.clone();
         config.network.upsample = Some(self.upsample());
+        config.network.hull_reach =
+            self.network.hull_reach.or(self.network.hull_margin.map(|_| self.network.hull_reach()));
         config.regressor.start = Some(self.regressor.start());
         config.regressor.color = Some(self.regressor.color());
         config.regressor.margin = self.crop().then(|| self.regressor.margin());

@@ -128,8 +128,8 @@ fn spread(inside: &[bool], [lines, length]: [usize; 2], strides: [usize; 2], mar
 mod tests {
     use super::*;
 
-    /// The person is the left half of the front photograph, hence x < 0. The right's camera stands at x = +2 and sees points at
-    /// x = 0.1 outside.
+    /// The person is the left half of the front photograph, hence x < 0. The right's camera stands at x = +2, also for the second
+    /// surfaces.
     #[test]
     fn points_of_sides_move_along_their_lines_of_sight_into_the_silhouettes() {
         let (side, area) = (64, 64 * 64);
@@ -141,9 +141,9 @@ mod tests {
         let far = [0.5, 0.2, 2.1];
         let inside = [-0.1, 0.2, 2.1];
         // Of each view: outside, inside, too far outside, not finite, and outside of low confidence.
-        let mut given = vec![0.0; 4 * 3 * area];
-        let mut conf = vec![0.0; 4 * area];
-        for view in 0..4 {
+        let mut given = vec![0.0; 6 * 3 * area];
+        let mut conf = vec![0.0; 6 * area];
+        for view in 0..6 {
             let rows = [outside, inside, far, [f32::NAN, 0.2, 2.1], outside];
             given[3 * area * view..][..15].copy_from_slice(rows.as_flattened());
             conf[area * view..][..4].fill(1.0);
@@ -161,8 +161,8 @@ mod tests {
         config.hull_reach = Some(0.2);
         let (points, count) = carved(&config);
         // The left's camera looks towards +x: its points only move further outside.
-        assert_eq!(count, 1);
-        let at = 3 * area * View::Right as usize;
+        assert_eq!(count, 2);
+        let [at, second] = [View::Right, View::RightSecond].map(|view| 3 * area * view as usize);
         let moved = [points[at], points[at + 1], points[at + 2]];
         let step = 0.5 * pixel_width(side);
         assert!(moved[0] <= 0.0 && moved[0] > -1.1 * step, "{moved:?}");
@@ -171,6 +171,7 @@ mod tests {
         assert!(from.normalize().distance(to.normalize()) < 1e-6, "{centre} {moved:?}");
         let mut expected = given.clone();
         expected[at..at + 3].copy_from_slice(&moved);
+        expected[second..second + 3].copy_from_slice(&moved);
         assert_eq!(bits(&points), bits(&expected), "nothing else moves");
         config.hull_reach = None;
         let (points, count) = carved(&config);

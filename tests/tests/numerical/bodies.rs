@@ -247,6 +247,34 @@ fn tokens_without_a_person_are_dropped() {
 }
 
 /// The plan counts channels and dropped tokens. Every valid pixel of a photograph becomes a Gaussian.
+/// The maps of a result, its Gaussians and its plan agree on the points that moved.
+#[test]
+fn points_that_moved_into_the_silhouettes_are_those_of_maps_and_gaussians() {
+    let Some(device) = device() else { return };
+    let runs = ["network.hull_reach=0", "network.hull_reach=1"].map(|reach| {
+        let keys = ["network.anchor=ray", "network.conf_threshold=0.0", "network.hull_margin=1024", reach];
+        let config = config(&keys);
+        let (_file, weights) = weights(&config, 4);
+        let model = Reconstructor::load(&weights, &device).expect("weights");
+        let side = config.network.resolution;
+        model.reconstruct(&photograph(side, 1), &photograph(side, 2), &|_| ())
+    });
+    let [before, after] = runs.each_ref().map(|run| values(run.maps.points.clone()));
+    let moved: Vec<bool> = before.chunks_exact(3).zip(after.chunks_exact(3)).map(|(a, b)| a != b).collect();
+    let photographed = moved.len() / 2;
+    let count = moved.iter().filter(|moved| **moved).count();
+    assert!(count > 0 && !moved[..photographed].contains(&true), "{count}");
+    let line = format!("{count} pixels of the sides moved into the silhouettes");
+    assert!(runs[1].plan.contains(&line), "{line}: {:?}", runs[1].plan);
+    assert!(!runs[0].plan.iter().any(|line| line.contains("moved")), "{:?}", runs[0].plan);
+    for (run, points) in runs.iter().zip([before, after]) {
+        let chosen = points.chunks_exact(3).zip(run.valid.iter().flatten());
+        let expected: Vec<f32> =
+            chosen.filter(|(_, valid)| **valid).flat_map(|(point, _)| point).copied().collect();
+        assert_same("centres", &values(run.gaussians.means.clone()), &expected);
+    }
+}
+
 #[test]
 fn the_plan_of_a_reconstruction_names_channels_window_and_dropped_tokens() {
     let Some(device) = device() else { return };

@@ -58,6 +58,21 @@ fn completed_sides_need_what_they_are_made_of() {
 }
 
 #[test]
+fn a_resolved_config_records_how_far_points_move_into_the_silhouettes() {
+    for (set, reach) in [
+        (&[][..], None),
+        (&["network.hull_margin=8"], Some(0.05)),
+        (&["network.hull_margin=8", "network.hull_reach=0"], Some(0.0)),
+        (&["network.hull_reach=0.1"], Some(0.1)),
+    ] {
+        let set: Vec<String> = set.iter().map(|s| (*s).to_owned()).collect();
+        let config = Config::from_toml("", "x", &set).expect("valid");
+        assert_eq!(config.resolved().network.hull_reach, reach, "{set:?}");
+        assert_eq!(config.resolved().network.hull_reach(), config.network.hull_reach(), "{set:?}");
+    }
+}
+
+#[test]
 fn normals_are_those_of_a_convolution() {
     let set = |more: &str| refusal("", &["network.normals=true", more]);
     assert!(set("network.body=transformer").contains("network.normals"));
