@@ -246,35 +246,55 @@ fn tokens_without_a_person_are_dropped() {
     }
 }
 
-/// The plan counts channels and dropped tokens. Every valid pixel of a photograph becomes a Gaussian.
 /// The maps of a result, its Gaussians and its plan agree on the points that moved.
 #[test]
 fn points_that_moved_into_the_silhouettes_are_those_of_maps_and_gaussians() {
     let Some(device) = device() else { return };
+    // A strip of a person, 0.3 to 0.5 m from the axis. The points of random weights are nearer to it.
+    let side = config(&[]).network.resolution;
+    let strip = |seed: u32, columns: std::ops::Range<usize>| {
+        let mut photograph = photograph(side, seed);
+        for (i, valid) in photograph.valid.iter_mut().enumerate() {
+            *valid &= columns.contains(&(i % side));
+        }
+        photograph
+    };
     let runs = ["network.hull_reach=0", "network.hull_reach=1"].map(|reach| {
-        let keys = ["network.anchor=ray", "network.conf_threshold=0.0", "network.hull_margin=1024", reach];
+        let keys = [
+            "network.anchor=ray",
+            "network.delta=1",
+            "network.conf_threshold=0.0",
+            "network.hull_margin=1024",
+            reach,
+        ];
         let config = config(&keys);
         let (_file, weights) = weights(&config, 4);
         let model = Reconstructor::load(&weights, &device).expect("weights");
-        let side = config.network.resolution;
-        model.reconstruct(&photograph(side, 1), &photograph(side, 2), &|_| ())
+        model.reconstruct(&strip(1, 0..side / 2 - 16), &strip(2, side / 2 + 16..side), &|_| ())
     });
     let [before, after] = runs.each_ref().map(|run| values(run.maps.points.clone()));
-    let moved: Vec<bool> = before.chunks_exact(3).zip(after.chunks_exact(3)).map(|(a, b)| a != b).collect();
+    // At least half a pixel's width. Two runs on a GPU may differ in the last bits.
+    let differs = |(a, b): (&[f32], &[f32])| a.iter().zip(b).any(|(a, b)| (a - b).abs() > 1e-3);
+    let moved: Vec<bool> = before.chunks_exact(3).zip(after.chunks_exact(3)).map(differs).collect();
     let photographed = moved.len() / 2;
     let count = moved.iter().filter(|moved| **moved).count();
     assert!(count > 0 && !moved[..photographed].contains(&true), "{count}");
     let line = format!("{count} pixels of the sides moved into the silhouettes");
     assert!(runs[1].plan.contains(&line), "{line}: {:?}", runs[1].plan);
     assert!(!runs[0].plan.iter().any(|line| line.contains("moved")), "{:?}", runs[0].plan);
+    // A Gaussian's centre is its pixel's point and the regressor's offset, millimetres here. The points move by centimetres.
     for (run, points) in runs.iter().zip([before, after]) {
         let chosen = points.chunks_exact(3).zip(run.valid.iter().flatten());
-        let expected: Vec<f32> =
+        let points: Vec<f32> =
             chosen.filter(|(_, valid)| **valid).flat_map(|(point, _)| point).copied().collect();
-        assert_same("centres", &values(run.gaussians.means.clone()), &expected);
+        let centres = values(run.gaussians.means.clone());
+        assert_eq!(centres.len(), points.len());
+        let farthest = centres.iter().zip(&points).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        assert!(farthest < 0.005, "{farthest} m");
     }
 }
 
+/// The plan counts channels and dropped tokens. Every valid pixel of a photograph becomes a Gaussian.
 #[test]
 fn the_plan_of_a_reconstruction_names_channels_window_and_dropped_tokens() {
     let Some(device) = device() else { return };
