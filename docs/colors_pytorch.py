@@ -1,4 +1,4 @@
-"""What shading tells of depth (docs/notes/people.md): one small network in PyTorch, trained for the same time on different inputs.
+"""Shape from shading (docs/notes/people.md): one small network in PyTorch, trained for the same time on different inputs.
 
     python docs/colors_pytorch.py people/makers --size 128 --minutes 4
 
