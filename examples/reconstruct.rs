@@ -11,9 +11,9 @@ use std::error::Error;
 use std::path::{Path, PathBuf};
 
 use burn::tensor::Device;
-use snapsnap_data::photo::{self, Canvas, Cutting, Placement, Source};
+use snapsnap_net::Reconstructor;
 use snapsnap_net::weights::WeightFile;
-use snapsnap_net::{Photograph, Reconstructor};
+use snapsnap_photo::{Cutting, Source, Told, person, read};
 use snapsnap_splat::scene;
 
 fn main() -> Result<(), Box<dyn Error>> {
@@ -24,21 +24,21 @@ fn main() -> Result<(), Box<dyn Error>> {
     let output = argument("human.ply".into());
 
     let weights = WeightFile::open(&assets.join("weights/default.safetensors"), None)?;
-    let reconstructor = Reconstructor::load(&weights, &Device::flex())?;
-    let config = reconstructor.config();
+    let networks = Reconstructor::load(&weights, &Device::flex())?;
+    let config = networks.config();
 
     // Each person is scaled and moved to the place that the networks were trained for.
-    let placement = Placement::Training { height: config.person_height() };
+    let told = Told::default();
     let sources = photographs.each_ref().map(|path| Source::file(path));
-    let canvases = photo::load(sources, Cutting::Given, config.network.resolution, placement, None)?.canvases;
-    let [front, back] = canvases.map(|Canvas { rgb, mask, valid, .. }| Photograph { rgb, mask, valid });
+    let placement = told.placement(config);
+    let photographs = read(&sources, Cutting::Given, config.network.resolution, placement, told.focal)?;
 
-    let result = reconstructor.reconstruct(&front, &back, &|module| println!("{module}"));
-    for (module, time) in &result.times {
+    let person = person(&photographs, &networks, &told, &|module| println!("{module}"));
+    let person = person.ok_or("no Gaussian came out")?;
+    for (module, time) in &person.made.times {
         println!("{module:<26} {:>8.1} ms", 1e3 * time.as_secs_f64());
     }
-    let gaussians = result.in_world(config);
-    scene::write(&gaussians, &output)?;
-    println!("{} Gaussians: {}", gaussians.len(), output.display());
+    scene::write(&person.gaussians, &output)?;
+    println!("{} Gaussians: {}", person.gaussians.len(), output.display());
     Ok(())
 }

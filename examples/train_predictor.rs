@@ -19,14 +19,16 @@ use snapsnap_base::config::Schema;
 use snapsnap_data::dataset::{Folder, Split};
 use snapsnap_data::prepare::{DataConfig, Subject};
 use snapsnap_data::sample::{Augment, SampleConfig, Stage1, Stage1Batcher, Stage1Item};
+use snapsnap_net::Prediction;
 use snapsnap_net::config::Config;
 use snapsnap_net::network::View;
+use snapsnap_net::steps::Record;
 use snapsnap_net::weights::{random_predictor, save};
 use snapsnap_people::synth;
 use snapsnap_train::gradients;
 use snapsnap_train::networks::Networks;
 use snapsnap_train::optimizer::{MuonSettings, OptimizerConfig};
-use snapsnap_train::points::{Losses, losses, predict};
+use snapsnap_train::points::{Losses, losses};
 use snapsnap_train::schedule::Schedule;
 
 /// A small convolutional body on a canvas of 64².
@@ -76,7 +78,8 @@ fn data_set(root: &Path, resolution: usize) -> Result<Arc<Folder>, FileError> {
 fn compare(networks: &Networks, config: &Config, items: Vec<Stage1Item>, device: &Device) -> Losses {
     let predictor = networks.predictor.as_ref().expect("the predictor is trained");
     let batch = Stage1Batcher.batch(items, device);
-    let prediction = predict(predictor, config, batch.images, &batch.masks);
+    let mut record = Record::default();
+    let prediction = Prediction::new(predictor, config, batch.images, &batch.masks, None, &mut record);
     losses(&prediction, &batch.points, &batch.valid, false)
 }
 

@@ -42,7 +42,6 @@ end = 0.01
 [stage2]
 alpha_weight = 0.5
 anisotropy_weight = 0.01
-point_noise = 0.01
 "#
 );
 

@@ -5,17 +5,18 @@ use std::fs;
 use std::path::Path;
 
 /// Crates, lowest layer first, and the crates of the workspace that each may depend on.
-const LAYERS: [(&str, &[&str]); 10] = [
+const LAYERS: [(&str, &[&str]); 11] = [
     ("base", &[]),
     ("splat", &["base"]),
     ("ops", &["base"]),
     ("mesh", &["splat", "base"]),
     ("net", &["splat", "ops", "base"]),
     ("people", &["mesh", "base"]),
-    ("data", &["people", "mesh", "splat", "base"]),
-    ("eval", &["net", "data", "ops", "mesh", "splat", "base"]),
+    ("photo", &["net", "ops", "mesh", "splat", "base"]),
+    ("data", &["photo", "people", "net", "mesh", "splat", "base"]),
+    ("eval", &["data", "photo", "net", "ops", "mesh", "splat", "base"]),
     ("train", &["eval", "data", "people", "net", "ops", "mesh", "splat", "base"]),
-    ("app", &["train", "eval", "data", "people", "net", "ops", "mesh", "splat", "base"]),
+    ("app", &["train", "eval", "data", "photo", "people", "net", "ops", "mesh", "splat", "base"]),
 ];
 
 /// Dependencies within the workspace, those of tests included, by the manifest of each folder below `crates`.

@@ -6,19 +6,20 @@ use burn::tensor::Tensor;
 use safetensors::Dtype;
 use safetensors::tensor::TensorView;
 use snapsnap_net::Reconstruction;
+use snapsnap_ops::host;
 
 use crate::failure::Failure;
 use crate::output;
 
 /// Writes `points conf valid side_images means opacity scale rotation rgb`, in the front camera's frame.
 pub fn write(result: &Reconstruction, path: &Path) -> Result<(), Failure> {
-    let [views, height, width, _] = result.maps.points.dims();
+    let [views, height, width, _] = result.points.maps.dims();
     let g = &result.gaussians;
     let float = Dtype::F32;
     let valid = result.valid.iter().flatten().map(|v| u8::from(*v)).collect();
     let mut tensors = vec![
-        ("points", float, vec![views, height, width, 3], bytes(&result.maps.points)),
-        ("conf", float, vec![views, height, width], bytes(&result.maps.conf)),
+        ("points", float, vec![views, height, width, 3], of_values(&result.points.host)),
+        ("conf", float, vec![views, height, width], of_values(&result.points.conf)),
         ("valid", Dtype::U8, vec![views, height, width], valid),
         ("means", float, g.means.dims().to_vec(), bytes(&g.means)),
         ("opacity", float, vec![g.len(), 1], bytes(&g.opacities)),
@@ -38,6 +39,9 @@ pub fn write(result: &Reconstruction, path: &Path) -> Result<(), Failure> {
 }
 
 fn bytes<const D: usize>(tensor: &Tensor<D>) -> Vec<u8> {
-    let values: Vec<f32> = tensor.to_data().try_into_vec().expect("all tensors here are f32");
+    of_values(&host(tensor.clone()))
+}
+
+fn of_values(values: &[f32]) -> Vec<u8> {
     values.iter().flat_map(|v| v.to_le_bytes()).collect()
 }

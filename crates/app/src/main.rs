@@ -23,9 +23,9 @@ mod progress;
 mod report;
 mod say;
 mod server;
+mod told;
 mod turntable;
 mod view_folder;
-mod viewpoint;
 mod weights;
 
 use std::process::ExitCode;

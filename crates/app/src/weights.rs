@@ -1,17 +1,13 @@
 //! The weights of a command.
 
-use std::cell::OnceCell;
 use std::io::{self, Read};
 use std::path::Path;
 
-use burn::tensor::Device;
 use sha2::{Digest, Sha256};
 use snapsnap_base::config::Schema;
 use snapsnap_base::{FileError, file};
-use snapsnap_data::photo::SEGMENTER_SIDE;
 use snapsnap_net::config::Config;
-use snapsnap_net::u2net::{SIDE, U2Net};
-use snapsnap_net::weights::{Source, WeightFile};
+use snapsnap_net::weights::WeightFile;
 
 use crate::commands::ConfigArguments;
 use crate::failure::Failure;
@@ -20,26 +16,8 @@ use crate::failure::Failure;
 const IN_FOLDER: &str = "weights.safetensors";
 /// The default weights, trained on synthetic people (docs/weights.md).
 const DEFAULT: &[u8] = include_bytes!("../../../assets/weights/default.safetensors");
-/// The weights of the network that removes backgrounds (docs/u2netp_convert.py).
-const U2NET: &[u8] = include_bytes!("../../../assets/weights/u2netp.safetensors");
 /// Name of the default weights, in place of a path.
 pub const DEFAULT_NAME: &str = "the default weights";
-
-// The photographs are resized for the network.
-const _: () = assert!(SEGMENTER_SIDE == SIDE);
-
-/// The network that finds a person's pixels, from 0 to 1, on the CPU: it is small, and a GPU's kernels would take longer to compile.
-pub fn segmenter() -> impl Fn(&[f32]) -> Vec<f32> {
-    let device = Device::flex();
-    let loaded = OnceCell::new();
-    move |rgb| {
-        let load = || {
-            let source = Source::embedded("U²-Net", U2NET).expect("a file of the program's own");
-            U2Net::load(&source, &device).expect("weights of the program's own")
-        };
-        loaded.get_or_init(load).forward(rgb, &device)
-    }
-}
 
 /// The SHA-256 of a weight file, or of the default weights.
 pub fn sum_of(weights: &WeightFile) -> Result<String, Failure> {

@@ -3,9 +3,7 @@
 pub mod dataset;
 mod jitter;
 mod light;
-pub mod photo;
 pub mod prepare;
-mod resize;
 pub mod sample;
 pub mod scan;
 pub mod smplx;

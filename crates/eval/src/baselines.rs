@@ -3,12 +3,14 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::Device;
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 use snapsnap_data::dataset::{Arrangement, Folder, Split};
 use snapsnap_net::config::Config;
-use snapsnap_net::gaussians::{CanvasView, geometric, placed, side_images};
+use snapsnap_net::gaussians::{CanvasView, geometric, side_images};
+use snapsnap_net::network::View;
+use snapsnap_net::placed;
 use snapsnap_ops::{bilinear, host};
 use snapsnap_splat::{Camera, Gaussians};
 
@@ -30,8 +32,8 @@ pub fn billboard(
     device: &Device,
 ) -> Gaussians {
     let part = |((image, valid), camera): ((&Vec<f32>, &Vec<bool>), &Camera)| {
-        let points = Tensor::from_data(TensorData::new(upright(camera, side), [1, side, side, 3]), device);
-        in_world(geometric(&[CanvasView { image, points, valid }], device), camera)
+        let points = &upright(camera, side);
+        in_world(geometric(&[CanvasView { view: View::Front, image, points, valid }], side, device), camera)
     };
     joined(photographs.iter().zip(valid).zip(cameras).map(part).collect())
 }
@@ -66,14 +68,12 @@ pub fn true_points(
         ([front, back], 4) => side_images([front, back], points, valid),
         _ => Vec::new(),
     };
-    let seen = |((image, valid), points): ((_, _), &[f32])| {
-        let points = TensorData::new(points.to_vec(), [1, side, side, 3]);
-        CanvasView { image, points: Tensor::from_data(points, device), valid }
-    };
+    // The first camera sees all of them.
+    let seen = |((image, valid), points)| CanvasView { view: View::Front, image, points, valid };
     let images = photographs.iter().chain(&sides).map(Vec::as_slice);
     let with_masks = images.zip(valid.iter().map(Vec::as_slice));
     let views: Vec<CanvasView> = with_masks.zip(points.chunks_exact(3 * side * side)).map(seen).collect();
-    in_world(geometric(&views, device), camera)
+    in_world(geometric(&views, side, device), camera)
 }
 
 fn in_world(gaussians: Gaussians, camera: &Camera) -> Gaussians {

@@ -41,6 +41,12 @@ impl Window {
         found
     }
 
+    /// The tight box around the person in photographs with these masks `[.., side, side]`: every pixel above 0.
+    pub fn around_person(masks: &[f32], side: usize) -> Option<Self> {
+        let masks: Vec<bool> = masks.iter().map(|mask| *mask > 0.0).collect();
+        Self::around(masks.chunks_exact(side * side), side)
+    }
+
     /// The smallest window that contains both.
     pub fn united(&self, other: &Self) -> Self {
         let both = |a: &Range<usize>, b: &Range<usize>| a.start.min(b.start)..a.end.max(b.end);

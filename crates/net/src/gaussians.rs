@@ -1,110 +1,185 @@
-//! From point maps to Gaussians, as inference and training do it: side colours, the regressor on a window, activations.
+//! Points → Gaussians, for the reconstruction and for stage 2: which pixels become Gaussians, colours of the sides, the regressor,
+//! activations, the closed top.
 
 use std::borrow::Cow;
+use std::ops::Range;
 
 use burn::tensor::{Device, Int, Tensor, TensorData};
-use glam::DVec3;
 use snapsnap_ops::host;
 use snapsnap_ops::rows::taken;
-use snapsnap_splat::{Camera, Gaussians, RigidTransform};
+use snapsnap_splat::Gaussians;
 
-use crate::config::{Config, NetworkConfig, RegressorConfig, RegressorStart, RotationFrame};
+use crate::chosen::Chosen;
+use crate::config::{Config, OPPOSITE, RegressorConfig, RegressorStart};
 use crate::crop::Window;
-use crate::hull::Hull;
+use crate::network::{View, nominal_camera};
+use crate::photograph::Photograph;
+use crate::points::Points;
 use crate::regressor::{Attributes, FEATURES, Geometry, Limits, Regressor, Statistics};
-use crate::sides::{Cloud, EMPTY, is_finite};
+use crate::sides::{Cloud, EMPTY};
+use crate::steps::{Record, Step};
+use crate::top::Top;
+
+/// The pixel to which a Gaussian belongs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Origin {
+    /// Its view; `None` for a Gaussian that closes the top.
+    pub view: Option<View>,
+    /// Its place on the view's canvas, row by row.
+    pub pixel: u32,
+}
+
+/// What makes Gaussians of points.
+pub struct Painter<'a> {
+    /// The networks' config.
+    pub config: &'a Config,
+    /// One network for all views, or one for front and back and one for the sides.
+    pub regressors: &'a [Regressor],
+    /// Front and back.
+    pub photographs: [&'a Photograph; 2],
+    /// Views whose Gaussians are made. Second surfaces belong to the sides.
+    pub views: Range<usize>,
+    /// Whether the sides take colours from the photographs. The regressor gets [`EMPTY`] instead.
+    pub side_colors: bool,
+}
+
+/// Gaussians and what they were made of.
+pub struct Painted {
+    /// View after view, row by row, in the front camera's frame; then those that close the top.
+    pub gaussians: Gaussians,
+    /// The pixel of each Gaussian.
+    pub origins: Vec<Origin>,
+    /// Per view, `[S, S]`: whether the pixel was to become a Gaussian.
+    pub valid: Vec<Vec<bool>>,
+    /// Pseudo images of the sides' maps `[3, S, S]` in [−1, 1], −1 where there is no point.
+    pub side_images: Vec<Vec<f32>>,
+    /// Pixels and Gaussians that were left out because they were not finite, or farther away than 1e30 m.
+    pub lost: usize,
+}
+
+impl Painter<'_> {
+    /// Makes the Gaussians on `device`. Points of the sides that lie outside of the silhouettes move, in `points` as well.
+    pub fn gaussians(&self, points: &mut Points, device: &Device, record: &mut Record) -> Painted {
+        let config = self.config;
+        let side = config.network.resolution;
+        let area = side * side;
+        let views = points.conf.len() / area;
+        let masks = self.photographs.map(|photograph| photograph.valid.as_slice());
+        let mut carve = |_: &mut Record| points.carve(&config.network, masks, device);
+        let is_carved = views > 2 && config.network.hull_reach() > 0.0;
+        let moved = if is_carved { record.timed("silhouettes", carve) } else { carve(record) };
+        record.add_some(moved, |pixels| Step::MovedIntoSilhouettes { pixels });
+        let Chosen { valid, lost, outside, between } = Chosen::new(&config.network, masks, points);
+        let names = View::WITH_SECOND.map(View::name);
+        record.steps.extend(names.iter().zip(&valid).map(|(view, valid)| Step::Chosen {
+            view,
+            pixels: count(valid),
+            of: area,
+        }));
+        record.add_some(lost, |pixels| Step::NotFinite { pixels });
+        record.add_some(outside, |pixels| Step::OutsideSilhouettes { pixels });
+        record.add_some(between, |pixels| Step::BetweenSurfaces { pixels });
+
+        let colors =
+            self.photographs.map(|photo| photograph_colors(&config.regressor, &photo.rgb, &photo.mask));
+        let colors = [&*colors[0], &*colors[1]];
+        let side_images = if views > 2 && self.side_colors {
+            record.timed("side colours", |_| side_images(colors, &points.host, &valid))
+        } else {
+            record.steps.push(Step::NoSideColors { as_asked: views > 2 });
+            vec![vec![EMPTY; 3 * area]; views - 2]
+        };
+        let images = colors.into_iter().chain(side_images.iter().map(Vec::as_slice));
+        let of_views = images.zip(points.host.chunks_exact(3 * area)).zip(&valid).zip(View::WITH_SECOND);
+        let canvases: Vec<CanvasView> = of_views
+            .map(|(((image, points), valid), view)| CanvasView { view, image, points, valid })
+            .collect();
+        let mut parts = self.regressed(&canvases, &points.maps, record);
+        if config.network.closed_top && views > 2 && self.views.contains(&0) {
+            parts.extend(record.timed("closed top", |record| {
+                let top =
+                    Top::new(colors, [canvases[0].points, canvases[1].points], [&valid[0], &valid[1]], side)?;
+                record.steps.push(Step::ClosedTop { gaussians: count(&top.valid) });
+                let seen = CanvasView {
+                    view: View::Front,
+                    image: &top.image,
+                    points: &top.points,
+                    valid: &top.valid,
+                };
+                let part = uncorrected(&seen, Limits::of(&config.regressor, 0), side, device);
+                let origins = part.origins.iter().map(|origin| Origin { view: None, ..*origin }).collect();
+                Some(Part { origins, ..part })
+            }));
+        }
+        let made: usize = parts.iter().map(|part| part.origins.len()).sum();
+        let (gaussians, origins) = record.timed("activations", |_| assemble(config, parts, device));
+        record.steps.push(Step::Gaussians { gaussians: origins.len() });
+        record.add_some(made - origins.len(), |gaussians| Step::GaussiansNotFinite { gaussians });
+        Painted { lost: lost + made - origins.len(), gaussians, origins, valid, side_images }
+    }
+
+    /// The parts of all views, pair after pair.
+    fn regressed(&self, views: &[CanvasView], maps: &Tensor<4>, record: &mut Record) -> Vec<Part> {
+        let (config, side) = (self.config, self.config.network.resolution);
+        let names = [
+            ("regressor (front, back)", "front, back"),
+            ("regressor (sides)", "sides"),
+            ("regressor (second surfaces)", "second surfaces"),
+        ];
+        let mut parts = Vec::new();
+        for (pair, ((module, name), seen)) in names.into_iter().zip(views.chunks(2)).enumerate() {
+            if !self.views.contains(&(2 * pair).min(2)) {
+                continue;
+            }
+            let Some(person) = Window::around(seen.iter().map(|view| view.valid), side) else {
+                record.steps.push(Step::NoRegressor { views: name });
+                continue;
+            };
+            let window = if config.crop() {
+                person.padded(config.regressor.margin(), side)
+            } else {
+                Window::whole(side)
+            };
+            record.steps.push(Step::Regressor { views: name, window: window.clone(), canvas: side, person });
+            let network = &self.regressors[pair.min(self.regressors.len() - 1)];
+            let maps = maps.clone().narrow(0, 2 * pair, seen.len());
+            parts.extend(record.timed(module, |_| regress(network, config, pair, seen, maps, &window)));
+        }
+        parts
+    }
+}
 
 /// One view on its square canvas of side S.
 pub struct CanvasView<'a> {
+    /// Which one it is.
+    pub view: View,
     /// `[3, S, S]` colours in [−1, 1], a photograph's or a side's pseudo image.
     pub image: &'a [f32],
-    /// `[1, S, S, 3]` metres, front camera's frame; tracked if the predictor is trained too.
-    pub points: Tensor<4>,
+    /// `[S, S, 3]` metres, front camera's frame.
+    pub points: &'a [f32],
     /// `[S, S]`: whether a pixel becomes a Gaussian.
     pub valid: &'a [bool],
 }
 
+impl CanvasView<'_> {
+    /// The pixels that become Gaussians.
+    fn origins(&self) -> Vec<Origin> {
+        let pixels = (0..self.valid.len()).filter(|pixel| self.valid[*pixel]);
+        pixels.map(|pixel| Origin { view: Some(self.view), pixel: pixel as u32 }).collect()
+    }
+
+    fn geometry(&self, side: usize, limits: Limits, device: &Device) -> Geometry {
+        let camera = nominal_camera(self.view, OPPOSITE, side);
+        Geometry::new(self.image, self.points, self.valid, &camera, limits, device)
+    }
+}
+
 /// Features of one view's N valid pixels.
-pub struct Part {
+struct Part {
     features: Tensor<2>,
     points: Tensor<2>,
     geometry: Option<Geometry>,
-}
-
-/// The pixels of each view that become Gaussians.
-pub struct Chosen {
-    /// `[S, S]` of every view.
-    pub valid: Vec<Vec<bool>>,
-    /// Pixels left out because their points are not finite.
-    pub lost: usize,
-    /// Pixels of the sides left out because they lie outside of the photographs' silhouettes.
-    pub outside: usize,
-    /// Pixels left out because their points lie between two surfaces.
-    pub between: usize,
-}
-
-impl Chosen {
-    /// Selects pixels of photographs by their masks `[S, S]`, and pixels of the sides by their confidences `[V, S, S]` and
-    /// their points `[V, S, S, 3]`, metres, front camera's frame.
-    pub fn new(config: &NetworkConfig, masks: [&[bool]; 2], points: &[f32], conf: &[f32]) -> Self {
-        let (side, area) = (config.resolution, config.resolution * config.resolution);
-        let views = conf.len() / area;
-        let hull = config.hull_margin.filter(|_| views > 2);
-        let hull = hull.map(|margin| Hull::new(masks, side, margin * side / 1024));
-        let (mut lost, mut outside) = (0, 0);
-        let mut keep = |view: usize, i: usize| {
-            let at = view * area + i;
-            let is_chosen = match masks.get(view) {
-                Some(mask) => mask[i],
-                None => conf[at] > config.conf_threshold,
-            };
-            if !is_chosen {
-                return false;
-            }
-            let point = [points[3 * at], points[3 * at + 1], points[3 * at + 2]];
-            if !is_finite(&point) {
-                lost += 1;
-                return false;
-            }
-            let is_inside = view < 2 || hull.as_ref().is_none_or(|hull| hull.contains(point));
-            outside += usize::from(!is_inside);
-            is_inside
-        };
-        let mut valid: Vec<Vec<bool>> =
-            (0..views).map(|view| (0..area).map(|i| keep(view, i)).collect()).collect();
-        let mut between = 0;
-        if let Some(steepest) = config.steepest {
-            for (view, points) in valid.iter_mut().zip(points.chunks_exact(3 * area)) {
-                between += without_steep(view, points, side, steepest);
-            }
-        }
-        Self { valid, lost, outside, between }
-    }
-}
-
-/// Width in metres of a pixel of the nominal cameras at the person's distance, on a canvas of `side`² pixels.
-pub(crate) fn pixel_width(side: usize) -> f32 {
-    let nominal = Camera::orbit_at_yaw_degrees(0.0, side as u32);
-    ((nominal.centre() * DVec3::new(1.0, 0.0, 1.0)).length() / nominal.focal.x) as f32
-}
-
-/// Takes away the valid pixels of a view whose points `[S, S, 3]`, metres, are further from a neighbour's than `steepest` times the
-/// width of a pixel at the person's distance. Returns their number.
-pub(crate) fn without_steep(valid: &mut [bool], points: &[f32], side: usize, steepest: f32) -> usize {
-    let farthest = (steepest * pixel_width(side)).powi(2);
-    let squared = |i: usize, j: usize| -> f32 {
-        (0..3).map(|axis| (points[3 * i + axis] - points[3 * j + axis]).powi(2)).sum()
-    };
-    let mut steep = vec![false; valid.len()];
-    for i in (0..valid.len()).filter(|&i| valid[i]) {
-        for j in [(i % side + 1 < side).then_some(i + 1), Some(i + side)].into_iter().flatten() {
-            if valid.get(j) == Some(&true) && squared(i, j) > farthest {
-                (steep[i], steep[j]) = (true, true);
-            }
-        }
-    }
-    valid.iter_mut().zip(&steep).for_each(|(valid, steep)| *valid &= !steep);
-    steep.into_iter().filter(|steep| *steep).count()
+    origins: Vec<Origin>,
 }
 
 /// Colours `[3, S, S]` in [−1, 1] of a photograph for its Gaussians. The input is multiplied by the `mask` `[S, S]`, so
@@ -156,29 +231,23 @@ fn pixel(rgb: &[f32], area: usize, i: usize) -> [f32; 3] {
     [rgb[i], rgb[area + i], rgb[2 * area + i]]
 }
 
-/// The regressor on a window of some views, which are one batch: both photographs (`pair` 0), or the two unseen sides. Views
-/// without a valid pixel have no part.
-pub fn regress(
+/// The regressor on a window of some views, which are one batch: both photographs (`pair` 0), or two unseen sides. `maps` `[2, S, S, 3]`
+/// are their points on the device. Views without a valid pixel have no part.
+fn regress(
     network: &Regressor,
     config: &Config,
     pair: usize,
     views: &[CanvasView],
+    maps: Tensor<4>,
     window: &Window,
 ) -> Vec<Part> {
     let limits = Limits::of(&config.regressor, pair);
-    let (side, device) = (config.network.resolution, views[0].points.device());
+    let (side, device) = (config.network.resolution, maps.device());
     let (h, w) = (window.rows.len(), window.columns.len());
-    let (colors, points): (Vec<_>, Vec<_>) = views
-        .iter()
-        .map(|view| {
-            let crop = TensorData::new(window.crop(view.image, 3, side), [1, 3, h, w]);
-            let points =
-                view.points.clone().narrow(1, window.rows.start, h).narrow(2, window.columns.start, w);
-            (Tensor::<4>::from_data(crop, &device), points)
-        })
-        .unzip();
-    let points = Tensor::cat(points, 0);
-    let input = Tensor::cat(vec![Tensor::cat(colors, 0), points.clone().permute([0, 3, 1, 2])], 1);
+    let colors: Vec<f32> = views.iter().flat_map(|view| window.crop(view.image, 3, side)).collect();
+    let colors = Tensor::<4>::from_data(TensorData::new(colors, [views.len(), 3, h, w]), &device);
+    let points = maps.narrow(1, window.rows.start, h).narrow(2, window.columns.start, w);
+    let input = Tensor::cat(vec![colors, points.clone().permute([0, 3, 1, 2])], 1);
     let features = network.forward(input, &mut Statistics::measured());
     let mut parts = Vec::new();
     for (i, view) in views.iter().enumerate() {
@@ -187,66 +256,73 @@ pub fn regress(
             continue;
         }
         let pick = |x: Tensor<4>, c: usize| taken(x.narrow(0, i, 1).reshape([h * w, c]), &rows);
-        let geometry = Geometry::is_needed(&config.regressor)
-            .then(|| Geometry::new(view.image, &view.points, view.valid, side, limits));
+        let geometry = Geometry::is_needed(&config.regressor).then(|| view.geometry(side, limits, &device));
         parts.push(Part {
             features: pick(features.clone(), FEATURES),
             points: pick(points.clone(), 3),
             geometry,
+            origins: view.origins(),
         });
     }
     parts
 }
 
-/// Gaussians of the geometry alone, without a regressor, front camera's frame. Every valid point of some views becomes
-/// a round Gaussian of its pixel's colour. σ is 0.3 times the distance of its neighbours
+/// Gaussians of the geometry alone, without a regressor, front camera's frame. Every valid point of some views on a canvas of `side`²
+/// pixels becomes a round Gaussian of its pixel's colour. σ is 0.3 times the distance of its neighbours
 /// (docs/method.md, "Geometric start").
-pub fn geometric(views: &[CanvasView], device: &Device) -> Gaussians {
+pub fn geometric(views: &[CanvasView], side: usize, device: &Device) -> Gaussians {
     let regressor = RegressorConfig { start: Some(RegressorStart::Geometric), ..RegressorConfig::default() };
     let limits = Limits::of(&regressor, 0);
     let config = Config { regressor, ..Config::default() };
     let parts = views.iter().filter(|view| view.valid.contains(&true));
-    let parts = parts.map(|view| uncorrected(view, limits)).collect();
+    let parts = parts.map(|view| uncorrected(view, limits, side, device)).collect();
     assemble(&config, parts, device).0
 }
 
 /// The part of a view to which no regressor adds anything.
-pub fn uncorrected(view: &CanvasView, limits: Limits) -> Part {
-    let side = view.points.dims()[1];
-    let rows = Window::whole(side).indices(view.valid, side);
+fn uncorrected(view: &CanvasView, limits: Limits, side: usize, device: &Device) -> Part {
+    let origins = view.origins();
+    let n = origins.len();
+    let points = origins.iter().flat_map(|origin| &view.points[3 * origin.pixel as usize..][..3]);
+    let points = points.copied().collect::<Vec<f32>>();
     Part {
-        features: Tensor::zeros([rows.len(), FEATURES], &view.points.device()),
-        points: taken(view.points.clone().reshape([side * side, 3]), &rows),
-        geometry: Some(Geometry::new(view.image, &view.points, view.valid, side, limits)),
+        features: Tensor::zeros([n, FEATURES], device),
+        points: Tensor::from_data(TensorData::new(points, [n, 3]), device),
+        geometry: Some(view.geometry(side, limits, device)),
+        origins,
     }
 }
 
-/// Activates and joins the parts: Gaussians in the front camera's frame, and the number of those left out because a
-/// feature is not finite or a centre lies beyond 1e30 m.
-pub fn assemble(config: &Config, parts: Vec<Part>, device: &Device) -> (Gaussians, usize) {
+/// Activates and joins the parts: Gaussians in the front camera's frame and their pixels, without those of which a feature is not finite
+/// or whose centre lies beyond 1e30 m.
+fn assemble(config: &Config, parts: Vec<Part>, device: &Device) -> (Gaussians, Vec<Origin>) {
     /// Coordinates beyond this could overflow on their way to the world frame.
     const FARTHEST: f32 = 1e30;
     if parts.is_empty() {
-        return (none(device), 0);
+        return (none(device), Vec::new());
     }
-    let (mut features, mut points, mut attributes) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut features, mut points, mut attributes, mut origins) =
+        (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     for part in parts {
         attributes.push(Attributes::new(&config.regressor, part.features.clone(), part.geometry));
         features.push(part.features);
         points.push(part.points);
+        origins.extend(part.origins);
     }
     let (features, attributes) = (Tensor::cat(features, 0), Attributes::joined(attributes));
     let means = Tensor::cat(points, 0) + attributes.offset;
-    let (raw, centres) = (host(features), host(means.clone()));
-    let rows = raw.chunks_exact(FEATURES).zip(centres.chunks_exact(3)).enumerate();
-    let sound = |raw: &[f32], centre: &[f32]| {
-        raw.iter().all(|v| v.is_finite()) && centre.iter().all(|v| v.abs() <= FARTHEST)
-    };
-    let keep: Vec<i64> =
-        rows.filter(|(_, (raw, centre))| sound(raw, centre)).map(|(i, _)| i as i64).collect();
-    let (n, kept) = (means.dims()[0], keep.len());
+    // 0 for sound rows; the product with 0 of anything else is not.
+    let unsound = (features.without_autodiff() * 0.0).sum_dim(1)
+        + means.clone().without_autodiff().abs().greater_elem(FARTHEST).float().sum_dim(1)
+        + (means.clone().without_autodiff() * 0.0).sum_dim(1);
+    let unsound = host(unsound);
+    let keep: Vec<i64> = (0..unsound.len()).filter(|i| unsound[*i] == 0.0).map(|i| i as i64).collect();
+    let (n, kept) = (unsound.len(), keep.len());
     if kept == 0 {
-        return (none(device), n);
+        return (none(device), Vec::new());
+    }
+    if kept < n {
+        origins = keep.iter().map(|row| origins[*row as usize]).collect();
     }
     let index = Tensor::<1, Int>::from_data(TensorData::new(keep, [kept]), &means.device());
     let pick = |x: Tensor<2>| if kept < n { x.select(0, index.clone()) } else { x };
@@ -257,7 +333,11 @@ pub fn assemble(config: &Config, parts: Vec<Part>, device: &Device) -> (Gaussian
         pick(attributes.opacity).squeeze_dim(1),
         pick(attributes.color) * 0.5 + 0.5,
     );
-    (gaussians.expect("consistent by construction"), n - kept)
+    (gaussians.expect("consistent by construction"), origins)
+}
+
+fn count(mask: &[bool]) -> usize {
+    mask.iter().filter(|set| **set).count()
 }
 
 fn none(device: &Device) -> Gaussians {
@@ -266,38 +346,10 @@ fn none(device: &Device) -> Gaussians {
         .expect("consistent by construction")
 }
 
-/// Gaussians of the front camera's frame in the frame that `camera_to_world` leads to.
-pub fn placed(config: &Config, gaussians: Gaussians, camera_to_world: &RigidTransform) -> Gaussians {
-    match config.rotation_frame() {
-        RotationFrame::Camera => gaussians.transformed(camera_to_world),
-        RotationFrame::World => gaussians.with_means_transformed(camera_to_world),
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::weights::random_regressors;
-
-    /// A wall at two metres, half of which is a metre closer. The pixels along the step lie between both.
-    #[test]
-    fn points_between_two_surfaces_are_left_out() {
-        let side = 8;
-        let point = |i: usize| {
-            let (x, y) = ((i % side) as f32, (i / side) as f32);
-            [0.3 * x, 0.3 * y, if x < 4.0 { 1.0 } else { 2.0 }]
-        };
-        let points: Vec<f32> = (0..64).flat_map(point).collect();
-        // A pixel is 31 cm wide there; the step is 3.4 times as long as that, from a row's end to the next it is 7 times.
-        for (steepest, step) in [(3.0, true), (4.0, false)] {
-            let mut valid = vec![true; 64];
-            valid[3] = false;
-            let lost = without_steep(&mut valid, &points, side, steepest);
-            let kept = |i: usize| i != 3 && !(step && i > 7 && matches!(i % side, 3 | 4));
-            assert_eq!(valid, (0..64).map(kept).collect::<Vec<_>>());
-            assert_eq!(lost, if step { 14 } else { 0 });
-        }
-    }
 
     /// The first limit of `regressor.color_limits` is the photographs', the second that of all surfaces of the sides.
     #[test]
@@ -315,11 +367,14 @@ mod tests {
         let image: Vec<f32> = (0..3 * side * side).map(|i| 0.8 * value(i) - 0.4).collect();
         let points: Vec<f32> =
             (0..side * side).flat_map(|i| [(i % side) as f32, (i / side) as f32, 300.0 + value(i)]).collect();
-        let points = Tensor::from_data(TensorData::new(points, [1, side, side, 3]), &device) * 0.007;
+        let points: Vec<f32> = points.into_iter().map(|v| 0.007 * v).collect();
+        let maps =
+            Tensor::from_data(TensorData::new([&*points, &points].concat(), [2, side, side, 3]), &device);
         let valid = vec![true; side * side];
         for (pair, limit) in [(0, 0.03), (1, 0.2), (2, 0.2)] {
-            let view = || CanvasView { image: &image, points: points.clone(), valid: &valid };
-            let parts = regress(network, &config, pair, &[view(), view()], &Window::whole(side));
+            let view = |view| CanvasView { view, image: &image, points: &points, valid: &valid };
+            let views = [View::Front, View::Back].map(view);
+            let parts = regress(network, &config, pair, &views, maps.clone(), &Window::whole(side));
             let (gaussians, _) = assemble(&config, parts, &device);
             let colors = host(gaussians.colors);
             let worst = colors.chunks_exact(3).enumerate().fold(0.0_f32, |worst, (i, color)| {
@@ -348,5 +403,27 @@ mod tests {
         // A white pixel under a lossy mask stays a colour.
         let config = RegressorConfig { straight_color: true, ..RegressorConfig::default() };
         assert_eq!(*photograph_colors(&config, &[0.9, -0.9, 0.9], &[0.6]), [1.0, -1.0, 1.0]);
+    }
+
+    /// The second Gaussian has a feature, the fourth a centre that is not finite. The others keep their pixels.
+    #[test]
+    fn lost_gaussians_take_no_others_pixel_away() {
+        let device = Device::flex();
+        let tensor = |columns: usize, bad: usize| {
+            let value = |i: usize| if i == bad { f32::NAN } else { 0.1 };
+            let values: Vec<f32> = (0..5 * columns).map(value).collect();
+            Tensor::<2>::from_data(TensorData::new(values, [5, columns]), &device)
+        };
+        let origins = (0..5).map(|i| Origin { view: (i != 4).then_some(View::Back), pixel: 7 * i }).collect();
+        let part = Part {
+            features: tensor(FEATURES, FEATURES + 2),
+            points: tensor(3, 3 * 3 + 1),
+            geometry: None,
+            origins,
+        };
+        let (gaussians, kept) = assemble(&Config::default(), vec![part], &device);
+        assert_eq!(gaussians.len(), 3);
+        let expected = [(Some(View::Back), 0), (Some(View::Back), 14), (None, 28)];
+        assert_eq!(kept, expected.map(|(view, pixel)| Origin { view, pixel }));
     }
 }

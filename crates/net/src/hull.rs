@@ -2,48 +2,36 @@
 
 use glam::DVec3;
 use rayon::prelude::*;
-use snapsnap_splat::{Camera, RigidTransform};
+use snapsnap_splat::Camera;
 
+use crate::chosen::pixel_width;
 use crate::config::{NetworkConfig, OPPOSITE};
-use crate::gaussians::pixel_width;
-use crate::network::{View, nominal};
+use crate::network::{View, nominal_camera};
 
 /// Most steps of a point on its way into the silhouettes, which bounds the time on large canvases.
 const MOST_STEPS: f64 = 100.0;
 
-/// The space inside the masks of the two photographs, for the nominal front and back cameras.
+/// The space inside the masks of the two photographs.
 pub struct Hull {
     side: usize,
     /// Masks, grown.
     masks: [Vec<bool>; 2],
-    /// From the front camera's frame to either camera's.
-    to_camera: [RigidTransform; 2],
-    camera: Camera,
+    cameras: [Camera; 2],
 }
 
 impl Hull {
-    /// The hull of masks `[S, S]` of the front and the back, each grown by `margin` pixels, since cameras and predicted points
-    /// have small errors.
+    /// The hull of masks `[S, S]` of the front and the back, each grown by `margin` pixels, since predicted points have small
+    /// errors. The cameras are the nominal ones: upright people are seen by exactly these (docs/method.md, "Upright targets").
     pub fn new(masks: [&[bool]; 2], side: usize, margin: usize) -> Self {
-        let [camera, back] = [0.0, 180.0].map(|yaw| Camera::orbit_at_yaw_degrees(yaw, side as u32));
-        let to_back = camera.world_to_camera.inverse().then(&back.world_to_camera);
-        Self {
-            side,
-            masks: masks.map(|mask| dilated(mask, side, margin)),
-            to_camera: [RigidTransform::IDENTITY, to_back],
-            camera,
-        }
+        let cameras = [View::Front, View::Back].map(|view| nominal_camera(view, OPPOSITE, side));
+        Self { side, masks: masks.map(|mask| dilated(mask, side, margin)), cameras }
     }
 
     /// Whether a point `[x, y, z]`, metres in the front camera's frame, is within the masks of both cameras.
     pub fn contains(&self, point: [f32; 3]) -> bool {
         let point = DVec3::from(point.map(f64::from));
-        self.masks.iter().zip(&self.to_camera).all(|(mask, to_camera)| {
-            let p = to_camera.apply(point);
-            if p.z <= 0.0 {
-                return false;
-            }
-            let place = self.camera.focal * p.truncate() / p.z + self.camera.principal_point;
+        self.masks.iter().zip(&self.cameras).all(|(mask, camera)| {
+            let Some((place, _)) = camera.project(point) else { return false };
             let inside = 0.0..self.side as f64;
             inside.contains(&place.x)
                 && inside.contains(&place.y)
@@ -67,10 +55,10 @@ impl Hull {
 }
 
 /// Moves the points of the sides that lie outside of the photographs' silhouettes along their lines of sight until they are inside
-/// (docs/method.md, "Points inside the silhouettes"). `masks` `[S, S]` are those of the photographs, `points` `[V, S, S, 3]` in metres in
-/// the front camera's frame, and `conf` `[V, S, S]` the confidences: pixels that become no Gaussians stay. Returns the number of points
-/// that moved.
-pub fn carve(config: &NetworkConfig, masks: [&[bool]; 2], points: &mut [f32], conf: &[f32]) -> usize {
+/// (docs/method.md, "Points inside the silhouettes"). `masks` `[S, S]` are those of the photographs, `points`
+/// `[V, S, S, 3]` in metres in the front camera's frame, and `conf` `[V, S, S]` the confidences: pixels that become no Gaussians stay.
+/// Returns the number of points that moved.
+pub(crate) fn carve(config: &NetworkConfig, masks: [&[bool]; 2], points: &mut [f32], conf: &[f32]) -> usize {
     let (side, area) = (config.resolution, config.resolution * config.resolution);
     let reach = config.hull_reach();
     if reach == 0.0 || conf.len() <= 2 * area {
@@ -81,7 +69,7 @@ pub fn carve(config: &NetworkConfig, masks: [&[bool]; 2], points: &mut [f32], co
     views
         .skip(2)
         .map(|((points, conf), view)| {
-            let centre = nominal(view, OPPOSITE, side).1.inverse().translation;
+            let centre = nominal_camera(view, OPPOSITE, side).centre();
             let moved = points.par_chunks_exact_mut(3).zip(conf).map(|(point, conf)| {
                 let place = (*conf > config.conf_threshold)
                     .then(|| hull.entered([point[0], point[1], point[2]], centre, reach))
@@ -127,6 +115,7 @@ fn spread(inside: &[bool], [lines, length]: [usize; 2], strides: [usize; 2], mar
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::network::nominal_camera;
 
     /// The person is the left half of the front photograph, hence x < 0. The right's camera stands at x = +2, also for the second
     /// surfaces.
@@ -166,7 +155,7 @@ mod tests {
         let moved = [points[at], points[at + 1], points[at + 2]];
         let step = 0.5 * pixel_width(side);
         assert!(moved[0] <= 0.0 && moved[0] > -1.1 * step, "{moved:?}");
-        let centre = nominal(View::Right, OPPOSITE, side).1.inverse().translation;
+        let centre = nominal_camera(View::Right, OPPOSITE, side).centre();
         let [from, to] = [outside, moved].map(|p| DVec3::from(p.map(f64::from)) - centre);
         assert!(from.normalize().distance(to.normalize()) < 1e-6, "{centre} {moved:?}");
         let mut expected = given.clone();

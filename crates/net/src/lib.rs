@@ -1,5 +1,6 @@
 //! The networks of snapsnap: two photographs → point maps → Gaussians, and the files their weights come from.
 
+mod chosen;
 pub mod config;
 mod crop;
 pub mod gaussians;
@@ -8,16 +9,23 @@ mod memory;
 pub mod names;
 mod neighbours;
 pub mod network;
+mod photograph;
+mod points;
 pub mod precision;
+mod predict;
 mod reconstruct;
 pub mod regressor;
 pub mod resample;
 pub mod sides;
+pub mod steps;
 mod top;
 pub mod u2net;
 pub mod weights;
 
 pub use crop::Window;
-pub use hull::{carve, dilated};
+pub use hull::dilated;
 pub use neighbours::Neighbours;
-pub use reconstruct::{Photograph, Reconstruction, Reconstructor};
+pub use photograph::Photograph;
+pub use points::Points;
+pub use predict::Prediction;
+pub use reconstruct::{Reconstruction, Reconstructor, placed};

@@ -3,7 +3,7 @@
 use glam::{DVec3, Vec3};
 use snapsnap_splat::Camera;
 
-use crate::gaussians::{pixel_width, without_steep};
+use crate::chosen::{pixel_width, without_steep};
 
 /// Farthest two edges may be apart, metres: a head with hair is not longer.
 const LONGEST: f32 = 0.35;

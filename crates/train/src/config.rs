@@ -143,15 +143,9 @@ pub struct Stage2Config {
     pub anisotropy_weight: f64,
     /// Largest ratio of the longest to the shortest axis without a penalty.
     pub anisotropy_limit: f64,
-    /// Standard deviation, in metres, of random shifts of the predicted points. The frozen predictor's points are
-    /// better for the people that it was trained on than for others.
-    pub point_noise: f64,
     /// Perceptual distance, in the last steps.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lpips: Option<LpipsConfig>,
-    /// Folder in which the frozen predictor's point maps are kept for later steps and runs.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub point_map_cache: Option<PathBuf>,
     /// Weight of stage 1's loss while the point predictor is trained as well; 0: it is frozen.
     pub points_weight: f64,
 }
@@ -212,9 +206,7 @@ impl Default for Stage2Config {
             alpha_weight: 0.0,
             anisotropy_weight: 0.0,
             anisotropy_limit: 8.0,
-            point_noise: 0.0,
             lpips: None,
-            point_map_cache: None,
             points_weight: 0.0,
         }
     }
@@ -233,9 +225,7 @@ impl Schema for TrainConfig {
         ("stage2.alpha", "stage2.alpha_weight"),
         ("stage2.needle", "stage2.anisotropy_weight"),
         ("stage2.anisotropy", "stage2.anisotropy_limit"),
-        ("stage2.noise", "stage2.point_noise"),
         ("stage2.points", "stage2.points_weight"),
-        ("stage2.maps", "stage2.point_map_cache"),
     ];
 
     fn refusal(&self) -> Option<(String, String)> {
@@ -285,7 +275,6 @@ impl TrainConfig {
             ("stage2.alpha_weight", two.alpha_weight, 0.0..=1e6),
             ("stage2.anisotropy_weight", two.anisotropy_weight, 0.0..=1e6),
             ("stage2.anisotropy_limit", two.anisotropy_limit, 1.0..=1e6),
-            ("stage2.point_noise", two.point_noise, 0.0..=1.0),
             ("stage2.points_weight", two.points_weight, 0.0..=1e6),
             ("stage2.lpips.weight", lpips.map_or(0.0, |lpips| lpips.weight), 0.0..=1e6),
             ("stage2.lpips.after", lpips.map_or(0.0, |lpips| lpips.after), 0.0..=1.0),
@@ -302,10 +291,6 @@ impl TrainConfig {
                 "must be false with `network.side_heads = false`: the curriculum begins with the sides";
             return refuse("stage2.curriculum", message);
         }
-        if two.points_weight > 0.0 && two.point_noise > 0.0 {
-            let message = "must be 0 with `stage2.points_weight` above 0: a predictor in training has errors of its own";
-            return refuse("stage2.point_noise", message);
-        }
         if two.points_weight > 0.0 && two.curriculum {
             let message = "must be 0 with `stage2.curriculum = true`, which renders parts of a person";
             return refuse("stage2.points_weight", message);
@@ -316,18 +301,6 @@ impl TrainConfig {
         if lpips.is_some() && self.network.resolution < MIN_SIDE {
             let message = format!("needs `network.resolution` of at least {MIN_SIDE}");
             return refuse("stage2.lpips", &message);
-        }
-        if two.point_map_cache.as_ref().is_some_and(|folder| folder.as_os_str().is_empty()) {
-            return refuse("stage2.point_map_cache", "must name a folder");
-        }
-        if two.point_map_cache.is_some() && two.points_weight > 0.0 {
-            let message = "needs a frozen predictor, `stage2.points_weight = 0`";
-            return refuse("stage2.point_map_cache", message);
-        }
-        if two.point_map_cache.is_some() && self.samples.augment.changes_photographs() {
-            let message = "needs photographs that do not change: exposure, white_balance, blur, noise, mask_erosion, mask_dilation \
-                           and jpeg_quality of `samples.augment` must be 0, and background false";
-            return refuse("stage2.point_map_cache", message);
         }
         if let Some((key, message)) = self.samples.problem() {
             return Some((format!("samples.{key}"), message));

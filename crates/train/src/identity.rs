@@ -14,10 +14,9 @@ use crate::task::Task;
 
 /// Keys that may change between the sessions of a run: its length, its reports, the speed of its loader, and paths. The files
 /// behind the paths have hashes of their own, or are no longer read.
-const FREE: [&str; 12] = [
+const FREE: [&str; 11] = [
     "data.folders",
     "stage2.lpips.files",
-    "stage2.point_map_cache",
     "training.checkpoint_every",
     "training.gradient_checkpointing",
     "training.log_every",

@@ -3,10 +3,8 @@
 
 use burn::tensor::Tensor;
 use snapsnap_eval::points::longest_side;
-use snapsnap_net::Window;
-use snapsnap_net::config::{Config, NetworkConfig};
-use snapsnap_net::network::{Input, PointMap, PointPredictor, View};
-use snapsnap_ops::{bilinear, host, mean, mean_lengths};
+use snapsnap_net::Prediction;
+use snapsnap_ops::{bilinear, mean, mean_lengths};
 
 use crate::config::Stage1Config;
 use crate::task::Part;
@@ -45,82 +43,6 @@ impl Losses {
         parts.extend(self.normals.map(|value| Part { name: "normals", weight: normals_weight, value }));
         parts
     }
-}
-
-/// Point maps of all views on the predictor's window of the canvas.
-#[derive(Debug, Clone)]
-pub struct Prediction {
-    /// The window.
-    pub window: Window,
-    /// `[B,h,w,3]` and `[B,h,w]` of every view.
-    pub maps: Vec<(View, PointMap)>,
-    /// Normals `[B,3,h',w']` of front and back in the network's pixels, with `network.normals`.
-    pub normals: Option<[Tensor<4>; 2]>,
-}
-
-impl Prediction {
-    /// The maps on the whole canvas, as in inference. They are 0 outside the window. `masks` `[B,2,S,S]` are those of
-    /// the photographs.
-    pub fn pasted(self, config: &NetworkConfig, masks: &Tensor<4>) -> Vec<(View, PointMap)> {
-        let placed = |(view, map): (View, PointMap)| {
-            let mask = mask_of(view, masks);
-            (view, map.pasted(config, view, &self.window, mask.as_ref()))
-        };
-        self.maps.into_iter().map(placed).collect()
-    }
-}
-
-/// The mask `[B,1,S,S]` of a photograph; `None` for the sides.
-fn mask_of(view: View, masks: &Tensor<4>) -> Option<Tensor<4>> {
-    ((view as usize) < 2).then(|| masks.clone().narrow(1, view as usize, 1))
-}
-
-/// The predictor's window for photographs with these masks `[.., S, S]`.
-pub(crate) fn window(config: &Config, masks: &[f32], side: usize) -> Window {
-    Window::of_predictor(config, person(masks, side))
-}
-
-/// The box around the person in photographs with these masks `[.., S, S]`.
-pub(crate) fn person(masks: &[f32], side: usize) -> Option<Window> {
-    let masks: Vec<bool> = masks.iter().map(|mask| *mask > 0.0).collect();
-    Window::around(masks.chunks_exact(side * side), side)
-}
-
-/// Predicted point maps of front and back `[B,2,3,S,S]` in [−1, 1]. Their masks `[B,2,S,S]` decide the window and
-/// `mask-aware` interpolation.
-pub fn predict(
-    predictor: &PointPredictor,
-    config: &Config,
-    images: Tensor<5>,
-    masks: &Tensor<4>,
-) -> Prediction {
-    let side = images.dims()[3];
-    let window =
-        if config.network.window { window(config, &host(masks.clone()), side) } else { Window::whole(side) };
-    predict_in(window, predictor, config, images, masks)
-}
-
-/// [`predict`] in the window of a larger batch.
-pub(crate) fn predict_in(
-    window: Window,
-    predictor: &PointPredictor,
-    config: &Config,
-    images: Tensor<5>,
-    masks: &Tensor<4>,
-) -> Prediction {
-    let [b, _, channels, side, _] = images.dims();
-    // All fronts, then all backs.
-    let photographs = images.swap_dims(0, 1).reshape([2 * b, channels, side, side]);
-    let of_input = masks.clone().swap_dims(0, 1).reshape([2 * b, 1, side, side]);
-    let finished = |(view, map): (View, PointMap)| {
-        (view, predictor.finished(config, view, map, &window, mask_of(view, masks).as_ref()))
-    };
-    let input = Input::new(config, photographs, of_input, &window);
-    let images = input.images.clone();
-    let decoded = predictor.decode(predictor.encode(input));
-    let maps = predictor.complete(predictor.heads(&decoded), &decoded, &images, &window);
-    let maps = maps.into_iter().map(finished).collect();
-    Prediction { maps, normals: predictor.normals(&decoded), window }
 }
 
 /// The losses of predicted maps of the first V views. `points` `[B,V,S,S,3]` are the true points in metres in the front

@@ -10,16 +10,17 @@ use image::RgbImage;
 use serde::{Deserialize, Serialize};
 use snapsnap_data::dataset::Folder;
 use snapsnap_data::sample::{Stage1, Stage1Batch, Stage1Batcher, Stage1Item};
-use snapsnap_net::Window;
 use snapsnap_net::config::Config;
 use snapsnap_net::network::{PointMap, View};
+use snapsnap_net::steps::Record;
+use snapsnap_net::{Prediction, Window};
 use snapsnap_ops::host;
 
 use crate::TrainError;
 use crate::config::{Stage1Config, TrainConfig};
 use crate::data::Data;
 use crate::networks::Networks;
-use crate::points::{Prediction, losses, person, predict_in};
+use crate::points::losses;
 use crate::ranks::Ranks;
 use crate::task::{Moment, Part, Task, Validation};
 use snapsnap_eval::points::{Pair, normal_error, point_errors};
@@ -65,14 +66,15 @@ impl PointTask {
     fn predict(&self, networks: &Networks, batch: &Stage1Batch, extent: Option<Window>) -> Prediction {
         let predictor = networks.predictor.as_ref().expect("stage 1 trains the predictor");
         let window = Window::of_predictor(&self.networks, extent);
-        predict_in(window, predictor, &self.networks, batch.images.clone(), &batch.masks)
+        let images = batch.images.clone();
+        Prediction::new(predictor, &self.networks, images, &batch.masks, Some(window), &mut Record::default())
     }
 
     /// Predicted maps of a sample on the whole canvas.
     fn maps(&self, networks: &Networks, item: &Stage1Item) -> Vec<Map> {
         let batch = Stage1Batcher.batch(vec![item.clone()], &self.device.clone().inner());
-        let maps = self.predict(networks, &batch, person(&item.masks, item.side));
-        let maps = maps.pasted(&self.networks.network, &batch.masks);
+        let prediction = self.predict(networks, &batch, Window::around_person(&item.masks, item.side));
+        let maps = prediction.pasted(&self.networks.network);
         let read = |(view, map): (View, PointMap)| (view as usize, host(map.points), host(map.conf));
         maps.into_iter().map(read).collect()
     }
@@ -91,7 +93,7 @@ impl Task for PointTask {
     }
 
     fn extent(&self, items: &[Stage1Item]) -> Option<Window> {
-        let extents = items.iter().filter_map(|item| person(&item.masks, item.side));
+        let extents = items.iter().filter_map(|item| Window::around_person(&item.masks, item.side));
         extents.reduce(|all, extent| all.united(&extent))
     }
 

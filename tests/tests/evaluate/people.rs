@@ -221,7 +221,7 @@ fn photographs_are_changed_by_ablations() {
         ("brighter", "{exposure=2.0}"),
         ("cut", "{cut=0.5}"),
         ("narrow", "{mask=-48.0}"),
-        ("placed", "{place=500}"),
+        ("placed", "{road=\"placed\"}"),
         ("same", "{exposure=0.0}"),
     ];
     let changes = changes.map(|(name, change)| format!("ablations.{name}.photographs={change}"));

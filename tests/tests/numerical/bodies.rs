@@ -3,8 +3,9 @@
 use burn::tensor::{Device, Tensor, TensorData};
 use snapsnap_net::config::Config;
 use snapsnap_net::network::{Grid, Input, PointMap, PointPredictor, View};
+use snapsnap_net::steps::Step;
 use snapsnap_net::weights::random_predictor;
-use snapsnap_net::{Reconstructor, Window};
+use snapsnap_net::{Reconstruction, Reconstructor, Window};
 use snapsnap_tests::{device, is_software, relative_error, values};
 
 use crate::properties::{assert_different, assert_same, config, noise, photograph, weights};
@@ -270,18 +271,21 @@ fn points_that_moved_into_the_silhouettes_are_those_of_maps_and_gaussians() {
         let config = config(&keys);
         let (_file, weights) = weights(&config, 4);
         let model = Reconstructor::load(&weights, &device).expect("weights");
-        model.reconstruct(&strip(1, 0..side / 2 - 16), &strip(2, side / 2 + 16..side), &|_| ())
+        model.reconstruct([&strip(1, 0..side / 2 - 16), &strip(2, side / 2 + 16..side)], &|_| ())
     });
-    let [before, after] = runs.each_ref().map(|run| values(run.maps.points.clone()));
+    let [before, after] = runs.each_ref().map(|run| run.points.host.clone());
     // At least half a pixel's width. Two runs on a GPU may differ in the last bits.
     let differs = |(a, b): (&[f32], &[f32])| a.iter().zip(b).any(|(a, b)| (a - b).abs() > 1e-3);
     let moved: Vec<bool> = before.chunks_exact(3).zip(after.chunks_exact(3)).map(differs).collect();
     let photographed = moved.len() / 2;
     let count = moved.iter().filter(|moved| **moved).count();
     assert!(count > 0 && !moved[..photographed].contains(&true), "{count}");
-    let line = format!("{count} pixels of the sides moved into the silhouettes");
-    assert!(runs[1].plan.contains(&line), "{line}: {:?}", runs[1].plan);
-    assert!(!runs[0].plan.iter().any(|line| line.contains("moved")), "{:?}", runs[0].plan);
+    let moved = |run: &Reconstruction| {
+        let pixels =
+            |step: &Step| if let Step::MovedIntoSilhouettes { pixels } = step { Some(*pixels) } else { None };
+        run.steps.iter().find_map(pixels)
+    };
+    assert_eq!([moved(&runs[0]), moved(&runs[1])], [None, Some(count)]);
     // A Gaussian's centre is its pixel's point and the regressor's offset, 1.25 mm at most here. The points move by centimetres.
     for (run, points) in runs.iter().zip([before, after]) {
         let chosen = points.chunks_exact(3).zip(run.valid.iter().flatten());
@@ -315,13 +319,13 @@ fn the_plan_of_a_reconstruction_names_channels_window_and_dropped_tokens() {
         let model = Reconstructor::load(&weights, &device).expect("weights");
         let side = config.network.resolution;
         let photographs = [photograph(side, 1), photograph(side, 2)];
-        let made = model.reconstruct(&photographs[0], &photographs[1], &|_| ());
-        let has = |text: &str| made.plan.iter().any(|line| line.contains(text));
+        let made = model.reconstruct(photographs.each_ref(), &|_| ());
+        let has = |text: &str| made.steps.iter().any(|step| step.to_string().contains(text));
         // Three colours, the mask, and two of the ray. The person's window is smaller than the canvas.
-        assert!(has("tokens each, 6 channels") && has(", the person's window"), "{:?}", made.plan);
-        assert_eq!(has("tokens left out"), drops_tokens, "{:?}", made.plan);
+        assert!(has("tokens each, 6 channels") && has(", the person's window"), "{:?}", made.steps);
+        assert_eq!(has("tokens left out"), drops_tokens, "{:?}", made.steps);
         for (photograph, valid) in photographs.iter().zip(&made.valid) {
-            assert_eq!(&photograph.valid, valid, "{:?}", made.plan);
+            assert_eq!(&photograph.valid, valid, "{:?}", made.steps);
         }
     }
 }

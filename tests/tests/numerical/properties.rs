@@ -6,6 +6,7 @@ use snapsnap_net::config::{Config, Downsample, NetworkConfig, Upsample};
 use snapsnap_net::network::{Grid, Input, PointMap, PointPredictor, View, activate};
 use snapsnap_net::regressor::{RECEPTIVE_RADIUS, Statistics};
 use snapsnap_net::resample::shrink;
+use snapsnap_net::steps::Step;
 use snapsnap_net::weights::{WeightFile, init};
 use snapsnap_net::{Photograph, Reconstruction, Reconstructor, Window};
 use snapsnap_ops::{Rope, bilinear};
@@ -45,7 +46,7 @@ pub(crate) fn photograph(side: usize, seed: u32) -> Photograph {
     let valid: Vec<bool> = (0..side * side).map(inside).collect();
     let mask: Vec<f32> = valid.iter().map(|v| if *v { 1.0 } else { 0.0 }).collect();
     let rgb = noise(3 * side * side, seed).iter().zip(mask.iter().cycle()).map(|(c, m)| c * m).collect();
-    Photograph { rgb, mask, valid }
+    Photograph::new(rgb, mask)
 }
 
 /// Equal but for f32 rounding: on GPUs, kernels are chosen by trial during the first runs.
@@ -63,7 +64,7 @@ fn reconstruct(config: &Config, device: &Device) -> Reconstruction {
     let (_file, weights) = weights(config, 4);
     let model = Reconstructor::load(&weights, device).expect("weights");
     let side = config.network.resolution;
-    model.reconstruct(&photograph(side, 1), &photograph(side, 2), &|_| ())
+    model.reconstruct([&photograph(side, 1), &photograph(side, 2)], &|_| ())
 }
 
 #[test]
@@ -220,10 +221,10 @@ fn points_of_extreme_size_give_finite_gaussians() {
         let weights = WeightFile::open(file.path(), None).expect("our file");
         let model = Reconstructor::load(&weights, &device).expect("weights");
         let side = config.network.resolution;
-        let result = model.reconstruct(&photograph(side, 1), &photograph(side, 2), &|_| ());
+        let result = model.reconstruct([&photograph(side, 1), &photograph(side, 2)], &|_| ());
         let pixels = result.valid.iter().flatten().filter(|v| **v).count();
         assert!(pixels > 1000, "bias {bias}: {pixels}");
-        assert_eq!(result.gaussians.len(), pixels, "bias {bias}: {:?}", result.plan);
+        assert_eq!(result.gaussians.len(), pixels, "bias {bias}: {:?}", result.steps);
         let world = result.in_world(&config);
         for values in
             [values(world.means), values(world.rotations), values(world.scales), values(world.colors)]
@@ -404,7 +405,7 @@ fn a_scene_without_side_heads_runs_neither_sides_nor_neighbour_search() {
     assert!(result.side_images.is_empty());
     let ran: Vec<&str> = result.times.iter().map(|(name, _)| *name).collect();
     assert!(!ran.contains(&"side colours") && !ran.contains(&"regressor (sides)"), "{ran:?}");
-    assert!(result.plan.iter().any(|line| line.contains("no side heads")), "{:?}", result.plan);
+    assert!(result.steps.contains(&Step::NoSideColors { as_asked: false }), "{:?}", result.steps);
 }
 
 #[test]

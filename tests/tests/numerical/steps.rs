@@ -11,17 +11,17 @@ use rand_chacha::ChaCha8Rng;
 use snapsnap_base::config::Schema;
 use snapsnap_data::dataset::{Folder, Split};
 use snapsnap_data::prepare::{DataConfig, Subject};
-use snapsnap_net::Window;
 use snapsnap_net::config::{Anchor, Body, Sides};
 use snapsnap_net::network::{PointMap, View, activate};
 use snapsnap_net::weights::{random_predictor, random_regressors};
+use snapsnap_net::{Prediction, Window};
 use snapsnap_people::synth;
 use snapsnap_tests::{TRAINING, device, device_name, is_software, relative_error, values};
 use snapsnap_train::config::TrainConfig;
 use snapsnap_train::gradients;
 use snapsnap_train::networks::{Networks, Rows};
 use snapsnap_train::photometric::Photometric;
-use snapsnap_train::points::{Prediction, losses};
+use snapsnap_train::points::losses;
 use snapsnap_train::precision::{LossScale, Precision, lower};
 use snapsnap_train::stage1::PointTask;
 use snapsnap_train::stage2::GaussianTask;
@@ -29,11 +29,10 @@ use snapsnap_train::task::{Moment, Task};
 
 fn config() -> TrainConfig {
     // The smaller network size includes interpolation. Confidences of random weights are near ½.
-    const OTHER: [&str; 6] = [
+    const OTHER: [&str; 5] = [
         "network.net_resolution=32",
         "network.conf_threshold=0.4",
         "training.validation_samples=0",
-        "stage2.point_noise=0",
         "stage2.anisotropy_weight=0.1",
         "stage2.anisotropy_limit=1.5",
     ];

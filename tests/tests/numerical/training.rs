@@ -4,8 +4,10 @@ use std::collections::BTreeMap;
 
 use burn::tensor::{Device, Tensor, TensorData};
 use snapsnap_base::config::Schema;
+use snapsnap_net::Prediction;
 use snapsnap_net::config::Config;
 use snapsnap_net::regressor::Statistics;
+use snapsnap_net::steps::Record;
 use snapsnap_net::weights::{Float, ImportOptions, SideHeads, WeightFile, import};
 use snapsnap_tests::{
     FIXTURE_VALUES, Numbers, data, device, fixture, is_software, relative_error, start_error, values,
@@ -98,8 +100,9 @@ fn follow(steps: usize) {
         let sample = step % 3;
         let photographs = masks.clone().narrow(0, sample, 1).narrow(1, 0, 2);
         let predictor = networks.predictor.as_ref().expect("is trained");
+        let images = images.clone().narrow(0, sample, 1);
         let prediction =
-            points::predict(predictor, &config, images.clone().narrow(0, sample, 1), &photographs);
+            Prediction::new(predictor, &config, images, &photographs, None, &mut Record::default());
         let [truth, masks] = [
             truth.clone().narrow(0, sample, 1).reshape([-1]),
             masks.clone().narrow(0, sample, 1).reshape([-1]),

@@ -1,92 +1,15 @@
-//! Options of a run: cached point maps, perceptual distance, 16 bits.
+//! Options of a run: perceptual distance, 16 bits.
 
 use std::collections::HashMap;
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use snapsnap_net::weights::write_tensors;
 use snapsnap_tests::{refused, snapsnap, succeed};
 
-use super::{logged, people, place, results, train, train_on};
-
-/// Cached maps give the same bytes as predicted ones. Damaged files are written again.
-#[test]
-fn cached_point_maps_change_nothing() {
-    let (temporary, config) = place();
-    let (one, maps) = (temporary.path().join("one"), temporary.path().join("maps"));
-    const PLAIN: [&str; 6] = [
-        "exposure=0",
-        "white_balance=0",
-        "mask_erosion=0",
-        "mask_dilation=0",
-        "jpeg_quality=0",
-        "background=false",
-    ];
-    let plain = PLAIN.map(|key| format!("--set=samples.augment.{key}"));
-    succeed(train(1, &config, &one).arg("--set=training.steps=12"));
-    let learn = |run: &str, is_cached: bool| {
-        let run = temporary.path().join(run);
-        let mut command = train(2, &config, &run);
-        command
-            .arg("--set=training.steps=12")
-            .args(&plain)
-            .arg("--weights")
-            .arg(one.join("best.safetensors"));
-        if is_cached {
-            command.arg("--set").arg(format!("stage2.point_map_cache='{}'", maps.display()));
-        }
-        succeed(&mut command);
-        results(&run)
-    };
-    let live = learn("live", false);
-    assert!(learn("first", true) == live, "other bytes with an empty cache");
-    let folder = fs::read_dir(&maps).expect("lists").next().expect("one predictor").expect("entry").path();
-    let files: Vec<PathBuf> =
-        fs::read_dir(&folder).expect("lists").map(|entry| entry.expect("entry").path()).collect();
-    // At most four fronts of each of the three training people, and those of one held-out person.
-    assert!((6..=14).contains(&files.len()), "{files:?}");
-    let before: Vec<Vec<u8>> = files.iter().map(|file| fs::read(file).expect("reads")).collect();
-    let times = || files.iter().map(|file| fs::metadata(file).expect("there").modified().expect("a time"));
-    fs::write(&files[0], &before[0][..before[0].len() / 2]).expect("writes");
-    fs::write(&files[1], b"").expect("writes");
-    let mut other = before[3].clone();
-    *other.last_mut().expect("values") ^= 1;
-    fs::write(&files[3], other).expect("writes");
-    fs::write(&files[2], b"{").expect("writes");
-    let written: Vec<_> = times().collect();
-    assert!(learn("second", true) == live, "other bytes with a full cache");
-    for (i, (file, before)) in files.iter().zip(&before).enumerate() {
-        assert!(fs::read(file).expect("reads") == *before, "{}", file.display());
-        let is_new = times().nth(i) != Some(written[i]);
-        assert_eq!(is_new, i < 4, "{}: only damaged files are written", file.display());
-    }
-
-    let refused = |arguments: &[&str]| {
-        let mut command = train(2, &config, &temporary.path().join("wrong"));
-        command.args(&plain).arg("--weights").arg(one.join("best.safetensors"));
-        refused(command.args(arguments))
-    };
-    let said = refused(&["--set", "stage2.point_map_cache=maps", "--set", "samples.augment.exposure=0.1"]);
-    assert!(said.contains("stage2.point_map_cache") && said.contains("exposure"), "{said}");
-    let said = refused(&[
-        "--set",
-        "stage2.point_map_cache=maps",
-        "--set",
-        "stage2.points_weight=1",
-        "--set",
-        "stage2.point_noise=0",
-    ]);
-    assert!(said.contains("stage2.point_map_cache"), "{said}");
-    let said = refused(&["--set=stage2.point_map_cache="]);
-    assert!(said.contains("stage2.point_map_cache") && said.contains("folder"), "{said}");
-    let said = refused(&["--set=stage2.lpips={ weight = 1.0, files = [] }"]);
-    assert!(said.contains("stage2.lpips.files"), "{said}");
-    let inside = format!("stage2.point_map_cache='{}'", people().join("maps").display());
-    let said = refused(&["--set", &inside]);
-    assert!(said.contains("lies in a data set"), "{said}");
-}
+use super::{logged, people, place, train, train_on};
 
 /// Random weights of AlexNet and of the learned layers.
 fn perceptual(path: &Path) {

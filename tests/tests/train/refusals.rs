@@ -281,15 +281,7 @@ fn stage_2_continues_with_its_own_predictor_only() {
     let joint = temporary.path().join("joint");
     let trained = |steps: &str, weights: &Path| {
         let mut command = train(2, &config, &joint);
-        command
-            .args([
-                "--resume",
-                "--set=stage2.points_weight=0.2",
-                "--set=stage2.point_noise=0",
-                steps,
-                "--weights",
-            ])
-            .arg(weights);
+        command.args(["--resume", "--set=stage2.points_weight=0.2", steps, "--weights"]).arg(weights);
         command
     };
     succeed(&mut trained("--set=training.steps=2", &weights(0)));

@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use clap::Args;
+use serde::Serialize;
 use snapsnap_splat::scene::{Kind, Stored};
 
 use super::{check_kind, check_outputs};
@@ -25,7 +26,7 @@ pub struct Arguments {
 }
 
 /// Axes of an output file of Gaussians.
-#[derive(Args, Debug)]
+#[derive(Args, Debug, Serialize)]
 pub struct AxesArguments {
     /// Write a PLY with y down, as SuperSplat and other viewers of INRIA's scenes expect it. Every command of this program
     /// recognises such a file.

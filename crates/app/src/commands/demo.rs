@@ -7,12 +7,12 @@ use clap::Args;
 use image::imageops::FilterType;
 use image::{DynamicImage, RgbImage, imageops};
 use serde_json::json;
-use snapsnap_data::photo::{self, Canvas, Cutting, Placement, Source};
 use snapsnap_eval::pictures::Picture;
 use snapsnap_eval::region::{Region, margin};
 use snapsnap_eval::similarity::psnr;
+use snapsnap_net::Reconstructor;
 use snapsnap_net::config::PrecisionChoice;
-use snapsnap_net::{Photograph, Reconstructor};
+use snapsnap_photo::{Cutting, Source, Told};
 use snapsnap_splat::{Camera, Gaussians, RenderOptions, render, scene};
 
 use super::ConfigArguments;
@@ -77,14 +77,14 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     // The sample pair fills its canvas. Hence its cameras are known, and other views can be compared.
     let photographs = PHOTOGRAPHS.map(|(name, _)| folder.path.join(name));
     let sources = photographs.each_ref().map(|path| Source::file(path));
-    let canvases =
-        photo::load(sources, Cutting::Given, config.network.resolution, Placement::AsIs, None)?.canvases;
-    let [front, back] = canvases.map(|Canvas { rgb, mask, valid, .. }| Photograph { rgb, mask, valid });
+    let told = Told { as_is: true, ..Told::default() };
+    let side = config.network.resolution;
+    let read = snapsnap_photo::read(&sources, Cutting::Given, side, told.placement(&config), None)?;
     let precision = PrecisionChoice::Auto.of_weights(&config, &device);
-    let reconstructor = Reconstructor::load(&weights, &device)?.in_precision(precision);
-    let made = reconstructor.reconstruct(&front, &back, &|name| progress.stage(name));
+    let networks = Reconstructor::load(&weights, &device)?.in_precision(precision);
+    let made = snapsnap_photo::person(&read, &networks, &told, &|name| progress.stage(name));
+    let world = made.expect("the sample pair shows a person").gaussians;
     let seconds = since.elapsed().as_secs_f64();
-    let world = made.in_world(&config);
     progress.stage("writing");
     scene::write(&world, &folder.file("human.ply"))?;
     drop(progress);

@@ -6,14 +6,17 @@ use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread;
 
-use snapsnap_base::config::Schema;
+use serde::Serialize;
+use snapsnap_base::config::{differences, keys};
 use snapsnap_base::{FileError, file};
-use snapsnap_data::photo::{self, Canvas, Cutting, Mapping, Pair, Placement, Shot, Source};
 use snapsnap_mesh::picture;
-use snapsnap_net::{Photograph, Reconstructor};
+use snapsnap_net::Reconstructor;
+use snapsnap_net::config::Config;
+use snapsnap_photo::{Photographs, Source, Told};
 use snapsnap_splat::scene::Stored;
 
-use super::reconstruct::{Arguments, check_memory, placement, unplaced};
+use super::convert::AxesArguments;
+use super::reconstruct::{Arguments, check_memory};
 use crate::batch::{Batch, files, stem, unpanicked};
 use crate::failure::{Failure, bail};
 use crate::progress::Progress;
@@ -42,11 +45,17 @@ struct Job {
     masks: [Option<PathBuf>; 2],
 }
 
-/// Photographs of one person on their canvases.
-struct Placed {
-    photographs: [Photograph; 2],
-    shots: [(Shot, [u32; 2], Mapping); 2],
-    doubts: Vec<String>,
+/// What decides the people of a folder.
+#[derive(Serialize)]
+struct Settings<'a> {
+    /// SHA-256 of the weights.
+    weights: String,
+    precision: &'a str,
+    cutout: &'a str,
+    told: Told,
+    /// Axes of the files.
+    axes: &'a AxesArguments,
+    config: Config,
 }
 
 pub fn run(arguments: &Arguments, pairs: &Path) -> Result<(), Failure> {
@@ -57,35 +66,34 @@ pub fn run(arguments: &Arguments, pairs: &Path) -> Result<(), Failure> {
     let jobs = if pairs.is_dir() { in_folder(pairs)? } else { in_list(pairs)? };
     let opened = arguments.model.open()?;
     let config = opened.config.clone();
-    arguments.camera.check(unplaced(&config, arguments.as_is))?;
+    let told = arguments.camera.told(&config, arguments.as_is)?;
     arguments.surface.must_be_unused::<()>("--pairs makes no meshes: snapsnap mesh takes their folder")?;
     let device = arguments.model.device(&opened)?;
-    let (reconstructor, _) = arguments.model.load(&opened, &device)?;
+    let (networks, precision) = arguments.model.load(&opened, &device)?;
     let path = folder.join(CONFIG);
-    let settings =
-        format!("# {}\n{}", arguments.of_people(&weights::sum_of(&opened)?), config.resolved().to_toml());
-    if path.exists() {
-        let there = file::read(&path, LARGEST_CONFIG).map_err(FileError::read(&path))?;
-        if there != settings.as_bytes() {
-            let message = "the people in this folder were made with other settings: give another folder";
-            return Err(Failure::file(&path, message));
-        }
-    }
+    let settings = Settings {
+        weights: weights::sum_of(&opened)?,
+        precision: precision.name(),
+        cutout: &arguments.cutout,
+        told,
+        axes: &arguments.axes,
+        config: config.resolved(),
+    };
+    check_settings(&path, &settings)?;
     let mut batch = Batch::new(folder, &arguments.shard)?;
     let jobs = batch.missing(jobs, |job| of_person(&job.name));
     if jobs.is_empty() {
         return batch.end(0);
     }
-    output::write(&path, settings.as_bytes())?;
+    output::write(&path, toml::to_string_pretty(&settings).expect("TOML types").as_bytes())?;
     let progress = Progress::steps(jobs.len(), "people");
     let (to_networks, photographs) = sync_channel(1);
     let (to_writer, people) = sync_channel(1);
     let (to_list, ended) = sync_channel(jobs.len());
     let (jobs, of_person) = (&jobs, &of_person);
     thread::scope(|scope| {
-        let side = config.network.resolution;
-        let placement = if arguments.as_is { Placement::AsIs } else { placement(&config) };
-        scope.spawn(move || read_all(arguments, jobs, side, placement, &to_networks));
+        let config = &config;
+        scope.spawn(move || read_all(arguments, jobs, config, &told, &to_networks));
         scope.spawn(move || write_all(arguments, of_person, people, &to_list));
         let mut results = 0;
         let mut count = |(name, result): (String, Result<(), Failure>)| {
@@ -93,11 +101,8 @@ pub fn run(arguments: &Arguments, pairs: &Path) -> Result<(), Failure> {
             progress.step(results, jobs.len(), "people");
             result.or_else(|failure| batch.failed(&name, failure))
         };
-        for (job, placed) in jobs.iter().zip(photographs) {
-            let person = placed.and_then(|placed| {
-                placed.doubts.iter().for_each(|doubt| say::note(&format!("{}: warning: {doubt}", job.name)));
-                unpanicked(|| make(arguments, &reconstructor, placed))
-            });
+        for (job, read) in jobs.iter().zip(photographs) {
+            let person = read.and_then(|photographs| unpanicked(|| make(&photographs, &networks, &told)));
             to_writer.send((job.name.clone(), person)).expect("the writer waits for the last person");
             ended.try_iter().try_for_each(&mut count)?;
         }
@@ -108,57 +113,51 @@ pub fn run(arguments: &Arguments, pairs: &Path) -> Result<(), Failure> {
     batch.end(jobs.len())
 }
 
+/// Refuses a folder whose people were made with other settings, and names the first that differs.
+fn check_settings(path: &Path, settings: &Settings) -> Result<(), Failure> {
+    if !path.exists() {
+        return Ok(());
+    }
+    let text = file::read_text(path, LARGEST_CONFIG).map_err(FileError::read(path))?;
+    let there: toml::Table = toml::from_str(&text).map_err(|e| Failure::file(path, e))?;
+    match differences(&keys(&there), &keys(settings)).first() {
+        None => Ok(()),
+        Some((_, message)) => {
+            let why = "the people in this folder were made with other settings: give another folder";
+            Err(Failure::file(path, format_args!("{message}; {why}")))
+        }
+    }
+}
+
 /// Reads all photographs, one person after another, until nobody wants the next one.
 fn read_all(
     arguments: &Arguments,
     jobs: &[Job],
-    side: usize,
-    placement: Placement,
-    to_networks: &SyncSender<Result<Placed, Failure>>,
+    config: &Config,
+    told: &Told,
+    to_networks: &SyncSender<Result<Photographs, Failure>>,
 ) {
-    let segmenter = weights::segmenter();
-    let cutting = arguments.cutting(&segmenter);
     for job in jobs {
-        let placed = unpanicked(|| read(arguments, job, cutting, side, placement));
-        if to_networks.send(placed).is_err() {
+        let read = unpanicked(|| {
+            let paths = job.photographs.as_ref().map_err(|missing| Failure::Input(missing.clone()))?;
+            paths.iter().try_for_each(|path| check_memory(path, picture::size(path)?))?;
+            let sources = [0, 1].map(|i| Source { mask: job.masks[i].as_deref(), ..Source::file(&paths[i]) });
+            let mut read = arguments.read(&sources, config, told, &format!("{}: ", job.name))?;
+            read.cutouts = Vec::new();
+            Ok(read)
+        });
+        if to_networks.send(read).is_err() {
             return;
         }
     }
 }
 
-fn read(
-    arguments: &Arguments,
-    job: &Job,
-    cutting: Cutting,
-    side: usize,
-    placement: Placement,
-) -> Result<Placed, Failure> {
-    let paths = job.photographs.as_ref().map_err(|missing| Failure::Input(missing.clone()))?;
-    paths.iter().try_for_each(|path| check_memory(path, picture::size(path)?))?;
-    let sources = [0, 1].map(|i| Source { mask: job.masks[i].as_deref(), ..Source::file(&paths[i]) });
-    let Pair { canvases, cutouts, shots, doubts } =
-        photo::load(sources, cutting, side, placement, arguments.camera.focal())?;
-    if arguments.strict && !doubts.is_empty() {
-        bail!("{} (--strict)", doubts.join("; "));
-    }
-    let shots = [0, 1].map(|i| (shots[i], cutouts[i].0.dimensions().into(), canvases[i].mapping));
-    let photographs = canvases.map(|Canvas { rgb, mask, valid, .. }| Photograph { rgb, mask, valid });
-    Ok(Placed { photographs, shots, doubts })
-}
-
 /// The person of two photographs.
-fn make(arguments: &Arguments, reconstructor: &Reconstructor, placed: Placed) -> Result<Stored, Failure> {
-    let [front, back] = &placed.photographs;
-    let config = reconstructor.config();
-    let result = reconstructor.reconstruct(front, back, &|_| ());
-    if result.gaussians.is_empty() {
-        bail!("no Gaussian came out of these photographs");
+fn make(photographs: &Photographs, networks: &Reconstructor, told: &Told) -> Result<Stored, Failure> {
+    match snapsnap_photo::person(photographs, networks, told, &|_| ()) {
+        Some(person) => Ok(Stored::of(&person.gaussians)?),
+        None => bail!("no Gaussian came out of these photographs"),
     }
-    let mut world = result.in_world(config);
-    if unplaced(config, arguments.as_is).is_none() {
-        world = arguments.camera.person(world, &result, placed.shots, config.network.resolution)?.0;
-    }
-    Ok(Stored::of(&world)?)
 }
 
 /// Writes all people.

@@ -1,19 +1,21 @@
 //! `snapsnap reconstruct`.
 
+use std::fmt::Display;
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use burn::tensor::Device;
 use clap::Args;
+use serde_json::{Value, json};
 use snapsnap_base::config::Schema;
 use snapsnap_base::file;
-use snapsnap_data::photo::{self, Canvas, Cutting, Pair, Placement, Source};
 use snapsnap_mesh::picture;
-use snapsnap_net::config::{Config, OPPOSITE, WorldFrame};
+use snapsnap_net::Reconstructor;
+use snapsnap_net::config::{Config, OPPOSITE};
 use snapsnap_net::precision::{Precision, PrecisionChoice, unit_of_cpu};
 use snapsnap_net::weights::WeightFile;
 use snapsnap_net::weights::schema::Part;
-use snapsnap_net::{Photograph, Reconstructor};
+use snapsnap_photo::{Cutting, Photographs, Source, Told};
 use snapsnap_splat::scene::Stored;
 
 use super::convert::AxesArguments;
@@ -22,8 +24,8 @@ use super::{ConfigArguments, check_kind, check_outputs, is_same_file, pairs};
 use crate::batch::{KindArgument, ShardArgument};
 use crate::failure::{Failure, bail};
 use crate::progress::Progress;
+use crate::told::CameraArguments;
 use crate::turntable::Turntable;
-use crate::viewpoint::CameraArguments;
 use crate::{cutouts, device, dump, memory, output, say, weights};
 
 /// Bytes per pixel of a photograph while it is placed on its canvas: 4 of the decoded picture, 3 + 1 of its colours and mask,
@@ -46,7 +48,7 @@ pub struct Arguments {
     /// Many people: a table with the columns front, back and perhaps name, front_mask and back_mask, or a folder of NAME_front.jpg and
     /// NAME_back.jpg. Their files NAME.ply go to the folder -o. People who are there already are left out. Pairs that fail are listed in
     /// errors.csv.
-    #[arg(long, value_name = "CSV|DIR", conflicts_with_all = ["front", "back", "masks", "save_cutouts", "turntable", "mesh", "dump", "verbose"])]
+    #[arg(long, value_name = "CSV|DIR", conflicts_with_all = ["front", "back", "masks", "save_cutouts", "turntable", "mesh", "dump", "verbose", "json"])]
     pairs: Option<PathBuf>,
     #[command(flatten)]
     pub kind: KindArgument,
@@ -58,7 +60,7 @@ pub struct Arguments {
     /// Background removal. auto: by the network, for photographs without an alpha channel and --masks; network: always by the network,
     /// alpha channels are ignored; none: by alpha channels and --masks alone.
     #[arg(long, value_name = "auto|network|none", default_value = "auto", value_parser = ["auto", "network", "none"])]
-    cutout: String,
+    pub cutout: String,
     /// Also write the photographs without background, before they are placed on the canvas, as front.png and back.png. The back's
     /// colours are matched to the front's. They are at most 4096 pixels long if the network removed the background.
     #[arg(long, value_name = "DIR")]
@@ -93,23 +95,38 @@ pub struct Arguments {
     /// Print the modules that ran, the omitted ones with the reasons, and the time of each.
     #[arg(short, long)]
     verbose: bool,
+    /// Print all of that as JSON, and doubts about the photographs.
+    #[arg(long, conflicts_with = "verbose")]
+    json: bool,
 }
 
 impl Arguments {
-    /// Options that decide what people of the same photographs become.
-    pub fn of_people(&self, weights: &str) -> String {
-        let Self { cutout, as_is, camera, model, axes, .. } = self;
-        let precision = model.precision;
-        format!("weights {weights}, {precision:?}, cutout {cutout}, as is {as_is}, {axes:?}, {camera:?}")
-    }
-
     /// What tells the person from the background.
-    pub fn cutting<'a>(&self, segmenter: &'a photo::Segmenter<'a>) -> Cutting<'a> {
+    fn cutting(&self) -> Cutting {
         match &*self.cutout {
             "none" => Cutting::Given,
-            "network" => Cutting::All(segmenter),
-            _ => Cutting::Missing(segmenter),
+            "network" => Cutting::All,
+            _ => Cutting::Missing,
         }
+    }
+
+    /// Reads the photographs of a person for the networks of a config. Prints doubts about them with `name` before each, or refuses them
+    /// with --strict.
+    pub fn read(
+        &self,
+        sources: &[Source],
+        config: &Config,
+        told: &Told,
+        name: &str,
+    ) -> Result<Photographs, Failure> {
+        let side = config.network.resolution;
+        let read = snapsnap_photo::read(sources, self.cutting(), side, told.placement(config), told.focal)?;
+        let doubts: Vec<String> = read.doubts.iter().map(ToString::to_string).collect();
+        if self.strict && !doubts.is_empty() {
+            bail!("{} (--strict)", doubts.join("\n"));
+        }
+        doubts.iter().for_each(|doubt| say::note(&format!("{name}warning: {doubt}")));
+        Ok(read)
     }
 }
 
@@ -181,22 +198,6 @@ pub fn check_memory(name: &Path, [width, height]: [u32; 2]) -> Result<(), Failur
     memory::check(&format!("{}, {width}×{height},", name.display()), bytes, "make the picture smaller")
 }
 
-/// The placement for these networks.
-pub fn placement(config: &Config) -> Placement {
-    let height = config.person_height();
-    if config.mode.compat { Placement::Demo { height } } else { Placement::Training { height } }
-}
-
-/// Why options about cameras and heights have no effect, if so.
-pub fn unplaced(config: &Config, as_is: bool) -> Option<&'static str> {
-    match (as_is, config.mode.compat) {
-        (true, _) => Some("with --as-is the cameras are the nominal ones"),
-        (_, true) => Some("weights in `mode.compat` have the published demo's cameras"),
-        _ if config.world_frame() == WorldFrame::Mirrored => Some("`mode.world_frame` is mirrored"),
-        _ => None,
-    }
-}
-
 fn precision(text: &str) -> Result<PrecisionChoice, &'static str> {
     match text {
         "auto" => Ok(PrecisionChoice::Auto),
@@ -244,31 +245,21 @@ fn one(arguments: &Arguments, paths: [&PathBuf; 2]) -> Result<(), Failure> {
     if arguments.masks.is_some() && arguments.cutout == "network" {
         bail!("--cutout network: --masks already tells the person from the background");
     }
-    let unplaced = unplaced(&config, arguments.as_is);
-    arguments.camera.check(unplaced)?;
+    let told = arguments.camera.told(&config, arguments.as_is)?;
     let saved = arguments.save_cutouts.as_deref().map(cutouts::paths).transpose()?;
     let config_path =
         check_paths(arguments, paths, output, weights.path(), turntable.as_ref(), target.as_ref(), &saved)?;
     paths.iter().try_for_each(|path| check_memory(path, picture::size(path)?))?;
-    let placement = if arguments.as_is { Placement::AsIs } else { placement(&config) };
     let masks = arguments.masks.as_deref().unwrap_or_default();
     let since = Instant::now();
     let sources =
         [0, 1].map(|i| Source { mask: masks.get(i).map(PathBuf::as_path), ..Source::file(paths[i]) });
-    let segmenter = weights::segmenter();
-    let cutting = arguments.cutting(&segmenter);
-    let focal = arguments.camera.focal();
-    let Pair { canvases, cutouts, shots, doubts } =
-        photo::load(sources, cutting, config.network.resolution, placement, focal)?;
-    if arguments.strict && !doubts.is_empty() {
-        bail!("{} (--strict)", doubts.join("\n"));
-    }
-    doubts.iter().for_each(|doubt| say::note(&format!("warning: {doubt}")));
+    let mut photographs = arguments.read(&sources, &config, &told, "")?;
     timed("photographs", since);
+    let cutouts = std::mem::take(&mut photographs.cutouts);
     for (path, (rgb, mask)) in saved.iter().flatten().zip(&cutouts) {
         cutouts::save(path, rgb, mask)?;
     }
-    let shots = [0, 1].map(|i| (shots[i], cutouts[i].0.dimensions().into(), canvases[i].mapping));
     drop(cutouts);
     let since = Instant::now();
     let device = arguments.model.device_for_one(&weights)?;
@@ -277,59 +268,75 @@ fn one(arguments: &Arguments, paths: [&PathBuf; 2]) -> Result<(), Failure> {
     let progress = Progress::stages();
     progress.stage("loading weights");
     let since = Instant::now();
-    let (reconstructor, precision) = arguments.model.load(&weights, &device)?;
+    let (networks, precision) = arguments.model.load(&weights, &device)?;
     timed("loading weights", since);
-    let mut plan = vec![
-        format!("device: {}", device::describe(&device)),
-        format!("weights: {}", weights.path().display()),
-        format!("precision: {}", in_words(precision, &device)),
-    ];
-    for (name, canvas) in ["front", "back"].into_iter().zip(&canvases) {
-        plan.push(format!("{name}: {}", canvas.report));
-    }
-    let [front, back] = canvases.map(|Canvas { rgb, mask, valid, .. }| Photograph { rgb, mask, valid });
-    let mut result = reconstructor.reconstruct(&front, &back, &|name| progress.stage(name));
-    plan.append(&mut result.plan);
-    times.append(&mut result.times);
-    if result.gaussians.is_empty() {
-        let (file, plan) = (weights.path().display(), plan.join("\n  "));
-        bail!("{file}: no Gaussian came out, so nothing was written; the steps:\n  {plan}");
-    }
+    let person = snapsnap_photo::person(&photographs, &networks, &told, &|name| progress.stage(name));
+    let Some(mut person) = person else {
+        bail!(
+            "{}: no Gaussian came out of these photographs, so nothing was written",
+            weights.path().display()
+        );
+    };
+    times.append(&mut person.made.times);
 
     progress.stage("writing");
     let since = Instant::now();
-    let mut world = result.in_world(&config);
-    if unplaced.is_none() {
-        let (person, cameras) = arguments.camera.person(world, &result, shots, config.network.resolution)?;
-        world = person;
-        plan.extend(["front", "back"].iter().zip(cameras).map(|(name, camera)| format!("{name}: {camera}")));
-    }
-    arguments.axes.write(&Stored::of(&world)?, output)?;
+    arguments.axes.write(&Stored::of(&person.gaussians)?, output)?;
     if let Some(path) = &config_path {
         output::write(path, config.resolved().to_toml().as_bytes())?;
     }
     if let Some(path) = &arguments.dump {
-        dump::write(&result, path)?;
+        dump::write(&person.made, path)?;
     }
     times.push(("writing", since.elapsed()));
     drop(progress);
     if let Some(turntable) = &turntable {
         let since = Instant::now();
-        turntable.write(&world)?;
+        turntable.write(&person.gaussians)?;
         times.push(("turntable", since.elapsed()));
     }
+    let mut surface = None;
     if let Some(target) = &target {
         let since = Instant::now();
-        plan.push(mesh::describe(&target.write(&world.clone().into(), output)?));
+        surface = Some(mesh::describe(&target.write(&person.gaussians.clone().into(), output)?));
         times.push(("mesh", since.elapsed()));
     }
+    times.push(("total", start.elapsed()));
     let print = say::beside(output);
+    let settings = [
+        ("device", device::describe(&device)),
+        ("weights", weights.path().display().to_string()),
+        ("precision", in_words(precision, &device)),
+    ];
+    if arguments.json {
+        let settings = settings.map(|(name, value)| (name.to_owned(), json!(value)));
+        let times = times.iter().map(|(name, time)| json!({ "module": name, "seconds": time.as_secs_f64() }));
+        let mut report = Value::Object(settings.into_iter().collect());
+        report["output"] = json!(output.display().to_string());
+        report["gaussians"] = json!(person.gaussians.len());
+        report["photographs"] = json!(photographs.reports);
+        report["doubts"] = json!(photographs.doubts);
+        report["cameras"] = json!(person.seats);
+        report["steps"] = json!(person.made.steps);
+        report["times"] = times.collect();
+        return say::json(&report.to_string());
+    }
     if arguments.verbose {
-        times.push(("total", start.elapsed()));
-        report(print, &plan, &times);
+        print("steps");
+        let line = |text: &dyn Display| print(&format!("  {text}"));
+        let of_both = |what: &dyn Display, i: usize| line(&format!("{}: {what}", ["front", "back"][i]));
+        settings.iter().for_each(|(name, value)| line(&format!("{name}: {value}")));
+        photographs.reports.iter().enumerate().for_each(|(i, report)| of_both(report, i));
+        person.made.steps.iter().for_each(|step| line(step));
+        person.seats.iter().flatten().enumerate().for_each(|(i, seat)| of_both(seat, i));
+        surface.iter().for_each(|surface| line(surface));
+        print("time, device synchronised");
+        for (name, time) in times {
+            print(&format!("  {name:<26} {:>9.1} ms", time.as_secs_f64() * 1e3));
+        }
     }
     if !say::is_quiet() {
-        print(&format!("{}: {} Gaussians", output.display(), result.gaussians.len()));
+        print(&format!("{}: {} Gaussians", output.display(), person.gaussians.len()));
     }
     Ok(())
 }
@@ -371,13 +378,4 @@ fn check_paths(
     check_kind(output)?;
     arguments.axes.check(output)?;
     Ok(config_path)
-}
-
-fn report(print: fn(&str), plan: &[String], times: &[(&str, Duration)]) {
-    print("steps");
-    plan.iter().for_each(|line| print(&format!("  {line}")));
-    print("time, device synchronised");
-    for (name, time) in times {
-        print(&format!("  {name:<26} {:>9.1} ms", time.as_secs_f64() * 1e3));
-    }
 }

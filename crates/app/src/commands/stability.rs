@@ -52,8 +52,7 @@ fn photographs(side: usize) -> [Photograph; 2] {
                 view.color.iter().zip(&view.alpha).map(move |(color, alpha)| 2.0 * color[c] - alpha)
             })
             .collect();
-        let valid = view.alpha.iter().map(|alpha| *alpha >= 0.5).collect();
-        Photograph { rgb, mask: view.alpha, valid }
+        Photograph::new(rgb, view.alpha)
     })
 }
 

@@ -12,19 +12,18 @@ use image::codecs::jpeg::JpegEncoder;
 use image::imageops::{self, FilterType};
 use image::{GrayImage, ImageFormat};
 use serde_json::json;
-use snapsnap_data::photo::{self, Canvas, Cutting, Pair, Source};
 use snapsnap_mesh::picture;
-use snapsnap_net::{Photograph, Reconstructor};
+use snapsnap_net::Reconstructor;
+use snapsnap_photo::{Content, Cutting, Source, Told, cut_out, person};
 use snapsnap_splat::scene::Stored;
 use ureq::http::StatusCode;
 
-use super::reconstruct::{ModelArguments, check_memory, placement, unplaced};
+use super::reconstruct::{ModelArguments, check_memory};
 use crate::downloads::Download;
 use crate::failure::Failure;
 use crate::page::{self, Job, PageArguments, busy, text};
 use crate::server::{Answer, Body, Refusal, Request};
-use crate::viewpoint::CameraArguments;
-use crate::weights;
+use crate::told::CameraArguments;
 
 #[derive(Args)]
 pub struct Arguments {
@@ -47,18 +46,10 @@ const QUALITY: u8 = 90;
 /// Number of people in memory.
 const KEPT: usize = 4;
 
-/// A network that finds the person's pixels, for any thread.
-type Segment = dyn Fn(&[f32]) -> Vec<f32> + Send;
-
-/// The networks, for one job at a time.
-struct Networks {
-    reconstructor: Reconstructor,
-    segment: Box<Segment>,
-}
-
-struct Studio<'a> {
-    camera: &'a CameraArguments,
-    networks: Mutex<Networks>,
+struct Studio {
+    told: Told,
+    /// For one job at a time.
+    networks: Mutex<Reconstructor>,
     /// The last people, under their names in addresses.
     people: Mutex<VecDeque<(String, Arc<Stored>)>>,
     /// Number of people so far.
@@ -71,12 +62,12 @@ struct Studio<'a> {
 
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let weights = arguments.model.open()?;
-    arguments.camera.check(unplaced(&weights.config, false))?;
+    let told = arguments.camera.told(&weights.config, false)?;
     let device = arguments.model.device(&weights)?;
-    let (reconstructor, _) = arguments.model.load(&weights, &device)?;
+    let (networks, _) = arguments.model.load(&weights, &device)?;
     let studio = Studio {
-        camera: &arguments.camera,
-        networks: Mutex::new(Networks { reconstructor, segment: Box::new(weights::segmenter()) }),
+        told,
+        networks: Mutex::new(networks),
         people: Mutex::default(),
         made: AtomicUsize::new(0),
         start: SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_nanos()),
@@ -87,7 +78,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     })
 }
 
-impl Studio<'_> {
+impl Studio {
     /// The answer, or in an error the answer that refuses.
     fn respond(&self, request: &Request, body: &mut Body) -> Result<Answer, Answer> {
         match (request.method.as_str(), request.path.as_str()) {
@@ -101,7 +92,7 @@ impl Studio<'_> {
     }
 
     /// The networks, after all earlier jobs.
-    fn networks(&self, job: &Job) -> MutexGuard<'_, Networks> {
+    fn networks(&self, job: &Job) -> MutexGuard<'_, Reconstructor> {
         job.step("waiting for another page");
         self.networks.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -114,8 +105,8 @@ impl Studio<'_> {
         check_memory(name, picture::size_of_bytes(name, upload.as_ref())?)?;
         let networks = self.networks(&job);
         job.step("removing the background");
-        let source = Source { bytes: Some(upload.as_ref()), ..Source::file(name) };
-        let (rgb, mask) = photo::cut_out(source, Cutting::Missing(&*networks.segment))?;
+        let source = Source { content: Content::Bytes(upload.as_ref()), ..Source::file(name) };
+        let (rgb, mask) = cut_out(source, Cutting::Missing)?;
         drop((networks, upload));
         let [width, height] = reduced(rgb.width(), rgb.height());
         let small = imageops::resize(&rgb, width, height, FilterType::Triangle);
@@ -145,29 +136,23 @@ impl Studio<'_> {
         let front_strokes = strokes("front strokes", front_strokes)?;
         let back_strokes = strokes("back strokes", back_strokes)?;
         let all = [front_strokes.as_ref(), back_strokes.as_ref()];
-        let source =
-            |i: usize| Source { bytes: Some(photographs[i]), strokes: all[i], ..Source::file(names[i]) };
+        let source = |i: usize| {
+            let content = Content::Bytes(photographs[i]);
+            Source { content, strokes: all[i], ..Source::file(names[i]) }
+        };
 
         let networks = self.networks(&job);
         job.step("photographs");
-        let config = networks.reconstructor.config();
-        let cutting = Cutting::Missing(&*networks.segment);
-        let sources = [source(0), source(1)];
-        let focal = self.camera.focal();
-        let Pair { canvases, cutouts, shots, doubts } =
-            photo::load(sources, cutting, config.network.resolution, placement(config), focal)?;
-        let shots = [0, 1].map(|i| (shots[i], cutouts[i].0.dimensions().into(), canvases[i].mapping));
-        drop(cutouts);
-        let [front, back] = canvases.map(|Canvas { rgb, mask, valid, .. }| Photograph { rgb, mask, valid });
-        let result = networks.reconstructor.reconstruct(&front, &back, &|step| job.step(step));
-        if result.gaussians.is_empty() {
+        let (config, told) = (networks.config(), &self.told);
+        let (side, placement) = (config.network.resolution, told.placement(config));
+        let mut read =
+            snapsnap_photo::read(&[source(0), source(1)], Cutting::Missing, side, placement, told.focal)?;
+        read.cutouts = Vec::new();
+        let Some(person) = person(&read, &networks, told, &|step| job.step(step)) else {
             return Err(text(StatusCode::UNPROCESSABLE_ENTITY, "no Gaussian came out of these photographs"));
-        }
-        let mut world = result.in_world(config);
-        if unplaced(config, false).is_none() {
-            world = self.camera.person(world, &result, shots, config.network.resolution)?.0;
-        }
-        let stored = Stored::of(&world).map_err(Failure::from)?;
+        };
+        let doubts: Vec<String> = read.doubts.iter().map(ToString::to_string).collect();
+        let stored = Stored::of(&person.gaussians).map_err(Failure::from)?;
         drop(networks);
         let name = format!("{:x}-{}", self.start, self.made.fetch_add(1, Ordering::Relaxed));
         let gaussians = stored.len();

@@ -71,12 +71,6 @@ impl Augment {
         }
     }
 
-    /// Whether photographs and masks differ from pass to pass.
-    pub fn changes_photographs(&self) -> bool {
-        let same = Self { background_color: self.background_color, flip: self.flip, ..Self::none() };
-        *self != same
-    }
-
     pub(super) fn problem(&self) -> Option<(&'static str, String)> {
         outside([
             ("exposure", self.exposure, 0.0..=0.9),

@@ -4,19 +4,32 @@ use image::{GrayImage, RgbImage};
 use serde::{Deserialize, Serialize};
 
 use super::augment::moved;
-use crate::photo::Rect;
 use snapsnap_base::config::outside;
+use snapsnap_photo::Rect;
 
 /// Canvas side that lengths refer to.
 const REFERENCE_SIDE: f32 = 1024.0;
+
+/// How photographs become a person.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Road {
+    /// The photographs are the canvases already. Cameras and masks are the data set's.
+    #[default]
+    Canvas,
+    /// The photographs are placed on their canvases as a user's are. Cameras and masks are the data set's.
+    Placed,
+    /// The photographs are a user's: neither cameras nor masks are known. The person is brought into the data set's world by the
+    /// similarity that moves its Gaussians nearest to where the true cameras see them.
+    User,
+}
 
 /// Changes to photographs before they become a model's input: the section `[photographs]` of an evaluation.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Handling {
-    /// Height, in pixels of 1024, of people who are placed on their canvas like a user's. The result is restored into the
-    /// photographs' own cameras' views. 0: photographs are the canvas already.
-    pub place: usize,
+    /// How photographs become a person.
+    pub road: Road,
     /// Difference of exposure, in stops, between the first photograph and the others. Each is changed by half of it.
     pub exposure: f32,
     /// Exposure of the back, in stops beside the front's, which stays as it is.
@@ -35,9 +48,6 @@ pub struct Handling {
 impl Handling {
     /// The first key that makes no sense, and why.
     pub fn problem(&self) -> Option<(&'static str, String)> {
-        if self.place != 0 && !(16..=1024).contains(&self.place) {
-            return Some(("place", format!("is {}, must be 0 or 16 to 1024", self.place)));
-        }
         let background = self.background.unwrap_or_default().map(|value| ("background", value, 0.0..=1.0));
         outside([
             ("exposure", self.exposure, -4.0..=4.0),

@@ -18,14 +18,14 @@ use image::{GrayImage, RgbImage};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
+use snapsnap_net::Photograph;
+use snapsnap_photo::{Cutting, Photographs, Placement, Source as Picture};
 use snapsnap_splat::Camera;
 
 use crate::dataset::{Arrangement, Description, Folder, Layout, Split};
-use crate::photo::{Canvas, on_canvas, place};
 pub use augment::Augment;
-pub use handling::Handling;
+pub use handling::{Handling, Road};
 pub use loader::{Batches, Loader, share};
-pub use rectified::Restoration;
 use snapsnap_base::FileError;
 use snapsnap_base::config::outside;
 use snapsnap_base::random::stream;
@@ -295,15 +295,28 @@ impl Source {
         Ok(((0..3).flat_map(pixels).collect(), share))
     }
 
-    /// Photographs of front and back as the networks' input.
+    /// Photographs of front and back as the networks' input: placed on their canvases like a user's, or used unchanged.
     fn photographs(
         &self,
         views: [(&RgbImage, &GrayImage); 2],
         is_placed: bool,
         random: &mut impl Rng,
-    ) -> Vec<Canvas> {
+    ) -> Result<Photographs, FileError> {
         let changed = views.map(|(color, mask)| self.config.augment.apply(color, mask, random));
-        canvases(&changed, if is_placed { self.config.person_height } else { 0 }, self.config.compat)
+        let sources =
+            changed.each_ref().map(|(color, mask)| Picture::pixels(self.folder.root(), color, Some(mask)));
+        let height = self.config.person_height;
+        let placement = if is_placed { Placement::Training { height } } else { Placement::AsIs };
+        let side = changed[0].0.width() as usize;
+        let mut made = snapsnap_photo::read(&sources, Cutting::Given, side, placement, None)?;
+        if self.config.compat {
+            for photograph in &mut made.canvases {
+                let inside = |share: &f32| f32::from(u8::from(*share >= f32::from(INSIDE) / 255.0));
+                let mask = photograph.mask.iter().map(inside).collect();
+                *photograph = Photograph::new(std::mem::take(&mut photograph.rgb), mask);
+            }
+        }
+        Ok(made)
     }
 
     /// Whether a sample's photographs are placed like a user's.
@@ -324,24 +337,7 @@ fn steps_of(degrees: f64, views: usize) -> f64 {
     degrees * views as f64 / 360.0
 }
 
-/// Photographs of a person as the networks' input. They are placed on their canvas like a user's, with a person of
-/// `height` pixels of 1024. With 0 they are used unchanged. With `compat`, masks are 0 or 1 as in the published code.
-fn canvases(photographs: &[(RgbImage, GrayImage)], height: usize, compat: bool) -> Vec<Canvas> {
-    let side = photographs.first().map_or(0, |(color, _)| color.width() as usize);
-    let placed = (height > 0).then(|| place(photographs, height, side)).flatten();
-    let unchanged = |(color, mask): &(_, _)| on_canvas(color, mask, String::new());
-    let mut canvases = placed.unwrap_or_else(|| photographs.iter().map(unchanged).collect());
-    if compat {
-        let inside = |share: f32| f32::from(u8::from(share >= f32::from(INSIDE) / 255.0));
-        let masks = canvases.iter_mut().flat_map(|canvas| &mut canvas.mask);
-        masks.for_each(|share| *share = inside(*share));
-    }
-    canvases
-}
-
-/// All colours, and all masks.
-fn joined(canvases: Vec<Canvas>) -> (Vec<f32>, Vec<f32>) {
-    let (images, masks): (Vec<_>, Vec<_>) =
-        canvases.into_iter().map(|canvas| (canvas.rgb, canvas.mask)).unzip();
-    (images.concat(), masks.concat())
+/// Front and back.
+fn pair(canvases: Vec<Photograph>) -> [Photograph; 2] {
+    canvases.try_into().expect("two photographs")
 }

@@ -6,12 +6,13 @@
 use glam::{DMat3, DVec2, DVec3};
 use rand::Rng;
 use snapsnap_base::FileError;
-use snapsnap_splat::{Camera, Orbit};
+use snapsnap_net::Photograph;
+use snapsnap_photo::{Mapping, Restoration, scale_of};
+use snapsnap_splat::Camera;
 
-use super::rectified::{Rectification, Restoration};
-use super::{INSIDE, Source, joined};
+use super::rectified::Rectification;
+use super::{INSIDE, Source, pair};
 use crate::dataset::{StoredView, unproject};
-use crate::photo::Mapping;
 
 /// Depth that the published code gives the background: 1/(0 + 10⁻⁸).
 const COMPAT_FAR: f32 = 1e8;
@@ -20,10 +21,8 @@ pub(super) const LOOKUPS: usize = 3;
 
 /// Two photographs and the points of four views, or of two without sides.
 pub(super) struct Four {
-    /// `[2,3,H,W]` front and back in [−1, 1] times the mask.
-    pub images: Vec<f32>,
-    /// `[2,H,W]` share of the person in the input masks; with `compat` 1 or 0.
-    pub masks: Vec<f32>,
+    /// Front and back on canvases of H and W pixels; masks are 1 or 0 with `compat`.
+    pub photographs: [Photograph; 2],
     /// `[4,H,W,3]` in metres in the front's frame, and their validity `[4,H,W]`. Without sides there are two instead of four.
     pub points: Vec<f32>,
     pub valid: Vec<f32>,
@@ -40,14 +39,13 @@ pub(super) struct Four {
 impl Four {
     /// Photographs alone. `front` is the front photograph's camera.
     pub(super) fn without_points(
-        images: Vec<f32>,
-        masks: Vec<f32>,
+        photographs: [Photograph; 2],
         front: Camera,
         restoration: Option<Restoration>,
     ) -> Self {
         let (front, scale) = restoration.as_ref().map_or((front, 1.0), |back| (back.front, back.scale));
         let (points, valid, second) = Default::default();
-        Self { images, masks, points, valid, second, front, scale, restoration }
+        Self { photographs, points, valid, second, front, scale, restoration }
     }
 }
 
@@ -83,7 +81,7 @@ impl Source {
         let seconds =
             if has_sides && self.config.second_depth { vec![second(2)?, second(3)?] } else { Vec::new() };
         let photographs =
-            self.photographs([0, 1].map(|i| (&views[i].color, &views[i].mask)), is_placed, random);
+            self.photographs([0, 1].map(|i| (&views[i].color, &views[i].mask)), is_placed, random)?;
         let (mut front, mut scale, mut restoration) = (views[0].camera, 1.0, None);
         let [mut first, mut second] = <[Points; 2]>::default();
         let add_seen = |to: &mut Points, map: Seen| {
@@ -93,8 +91,10 @@ impl Source {
             }
         };
         if self.config.upright {
-            let (rectification, back) =
-                Rectification::new([0, 1].map(|i| &views[i].camera), [0, 1].map(|i| &photographs[i].mapping));
+            let (rectification, back) = Rectification::new(
+                [0, 1].map(|i| &views[i].camera),
+                [0, 1].map(|i| &photographs.frames[i].mapping),
+            );
             (front, scale, restoration) = (back.front, back.scale, Some(back));
             (0..2).for_each(|i| add_seen(&mut first, rectification.photographed(&views[i], i)));
             for (to, sides) in [(&mut first, &views[2..]), (&mut second, &seconds)] {
@@ -115,20 +115,21 @@ impl Source {
             seconds.iter().for_each(|view| add(&mut second, view));
         } else {
             let nominal = Camera::orbit_at_yaw_degrees(0.0, front.width);
-            scale = scale_of(&photographs[0].mapping, &front);
-            let seen = views[0].through(&photographs[0].mapping, &front, scale);
+            scale = scale_of(&photographs.frames[0].mapping, &front, front.width);
+            let seen = views[0].through(&photographs.frames[0].mapping, &front, scale);
             let rays = centres(front.width).map(|place| (place - nominal.principal_point) / nominal.focal);
             front.world_to_camera.translation +=
                 scale * shift(rays.zip(seen).filter_map(|(ray, point)| Some((ray, point?))));
-            let photographed = [0, 1].map(|i| views[i].through(&photographs[i].mapping, &front, scale));
+            let photographed =
+                [0, 1].map(|i| views[i].through(&photographs.frames[i].mapping, &front, scale));
             let side = |(view, degrees): (&StoredView, f64)| view.as_nominal(&front, scale, degrees);
             let sides = |views: &[StoredView]| views.iter().zip([90.0, 270.0]).map(side).collect::<Vec<_>>();
             photographed.into_iter().chain(sides(&views[2..])).for_each(|map| add_seen(&mut first, map));
             sides(&seconds).into_iter().for_each(|map| add_seen(&mut second, map));
         }
-        let (images, masks) = joined(photographs);
         let (points, valid) = first;
-        Ok(Four { images, masks, points, valid, second, front, scale, restoration })
+        let photographs = pair(photographs.canvases);
+        Ok(Four { photographs, points, valid, second, front, scale, restoration })
     }
 }
 
@@ -193,14 +194,6 @@ impl StoredView {
 /// Centres of a square picture's pixels, row by row.
 pub(super) fn centres(side: u32) -> impl Iterator<Item = DVec2> {
     (0..side).flat_map(move |row| (0..side).map(move |column| DVec2::new(column.into(), row.into()) + 0.5))
-}
-
-/// Scale of a camera's points relative to a nominal camera's, if `mapping` maps its photograph to the canvas. It is the
-/// ratio of the distances from the body's axis times the ratio of the pixel sizes.
-pub(super) fn scale_of(mapping: &Mapping, camera: &Camera) -> f64 {
-    let nominal = Orbit::default();
-    let distance = camera.world_to_camera.apply(nominal.centre).z / nominal.radius;
-    distance * nominal.focal * f64::from(camera.width) / camera.focal.y / mapping.scale.y
 }
 
 /// The shift t, in metres, that moves points p onto their rays r = `(x/z, y/z)`: the least-squares solution of

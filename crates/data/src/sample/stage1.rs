@@ -81,8 +81,10 @@ impl Stage1Item {
         let order = source.order(first);
         let side = source.folder.description().resolution as usize;
         let is_placed = source.is_placed(&mut random);
-        let Four { images, masks, points, valid, second, .. } =
+        let Four { photographs, points, valid, second, .. } =
             source.four(subject, &order, is_placed, &mut random)?;
+        let images = photographs.each_ref().map(|photo| &*photo.rgb).concat();
+        let masks = photographs.each_ref().map(|photo| &*photo.mask).concat();
         let (second_points, second_valid) = second;
         let name = format!("{}: {subject}, view {first}", source.folder.root().display());
         let mut item = Self { name, side, images, masks, points, valid, second_points, second_valid };

@@ -3,10 +3,12 @@
 use std::sync::Arc;
 
 use rand::Rng;
+use snapsnap_net::Photograph;
+use snapsnap_photo::Restoration;
 use snapsnap_splat::Camera;
 
 use super::place::Four;
-use super::{Restoration, SampleConfig, Source, Stage, joined};
+use super::{SampleConfig, Source, Stage, pair};
 use crate::dataset::{Folder, Layout, Split};
 use snapsnap_base::FileError;
 
@@ -21,10 +23,8 @@ pub struct Stage2Item {
     pub name: String,
     /// H and W.
     pub side: usize,
-    /// `[2,3,H,W]` front and back in [−1, 1] times the mask.
-    pub images: Vec<f32>,
-    /// `[2,H,W]` share of the person in the input masks; with `compat` 1 or 0.
-    pub masks: Vec<f32>,
+    /// Front and back on canvases of H and W pixels; masks are 1 or 0 with `compat`.
+    pub photographs: [Photograph; 2],
     /// Cameras of front, back, right and left, side H. The front camera of a placed or upright sample is moved with its points.
     pub cameras: [Camera; 4],
     /// Scale of a placed or upright sample: the person's size in metres over the size of the points.
@@ -100,20 +100,20 @@ impl Stage2Item {
             let picture = |view: usize| folder.picture(*split, subject, view, false);
             let pictures = [picture(front)?, picture(back)?];
             let pictures = pictures.each_ref().map(|(color, mask)| (color, mask));
-            let photographs = source.photographs(pictures, is_placed, &mut random);
-            let mappings = [0, 1].map(|i| &photographs[i].mapping);
-            let restoration = config.upright.then(|| Restoration::new([&cameras[0], &cameras[1]], mappings));
-            let (images, masks) = joined(photographs);
-            Four::without_points(images, masks, cameras[0], restoration)
+            let photographs = source.photographs(pictures, is_placed, &mut random)?;
+            let mappings = [0, 1].map(|i| &photographs.frames[i].mapping);
+            let restoration = config.upright.then(|| {
+                Restoration::to_cameras([&cameras[0], &cameras[1]], mappings, description.resolution)
+            });
+            Four::without_points(pair(photographs.canvases), cameras[0], restoration)
         };
-        let Four { images, masks, points, valid, front, scale, restoration, .. } = four;
+        let Four { photographs, points, valid, front, scale, restoration, .. } = four;
         cameras[0] = front;
         let (points, valid) = if config.points { (points, valid) } else { Default::default() };
         Ok(Self {
             name: format!("{}: {subject}, view {first}", folder.root().display()),
             side: description.resolution as usize,
-            images,
-            masks,
+            photographs,
             cameras,
             scale,
             restoration,

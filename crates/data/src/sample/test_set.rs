@@ -2,11 +2,11 @@
 
 use std::sync::Arc;
 
+use image::{GrayImage, RgbImage};
 use snapsnap_splat::Camera;
 
-use super::{Augment, Handling, SampleConfig, Source, canvases, joined};
+use super::{Augment, Handling, SampleConfig, Source};
 use crate::dataset::{Folder, Split, unproject};
-use crate::photo::Mapping;
 use snapsnap_base::FileError;
 
 /// Subjects of a test set. The caller chooses the input views. The published test takes the first and the opposite one,
@@ -21,12 +21,8 @@ pub struct TestItem {
     pub subject: String,
     /// H and W.
     pub side: usize,
-    /// `[N,3,H,W]` input photographs in [−1, 1] times the mask.
-    pub images: Vec<f32>,
-    /// `[N,H,W]` share of the person in the input masks; with `compat` 1 or 0.
-    pub masks: Vec<f32>,
-    /// Places of the photographs on their canvases.
-    pub mappings: Vec<Mapping>,
+    /// Input photographs and the person's share of their pixels.
+    pub photographs: Vec<(RgbImage, GrayImage)>,
     /// Cameras of all views.
     pub cameras: Vec<Camera>,
 }
@@ -69,17 +65,12 @@ impl Test {
             Ok(handling.apply(place, color, mask))
         };
         let photographs = views.iter().enumerate().map(photograph).collect::<Result<Vec<_>, FileError>>()?;
-        let canvases = canvases(&photographs, handling.place, source.config.compat);
-        let mappings = canvases.iter().map(|canvas| canvas.mapping).collect();
         let camera = |view: usize| source.folder.camera(source.split, subject, view);
         let cameras = (0..description.views).map(|view| camera(view).map(|stored| source.camera(&stored)));
-        let (images, masks) = joined(canvases);
         Ok(TestItem {
             subject: subject.to_owned(),
             side: description.resolution as usize,
-            images,
-            masks,
-            mappings,
+            photographs,
             cameras: cameras.collect::<Result<_, _>>()?,
         })
     }

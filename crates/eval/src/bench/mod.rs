@@ -180,7 +180,8 @@ pub fn measure(
     let patch = patch(&made.gaussians, &camera.resized(side as u32, side as u32), config.bench.oracle);
     let (splat_error, cutoff_error) = oracle::errors(&made.gaussians, &patch, &eval.views.render_options())?;
 
-    let (gaussians, plan) = (made.gaussians.len(), made.plan);
+    let gaussians = made.gaussians.len();
+    let plan = made.steps.iter().map(ToString::to_string).collect();
     let contestant = match variant.tune {
         Some(_) => Contestant::fixed(name, made.gaussians),
         None => Contestant::model(name, Kind::Model, model),

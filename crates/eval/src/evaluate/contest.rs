@@ -307,7 +307,7 @@ mod tests {
                 lost: 0,
                 time: Duration::ZERO,
                 modules: Vec::new(),
-                plan: Vec::new(),
+                steps: Vec::new(),
             };
             let [degrees, _, scale] = aligned(&mut made, &metrics, Some(&truth), &front).expect("aligned");
             let farthest =

@@ -1,19 +1,24 @@
 //! A variant of the model: photographs of a person → Gaussians in the data set's world.
 
+use std::path::Path;
 use std::time::{Duration, Instant};
 
-use burn::tensor::{Device, Int, Tensor, TensorData};
-use snapsnap_data::photo::Mapping;
-use snapsnap_data::sample::{Handling, Restoration, TestItem};
+use burn::tensor::{Device, Tensor};
+use snapsnap_data::sample::{Handling, Road, TestItem};
 use snapsnap_net::config::{OPPOSITE, PrecisionChoice};
-use snapsnap_net::gaussians::placed;
+use snapsnap_net::gaussians::Origin;
+use snapsnap_net::network::View;
+use snapsnap_net::steps::Step;
 use snapsnap_net::weights::{WeightFile, WeightsError};
-use snapsnap_net::{Reconstruction, Reconstructor};
+use snapsnap_net::{Photograph, Reconstructor, placed};
 use snapsnap_ops::host;
+use snapsnap_ops::rows::taken;
+use snapsnap_photo::{Cutting, Frame, Person, Photographs, Restoration, Source as Picture, Told};
 use snapsnap_splat::Gaussians;
 
 use super::person::{degrees, photograph};
 use crate::EvalError;
+use crate::geometry::procrustes;
 use crate::variant::Variant;
 
 /// The networks of a variant on a device.
@@ -39,7 +44,7 @@ pub struct Made {
     /// Times of the modules, over all pairs of photographs.
     pub modules: Vec<(&'static str, Duration)>,
     /// The steps that ran, and the omitted ones with reasons.
-    pub plan: Vec<String>,
+    pub steps: Vec<Step>,
 }
 
 impl Model {
@@ -85,46 +90,105 @@ impl Model {
         Ok(())
     }
 
+    /// The photographs on their canvases, as the variant's road has it.
+    fn canvases(&self, item: &TestItem, cutting: Cutting) -> Result<Photographs, EvalError> {
+        let (config, name) = (self.reconstructor.config(), Path::new(&item.subject));
+        let knows_masks = cutting == Cutting::Given;
+        let sources = item
+            .photographs
+            .iter()
+            .map(|(rgb, mask)| Picture::pixels(name, rgb, knows_masks.then_some(mask)));
+        let placement = Told::default().placement(config);
+        Ok(snapsnap_photo::read(&sources.collect::<Vec<_>>(), cutting, self.side(), placement, None)?)
+    }
+
     /// Gaussians of a person seen from the views `inputs`. With more than two photographs, each and the next around the
-    /// circle form a pair, of which the first one's Gaussians are kept (both photographs' if some were left out), in the frame of its
-    /// known camera.
+    /// circle form a pair, of which the first one's Gaussians are kept, in the frame of its known camera.
     ///
     /// # Errors
-    /// [`EvalError::Empty`] if no Gaussian came out.
+    /// [`EvalError`] for photographs without a person, if no Gaussian came out, and for more than two photographs of a user.
     pub fn reconstruct(&self, item: &TestItem, inputs: &[usize]) -> Result<Made, EvalError> {
+        match self.photographs.road {
+            Road::Canvas => {
+                let canvases: Vec<_> =
+                    (0..inputs.len()).map(|place| photograph(item, place, self.side())).collect();
+                self.of_known_cameras(item, inputs, &canvases, None)
+            }
+            Road::Placed => {
+                let Photographs { canvases, frames, .. } = self.canvases(item, Cutting::Given)?;
+                self.of_known_cameras(item, inputs, &canvases, Some(&frames))
+            }
+            Road::User => self.of_user(item, inputs),
+        }
+    }
+
+    /// A user's person, in the data set's world.
+    fn of_user(&self, item: &TestItem, inputs: &[usize]) -> Result<Made, EvalError> {
+        let &[front, back] = inputs else {
+            let message = "`photographs.road = \"user\"` is for a front and a back: `views.inputs`";
+            return Err(EvalError::Empty(message.into()));
+        };
+        let photographs = self.canvases(item, Cutting::All)?;
+        let start = Instant::now();
+        let person = snapsnap_photo::person(&photographs, &self.reconstructor, &Told::default(), &|_| ());
+        let Person { gaussians, made, .. } = person.ok_or_else(no_gaussian)?;
+        let time = start.elapsed();
+        let cameras = [&item.cameras[front], &item.cameras[back]];
+        let mappings = [0, 1].map(|i| &photographs.frames[i].mapping);
+        let restoration = Restoration::to_cameras(cameras, mappings, self.side() as u32);
+        let restored = restoration.person(made.gaussians.clone(), &made.origins).scaled(restoration.scale);
+        let restored = restored.transformed(&restoration.front.world_to_camera.inverse());
+        let [from, onto] = [&gaussians, &restored].map(|person| host(person.means.clone()));
+        let motion = procrustes(from.as_chunks().0, onto.as_chunks().0, true);
+        let (gaussians, _) = self.thinned(gaussians, &made.origins, false);
+        let gaussians = gaussians.scaled(motion.scale).transformed(&motion.rigid());
+        Ok(Made {
+            gaussians,
+            maps: Vec::new(),
+            lost: made.lost,
+            time,
+            modules: made.times,
+            steps: made.steps,
+        })
+    }
+
+    /// A person from photographs on their canvases, whose cameras are known. `frames` are those of placed photographs.
+    fn of_known_cameras(
+        &self,
+        item: &TestItem,
+        inputs: &[usize],
+        photographs: &[Photograph],
+        frames: Option<&[Frame]>,
+    ) -> Result<Made, EvalError> {
         let side = self.side();
-        let photographs: Vec<_> = (0..inputs.len()).map(|place| photograph(item, place, side)).collect();
         let start = Instant::now();
         let count = if inputs.len() == 2 { 1 } else { inputs.len() };
         let (mut parts, mut maps, mut lost) = (Vec::new(), Vec::new(), 0);
-        let (mut modules, mut plan) = (Vec::<(&'static str, Duration)>::new(), Vec::new());
+        let (mut modules, mut steps) = (Vec::<(&'static str, Duration)>::new(), Vec::new());
         for first in 0..count {
-            let pair = [&photographs[first], &photographs[(first + 1) % inputs.len()]];
+            let second = (first + 1) % inputs.len();
             let camera = &item.cameras[inputs[first]];
-            self.check_pair(degrees(&item.cameras[inputs[(first + 1) % inputs.len()]], camera))?;
-            let mut made = self.reconstructor.reconstruct(pair[0], pair[1], &|_| ());
+            self.check_pair(degrees(&item.cameras[inputs[second]], camera))?;
+            let made = self.reconstructor.reconstruct([&photographs[first], &photographs[second]], &|_| ());
             let mut to_world = camera.world_to_camera.inverse();
-            let mut scale = 1.0;
-            let is_placed = item.mappings[first] != Mapping::AS_IT_IS;
-            if is_placed {
+            // The second of more than two photographs is the first one of the next pair.
+            let (mut gaussians, origins) = self.thinned(made.gaussians.clone(), &made.origins, count > 1);
+            if let Some(frames) = frames {
                 // The second of more than two photographs is a neighbour, and shows no back.
                 let opposite = camera.turned(180.0);
-                let second = if count == 1 {
-                    (&item.cameras[inputs[1]], &item.mappings[1])
+                let (other, frame) = if count == 1 {
+                    (&item.cameras[inputs[1]], &frames[1])
                 } else {
-                    (&opposite, &item.mappings[first])
+                    (&opposite, &frames[first])
                 };
-                let restoration = Restoration::new([camera, second.0], [&item.mappings[first], second.1]);
-                made.gaussians = restoration.person(made.gaussians.clone(), made.photographed());
-                (scale, to_world) = (restoration.scale, restoration.front.world_to_camera.inverse());
+                let restoration = Restoration::to_cameras(
+                    [camera, other],
+                    [&frames[first].mapping, &frame.mapping],
+                    side as u32,
+                );
+                gaussians = restoration.person(gaussians, &origins).scaled(restoration.scale);
+                to_world = restoration.front.world_to_camera.inverse();
             }
-            if count > 1 && made.lost_gaussians == 0 {
-                // The second photograph is the first one of the next pair.
-                let [first, _] = made.photographed();
-                made.gaussians = first_rows(made.gaussians, first);
-                made.valid.truncate(1);
-            }
-            let gaussians = self.thinned(&made, side).scaled(scale);
             parts.push(placed(self.reconstructor.config(), gaussians, &to_world));
             lost += made.lost;
             for (name, time) in &made.times {
@@ -133,19 +197,18 @@ impl Model {
                     None => modules.push((*name, *time)),
                 }
             }
+            // Pixels of placed photographs have no ground truth.
+            if count == 1 && frames.is_none() {
+                let of_view = made.points.host.chunks_exact(3 * side * side).map(<[f32]>::to_vec);
+                maps = made.views.iter().map(|view| *view as usize).zip(of_view).collect();
+            }
             // All pairs have one plan.
             if first == 0 {
-                plan.clone_from(&made.plan);
-            }
-            // Pixels of placed photographs have no ground truth.
-            if count == 1 && !is_placed {
-                let points = host(made.maps.points.clone());
-                let of_view = points.chunks_exact(3 * side * side).map(<[f32]>::to_vec);
-                maps = made.views.iter().map(|view| *view as usize).zip(of_view).collect();
+                steps = made.steps;
             }
         }
         if count > 1 {
-            plan.insert(0, format!("{count} pairs of photographs, the first one"));
+            steps.insert(0, Step::Pairs { pairs: count });
         }
         let gaussians = joined(parts);
         gaussians.device().sync().expect("the device finishes its work");
@@ -153,49 +216,38 @@ impl Model {
         if gaussians.is_empty() {
             return Err(no_gaussian());
         }
-        Ok(Made { gaussians, maps, lost, time, modules, plan })
+        Ok(Made { gaussians, maps, lost, time, modules, steps })
     }
 
-    /// The Gaussians after the variant's stride and least opacity.
-    fn thinned(&self, made: &Reconstruction, side: usize) -> Gaussians {
+    /// The Gaussians after the variant's stride and least opacity, only the first photograph's with `only_front`, and their pixels.
+    fn thinned(
+        &self,
+        gaussians: Gaussians,
+        origins: &[Origin],
+        only_front: bool,
+    ) -> (Gaussians, Vec<Origin>) {
         let Self { stride, min_opacity, .. } = *self;
-        let gaussians = made.gaussians.clone();
-        if stride == 1 && min_opacity <= 0.0 {
-            return gaussians;
+        if stride == 1 && min_opacity <= 0.0 && !only_front {
+            return (gaussians, origins.to_vec());
         }
-        let pixels: Vec<usize> =
-            made.valid.iter().flat_map(|valid| (0..valid.len()).filter(|i| valid[*i])).collect();
-        // The last Gaussians may close the top, and belong to no pixel. If some were lost, no pixel is known.
-        let on_grid = |row: usize| match pixels.get(row).filter(|_| made.lost_gaussians == 0) {
-            Some(pixel) => [pixel / side, pixel % side].iter().all(|at| at.is_multiple_of(stride)),
-            None => row.is_multiple_of(stride * stride),
+        let (side, opacities) = (self.side(), host(gaussians.opacities.clone()));
+        let is_kept = |row: &usize| {
+            let Origin { view, pixel } = origins[*row];
+            let on_grid =
+                [pixel as usize / side, pixel as usize % side].iter().all(|at| at.is_multiple_of(stride));
+            on_grid && opacities[*row] >= min_opacity && !(only_front && view != Some(View::Front))
         };
-        let opacities = host(gaussians.opacities.clone());
-        let keep = (0..gaussians.len()).filter(|row| on_grid(*row) && opacities[*row] >= min_opacity);
-        let keep: Vec<i64> = keep.map(|row| row as i64).collect();
-        let n = keep.len();
-        let keep = Tensor::<1, Int>::from_data(TensorData::new(keep, [n]), &gaussians.device());
-        let rows = |of: Tensor<2>| of.select(0, keep.clone());
-        Gaussians {
+        let keep: Vec<i32> = (0..origins.len()).filter(is_kept).map(|row| row as i32).collect();
+        let kept = keep.iter().map(|row| origins[*row as usize]).collect();
+        let rows = |of: Tensor<2>| taken(of, &keep);
+        let gaussians = Gaussians {
             means: rows(gaussians.means),
             rotations: rows(gaussians.rotations),
             scales: rows(gaussians.scales) * stride as f64,
-            opacities: gaussians.opacities.select(0, keep.clone()),
+            opacities: rows(gaussians.opacities.unsqueeze_dim(1)).squeeze_dim(1),
             colors: rows(gaussians.colors),
-        }
-    }
-}
-
-/// The first `count` Gaussians.
-fn first_rows(gaussians: Gaussians, count: usize) -> Gaussians {
-    let Gaussians { means, rotations, scales, opacities, colors } = gaussians;
-    let rows = |of: Tensor<2>| of.narrow(0, 0, count);
-    Gaussians {
-        means: rows(means),
-        rotations: rows(rotations),
-        scales: rows(scales),
-        opacities: opacities.narrow(0, 0, count),
-        colors: rows(colors),
+        };
+        (gaussians, kept)
     }
 }
 

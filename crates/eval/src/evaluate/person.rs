@@ -12,6 +12,7 @@ use snapsnap_net::Photograph;
 use snapsnap_net::config::Downsample;
 use snapsnap_net::resample::shrink;
 use snapsnap_ops::{bilinear, host};
+use snapsnap_photo::on_canvas;
 use snapsnap_splat::Camera;
 
 use super::config::{DataSection, ViewsSection};
@@ -156,25 +157,22 @@ pub fn planes(values: Vec<f32>, channels: usize, side: usize) -> Tensor<4> {
     Tensor::from_data(TensorData::new(values, [1, channels, side, side]), &Device::flex())
 }
 
-/// One of the input photographs on a canvas of `side` pixels: area means if that is a whole part of its own side, else
-/// interpolated.
+/// One of the input photographs, which is a canvas already, on a canvas of `side` pixels: area means if that is a whole part of its own
+/// side, else interpolated.
 pub fn photograph(item: &TestItem, place: usize, side: usize) -> Photograph {
-    let from = item.side;
-    let sized = |all: &[f32], channels: usize| {
-        let len = channels * from * from;
-        let values = all[place * len..(place + 1) * len].to_vec();
-        if from == side {
-            return values;
-        }
+    let (from, (rgb, mask)) = (item.side, &item.photographs[place]);
+    let photograph = on_canvas(rgb, mask);
+    if from == side {
+        return photograph;
+    }
+    let sized = |values: Vec<f32>, channels: usize| {
         let planes = planes(values, channels, from);
         host(match from.is_multiple_of(side) {
             true => shrink(planes, from / side, Downsample::Area),
             false => bilinear(planes, [side, side], false),
         })
     };
-    let (rgb, mask) = (sized(&item.images, 3), sized(&item.masks, 1));
-    let valid = mask.iter().map(|share| *share >= 0.5).collect();
-    Photograph { rgb, mask, valid }
+    Photograph::new(sized(photograph.rgb, 3), sized(photograph.mask, 1))
 }
 
 /// Points `[V,S,S,3]`, and their mask `[V,S,S]`.

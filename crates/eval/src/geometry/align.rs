@@ -106,7 +106,7 @@ pub fn icp(points: &[[f32; 3]], onto: &[[f32; 3]], scale: bool) -> Result<Alignm
 
 /// The motion with the least squared distances of points from their partners (Horn 1987). Its rotation is the
 /// eigenvector of the largest eigenvalue of a symmetric matrix of their covariances.
-fn procrustes(points: &[[f32; 3]], targets: &[[f32; 3]], scale: bool) -> Alignment {
+pub(crate) fn procrustes(points: &[[f32; 3]], targets: &[[f32; 3]], scale: bool) -> Alignment {
     let n = points.len() as f64;
     let centre = |of: &[[f32; 3]]| of.iter().map(|p| double(*p)).sum::<DVec3>() / n;
     let (from, to) = (centre(points), centre(targets));

@@ -16,6 +16,7 @@ use snapsnap_mesh::mesh::Mesh;
 use snapsnap_net::Neighbours;
 
 use crate::EvalError;
+pub(crate) use align::procrustes;
 pub use align::{Align, Alignment, icp};
 pub use normals::{consistency, normals};
 

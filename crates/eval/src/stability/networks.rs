@@ -75,8 +75,8 @@ fn in_precision(
     }
     let maps = |precision: Precision| -> Result<_, WeightsError> {
         let model = Reconstructor::load(weights, device)?;
-        let made = model.in_precision(precision).reconstruct(front, back, &|_| ());
-        Ok((host(made.maps.points), made.valid))
+        let made = model.in_precision(precision).reconstruct([front, back], &|_| ());
+        Ok((made.points.host, made.valid))
     };
     let ((whole, valid), (half, _)) =
         match maps(Precision::F32).and_then(|whole| Ok((whole, maps(precision)?))) {

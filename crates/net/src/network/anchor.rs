@@ -25,6 +25,12 @@ pub(crate) fn nominal(view: View, pair_degrees: f64, side: usize) -> (Camera, Ri
     (camera, front.world_to_camera.inverse().then(&camera.world_to_camera))
 }
 
+/// A view's nominal camera of a canvas of `side`² pixels. Its world is the front camera's frame.
+pub(crate) fn nominal_camera(view: View, pair_degrees: f64, side: usize) -> Camera {
+    let (camera, world_to_camera) = nominal(view, pair_degrees, side);
+    Camera { world_to_camera, ..camera }
+}
+
 /// The rays of a view's pixels in a window of a canvas of `side`² pixels.
 pub(super) struct Rays {
     /// Directions in the front camera's frame `[1, h, w, 3]`, scaled to a depth of 1 in the view's camera.
@@ -32,7 +38,9 @@ pub(super) struct Rays {
     /// Depths of the anchors `[1, h, w, 1]`, metres.
     pub depths: Tensor<4>,
     /// Centre of the camera in the front camera's frame `[1, 1, 1, 3]`, metres.
-    centre: Tensor<4>,
+    pub centre: Tensor<4>,
+    /// Where the camera looks, likewise.
+    pub forward: Tensor<4>,
 }
 
 impl Rays {
@@ -55,11 +63,13 @@ impl Rays {
         }
         let tensor =
             |values: Vec<f32>, dims: [usize; 4]| Tensor::from_data(TensorData::new(values, dims), device);
-        let centre = to_front.translation.to_array().map(|v| v as f32).to_vec();
+        let vector = |v: DVec3| tensor(v.to_array().map(|v| v as f32).to_vec(), [1, 1, 1, 3]);
+        let (centre, forward) = (vector(to_front.translation), vector(to_front.rotation * DVec3::Z));
         Self {
             directions: tensor(directions, [1, h, w, 3]),
             depths: tensor(depths, [1, h, w, 1]),
-            centre: tensor(centre, [1, 1, 1, 3]),
+            centre,
+            forward,
         }
     }
 }
@@ -67,7 +77,7 @@ impl Rays {
 /// The anchors of a view's pixels in a window of a canvas of `side`² pixels, `[1, h, w, 3]` metres, front camera's frame. The second
 /// photograph was taken `pair_degrees` around the person from the first.
 pub fn anchors(view: View, pair_degrees: f64, side: usize, window: &Window, device: &Device) -> Tensor<4> {
-    let Rays { directions, depths, centre } = Rays::new(view, pair_degrees, side, window, device);
+    let Rays { directions, depths, centre, .. } = Rays::new(view, pair_degrees, side, window, device);
     directions * depths + centre
 }
 

@@ -15,7 +15,7 @@ mod rays;
 mod shells;
 
 pub use anchor::anchors;
-pub(crate) use anchor::nominal;
+pub(crate) use anchor::nominal_camera;
 pub use convolution::{Levels, PointUNet};
 pub use dust3r::{Dust3r, Grid, TokenMaps, View};
 pub use input::Input;

@@ -28,19 +28,13 @@ pub struct PointMap {
 
 impl PointMap {
     /// A view's map of a window, pasted into the whole canvas of `config`, which is 0 elsewhere. With `network.on_rays`,
-    /// the points of a photograph with the `mask` `[B, 1, S, S]` are moved onto their pixels' rays. The losses of stage 1
-    /// compare maps before that move, so that the network still learns where the rays are.
-    pub fn pasted(
-        self,
-        config: &NetworkConfig,
-        view: View,
-        window: &Window,
-        mask: Option<&Tensor<4>>,
-    ) -> Self {
+    /// the points of a photograph are moved onto their pixels' rays. The losses of stage 1 compare maps before that move, so that
+    /// the network still learns where the rays are.
+    pub fn pasted(self, config: &NetworkConfig, view: View, window: &Window) -> Self {
         let Self { mut points, conf } = self;
         let side = config.resolution;
-        if let Some(mask) = mask.filter(|_| config.on_rays) {
-            points = on_rays(view, config.pair_degrees, side, window, points, mask);
+        if config.on_rays && (view as usize) < 2 {
+            points = on_rays(view, config.pair_degrees, side, window, points);
         }
         if *window == Window::whole(side) {
             return Self { points, conf };

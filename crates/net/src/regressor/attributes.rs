@@ -1,9 +1,9 @@
 //! Activations of the regressor's 14 channels (docs/method.md, "Attributes").
 
 use burn::tensor::activation::sigmoid;
-use burn::tensor::{Tensor, TensorData};
-
-use snapsnap_ops::host;
+use burn::tensor::{Device, Tensor, TensorData};
+use glam::DVec3;
+use snapsnap_splat::{Camera, RigidTransform};
 
 use crate::config::{RegressorColor, RegressorConfig, RegressorStart};
 
@@ -68,17 +68,25 @@ impl Geometry {
         config.start() == RegressorStart::Geometric || config.color() == RegressorColor::Residual
     }
 
-    /// The geometry of the valid pixels of a view on a canvas of `side`² pixels, row by row, from colours `[3, S, S]` and
-    /// points `[1, S, S, 3]`.
-    pub fn new(image: &[f32], points: &Tensor<4>, valid: &[bool], side: usize, limits: Limits) -> Self {
-        let device = points.device();
-        let points = host(points.clone());
+    /// The geometry of the valid pixels of a view, row by row, from colours `[3, S, S]` and points `[S, S, 3]`. The world of its
+    /// `camera` is the frame of the points.
+    pub fn new(
+        image: &[f32],
+        points: &[f32],
+        valid: &[bool],
+        camera: &Camera,
+        limits: Limits,
+        device: &Device,
+    ) -> Self {
+        let side = camera.width as usize;
+        let RigidTransform { rotation, translation } = camera.world_to_camera;
+        let depth =
+            |point: [f32; 3]| (rotation.row(2).dot(DVec3::from(point.map(f64::from))) + translation.z) as f32;
         let point = |i: usize| [points[3 * i], points[3 * i + 1], points[3 * i + 2]];
         let (mut spacing, mut colors) = (Vec::new(), Vec::new());
         for i in (0..side * side).filter(|i| valid[*i]) {
             let (here, row, column) = (point(i), i / side, i % side);
-            // The nominal cameras' focal length is 0.8 of the canvas (docs/method.md, "Cameras").
-            let footprint = (here[2].abs() / (0.8 * side as f32)).clamp(1e-5, 1.0);
+            let footprint = (depth(here).abs() / camera.focal.x as f32).clamp(1e-5, 1.0);
             let beside = [
                 (column > 0, i.wrapping_sub(1)),
                 (column + 1 < side, i + 1),
@@ -97,8 +105,8 @@ impl Geometry {
         }
         let n = spacing.len();
         Self {
-            spacing: Tensor::from_data(TensorData::new(spacing, [n, 1]), &device),
-            colors: Tensor::from_data(TensorData::new(colors, [n, 3]), &device),
+            spacing: Tensor::from_data(TensorData::new(spacing, [n, 1]), device),
+            colors: Tensor::from_data(TensorData::new(colors, [n, 3]), device),
             limits,
         }
     }
@@ -173,7 +181,6 @@ fn unit(x: Tensor<2>) -> Tensor<2> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use burn::tensor::Device;
 
     fn values(x: Tensor<2>) -> Vec<f32> {
         x.into_data().try_into_vec().expect("f32")

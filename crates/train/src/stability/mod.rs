@@ -18,8 +18,9 @@ use crate::config::TrainConfig;
 use crate::networks::{Networks, Rows};
 use crate::optimizer::{MuonSettings, OptimizerConfig};
 use crate::photometric::Photometric;
-use crate::points::{Prediction, losses};
+use crate::points::losses;
 use crate::schedule::Schedule;
+use snapsnap_net::Prediction;
 
 /// A short training of small networks.
 const SMALL: &str = concat!(

@@ -15,10 +15,10 @@ use snapsnap_base::random::stream;
 use snapsnap_data::dataset::Folder;
 use snapsnap_data::sample::{SampleConfig, Stage2, Stage2Item};
 use snapsnap_eval::lpips::Lpips;
-use snapsnap_net::Window;
 use snapsnap_net::config::{Config, RegressorStart};
 use snapsnap_net::network::{PointMap, PointPredictor, View, anchors};
 use snapsnap_net::weights::random_regressors;
+use snapsnap_net::{Prediction, Window};
 use snapsnap_ops::{host, mean};
 use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
 
@@ -27,7 +27,7 @@ use crate::config::{LpipsConfig, Stage1Config, Stage2Config, TrainConfig};
 use crate::data::Data;
 use crate::networks::Networks;
 use crate::photometric::Photometric;
-use crate::points::{Prediction, losses as points_losses};
+use crate::points::losses as points_losses;
 use crate::ranks::Ranks;
 use crate::task::{Moment, Part, Task, Validation};
 use snapsnap_eval::preview::{grid, heat, picture};
@@ -100,34 +100,24 @@ impl GaussianTask {
     }
 
     /// Predicts the points of a sample's photographs with the trained or the frozen predictor, in a step or in a validation.
-    fn predict(
-        &self,
-        networks: &Networks,
-        item: &Stage2Item,
-        is_step: bool,
-    ) -> Result<Prediction, TrainError> {
+    fn predict(&self, networks: &Networks, item: &Stage2Item, is_step: bool) -> Prediction {
         let inner = self.device.clone().inner();
         match (&networks.predictor, &self.frozen) {
             (Some(predictor), _) => {
                 let device = if is_step { &self.device } else { &inner };
-                Ok(of_sample(predictor, &self.config, item, device))
+                of_sample(predictor, &self.config, item, device)
             }
             (None, frozen) => {
                 let frozen = frozen.as_ref().expect("a predictor that is not trained is frozen");
-                frozen.predict(&self.config, item, is_step, &inner)
+                of_sample(frozen.predictor(is_step), &self.config, item, &inner)
             }
         }
     }
 
     /// Gaussians of all views, for validations.
-    fn whole(
-        &self,
-        networks: &Networks,
-        item: &Stage2Item,
-        device: &Device,
-    ) -> Result<Option<Gaussians>, TrainError> {
-        let prediction = self.predict(networks, item, false)?;
-        Ok(gaussians(&self.config, networks, item, prediction, &Phase::new(false, 0), None, device))
+    fn whole(&self, networks: &Networks, item: &Stage2Item, device: &Device) -> Option<Gaussians> {
+        let prediction = self.predict(networks, item, false);
+        gaussians(&self.config, networks, item, prediction, &Phase::new(false, 0), device)
     }
 
     /// Renders all target views `[V,3,h,w]`. Without Gaussians the pictures show the background.
@@ -167,8 +157,7 @@ impl GaussianTask {
             };
             let prediction =
                 Prediction { maps: View::ALL.map(map).to_vec(), window: window.clone(), normals: None };
-            let gaussians =
-                gaussians(&config, &networks, &item, prediction, &Phase::new(false, 0), None, &device);
+            let gaussians = gaussians(&config, &networks, &item, prediction, &Phase::new(false, 0), &device);
             Ok(sums.add(&item, self.shown(&item, gaussians, &device)?, &device)?)
         })?;
         Ok(*self.billboard_scores.get_or_init(|| Scores::mean(&all)))
@@ -216,13 +205,7 @@ impl Task for GaussianTask {
             let first = if phase.views.start == 2 { count - 2 } else { 0 };
             let chosen =
                 if phase.one_view { vec![random.random_range(first..count)] } else { (0..count).collect() };
-            let deviation = config.point_noise as f32;
-            let mut noise = || {
-                // The sum of three has a standard deviation of 1, is nearly normal, and 3 at most.
-                deviation * (0..3).map(|_| random.random_range(-1.0_f32..1.0)).sum::<f32>()
-            };
-            let noise = (deviation > 0.0).then_some(&mut noise as &mut dyn FnMut() -> f32);
-            let prediction = self.predict(networks, item, true)?;
+            let prediction = self.predict(networks, item, true);
             let mut add = |name, weight: f64, value: Tensor<1>| {
                 sums.entry(name).or_insert((weight, Vec::new())).1.push(value);
             };
@@ -236,7 +219,7 @@ impl Task for GaussianTask {
                 let value = parts.into_iter().map(|part| part.value * part.weight);
                 add("points", config.points_weight, value.reduce(|a, b| a + b).expect("there are points"));
             }
-            let made = gaussians(&self.config, networks, item, prediction, &phase, noise, device);
+            let made = gaussians(&self.config, networks, item, prediction, &phase, device);
             // A sample without a valid pixel has no picture, and counts as one without an error.
             let Some(gaussians) = made else { continue };
             let cameras: Vec<Camera> = chosen.iter().map(|v| item.target_cameras[*v]).collect();
@@ -272,7 +255,7 @@ impl Task for GaussianTask {
         }
         let device = self.device.clone().inner();
         let all = self.data.validated(ranks, |sums: &mut Scores, item| {
-            let shown = self.shown(&item, self.whole(networks, &item, &device)?, &device)?;
+            let shown = self.shown(&item, self.whole(networks, &item, &device), &device)?;
             Ok(sums.add(&item, shown, &device)?)
         })?;
         let (scores, billboard) = (Scores::mean(&all), self.billboard(ranks)?);
@@ -294,12 +277,12 @@ impl Task for GaussianTask {
             let item = item?;
             let (side, area) = (item.side, item.side * item.side);
             let photo = |view: usize| {
-                picture(side, |i| [0, 1, 2].map(|c| item.images[(3 * view + c) * area + i] * 0.5 + 0.5))
+                picture(side, |i| [0, 1, 2].map(|c| item.photographs[view].rgb[c * area + i] * 0.5 + 0.5))
             };
             let mut row = vec![photo(0), photo(1)];
             let views = [0, item.target_cameras.len() - 2];
             let cameras = views.map(|v| item.target_cameras[v]);
-            let seen = match self.whole(networks, &item, &device)? {
+            let seen = match self.whole(networks, &item, &device) {
                 Some(gaussians) => host(self.render(&gaussians, &cameras, item.background)?.0),
                 None => vec![0.0; 2 * 3 * item.target_side.pow(2)],
             };

@@ -56,7 +56,6 @@ l1_share = 0.8
 alpha_weight = 0.5
 anisotropy_weight = 0.01
 anisotropy_limit = 4.0
-point_noise = 0.01
 "#;
 
 /// A rehearsal, which writes nothing. Settings that could make it slow are fixed.

@@ -30,7 +30,7 @@ pub fn config(arguments: &Arguments) -> Result<TrainConfig, Failure> {
     config.training.weights = arguments.weights.clone().or(config.training.weights);
     // Absolute paths, since a run may be continued from another working directory.
     let lpips = config.stage2.lpips.iter_mut().flat_map(|lpips| &mut lpips.files);
-    let others = config.training.weights.iter_mut().chain(&mut config.stage2.point_map_cache).chain(lpips);
+    let others = config.training.weights.iter_mut().chain(lpips);
     let paths = config.data.folders.iter_mut().chain(others);
     for path in paths {
         *path = std::path::absolute(&*path).unwrap_or_else(|_| path.clone());

@@ -27,7 +27,6 @@ use snapsnap_train::stage2::GaussianTask;
 use snapsnap_train::task::Task;
 
 use super::evaluate::check_data;
-use super::outside_data;
 use crate::failure::{Failure, bail};
 use crate::{device, interrupt, memory, say};
 
@@ -160,9 +159,6 @@ fn humans(arguments: &Arguments, ranks: &Ranks) -> Result<ExitCode, Failure> {
              training.weights in the config"
         ),
     };
-    if let Some(maps) = &plan.config.stage2.point_map_cache {
-        outside_data(maps, plan.folders.iter().map(|folder| folder.root()))?;
-    }
     let frozen = weights.as_ref().filter(|_| !joint);
     let frozen = frozen.map(|weights| weights.point_predictor(&plan.device.clone().inner())).transpose()?;
     let task = GaussianTask::new(&plan.folders, &plan.config, frozen, &plan.device)?;
@@ -195,7 +191,6 @@ impl<'a> Plan<'a> {
         }
         let mut config = folder::config(arguments)?;
         if arguments.dry_run {
-            config.stage2.point_map_cache = None;
             // The estimate includes the steps with the perceptual distance.
             config.stage2.lpips.iter_mut().for_each(|lpips| lpips.after = 0.0);
         }

@@ -2,6 +2,8 @@
 
 use burn::tensor::{Tensor, TensorData};
 use glam::DVec3;
+use snapsnap_net::gaussians::Origin;
+use snapsnap_net::network::View;
 use snapsnap_splat::Gaussians;
 
 use super::*;
@@ -89,14 +91,16 @@ fn placed_samples_fit_the_nominal_cameras() {
     let first =
         |samples| Stage1::new(folder.clone(), TRAIN, samples).expect("samples").sample(0).expect("a sample");
     let placed = first(samples.clone());
-    assert!(placed.images == item.images && placed.points == item.points);
+    let images = item.photographs.each_ref().map(|photo| &*photo.rgb).concat();
+    assert!(placed.images == images && placed.points == item.points);
     // The cameras' distance varies: all samples are placed, or none.
     let always = first(SampleConfig { placed_share: 1e-6, ..samples.clone() });
     assert!((&always.points, &always.images) == (&placed.points, &placed.images));
     assert!(first(SampleConfig { placed_share: 0.0, ..samples }).images != placed.images);
     let side = 128;
     // Both photographs together have the height of a user's.
-    let seen: Vec<usize> = (0..2 * side * side).filter(|i| item.masks[*i] > 0.5).collect();
+    let masks = item.photographs.each_ref().map(|photo| &*photo.mask).concat();
+    let seen: Vec<usize> = (0..2 * side * side).filter(|i| masks[*i] > 0.5).collect();
     let rows = || seen.iter().map(|i| i / side % side);
     let height = rows().max().expect("a person") + 1 - rows().min().expect("a person");
     assert_eq!(height, (700.0 / 1024.0 * side as f32).round() as usize);
@@ -150,7 +154,7 @@ fn restored_points_lie_on_the_photographed_person() {
     };
     let item = {
         let (with, without) = (item(true), item(false));
-        assert!(without.points.is_empty() && with.images == without.images);
+        assert!(without.points.is_empty() && with.photographs[1].rgb == without.photographs[1].rgb);
         assert_eq!((with.scale, with.cameras), (without.scale, without.cameras));
         with
     };
@@ -167,9 +171,9 @@ fn restored_points_lie_on_the_photographed_person() {
         let ones = |columns: usize| Tensor::<2>::ones([pixels.len(), columns], &device);
         let opacities = Tensor::ones([pixels.len()], &device);
         let gaussians = Gaussians::new(means, ones(4), ones(3), opacities, ones(3)).expect("fits");
-        let photographed = [0, 1].map(|photograph| if photograph == view { pixels.len() } else { 0 });
-        let restored =
-            restoration.person(gaussians, photographed).means.into_data().try_to_vec::<f32>().expect("f32");
+        let origin = Origin { view: Some(View::ALL[view]), pixel: 0 };
+        let restored = restoration.person(gaussians, &vec![origin; pixels.len()]);
+        let restored = restored.means.into_data().try_to_vec::<f32>().expect("f32");
         let off = |points: &[f32]| {
             let depth = |point: &[f32]| {
                 let point = to_world.apply(item.scale * Vec3::from_slice(point).as_dvec3());

@@ -6,6 +6,7 @@ use burn::data::dataloader::batcher::Batcher;
 use burn::data::dataset::Dataset;
 use burn::tensor::Device;
 use glam::{DVec2, Vec3};
+use snapsnap_photo::on_canvas;
 use snapsnap_splat::RigidTransform;
 
 use super::*;
@@ -176,7 +177,7 @@ fn stage_two_samples_have_cameras_for_what_they_compare() {
             let off = (found.0 - low).abs().max((found.1 - high).abs()).max_element();
             assert!(off < 2.5, "{layout:?} {view}: {found:?} {low} {high}");
         }
-        assert_eq!(item.images.len(), 2 * 3 * 64 * 64);
+        assert!(item.photographs.iter().all(|photograph| photograph.rgb.len() == 3 * 64 * 64));
     }
 }
 
@@ -201,8 +202,8 @@ fn test_samples_are_the_given_views() {
         for (place, view) in [(0, 0), (1, 15)] {
             let (target, share) = test.target(1, view, [0.25, 0.5, 0.75]).expect("reads");
             assert_eq!(share.len(), area);
-            let image = &item.images[place * 3 * area..][..3 * area];
-            let mask = &item.masks[place * area..][..area];
+            let (rgb, mask) = &item.photographs[place];
+            let Photograph { rgb: image, mask, .. } = on_canvas(rgb, mask);
             let stored = folder.view(TRAIN, "0001", view).expect("reads");
             let mut inside = 0;
             for i in 0..3 * area {

@@ -7,7 +7,7 @@ use glam::DVec3;
 use snapsnap_base::{file, guarded};
 use snapsnap_splat::{Camera, Orbit};
 
-use super::{Mapping, PlaneMap, Source};
+use super::{Content, Frame, Source};
 
 /// Focal lengths of lenses, in millimetres of 35 mm film.
 pub const FOCALS: std::ops::RangeInclusive<f64> = 8.0..=1200.0;
@@ -15,8 +15,6 @@ pub const FOCALS: std::ops::RangeInclusive<f64> = 8.0..=1200.0;
 pub const ELEVATIONS: std::ops::RangeInclusive<f64> = -45.0..=60.0;
 /// Diagonal of a frame of 35 mm film, in millimetres.
 const FILM: f64 = 43.267;
-/// Side of the nominal canvas. Its number does not matter.
-const SIDE: u32 = 1024;
 /// First bytes of Apple's maker note, and its entry with the measured acceleration.
 const APPLE: &[u8] = b"Apple iOS\0";
 const ACCELERATION: u16 = 8;
@@ -34,9 +32,12 @@ impl Shot {
     /// What the file's EXIF data say; nothing if there are none or they are damaged.
     pub fn of(source: &Source) -> Self {
         let reader = exif::Reader::new();
-        let read = || match source.bytes {
-            Some(bytes) => reader.read_from_container(&mut Cursor::new(bytes)).ok(),
-            None => reader.read_from_container(&mut BufReader::new(file::open(source.path).ok()?)).ok(),
+        let read = || match source.content {
+            Content::File => {
+                reader.read_from_container(&mut BufReader::new(file::open(source.path).ok()?)).ok()
+            }
+            Content::Bytes(bytes) => reader.read_from_container(&mut Cursor::new(bytes)).ok(),
+            Content::Pixels(..) => None,
         };
         let found = guarded(source.path, || Ok(read()));
         found.ok().flatten().map_or(Self::default(), |found| Self::in_exif(&found))
@@ -100,35 +101,29 @@ impl Default for Viewpoint {
 }
 
 impl Viewpoint {
-    /// The distance in metres from which a lens sees a person of this size: `focal` is in millimetres of 35 mm film, `picture` the photograph's
-    /// width and height, and `mapping` its map to a canvas of `side` pixels.
-    pub fn distance(focal: f64, picture: [u32; 2], mapping: &Mapping, side: usize) -> f64 {
+    /// The distance in metres from which a lens of `focal` millimetres of 35 mm film sees a person of this size on a canvas of `side`
+    /// pixels.
+    pub fn distance(focal: f64, frame: &Frame, side: usize) -> f64 {
         let Orbit { focal: nominal, radius, .. } = Orbit::default();
-        radius * pixels(focal, picture) * mapping.scale.y / (nominal * side as f64)
+        radius * pixels(focal, frame.size) * frame.mapping.scale.y / (nominal * side as f64)
     }
 
     /// How far, in degrees, a camera whose optical axis looks down by `pitch` degrees looks down at the body's middle. The other arguments
     /// are those of [`Self::distance`].
-    pub fn elevation(pitch: f64, focal: f64, picture: [u32; 2], mapping: &Mapping, side: usize) -> f64 {
+    pub fn elevation(pitch: f64, focal: f64, frame: &Frame, side: usize) -> f64 {
         let principal = Orbit::default().camera(side as u32).principal_point;
-        let below = mapping.source(principal).y - f64::from(picture[1]) / 2.0;
-        pitch + (below / pixels(focal, picture)).atan().to_degrees()
+        let below = frame.mapping.source(principal).y - f64::from(frame.size[1]) / 2.0;
+        pitch + (below / pixels(focal, frame.size)).atan().to_degrees()
     }
 
-    fn camera(&self, yaw_degrees: f64) -> Camera {
+    /// The camera of a canvas of `side` pixels that stands here, `yaw_degrees` around the person from the front's. World: y up, the front
+    /// camera above +z.
+    pub fn camera(&self, yaw_degrees: f64, side: u32) -> Camera {
         let nominal = Orbit::default();
         // The person has the same size on the canvas.
         let focal = nominal.focal * self.distance / nominal.radius;
         Orbit { yaw_degrees, pitch_degrees: self.elevation, radius: self.distance, focal, ..nominal }
-            .camera(SIDE)
-    }
-
-    /// A map of points from where the nominal camera of the front (`yaw_degrees` 0) or the back (180) sees them to where this one does,
-    /// at the same distance ahead of the body's axis. World: y up, the front camera above +z. Points that no camera sees stay.
-    pub fn restorer(&self, yaw_degrees: f64) -> impl Fn(DVec3) -> DVec3 + use<> {
-        let nominal = Camera::orbit_at_yaw_degrees(yaw_degrees, SIDE);
-        let map = PlaneMap::new(&nominal, &self.camera(yaw_degrees), &Mapping::AS_IT_IS, 1.0);
-        move |point| map.apply(point).unwrap_or(point)
+            .camera(side)
     }
 }
 
@@ -142,6 +137,7 @@ mod tests {
     use glam::DVec2;
 
     use super::*;
+    use crate::Mapping;
 
     /// A telephone's EXIF segment: 26 mm, and Apple's note with this acceleration in thousandths.
     fn segment(acceleration: [i32; 3]) -> Vec<u8> {
@@ -198,30 +194,13 @@ mod tests {
     #[test]
     fn distances_follow_from_the_lens() {
         // The nominal camera's field: 0.8 of the side of a square.
-        let picture = [1000, 1000];
         let focal = 0.8 * FILM / 2.0_f64.sqrt();
         let mapping = Mapping { scale: DVec2::splat(1.024), origin: DVec2::ZERO };
-        assert!((Viewpoint::distance(focal, picture, &mapping, 1024) - 2.0).abs() < 1e-9);
-        assert!((Viewpoint::distance(2.0 * focal, picture, &mapping, 1024) - 4.0).abs() < 1e-9);
+        let frame = Frame { shot: Shot::default(), size: [1000, 1000], mapping };
+        assert!((Viewpoint::distance(focal, &frame, 1024) - 2.0).abs() < 1e-9);
+        assert!((Viewpoint::distance(2.0 * focal, &frame, 1024) - 4.0).abs() < 1e-9);
         // The body's middle is 25 of 1024 pixels below the picture's middle.
-        let elevation = Viewpoint::elevation(3.0, focal, picture, &mapping, 1024);
+        let elevation = Viewpoint::elevation(3.0, focal, &frame, 1024);
         assert!((elevation - 3.0 - (25.0_f64 / 819.2).atan().to_degrees()).abs() < 1e-6, "{elevation}");
-    }
-
-    #[test]
-    fn known_cameras_move_points_along_their_planes() {
-        let point = DVec3::new(0.2, 1.5, 0.12);
-        let nominal = Viewpoint::default().restorer(0.0)(point);
-        assert!(nominal.abs_diff_eq(point, 1e-12), "{nominal}");
-        // A level camera far away sees heights as they are: the nominal one's picture of a point is a lower one there.
-        let level = Viewpoint { elevation: 0.0, distance: 1e6 };
-        let (place, _) = Camera::orbit_at_yaw_degrees(0.0, SIDE).project(point).expect("in front");
-        let moved = level.restorer(0.0)(point);
-        let expected = (537.0 - place.y) * 2.0 / (0.8 * 1024.0) + 0.85;
-        assert!((moved.z - point.z).abs() < 1e-9 && (moved.y - expected).abs() < 1e-4, "{moved}, {expected}");
-        // The back's camera is the front's, turned.
-        let front = level.restorer(0.0)(point);
-        let back = level.restorer(180.0)(DVec3::new(-point.x, point.y, -point.z));
-        assert!(back.abs_diff_eq(DVec3::new(-front.x, front.y, -front.z), 1e-9), "{front} {back}");
     }
 }

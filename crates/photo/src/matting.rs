@@ -8,17 +8,16 @@ use image::{GrayImage, Luma, Rgb, RgbImage};
 use snapsnap_base::bilinear::{Tap, taps};
 
 use super::Rect;
+use super::segmenter::SIDE;
 use super::specks::{Pieces, pieces};
 use super::strokes::paint;
 use crate::resize::bilinear;
 
-/// Side of the pictures that the network receives.
-pub const SEGMENTER_SIDE: usize = 320;
 /// Margin of the network's second look around the person's box, as a share of the box's longer side.
 const MARGIN: f32 = 0.1;
 /// Probability of a pixel of the person.
 const LIKELY: f32 = 0.5;
-/// Distance from the person's largest piece, in pixels of [`SEGMENTER_SIDE`], beyond which nothing belongs to it.
+/// Distance from the person's largest piece, in pixels of [`SIDE`], beyond which nothing belongs to it.
 const NEAR: usize = 6;
 /// Longest side of a cut-out. Pictures of more pixels are reduced first, two of one size alike. Canvases have 1024 rows.
 const LONGEST: u32 = 4096;
@@ -38,14 +37,14 @@ const SOFT: (f32, f32) = (0.3, 0.7);
 /// The same for colours: a mixed one does more harm than a corrected one.
 const MIXED: (f32, f32) = (0.1, 0.8);
 
-/// Colours from 0 to 1, `[3, SEGMENTER_SIDE, SEGMENTER_SIDE]` → probability of each pixel to belong to the person, `[SEGMENTER_SIDE, SEGMENTER_SIDE]`.
-pub type Segmenter<'a> = dyn Fn(&[f32]) -> Vec<f32> + 'a;
+/// As [`super::segmenter::segment`].
+type Segment<'a> = dyn Fn(&[f32]) -> Vec<f32> + 'a;
 
 /// Cuts the person out of a picture: its coverage, and the colours without the background's share. The picture is reduced first if it
 /// is longer than [`LONGEST`]. `strokes` correct the coverage. `None` if the network finds nobody.
 pub fn matte(
     mut picture: RgbImage,
-    segment: &Segmenter,
+    segment: &Segment,
     strokes: Option<&GrayImage>,
 ) -> Option<(RgbImage, GrayImage)> {
     let longest = picture.width().max(picture.height());
@@ -73,9 +72,9 @@ pub fn matte(
 }
 
 /// The network's answer for a part of a picture.
-fn found(picture: &RgbImage, part: Rect, segment: &Segmenter) -> Vec<f32> {
+fn found(picture: &RgbImage, part: Rect, segment: &Segment) -> Vec<f32> {
     let part = imageops::crop_imm(picture, part.x, part.y, part.width, part.height);
-    let small = imageops::resize(&*part, SEGMENTER_SIDE as u32, SEGMENTER_SIDE as u32, FilterType::Lanczos3);
+    let small = imageops::resize(&*part, SIDE as u32, SIDE as u32, FilterType::Lanczos3);
     // The network was trained on pictures with a white point of 1.
     let white = f32::from(small.as_raw().iter().copied().max().unwrap_or(0).max(1));
     let plane = |channel: usize| small.pixels().map(move |pixel| f32::from(pixel[channel]) / white);
@@ -85,16 +84,16 @@ fn found(picture: &RgbImage, part: Rect, segment: &Segmenter) -> Vec<f32> {
 /// Pixels within [`NEAR`] of the largest piece of likely ones, and that piece's box.
 fn largest(probability: &[f32]) -> Option<(Vec<bool>, Rect)> {
     let likely: Vec<bool> = probability.iter().map(|p| *p > LIKELY).collect();
-    let Pieces { of, pieces } = pieces(&likely, SEGMENTER_SIDE as u32);
+    let Pieces { of, pieces } = pieces(&likely, SIDE as u32);
     let (row, (_, person)) = pieces.iter().enumerate().max_by_key(|(_, (size, _))| *size)?;
     let is_person: Vec<f32> = of.iter().map(|piece| f32::from(u8::from(*piece == row as u32 + 1))).collect();
-    let near = means(&is_person, SEGMENTER_SIDE, NEAR);
+    let near = means(&is_person, SIDE, NEAR);
     Some((near.iter().map(|share| *share > 1e-6).collect(), *person))
 }
 
-/// A box in pixels of [`SEGMENTER_SIDE`] with its margin, in pixels of the picture.
+/// A box in pixels of [`SIDE`] with its margin, in pixels of the picture.
 fn around(person: Rect, whole: Rect) -> Rect {
-    let (sx, sy) = (whole.width as f32 / SEGMENTER_SIDE as f32, whole.height as f32 / SEGMENTER_SIDE as f32);
+    let (sx, sy) = (whole.width as f32 / SIDE as f32, whole.height as f32 / SIDE as f32);
     let margin = MARGIN * (person.width as f32 * sx).max(person.height as f32 * sy);
     let span = |first: u32, length: u32, scale: f32, most: u32| {
         let low = (first as f32 * scale - margin).max(0.0) as u32;
@@ -126,7 +125,7 @@ impl Filter {
         let color: Vec<Vec3> = small.pixels().map(unit).collect();
         let size = [height as usize, width as usize];
         let wide = size[1];
-        let p = bilinear(probability, [SEGMENTER_SIDE; 2], size);
+        let p = bilinear(probability, [SIDE; 2], size);
 
         let mean = |of: &dyn Fn(usize) -> f32| means(&(0..p.len()).map(of).collect::<Vec<_>>(), wide, RADIUS);
         let mean_of_color: [Vec<f32>; 3] = std::array::from_fn(|c| mean(&|i| color[i][c]));
@@ -279,12 +278,11 @@ mod tests {
 
     /// A network that finds what is redder than the wall, blurred, and is unsure about the spot.
     fn network(rgb: &[f32]) -> Vec<f32> {
-        let (red, blue) =
-            (&rgb[..SEGMENTER_SIDE * SEGMENTER_SIDE], &rgb[2 * SEGMENTER_SIDE * SEGMENTER_SIDE..]);
+        let (red, blue) = (&rgb[..SIDE * SIDE], &rgb[2 * SIDE * SIDE..]);
         let of = |(red, blue): (&f32, &f32)| {
             if red > blue { 1.0 } else { f32::from((red - blue).abs() < 0.02) * 0.4 }
         };
-        means(&red.iter().zip(blue).map(of).collect::<Vec<f32>>(), SEGMENTER_SIDE, 3)
+        means(&red.iter().zip(blue).map(of).collect::<Vec<f32>>(), SIDE, 3)
     }
 
     #[test]
@@ -319,7 +317,7 @@ mod tests {
         });
         assert_eq!(matte(line, &network, None).expect("a person").1.dimensions(), (1, 4096));
         assert!(matte(RgbImage::from_pixel(90, 80, Rgb(WALL)), &network, None).is_none());
-        assert!(matte(RgbImage::new(1, 1), &|_| vec![0.0; SEGMENTER_SIDE * SEGMENTER_SIDE], None).is_none());
+        assert!(matte(RgbImage::new(1, 1), &|_| vec![0.0; SIDE * SIDE], None).is_none());
         // Everything is the person.
         let (_, mask) = matte(RgbImage::from_pixel(70, 64, Rgb(PERSON)), &network, None).expect("a person");
         assert!(mask.pixels().all(|value| value[0] == 255));

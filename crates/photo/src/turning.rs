@@ -6,7 +6,7 @@ use image::{GrayImage, Luma, Rgb, RgbImage};
 use rayon::prelude::*;
 
 use super::Rect;
-use super::viewpoint::{ELEVATIONS, Shot, pixels};
+use super::shot::{ELEVATIONS, Shot, pixels};
 
 /// Angle in degrees between the optical axis and the person's middle up to which a photograph stays as it is.
 const LEAST: f64 = 2.0;
@@ -21,7 +21,7 @@ pub(super) struct Turn {
     focals: [f64; 2],
     size: DVec2,
     /// To the right and down, in degrees.
-    angles: [f64; 2],
+    pub angles: [f64; 2],
     /// The turned camera.
     pub shot: Shot,
 }
@@ -60,12 +60,6 @@ impl Turn {
             angles: [angle(forward.x), angle(forward.y)],
             shot: Shot { focal: shot.focal.map(|focal| focal / reach), pitch },
         })
-    }
-
-    /// In words.
-    pub fn report(&self) -> String {
-        let [right, down] = self.angles;
-        format!("turned towards the person by {right:.1}° to the right and {down:.1}° down")
     }
 
     /// The turned picture and its mask, sampled bilinearly. Colours are weighted by the mask.

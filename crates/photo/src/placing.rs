@@ -3,8 +3,10 @@
 use glam::DVec2;
 use image::{GenericImageView, GrayImage, RgbImage, imageops};
 
-use super::exposure::match_back;
-use super::{Canvas, REFERENCE_SIDE, Rect, THRESHOLD, rim, unit};
+use snapsnap_net::Photograph;
+
+use super::{REFERENCE_SIDE, Rect, unit};
+use crate::report::Canvas;
 use crate::resize::{bilinear, lanczos3};
 
 /// Middle row of a training subject on a canvas of 1024. The subject covers rows 124.39 to 862.52
@@ -25,7 +27,7 @@ impl Mapping {
     pub const AS_IT_IS: Self = Self { scale: DVec2::ONE, origin: DVec2::ZERO };
 
     /// The map of the box `person` to the place `left`, `top` and this size.
-    pub(super) fn of(person: Rect, [left, top]: [usize; 2], [width, height]: [usize; 2]) -> Self {
+    pub(crate) fn of(person: Rect, [left, top]: [usize; 2], [width, height]: [usize; 2]) -> Self {
         let size = |width: u32, height: u32| DVec2::new(f64::from(width), f64::from(height));
         let scale = DVec2::new(width as f64, height as f64) / size(person.width, person.height);
         Self { scale, origin: DVec2::new(left as f64, top as f64) - size(person.x, person.y) * scale }
@@ -42,7 +44,7 @@ impl Mapping {
     }
 
     /// The map from the canvas to the photograph.
-    pub(crate) fn inverse(&self) -> Self {
+    pub fn inverse(&self) -> Self {
         Self { scale: 1.0 / self.scale, origin: -self.origin / self.scale }
     }
 }
@@ -101,42 +103,20 @@ fn median_column(mask: &GrayImage, person: Rect) -> u32 {
     person.x + before.count() as u32
 }
 
-/// Places photographs on canvases of `side` pixels as [`super::Placement::Training`] does, two photographs from one
-/// place together; `None` if a mask is empty.
-pub fn place(photographs: &[(RgbImage, GrayImage)], height: usize, side: usize) -> Option<Vec<Canvas>> {
-    let mut photographs = photographs.to_vec();
-    photographs.iter_mut().for_each(|(rgb, mask)| {
-        rim::clean(rgb, mask);
-    });
-    if let [(front, front_mask), (back, mask)] = &mut *photographs {
-        match_back((front, front_mask), (back, mask));
-    }
-    let people = photographs.iter().map(|(_, mask)| Rect::around(mask, u8::MAX.div_ceil(2)));
-    let people: Vec<Rect> = people.collect::<Option<_>>()?;
-    let common = match (&*photographs, people.as_slice()) {
-        ([(_, front), (_, back)], [a, b]) => together([front, back], [*a, *b]),
-        _ => None,
-    };
-    let placed = |((rgb, mask), person): (&(RgbImage, GrayImage), &Rect)| {
-        placed(rgb, mask, common.unwrap_or(Standing::alone(*person)), [height, side], "")
-    };
-    Some(photographs.iter().zip(&people).map(placed).collect())
-}
-
 /// Places the box at the size and place of the training subjects, with soft edges outside the box.
 pub(super) fn placed(
     rgb: &RgbImage,
     mask: &GrayImage,
     Standing { person, axis }: Standing,
+    together: bool,
     [height, side]: [usize; 2],
-    source: &str,
-) -> Canvas {
+) -> (Photograph, Mapping, Canvas) {
     let canvas = side as f32;
     let by_height = height as f32 / REFERENCE_SIDE * canvas / person.height as f32;
     // A person with outstretched arms may be wider than high.
     let (before, behind) = (axis - person.x as f32, (person.x + person.width) as f32 - axis);
     let scale = by_height.min(canvas / 2.0 / before.max(behind));
-    let limited = if scale < by_height { " (limited by the width)" } else { "" };
+    let limited_by_width = scale < by_height;
     let size = |length: u32| ((length as f32 * scale).round() as usize).clamp(1, side);
     let (width, height) = (size(person.width), size(person.height));
     let left = ((canvas / 2.0 - before * scale - 0.5).ceil().max(0.0) as usize).min(side - width);
@@ -173,15 +153,13 @@ pub(super) fn placed(
             }
         }
     }
-    let valid = on_canvas.iter().map(|m| *m >= THRESHOLD).collect();
-    let report = format!(
-        "{source}, scaled by {scale:.4}{limited} to {width}×{height} at ({left}, {top}) of {side}×{side}"
-    );
-    Canvas { rgb: values, mask: on_canvas, valid, mapping, report }
+    let (size, at) = ([width, height], [left, top]);
+    let canvas = Canvas::Scaled { together, scale, limited_by_width, size, at, side };
+    (Photograph::new(values, on_canvas), mapping, canvas)
 }
 
 /// The picture without a resize (docs/method.md, "Photographs on the canvas").
-pub fn on_canvas(rgb: &RgbImage, mask: &GrayImage, report: String) -> Canvas {
+pub fn on_canvas(rgb: &RgbImage, mask: &GrayImage) -> Photograph {
     let mask: Vec<f32> = mask.pixels().map(|p| unit(p[0])).collect();
     let area = mask.len();
     let mut values = vec![0.0; 3 * area];
@@ -190,8 +168,7 @@ pub fn on_canvas(rgb: &RgbImage, mask: &GrayImage, report: String) -> Canvas {
             values[c * area + i] = (2.0 * unit(pixel[c]) - 1.0) * mask[i];
         }
     }
-    let valid = mask.iter().map(|m| *m >= THRESHOLD).collect();
-    Canvas { rgb: values, mask, valid, mapping: Mapping::AS_IT_IS, report }
+    Photograph::new(values, mask)
 }
 
 /// The placement of the published demo with its quirks. The box loses its last row and column, sampling is bilinear,
@@ -201,8 +178,7 @@ pub(super) fn placed_as_demo(
     mask: &GrayImage,
     person: Rect,
     [height, side]: [usize; 2],
-    source: &str,
-) -> Canvas {
+) -> (Photograph, Mapping, Canvas) {
     let person = Rect { width: (person.width - 1).max(1), height: (person.height - 1).max(1), ..person };
     let height = ((height as f32 / REFERENCE_SIDE * side as f32).round() as usize).clamp(1, side);
     let scaled = person.width as usize * height / person.height as usize;
@@ -219,7 +195,7 @@ pub(super) fn placed_as_demo(
         for x in 0..width {
             let (from, to) = (y * width + x, (top + y) * side + left + x);
             on_canvas[to] = m[from];
-            if m[from] >= THRESHOLD {
+            if m[from] >= Photograph::LEAST {
                 for (c, plane) in [&r, &g, &b].into_iter().enumerate() {
                     values[c * area + to] = 2.0 * plane[from] - 1.0;
                 }
@@ -227,9 +203,8 @@ pub(super) fn placed_as_demo(
         }
     }
     let valid = on_canvas.iter().map(|m| *m >= 1.0).collect();
-    let report =
-        format!("{source}, sampled to {width}×{height} at ({left}, {top}) of {side}×{side} as in the demo");
-    Canvas { rgb: values, mask: on_canvas, valid, mapping, report }
+    let canvas = Canvas::Demo { size: [width, height], at: [left, top], side };
+    (Photograph { rgb: values, mask: on_canvas, valid }, mapping, canvas)
 }
 
 /// Red, green, blue and mask of the person's box, resized to `size` (rows, columns). `color` converts a colour and the

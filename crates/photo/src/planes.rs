@@ -4,7 +4,7 @@ use burn::tensor::Tensor;
 use glam::{DMat3, DVec3};
 use snapsnap_splat::{Camera, RigidTransform, affine};
 
-use super::Mapping;
+use crate::placing::Mapping;
 
 /// Least distance in metres in front of the first camera and, along z, from the second one. Points nearer than that do not move.
 const NEAREST: f64 = 1e-3;
@@ -12,7 +12,7 @@ const NEAREST: f64 = 1e-3;
 /// A map of points: a pixel of one camera is a pixel of another, and the point moves from the first one's ray to the second one's. Its z
 /// is multiplied by `scale`. Both cameras are on the same side of the plane z = 0 and look towards it.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct PlaneMap {
+pub struct PlaneMap {
     /// The second camera's ray of a point p is `matrix`·p + `offset`, as long as p is far from the first camera.
     matrix: DMat3,
     offset: DVec3,

@@ -27,13 +27,13 @@ fn quarters() -> tempfile::NamedTempFile {
     saved(&picture)
 }
 
-/// The canvas of a photograph that is front and back.
-fn one(path: &Path, placement: Placement) -> Result<Canvas, FileError> {
-    load([Source::file(path); 2], Cutting::Given, SIDE, placement, None)
-        .map(|Pair { canvases: [canvas, _], .. }| canvas)
+/// The canvas of a photograph that is front and back, and what was done to it.
+fn one(path: &Path, placement: Placement) -> Result<(Photograph, PhotoReport), FileError> {
+    let mut read = read(&[Source::file(path); 2], Cutting::Given, SIDE, placement, None)?;
+    Ok((read.canvases.remove(0), read.reports.remove(0)))
 }
 
-fn check_quarters(canvas: &Canvas, rows: std::ops::Range<usize>) {
+fn check_quarters(canvas: &Photograph, rows: std::ops::Range<usize>) {
     let columns = {
         let width = rows.len() / 2;
         (SIDE - width) / 2..(SIDE + width) / 2
@@ -61,14 +61,14 @@ fn check_quarters(canvas: &Canvas, rows: std::ops::Range<usize>) {
 
 #[test]
 fn the_person_stands_upright_where_training_subjects_stand() {
-    let canvas = one(quarters().path(), Placement::Training { height: 740 }).expect("a person");
+    let (canvas, _) = one(quarters().path(), Placement::Training { height: 740 }).expect("a person");
     // 740 and the middle row 493.5 of 1024, at a quarter of the size.
     check_quarters(&canvas, 31..216);
 }
 
 #[test]
 fn the_demo_puts_the_person_in_the_middle() {
-    let canvas = one(quarters().path(), Placement::Demo { height: 700 }).expect("a person");
+    let (canvas, _) = one(quarters().path(), Placement::Demo { height: 700 }).expect("a person");
     check_quarters(&canvas, 40..215);
 }
 
@@ -83,7 +83,7 @@ fn soft_edges_stay_soft_and_outside_the_box() {
         Rgba([200, (x * 2) as u8, y as u8, alpha])
     });
     let file = saved(&picture);
-    let canvas = one(file.path(), Placement::Training { height: 739 }).expect("a person");
+    let (canvas, _) = one(file.path(), Placement::Training { height: 739 }).expect("a person");
     let column: Vec<f32> = (0..SIDE).map(|row| canvas.mask[row * SIDE + SIDE / 2]).collect();
     let soft = column.iter().filter(|m| (0.3..0.5).contains(*m)).count();
     // Five rows of 100/255, enlarged by 739/4/120.
@@ -98,7 +98,7 @@ fn a_person_wider_than_the_canvas_gets_smaller_not_narrower() {
     });
     let file = saved(&picture);
     for placement in [Placement::Training { height: 739 }, Placement::Demo { height: 700 }] {
-        let canvas = one(file.path(), placement).expect("a person");
+        let (canvas, _) = one(file.path(), placement).expect("a person");
         let rows = (0..SIDE).filter(|y| canvas.valid[y * SIDE + SIDE / 2]).count();
         let columns = canvas.valid.chunks_exact(SIDE).map(|r| r.iter().filter(|v| **v).count()).max();
         let ratio = columns.expect("rows") as f32 / rows as f32;
@@ -118,7 +118,7 @@ fn a_speck_far_from_a_tiny_person_costs_nothing() {
         Rgba([(x % 256) as u8, (y % 256) as u8, 0, alpha])
     });
     let file = saved(&picture);
-    let canvas = one(file.path(), Placement::Training { height: 739 }).expect("a person");
+    let (canvas, _) = one(file.path(), Placement::Training { height: 739 }).expect("a person");
     let valid = canvas.valid.iter().filter(|v| **v).count();
     assert!((170 * 170..200 * 200).contains(&valid), "{valid}");
 }
@@ -133,15 +133,18 @@ fn photographs_from_one_place_are_placed_together() {
         });
         (RgbImage::from_fn(size.0, size.1, |i, j| image::Rgb([(i % 251) as u8, (j % 241) as u8, 9])), mask)
     };
-    let rows = |canvas: &Canvas| {
+    let rows = |canvas: &Photograph| {
         let set: Vec<usize> = (0..SIDE * SIDE).filter(|i| canvas.valid[*i]).collect();
         let columns = || set.iter().map(|i| i % SIDE);
         let middle = columns().min().expect("a person") + columns().max().expect("a person");
         (set[0] / SIDE, set[set.len() - 1] / SIDE, middle)
     };
     let placed = |a: &(RgbImage, GrayImage), b: &(RgbImage, GrayImage)| {
-        let made = place(&[a.clone(), b.clone()], 800, SIDE).expect("two people");
-        (rows(&made[0]), rows(&made[1]), made[0].mapping, made[1].mapping)
+        let sources = [a, b].map(|(rgb, mask)| Source::pixels(Path::new("x"), rgb, Some(mask)));
+        let placement = Placement::Training { height: 800 };
+        let made = read(&sources, Cutting::Given, SIDE, placement, None).expect("two people");
+        let [front, back] = [0, 1].map(|i| made.frames[i].mapping);
+        (rows(&made.canvases[0]), rows(&made.canvases[1]), front, back)
     };
     // Toes reach 10 pixels lower than heels; the axis is at 130.
     let (front, back) = (person((300, 300), 110, 40, 210), person((300, 300), 90, 40, 200));
@@ -171,24 +174,23 @@ fn rims_of_the_background_are_left_out_of_a_users_photographs() {
         };
         Rgba([r, g, b, if distance(x, y) < 1.012 { 255 } else { 0 }])
     });
-    let greenish = |canvas: &Canvas| {
+    let greenish = |canvas: &Photograph| {
         let area = SIDE * SIDE;
         (0..area).filter(|i| canvas.valid[*i] && canvas.rgb[area + i] > canvas.rgb[*i]).count()
     };
     let file = saved(&picture);
-    let corrected = one(file.path(), Placement::Training { height: 880 }).expect("a person");
-    assert!(corrected.report.contains("rim left out"), "{}", corrected.report);
+    let (corrected, report) = one(file.path(), Placement::Training { height: 880 }).expect("a person");
+    assert!(report.rim > 0 && report.to_string().contains("rim left out"), "{report}");
     assert_eq!(greenish(&corrected), 0);
     for placement in [Placement::AsIs, Placement::Demo { height: 880 }] {
-        let canvas = one(file.path(), placement).expect("a person");
-        assert!(
-            greenish(&canvas) > 300 && !canvas.report.contains("rim"),
-            "{placement:?}: {}",
-            greenish(&canvas)
-        );
+        let (canvas, report) = one(file.path(), placement).expect("a person");
+        assert!(greenish(&canvas) > 300 && report.rim == 0, "{placement:?}: {}", greenish(&canvas));
     }
+    // Photographs of a training go the same way.
     let rgb = DynamicImage::from(picture.clone()).into_rgb8();
     let mask = GrayImage::from_fn(side, side, |x, y| image::Luma([picture.get_pixel(x, y).0[3]]));
-    let training = place(&[(rgb, mask)], 880, SIDE).expect("a person");
-    assert_eq!(greenish(&training[0]), 0);
+    let source = Source::pixels(Path::new("x"), &rgb, Some(&mask));
+    let training =
+        read(&[source], Cutting::Given, SIDE, Placement::Training { height: 880 }, None).expect("a person");
+    assert_eq!(greenish(&training.canvases[0]), 0);
 }

@@ -1,8 +1,12 @@
 //! Signs that two photographs are not those of the front and the back of one person who stands upright.
 
-use image::{GrayImage, RgbImage};
+use std::fmt;
 
-use super::{Cutout, Rect};
+use image::{GrayImage, RgbImage};
+use serde::Serialize;
+
+use super::Rect;
+use super::cutout::Cutout;
 
 /// Mask value from which a pixel belongs to the person.
 const PERSON: u8 = 128;
@@ -28,41 +32,101 @@ const COLUMNS: i64 = 2 * GRID as i64;
 /// Largest mean difference of colours, of 255, between two files of one picture.
 const EQUAL: f32 = 2.0;
 
-/// The doubts about both photographs, a sentence each.
-pub(super) fn doubts(front: &Cutout, back: &Cutout) -> Vec<String> {
-    let mut doubts = Vec::new();
-    for one in [front, back] {
-        let mut add = |message: String| doubts.push(format!("{}: {message}", one.path.display()));
-        let touched = borders(&one.mask);
-        if touched >= BORDERS {
-            add(format!(
-                "the mask touches {touched} borders of the picture: is it inverted? The person must be white"
-            ));
-        }
-        let Rect { width, height, .. } = one.person;
-        if width as f32 > WIDEST * height as f32 {
-            add(format!(
+/// A sign that photographs are not those of the front and the back of one person who stands upright.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Doubt {
+    /// The photographs that it is about: their files, or other names.
+    pub photographs: Vec<String>,
+    /// What is wrong.
+    #[serde(flatten)]
+    pub sign: Sign,
+}
+
+/// What is wrong with photographs.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[serde(tag = "sign", rename_all = "kebab-case")]
+pub enum Sign {
+    /// The mask touches so many borders of the picture as no person does.
+    TouchesBorders {
+        /// Their number.
+        borders: usize,
+    },
+    /// The person is wider than high.
+    Wide {
+        /// Width and height in pixels.
+        size: [u32; 2],
+    },
+    /// Both are one picture.
+    Equal,
+    /// One is the mirror image of the other.
+    Mirrored,
+    /// Only the second shows a face.
+    Swapped,
+    /// The silhouettes do not fit one another.
+    LittleOverlap {
+        /// Intersection over union.
+        overlap: f32,
+    },
+}
+
+impl fmt::Display for Doubt {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}: ", self.photographs.join(" and "))?;
+        match self.sign {
+            Sign::TouchesBorders { borders } => write!(
+                f,
+                "the mask touches {borders} borders of the picture: is it inverted? The person must be white"
+            ),
+            Sign::Wide { size: [width, height] } => write!(
+                f,
                 "the person is wider than high ({width}×{height} pixels): the person should stand upright"
-            ));
+            ),
+            Sign::Equal => write!(f, "this is the same picture twice"),
+            Sign::Mirrored => write!(f, "one is the mirror image of the other"),
+            Sign::Swapped => write!(
+                f,
+                "the head has the colour of skin in the second picture only: are front and back swapped?"
+            ),
+            Sign::LittleOverlap { overlap } => {
+                let share = (100.0 * overlap).round();
+                write!(
+                    f,
+                    "the silhouettes of the front and of the mirrored back overlap by {share} % only: are they one person in one pose?"
+                )
+            }
         }
     }
-    let pair = |message: &str| format!("{} and {}: {message}", front.path.display(), back.path.display());
+}
+
+/// The doubts about both photographs.
+pub(super) fn doubts(front: &Cutout, back: &Cutout) -> Vec<Doubt> {
+    let mut doubts = Vec::new();
+    let mut add = |about: &[&Cutout], sign: Sign| {
+        let photographs = about.iter().map(|one| one.path.display().to_string()).collect();
+        doubts.push(Doubt { photographs, sign });
+    };
+    for one in [front, back] {
+        let borders = borders(&one.mask);
+        if borders >= BORDERS {
+            add(&[one], Sign::TouchesBorders { borders });
+        }
+        let Rect { width, height, .. } = one.report.person;
+        if width as f32 > WIDEST * height as f32 {
+            add(&[one], Sign::Wide { size: [width, height] });
+        }
+    }
+    let both = [front, back];
     if are_equal(front, back, false) {
-        doubts.push(pair("this is the same picture twice"));
+        add(&both, Sign::Equal);
     } else if are_equal(front, back, true) {
-        doubts.push(pair("one is the mirror image of the other"));
+        add(&both, Sign::Mirrored);
     } else {
         if skin(front) + SWAPPED < skin(back) {
-            doubts.push(pair(
-                "the head has the colour of skin in the second picture only: are front and back swapped?",
-            ));
+            add(&both, Sign::Swapped);
         }
         let overlap = overlap(front, back);
         if overlap < OVERLAP {
-            let share = (100.0 * overlap).round();
-            doubts.push(pair(&format!(
-                "the silhouettes of the front and of the mirrored back overlap by {share} % only: are they one person in one pose?"
-            )));
+            add(&both, Sign::LittleOverlap { overlap });
         }
     }
     doubts
@@ -111,7 +175,7 @@ fn overlap(front: &Cutout, back: &Cutout) -> f32 {
 
 /// Rows of a silhouette, mirrored or not, in cells of 1/64 of the person's height, around the middle of the person's box.
 fn silhouette(one: &Cutout, mirrored: bool) -> Vec<Vec<bool>> {
-    let Rect { x, y, width, height } = one.person;
+    let Rect { x, y, width, height } = one.report.person;
     let (height, grid) = (i64::from(height), i64::from(GRID));
     let middle = i64::from(x) + i64::from(width) / 2;
     let inside = |row: i64, column: i64| {
@@ -129,7 +193,7 @@ fn are_equal(front: &Cutout, back: &Cutout, mirrored: bool) -> bool {
     let (mut sum, mut count) = (0.0, 0);
     for (x, y) in grid() {
         let [a, b] = [(front, false), (back, mirrored)].map(|(one, mirrored)| {
-            let at = place(one.person, x, y, mirrored);
+            let at = place(one.report.person, x, y, mirrored);
             (color(&one.rgb, at), one.mask.get_pixel(at.0, at.1)[0] >= PERSON)
         });
         if a.1 || b.1 {
@@ -143,7 +207,7 @@ fn are_equal(front: &Cutout, back: &Cutout, mirrored: bool) -> bool {
 /// Share of the pixels at the place of the face that have the colour of skin. Its hue hardly depends on its brightness (Chai and Ngan, "Face
 /// segmentation using skin-color map in videophone applications", 1999). Brown hair has it as well.
 fn skin(one: &Cutout) -> f32 {
-    let Rect { x, y, width, height } = one.person;
+    let Rect { x, y, width, height } = one.report.person;
     let at = |share: f32| (share * height as f32) as u32;
     let rows = y + at(FACE[0])..(y + at(FACE[1])).max(y + at(FACE[0]) + 1);
     let inside = |x: u32, y: u32| one.mask.get_pixel(x, y)[0] >= PERSON;

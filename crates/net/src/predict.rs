@@ -1,0 +1,90 @@
+//! Photographs on their canvases → predicted points on the canvas, for trainings and for the reconstruction.
+
+use burn::tensor::Tensor;
+use rayon::prelude::*;
+use snapsnap_ops::{has_kernels, host};
+
+use crate::config::{Config, NetworkConfig};
+use crate::crop::Window;
+use crate::network::{Input, PointMap, PointPredictor, View};
+use crate::steps::{Record, Step};
+
+/// Point maps of all views on the predictor's window of the canvas.
+#[derive(Debug, Clone)]
+pub struct Prediction {
+    /// The window.
+    pub window: Window,
+    /// `[B,h,w,3]` and `[B,h,w]` of every view.
+    pub maps: Vec<(View, PointMap)>,
+    /// Normals `[B,3,h',w']` of front and back in the network's pixels, with `network.normals`.
+    pub normals: Option<[Tensor<4>; 2]>,
+}
+
+impl Prediction {
+    /// Predicted point maps of front and back `[B,2,3,S,S]` in [−1, 1], with the masks `[B,2,S,S]`, in a window of the canvas: without
+    /// one, in the window around these people.
+    pub fn new(
+        predictor: &PointPredictor,
+        config: &Config,
+        images: Tensor<5>,
+        masks: &Tensor<4>,
+        window: Option<Window>,
+        record: &mut Record,
+    ) -> Self {
+        let [b, _, colors, side, _] = images.dims();
+        let window = window.unwrap_or_else(|| {
+            Window::of_predictor(config, Window::around_person(&host(masks.clone()), side))
+        });
+        let input = record.timed("input", |_| {
+            // All fronts, then all backs.
+            let photographs = images.swap_dims(0, 1).reshape([2 * b, colors, side, side]);
+            let of_input = masks.clone().swap_dims(0, 1).reshape([2 * b, 1, side, side]);
+            Input::new(config, photographs, of_input, &window)
+        });
+        let [_, channels, height, width] = input.images.dims();
+        record.steps.push(Step::PointPredictor {
+            window: window.clone(),
+            canvas: side,
+            size: [width, height],
+            downsample: config.downsample(),
+            tokens: input.grid.tokens(),
+            channels,
+        });
+        let images = input.images.clone();
+        let encoded = record.timed("encoder", |_| predictor.encode(input));
+        let decoded = record.timed("decoders", |_| predictor.decode(encoded));
+        let heads = if predictor.has_side_heads() { "heads (4)" } else { "heads (2)" };
+        let mut maps = record.timed(heads, |_| predictor.heads(&decoded));
+        if maps.len() < predictor.views().len() {
+            maps = record.timed("completed sides", |_| predictor.complete(maps, &decoded, &images, &window));
+        }
+        let finished = |(view, map): (View, PointMap)| {
+            (view, predictor.finished(config, view, map, &window, mask_of(view, masks).as_ref()))
+        };
+        let maps = record.timed("up-sampling", |_| each_view(maps, finished));
+        Self { maps, normals: predictor.normals(&decoded), window }
+    }
+
+    /// The maps on the whole canvas, 0 outside the window.
+    pub fn pasted(self, config: &NetworkConfig) -> Vec<(View, PointMap)> {
+        each_view(self.maps, |(view, map)| (view, map.pasted(config, view, &self.window)))
+    }
+}
+
+/// Applies `change` to the map of each view. On a CPU, the operations of a map run on one thread each.
+fn each_view<T: Send>(
+    maps: Vec<(View, PointMap)>,
+    change: impl Fn((View, PointMap)) -> T + Send + Sync,
+) -> Vec<T> {
+    let conf = &maps[0].1.conf;
+    // The order of tracked operations decides the order of their gradients' sums.
+    match has_kernels(conf) && !conf.device().is_autodiff() {
+        true => maps.into_par_iter().map(change).collect(),
+        false => maps.into_iter().map(change).collect(),
+    }
+}
+
+/// The mask `[B,1,S,S]` of a photograph; `None` for the sides.
+fn mask_of(view: View, masks: &Tensor<4>) -> Option<Tensor<4>> {
+    ((view as usize) < 2).then(|| masks.clone().narrow(1, view as usize, 1))
+}

@@ -1,0 +1,197 @@
+//! What a run did, what it left out and why, and the time of each module: data, which the command line turns into words.
+
+use std::fmt;
+use std::time::{Duration, Instant};
+
+use burn::tensor::Device;
+use serde::Serialize;
+
+use crate::config::Downsample;
+use crate::crop::Window;
+
+/// A step of a run, or one that was left out.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+#[serde(tag = "step", rename_all = "kebab-case")]
+pub enum Step {
+    /// The point predictor received the `window` of the canvas, reduced to `size` (width, height).
+    PointPredictor {
+        /// Part of the canvas.
+        window: Window,
+        /// Side of the canvas in pixels.
+        canvas: usize,
+        /// Width and height of the network's input in pixels.
+        size: [usize; 2],
+        /// How the window was reduced.
+        downsample: Downsample,
+        /// Tokens of each photograph.
+        tokens: usize,
+        /// Channels of each photograph.
+        channels: usize,
+    },
+    /// Pixels of the sides moved into the silhouettes.
+    MovedIntoSilhouettes {
+        /// Their number.
+        pixels: usize,
+    },
+    /// Pixels of a view that become Gaussians.
+    Chosen {
+        /// The view.
+        view: &'static str,
+        /// Their number.
+        pixels: usize,
+        /// Pixels of the canvas.
+        of: usize,
+    },
+    /// Pixels left out, since their points are not finite.
+    NotFinite {
+        /// Their number.
+        pixels: usize,
+    },
+    /// Pixels of the sides left out, since they lie outside of the silhouettes.
+    OutsideSilhouettes {
+        /// Their number.
+        pixels: usize,
+    },
+    /// Pixels left out, since their points hang between two surfaces.
+    BetweenSurfaces {
+        /// Their number.
+        pixels: usize,
+    },
+    /// Colours of the sides were left out.
+    NoSideColors {
+        /// As the caller wanted; otherwise there are no sides.
+        as_asked: bool,
+    },
+    /// The regressor received the `window` of some views.
+    Regressor {
+        /// The views.
+        views: &'static str,
+        /// Part of the canvas.
+        window: Window,
+        /// Side of the canvas in pixels.
+        canvas: usize,
+        /// The box around the person.
+        person: Window,
+    },
+    /// The regressor left views out in which no pixel is valid.
+    NoRegressor {
+        /// The views.
+        views: &'static str,
+    },
+    /// Gaussians between the upper edges of front and back.
+    ClosedTop {
+        /// Their number.
+        gaussians: usize,
+    },
+    /// All Gaussians.
+    Gaussians {
+        /// Their number.
+        gaussians: usize,
+    },
+    /// Gaussians left out, since their attributes are not finite.
+    GaussiansNotFinite {
+        /// Their number.
+        gaussians: usize,
+    },
+    /// The reconstruction of many photographs is that of this number of pairs. The other steps are those of the first pair.
+    Pairs {
+        /// Their number.
+        pairs: usize,
+    },
+}
+
+impl fmt::Display for Step {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::PointPredictor { window, canvas, size: [width, height], downsample, tokens, channels } => {
+                let reduced = match downsample {
+                    _ if window.columns.len() == *width => "as they are instead",
+                    Downsample::Area => "area means",
+                    Downsample::Nearest => "every first pixel",
+                };
+                let part = if *window == Window::whole(*canvas) { "" } else { ", the person's window" };
+                write!(
+                    f,
+                    "point predictor: 2 photographs of {width}×{height} ({reduced} of {window}{part}), {tokens} tokens each, {channels} \
+                     channels"
+                )
+            }
+            Self::MovedIntoSilhouettes { pixels } => {
+                write!(f, "{pixels} pixels of the sides moved into the silhouettes")
+            }
+            Self::Chosen { view, pixels, of } => {
+                write!(f, "{view}: {pixels} of {of} pixels become Gaussians")
+            }
+            Self::NotFinite { pixels } => write!(f, "{pixels} pixels left out: their points are not finite"),
+            Self::OutsideSilhouettes { pixels } => {
+                write!(f, "{pixels} pixels of the sides left out: they lie outside of the silhouettes")
+            }
+            Self::BetweenSurfaces { pixels } => {
+                write!(f, "{pixels} pixels left out: their points hang between two surfaces")
+            }
+            Self::NoSideColors { as_asked: true } => write!(f, "side colours left out, as asked for"),
+            Self::NoSideColors { as_asked: false } => {
+                write!(f, "side colours left out: there are no side heads")
+            }
+            Self::Regressor { views, window, canvas, person } => {
+                write!(
+                    f,
+                    "regressor ({views}): {window} of {canvas}×{canvas} pixels each, person's box {person}"
+                )
+            }
+            Self::NoRegressor { views } => {
+                write!(f, "regressor ({views}) left out: no pixel of these views is valid")
+            }
+            Self::ClosedTop { gaussians } => {
+                write!(f, "closed top: {gaussians} Gaussians between the upper edges of front and back")
+            }
+            Self::Gaussians { gaussians } => write!(f, "{gaussians} Gaussians"),
+            Self::GaussiansNotFinite { gaussians } => {
+                write!(f, "{gaussians} Gaussians left out: their attributes are not finite")
+            }
+            Self::Pairs { pairs } => write!(f, "{pairs} pairs of photographs, the first one"),
+        }
+    }
+}
+
+/// The steps and times of a run.
+#[derive(Default)]
+pub struct Record<'a> {
+    /// What ran, and what was left out.
+    pub steps: Vec<Step>,
+    /// Time per module, the device synchronised before and after each. Empty for a silent record.
+    pub times: Vec<(&'static str, Duration)>,
+    watch: Option<Watch<'a>>,
+}
+
+#[derive(Clone, Copy)]
+struct Watch<'a> {
+    device: &'a Device,
+    stage: &'a dyn Fn(&'static str),
+}
+
+impl<'a> Record<'a> {
+    /// Measures times on `device`. `stage` is called with the name of each module before it runs.
+    pub fn new(device: &'a Device, stage: &'a dyn Fn(&'static str)) -> Self {
+        Self { watch: Some(Watch { device, stage }), ..Self::default() }
+    }
+
+    /// Does the work of a module.
+    pub(crate) fn timed<T>(&mut self, name: &'static str, work: impl FnOnce(&mut Self) -> T) -> T {
+        let Some(Watch { device, stage }) = self.watch else { return work(self) };
+        stage(name);
+        device.sync().expect("the device finishes its work");
+        let start = Instant::now();
+        let result = work(self);
+        device.sync().expect("the device finishes its work");
+        self.times.push((name, start.elapsed()));
+        result
+    }
+
+    /// Adds a step that concerns a number of pixels or Gaussians, unless the number is 0.
+    pub(crate) fn add_some(&mut self, count: usize, step: impl FnOnce(usize) -> Step) {
+        if count > 0 {
+            self.steps.push(step(count));
+        }
+    }
+}

@@ -1,0 +1,183 @@
+//! A photograph without its background.
+
+use std::borrow::Cow;
+use std::mem::replace;
+use std::path::Path;
+
+use image::{DynamicImage, GrayImage, RgbImage};
+use snapsnap_base::FileError;
+use snapsnap_mesh::picture::{self, MAX_BYTES};
+use snapsnap_net::Photograph;
+
+use crate::matting::matte;
+use crate::placing::{Mapping, Standing, on_canvas, placed, placed_as_demo};
+use crate::report::{Canvas, PhotoReport};
+use crate::segmenter::segment;
+use crate::shot::Shot;
+use crate::turning::Turn;
+use crate::{Content, Cutting, Frame, MIN_SIDE, Placement, Rect, Source, rim, specks, strokes};
+
+/// A photograph without its background.
+pub(super) struct Cutout<'a> {
+    pub path: &'a Path,
+    /// File of the mask.
+    mask_path: &'a Path,
+    pub rgb: RgbImage,
+    pub mask: GrayImage,
+    pub frame: Frame,
+    pub report: PhotoReport,
+}
+
+impl<'a> Cutout<'a> {
+    pub fn read(
+        source: Source<'a>,
+        cutting: Cutting,
+        side: usize,
+        placement: Placement,
+    ) -> Result<Self, FileError> {
+        let Source { path, content, mask, strokes } = source;
+        let is_file = !matches!(content, Content::Pixels(..));
+        let picture = source.decode()?;
+        let (width, height) = (picture.width(), picture.height());
+        if placement == Placement::AsIs && (width as usize, height as usize) != (side, side) {
+            let message =
+                format!("is {width}×{height}, --as-is needs a picture of the canvas's size, {side}×{side}");
+            return Err(FileError::unsuitable(path, message));
+        }
+        if is_file && placement != Placement::AsIs && width.min(height) < MIN_SIDE {
+            let message = format!("is {width}×{height}; both sides must have at least {MIN_SIDE} pixels");
+            return Err(FileError::unsuitable(path, message));
+        }
+        let (given, mask_path) = match (mask, cutting) {
+            (_, Cutting::Given | Cutting::Missing) if let Content::Pixels(_, Some(mask)) = content => {
+                (Ok(mask.clone()), path)
+            }
+            (Some(mask_path), _) => (Ok(grey(&picture::decode(mask_path, MAX_BYTES)?)), mask_path),
+            (None, Cutting::All) => (Err(""), path),
+            (None, _) => (alpha(&picture), path),
+        };
+        if let Ok((mask_width, mask_height)) = given.as_ref().map(GrayImage::dimensions)
+            && (mask_width, mask_height) != (width, height)
+        {
+            let path = path.display();
+            let message =
+                format!("the mask is {mask_width}×{mask_height}, its picture {path} is {width}×{height}");
+            return Err(FileError::unsuitable(mask_path, message));
+        }
+        let is_given = given.is_ok();
+        let rgb = picture.into_rgb8();
+        let (mut rgb, mut mask) = match (given, cutting) {
+            (Ok(mask), _) => (rgb, mask),
+            (Err(_), Cutting::Missing | Cutting::All) => matte(rgb, &segment, strokes).ok_or_else(|| {
+                let message =
+                    "no person was found in the picture: give masks with --masks FRONT_MASK BACK_MASK";
+                FileError::unsuitable(path, message)
+            })?,
+            (Err(message), Cutting::Given) => return Err(FileError::unsuitable(path, message)),
+        };
+        // The demo includes every pixel that is not 0. Lossy masks have many such pixels outside the person.
+        let least = if matches!(placement, Placement::Demo { .. }) { 1 } else { u8::MAX.div_ceil(2) };
+        // The demo has no such steps, and a network's mask needs none.
+        let (specks, rim) = match placement {
+            Placement::Training { .. } if is_given => {
+                (specks::remove(&mut mask, least), rim::clean(&mut rgb, &mut mask))
+            }
+            _ => (0, 0),
+        };
+        // A network's mask has them already.
+        if let Some(strokes) = strokes.filter(|_| is_given) {
+            strokes::paint(strokes, &mut mask, |_, _| {});
+        }
+        let person = Rect::around(&mask, least).ok_or_else(|| nobody(mask_path, placement))?;
+        if is_file && is_single_colour(&rgb, &mask) {
+            let message = "the person is of a single colour: this is no photograph";
+            return Err(FileError::unsuitable(path, message));
+        }
+        let report = PhotoReport {
+            size: [width, height],
+            cut_out: (!is_given).then(|| rgb.dimensions().into()),
+            person,
+            specks,
+            rim,
+            gains: None,
+            turned: None,
+            canvas: Canvas::AsIs,
+        };
+        let shot = if is_file { Shot::of(&source) } else { Shot::default() };
+        let frame = Frame { shot, size: rgb.dimensions().into(), mapping: Mapping::AS_IT_IS };
+        Ok(Self { path, mask_path, rgb, mask, frame, report })
+    }
+
+    /// Turns the photograph towards the middle of the person's box, or of the common box of both photographs. Returns colours and mask
+    /// before the turn.
+    pub fn turn(&mut self, common: Option<Standing>) -> Option<(RgbImage, GrayImage)> {
+        let person = common.map_or(self.report.person, |standing| standing.person);
+        let turn = Turn::towards(person, self.frame.size, self.frame.shot)?;
+        let (rgb, mask) = turn.apply(&self.rgb, &self.mask);
+        self.report.person = Rect::around(&mask, u8::MAX.div_ceil(2))?;
+        self.report.turned = Some(turn.angles);
+        self.frame.shot = turn.shot;
+        Some((replace(&mut self.rgb, rgb), replace(&mut self.mask, mask)))
+    }
+
+    /// Places the photograph by the person's box, or by the common box of both photographs.
+    pub fn place(
+        &mut self,
+        common: Option<Standing>,
+        side: usize,
+        placement: Placement,
+    ) -> Result<Photograph, FileError> {
+        let Self { rgb, mask, report, .. } = &*self;
+        let (photograph, mapping, canvas) = match placement {
+            Placement::AsIs => (on_canvas(rgb, mask), Mapping::AS_IT_IS, Canvas::AsIs),
+            Placement::Training { height } => {
+                let standing = common.unwrap_or(Standing::alone(report.person));
+                placed(rgb, mask, standing, common.is_some(), [height, side])
+            }
+            Placement::Demo { height } => placed_as_demo(rgb, mask, report.person, [height, side]),
+        };
+        (self.frame.mapping, self.report.canvas) = (mapping, canvas);
+        if photograph.valid.contains(&true) { Ok(photograph) } else { Err(nobody(self.mask_path, placement)) }
+    }
+}
+
+fn nobody(mask_path: &Path, placement: Placement) -> FileError {
+    let least =
+        if matches!(placement, Placement::Demo { .. }) { "255, which `mode.compat` needs" } else { "128" };
+    let message = format!("the mask is empty: no pixel of the person reaches {least}");
+    FileError::unsuitable(mask_path, message)
+}
+
+/// A mask picture's brightness, black where it is transparent.
+fn grey(picture: &DynamicImage) -> GrayImage {
+    let pixels = picture.to_luma_alpha8();
+    GrayImage::from_fn(pixels.width(), pixels.height(), |x, y| {
+        let [value, alpha] = pixels.get_pixel(x, y).0;
+        image::Luma([(u16::from(value) * u16::from(alpha) / 255) as u8])
+    })
+}
+
+/// The alpha channel as a mask.
+fn alpha(picture: &DynamicImage) -> Result<GrayImage, &'static str> {
+    if !picture.color().has_alpha() {
+        return Err(
+            "has no alpha channel: cut the person out, give masks with --masks FRONT_MASK BACK_MASK, or let --cutout auto do it",
+        );
+    }
+    // The usual case needs no copy.
+    let rgba = picture.as_rgba8().map_or_else(|| Cow::Owned(picture.to_rgba8()), Cow::Borrowed);
+    let mask = GrayImage::from_fn(rgba.width(), rgba.height(), |x, y| image::Luma([rgba.get_pixel(x, y)[3]]));
+    if mask.pixels().all(|p| p[0] == u8::MAX) {
+        return Err(
+            "is opaque everywhere, so its alpha channel does not show the person: cut the person out, give masks with --masks \
+                    FRONT_MASK BACK_MASK, or let --cutout auto do it",
+        );
+    }
+    Ok(mask)
+}
+
+fn is_single_colour(rgb: &RgbImage, mask: &GrayImage) -> bool {
+    let mut inside = rgb.pixels().zip(mask.pixels()).filter(|(_, m)| m[0] > 0).map(|(p, _)| p);
+    let first = inside.next();
+    inside.all(|p| Some(p) == first)
+}

@@ -1,0 +1,245 @@
+//! Photographs on their canvases → the person, at its height and where the photographs' cameras saw it.
+
+use std::fmt;
+use std::ops::RangeInclusive;
+
+use burn::tensor::{Tensor, TensorData};
+use serde::Serialize;
+use snapsnap_net::config::{Config, WorldFrame};
+use snapsnap_net::{Reconstruction, Reconstructor, placed};
+use snapsnap_ops::host;
+use snapsnap_splat::Gaussians;
+
+use crate::restoration::Restoration;
+use crate::shot::{ELEVATIONS, Viewpoint};
+use crate::{Frame, Photographs, Placement};
+
+/// Distances in metres beyond which a camera photographs nobody who stands upright.
+pub const DISTANCES: RangeInclusive<f64> = 1.0..=30.0;
+/// Height of a person whose height is not given, in metres.
+const USUAL: f64 = 1.72;
+/// Share of the Gaussians above and below a person's height, which may be outliers.
+const OUTSIDE: f64 = 0.0002;
+
+/// What a user says of the photographs.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
+pub struct Told {
+    /// The photographs are the canvases already.
+    pub as_is: bool,
+    /// Height of the person in metres.
+    pub height: Option<f64>,
+    /// Focal length of the photographs in millimetres of 35 mm film.
+    pub focal: Option<f64>,
+    /// Distance of the cameras in metres.
+    pub distance: Option<f64>,
+    /// How far the cameras look down at the person's middle, in degrees.
+    pub elevation: Option<f64>,
+}
+
+impl Told {
+    /// The placement for the networks of a config.
+    pub fn placement(&self, config: &Config) -> Placement {
+        let height = config.person_height();
+        match (self.as_is, config.mode.compat) {
+            (true, _) => Placement::AsIs,
+            (_, true) => Placement::Demo { height },
+            _ => Placement::Training { height },
+        }
+    }
+}
+
+/// Why cameras and heights have no effect.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Unplaced {
+    /// The photographs are the canvases: their cameras are the nominal ones.
+    AsIs,
+    /// The weights have the published demo's cameras.
+    Compat,
+    /// The world is mirrored.
+    Mirrored,
+}
+
+/// Why cameras and heights have no effect with these networks, if so.
+pub fn unplaced(config: &Config, as_is: bool) -> Option<Unplaced> {
+    match (as_is, config.mode.compat) {
+        (true, _) => Some(Unplaced::AsIs),
+        (_, true) => Some(Unplaced::Compat),
+        _ => (config.world_frame() == WorldFrame::Mirrored).then_some(Unplaced::Mirrored),
+    }
+}
+
+/// Where a camera stood, and how that is known.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Seat {
+    /// Its place relative to the networks' person.
+    #[serde(skip)]
+    pub viewpoint: Viewpoint,
+    /// Distance in metres from a person of this height.
+    pub distance: f64,
+    /// How the distance is known.
+    pub distance_by: DistanceBy,
+    /// Height of the person in metres.
+    pub height: f64,
+    /// Whether the height was not told.
+    pub height_assumed: bool,
+    /// How far it looks down at the person's middle, in degrees.
+    pub elevation: f64,
+    /// How the elevation is known.
+    pub elevation_by: ElevationBy,
+}
+
+/// How a distance is known.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[serde(tag = "by", rename_all = "kebab-case")]
+pub enum DistanceBy {
+    /// It was told.
+    Told,
+    /// It follows from the lens.
+    Lens {
+        /// Millimetres of 35 mm film.
+        focal: f64,
+        /// Whether a user told it; otherwise the file.
+        told: bool,
+    },
+    /// The nominal one: the lens does not fit a person of this size.
+    Misfit {
+        /// Millimetres of 35 mm film.
+        focal: f64,
+        /// Whether a user told it; otherwise the file.
+        told: bool,
+    },
+    /// The nominal one: nothing is known.
+    Unknown,
+}
+
+/// How an elevation is known.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ElevationBy {
+    /// It was told.
+    Told,
+    /// The file says it.
+    File,
+    /// The nominal one: nothing is known.
+    Unknown,
+}
+
+impl fmt::Display for Seat {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { distance, distance_by, height, height_assumed, elevation, elevation_by, .. } = self;
+        let whence = |told: &bool| if *told { "--focal" } else { "the file" };
+        write!(f, "camera {distance:.2} m away (")?;
+        match distance_by {
+            DistanceBy::Told => write!(f, "--distance")?,
+            DistanceBy::Lens { focal, told } => {
+                write!(f, "{focal:.0} mm of 35 mm film, {}", whence(told))?;
+            }
+            DistanceBy::Misfit { focal, told } => write!(
+                f,
+                "nominal: {focal:.0} mm of 35 mm film, {}, does not fit a person of this size",
+                whence(told)
+            )?,
+            DistanceBy::Unknown => write!(f, "nominal: the focal length is unknown")?,
+        }
+        let assumed = if *height_assumed { ", assumed" } else { "" };
+        let known = match elevation_by {
+            ElevationBy::Told => "--elevation",
+            ElevationBy::File => "the file",
+            ElevationBy::Unknown => "nominal: unknown",
+        };
+        write!(f, "; person {height} m high{assumed}), looking down by {elevation:.1}° ({known})")
+    }
+}
+
+impl Told {
+    /// Where the camera of a photograph stood. `height` is that of the networks' person in metres, on a canvas of `side` pixels.
+    fn seat(&self, frame: &Frame, side: usize, height: f64) -> Seat {
+        let nominal = Viewpoint::default();
+        let tall = self.height.unwrap_or(USUAL);
+        let focal = frame.shot.focal;
+        let seen = focal.map(|focal| Viewpoint::distance(focal, frame, side));
+        // The lens of a turned picture is a little shorter where the person would not fit into it.
+        let (lens, told) = (self.focal.or(focal).unwrap_or_default(), self.focal.is_some());
+        let (distance, distance_by) = match (self.distance, seen) {
+            (Some(distance), _) => (distance * height / tall, DistanceBy::Told),
+            (None, Some(seen)) if DISTANCES.contains(&seen) => (seen, DistanceBy::Lens { focal: lens, told }),
+            (None, Some(_)) => (nominal.distance, DistanceBy::Misfit { focal: lens, told }),
+            (None, None) => (nominal.distance, DistanceBy::Unknown),
+        };
+        let pitch = frame.shot.pitch.zip(focal);
+        let pitch = pitch.map(|(pitch, focal)| Viewpoint::elevation(pitch, focal, frame, side));
+        let (elevation, elevation_by) =
+            match (self.elevation, pitch.filter(|pitch| ELEVATIONS.contains(pitch))) {
+                (Some(elevation), _) => (elevation, ElevationBy::Told),
+                (None, Some(elevation)) => (elevation, ElevationBy::File),
+                (None, None) => (nominal.elevation, ElevationBy::Unknown),
+            };
+        Seat {
+            viewpoint: Viewpoint { elevation, distance },
+            distance: distance * tall / height,
+            distance_by,
+            height: tall,
+            height_assumed: self.height.is_none(),
+            elevation,
+            elevation_by,
+        }
+    }
+}
+
+/// A person of photographs.
+pub struct Person {
+    /// In the world of the config: y up, metres.
+    pub gaussians: Gaussians,
+    /// Where the cameras of front and back stood, unless they are the canvases'.
+    pub seats: Option<[Seat; 2]>,
+    /// What the networks made, in the front camera's frame. `origins` are those of [`Self::gaussians`] as well.
+    pub made: Reconstruction,
+}
+
+/// The person in the photographs of front and back, as their cameras saw it, at its height. `stage` is called with the name of each module
+/// before it runs. `None` if no Gaussian comes out.
+///
+/// # Panics
+/// If there are not two photographs on canvases of the networks' size.
+pub fn person(
+    photographs: &Photographs,
+    networks: &Reconstructor,
+    told: &Told,
+    stage: &dyn Fn(&'static str),
+) -> Option<Person> {
+    let [front, back] = &*photographs.canvases else { panic!("a person needs two photographs") };
+    let config = networks.config();
+    let made = networks.reconstruct([front, back], stage);
+    if made.gaussians.is_empty() {
+        return None;
+    }
+    let mut gaussians = made.in_world(config);
+    let mut seats = None;
+    if unplaced(config, told.as_is).is_none() {
+        let side = config.network.resolution;
+        let [floor, top] = range(&host(gaussians.means.clone()));
+        let here = [0, 1].map(|i| told.seat(&photographs.frames[i], side, top - floor));
+        if told.height.is_some() || here.iter().any(|seat| seat.viewpoint != Viewpoint::default()) {
+            let restoration = Restoration::to_viewpoints(here.map(|seat| seat.viewpoint));
+            let person = restoration.person(made.gaussians.clone(), &made.origins);
+            gaussians = placed(config, person, &restoration.front.world_to_camera.inverse());
+            let mut means = host(gaussians.means.clone());
+            let [low, top] = range(&means);
+            // The person stands where it stood.
+            means.iter_mut().skip(1).step_by(3).for_each(|y| *y += (floor - low) as f32);
+            let scale = told.height.map_or(1.0, |wanted| wanted / (top - low));
+            let means =
+                Tensor::from_data(TensorData::new(means, gaussians.means.dims()), &gaussians.device());
+            gaussians = Gaussians { means, ..gaussians }.scaled(scale);
+        }
+        seats = Some(here);
+    }
+    Some(Person { gaussians, seats, made })
+}
+
+/// The y of the person's lowest and highest Gaussians, without outliers, in metres.
+fn range(means: &[f32]) -> [f64; 2] {
+    let mut heights: Vec<f32> = means.chunks_exact(3).map(|mean| mean[1]).collect();
+    heights.sort_unstable_by(f32::total_cmp);
+    [OUTSIDE, 1.0 - OUTSIDE].map(|share| f64::from(heights[(share * (heights.len() - 1) as f64) as usize]))
+}
