@@ -34,7 +34,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let photographs = read(&sources, Cutting::Given, config.network.resolution, placement, told.focal)?;
 
     let person = person(&photographs, &networks, &told, &|module| println!("{module}"));
-    let person = person.ok_or("no Gaussian came out")?;
+    let person = person.map_err(|steps| format!("no Gaussian came out: {steps:?}"))?;
     for (module, time) in &person.made.times {
         println!("{module:<26} {:>8.1} ms", 1e3 * time.as_secs_f64());
     }

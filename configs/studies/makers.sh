@@ -42,12 +42,9 @@ row completed-no-makehuman 1400 synth avatars
 row completed-no-avatars 1400 synth makehuman
 options='--set network.sides="completed" --set stage1.relief_weight=1'
 row relief 1400 synth makehuman avatars
-# Photographs alone, without and with a head for normals, in equal time.
+# Photographs alone.
 options='--set network.side_heads=false'
 row photographs 2000 synth makehuman avatars
 row photographs-no-synth 2000 makehuman avatars
-options='--set network.side_heads=false --set network.normals=true'
-row normals 1900 synth makehuman avatars
-row normals-no-synth 1900 makehuman avatars
 options='--set network.sides="completed" --set network.second_layer=true --set samples.second_depth=true'
 row second 1400 synth makehuman avatars

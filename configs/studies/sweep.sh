@@ -40,7 +40,6 @@ row plain groups --set network.mask_channel=false --set network.ray_channels=fal
 transformer="--set network.body=\"transformer\" --set network.enc_depth=4 --set network.dec_dim=128 --set network.dec_depth=3 \
   --set network.layer_dims=[16,32,48,64] --set network.feature_dim=32 --set network.last_dim=16 --set network.hooks=[0,1,2,3] --set network.patch=16"
 row transformer groups $transformer
-row drop-empty groups $transformer --set network.drop_empty=true
 row rings rings
 row whole-canvas groups --set network.window=false
 row net-64 groups --set network.net_resolution=64
@@ -61,7 +60,6 @@ regressor() {
 regressor regressor
 regressor free-start --set 'regressor.start="published"'
 regressor free-color --set 'regressor.color="free"'
-regressor grey-rims --set regressor.straight_color=false
 if wanted bench; then
   cargo xtask bench --config configs/studies/sweep.toml -o reports/sweep
 fi

@@ -24,7 +24,7 @@ fn the_doctor_names_devices_weights_and_what_mends() {
         report["threads"].as_u64() > Some(0)
             && report["compiled_in"].as_array().is_some_and(|all| all.len() > 2)
     );
-    assert!(report["bf16"].is_null() || report["bf16"] == "AMX" || report["bf16"] == "AVX-512", "{report}");
+    assert!(report["bf16"].is_boolean(), "{report}");
     assert_eq!(report["weights"][0]["sound"], true);
     let missing = report["missing"].as_array().expect("a list");
     assert!(missing.iter().any(|m| m["mend"].as_str().is_some_and(|mend| mend.contains("fetch-weights"))));

@@ -274,7 +274,7 @@ fn unsuitable_configs_weights_devices_and_outputs_are_refused_by_name() {
         }
     };
     case(&["--set", "network.nothing=1"], &["nothing"]);
-    case(&["--set", "network.fusion=sum"], &["fusion", "mirror-mean"]);
+    case(&["--set", "network.fusion=sum"], &["fusion", "concat"]);
     case(&["--set", "mode.compat=true", "--set", "mode.crop=true"], &["mode.crop", "mode.compat"]);
     case(&["--set", "network.enc_dim=128"], &["`network.enc_dim`", "64", "128"]);
     fs::write(place.path("bad.toml"), "[network]\nenc_dim = \"many\"\n").expect("written");

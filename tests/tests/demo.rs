@@ -118,7 +118,7 @@ fn a_filled_regressor_keeps_its_config() {
         WeightFile::open(&path("both"), None).expect("weights"),
     );
     let mut config = both.config.clone();
-    (config.network.closed_top, config.network.steepest) = (false, Some(5.0));
+    (config.network.closed_top, config.network.hull_margin) = (false, Some(5));
     config.mode.rotation_frame = Some(RotationFrame::World);
     config.regressor = RegressorConfig::default();
     let predictors =

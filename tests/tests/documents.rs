@@ -1,4 +1,4 @@
-//! Every command that README and docs show, in the order in which they show it, on less work: two people, a few steps, small
+//! Every command that README and docs show, but for the notes, in the order in which they show it, on less work: two people, a few steps, small
 //! pictures. A shell reads the pages' blocks, so that its variables and loops count; the programs it would start are recorded
 //! and then run here. Commands within the text are looked at: programs, benches, tests and options must be there.
 #![cfg(unix)]
@@ -12,7 +12,7 @@ use std::time::Instant;
 use snapsnap_tests::{data, root, shared, snapsnap, succeed, toml_config};
 
 /// In the order in which a reader meets them: each page's commands find what earlier ones made.
-const PAGES: [&str; 22] = [
+const PAGES: [&str; 14] = [
     "README.md",
     "CONTRIBUTING.md",
     "docs/training.md",
@@ -27,14 +27,6 @@ const PAGES: [&str; 22] = [
     "docs/data.md",
     "docs/fuzz.md",
     "datasets/README.md",
-    "docs/notes/training.md",
-    "docs/notes/weights.md",
-    "docs/notes/evaluation.md",
-    "docs/notes/inference.md",
-    "docs/notes/splat.md",
-    "docs/notes/data.md",
-    "docs/notes/people.md",
-    "docs/notes/look.md",
 ];
 /// Tasks of `cargo xtask` that are no commands of the program; the suite itself and its neighbours.
 const TASKS: [&str; 6] = ["test", "lint", "dist", "fuzz", "bundle", "help"];
@@ -347,13 +339,13 @@ fn help(own: &[String]) -> String {
 /// Links from page to page lead somewhere.
 #[test]
 fn links_within_the_repository_lead_somewhere() {
-    let pages = PAGES.into_iter().chain([
-        "assets/README.md",
-        "assets/weights/README.md",
-        "assets/sample/README.md",
-        "docs/stability.md",
-    ]);
-    for page in pages {
+    let notes =
+        fs::read_dir(root().join("docs/notes")).expect("lists").map(|entry| entry.expect("an entry").path());
+    let notes = notes.map(|path| format!("docs/notes/{}", path.file_name().expect("a name").display()));
+    let others =
+        ["assets/README.md", "assets/weights/README.md", "assets/sample/README.md", "docs/stability.md"];
+    let pages: Vec<String> = PAGES.into_iter().chain(others).map(str::to_owned).chain(notes).collect();
+    for page in &pages {
         let text = fs::read_to_string(root().join(page)).unwrap_or_else(|e| panic!("{page}: {e}"));
         let folder = Path::new(page).parent().expect("a folder");
         for target in text.split("](").skip(1).filter_map(|rest| rest.split(')').next()) {

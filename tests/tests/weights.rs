@@ -216,45 +216,19 @@ fn another_file_gives_the_tensors_that_are_in_none_of_the_first() {
     assert!(with(Some(&place.path("absent"))).is_err());
 }
 
-/// A training with normals begins from weights without them, and the other way round.
+/// Keys that are gone are ignored with the value that they always have now, and refused with others.
 #[test]
-fn the_layer_of_normals_is_drawn_or_left_out() {
-    let place = tempfile::tempdir().expect("temporary folder");
-    let at = |name: &str| place.path().join(name);
-    let config = |normals: bool| {
-        let lines = "[network]\nbody = \"convolution\"\npatch = 8\nlayer_dims = [8, 8, 8, 8]\nenc_dim = 8\nenc_depth = 1\n\
-                     enc_heads = 1\nmlp_ratio = 1\nlast_dim = 8\nside_heads = false\n";
-        Config::from_toml(lines, "x", &[format!("network.normals={normals}")]).expect("valid")
-    };
-    let import_to = |from: &str, normals: bool, to: &str| {
-        import(&[at(from)], &config(normals), OPTIONS, &at(to), &|_, _| ())
-    };
-    let import =
-        |from: &str, normals: bool, to: &str| import_to(from, normals, to).expect("imports").notes.join("\n");
-    init(&config(false), 1, &at("without"), &|_, _| ()).expect("writes");
-    let notes = import("without", true, "with");
-    assert!(notes.contains("unet.normals.weight is in no file: drawn from seed 3"), "{notes}");
-    assert!(notes.contains("unet.normals.bias"), "{notes}");
-    let (with, without) = (read(&at("with")), read(&at("without")));
-    assert_eq!(with["unet.normals.weight"].1, [6, 8, 1, 1]);
-    assert_eq!(with.len(), without.len() + 2);
-    assert!(WeightFile::open(&at("with"), Some(config(false))).is_err());
-    // A file that should have both tensors is damaged.
-    let mut damaged = with.clone();
-    damaged.remove("unet.normals.bias");
-    write(&damaged, &at("damaged"));
-    let into = |from: &str| import_to(from, true, "never").expect_err("is damaged").to_string();
-    assert!(into("damaged").contains("missing: unet.normals.bias"));
-    damaged.remove("unet.normals.weight");
-    write_beside(&damaged, Some(&config(true)), &at("promised"));
-    let problems = into("promised");
+fn keys_that_are_gone_are_ignored_or_refused() {
+    let opened = |line: &str| Config::from_toml(&format!("[network]\nenc_depth = 1\n{line}\n"), "x", &[]);
+    let older = opened("drop_empty = false\nsteepest = 4.0\n[regressor]\nstraight_color = true");
+    assert_eq!(older.expect("opens"), opened("").expect("opens"));
+    let refused = opened("drop_empty = true").expect_err("is refused").to_string();
     assert!(
-        ["weight", "bias"].iter().all(|end| problems.contains(&format!("missing: unet.normals.{end}"))),
-        "{problems}"
+        refused.contains("`network.drop_empty` is gone: it is always false, and cannot be true"),
+        "{refused}"
     );
-    let notes = import("with", false, "again");
-    assert!(notes.contains("2 tensors of the normals are left out"), "{notes}");
-    assert_eq!(read(&at("again")), without);
+    let refused = opened("drop_empty = false\nenc_depths = 1").expect_err("is refused").to_string();
+    assert!(refused.contains("enc_depths"), "{refused}");
 }
 
 #[test]

@@ -145,10 +145,19 @@ impl Adapter {
     }
 }
 
+/// What graphics drivers answer.
+#[derive(Debug, Default, Serialize, Deserialize)]
+struct Drivers {
+    /// All adapters of the compiled kinds.
+    adapters: Vec<Adapter>,
+    /// Whether wgpu would take OpenGL, which is not used.
+    is_opengl: bool,
+}
+
 /// Name of the hidden command that prints [`probe`]'s text.
 pub const PROBE: &str = "probe-adapters";
 
-/// All adapters of the compiled kinds, as JSON.
+/// The answers of the graphics drivers, as JSON.
 pub fn probe() -> String {
     let of_kind = |(kind, device_type): (&str, DeviceType)| {
         let adapter = |(index, device): (usize, Device)| Adapter {
@@ -159,20 +168,31 @@ pub fn probe() -> String {
         };
         devices(device_type).into_iter().enumerate().map(adapter).collect::<Vec<_>>()
     };
-    let adapters: Vec<Adapter> = gpus().into_iter().flat_map(of_kind).collect();
-    serde_json::to_string(&adapters).expect("plain text and numbers")
+    let drivers =
+        Drivers { adapters: gpus().into_iter().flat_map(of_kind).collect(), is_opengl: adapter::is_opengl() };
+    serde_json::to_string(&drivers).expect("plain text and numbers")
 }
 
-/// All adapters of the compiled kinds, listed by another process: drivers may crash, for example when memory is short.
-fn adapters() -> &'static [Adapter] {
-    static ADAPTERS: OnceLock<Vec<Adapter>> = OnceLock::new();
-    ADAPTERS.get_or_init(|| {
+/// The graphics drivers, asked by another process: they may crash, for example when memory is short, and their loaders
+/// print warnings.
+fn drivers() -> &'static Drivers {
+    static DRIVERS: OnceLock<Drivers> = OnceLock::new();
+    DRIVERS.get_or_init(|| {
         let probed = std::env::current_exe().and_then(|program| {
             Command::new(program).arg(PROBE).stdin(Stdio::null()).stderr(Stdio::null()).output()
         });
         let probed = probed.ok().filter(|output| output.status.success());
         probed.and_then(|output| serde_json::from_slice(&output.stdout).ok()).unwrap_or_default()
     })
+}
+
+fn adapters() -> &'static [Adapter] {
+    &drivers().adapters
+}
+
+/// Whether the only graphics driver is OpenGL's, which is not used.
+pub fn is_opengl() -> bool {
+    drivers().is_opengl
 }
 
 /// Kinds of devices of this build.

@@ -58,7 +58,8 @@ fn keep_kernels() {
     let mut config = CubeClRuntimeConfig::from_current_dir().override_from_env();
     config.compilation.cache = true;
     if config.environment.name == cubecl::environment::DEFAULT {
-        config.environment.name = concat!("snapsnap-", env!("CARGO_PKG_VERSION")).into();
+        config.environment.name =
+            concat!("snapsnap-", env!("CARGO_PKG_VERSION"), "-", env!("SNAPSNAP_COMMIT")).into();
     }
     CubeClRuntimeConfig::try_set(config);
 }
@@ -177,8 +178,6 @@ fn main() -> ExitCode {
     keep_pages();
     #[cfg(feature = "vulkan")]
     keep_kernels();
-    #[cfg(unix)]
-    set_runtime_folder();
     // Panics of libraries on damaged files become errors, which are reported without this hook.
     let hook = std::panic::take_hook();
     std::panic::set_hook(Box::new(move |panic| {
@@ -233,23 +232,6 @@ fn main() -> ExitCode {
         Command::Man(arguments) => commands::manuals::pages(&arguments, Arguments::command()),
     };
     ended(result)
-}
-
-/// Sets `XDG_RUNTIME_DIR` where it is missing, by starting the program anew: loaders of Vulkan would print several lines about
-/// it in every command.
-#[cfg(unix)]
-fn set_runtime_folder() {
-    use std::os::unix::process::CommandExt;
-    const FOLDER: &str = "XDG_RUNTIME_DIR";
-    if std::env::var_os(FOLDER).is_none()
-        && let Ok(program) = std::env::current_exe()
-    {
-        // It returns only after a failure, and then the program goes on.
-        let _ = std::process::Command::new(program)
-            .args(std::env::args_os().skip(1))
-            .env(FOLDER, std::env::temp_dir())
-            .exec();
-    }
 }
 
 /// Refuses a number of threads at whose start the program would hang.

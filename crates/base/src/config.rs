@@ -49,6 +49,10 @@ pub trait Schema: DeserializeOwned + Serialize {
     /// Former names of keys with the present ones, dotted. A former name is refused with the present one in the message.
     const RENAMED: &'static [(&'static str, &'static str)] = &[];
 
+    /// Keys that are gone, dotted, each with the values (as TOML) that mean what the program does now. With them a key is ignored, so
+    /// that older files open; other values are refused.
+    const REMOVED: &'static [(&'static str, &'static [&'static str])] = &[];
+
     /// The dotted key of the first refused value, and the reason.
     fn refusal(&self) -> Option<(String, String)>;
 
@@ -168,10 +172,14 @@ fn layer<T: Schema>(text: &str, origin: &str) -> Result<(Table, Option<String>),
             return Err(syntax(origin, format!("`{EXTENDS}` is a {}, must be a path", other.type_str())));
         }
     };
-    check_names::<T>(&table, origin)?;
+    let is_older = check_names::<T>(&mut table, origin)?;
     // A list of values would pass for a section.
     if let Some((key, value)) = table.iter().find(|(_, value)| !value.is_table()) {
         return Err(syntax(origin, format!("`{key}` is a {}, must be a section [{key}]", value.type_str())));
+    }
+    if is_older {
+        Value::Table(table.clone()).try_into::<T>().map_err(|e| syntax(origin, e.to_string()))?;
+        return Ok((table, extended));
     }
     // From the text, since only then do messages carry line numbers. Keys of the whole file come before its sections.
     let is_extends = |line: &str| line.trim_start().starts_with(EXTENDS);
@@ -187,16 +195,42 @@ fn layer<T: Schema>(text: &str, origin: &str) -> Result<(Table, Option<String>),
     Ok((table, extended))
 }
 
-/// Refuses former names of keys.
-fn check_names<T: Schema>(table: &Table, origin: &str) -> Result<(), ConfigError> {
+/// Refuses former names of keys, and takes out keys that are gone; returns whether there was one.
+fn check_names<T: Schema>(table: &mut Table, origin: &str) -> Result<bool, ConfigError> {
     for (old, new) in T::RENAMED {
         let (section, key) = old.rsplit_once('.').expect("a dotted key");
-        let section = section.split('.').try_fold(table, |at, name| at.get(name)?.as_table());
+        let section = section.split('.').try_fold(&*table, |at, name| at.get(name)?.as_table());
         if section.is_some_and(|section| section.contains_key(key)) {
             return Err(syntax(origin, format!("`{old}` is now called `{new}`")));
         }
     }
-    Ok(())
+    let mut is_older = false;
+    for (gone, values) in T::REMOVED {
+        let (section, key) = gone.rsplit_once('.').expect("a dotted key");
+        let mut at = Some(&mut *table);
+        for name in section.split('.') {
+            at = at.and_then(|at| at.get_mut(name)?.as_table_mut());
+        }
+        match at.and_then(|at| at.remove(key)).map(|there| there.to_string()) {
+            None => {}
+            Some(there) if is_gone::<T>(gone, &there) => is_older = true,
+            Some(there) => {
+                let message = format!("`{gone}` is gone: it is always {}, and cannot be {there}", values[0]);
+                return Err(syntax(origin, message));
+            }
+        }
+    }
+    Ok(is_older)
+}
+
+/// Whether `key` is one of [`Schema::REMOVED`], and `value`, as TOML, means what the program does now.
+pub fn is_gone<T: Schema>(key: &str, value: &str) -> bool {
+    // 4 is 4.0.
+    let number = |text: &str| text.parse::<f64>().ok();
+    let is_same = |now: &&str| *now == value || number(now).is_some_and(|now| number(value) == Some(now));
+    T::REMOVED
+        .iter()
+        .any(|(gone, values)| *gone == key && (values.is_empty() || values.iter().any(|now| is_same(now))))
 }
 
 /// Puts `above` over `below`, section by section and key by key.
@@ -215,7 +249,7 @@ fn build<T: Schema>(mut table: Table, origin: String, overrides: &[String]) -> R
     for assignment in overrides {
         let origin = format!("--set {assignment}");
         assign(&mut table, assignment).map_err(|message| syntax(&origin, message))?;
-        check_names::<T>(&table, &origin)?;
+        check_names::<T>(&mut table, &origin)?;
     }
     let origin = match overrides {
         [] => origin,
@@ -278,6 +312,8 @@ mod tests {
 
     impl Schema for Config {
         const RENAMED: &'static [(&'static str, &'static str)] = &[("network.width", "network.dim")];
+        const REMOVED: &'static [(&'static str, &'static [&'static str])] =
+            &[("network.slope", &["4.0"]), ("network.cache", &[])];
 
         fn refusal(&self) -> Option<(String, String)> {
             (self.network.dim > 9).then(|| ("network.dim".into(), "must be at most 9".into()))
@@ -329,6 +365,16 @@ mod tests {
         let files = [("a.toml", "extends = \"b.toml\"\n"), ("b.toml", "[network]\ndim = 10\n")];
         let message = in_folder(&files, &[]).expect_err("too large");
         assert!(message.contains("a.toml extending") && message.contains("`network.dim`: must"), "{message}");
+    }
+
+    #[test]
+    fn keys_that_are_gone_may_have_the_values_that_the_program_has_now() {
+        let read = |text: &str| Config::from_toml(text, "x", &[]).map_err(|e| e.to_string());
+        let text = "[network]\nslope = 4\ncache = \"points\"\ndim = 3\n";
+        assert_eq!(read(text), Ok(Config { network: Network { dim: 3, name: String::new() } }));
+        let message = read("[network]\nslope = 3.0\n").expect_err("another value");
+        assert_eq!(message, "x: `network.slope` is gone: it is always 4.0, and cannot be 3.0");
+        assert!(is_gone::<Config>("network.slope", "4.0") && !is_gone::<Config>("network.dim", "4.0"));
     }
 
     #[test]

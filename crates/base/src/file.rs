@@ -170,7 +170,8 @@ pub fn read_exact_at(file: &File, mut buffer: &mut [u8], mut offset: u64) -> io:
 
 /// Writes `path` through `fill` into a temporary file beside it, which is renamed after success. A failure leaves the former
 /// file. The new file keeps the permissions of the former one; a write-protected file is refused. A symbolic link stays and
-/// its target is replaced. A pipe or a device is written in place, since renaming would replace it.
+/// its target is replaced. A pipe or a device is written in place, since renaming would replace it. After a power failure there is the
+/// former file or the whole new one.
 ///
 /// # Errors
 /// The error of `fill`, or the operating system's refusal to create, write or rename the file.
@@ -201,9 +202,33 @@ pub fn write_whole<E: From<io::Error>>(
     let mut out = BufWriter::with_capacity(1 << 20, file.as_file_mut());
     let filled = fill(&mut out).and_then(|()| Ok(out.flush()?));
     drop(out);
-    let written = filled.and_then(|()| file.persist(path).map(drop).map_err(|e| e.error.into()));
+    // A name must not reach the disk before its data.
+    let synced = filled.and_then(|()| Ok(file.as_file().sync_all()?));
+    let written = synced.and_then(|()| file.persist(path).map(drop).map_err(|e| e.error.into()));
     unfinished().paths.retain(|p| *p != temporary);
-    written
+    written?;
+    sync_folder(folder_of(path));
+    Ok(())
+}
+
+/// Renames a file, or a folder of files, so that the new name and the data are there after a power failure.
+///
+/// # Errors
+/// The operating system's refusal.
+pub fn rename(from: &Path, to: &Path) -> io::Result<()> {
+    let files = fs::read_dir(from).into_iter().flatten().flatten().map(|entry| entry.path());
+    for path in files.chain([from.to_owned()]) {
+        // Not all systems bring a file to the disk that is open for reading.
+        let _ = File::open(path).and_then(|file| file.sync_all());
+    }
+    fs::rename(from, to)?;
+    sync_folder(folder_of(to));
+    Ok(())
+}
+
+/// Brings the names in a folder to the disk. Not all systems and folders can be opened for that; the names then follow later.
+fn sync_folder(folder: &Path) {
+    let _ = File::open(folder).and_then(|folder| folder.sync_all());
 }
 
 /// Whether `path` exists and is neither a regular file nor a folder.

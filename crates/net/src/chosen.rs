@@ -3,10 +3,14 @@
 use glam::DVec3;
 use snapsnap_splat::Camera;
 
-use crate::config::NetworkConfig;
+use crate::config::{Config, RegressorStart};
 use crate::hull::Hull;
 use crate::points::Points;
 use crate::sides::is_finite;
+
+/// Largest distance of a pixel's point from its neighbours', relative to that on a surface that faces the camera. Points beyond lie
+/// between two surfaces. A steeper surface is seen from the sides.
+pub(crate) const STEEPEST: f32 = 4.0;
 
 /// The pixels of each view that become Gaussians.
 pub(crate) struct Chosen {
@@ -22,8 +26,10 @@ pub(crate) struct Chosen {
 
 impl Chosen {
     /// Selects pixels of photographs by their masks `[S, S]`, and pixels of the sides by their confidences and points.
-    pub fn new(config: &NetworkConfig, masks: [&[bool]; 2], points: &Points) -> Self {
+    pub fn new(config: &Config, masks: [&[bool]; 2], points: &Points) -> Self {
         let Points { host: points, conf, .. } = points;
+        let is_geometric = config.regressor.start() == RegressorStart::Geometric;
+        let config = &config.network;
         let (side, area) = (config.resolution, config.resolution * config.resolution);
         let views = conf.len() / area;
         let hull = config.hull_margin.filter(|_| views > 2);
@@ -50,9 +56,9 @@ impl Chosen {
         let mut valid: Vec<Vec<bool>> =
             (0..views).map(|view| (0..area).map(|i| keep(view, i)).collect()).collect();
         let mut between = 0;
-        if let Some(steepest) = config.steepest {
+        if is_geometric {
             for (view, points) in valid.iter_mut().zip(points.chunks_exact(3 * area)) {
-                between += without_steep(view, points, side, steepest);
+                between += without_steep(view, points, side, STEEPEST);
             }
         }
         Self { valid, lost, outside, between }

@@ -80,9 +80,6 @@ pub struct NetworkConfig {
     pub side_dims: [usize; 4],
     /// Whether completed sides have the second surface that faces their cameras, too, such as the flank behind an arm.
     pub second_layer: bool,
-    /// Whether the network also predicts the normals of the photographs' surfaces. Only the losses of stage 1 use them.
-    #[serde(skip_serializing_if = "std::ops::Not::not")]
-    pub normals: bool,
     /// Fusion of the tokens of the two photographs into those of the unseen sides.
     pub fusion: Fusion,
     /// Activation of the confidence channel.
@@ -124,10 +121,6 @@ pub struct NetworkConfig {
     /// inside both silhouettes. Unset: 0.05 with [`Self::hull_margin`], else 0.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub hull_reach: Option<f64>,
-    /// Largest distance of a pixel's point from its neighbours', relative to that on a surface that faces the camera. Points
-    /// beyond lie between two surfaces and are left out. Unset: all points are kept.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub steepest: Option<f32>,
     /// Whether Gaussians close the top of head and shoulders between front and back, where there are sides.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub closed_top: bool,
@@ -135,8 +128,6 @@ pub struct NetworkConfig {
     /// above. 180: front and back. Others are for scenes of several known cameras, and have no unseen sides.
     #[serde(skip_serializing_if = "is_opposite")]
     pub pair_degrees: f64,
-    /// Whether a transformer's tokens without a person in either photograph are left out.
-    pub drop_empty: bool,
 }
 
 impl Default for NetworkConfig {
@@ -161,7 +152,6 @@ impl Default for NetworkConfig {
             sides: Sides::Predicted,
             side_dims: [32, 48, 64, 96],
             second_layer: false,
-            normals: false,
             fusion: Fusion::Mean,
             conf_mode: ConfMode::Sigmoid,
             resolution: 1024,
@@ -179,10 +169,8 @@ impl Default for NetworkConfig {
             on_rays: false,
             hull_margin: None,
             hull_reach: None,
-            steepest: None,
             closed_top: false,
             pair_degrees: OPPOSITE,
-            drop_empty: false,
         }
     }
 }
@@ -231,8 +219,6 @@ pub struct RegressorConfig {
     /// Least opacities of the Gaussians of photographed pixels and of the pixels of unseen sides. Unset: 0.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub least_opacities: Option<[f64; 2]>,
-    /// Whether pixels that the person covers in part have the person's colour, not mixed with grey.
-    pub straight_color: bool,
     /// With `mode.crop`, pixels around the person's box that the network receives; unset: all that influence the person's
     /// pixels. Training and inference should use the same value.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -279,7 +265,6 @@ impl Default for RegressorConfig {
             color: None,
             color_limits: None,
             least_opacities: None,
-            straight_color: false,
             margin: None,
         }
     }

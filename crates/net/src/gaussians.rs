@@ -10,7 +10,7 @@ use snapsnap_ops::rows::taken;
 use snapsnap_splat::Gaussians;
 
 use crate::chosen::Chosen;
-use crate::config::{Config, OPPOSITE, RegressorConfig, RegressorStart};
+use crate::config::{Config, RegressorConfig, RegressorStart};
 use crate::crop::Window;
 use crate::network::{View, nominal_camera};
 use crate::photograph::Photograph;
@@ -69,7 +69,7 @@ impl Painter<'_> {
         let is_carved = views > 2 && config.network.hull_reach() > 0.0;
         let moved = if is_carved { record.timed("silhouettes", carve) } else { carve(record) };
         record.add_some(moved, |pixels| Step::MovedIntoSilhouettes { pixels });
-        let Chosen { valid, lost, outside, between } = Chosen::new(&config.network, masks, points);
+        let Chosen { valid, lost, outside, between } = Chosen::new(config, masks, points);
         let names = View::WITH_SECOND.map(View::name);
         record.steps.extend(names.iter().zip(&valid).map(|(view, valid)| Step::Chosen {
             view,
@@ -106,7 +106,7 @@ impl Painter<'_> {
                     points: &top.points,
                     valid: &top.valid,
                 };
-                let part = uncorrected(&seen, Limits::of(&config.regressor, 0), side, device);
+                let part = uncorrected(&seen, config, Limits::of(&config.regressor, 0), side, device);
                 let origins = part.origins.iter().map(|origin| Origin { view: None, ..*origin }).collect();
                 Some(Part { origins, ..part })
             }));
@@ -168,8 +168,8 @@ impl CanvasView<'_> {
         pixels.map(|pixel| Origin { view: Some(self.view), pixel: pixel as u32 }).collect()
     }
 
-    fn geometry(&self, side: usize, limits: Limits, device: &Device) -> Geometry {
-        let camera = nominal_camera(self.view, OPPOSITE, side);
+    fn geometry(&self, config: &Config, side: usize, limits: Limits, device: &Device) -> Geometry {
+        let camera = nominal_camera(self.view, config.network.pair_degrees, side);
         Geometry::new(self.image, self.points, self.valid, &camera, limits, device)
     }
 }
@@ -183,10 +183,10 @@ struct Part {
 }
 
 /// Colours `[3, S, S]` in [−1, 1] of a photograph for its Gaussians. The input is multiplied by the `mask` `[S, S]`, so
-/// the rim, from which the sides get their colours, fades to grey. With `regressor.straight_color` it is divided by the mask
+/// the rim, from which the sides get their colours, fades to grey. With a geometric start it is divided by the mask
 /// where the person covers at least half of a pixel.
 pub fn photograph_colors<'a>(config: &RegressorConfig, rgb: &'a [f32], mask: &[f32]) -> Cow<'a, [f32]> {
-    if !config.straight_color {
+    if config.start() == RegressorStart::Published {
         return Cow::Borrowed(rgb);
     }
     let mut colors = rgb.to_vec();
@@ -256,7 +256,8 @@ fn regress(
             continue;
         }
         let pick = |x: Tensor<4>, c: usize| taken(x.narrow(0, i, 1).reshape([h * w, c]), &rows);
-        let geometry = Geometry::is_needed(&config.regressor).then(|| view.geometry(side, limits, &device));
+        let geometry =
+            Geometry::is_needed(&config.regressor).then(|| view.geometry(config, side, limits, &device));
         parts.push(Part {
             features: pick(features.clone(), FEATURES),
             points: pick(points.clone(), 3),
@@ -275,12 +276,12 @@ pub fn geometric(views: &[CanvasView], side: usize, device: &Device) -> Gaussian
     let limits = Limits::of(&regressor, 0);
     let config = Config { regressor, ..Config::default() };
     let parts = views.iter().filter(|view| view.valid.contains(&true));
-    let parts = parts.map(|view| uncorrected(view, limits, side, device)).collect();
+    let parts = parts.map(|view| uncorrected(view, &config, limits, side, device)).collect();
     assemble(&config, parts, device).0
 }
 
 /// The part of a view to which no regressor adds anything.
-fn uncorrected(view: &CanvasView, limits: Limits, side: usize, device: &Device) -> Part {
+fn uncorrected(view: &CanvasView, config: &Config, limits: Limits, side: usize, device: &Device) -> Part {
     let origins = view.origins();
     let n = origins.len();
     let points = origins.iter().flat_map(|origin| &view.points[3 * origin.pixel as usize..][..3]);
@@ -288,7 +289,7 @@ fn uncorrected(view: &CanvasView, limits: Limits, side: usize, device: &Device) 
     Part {
         features: Tensor::zeros([n, FEATURES], device),
         points: Tensor::from_data(TensorData::new(points, [n, 3]), device),
-        geometry: Some(view.geometry(side, limits, device)),
+        geometry: Some(view.geometry(config, side, limits, device)),
         origins,
     }
 }
@@ -391,17 +392,17 @@ mod tests {
         let mask = [0.0, 0.4, 0.5, 0.9, 1.0];
         let own = [0.8, -0.6, 1.0];
         let rgb: Vec<f32> = own.iter().flat_map(|c| mask.map(|share| c * share)).collect();
-        let colors = |straight_color| {
-            let config = RegressorConfig { straight_color, ..RegressorConfig::default() };
+        let colors = |start| {
+            let config = RegressorConfig { start: Some(start), ..RegressorConfig::default() };
             photograph_colors(&config, &rgb, &mask).into_owned()
         };
-        assert_eq!(colors(false), rgb);
-        for (c, plane) in colors(true).chunks_exact(5).enumerate() {
+        assert_eq!(colors(RegressorStart::Published), rgb);
+        for (c, plane) in colors(RegressorStart::Geometric).chunks_exact(5).enumerate() {
             assert_eq!(plane[..2], rgb[5 * c..5 * c + 2]);
             assert!(plane[2..].iter().all(|value| (value - own[c]).abs() < 1e-6), "{plane:?}");
         }
         // A white pixel under a lossy mask stays a colour.
-        let config = RegressorConfig { straight_color: true, ..RegressorConfig::default() };
+        let config = RegressorConfig { start: Some(RegressorStart::Geometric), ..RegressorConfig::default() };
         assert_eq!(*photograph_colors(&config, &[0.9, -0.9, 0.9], &[0.6]), [1.0, -1.0, 1.0]);
     }
 

@@ -7,7 +7,6 @@ pub mod gaussians;
 mod hull;
 mod memory;
 pub mod names;
-mod neighbours;
 pub mod network;
 mod photograph;
 mod points;
@@ -24,7 +23,6 @@ pub mod weights;
 
 pub use crop::Window;
 pub use hull::dilated;
-pub use neighbours::Neighbours;
 pub use photograph::Photograph;
 pub use points::Points;
 pub use predict::Prediction;

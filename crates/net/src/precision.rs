@@ -24,30 +24,16 @@ impl Precision {
     }
 }
 
-/// What computes products in bf16 on this processor, by name; `None` if it has no instructions for them.
-pub fn unit_of_cpu() -> Option<&'static str> {
-    snapsnap_ops::half::unit().map(snapsnap_ops::half::Unit::name)
-}
-
-/// Whether products in bf16 are faster on this device: on the CPU, if its processor has them. Whether it is on GPUs is not known.
-fn is_fast_in_bf16(device: &Device) -> bool {
-    let device = device.clone();
-    let device = if device.is_autodiff() { device.inner() } else { device };
-    device == Device::flex() && unit_of_cpu().is_some()
+/// Whether this processor has instructions for products in bf16.
+pub fn cpu_has_bf16() -> bool {
+    snapsnap_ops::half::is_there()
 }
 
 impl PrecisionChoice {
-    /// The precision of a training: with `auto`, bf16 where the device is faster in it.
-    pub fn of_training(self, device: &Device) -> Precision {
-        let auto = if is_fast_in_bf16(device) { Precision::Bf16 } else { Precision::F32 };
-        self.fixed().unwrap_or(auto)
-    }
-
-    /// The precision of a reconstruction: with `auto`, that of the weights' training where the device is faster in it.
+    /// The precision of a reconstruction: with `auto`, that of the weights' training on a CPU that has bf16, else f32.
     pub fn of_weights(self, config: &Config, device: &Device) -> Precision {
-        let trained = config.network.precision;
-        let auto = if is_fast_in_bf16(device) { trained } else { Precision::F32 };
-        self.fixed().unwrap_or(auto)
+        let is_fast = *device == Device::flex() && cpu_has_bf16();
+        self.fixed().unwrap_or(if is_fast { config.network.precision } else { Precision::F32 })
     }
 }
 
@@ -109,8 +95,7 @@ mod tests {
         config.network.head = HeadKind::Linear;
         assert_eq!(in_f32(&config), of_heads("proj"));
         (config.network.body, config.network.patch) = (Body::Convolution, 8);
-        config.network.normals = true;
-        let last = ["unet.decoder.conv_out", "unet.normals", "unet.side_decoder.conv_out"];
+        let last = ["unet.decoder.conv_out", "unet.side_decoder.conv_out"];
         assert_eq!(in_f32(&config), last.map(|name| format!("{name}.weight")));
     }
 }

@@ -16,8 +16,6 @@ pub struct Prediction {
     pub window: Window,
     /// `[B,h,w,3]` and `[B,h,w]` of every view.
     pub maps: Vec<(View, PointMap)>,
-    /// Normals `[B,3,h',w']` of front and back in the network's pixels, with `network.normals`.
-    pub normals: Option<[Tensor<4>; 2]>,
 }
 
 impl Prediction {
@@ -62,7 +60,7 @@ impl Prediction {
             (view, predictor.finished(config, view, map, &window, mask_of(view, masks).as_ref()))
         };
         let maps = record.timed("up-sampling", |_| each_view(maps, finished));
-        Self { maps, normals: predictor.normals(&decoded), window }
+        Self { maps, window }
     }
 
     /// The maps on the whole canvas, 0 outside the window.

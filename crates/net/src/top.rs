@@ -3,14 +3,12 @@
 use glam::{DVec3, Vec3};
 use snapsnap_splat::Camera;
 
-use crate::chosen::{pixel_width, without_steep};
+use crate::chosen::{STEEPEST, pixel_width, without_steep};
 
 /// Farthest two edges may be apart, metres: a head with hair is not longer.
 const LONGEST: f32 = 0.35;
 /// Largest difference in height of two edges that belong to one surface, metres.
 const STEP: f32 = 0.05;
-/// Most pixel widths between neighbours, as of `network.steepest`. A steeper surface is seen from the sides.
-const STEEPEST: f32 = 4.0;
 
 /// The surface between the upper edges of front and back, as a map like that of a view: column for column of the front's
 /// canvas, and row after row from the front's edge backwards.

@@ -68,10 +68,10 @@ fn build<'a>(name: &str, half: bool, s: &[usize], x: &'a [Vec<f32>]) -> [Run<'a>
     let [outputs, height] = [2, 3].map(|i| s.get(i).copied().unwrap_or(0));
     let width = height;
     match name {
-        "conv3x3" => passes!(Conv3x3 { batch, inputs, outputs, height, width, rectified, half }),
+        "conv3x3" => passes!(Conv3x3 { batch, inputs, outputs, height, width, rectified }),
         "conv1x1" => passes!(Conv1x1 { batch, inputs, outputs, pixels: height * width, rectified, half }),
         "halve" => {
-            passes!(Unfolded { batch, inputs, outputs, height, width, stride: 2, rectified: false, half })
+            passes!(Unfolded { batch, inputs, outputs, height, width, stride: 2, rectified: false })
         }
         "resize" => {
             let size = [s[2]; 2];

@@ -31,6 +31,12 @@ pub fn give_words(buffer: Vec<u32>) {
     WORDS.give(buffer);
 }
 
+/// Returns all unused memory to the allocator.
+pub fn release() {
+    FLOATS.release();
+    WORDS.release();
+}
+
 /// Unused blocks of values.
 #[derive(Default)]
 struct Pool<T> {
@@ -47,6 +53,10 @@ impl<T: Bits> Pool<T> {
         let Some(mut buffer) = best else { return arbitrary(len) };
         buffer.resize(len, T::default());
         buffer
+    }
+
+    fn release(&self) {
+        self.free.lock().unwrap_or_else(PoisonError::into_inner).clear();
     }
 
     /// Beyond [`MOST`], the oldest blocks are freed.

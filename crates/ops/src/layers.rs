@@ -84,11 +84,11 @@ pub fn conv2d(layer: &Conv2d, x: Tensor<4>, rectified: bool) -> Tensor<4> {
     let plain = is_plain && has_kernels(&x);
     match (plain, [rows, columns], layer.stride) {
         (true, [3, 3], [1, 1]) => {
-            let sizes = Conv3x3 { batch, inputs, outputs, height, width, rectified, half };
+            let sizes = Conv3x3 { batch, inputs, outputs, height, width, rectified };
             run(sizes, [batch, outputs, height, width], x, weight, bias)
         }
         (true, [3, 3], [2, 2]) => {
-            let sizes = Unfolded { batch, inputs, outputs, height, width, stride: 2, rectified, half };
+            let sizes = Unfolded { batch, inputs, outputs, height, width, stride: 2, rectified };
             run(sizes, [batch, outputs, height.div_ceil(2), width.div_ceil(2)], x, weight, bias)
         }
         (true, [1, 1], [1, 1]) => {

@@ -4,7 +4,7 @@
 use rayon::prelude::*;
 
 use crate::buffers::{give_words, take_words};
-use crate::half::{self, Edge, Left, PANEL, SLACK, Source, Unit};
+use crate::half::{self, Left, PANEL, SLACK, Source};
 
 /// A matrix in f32: values, and their (column, row) strides in elements.
 pub type Matrix<'a> = (&'a [f32], [usize; 2]);
@@ -14,23 +14,16 @@ pub enum Right<'a> {
     /// As it is.
     Plain(Matrix<'a>),
     /// In bf16.
-    Packed(Unit, Vec<u32>),
+    Packed(Vec<u32>),
 }
 
 impl<'a> Right<'a> {
     /// The factor for products in f32, or, if `half` and the processor can, in bf16.
     pub fn new(half: bool, [k, n]: [usize; 2], matrix: Matrix<'a>) -> Self {
-        match half::unit().filter(|_| half) {
-            None => Self::Plain(matrix),
-            Some(unit) => Self::packed(unit, [k, n], matrix),
-        }
+        if half && half::is_there() { Self::packed([k, n], matrix) } else { Self::Plain(matrix) }
     }
 
-    pub(crate) fn packed(
-        unit: Unit,
-        [depth, columns]: [usize; 2],
-        (values, [stride, inner]): Matrix,
-    ) -> Self {
+    pub(crate) fn packed([depth, columns]: [usize; 2], (values, [stride, inner]): Matrix) -> Self {
         /// Words per task.
         const PIECE: usize = 32 * 1024;
         let source = Source { values, stride, inner, count: columns, depth };
@@ -47,13 +40,13 @@ impl<'a> Right<'a> {
         } else {
             words.par_chunks_exact_mut(panel).with_min_len(PIECE.div_ceil(panel)).enumerate().for_each(pack);
         }
-        Self::Packed(unit, words)
+        Self::Packed(words)
     }
 }
 
 impl Drop for Right<'_> {
     fn drop(&mut self) {
-        if let Self::Packed(_, words) = self {
+        if let Self::Packed(words) = self {
             give_words(std::mem::take(words));
         }
     }
@@ -76,11 +69,11 @@ impl Multiply<'_> {
     pub fn write(self, out: &mut [f32], stride: usize) {
         match self.rhs {
             Right::Plain(rhs) => self.in_f32(*rhs, out, stride),
-            Right::Packed(unit, words) => self.in_bf16(*unit, words, out, stride),
+            Right::Packed(words) => self.in_bf16(words, out, stride),
         }
     }
 
-    fn in_bf16(&self, unit: Unit, rhs: &[u32], out: &mut [f32], stride: usize) {
+    fn in_bf16(&self, rhs: &[u32], out: &mut [f32], stride: usize) {
         /// Words of the left factor at once: 128 KiB, which leaves a core's second-level cache room for a panel.
         const WORDS: usize = 32 * 1024;
         let Self { size: [m, columns, depth], lhs: (values, [inner, row]), add, .. } = *self;
@@ -98,9 +91,12 @@ impl Multiply<'_> {
             let firsts: Vec<_> = (0..blocks).map(|block| block * half::PAIRS * PANEL).collect();
             let panel = blocks * half::PAIRS * PANEL;
             let right = half::Right { values: rhs, starts: &firsts, pair: PANEL, panel };
-            let edge = if add { Edge::Add } else { Edge::Write };
-            half::product(unit, left, right, columns, |row, column, sums| {
-                edge.write(sums, &mut out[(first + row) * stride + column..][..sums.len()]);
+            half::product(left, right, columns, |row, column, sums| {
+                let out = &mut out[(first + row) * stride + column..][..sums.len()];
+                match add {
+                    true => out.iter_mut().zip(sums).for_each(|(out, sum)| *out += sum),
+                    false => out.copy_from_slice(sums),
+                }
             });
             give_words(words);
         }

@@ -11,7 +11,7 @@ use burn::backend::autodiff::grads::Gradients;
 use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
 use burn::backend::tensor::{FloatTensor, IntTensor};
 use burn::backend::{Backend, Dispatch, ExtensionType, Flex, NdArray, TensorMetadata, backend_extension};
-use burn::tensor::{Device, Int, Shape, Tensor, TensorData};
+use burn::tensor::{Int, Shape, Tensor, TensorData};
 use burn_cubecl::CubeBackend;
 
 use crate::gpu::is_tracked_on_gpu;
@@ -83,13 +83,35 @@ impl<B: RowsBackend, C: CheckpointStrategy> RowsBackend for Autodiff<B, C> {
     }
 }
 
-/// The `rows` `[M, C]` of a table `[N, C]`. A row may be taken more than once only if it is constant: on GPUs its gradient is
-/// that of the last one.
+/// No row of a table: [`taken`] returns zeros.
+pub const NONE: i32 = -1;
+
+/// The `rows` `[M, C]` of a table `[N, C]`, zeros for [`NONE`].
+///
+/// # Panics
+/// If a row is taken twice: on GPUs its gradient would be that of the last one alone.
 pub fn taken(table: Tensor<2>, rows: &[i32]) -> Tensor<2> {
+    let [n, columns] = table.dims();
+    let mut is_taken = vec![false; n];
+    for row in rows.iter().filter(|row| **row != NONE) {
+        let before = std::mem::replace(&mut is_taken[*row as usize], true);
+        assert!(!before, "row {row} is taken twice");
+    }
+    if !rows.contains(&NONE) {
+        return selected(table, rows);
+    }
+    // A last row without a gradient.
+    let zeros = Tensor::zeros([1, columns], &table.device());
+    let rows: Vec<i32> = rows.iter().map(|row| if *row == NONE { n as i32 } else { *row }).collect();
+    selected(Tensor::cat(vec![table, zeros], 0), &rows)
+}
+
+fn selected(table: Tensor<2>, rows: &[i32]) -> Tensor<2> {
     if is_tracked_on_gpu(&table) {
         return taken_once(table, rows);
     }
-    table.clone().select(0, indices(rows, &table.device()))
+    let device = table.device();
+    table.select(0, Tensor::<1, Int>::from_data(TensorData::new(rows.to_vec(), [rows.len()]), &device))
 }
 
 fn taken_once(table: Tensor<2>, rows: &[i32]) -> Tensor<2> {
@@ -97,36 +119,45 @@ fn taken_once(table: Tensor<2>, rows: &[i32]) -> Tensor<2> {
     Tensor::from_dispatch(<Dispatch as RowsBackend>::take(table, rows.into()).values)
 }
 
-fn indices(rows: &[i32], device: &Device) -> Tensor<1, Int> {
-    Tensor::from_data(TensorData::new(rows.to_vec(), [rows.len()]), device)
-}
-
 #[cfg(test)]
 mod tests {
+    use burn::tensor::Device;
+
     use super::*;
     use crate::host;
     use crate::tests::uniform;
 
-    /// Row 5 is constant and taken three times; rows 1 and 4 are not taken.
+    /// Rows 1 and 4 are not taken.
     #[test]
     fn gradients_of_rows_equal_burns() {
-        let rows = [3, 5, 0, 5, 2, 5];
+        let rows = [3, NONE, 0, NONE, 2, NONE];
         let device = Device::flex().autodiff();
         let tensor = |shape: [usize; 2], seed| {
             let data = TensorData::new(uniform(shape.iter().product(), seed), shape);
             Tensor::<2>::from_data(data, &device)
         };
-        let (upstream, constant) = (tensor([6, 3], 2), tensor([1, 3], 3));
-        let results = [taken_once, |table: Tensor<2>, rows: &[i32]| {
-            table.clone().select(0, indices(rows, &table.device()))
-        }]
+        let upstream = tensor([6, 3], 2);
+        let with_zeros =
+            |table: &Tensor<2>| Tensor::cat(vec![table.clone(), Tensor::zeros([1, 3], &device)], 0);
+        let numbers = rows.map(|row| if row == NONE { 5 } else { row });
+        let results = [
+            &(|table: &Tensor<2>| taken(table.clone(), &rows)) as &dyn Fn(&Tensor<2>) -> Tensor<2>,
+            &|table| taken_once(with_zeros(table), &numbers),
+        ]
         .map(|take| {
             let table = tensor([5, 3], 1).require_grad();
-            let out = take(Tensor::cat(vec![table.clone(), constant.clone()], 0), &rows);
+            let out = take(&table);
             let gradients = (out.clone() * upstream.clone()).sum().backward();
             [host(out), host(table.grad(&gradients).expect("tracked"))]
         });
         assert_eq!(results[0], results[1]);
         assert!(results[0][1].iter().any(|value| *value != 0.0));
+        assert_eq!(results[0][0][3..6], [0.0; 3]);
+    }
+
+    #[test]
+    #[should_panic(expected = "row 2 is taken twice")]
+    fn a_row_that_repeats_is_refused() {
+        taken(Tensor::zeros([3, 1], &Device::flex()), &[2, 0, 2]);
     }
 }

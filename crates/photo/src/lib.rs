@@ -36,7 +36,7 @@ use placing::together;
 pub use placing::{Mapping, on_canvas};
 pub use planes::PlaneMap;
 pub use report::{Canvas, PhotoReport};
-pub use restoration::{AXIS, Restoration, nominal, scale_of, turn_to_front, turned};
+pub use restoration::{AXIS, Restoration, nominal, turn_to_front, turned};
 pub use shot::{ELEVATIONS, FOCALS, Shot, Viewpoint};
 
 /// Least side of a photograph in pixels.

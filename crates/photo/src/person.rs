@@ -6,6 +6,7 @@ use std::ops::RangeInclusive;
 use burn::tensor::{Tensor, TensorData};
 use serde::Serialize;
 use snapsnap_net::config::{Config, WorldFrame};
+use snapsnap_net::steps::Step;
 use snapsnap_net::{Reconstruction, Reconstructor, placed};
 use snapsnap_ops::host;
 use snapsnap_splat::Gaussians;
@@ -197,7 +198,10 @@ pub struct Person {
 }
 
 /// The person in the photographs of front and back, as their cameras saw it, at its height. `stage` is called with the name of each module
-/// before it runs. `None` if no Gaussian comes out.
+/// before it runs.
+///
+/// # Errors
+/// The steps, if no Gaussian came out of them.
 ///
 /// # Panics
 /// If there are not two photographs on canvases of the networks' size.
@@ -206,12 +210,12 @@ pub fn person(
     networks: &Reconstructor,
     told: &Told,
     stage: &dyn Fn(&'static str),
-) -> Option<Person> {
+) -> Result<Person, Vec<Step>> {
     let [front, back] = &*photographs.canvases else { panic!("a person needs two photographs") };
     let config = networks.config();
     let made = networks.reconstruct([front, back], stage);
     if made.gaussians.is_empty() {
-        return None;
+        return Err(made.steps);
     }
     let mut gaussians = made.in_world(config);
     let mut seats = None;
@@ -234,7 +238,7 @@ pub fn person(
         }
         seats = Some(here);
     }
-    Some(Person { gaussians, seats, made })
+    Ok(Person { gaussians, seats, made })
 }
 
 /// The y of the person's lowest and highest Gaussians, without outliers, in metres.

@@ -23,7 +23,7 @@ pub fn nominal(photograph: usize, side: u32) -> Camera {
 
 /// Scale of a camera's points relative to a nominal camera's, if `mapping` maps its photograph to the canvas of `side` pixels. It is the
 /// ratio of the distances from the body's axis times the ratio of the pixel sizes.
-pub fn scale_of(mapping: &Mapping, camera: &Camera, side: u32) -> f64 {
+fn scale_of(mapping: &Mapping, camera: &Camera, side: u32) -> f64 {
     let nominal = Orbit::default();
     let distance = camera.world_to_camera.apply(nominal.centre).z / nominal.radius;
     distance * nominal.focal * f64::from(side) / camera.focal.y / mapping.scale.y

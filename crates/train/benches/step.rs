@@ -113,7 +113,7 @@ fn run(seconds: f64, side: usize, batch: usize) {
             continue;
         }
         let masters = frozen(masters.clone(), &trained.split(',').collect::<Vec<_>>());
-        let grid = Grid::whole([side / config.network.patch; 2]);
+        let grid = Grid([side / config.network.patch; 2]);
         let time = measure(seconds, || {
             let start = Instant::now();
             let predictor = precision.lower(masters.clone());

@@ -97,5 +97,5 @@ pub(crate) fn load<T: Task>(
     learner.networks = std::mem::take(&mut learner.networks).with_rows(&weights);
     learner.optimizer.restore(&learner.networks, &mut rows, &progress.times, device);
     learner.progress = progress;
-    Ok(run)
+    Ok(run.current())
 }

@@ -7,9 +7,7 @@ use snapsnap_base::config::outside;
 use snapsnap_data::dataset::Split;
 use snapsnap_data::sample::SampleConfig;
 use snapsnap_eval::lpips::MIN_SIDE;
-use snapsnap_net::config::{
-    ConfMode, Config, ModeConfig, NetworkConfig, Precision, PrecisionChoice, RegressorConfig, Schema,
-};
+use snapsnap_net::config::{ConfMode, Config, ModeConfig, NetworkConfig, Precision, RegressorConfig, Schema};
 
 use crate::optimizer::OptimizerConfig;
 use crate::schedule::Schedule;
@@ -87,12 +85,8 @@ pub struct TrainingConfig {
     pub checkpoint_every: usize,
     /// Steps between two previews; 0: only at the end.
     pub preview_every: usize,
-    /// Number format of the point predictor's layers. The device must support it. A program that trains replaces `auto` by
-    /// the device's before it begins.
-    pub precision: PrecisionChoice,
-    /// Whether the backward pass computes cheap intermediate results again instead of keeping them. Operators with a
-    /// backward pass of their own ignore it.
-    pub gradient_checkpointing: bool,
+    /// Number format of the point predictor's layers. The device must support it.
+    pub precision: Precision,
 }
 
 /// People of the validations.
@@ -123,8 +117,6 @@ pub struct Stage1Config {
     pub confidence_weight: f64,
     /// Weight of the mean error of differences between pixels that are 1, 2, 4 and 8 apart.
     pub relief_weight: f64,
-    /// With `network.normals`: weight of the mean error of the normals.
-    pub normals_weight: f64,
 }
 
 /// The section `[stage2]`.
@@ -186,15 +178,14 @@ impl Default for TrainingConfig {
             validate_on: ValidationSplit::Val,
             checkpoint_every: 1000,
             preview_every: 2000,
-            precision: PrecisionChoice::F32,
-            gradient_checkpointing: false,
+            precision: Precision::F32,
         }
     }
 }
 
 impl Default for Stage1Config {
     fn default() -> Self {
-        Self { confidence_weight: 0.5, relief_weight: 0.0, normals_weight: 0.05 }
+        Self { confidence_weight: 0.5, relief_weight: 0.0 }
     }
 }
 
@@ -219,7 +210,6 @@ impl Schema for TrainConfig {
         ("samples.augment.mirror", "samples.augment.flip"),
         ("training.average", "training.ema_decay"),
         ("training.start", "training.weights"),
-        ("training.checkpointing", "training.gradient_checkpointing"),
         ("stage1.confidence", "stage1.confidence_weight"),
         ("stage2.beta", "stage2.l1_share"),
         ("stage2.alpha", "stage2.alpha_weight"),
@@ -227,6 +217,22 @@ impl Schema for TrainConfig {
         ("stage2.anisotropy", "stage2.anisotropy_limit"),
         ("stage2.points", "stage2.points_weight"),
     ];
+
+    const REMOVED: &'static [(&'static str, &'static [&'static str])] = &{
+        let [a, b, c, d] = Config::GONE;
+        [
+            a,
+            b,
+            c,
+            d,
+            ("samples.augment.blur", &["0.0"]),
+            ("samples.augment.noise", &["0.0"]),
+            ("training.gradient_checkpointing", &["false"]),
+            ("stage1.normals_weight", &["0.05", "0.0"]),
+            ("stage2.point_noise", &["0.0"]),
+            ("stage2.point_map_cache", &[]),
+        ]
+    };
 
     fn refusal(&self) -> Option<(String, String)> {
         self.networks().refusal().or_else(|| self.problem())
@@ -236,13 +242,8 @@ impl Schema for TrainConfig {
 impl TrainConfig {
     /// The part of the config that a weight file contains.
     pub fn networks(&self) -> Config {
-        let network = NetworkConfig { precision: self.precision(), ..self.network.clone() };
+        let network = NetworkConfig { precision: self.training.precision, ..self.network.clone() };
         Config { network, regressor: self.regressor.clone(), mode: self.mode.clone() }
-    }
-
-    /// The precision of the point predictor. `auto` that was not replaced is f32.
-    pub fn precision(&self) -> Precision {
-        self.training.precision.fixed().unwrap_or(Precision::F32)
     }
 
     /// The samples' config, with what the sections `[mode]` and `[network]` say of photographs.
@@ -270,7 +271,6 @@ impl TrainConfig {
             ("training.ema_decay", t.ema_decay, 0.0..=0.999_999),
             ("stage1.confidence_weight", self.stage1.confidence_weight, 0.0..=1e6),
             ("stage1.relief_weight", self.stage1.relief_weight, 0.0..=1e6),
-            ("stage1.normals_weight", self.stage1.normals_weight, 0.0..=1e6),
             ("stage2.l1_share", two.l1_share, 0.0..=1.0),
             ("stage2.alpha_weight", two.alpha_weight, 0.0..=1e6),
             ("stage2.anisotropy_weight", two.anisotropy_weight, 0.0..=1e6),

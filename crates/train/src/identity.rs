@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use snapsnap_base::FileError;
-use snapsnap_base::config::{differences, keys};
+use snapsnap_base::config::{differences, is_gone, keys};
 use snapsnap_data::dataset::Split::{self, Train, Val};
 
 use crate::TrainError;
@@ -14,11 +14,10 @@ use crate::task::Task;
 
 /// Keys that may change between the sessions of a run: its length, its reports, the speed of its loader, and paths. The files
 /// behind the paths have hashes of their own, or are no longer read.
-const FREE: [&str; 11] = [
+const FREE: [&str; 10] = [
     "data.folders",
     "stage2.lpips.files",
     "training.checkpoint_every",
-    "training.gradient_checkpointing",
     "training.log_every",
     "training.prefetch",
     "training.preview_every",
@@ -73,6 +72,12 @@ impl Identity {
         });
         let (data, validated) = (fingerprints(&[Train, Val])?, fingerprints(&[validated])?);
         Ok(Self { config: own, data, validated, predictor })
+    }
+
+    /// The identity of a run of an earlier program, without the keys that are gone.
+    pub fn current(mut self) -> Self {
+        self.config.retain(|key, value| !is_gone::<TrainConfig>(key, value));
+        self
     }
 
     /// What differs in the identity `there`.

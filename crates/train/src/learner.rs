@@ -152,7 +152,7 @@ impl<'a, T: Task> Learner<'a, T> {
     fn update(&mut self, step: u64) -> Result<Result<BTreeMap<String, f64>, Skipped>, TrainError> {
         let t = &self.config.training;
         let scale = &mut self.progress.loss_scale;
-        *scale = (self.config.precision() == Precision::F16).then(|| scale.unwrap_or_default());
+        *scale = (self.config.training.precision == Precision::F16).then(|| scale.unwrap_or_default());
         let scale = scale.map_or(1.0, |scale| scale.factor);
         let (mut sum, mut values) = (Rows::new(), BTreeMap::<String, f64>::new());
         let mut names: Vec<String> = Vec::new();
@@ -168,9 +168,9 @@ impl<'a, T: Task> Learner<'a, T> {
             let extents = self.ranks.gather(&self.task.extent(&items)).into_iter().flatten();
             let extent = extents.reduce(|all, extent| all.united(&extent));
             let at = Moment { step, batch: batch as u64, first, extent };
-            let how = How { precision: self.config.precision(), scale, share };
+            let how = How { precision: self.config.training.precision, scale, share };
             let (made, failed) = match self.losses(items, at, how) {
-                // A scene that the rasteriser refuses costs the sample, not the run.
+                // A scene that the rasteriser refuses costs the step, not the run.
                 Err(TrainError::Splat(e)) => (Err(e.to_string()), None),
                 Err(e) => (Err(String::new()), Some(e)),
                 Ok(Made { gradients: None, .. }) => (Err("the loss is not finite".to_owned()), None),

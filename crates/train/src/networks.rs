@@ -110,10 +110,7 @@ impl Networks {
                 let (id, old, mapper) = parameter.consume();
                 let device = old.clone().without_autodiff().device();
                 let values = row.clone().to_device(&device).reshape(old.shape());
-                let values = match old.gradient_checkpointing_strategy() {
-                    Some(strategy) => values.autodiff().with_gradient_checkpointing_strategy(strategy),
-                    None => values,
-                };
+                let values = if old.device().is_autodiff() { values.autodiff() } else { values };
                 Param::from_mapped_value(id, values.set_require_grad(old.is_require_grad()), mapper)
             }
         }

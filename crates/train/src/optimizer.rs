@@ -112,8 +112,7 @@ pub struct Optimizer {
 /// Whether a parameter is a matrix or a kernel between the first layer and the last layers.
 fn is_hidden(name: &str, rank: usize) -> bool {
     /// Parts of the names of first and last layers.
-    const OUTER: [&str; 6] =
-        ["patch_embed.", ".dpt.head.4.", "conv_in.", "conv_out.", "gs_conv.", "unet.normals."];
+    const OUTER: [&str; 5] = ["patch_embed.", ".dpt.head.4.", "conv_in.", "conv_out.", "gs_conv."];
     // `downstream_headK.proj.weight` is the only layer of a linear head.
     let is_linear_head =
         name.contains("downstream_head") && name.ends_with("proj.weight") && !name.contains(".dpt.");
@@ -322,13 +321,13 @@ mod tests {
     fn muon_changes_neither_the_first_layer_nor_the_last() {
         let mut config = Config::default();
         let n = &mut config.network;
-        (n.body, n.patch, n.side_heads, n.normals) = (Body::Convolution, 8, false, true);
+        (n.body, n.patch, n.side_heads) = (Body::Convolution, 8, false);
         (n.enc_dim, n.enc_depth, n.enc_heads, n.layer_dims, n.last_dim) = (8, 1, 1, [8; 4], 8);
         let predictor = Some(random_predictor(&config, 0, &Device::flex()));
         let parameters = Networks { predictor, regressors: Vec::new() }.parameters();
         let outer = parameters.iter().filter(|p| p.shape.len() >= 2 && !is_hidden(&p.name, p.shape.len()));
         let outer: Vec<&str> = outer.map(|p| p.name.as_str()).collect();
-        assert_eq!(outer, ["unet.conv_in.weight", "unet.decoder.conv_out.weight", "unet.normals.weight"]);
+        assert_eq!(outer, ["unet.conv_in.weight", "unet.decoder.conv_out.weight"]);
     }
 
     /// Burn's Muon takes matrices only.

@@ -10,12 +10,11 @@ use snapsnap_tests::{device, is_software, relative_error, values};
 
 use crate::properties::{assert_different, assert_same, config, noise, photograph, weights};
 
-const CONVOLUTION: [&str; 5] = [
+const CONVOLUTION: [&str; 4] = [
     "network.body=convolution",
     "network.dec_depth=1",
     "network.mask_channel=true",
     "network.ray_channels=true",
-    "network.normals=true",
 ];
 
 /// The device, unless it is a software adapter: compiling kernels takes minutes there, and keys act alike on every device.
@@ -39,14 +38,9 @@ fn maps(net: &PointPredictor, input: Input) -> Vec<(View, Vec<f32>)> {
     maps.map(|(view, map)| (view, [values(map.points), values(map.conf)].concat())).collect()
 }
 
-/// Normals `[B, 3, h, w]` of front and back, for a body that has them.
-fn normals(net: &PointPredictor, input: Input) -> Vec<Tensor<4>> {
-    net.normals(&net.decode(net.encode(input))).into_iter().flatten().collect()
-}
-
 fn whole(config: &Config, images: Tensor<4>) -> Input {
     let [_, _, h, w] = images.dims();
-    Input { images, grid: Grid::whole([h / config.network.patch, w / config.network.patch]) }
+    Input { images, grid: Grid([h / config.network.patch, w / config.network.patch]) }
 }
 
 #[test]
@@ -114,13 +108,6 @@ fn a_mirrored_back_is_the_back_of_a_mirrored_photograph() {
         other.images = other.images.slice_assign([0..2, 4..5, 0..h, 0..w], rays);
         assert_same("input", &values(seen.images.clone()), &values(other.images.clone()));
         let net = |config: &Config| random_predictor(config, 5, &device);
-        let (a, b) = (normals(&net(&mirrored), seen.clone()), normals(&net(&plain), other.clone()));
-        assert_eq!(a.len(), if body.len() == CONVOLUTION.len() { 2 } else { 0 });
-        if let ([front, back], [of_front, of_back]) = (&a[..], &b[..]) {
-            assert_same("normals", &values(front.clone()), &values(of_front.clone()));
-            assert_same("normals", &values(back.clone()), &values(of_back.clone().flip([3])));
-            assert_different("normals", &values(front.clone()), &values(back.clone()));
-        }
         let (a, b) = (net(&mirrored).forward(seen, &window), net(&plain).forward(other, &window));
         for ((view, a), (_, b)) in a.into_iter().zip(b) {
             let b = if view == View::Back { b.points.flip([2]) } else { b.points };
@@ -145,14 +132,6 @@ fn predictions_of_both_ways_are_symmetric() {
             let input = Input::new(config, seen(&colors), seen(&masks), &window);
             random_predictor(config, 5, &device).forward(input, &window)
         };
-        let [of_both, of_one] = [&both, &one].map(|config| {
-            let input = Input::new(config, colors.clone(), masks.clone(), &window);
-            normals(&random_predictor(config, 5, &device), input)
-        });
-        for (both, one) in of_both.into_iter().zip(of_one) {
-            assert_eq!(both.dims(), one.dims());
-            assert!(relative_error(&values(both), &values(one)) < 1e-6);
-        }
         let mirrored = |map: &PointMap| {
             let [b, h, w, _] = map.points.dims();
             let points = map.points.clone().flip([2]);
@@ -202,49 +181,6 @@ fn channels_hold_the_share_of_the_person_and_the_ray() {
     let down = (33.0 / 128.0 - 537.0 / 1024.0) / 0.8;
     near(at(0, 5, 0, 7), down);
     near(at(1, 5, 0, 7), down);
-}
-
-/// The pixels of dropped tokens have no influence. Without a dropped token nothing changes.
-#[test]
-fn tokens_without_a_person_are_dropped() {
-    let Some(device) = real_device() else { return };
-    let dropping = config(&["network.drop_empty=true"]);
-    let (side, patch) = (dropping.network.net_resolution, dropping.network.patch);
-    let net = random_predictor(&dropping, 5, &device);
-    let grid = side / patch;
-    // The first photograph shows the person in all tokens but those of the first column. The second shows one pixel in that
-    // column.
-    let mut masks = vec![0.0; 2 * side * side];
-    for row in 0..side {
-        masks[row * side + patch..(row + 1) * side].fill(1.0);
-    }
-    masks[side * side + (patch + 3) * side + 2] = 0.5;
-    let masks = Tensor::<4>::from_data(TensorData::new(masks, [2, 1, side, side]), &device);
-    let kept = Grid::of_persons(&masks, patch);
-    let expected: Vec<usize> = (0..grid * grid).filter(|t| t % grid > 0 || *t == grid).collect();
-    assert_eq!((kept.size, kept.kept.as_ref(), kept.tokens()), ([grid; 2], Some(&expected), expected.len()));
-    let one = images([side; 2], 3, 1, &device);
-    let other = one.clone().slice_assign([0..2, 0..3, 0..patch, 0..patch], images([patch; 2], 3, 9, &device));
-    let with =
-        |images: &Tensor<4>, grid: &Grid| maps(&net, Input { images: images.clone(), grid: grid.clone() });
-    let whole = Grid::whole([grid; 2]);
-    for (((view, a), (_, b)), ((_, c), (_, d))) in with(&one, &kept)
-        .iter()
-        .zip(&with(&other, &kept))
-        .zip(with(&one, &whole).iter().zip(&with(&other, &whole)))
-    {
-        assert_same(&format!("{view:?} without them"), a, b);
-        assert_different(&format!("{view:?} with them"), c, d);
-        assert_different(&format!("{view:?} with and without"), a, c);
-    }
-    let everybody = Tensor::<4>::ones([2, 1, side, side], &device);
-    assert_eq!(Grid::of_persons(&everybody, patch), whole);
-    assert_eq!(Grid::of_persons(&Tensor::<4>::zeros([2, 1, side, side], &device), patch), whole);
-    // A list of all tokens is the whole grid.
-    let all = Grid { kept: Some((0..grid * grid).collect()), ..whole.clone() };
-    for ((view, a), (_, b)) in with(&one, &all).iter().zip(&with(&one, &whole)) {
-        assert_same(&format!("{view:?} with all"), a, b);
-    }
 }
 
 /// The maps of a result, its Gaussians and its plan agree on the points that moved.
@@ -298,13 +234,13 @@ fn points_that_moved_into_the_silhouettes_are_those_of_maps_and_gaussians() {
     }
 }
 
-/// The plan counts channels and dropped tokens. Every valid pixel of a photograph becomes a Gaussian.
+/// The steps tell channels and the window. Every valid pixel of a photograph becomes a Gaussian.
 #[test]
-fn the_plan_of_a_reconstruction_names_channels_window_and_dropped_tokens() {
+fn the_steps_of_a_reconstruction_name_channels_and_window() {
     let Some(device) = device() else { return };
-    for (body, drops_tokens) in [
-        (&["network.drop_empty=true", "network.head=linear", "network.patch=8"][..], true),
-        (&["network.body=convolution", "network.dec_depth=1"], false),
+    for body in [
+        &["network.head=linear", "network.patch=8"][..],
+        &["network.body=convolution", "network.dec_depth=1"],
     ] {
         let keys = [
             "network.window=true",
@@ -320,10 +256,9 @@ fn the_plan_of_a_reconstruction_names_channels_window_and_dropped_tokens() {
         let side = config.network.resolution;
         let photographs = [photograph(side, 1), photograph(side, 2)];
         let made = model.reconstruct(photographs.each_ref(), &|_| ());
-        let has = |text: &str| made.steps.iter().any(|step| step.to_string().contains(text));
         // Three colours, the mask, and two of the ray. The person's window is smaller than the canvas.
-        assert!(has("tokens each, 6 channels") && has(", the person's window"), "{:?}", made.steps);
-        assert_eq!(has("tokens left out"), drops_tokens, "{:?}", made.steps);
+        let is_told = |step: &Step| matches!(step, Step::PointPredictor { window, channels: 6, .. } if *window != Window::whole(side));
+        assert!(made.steps.iter().any(is_told), "{:?}", made.steps);
         for (photograph, valid) in photographs.iter().zip(&made.valid) {
             assert_eq!(&photograph.valid, valid, "{:?}", made.steps);
         }

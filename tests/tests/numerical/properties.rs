@@ -3,7 +3,7 @@
 use burn::tensor::{Device, Tensor, TensorData};
 use snapsnap_base::config::Schema;
 use snapsnap_net::config::{Config, Downsample, NetworkConfig, Upsample};
-use snapsnap_net::network::{Grid, Input, PointMap, PointPredictor, View, activate};
+use snapsnap_net::network::{Grid, Input, PointMap, View, activate};
 use snapsnap_net::regressor::{RECEPTIVE_RADIUS, Statistics};
 use snapsnap_net::resample::shrink;
 use snapsnap_net::steps::Step;
@@ -191,7 +191,7 @@ fn concatenation_puts_the_front_first() {
     let maps = |x: Tensor<3>| vec![x; dec_depth + 1];
     let zero = || Tensor::<3>::zeros([1, 4, width], &device);
     let right = |front: Tensor<3>, back: Tensor<3>| {
-        net.transformer().raw_points(View::Right, &[maps(front), maps(back)], &Grid::whole([2, 2]))
+        net.transformer().raw_points(View::Right, &[maps(front), maps(back)], &Grid([2, 2]))
     };
     // A linear head is affine: the contributions of both halves add up. Their matrices differ.
     let both = values(right(tokens(1), tokens(2)) + right(zero(), zero()));
@@ -268,7 +268,7 @@ fn swapping_two_heads_weights_swaps_their_outputs() {
 /// Two photographs of three channels, for patches of 16 pixels.
 fn pair(front: Tensor<4>, back: Tensor<4>) -> Input {
     let [_, _, h, w] = front.dims();
-    Input { images: Tensor::cat(vec![front, back], 0), grid: Grid::whole([h / 16, w / 16]) }
+    Input { images: Tensor::cat(vec![front, back], 0), grid: Grid([h / 16, w / 16]) }
 }
 
 #[test]
@@ -278,7 +278,7 @@ fn every_fusion_and_head_gives_points_of_its_own_on_oblong_pictures() {
         |seed| Tensor::<4>::from_data(TensorData::new(noise(3 * 48 * 80, seed), [1, 3, 48, 80]), &device);
     let mut seen: Vec<Vec<f32>> = Vec::new();
     for head in ["dpt", "linear"] {
-        for fusion in ["mean", "mirror-mean", "concat"] {
+        for fusion in ["mean", "concat"] {
             let config = config(&[&format!("network.head={head}"), &format!("network.fusion={fusion}")]);
             let (_file, weights) = weights(&config, 2);
             let net = weights.point_predictor(&device).expect("weights");
@@ -295,31 +295,6 @@ fn every_fusion_and_head_gives_points_of_its_own_on_oblong_pictures() {
         let net = weights.point_predictor(&device).expect("weights");
         assert_eq!(net.forward(pair(image(1), image(2)), &Window::whole(64)).len(), 2);
     }
-}
-
-/// If the back's tokens are the mirrored front tokens, `mirror-mean` gives the front tokens.
-#[test]
-fn mirror_mean_undoes_a_mirror_image() {
-    let Some(device) = device() else { return };
-    let net = |fusion: &str| {
-        let config = config(&[&format!("network.fusion={fusion}"), "network.head=linear"]);
-        weights(&config, 2).1.point_predictor(&device).expect("weights")
-    };
-    let NetworkConfig { dec_dim: width, dec_depth, .. } = config(&[]).network;
-    let (rows, columns) = (3, 5);
-    let front = Tensor::<3>::from_data(TensorData::new(noise(15 * width, 3), [1, 15, width]), &device);
-    let mirrored = front.clone().reshape([1, rows, columns, width]).flip([2]).reshape([1, 15, width]);
-    let maps = |x: &Tensor<3>| vec![x.clone(); dec_depth + 1];
-    let right = |net: &PointPredictor, back: &Tensor<3>| {
-        values(net.transformer().raw_points(
-            View::Right,
-            &[maps(&front), maps(back)],
-            &Grid::whole([rows, columns]),
-        ))
-    };
-    let (mirror_mean, mean) = (net("mirror-mean"), net("mean"));
-    assert_same("mirrored twice", &right(&mirror_mean, &mirrored), &right(&mean, &front));
-    assert_different("mirrored once", &right(&mean, &mirrored), &right(&mean, &front));
 }
 
 #[test]

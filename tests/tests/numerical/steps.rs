@@ -137,7 +137,7 @@ const TRANSFORMER: fn(&mut TrainConfig) = |_| {};
 const CONVOLUTION: fn(&mut TrainConfig) = |config| {
     let network = &mut config.network;
     network.body = Body::Convolution;
-    (network.mask_channel, network.ray_channels, network.mirror, network.normals) = (true, true, true, true);
+    (network.mask_channel, network.ray_channels, network.mirror) = (true, true, true);
 };
 const COMPLETED: fn(&mut TrainConfig) = |config| {
     CONVOLUTION(config);
@@ -307,21 +307,12 @@ fn gradients_of_the_losses_are_finite_differences() {
             let PointMap { points, conf } = activate(raw, &config.network);
             let window = Window { rows: 0..h, columns: 0..w };
             let maps = vec![(View::Front, PointMap { points, conf })];
-            let prediction = Prediction { window, maps, normals: None };
+            let prediction = Prediction { window, maps };
             let losses = losses(&prediction, &truth, &valid, true);
             losses.regression + losses.confidence * 0.5 + losses.relief.expect("was asked for")
         };
         check(&format!("stage 1, {name}"), &random(&[2, 4, h, w], -1.5..1.5, 3), [2, 4, h, w], stage1);
     }
-
-    let of_normals = |predicted: Tensor<4>| {
-        let conf = valid.clone().reshape([2, h, w]) * 0.0 + 0.5;
-        let map = PointMap { points: truth.clone().reshape([2, h, w, 3]), conf };
-        let (window, maps) = (Window { rows: 0..h, columns: 0..w }, vec![(View::Front, map)]);
-        let prediction = Prediction { window, maps, normals: Some([predicted.clone(), predicted]) };
-        losses(&prediction, &truth, &valid, false).normals.expect("there are normals")
-    };
-    check("normals", &random(&[2, 3, h, w], -1.0..1.0, 7), [2, 3, h, w], of_normals);
 
     let target = tensor(&random(&[1, 2, 13, 12], 0.0..1.0, 4), [1, 2, 13, 12]);
     let photometric = |image: Tensor<4>| Photometric::new(image, target.clone()).loss(0.8);

@@ -53,29 +53,29 @@ fn perceptual_distance_is_part_of_the_last_steps() {
     assert!(said.contains("stage2.lpips"), "{said}");
 }
 
-/// `auto` is bf16 where the processor has it. The run's config and its weights say so, and `reconstruct` does the same.
+/// A run keeps the precision in which it began, and weights tell it to `reconstruct`.
 #[test]
-fn automatic_precision_is_that_of_the_processor() {
+fn the_precision_of_a_run_is_that_of_its_weights() {
     let (temporary, config) = place();
+    let [one, two] = ["one", "two"].map(|run| temporary.path().join(run));
+    let with = |precision: &str, steps: u32| {
+        let mut command = train(1, &config, &one);
+        command.arg("--resume").arg(format!("--set=training.precision={precision}"));
+        command.arg(format!("--set=training.steps={steps}"));
+        command
+    };
+    succeed(&mut with("f32", 2));
+    let said = refused(&mut with("bf16", 3));
+    assert!(said.contains("`training.precision`") && said.contains("--force"), "{said}");
+    succeed(with("bf16", 3).arg("--force"));
+    let written = fs::read_to_string(one.join("config.toml")).expect("a config");
+    assert!(written.contains("\nprecision = \"bf16\""), "{written}");
+    let mut second = train(2, &config, &two);
+    second.args(["--set=training.precision=bf16", "--set=training.steps=2"]).arg("--weights");
+    succeed(second.arg(one.join("last.safetensors")));
     let report = succeed(snapsnap().current_dir(temporary.path()).args(["doctor", "--json"]));
     let report: serde_json::Value = serde_json::from_str(&report).expect("JSON");
-    let name = if report["bf16"].is_null() { "f32" } else { "bf16" };
-    println!("{name}");
-    // A device without bf16 is kept from it.
-    let both = temporary.path().join("both");
-    let mut command = snapsnap();
-    command.args(["train-stage1", "--device=ndarray", "--set=training.precision=auto"]);
-    command.args(["--set=training.steps=3", "--set=training.batch=2", "--config"]).arg(&config);
-    succeed(command.arg("--data").arg(people()).arg("-o").arg(&both));
-    let written = fs::read_to_string(both.join("config.toml")).expect("a config");
-    assert!(written.contains("\nprecision = \"f32\""), "{written}");
-    let [one, two] = ["one", "two"].map(|run| temporary.path().join(run));
-    succeed(train(1, &config, &one).args(["--set=training.precision=auto", "--set=training.steps=3"]));
-    let written = fs::read_to_string(one.join("config.toml")).expect("a config");
-    assert!(written.contains(&format!("\nprecision = \"{name}\"")), "{written}");
-    let mut second = train(2, &config, &two);
-    second.args(["--set=training.precision=auto", "--set=training.steps=2"]).arg("--weights");
-    succeed(second.arg(one.join("last.safetensors")));
+    let auto = if report["bf16"] == true { "bf16" } else { "f32" };
     let view = |view: u32| people().join(format!("val/img/0000/{view}.png"));
     let said = |precision: &str| {
         let mut command = snapsnap();
@@ -83,34 +83,11 @@ fn automatic_precision_is_that_of_the_processor() {
         command.args(["--as-is", "--device=cpu", "-v", "--precision", precision, "--weights"]);
         succeed(command.arg(two.join("last.safetensors")))
     };
-    assert!(said("auto").contains(&format!("precision: {name}")));
+    assert!(said("auto").contains(&format!("precision: {auto}")));
     assert!(said("f32").contains("precision: f32\n") && said("bf16").contains("precision: bf16, by "));
 }
 
-/// A run keeps the precision in which it began, on whatever processor it goes on.
-#[test]
-fn automatic_precision_of_a_run_is_that_of_its_beginning() {
-    let (temporary, config) = place();
-    for (i, [own, other]) in [["f32", "bf16"], ["bf16", "f32"]].into_iter().enumerate() {
-        let run = temporary.path().join(own);
-        let with = |precision: &str, steps: u32| {
-            let mut command = train(1, &config, &run);
-            command.arg("--resume").arg(format!("--set=training.precision={precision}"));
-            command.arg(format!("--set=training.steps={steps}"));
-            command
-        };
-        let written = || fs::read_to_string(run.join("config.toml")).expect("a config");
-        succeed(&mut with(own, 2));
-        succeed(&mut with("auto", 3));
-        assert!(written().contains(&format!("\nprecision = \"{own}\"")), "{i}: {}", written());
-        let said = refused(&mut with(other, 4));
-        assert!(said.contains("`training.precision`") && said.contains("--force"), "{said}");
-        succeed(with(other, 4).arg("--force"));
-        assert!(written().contains(&format!("\nprecision = \"{other}\"")), "{i}: {}", written());
-    }
-}
-
-/// Completed sides with their second surfaces, beside normals, from the data to the Gaussians.
+/// Completed sides with their second surfaces, from the data to the Gaussians.
 #[test]
 fn second_surfaces_of_completed_sides_are_trained_and_become_gaussians() {
     let (temporary, config) = place();
@@ -121,7 +98,7 @@ fn second_surfaces_of_completed_sides_are_trained_and_become_gaussians() {
         command.args(["views.count=4", "--set=views.resolution=64", "--set=views.second_depth=true", "-o"]);
         succeed(command.arg(&data));
     }
-    const KEYS: [&str; 9] = [
+    const KEYS: [&str; 8] = [
         "network.body=convolution",
         "network.patch=8",
         "network.mask_channel=true",
@@ -129,7 +106,6 @@ fn second_surfaces_of_completed_sides_are_trained_and_become_gaussians() {
         "network.sides=completed",
         "network.second_layer=true",
         "network.side_dims=[4,4,8,8]",
-        "network.normals=true",
         "network.conf_threshold=0.01",
     ];
     let keys = KEYS.map(|key| format!("--set={key}"));
@@ -147,9 +123,6 @@ fn second_surfaces_of_completed_sides_are_trained_and_become_gaussians() {
         let (_, error) = *logged(&one, name).last().expect("a validation");
         assert!(error > 1.0 && error < 2000.0, "{name}: {error}");
     }
-    // Normals of length 0 have an error of 1 in each photograph.
-    let (_, error) = *logged(&one, "normals").last().expect("a step");
-    assert!(error > 0.1 && error < 1.8, "{error}");
     succeed(with(2, &data, &two).arg("--weights").arg(one.join("last.safetensors")));
     let view = |view: u32| data.join(format!("val/img/0000/{view}.png"));
     let mut command = snapsnap();

@@ -86,3 +86,45 @@ fn a_rehearsal_writes_nothing_and_prints_the_time_of_the_run() {
     assert!(said.contains("40 steps will take about") && said.contains("memory"), "{said}");
     assert!(!run.exists());
 }
+
+/// Data reach the disk before their name does, the name before the next step, and weights before the state that continues with them.
+#[test]
+#[cfg(target_os = "linux")]
+fn checkpoints_reach_the_disk_in_their_order() {
+    use std::path::Path;
+    use std::process::Command;
+
+    let probe = Command::new("strace").arg("true").output();
+    if !probe.is_ok_and(|probe| probe.status.success()) {
+        println!("skipped: strace cannot watch processes here (Debian: apt-get install strace)");
+        return;
+    }
+    let (temporary, config) = place();
+    let (run, log) = (temporary.path().join("run"), temporary.path().join("calls"));
+    let command = train(1, &config, &run);
+    let mut watched = Command::new("strace");
+    watched.args(["-f", "-y", "-s", "4096", "-e", "trace=fsync,rename,renameat,renameat2", "-o"]).arg(&log);
+    watched.arg(command.get_program()).args(command.get_args());
+    succeed(watched.arg("--set=training.steps=2"));
+    let calls = fs::read_to_string(&log).expect("calls");
+    let calls: Vec<&str> = calls.lines().filter(|line| !line.contains("resumed>")).collect();
+    let synced = |part: &[&str], path: &Path| {
+        part.iter().any(|call| call.contains("fsync(") && call.contains(&format!("<{}>", path.display())))
+    };
+    let mut renamed = Vec::new();
+    for (i, call) in calls.iter().enumerate().filter(|(_, call)| call.contains("rename")) {
+        let mut paths = call.split('"').skip(1).step_by(2).map(Path::new);
+        let (from, to) = (paths.next().expect("a path"), paths.next().expect("a path"));
+        let folder = to.parent().expect("lies in a folder").canonicalize().expect("a folder");
+        let from = folder.join(from.file_name().expect("a name"));
+        assert!(synced(&calls[..i], &from), "{call}: before its data");
+        let next = calls[i + 1..].iter().position(|call| call.contains("rename"));
+        let before_next = &calls[i + 1..next.map_or(calls.len(), |next| i + 1 + next)];
+        assert!(synced(before_next, &folder), "{call}: the folder is not synced");
+        renamed.push(to.file_name().expect("a name").to_string_lossy().into_owned());
+    }
+    // The first state is written before the first step.
+    let place = |name: &str| renamed.iter().rposition(|renamed| renamed == name);
+    let [weights, state] = ["last.safetensors", "state.safetensors"].map(place);
+    assert!(weights.is_some() && weights < state, "{renamed:?}");
+}

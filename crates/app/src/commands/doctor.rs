@@ -6,7 +6,7 @@ use burn::tensor::Device;
 use clap::Args;
 use serde_json::{Value, json};
 use snapsnap_eval::lpips::Lpips;
-use snapsnap_net::precision::unit_of_cpu;
+use snapsnap_net::precision::cpu_has_bf16;
 
 use super::ConfigArguments;
 use crate::device::{self, Found};
@@ -67,7 +67,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
             "compiled_in": device::compiled_in(),
             "mpi": cfg!(feature = "mpi"),
             "threads": threads(),
-            "bf16": unit_of_cpu(),
+            "bf16": cpu_has_bf16(),
             "memory_bytes": memory,
             "devices": devices.iter().map(device).collect::<Vec<Value>>(),
             "chosen": chosen,
@@ -86,7 +86,10 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
             if cfg!(feature = "mpi") { "compiled in" } else { "not compiled in: build with --features mpi" }
         ),
         format!("threads      {}", threads()),
-        format!("bf16         {}", unit_of_cpu().unwrap_or("no instructions for it in this processor")),
+        format!(
+            "bf16         {}",
+            if cpu_has_bf16() { "AVX-512" } else { "no instructions for it in this processor" }
+        ),
         format!("memory       {}", gigabytes(memory)),
         "devices".into(),
     ];
@@ -165,7 +168,7 @@ fn missing(devices: &[Found], weights: &[Weights], memory: u64) -> Vec<Missing> 
     let mut missing = Vec::new();
     let mut add = |what: &str, mend| missing.push(Missing { what: what.into(), mend });
     if !devices.iter().any(|found| found.card) {
-        let mend = if snapsnap_splat::adapter::is_opengl() {
+        let mend = if device::is_opengl() {
             "the card works with OpenGL only, which is not used: install its Vulkan driver (Debian, Ubuntu: apt-get install \
              libvulkan1 mesa-vulkan-drivers, or NVIDIA's own)"
         } else {

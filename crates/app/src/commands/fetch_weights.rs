@@ -202,7 +202,7 @@ fn download(item: &Item, address: &str, path: &Path) -> Result<(), Failure> {
             return Err(Failure::Input(message));
         }
     }
-    file.sync_all().and_then(|()| fs::rename(&part, path)).map_err(|e| Failure::cannot_write(path, &e))
+    file::rename(&part, path).map_err(|e| Failure::cannot_write(path, &e))
 }
 
 /// Whether a file has another name as well.

@@ -120,7 +120,10 @@ fn check_settings(path: &Path, settings: &Settings) -> Result<(), Failure> {
     }
     let text = file::read_text(path, LARGEST_CONFIG).map_err(FileError::read(path))?;
     let there: toml::Table = toml::from_str(&text).map_err(|e| Failure::file(path, e))?;
-    match differences(&keys(&there), &keys(settings)).first() {
+    // As text, since a table of its own would have other digits.
+    let wanted: toml::Table =
+        toml::from_str(&toml::to_string_pretty(settings).expect("TOML types")).expect("TOML");
+    match differences(&keys(&there), &keys(&wanted)).first() {
         None => Ok(()),
         Some((_, message)) => {
             let why = "the people in this folder were made with other settings: give another folder";
@@ -155,8 +158,8 @@ fn read_all(
 /// The person of two photographs.
 fn make(photographs: &Photographs, networks: &Reconstructor, told: &Told) -> Result<Stored, Failure> {
     match snapsnap_photo::person(photographs, networks, told, &|_| ()) {
-        Some(person) => Ok(Stored::of(&person.gaussians)?),
-        None => bail!("no Gaussian came out of these photographs"),
+        Ok(person) => Ok(Stored::of(&person.gaussians)?),
+        Err(_) => bail!("no Gaussian came out of these photographs"),
     }
 }
 

@@ -12,7 +12,7 @@ use snapsnap_base::file;
 use snapsnap_mesh::picture;
 use snapsnap_net::Reconstructor;
 use snapsnap_net::config::{Config, OPPOSITE};
-use snapsnap_net::precision::{Precision, PrecisionChoice, unit_of_cpu};
+use snapsnap_net::precision::{Precision, PrecisionChoice, cpu_has_bf16};
 use snapsnap_net::weights::WeightFile;
 use snapsnap_net::weights::schema::Part;
 use snapsnap_photo::{Cutting, Photographs, Source, Told};
@@ -123,7 +123,7 @@ impl Arguments {
         let read = snapsnap_photo::read(sources, self.cutting(), side, told.placement(config), told.focal)?;
         let doubts: Vec<String> = read.doubts.iter().map(ToString::to_string).collect();
         if self.strict && !doubts.is_empty() {
-            bail!("{} (--strict)", doubts.join("\n"));
+            bail!("{} (--strict)", doubts.join("; "));
         }
         doubts.iter().for_each(|doubt| say::note(&format!("{name}warning: {doubt}")));
         Ok(read)
@@ -213,10 +213,11 @@ fn in_words(precision: Precision, device: &Device) -> String {
     if precision != Precision::Bf16 || !memory::is_cpu(device) {
         return name.into();
     }
-    format!(
-        "{name}, by {}",
-        unit_of_cpu().unwrap_or("f32 products of rounded weights: this processor has no bf16 instructions")
-    )
+    let by = match cpu_has_bf16() {
+        true => "AVX-512",
+        false => "f32 products of rounded weights: this processor has no bf16 instructions",
+    };
+    format!("{name}, by {by}")
 }
 
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
@@ -271,12 +272,11 @@ fn one(arguments: &Arguments, paths: [&PathBuf; 2]) -> Result<(), Failure> {
     let (networks, precision) = arguments.model.load(&weights, &device)?;
     timed("loading weights", since);
     let person = snapsnap_photo::person(&photographs, &networks, &told, &|name| progress.stage(name));
-    let Some(mut person) = person else {
-        bail!(
-            "{}: no Gaussian came out of these photographs, so nothing was written",
-            weights.path().display()
-        );
-    };
+    let mut person = person.map_err(|steps| {
+        let steps: String = steps.iter().map(|step| format!("\n  {step}")).collect();
+        let why = format!("no Gaussian came out, so nothing was written; the steps:{steps}");
+        Failure::file(weights.path(), why)
+    })?;
     times.append(&mut person.made.times);
 
     progress.stage("writing");
@@ -319,7 +319,13 @@ fn one(arguments: &Arguments, paths: [&PathBuf; 2]) -> Result<(), Failure> {
         report["cameras"] = json!(person.seats);
         report["steps"] = json!(person.made.steps);
         report["times"] = times.collect();
-        return say::json(&report.to_string());
+        report["mesh"] = json!(surface);
+        // A pipe or a device may be stdout.
+        return if file::is_special(output) {
+            Ok(say::err(&report.to_string()))
+        } else {
+            say::json(&report.to_string())
+        };
     }
     if arguments.verbose {
         print("steps");

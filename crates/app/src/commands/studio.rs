@@ -148,11 +148,13 @@ impl Studio {
         let mut read =
             snapsnap_photo::read(&[source(0), source(1)], Cutting::Missing, side, placement, told.focal)?;
         read.cutouts = Vec::new();
-        let Some(person) = person(&read, &networks, told, &|step| job.step(step)) else {
+        let Ok(person) = person(&read, &networks, told, &|step| job.step(step)) else {
             return Err(text(StatusCode::UNPROCESSABLE_ENTITY, "no Gaussian came out of these photographs"));
         };
         let doubts: Vec<String> = read.doubts.iter().map(ToString::to_string).collect();
         let stored = Stored::of(&person.gaussians).map_err(Failure::from)?;
+        // The next person may come in an hour.
+        snapsnap_ops::buffers::release();
         drop(networks);
         let name = format!("{:x}-{}", self.start, self.made.fetch_add(1, Ordering::Relaxed));
         let gaussians = stored.len();

@@ -87,7 +87,7 @@ pub fn pack(
             let packed = packer.finish()?;
             // An empty folder is replaced.
             let _ = fs::remove_dir(&output);
-            fs::rename(&temporary, &output).map_err(FileError::write(&output))?;
+            file::rename(&temporary, &output).map_err(FileError::write(&output))?;
             Ok(packed)
         });
         let _ = fs::remove_dir_all(&temporary);

@@ -188,7 +188,7 @@ impl Folder {
             if to.is_dir() {
                 fs::remove_dir_all(&to).map_err(FileError::write(&to))?;
             }
-            fs::rename(&from, &to).map_err(FileError::write(&to))?;
+            file::rename(&from, &to).map_err(FileError::write(&to))?;
         }
         Ok(())
     }

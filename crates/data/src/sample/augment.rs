@@ -18,10 +18,6 @@ pub struct Augment {
     pub exposure: f32,
     /// Red and blue against green, up to this share.
     pub white_balance: f32,
-    /// Largest blur, standard deviation in pixels.
-    pub blur: f32,
-    /// Largest noise of the sensor, standard deviation as a share of white.
-    pub noise: f32,
     /// Largest error of masks that are too small, in pixels.
     pub mask_erosion: f32,
     /// Largest error of masks that are too large, in pixels.
@@ -42,8 +38,6 @@ impl Default for Augment {
         Self {
             exposure: 0.15,
             white_balance: 0.06,
-            blur: 0.0,
-            noise: 0.0,
             mask_erosion: 1.5,
             mask_dilation: 1.5,
             jpeg_quality: 70,
@@ -60,8 +54,6 @@ impl Augment {
         Self {
             exposure: 0.0,
             white_balance: 0.0,
-            blur: 0.0,
-            noise: 0.0,
             mask_erosion: 0.0,
             mask_dilation: 0.0,
             jpeg_quality: 0,
@@ -75,8 +67,6 @@ impl Augment {
         outside([
             ("exposure", self.exposure, 0.0..=0.9),
             ("white_balance", self.white_balance, 0.0..=0.9),
-            ("blur", self.blur, 0.0..=8.0),
-            ("noise", self.noise, 0.0..=0.5),
             ("mask_erosion", self.mask_erosion, 0.0..=16.0),
             ("mask_dilation", self.mask_dilation, 0.0..=16.0),
             ("jpeg_quality", f32::from(self.jpeg_quality), 0.0..=100.0),
@@ -109,22 +99,6 @@ impl Augment {
                     lit
                 };
                 *pixel = Rgb(mixed.to_array().map(|c| c.round() as u8));
-            }
-        }
-        if self.blur > 0.0 {
-            let sigma = self.blur * random.random_range(0.0_f32..1.0);
-            // Less than a third of a pixel changes nothing.
-            if sigma > 0.3 {
-                picture = image::imageops::fast_blur(&picture, sigma);
-            }
-        }
-        if self.noise > 0.0 {
-            let sigma = 255.0 * self.noise * random.random_range(0.0_f32..1.0);
-            for value in picture.iter_mut() {
-                // The sum of four uniform numbers is nearly normal, with a variance of 1/3.
-                let sum: f32 =
-                    random.random::<u32>().to_le_bytes().iter().map(|b| f32::from(*b) / 255.0 - 0.5).sum();
-                *value = (f32::from(*value) + sigma * 3.0_f32.sqrt() * sum).round().clamp(0.0, 255.0) as u8;
             }
         }
         if self.jpeg_quality > 0 {

@@ -11,6 +11,7 @@ mod test_set;
 #[cfg(test)]
 mod tests;
 
+use std::path::Path;
 use std::sync::Arc;
 
 use burn::data::dataset::{Dataset, DatasetError};
@@ -120,6 +121,10 @@ impl SampleConfig {
         ];
         if let Some((key, message)) = outside(ranges) {
             return Some((key.into(), message));
+        }
+        if self.placed_share > 0.0 && !self.upright {
+            let message = "needs `samples.upright = true`: a placed photograph shows no camera's elevation";
+            return Some(("placed_share".into(), message.into()));
         }
         let beside_compat = [
             ("front_within_degrees", "must be 180", self.front_within_degrees != 180.0),
@@ -298,13 +303,14 @@ impl Source {
     /// Photographs of front and back as the networks' input: placed on their canvases like a user's, or used unchanged.
     fn photographs(
         &self,
+        paths: [&Path; 2],
         views: [(&RgbImage, &GrayImage); 2],
         is_placed: bool,
         random: &mut impl Rng,
     ) -> Result<Photographs, FileError> {
         let changed = views.map(|(color, mask)| self.config.augment.apply(color, mask, random));
-        let sources =
-            changed.each_ref().map(|(color, mask)| Picture::pixels(self.folder.root(), color, Some(mask)));
+        let source = |i: usize| Picture::pixels(paths[i], &changed[i].0, Some(&changed[i].1));
+        let sources = [source(0), source(1)];
         let height = self.config.person_height;
         let placement = if is_placed { Placement::Training { height } } else { Placement::AsIs };
         let side = changed[0].0.width() as usize;

@@ -1,13 +1,14 @@
 //! Training photographs placed on their canvas as a user's are, and the points that belong to them
-//! (docs/method.md, "Targets placed as a user's photographs"). A person then always has the same height and place.
-//! Size and distance, which no picture shows, are no part of the task. Points are scaled as if the body's axis were at
-//! the nominal camera's distance. One shift per sample then aligns the front's points with the rays of its pixels.
+//! (docs/method.md, "Photographs placed as a user's"). A person then always has the same height and place.
+//! Size and distance, which no picture shows, are no part of the task.
 
-use glam::{DMat3, DVec2, DVec3};
+use std::path::PathBuf;
+
+use glam::{DVec2, DVec3};
 use rand::Rng;
 use snapsnap_base::FileError;
 use snapsnap_net::Photograph;
-use snapsnap_photo::{Mapping, Restoration, scale_of};
+use snapsnap_photo::Restoration;
 use snapsnap_splat::Camera;
 
 use super::rectified::Rectification;
@@ -80,8 +81,10 @@ impl Source {
         };
         let seconds =
             if has_sides && self.config.second_depth { vec![second(2)?, second(3)?] } else { Vec::new() };
+        let paths = [0, 1].map(|i| self.folder.picture_path(self.split, subject, order[i]));
+        let paths = paths.each_ref().map(PathBuf::as_path);
         let photographs =
-            self.photographs([0, 1].map(|i| (&views[i].color, &views[i].mask)), is_placed, random)?;
+            self.photographs(paths, [0, 1].map(|i| (&views[i].color, &views[i].mask)), is_placed, random)?;
         let (mut front, mut scale, mut restoration) = (views[0].camera, 1.0, None);
         let [mut first, mut second] = <[Points; 2]>::default();
         let add_seen = |to: &mut Points, map: Seen| {
@@ -101,7 +104,7 @@ impl Source {
                 let side = |(view, degrees)| rectification.of_side(view, degrees);
                 sides.iter().zip([90.0, 270.0]).map(side).for_each(|map| add_seen(to, map));
             }
-        } else if !is_placed {
+        } else {
             let far = if compat { COMPAT_FAR } else { 0.0 };
             let add = |to: &mut Points, view: &StoredView| {
                 to.0.extend(unproject(&view.depth, &view.camera, &front.world_to_camera, far));
@@ -113,19 +116,6 @@ impl Source {
             };
             views.iter().for_each(|view| add(&mut first, view));
             seconds.iter().for_each(|view| add(&mut second, view));
-        } else {
-            let nominal = Camera::orbit_at_yaw_degrees(0.0, front.width);
-            scale = scale_of(&photographs.frames[0].mapping, &front, front.width);
-            let seen = views[0].through(&photographs.frames[0].mapping, &front, scale);
-            let rays = centres(front.width).map(|place| (place - nominal.principal_point) / nominal.focal);
-            front.world_to_camera.translation +=
-                scale * shift(rays.zip(seen).filter_map(|(ray, point)| Some((ray, point?))));
-            let photographed =
-                [0, 1].map(|i| views[i].through(&photographs.frames[i].mapping, &front, scale));
-            let side = |(view, degrees): (&StoredView, f64)| view.as_nominal(&front, scale, degrees);
-            let sides = |views: &[StoredView]| views.iter().zip([90.0, 270.0]).map(side).collect::<Vec<_>>();
-            photographed.into_iter().chain(sides(&views[2..])).for_each(|map| add_seen(&mut first, map));
-            sides(&seconds).into_iter().for_each(|map| add_seen(&mut second, map));
         }
         let (points, valid) = first;
         let photographs = pair(photographs.canvases);
@@ -151,64 +141,9 @@ impl StoredView {
         let ray = (place - self.camera.principal_point) / self.camera.focal;
         (z > 0.0).then(|| f64::from(z) * ray.extend(1.0))
     }
-
-    /// The view's points at the pixels of its canvas.
-    fn through(&self, mapping: &Mapping, front: &Camera, scale: f64) -> Seen {
-        let to_front = self.camera.world_to_camera.inverse().then(&front.world_to_camera);
-        let seen = |place| self.point(mapping.source(place)).map(|p| to_front.apply(p) / scale);
-        centres(self.camera.width).map(seen).collect()
-    }
-
-    /// The view's points at the pixels of the nominal camera that stands `degrees` around the body's axis from the
-    /// front's, in the frame of `front`.
-    fn as_nominal(&self, front: &Camera, scale: f64, degrees: f64) -> Seen {
-        let [nominal, nominal_front] =
-            [degrees, 0.0].map(|yaw| Camera::orbit_at_yaw_degrees(yaw, self.camera.width));
-        let to_front = nominal.world_to_camera.inverse().then(&nominal_front.world_to_camera);
-        let onwards = front.world_to_camera.inverse().then(&self.camera.world_to_camera);
-        let to_view = |p: DVec3| onwards.apply(scale * to_front.apply(p));
-        let (back, from_front) = (onwards.inverse(), to_front.inverse());
-        let from_view = |p: DVec3| from_front.apply(back.apply(p) / scale);
-        let all = centres(self.camera.width).filter_map(|place| self.point(place));
-        let (sum, count) = all.fold((0.0, 0.0), |(sum, count), p| (sum + from_view(p).z, count + 1.0));
-        if count == 0.0 {
-            return vec![None; self.depth.len()];
-        }
-        let seen = |place: DVec2| {
-            let ray = ((place - nominal.principal_point) / nominal.focal).extend(1.0);
-            let mut found = DVec3::new(0.0, 0.0, sum / count);
-            for _ in 0..LOOKUPS {
-                let there = to_view(found.z * ray);
-                if there.z <= 0.0 {
-                    return None;
-                }
-                let pixel = self.camera.focal * there.truncate() / there.z + self.camera.principal_point;
-                found = from_view(self.point(pixel)?);
-            }
-            Some(to_front.apply(found))
-        };
-        centres(self.camera.width).map(seen).collect()
-    }
 }
 
 /// Centres of a square picture's pixels, row by row.
 pub(super) fn centres(side: u32) -> impl Iterator<Item = DVec2> {
     (0..side).flat_map(move |row| (0..side).map(move |column| DVec2::new(column.into(), row.into()) + 0.5))
-}
-
-/// The shift t, in metres, that moves points p onto their rays r = `(x/z, y/z)`: the least-squares solution of
-/// t_x − r_x·t_z = r_x·z − x, and of the same equation for y.
-pub(super) fn shift(seen: impl Iterator<Item = (DVec2, DVec3)>) -> DVec3 {
-    let (mut matrix, mut right) = (DMat3::ZERO, DVec3::ZERO);
-    for (ray, point) in seen {
-        for (row, value) in [
-            (DVec3::new(1.0, 0.0, -ray.x), ray.x * point.z - point.x),
-            (DVec3::new(0.0, 1.0, -ray.y), ray.y * point.z - point.y),
-        ] {
-            matrix += DMat3::from_cols(row * row.x, row * row.y, row * row.z);
-            right += row * value;
-        }
-    }
-    // One point is not enough for a distance.
-    if matrix.determinant().abs() < 1e-9 { DVec3::ZERO } else { matrix.inverse() * right }
 }

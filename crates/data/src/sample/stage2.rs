@@ -1,5 +1,6 @@
 //! Stage 2: front and back photographs, and target views of the rendered Gaussians.
 
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use rand::Rng;
@@ -25,9 +26,9 @@ pub struct Stage2Item {
     pub side: usize,
     /// Front and back on canvases of H and W pixels; masks are 1 or 0 with `compat`.
     pub photographs: [Photograph; 2],
-    /// Cameras of front, back, right and left, side H. The front camera of a placed or upright sample is moved with its points.
+    /// Cameras of front, back, right and left, side H. The front camera of an upright sample is moved with its points.
     pub cameras: [Camera; 4],
-    /// Scale of a placed or upright sample: the person's size in metres over the size of the points.
+    /// Scale of an upright sample: the person's size in metres over the size of the points.
     pub scale: f64,
     /// Moves upright people to where the photographs' cameras saw them, before they are scaled.
     pub restoration: Option<Restoration>,
@@ -92,15 +93,15 @@ impl Stage2Item {
             target_cameras.push(source.camera(&stored));
         }
         let is_placed = source.is_placed(&mut random);
-        // Without upright people, a placed front camera depends on the points.
-        let needs_points = config.points || is_placed && !config.upright;
-        let four = if needs_points {
+        let four = if config.points {
             source.four(subject, &order, is_placed, &mut random)?
         } else {
             let picture = |view: usize| folder.picture(*split, subject, view, false);
             let pictures = [picture(front)?, picture(back)?];
             let pictures = pictures.each_ref().map(|(color, mask)| (color, mask));
-            let photographs = source.photographs(pictures, is_placed, &mut random)?;
+            let paths = [front, back].map(|view| folder.picture_path(*split, subject, view));
+            let paths = paths.each_ref().map(PathBuf::as_path);
+            let photographs = source.photographs(paths, pictures, is_placed, &mut random)?;
             let mappings = [0, 1].map(|i| &photographs.frames[i].mapping);
             let restoration = config.upright.then(|| {
                 Restoration::to_cameras([&cameras[0], &cameras[1]], mappings, description.resolution)

@@ -256,6 +256,8 @@ fn on_device(name: &str) -> String {
 }
 
 impl Schema for EvalConfig {
+    const RENAMED: &'static [(&'static str, &'static str)] = &[("photographs.place", "photographs.road")];
+
     fn refusal(&self) -> Option<(String, String)> {
         if let Some((key, message)) = self.problem() {
             return Some((key.to_owned(), message));

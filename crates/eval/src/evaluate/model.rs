@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use burn::tensor::{Device, Tensor};
 use snapsnap_data::sample::{Handling, Road, TestItem};
-use snapsnap_net::config::{OPPOSITE, PrecisionChoice};
+use snapsnap_net::config::{OPPOSITE, PrecisionChoice, RotationFrame, WorldFrame};
 use snapsnap_net::gaussians::Origin;
 use snapsnap_net::network::View;
 use snapsnap_net::steps::Step;
@@ -128,10 +128,17 @@ impl Model {
             let message = "`photographs.road = \"user\"` is for a front and a back: `views.inputs`";
             return Err(EvalError::Empty(message.into()));
         };
+        let config = self.reconstructor.config();
+        if config.world_frame() == WorldFrame::Mirrored || config.rotation_frame() == RotationFrame::World {
+            let message =
+                "`photographs.road = \"user\"` is for networks whose people are upright: `mode.compat`";
+            return Err(EvalError::Empty(message.into()));
+        }
+        self.check_pair(degrees(&item.cameras[back], &item.cameras[front]))?;
         let photographs = self.canvases(item, Cutting::All)?;
         let start = Instant::now();
         let person = snapsnap_photo::person(&photographs, &self.reconstructor, &Told::default(), &|_| ());
-        let Person { gaussians, made, .. } = person.ok_or_else(no_gaussian)?;
+        let Person { gaussians, made, .. } = person.map_err(|_| no_gaussian())?;
         let time = start.elapsed();
         let cameras = [&item.cameras[front], &item.cameras[back]];
         let mappings = [0, 1].map(|i| &photographs.frames[i].mapping);

@@ -6,6 +6,7 @@ mod normals;
 
 use burn::tensor::Tensor;
 use glam::DVec3;
+use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use parry3d::math::Vector;
 use parry3d::query::PointQuery;
 use parry3d::shape::TriMesh;
@@ -13,7 +14,6 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 use snapsnap_mesh::mesh::Mesh;
-use snapsnap_net::Neighbours;
 
 use crate::EvalError;
 pub(crate) use align::procrustes;
@@ -80,9 +80,10 @@ pub fn chamfer(a: &[[f32; 3]], b: &[[f32; 3]]) -> Result<Chamfer, EvalError> {
 
 /// For each of the first points, the row of the nearest of the second and its distance.
 fn nearest(from: &[[f32; 3]], to: &[[f32; 3]]) -> Vec<(usize, f64)> {
-    let rows = Neighbours::new(to).expect("points were checked").nearest(from);
-    let apart = |(p, row): (&[f32; 3], u32)| (row as usize, distance(*p, to[row as usize]));
-    from.iter().zip(rows).map(apart).collect()
+    let tree = ImmutableKdTree::<f32, 3>::new_from_slice(to).expect("fewer points than u32 can number");
+    let found = tree.query_batch(from).nearest_one::<SquaredEuclidean<f32>>().execute();
+    let apart = |(p, row): (&[f32; 3], usize)| (row, distance(*p, to[row]));
+    from.iter().zip(found.iter().map(|found| found.item as usize)).map(apart).collect()
 }
 
 /// A point in f64.

@@ -15,7 +15,20 @@ const MAX_PARAMETERS: usize = 4_000_000_000;
 /// A key and the reason why its value is refused.
 type Problem = (&'static str, String);
 
+impl Config {
+    /// [`Schema::REMOVED`], also for configs that contain this one.
+    pub const GONE: [(&str, &[&str]); 4] = [
+        ("network.drop_empty", &["false"]),
+        ("network.normals", &["false"]),
+        ("network.steepest", &["4.0"]),
+        // With a geometric start it is true.
+        ("regressor.straight_color", &["true", "false"]),
+    ];
+}
+
 impl Schema for Config {
+    const REMOVED: &'static [(&'static str, &'static [&'static str])] = &Self::GONE;
+
     fn refusal(&self) -> Option<(String, String)> {
         let problem = self.size_problem().or_else(|| self.problem()).or_else(|| self.contradiction());
         problem.map(|(key, message)| (key.to_owned(), message))
@@ -81,9 +94,6 @@ impl Config {
                 format!("is {}, must be 8 or 16 with `network.body = \"convolution\"`", n.patch),
             );
         }
-        if !is_transformer && n.drop_empty {
-            return refuse("network.drop_empty", "must be false: a convolution has no tokens to drop".into());
-        }
         let completed = [
             ("network.body", n.body == Body::Convolution, "\"convolution\""),
             ("network.anchor", n.anchor == Anchor::Ray, "\"ray\""),
@@ -101,9 +111,6 @@ impl Config {
         if n.second_layer && (n.sides != Sides::Completed || !n.side_heads) {
             let needed = "`network.sides = \"completed\"` and `network.side_heads = true`";
             return refuse("network.second_layer", format!("needs {needed}"));
-        }
-        if n.normals && is_transformer {
-            return refuse("network.normals", "needs `network.body = \"convolution\"`".into());
         }
         if let Some((key, message)) = outside([("network.pair_degrees", n.pair_degrees, 1.0..=359.0)]) {
             return refuse(key, message);
@@ -124,10 +131,6 @@ impl Config {
         }
         if n.hull_reach.is_some_and(|reach| !(0.0..=1.0).contains(&reach)) {
             return refuse("network.hull_reach", "must be between 0 and 1 (metres)".into());
-        }
-        if n.steepest.is_some_and(|steepest| steepest.is_nan() || steepest < 1.0) {
-            let message = "must be at least 1 (as on a surface that faces the camera)";
-            return refuse("network.steepest", message.into());
         }
         if n.closed_top && r.start() != RegressorStart::Geometric {
             let needed = "`regressor.start = \"geometric\"`: the regressor does not make these Gaussians";
@@ -204,14 +207,11 @@ impl Config {
             ("network.on_rays", !self.network.on_rays, "false"),
             ("network.hull_margin", self.network.hull_margin.is_none(), "unset"),
             ("network.hull_reach", self.network.hull_reach.is_none(), "unset"),
-            ("network.steepest", self.network.steepest.is_none(), "unset"),
             ("network.closed_top", !self.network.closed_top, "false"),
-            ("network.drop_empty", !self.network.drop_empty, "false"),
             ("regressor.start", self.regressor.start() == RegressorStart::Published, "\"published\""),
             ("regressor.color", self.regressor.color() == RegressorColor::Free, "\"free\""),
             ("regressor.color_limits", self.regressor.color_limits.is_none(), "unset"),
             ("regressor.least_opacities", self.regressor.least_opacities.is_none(), "unset"),
-            ("regressor.straight_color", !self.regressor.straight_color, "false"),
             ("mode.rotation_frame", self.rotation_frame() == RotationFrame::World, "\"world\""),
             ("mode.downsample", self.downsample() == Downsample::Nearest, "\"nearest\""),
             ("mode.world_frame", self.world_frame() == WorldFrame::Mirrored, "\"mirrored\""),

@@ -42,8 +42,6 @@ choices! {
     Fusion {
         /// Arithmetic mean at equal token positions.
         Mean,
-        /// Mean of the front tokens and the horizontally flipped back tokens.
-        MirrorMean,
         /// Both token maps stacked along the channels.
         Concat,
     }
@@ -133,7 +131,7 @@ choices! {
         Bf16,
         /// As `Precision::F16`.
         F16,
-        /// On a CPU with instructions for bf16: bf16 in a training, the weights' own precision in a reconstruction. Elsewhere f32.
+        /// The weights' own precision on a CPU with instructions for bf16, f32 elsewhere.
         Auto,
     }
 }

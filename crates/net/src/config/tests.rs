@@ -25,7 +25,7 @@ fn an_unknown_key_is_named_with_its_line() {
 #[test]
 fn an_unknown_name_lists_the_allowed_ones() {
     let message = refusal("[network]\nfusion = \"sum\"\n", &[]);
-    assert!(message.contains("mirror-mean") && message.contains("concat"), "{message}");
+    assert!(message.contains("mean") && message.contains("concat"), "{message}");
 }
 
 #[test]
@@ -70,14 +70,6 @@ fn a_resolved_config_records_how_far_points_move_into_the_silhouettes() {
         assert_eq!(config.resolved().network.hull_reach, reach, "{set:?}");
         assert_eq!(config.resolved().network.hull_reach(), config.network.hull_reach(), "{set:?}");
     }
-}
-
-#[test]
-fn normals_are_those_of_a_convolution() {
-    let set = |more: &str| refusal("", &["network.normals=true", more]);
-    assert!(set("network.body=transformer").contains("network.normals"));
-    let both = ["network.normals=true", "network.body=convolution", "network.patch=8"].map(str::to_owned);
-    assert!(Config::from_toml("", "x", &both).expect("valid").network.normals);
 }
 
 #[test]

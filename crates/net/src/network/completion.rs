@@ -150,7 +150,7 @@ impl SideInput {
         let (h, w) = (window.rows.len(), window.columns.len());
         let table = Tensor::cat(vec![depths(view, points), table], 2);
         let c = table.dims()[2];
-        let table = Tensor::cat(vec![table, Tensor::zeros([b, 1, c], &device)], 1).reshape([b * (n + 1), c]);
+        let table = table.reshape([b * n, c]);
         let image = |x: Tensor<2>, c: usize| x.reshape([b, h, w, c]).permute([0, 3, 1, 2]);
         let [second, farthest] =
             [rows.second, rows.farthest].map(|rows| image(taken(table.clone().narrow(1, 0, 6), &rows), 6));

@@ -191,8 +191,6 @@ impl UNet {
 #[derive(Module, Debug)]
 pub struct PointUNet {
     body: UNet,
-    /// From features to the normals of both photographs.
-    normals: Option<Conv2d>,
     side_attention: Option<Attention>,
     side_decoder: Option<Decoder>,
     completion: Option<Completion>,
@@ -216,7 +214,6 @@ impl PointUNet {
         let has = |sides: Sides| c.side_heads && c.sides == sides;
         Self {
             body: UNet::new(c, &sizes, device),
-            normals: c.normals.then(|| conv1x1(c.last_dim, 6, device)),
             side_attention: has(Sides::Predicted).then(attention),
             side_decoder: has(Sides::Predicted).then(|| Decoder::new(widths, c.last_dim, 8, device)),
             completion: has(Sides::Completed).then(|| Completion::new(c, device)),
@@ -229,9 +226,9 @@ impl PointUNet {
         Self { side_attention: None, side_decoder: None, completion: None, ..self }
     }
 
-    /// Whether the layer of this name gives the raw points or the normals.
+    /// Whether the layer of this name gives the raw points.
     pub(super) fn is_last_layer(name: &str) -> bool {
-        name.ends_with("decoder.conv_out") || name.ends_with("unet.normals")
+        name.ends_with("decoder.conv_out")
     }
 
     /// Whether it has the unseen sides.
@@ -257,11 +254,6 @@ impl PointUNet {
     /// Raw x, y, z, confidence `[B, 4, H, W]` of the front and the back from their features.
     pub fn photographed(&self, features: Tensor<4>) -> [Tensor<4>; 2] {
         self.pair(self.body.out(features))
-    }
-
-    /// Normals `[B, 3, H, W]` of the front and the back from their features; `None` without their layer.
-    pub(super) fn normals(&self, features: Tensor<4>) -> Option<[Tensor<4>; 2]> {
-        self.normals.as_ref().map(|layer| self.pair(out(layer, features)))
     }
 
     /// Raw x, y, z, confidence `[B, 4, H, W]` of the right and the left; `None` without predicted sides.

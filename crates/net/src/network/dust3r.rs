@@ -6,15 +6,14 @@
 use burn::module::Module;
 use burn::nn::conv::{Conv2d, Conv2dConfig};
 use burn::nn::{LayerNorm, Linear, LinearConfig, PaddingConfig2d};
-use burn::tensor::{Device, IndexingUpdateOp, Int, Tensor, TensorData};
+use burn::tensor::{Device, Tensor};
 
 use super::block::{DecoderBlock, EncoderBlock, layer_norm, normalise};
 use super::dpt::DptHead;
 use super::linear::LinearHead;
-use crate::config::{Downsample, Fusion, HeadKind, NetworkConfig};
-use crate::resample::shrink;
+use crate::config::{Fusion, HeadKind, NetworkConfig};
 use snapsnap_ops::layers::{linear, patches};
-use snapsnap_ops::{Rope, as_weight, host};
+use snapsnap_ops::{Rope, as_weight};
 
 /// One side of the person. The sides are named as seen in the front picture.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -58,71 +57,18 @@ enum Head {
     Linear(LinearHead),
 }
 
-/// The tokens of an image: all of a grid, or those that show the person.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Grid {
-    /// Rows and columns.
-    pub size: [usize; 2],
-    /// Places of the tokens in the grid, row by row; `None` for all of them.
-    pub kept: Option<Vec<usize>>,
-}
+/// Rows and columns of the tokens of an image.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Grid(pub [usize; 2]);
 
 impl Grid {
-    /// All tokens.
-    pub fn whole(size: [usize; 2]) -> Self {
-        Self { size, kept: None }
-    }
-
-    /// The tokens whose patch of `patch`² pixels has a mask `[N, 1, H, W]` above 0 in some image; all of them if no token has.
-    pub fn of_persons(masks: &Tensor<4>, patch: usize) -> Self {
-        let [_, _, h, w] = masks.dims();
-        let size = [h / patch, w / patch];
-        let covered = host(shrink(masks.clone(), patch, Downsample::Area));
-        let area = size[0] * size[1];
-        let kept: Vec<usize> = (0..area)
-            .filter(|token| covered.iter().skip(*token).step_by(area).any(|mask| *mask > 0.0))
-            .collect();
-        Self { size, kept: (!kept.is_empty() && kept.len() < area).then_some(kept) }
-    }
-
     /// Number of tokens.
     pub fn tokens(&self) -> usize {
-        self.kept.as_ref().map_or(self.size[0] * self.size[1], Vec::len)
+        self.0.iter().product()
     }
 
-    /// Rotary tables for the kept tokens.
     fn rope(&self, head_dim: usize, base: f64, device: &Device) -> Rope {
-        let [rows, columns] = self.size;
-        match &self.kept {
-            None => Rope::new(rows, columns, head_dim, base, device),
-            Some(kept) => {
-                let positions: Vec<_> = kept.iter().map(|token| [token / columns, token % columns]).collect();
-                Rope::at(&positions, head_dim, base, device)
-            }
-        }
-    }
-
-    fn index(&self, device: &Device) -> Option<Tensor<1, Int>> {
-        let kept: Vec<i64> = self.kept.as_ref()?.iter().map(|token| *token as i64).collect();
-        let count = kept.len();
-        Some(Tensor::from_data(TensorData::new(kept, [count]), device))
-    }
-
-    /// The kept tokens of all of a grid's.
-    fn pick(&self, tokens: Tensor<3>) -> Tensor<3> {
-        match self.index(&tokens.device()) {
-            Some(index) => tokens.select(1, index),
-            None => tokens,
-        }
-    }
-
-    /// All of a grid's tokens, 0 for those that are not kept.
-    fn spread(&self, tokens: Tensor<3>) -> Tensor<3> {
-        let device = tokens.device();
-        let Some(index) = self.index(&device) else { return tokens };
-        let [b, _, c] = tokens.dims();
-        let all = Tensor::<3>::zeros([b, self.size[0] * self.size[1], c], &device).cast(tokens.dtype());
-        all.select_assign(1, index, tokens, IndexingUpdateOp::Add)
+        Rope::new(self.0[0], self.0[1], head_dim, base, device)
     }
 }
 
@@ -206,7 +152,7 @@ impl Dust3r {
             height % patch == 0 && width % patch == 0 && height * width > 0,
             "image {height}×{width}: both sides must be positive multiples of the patch {patch}"
         );
-        Grid::whole([height / patch, width / patch])
+        Grid([height / patch, width / patch])
     }
 
     /// Images `[B, C, H, W]`, colours in [−1, 1] first → normalised encoder tokens `[B, N, enc_dim]`.
@@ -214,7 +160,7 @@ impl Dust3r {
         let c = &self.config;
         let rope = grid.rope(c.enc_dim / c.enc_heads, c.rope_base, &images.device());
         let proj = &self.patch_embed.proj;
-        let tokens = grid.pick(patches(proj, as_weight(images, &proj.weight)));
+        let tokens = patches(proj, as_weight(images, &proj.weight));
         let tokens = self.enc_blocks.iter().fold(tokens, |x, block| block.forward(x, &rope));
         normalise(&self.enc_norm, tokens)
     }
@@ -252,27 +198,21 @@ impl Dust3r {
             View::Left => self.downstream_head4.as_ref().expect("a network with side heads"),
             View::RightSecond | View::LeftSecond => panic!("the transformer has no second surfaces"),
         };
-        let all = |tokens: &Tensor<3>| grid.spread(tokens.clone());
         let tokens = |i: usize| match view {
-            View::Front => all(&front[i]),
-            View::Back => all(&back[i]),
-            _ => self.fuse(all(&front[i]), all(&back[i]), grid.size),
+            View::Front => front[i].clone(),
+            View::Back => back[i].clone(),
+            _ => self.fuse(front[i].clone(), back[i].clone()),
         };
         match head {
-            Head::Linear(head) => head.forward(tokens(self.config.dec_depth), grid.size),
-            Head::Dpt(head) => head.forward(self.config.hooks.map(tokens), grid.size),
+            Head::Linear(head) => head.forward(tokens(self.config.dec_depth), grid.0),
+            Head::Dpt(head) => head.forward(self.config.hooks.map(tokens), grid.0),
         }
     }
 
     /// Tokens of an unseen side.
-    fn fuse(&self, front: Tensor<3>, back: Tensor<3>, [rows, columns]: [usize; 2]) -> Tensor<3> {
+    fn fuse(&self, front: Tensor<3>, back: Tensor<3>) -> Tensor<3> {
         match self.config.fusion {
             Fusion::Mean => (front + back) * 0.5,
-            Fusion::MirrorMean => {
-                let [b, n, c] = back.dims();
-                let mirrored = back.reshape([b, rows, columns, c]).flip([2]).reshape([b, n, c]);
-                (front + mirrored) * 0.5
-            }
             Fusion::Concat => Tensor::cat(vec![front, back], 2),
         }
     }

@@ -14,7 +14,7 @@ pub struct Input {
     /// `[2·B, C, h, w]`, all fronts, then all backs: colours in [−1, 1] times the mask, then what else the config adds. With
     /// `network.both_ways` each of both halves is followed by its mirror images.
     pub images: Tensor<4>,
-    /// Which tokens a transformer has of them.
+    /// A transformer's tokens of them.
     pub grid: Grid,
 }
 
@@ -28,9 +28,8 @@ impl Input {
             if n.both_ways { both_ways(small) } else { small }
         };
         let mut parts = vec![small(photographs)];
-        let masks = (n.mask_channel || n.drop_empty).then(|| small(masks));
-        if let (true, Some(masks)) = (n.mask_channel, &masks) {
-            parts.push(masks.clone());
+        if n.mask_channel {
+            parts.push(small(masks));
         }
         let [count, _, height, width] = parts[0].dims();
         if n.ray_channels {
@@ -40,11 +39,7 @@ impl Input {
         }
         let images = if parts.len() > 1 { Tensor::cat(parts, 1) } else { parts.remove(0) };
         let seen = |x: Tensor<4>| if n.mirror { mirrored_backs(x) } else { x };
-        let grid = match masks.filter(|_| n.drop_empty) {
-            Some(masks) => Grid::of_persons(&seen(masks), n.patch),
-            None => Grid::whole([height / n.patch, width / n.patch]),
-        };
-        Self { images: seen(images), grid }
+        Self { images: seen(images), grid: Grid([height / n.patch, width / n.patch]) }
     }
 }
 

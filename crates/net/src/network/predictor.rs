@@ -332,17 +332,6 @@ impl PointPredictor {
         if self.config.both_ways { mean_with_mirrored(&maps) } else { maps }
     }
 
-    /// Normals `[B, 3, h, w]` of the surfaces in front and back at the network's resolution, in the front camera's frame, outward and
-    /// of any length; `None` without `network.normals`. With `network.both_ways`, those of the photographs, not of their mirror images.
-    pub fn normals(&self, decoded: &Decoded) -> Option<[Tensor<4>; 2]> {
-        let (Body::Convolution(net), Decoded::Levels(_, features)) = (&self.body, decoded) else {
-            return None;
-        };
-        let b = features.dims()[0] / if self.config.both_ways { 2 } else { 1 };
-        let [front, back] = net.normals(features.clone().narrow(0, 0, b))?;
-        Some([front, if self.config.mirror { back.flip([3]) } else { back }])
-    }
-
     /// The network of completed sides.
     #[cfg(test)]
     pub(super) fn completion(&self) -> Option<&super::completion::Completion> {

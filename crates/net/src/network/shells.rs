@@ -7,12 +7,13 @@ use super::View;
 use super::anchor::nominal;
 use crate::config::OPPOSITE;
 use crate::crop::Window;
+use snapsnap_ops::rows::NONE;
 
 /// A point that lies so far behind the nearest, in metres, is of another limb.
 const APART: f64 = 0.05;
 
 /// For every pixel of a side, the nearest of N points, the nearest of those that are [`APART`] behind it, and the farthest:
-/// `[B·h·w]` rows of tables of N + 1 rows for each sample. The last row means that there is none.
+/// `[B·h·w]` rows of a table of N rows for each sample, or [`NONE`].
 pub struct Visible {
     pub nearest: Vec<i32>,
     pub second: Vec<i32>,
@@ -32,7 +33,6 @@ impl Visible {
         let (camera, to_side) = nominal(view, OPPOSITE, side);
         let (n, w) = (inside.len() / batch, window.columns.len());
         let area = window.rows.len() * w;
-        let none = |sample: usize| (sample * (n + 1) + n) as i32;
         let mut found: [Vec<i32>; 3] = Default::default();
         for (sample, (points, inside)) in points.chunks_exact(3 * n).zip(inside.chunks_exact(n)).enumerate() {
             let seen = |(i, point): (usize, &[f32])| {
@@ -44,13 +44,13 @@ impl Visible {
                     return None;
                 }
                 let pixel = (row - window.rows.start) * w + column - window.columns.start;
-                Some((pixel, p.z, (sample * (n + 1) + i) as i32))
+                Some((pixel, p.z, (sample * n + i) as i32))
             };
             let of_person = points.chunks_exact(3).enumerate().filter(|(i, _)| inside[*i] >= 0.5);
             let seen: Vec<(usize, f64, i32)> = of_person.filter_map(seen).collect();
             // The first of all points with the smallest distance beyond `from`.
             let nearest = |from: &dyn Fn(usize) -> f64, distance: fn(f64) -> f64| {
-                let mut best = vec![(f64::INFINITY, none(sample)); area];
+                let mut best = vec![(f64::INFINITY, NONE); area];
                 for &(pixel, depth, row) in &seen {
                     if depth >= from(pixel) && distance(depth) < best[pixel].0 {
                         best[pixel] = (distance(depth), row);
@@ -127,10 +127,10 @@ mod tests {
             let found = nearest.iter().zip(second).zip(farthest).map(|((a, b), c)| [*a, b, c]);
             let (area, pixel) = (48 * 32, (30 - 8) * 32 + 20 - 16);
             for (i, found) in found.enumerate() {
-                let expected = if i % area == pixel { [1, 0, 2] } else { [8; 3] };
-                // The second sample's table follows the first one's.
-                let first = if i < area { 0 } else { 9 };
-                assert_eq!(found.map(|row| row - first), expected, "{view:?} {i}");
+                // The second sample's rows follow the first one's.
+                let first = if i < area { 0 } else { 8 };
+                let expected = if i % area == pixel { [first + 1, first, first + 2] } else { [NONE; 3] };
+                assert_eq!(found, expected, "{view:?} {i}");
             }
             assert_eq!(nearest.len(), 2 * area);
             let finite = Tensor::<3>::from_data(TensorData::new(points[..21].to_vec(), [1, 7, 3]), &device);

@@ -70,13 +70,6 @@ enum Origin<'a> {
     Drawn,
 }
 
-/// What may be absent from the checkpoints.
-#[derive(Clone, Copy)]
-struct Lacking {
-    heads: bool,
-    normals: bool,
-}
-
 /// Keys of the authors' files that neither inference nor training uses.
 fn is_ignored(key: &str) -> bool {
     key == "mask_token" || key.starts_with("prediction_head.")
@@ -107,8 +100,7 @@ fn canonical(key: &str) -> String {
 ///
 /// Each of the two parts (point predictor, regressor) must be complete or wholly absent, except that files without δ,
 /// without side heads or without any heads, as DUSt3R's and CroCo's are, get those from the config and the seed. Without
-/// `network.side_heads`, the tensors of the unseen sides are left out; `network.normals` decides likewise on the layer of the normals,
-/// which comes from the seed if no file has it. Where both `from` and `options.fill` have a tensor, it is that of `from`.
+/// `network.side_heads`, the tensors of the unseen sides are left out. Where both `from` and `options.fill` have a tensor, it is that of `from`.
 ///
 /// # Errors
 /// [`WeightsError`]; `to` is then left as it was.
@@ -127,21 +119,16 @@ pub fn import(
     let mut problems = Vec::new();
     let mut found = collect(&sources, &mut problems, &mut report)?;
     copy_decoder(&mut found, &mut report);
-    let has_normals = sources.iter().any(|source| source.config().is_ok_and(|config| config.network.normals));
     // DUSt3R's files lack δ and the side heads, CroCo's all heads; Snap-Snap's are complete, or damaged.
-    let mut lacking = Lacking { heads: !found.contains_key(SCALE), normals: !has_normals };
+    let lacks_heads = !found.contains_key(SCALE);
     if let Some(fill) = &fill {
         let others = collect(slice::from_ref(fill), &mut problems, &mut report)?;
         for (name, place) in others {
             found.entry(name).or_insert(place);
         }
     }
-    lacking.normals &= !found.keys().any(|name| is_of_normals(name));
     if !config.network.side_heads {
         leave_out(&mut found, is_of_sides, "unseen sides are left out: `network.side_heads`", &mut report);
-    }
-    if !config.network.normals {
-        leave_out(&mut found, is_of_normals, "normals are left out: `network.normals`", &mut report);
     }
     let parts = parts_of(found.keys());
     let specs: Vec<_> = schema::tensors(config).into_iter().filter(|t| parts.contains(&t.part)).collect();
@@ -153,7 +140,7 @@ pub fn import(
         let path = fill.path().display();
         report.notes.push(format!("{count} tensors are in none of the others: from {path}"));
     }
-    let plan = plan(&specs, found, (options, lacking), &mut problems, &mut report);
+    let plan = plan(&specs, found, (options, lacks_heads), &mut problems, &mut report);
     if !problems.is_empty() {
         return Err(WeightsError::Tensors { origin, problems });
     }
@@ -186,11 +173,6 @@ fn is_of_sides(name: &str) -> bool {
         || name.strip_prefix(UNET).is_some_and(of_unet)
 }
 
-/// Whether the tensor belongs to the photographs' normals.
-fn is_of_normals(name: &str) -> bool {
-    name.strip_prefix(UNET).is_some_and(|tail| tail.starts_with("normals."))
-}
-
 /// The key of head `k`'s tensors up to their own names.
 fn head(k: usize) -> String {
     format!("{DUST3R}downstream_head{k}.")
@@ -200,13 +182,13 @@ fn head(k: usize) -> String {
 fn plan<'a>(
     specs: &[TensorSpec],
     mut found: Found<'a>,
-    (options, lacking): (ImportOptions<'_>, Lacking),
+    (options, lacks_heads): (ImportOptions<'_>, bool),
     problems: &mut Vec<String>,
     report: &mut ImportReport,
 ) -> Vec<Origin<'a>> {
     let wanted = |k: &usize| specs.iter().any(|spec| spec.name.starts_with(&head(*k)));
     let given = |k: &usize| found.keys().any(|key| key.starts_with(&head(*k)));
-    let absent: Vec<usize> = (1..=4).filter(|k| lacking.heads && wanted(k) && !given(k)).collect();
+    let absent: Vec<usize> = (1..=4).filter(|k| lacks_heads && wanted(k) && !given(k)).collect();
     for &k in &absent {
         report.notes.push(match options.side_heads {
             SideHeads::Copy if k > 2 && !absent.contains(&(k - 2)) => {
@@ -240,10 +222,6 @@ fn plan<'a>(
             (None, Some(_)) => Origin::Drawn,
             (None, None) if spec.name == SCALE => {
                 report.notes.push("δ (`scale`) is in no file: `network.delta` of the config".into());
-                Origin::Drawn
-            }
-            (None, None) if lacking.normals && is_of_normals(&spec.name) => {
-                report.notes.push(format!("{} is in no file: drawn from seed {}", spec.name, options.seed));
                 Origin::Drawn
             }
             (None, None) => {

@@ -4,7 +4,7 @@
 
 use std::arch::x86_64::{
     __m512, __m512bh, __m512i, _mm512_cvtepu16_epi32, _mm512_cvtne2ps_pbh, _mm512_cvtneps_pbh,
-    _mm512_dpbf16_ps, _mm512_loadu_ps, _mm512_loadu_si512, _mm512_max_ps, _mm512_or_si512, _mm512_set1_epi32,
+    _mm512_dpbf16_ps, _mm512_loadu_ps, _mm512_loadu_si512, _mm512_or_si512, _mm512_set1_epi32,
     _mm512_setzero_ps, _mm512_setzero_si512, _mm512_shuffle_i32x4, _mm512_slli_epi32, _mm512_storeu_ps,
     _mm512_storeu_si512, _mm512_unpackhi_epi32, _mm512_unpackhi_epi64, _mm512_unpacklo_epi32,
     _mm512_unpacklo_epi64,
@@ -12,7 +12,7 @@ use std::arch::x86_64::{
 use std::mem::transmute;
 use std::sync::OnceLock;
 
-use super::{BLOCK, Columns, Edge, Left, PAIRS, PANEL, Right, Row, Source, Sums};
+use super::{BLOCK, Columns, Left, PAIRS, PANEL, Right, Row, Source, Sums};
 
 /// Whether this processor has the instructions of all functions here.
 #[inline]
@@ -45,20 +45,6 @@ pub fn block(left: &Left, row: usize, rows: usize, columns: usize, panel: &Right
             (_, false) => kernel::<4, 1>(left, row, panel, sums),
         }
     }
-}
-
-/// As [`Edge::write`].
-pub fn write(edge: Edge, sums: &[f32], out: &mut [f32]) {
-    check();
-    // SAFETY: the processor has the instructions.
-    unsafe { finish(edge, sums, out) }
-}
-
-/// As [`super::pack_pairs`].
-pub fn pack_pairs(lines: [Option<&[f32]>; 2], rectified: bool, out: &mut [u32]) {
-    check();
-    // SAFETY: the processor has the instructions.
-    unsafe { pairs(lines, rectified, out) }
 }
 
 /// As [`Source::pack_left`].
@@ -98,57 +84,6 @@ fn kernel<const ROWS: usize, const VECTORS: usize>(left: &Left, row: usize, pane
     for (out, sums) in out.iter_mut().zip(sums) {
         for (out, sum) in out.as_chunks_mut().0.iter_mut().zip(sums) {
             put(sum, out);
-        }
-    }
-}
-
-#[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
-fn finish(edge: Edge, sums: &[f32], out: &mut [f32]) {
-    // Whole vectors first: for loops over few values the preparations take longer than the values.
-    let (vectors, rest) = out.as_chunks_mut::<PAIRS>();
-    let whole = vectors.len() * PAIRS;
-    for (i, (out, sums)) in vectors.iter_mut().zip(sums.as_chunks::<PAIRS>().0).enumerate() {
-        apply(edge, i * PAIRS, sums, out);
-    }
-    if !rest.is_empty() {
-        apply(edge, whole, &sums[whole..], rest);
-    }
-}
-
-/// The edge from value `first` of a row on.
-#[inline]
-#[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
-fn apply(edge: Edge, first: usize, sums: &[f32], out: &mut [f32]) {
-    let pairs = out.iter_mut().zip(sums);
-    match edge {
-        Edge::Write => pairs.for_each(|(out, sum)| *out = *sum),
-        Edge::Add => pairs.for_each(|(out, sum)| *out += sum),
-        Edge::Bias(bias) => pairs.for_each(|(out, sum)| *out = sum + bias),
-        Edge::Mask(mask) => {
-            let mask = &mask[first..];
-            pairs.zip(mask).for_each(|((out, sum), mask)| *out = if *mask > 0.0 { *sum } else { 0.0 });
-        }
-    }
-}
-
-#[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
-fn pairs(lines: [Option<&[f32]>; 2], rectified: bool, out: &mut [u32]) {
-    let zero = _mm512_setzero_ps();
-    let length = out.len();
-    for (i, out) in out.chunks_mut(PAIRS).enumerate() {
-        let count = (length - i * PAIRS).min(PAIRS);
-        let read = |values: Option<&[f32]>| {
-            let values = values.map_or(zero, |values| line(values, i * PAIRS, 1, count));
-            // The second argument is the result where one is no number.
-            if rectified { _mm512_max_ps(values, zero) } else { values }
-        };
-        let words = interleaved(read(lines[0]), read(lines[1]));
-        if let Some(out) = out.first_chunk_mut() {
-            put_words(words, out);
-        } else {
-            let mut all = [0; PAIRS];
-            put_words(words, &mut all);
-            out.copy_from_slice(&all[..out.len()]);
         }
     }
 }

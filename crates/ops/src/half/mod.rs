@@ -1,23 +1,17 @@
-//! Matrix products of factors in bf16 with sums in f32, on processors that have instructions for them: tiles of AMX, else
-//! `vdpbf16ps` of AVX-512.
+//! Matrix products of factors in bf16 with sums in f32, on processors that have `vdpbf16ps` of AVX-512.
 //!
-//! Both kernels read the same layout. Values are rounded to bf16 to the nearest, ties to even, and stored in pairs that
+//! Values are rounded to bf16 to the nearest, ties to even, and stored in pairs that
 //! follow one another in the inner dimension k, which is filled up with zeros to blocks of 32:
 //!
-//! * the left factor as `[blocks][rows][16 pairs]`, where each block may begin anywhere, so that the windows of a
-//!   convolution need no copies of their own;
-//! * the right factor as pairs of 32 columns, where blocks, pairs and panels of columns may lie anywhere, too.
+//! * the left factor as `[blocks][rows][16 pairs]`;
+//! * the right factor as panels of 32 columns, `[panels][blocks · 16 pairs][32]`.
 //!
-//! Every element is one sum in one order, for any number of threads. The two kernels add in different orders. Both take
-//! subnormal numbers for 0.
+//! Every element is one sum in one order, for any number of threads. Subnormal numbers count as 0.
 //!
-//! `unsafe` is needed to call functions that use instructions which not every processor has, to read and write vectors, and
-//! for the instructions of AMX, which are inline assembly.
+//! `unsafe` is needed to call functions that use instructions which not every processor has, and to read and write vectors.
 
 #![cfg_attr(not(target_arch = "x86_64"), allow(unused, reason = "there is no unit"))]
 
-#[cfg(target_arch = "x86_64")]
-mod amx;
 #[cfg(target_arch = "x86_64")]
 mod avx512;
 #[cfg(test)]
@@ -41,51 +35,20 @@ pub type Columns = [u32; PANEL];
 /// A block of sums. A kernel fills its first rows.
 type Sums = [[f32; PANEL]; SLACK];
 
-/// What computes products.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Unit {
-    /// `tdpbf16ps`.
-    Amx,
-    /// `vdpbf16ps`.
-    Avx512,
-    /// The tiles of AMX in plain loops, for tests.
-    #[cfg(test)]
-    Emulated,
+/// Rows of the kernel's block of sums, if `left` rows remain.
+fn block_rows(left: usize) -> usize {
+    left.next_multiple_of(4).min(12)
 }
 
-impl Unit {
-    /// Name for messages.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Amx => "AMX",
-            Self::Avx512 => "AVX-512",
-            #[cfg(test)]
-            Self::Emulated => "emulated AMX",
-        }
-    }
-
-    /// Rows of the kernel's block of sums, if `left` rows remain.
-    fn rows(self, left: usize) -> usize {
-        match self {
-            Self::Avx512 => left.next_multiple_of(4).min(12),
-            _ => 32,
-        }
-    }
-}
-
-/// The fastest unit of this processor, if it has one.
-pub fn unit() -> Option<Unit> {
+/// Whether this processor has the instructions.
+pub fn is_there() -> bool {
     #[cfg(target_arch = "x86_64")]
     {
-        static UNIT: OnceLock<Option<Unit>> = OnceLock::new();
-        *UNIT.get_or_init(|| {
-            let packs = avx512::is_there();
-            let tiles = packs && amx::permitted();
-            if tiles { Some(Unit::Amx) } else { packs.then_some(Unit::Avx512) }
-        })
+        static THERE: OnceLock<bool> = OnceLock::new();
+        *THERE.get_or_init(avx512::is_there)
     }
     #[cfg(not(target_arch = "x86_64"))]
-    None
+    false
 }
 
 /// The left factor of a product.
@@ -165,46 +128,11 @@ impl Source<'_> {
     }
 }
 
-/// Rounds pairs (a₀, b₀), (a₁, b₁) … of max(a, 0) or a, and so on. An absent line is zeros.
-pub fn pack_pairs(a: Option<&[f32]>, b: Option<&[f32]>, rectified: bool, out: &mut [u32]) {
-    assert!([a, b].into_iter().flatten().all(|line| line.len() == out.len()));
-    #[cfg(target_arch = "x86_64")]
-    avx512::pack_pairs([a, b], rectified, out);
-}
-
-/// What happens to sums on their way out.
-#[derive(Clone, Copy)]
-pub enum Edge<'a> {
-    /// Nothing.
-    Write,
-    /// They are added to the present values.
-    Add,
-    /// A number is added to them.
-    Bias(f32),
-    /// Those become 0 where these values are not positive.
-    Mask(&'a [f32]),
-}
-
-impl Edge<'_> {
-    /// Writes a row of sums.
-    pub fn write(self, sums: &[f32], out: &mut [f32]) {
-        assert_eq!(sums.len(), out.len());
-        #[cfg(target_arch = "x86_64")]
-        avx512::write(self, sums, out);
-    }
-}
-
 /// Calls `each` with row, column and the sums from there on, up to 32 of a row, of `left` · `right`.
 ///
 /// # Panics
-/// If a factor is smaller than the sizes say, or if the processor lacks the unit.
-pub fn product(
-    unit: Unit,
-    left: Left,
-    right: Right,
-    columns: usize,
-    mut each: impl FnMut(usize, usize, &[f32]),
-) {
+/// If a factor is smaller than the sizes say, or if the processor lacks the instructions.
+pub fn product(left: Left, right: Right, columns: usize, mut each: impl FnMut(usize, usize, &[f32])) {
     let panels = columns.div_ceil(PANEL);
     assert!(left.rows > 0 && panels > 0 && left.starts.len() == right.starts.len());
     let reach = left.starts.iter().max().map_or(0, |start| start + left.rows + SLACK);
@@ -213,20 +141,14 @@ pub fn product(
     assert!(right.starts.iter().all(|start| start + reach <= right.values.len()), "panels lie inside");
     #[cfg(target_arch = "x86_64")]
     {
-        let tiles = (unit == Unit::Amx).then(amx::Tiles::configured);
         let mut sums: Sums = [[0.0; PANEL]; SLACK];
         for p in 0..panels {
             let count = (columns - p * PANEL).min(PANEL);
             let panel = Right { values: &right.values[p * right.panel..], ..right };
             let mut row = 0;
             while row < left.rows {
-                let rows = unit.rows(left.rows - row);
-                match (unit, &tiles) {
-                    (_, Some(tiles)) => amx::block(tiles, &left, row, &panel, &mut sums),
-                    #[cfg(test)]
-                    (Unit::Emulated, _) => tests::block(&left, row, &panel, &mut sums),
-                    _ => avx512::block(&left, row, rows, count, &panel, &mut sums),
-                }
+                let rows = block_rows(left.rows - row);
+                avx512::block(&left, row, rows, count, &panel, &mut sums);
                 for (i, sums) in sums[..rows.min(left.rows - row)].iter().enumerate() {
                     each(row + i, p * PANEL, &sums[..count]);
                 }
@@ -235,5 +157,5 @@ pub fn product(
         }
     }
     #[cfg(not(target_arch = "x86_64"))]
-    unreachable!("{} is of other processors", unit.name());
+    unreachable!("other processors have no such instructions");
 }

@@ -1,26 +1,7 @@
-//! Products against f64, with every unit, and the tiles of AMX in plain loops.
+//! Products against f64.
 
 use super::*;
 use crate::tests::uniform;
-
-fn rounded(bits: u32) -> f32 {
-    f32::from_bits(bits << 16)
-}
-
-/// As `amx::block`: one row and one column at a time, pair by pair.
-pub fn block(left: &Left, row: usize, panel: &Right, sums: &mut Sums) {
-    for (r, sums) in sums.iter_mut().enumerate() {
-        *sums = [0.0; PANEL];
-        for (start, first) in left.starts.iter().zip(panel.starts) {
-            for (i, pair) in left.values[start + row + r].iter().enumerate() {
-                for (sum, column) in sums.iter_mut().zip(&panel.values[first + i * panel.pair..][..PANEL]) {
-                    *sum += rounded(pair & 0xffff) * rounded(column & 0xffff);
-                    *sum += rounded(pair >> 16) * rounded(column >> 16);
-                }
-            }
-        }
-    }
-}
 
 /// Nearest bf16, ties to even.
 fn nearest(x: f32) -> f32 {
@@ -28,21 +9,19 @@ fn nearest(x: f32) -> f32 {
     f32::from_bits((bits + 0x7fff + (bits >> 16 & 1)) & 0xffff_0000)
 }
 
-/// The units that can be tried here.
-pub fn units() -> Vec<Unit> {
-    let Some(best) = unit() else {
+/// Whether the instructions can be tried here.
+fn can_try() -> bool {
+    if !is_there() {
         println!("skipped: this processor has no instructions for bf16 (AVX512-BF16)");
-        return Vec::new();
-    };
-    if best != Unit::Amx {
-        println!("skipped: this processor has no tiles (AMX); its kernel is not run, only emulated");
     }
-    let tiles = (best == Unit::Amx).then_some(Unit::Amx);
-    [Unit::Avx512, Unit::Emulated].into_iter().chain(tiles).collect()
+    is_there()
 }
 
 #[test]
 fn products_equal_those_of_rounded_factors() {
+    if !can_try() {
+        return;
+    }
     for [m, n, k] in
         [[1, 1, 1], [12, 32, 32], [13, 33, 33], [5, 70, 31], [150, 16, 64], [40, 100, 300], [3, 9, 1000]]
     {
@@ -53,8 +32,8 @@ fn products_equal_those_of_rounded_factors() {
                 .enumerate()
         {
             let (lhs, rhs) = (uniform(2 * m * k, 1), uniform(2 * k * n, 2));
-            for unit in units() {
-                let right = crate::multiply::Right::packed(unit, [k, n], (&rhs, rs));
+            {
+                let right = crate::multiply::Right::packed([k, n], (&rhs, rs));
                 for add in [false, true] {
                     let stride = n + 3;
                     let mut out = vec![0.5; m * stride];
@@ -71,7 +50,7 @@ fn products_equal_those_of_rounded_factors() {
                             let error = (f64::from(*got) - expected).abs();
                             assert!(
                                 error < 2e-5,
-                                "{unit:?}, {m}×{n}×{k}, order {i}, {row}, {column}: {got}, {expected}"
+                                "{m}×{n}×{k}, order {i}, {row}, {column}: {got}, {expected}"
                             );
                         }
                     }
@@ -91,16 +70,17 @@ fn rounding_keeps_what_is_not_finite() {
         f32::from_bits(0xffff_ffff),
         f32::MAX,
     ];
-    for unit in units() {
-        let right = crate::multiply::Right::packed(unit, [1, 5], (&values, [1, 5]));
-        let mut out = [0.0; 5];
-        crate::multiply::Multiply { size: [1, 5, 1], lhs: (&[1.0], [1, 1]), rhs: &right, add: false }
-            .write(&mut out, 5);
-        assert!(
-            out[0] == f32::INFINITY && out[1] == f32::NEG_INFINITY && out[2].is_nan() && out[3].is_nan(),
-            "{out:?}"
-        );
-        // The largest float is nearer to infinity than to the largest bf16.
-        assert_eq!(out[4], f32::INFINITY);
+    if !can_try() {
+        return;
     }
+    let right = crate::multiply::Right::packed([1, 5], (&values, [1, 5]));
+    let mut out = [0.0; 5];
+    crate::multiply::Multiply { size: [1, 5, 1], lhs: (&[1.0], [1, 1]), rhs: &right, add: false }
+        .write(&mut out, 5);
+    assert!(
+        out[0] == f32::INFINITY && out[1] == f32::NEG_INFINITY && out[2].is_nan() && out[3].is_nan(),
+        "{out:?}"
+    );
+    // The largest float is nearer to infinity than to the largest bf16.
+    assert_eq!(out[4], f32::INFINITY);
 }

@@ -87,7 +87,7 @@ impl Conv1x1 {
         dy: &[f32],
         wanted: Wanted,
     ) -> (Vec<f32>, Vec<f32>) {
-        let Self { inputs, outputs, pixels, rectified, half, .. } = *self;
+        let Self { inputs, outputs, pixels, rectified, .. } = *self;
         let mut weights = vec![0.0; if wanted.weight { outputs * inputs } else { 0 }];
         let mut biases = vec![0.0; if wanted.bias { outputs } else { 0 }];
         let mut add = false;
@@ -97,8 +97,7 @@ impl Conv1x1 {
             if wanted.weight {
                 let mut read = take(if rectified { inputs * n } else { 0 });
                 let (x, [_, stride]) = self.read(&x[*first..], n, &mut read);
-                let (lhs, rhs) =
-                    ((&dy[*first..], [1, pixels]), Right::new(half, [n, inputs], (x, [stride, 1])));
+                let (lhs, rhs) = ((&dy[*first..], [1, pixels]), Right::Plain((x, [stride, 1])));
                 Multiply { size: [outputs, inputs, n], lhs, rhs: &rhs, add }.write(&mut weights, inputs);
                 drop(rhs);
                 give(read);
@@ -111,7 +110,7 @@ impl Conv1x1 {
             }
             if wanted.input {
                 let mut results = take(inputs * n);
-                let rhs = &Right::new(half, [outputs, n], (&dy[*first..], [1, pixels]));
+                let rhs = &Right::Plain((&dy[*first..], [1, pixels]));
                 Multiply { size: [inputs, n, outputs], lhs: (weight, [inputs, 1]), rhs, add: false }
                     .write(&mut results, n);
                 let channels = out.iter_mut().zip(results.chunks_exact(n)).zip(x.chunks_exact(pixels));

@@ -10,10 +10,8 @@ use rayon::prelude::*;
 
 use super::elements::channel_sums;
 use super::planes::{Planes, Scatter, Transposer};
-use super::windows::Windows;
 use super::{Gradients, Unfolded, Wanted};
 use crate::buffers::{give, take};
-use crate::half::{Unit, unit};
 use crate::wide::convolution::{Bands, Weights};
 use crate::wide::transforms::{POINTS, TILE};
 use crate::wide::{GROUP, pieces};
@@ -41,32 +39,25 @@ pub struct Conv3x3 {
     pub width: usize,
     /// Reads max(x, 0).
     pub rectified: bool,
-    /// Products in bf16, if the processor has them.
-    pub half: bool,
 }
 
 impl Conv3x3 {
     /// `x` `[B, inputs, H, W]`, `weight` `[outputs, inputs, 3, 3]`, `bias` `[outputs]` → `[B, outputs, H, W]`.
     pub fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>) -> Vec<f32> {
-        if let Some(windows) = self.windows() {
-            return windows.forward(x, weight, bias);
-        }
         let filters = Weights { values: weight, strides: [9 * self.inputs, 9], turned: false };
         self.run(x, self.rectified, filters, bias, None)
     }
 
     /// Gradients from that of the output, `dy` `[B, outputs, H, W]`.
     pub fn backward(&self, x: &[f32], weight: &[f32], dy: &[f32], wanted: Wanted) -> Gradients {
-        if let Some(windows) = self.windows() {
-            return windows.backward(x, weight, dy, wanted);
-        }
         let input = wanted.input.then(|| {
             let filters = Weights { values: weight, strides: [9, 9 * self.inputs], turned: true };
             let back = Self { inputs: self.outputs, outputs: self.inputs, ..*self };
             back.run(dy, false, filters, None, self.rectified.then_some(x))
         });
         if wanted.weight && self.batch * self.height * self.width <= FEW_PIXELS {
-            let direct = self.unfolded();
+            let Self { batch, inputs, outputs, height, width, rectified } = *self;
+            let direct = Unfolded { batch, inputs, outputs, height, width, stride: 1, rectified };
             let gradients = direct.backward(x, weight, dy, Wanted { input: false, ..wanted });
             Gradients { input, ..gradients }
         } else if wanted.weight {
@@ -77,17 +68,6 @@ impl Conv3x3 {
             let bias = wanted.bias.then(|| channel_sums(dy, self.batch, self.outputs));
             Gradients { input, weight: None, bias }
         }
-    }
-
-    /// The same by tiles in bf16, which are faster than Winograd's method.
-    fn windows(&self) -> Option<Windows> {
-        let unit = unit().filter(|unit| self.half && *unit == Unit::Amx)?;
-        Some(Windows { sizes: self.unfolded(), unit })
-    }
-
-    fn unfolded(&self) -> Unfolded {
-        let Self { batch, inputs, outputs, height, width, rectified, half } = *self;
-        Unfolded { batch, inputs, outputs, height, width, stride: 1, rectified, half }
     }
 
     /// Winograd's method with any filters; where `mask` is given and not positive, the result is 0.

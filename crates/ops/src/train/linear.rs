@@ -90,8 +90,7 @@ impl Linear {
         let mut dz = before.map(|_| take(rows * outputs));
         let mut sums = vec![0.0; if wanted.bias { blocks * outputs } else { 0 }];
         let [column, row] = self.strides();
-        let transposed =
-            wanted.input.then(|| Right::new(self.half, [outputs, inputs], (weight, [row, column])));
+        let transposed = wanted.input.then(|| Right::Plain((weight, [row, column])));
         let results = parts(dx.as_deref_mut(), ROWS * inputs, blocks).into_par_iter();
         let changed = parts(dz.as_deref_mut(), ROWS * outputs, blocks);
         let totals = parts(wanted.bias.then_some(&mut sums), outputs, blocks);
@@ -126,7 +125,7 @@ impl Linear {
         let ((left, rows), (right, columns)) =
             if self.transposed { (outputs, inputs) } else { (inputs, outputs) };
         let mut out = take(rows * columns);
-        let rhs = &Right::new(self.half, [self.rows, columns], (right, [1, columns]));
+        let rhs = &Right::Plain((right, [1, columns]));
         let block = rows.div_ceil(WEIGHT_TASKS).clamp(WEIGHT_ROWS[0], WEIGHT_ROWS[1]);
         out.par_chunks_mut(block * columns).enumerate().for_each(|(i, out)| {
             let size = [out.len() / columns, columns, self.rows];

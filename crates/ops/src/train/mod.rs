@@ -15,7 +15,6 @@ mod planes;
 mod transposed;
 mod unfolded;
 mod weights3x3;
-mod windows;
 
 #[cfg(test)]
 mod tests;

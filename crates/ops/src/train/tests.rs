@@ -1,9 +1,7 @@
 //! The operators against Burn's in f64, forward and backward, at sizes that reach the corners: channels that fill no
 //! group, tiles and blocks that overhang, single rows.
 
-use super::windows::Windows;
 use super::*;
-use crate::half::tests::units;
 use crate::tests::uniform as random;
 use crate::{Rope, bilinear, host, layers, linear_gelu, plain_attention, rotary_attention};
 use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
@@ -118,61 +116,9 @@ fn convolutions_of_three_taps_equal_burns() {
     }
 }
 
-/// Processors with tiles take windows for stride 1, too. Here every unit does, forward and backward.
-#[test]
-fn windows_equal_burns_with_every_unit() {
-    let sizes = [[1, 1, 1, 1, 1], [2, 5, 7, 2, 3], [1, 33, 48, 9, 13], [2, 20, 40, 18, 70]];
-    for ([batch, inputs, outputs, height, width], stride) in
-        sizes.into_iter().flat_map(|size| [1, 2].map(|stride| (size, stride)))
-    {
-        for (unit, rectified) in
-            units().into_iter().flat_map(|unit| [false, true].map(|rectified| (unit, rectified)))
-        {
-            let what =
-                format!("{unit:?}: {batch}×{inputs}→{outputs} at {height}×{width}, {stride}, {rectified}");
-            let sizes = Unfolded { batch, inputs, outputs, height, width, stride, rectified, half: true };
-            let windows = Windows { sizes, unit };
-            let pixels = height.div_ceil(stride) * width.div_ceil(stride);
-            let x = random(batch * inputs * height * width, 1);
-            let (weight, bias) = (random(outputs * inputs * 9, 2), random(outputs, 3));
-            let dy = random(batch * outputs * pixels, 4);
-            let gradients = windows.backward(&x, &weight, &dy, Wanted::ALL);
-            let got = [windows.forward(&x, &weight, Some(&bias))]
-                .into_iter()
-                .chain([gradients.input, gradients.weight, gradients.bias].into_iter().flatten());
-
-            let exact = |values: &[f32], shape| -> Tensor<4> {
-                let data = TensorData::new(values.to_vec(), shape);
-                Tensor::<4>::from_data(data, &Device::flex().autodiff()).cast(FloatDType::F64).require_grad()
-            };
-            let image = exact(&x, [batch, inputs, height, width]);
-            let filters = exact(&weight, [outputs, inputs, 3, 3]);
-            let added = exact(&bias, [1, 1, 1, outputs]);
-            let read = if rectified { burn::tensor::activation::relu(image.clone()) } else { image.clone() };
-            let options = burn::tensor::ops::ConvOptions::new([stride; 2], [1, 1], [1, 1], 1);
-            let y = burn::tensor::module::conv2d(
-                read,
-                filters.clone(),
-                Some(added.clone().reshape([outputs])),
-                options,
-            );
-            let shape = y.dims();
-            let all = (y.clone() * exact(&dy, shape)).sum().backward();
-            let of = |x: &Tensor<4>| values(x.grad(&all).expect("tracked"));
-            let expected = [values(y), of(&image), of(&filters), of(&added)];
-            for (i, (got, expected)) in got.zip(expected).enumerate() {
-                let got: Vec<f64> = got.into_iter().map(f64::from).collect();
-                assert_close(&format!("{what}, tensor {i}"), &got, &expected);
-            }
-        }
-    }
-}
-
-/// A channel that is positive in one corner only: eight taps never meet it together with a gradient.
 #[test]
 fn taps_that_see_nothing_have_no_gradient() {
-    let conv =
-        Conv3x3 { batch: 1, inputs: 1, outputs: 1, height: 32, width: 32, rectified: true, half: false };
+    let conv = Conv3x3 { batch: 1, inputs: 1, outputs: 1, height: 32, width: 32, rectified: true };
     let mut x = vec![-1.0; 1024];
     x[0] = 0.7;
     let mut dy = vec![0.0; 1024];
@@ -312,11 +258,11 @@ fn everything(half: bool) -> Vec<Vec<f32>> {
     let keep = |all: &mut Vec<_>, g: Gradients| all.extend([g.input, g.weight, g.bias].into_iter().flatten());
     let (x, dy) = (random(2 * 40 * 30 * 50, 1), random(2 * 72 * 30 * 50, 2));
     let (weight, bias) = (random(72 * 40 * 9, 3), random(72, 4));
-    let conv = Conv3x3 { batch: 2, inputs: 40, outputs: 72, height: 30, width: 50, rectified: true, half };
+    let conv = Conv3x3 { batch: 2, inputs: 40, outputs: 72, height: 30, width: 50, rectified: true };
     all.push(conv.forward(&x, &weight, Some(&bias)));
     keep(&mut all, conv.backward(&x, &weight, &dy, Wanted::ALL));
     let (batch, inputs, outputs, height, width) = (2, 40, 72, 30, 50);
-    let conv = Unfolded { batch, inputs, outputs, height, width, stride: 2, rectified: true, half };
+    let conv = Unfolded { batch, inputs, outputs, height, width, stride: 2, rectified: true };
     all.push(conv.forward(&x, &weight, Some(&bias)));
     keep(&mut all, conv.backward(&x, &weight, &dy[..2 * 72 * 15 * 25], Wanted::ALL));
     let conv = Conv1x1 { batch: 2, inputs: 40, outputs: 72, pixels: 1500, rectified: true, half };
@@ -354,8 +300,7 @@ fn the_number_of_threads_changes_no_bit() {
 
 #[test]
 fn only_wanted_gradients_are_found_and_they_are_the_same() {
-    let conv =
-        Conv3x3 { batch: 1, inputs: 3, outputs: 5, height: 6, width: 7, rectified: false, half: false };
+    let conv = Conv3x3 { batch: 1, inputs: 3, outputs: 5, height: 6, width: 7, rectified: false };
     let (x, weight, dy) = (random(3 * 42, 1), random(135, 2), random(5 * 42, 3));
     let all = conv.backward(&x, &weight, &dy, Wanted::ALL);
     for bits in 0..8 {

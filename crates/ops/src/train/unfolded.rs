@@ -5,10 +5,8 @@
 use rayon::prelude::*;
 
 use super::elements::{add_constant, channel_sums, mask, rectify};
-use super::windows::Windows;
 use super::{Gradients, Wanted};
 use crate::buffers::{give, take};
-use crate::half::unit;
 use crate::multiply::{Multiply, Right};
 use crate::wide::pieces;
 
@@ -37,17 +35,12 @@ pub struct Unfolded {
     pub stride: usize,
     /// Reads max(x, 0).
     pub rectified: bool,
-    /// Products in bf16, if the processor has them.
-    pub half: bool,
 }
 
 impl Unfolded {
     /// `x` `[B, inputs, H, W]`, `weight` `[outputs, inputs, 3, 3]`, `bias` `[outputs]` →
     /// `[B, outputs, ⌈H/stride⌉, ⌈W/stride⌉]`.
     pub fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>) -> Vec<f32> {
-        if let Some(windows) = self.windows() {
-            return windows.forward(x, weight, bias);
-        }
         let Self { inputs, outputs, .. } = *self;
         let [rows, columns] = self.size();
         let plane = self.height * self.width;
@@ -80,9 +73,6 @@ impl Unfolded {
 
     /// Gradients from that of the output, `dy` `[B, outputs, ⌈H/stride⌉, ⌈W/stride⌉]`.
     pub fn backward(&self, x: &[f32], weight: &[f32], dy: &[f32], wanted: Wanted) -> Gradients {
-        if let Some(windows) = self.windows() {
-            return windows.backward(x, weight, dy, wanted);
-        }
         let Self { batch, inputs, outputs, .. } = *self;
         let [rows, columns] = self.size();
         let (plane, n) = (self.height * self.width, rows * columns);
@@ -133,11 +123,6 @@ impl Unfolded {
         sums.into_iter().for_each(give);
         let bias = wanted.bias.then(|| channel_sums(dy, batch, outputs));
         Gradients { input: dx, weight, bias }
-    }
-
-    /// The same in bf16, if it is wanted and the processor can.
-    fn windows(&self) -> Option<Windows> {
-        unit().filter(|_| self.half).map(|unit| Windows { sizes: *self, unit })
     }
 
     /// Rows and columns of the output.

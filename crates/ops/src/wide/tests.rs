@@ -18,7 +18,7 @@ fn winograd_is_accurate() {
     let x = random([1, channels, side, side], 3);
     let (weight, bias) = (random([channels, channels, 3, 3], 1), random([channels], 2));
     let (inputs, outputs, rectified) = (channels, channels, false);
-    let layer = Conv3x3 { batch: 1, inputs, outputs, height: side, width: side, rectified, half: false };
+    let layer = Conv3x3 { batch: 1, inputs, outputs, height: side, width: side, rectified };
     let got = layer.forward(&host(x.clone()), &host(weight.clone()), Some(&host(bias.clone())));
     let [x, weight] = [x, weight].map(|tensor| tensor.cast(FloatDType::F64));
     let options = ConvOptions::new([1, 1], [1, 1], [1, 1], 1);

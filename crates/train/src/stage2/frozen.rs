@@ -22,7 +22,7 @@ impl Frozen {
     /// `predictor` has no gradients.
     pub fn new(config: &TrainConfig, predictor: PointPredictor) -> Self {
         let networks = Networks { predictor: Some(predictor), regressors: Vec::new() };
-        let lowered = lower(config.precision(), &networks).predictor.expect("there is one");
+        let lowered = lower(config.training.precision, &networks).predictor.expect("there is one");
         Self { networks, lowered }
     }
 

@@ -155,8 +155,7 @@ impl GaussianTask {
                 let points = anchors(view, self.config.network.pair_degrees, item.side, &window, &device);
                 (view, PointMap { conf: Tensor::zeros([1, item.side, item.side], &device), points })
             };
-            let prediction =
-                Prediction { maps: View::ALL.map(map).to_vec(), window: window.clone(), normals: None };
+            let prediction = Prediction { maps: View::ALL.map(map).to_vec(), window: window.clone() };
             let gaussians = gaussians(&config, &networks, &item, prediction, &Phase::new(false, 0), &device);
             Ok(sums.add(&item, self.shown(&item, gaussians, &device)?, &device)?)
         })?;

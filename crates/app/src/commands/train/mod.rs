@@ -15,7 +15,6 @@ use clap::Args;
 use snapsnap_base::config::Schema;
 use snapsnap_base::file;
 use snapsnap_data::dataset::{Folder, Layout};
-use snapsnap_net::config::Precision;
 use snapsnap_net::weights::schema::{self, Part};
 use snapsnap_net::weights::{WeightFile, random_predictor, random_regressors};
 use snapsnap_train::config::TrainConfig;
@@ -219,23 +218,12 @@ impl<'a> Plan<'a> {
         let begun = output.filter(|_| ranks.gather(&is_begun)[0]);
         let begun = begun.map(|run| Ok::<_, Failure>((run, TrainConfig::from_file(&run.join(CONFIG), &[])?)));
         let begun = begun.transpose()?;
-        // `auto` of a run that is continued is what it was when the run began, on whatever processor that was.
-        if let (Some((_, there)), None) = (&begun, config.training.precision.fixed()) {
-            config.training.precision = there.training.precision;
-        }
-        // All ranks compute in the format of the least of them.
-        let precision = config.training.precision.of_training(&device);
-        let all = ranks.gather(&precision);
-        let precision = if all.contains(&Precision::F32) { Precision::F32 } else { all[0] };
-        config.training.precision = precision.into();
+        let precision = config.training.precision;
         if !device.supports_dtype(precision.dtype()) {
             let (name, precision) = (&arguments.device, precision.name());
             bail!("--device {name}: does not compute in {precision}: set training.precision to f32");
         }
-        let device = match config.training.gradient_checkpointing {
-            true => device.autodiff().gradient_checkpointing(),
-            false => device.autodiff(),
-        };
+        let device = device.autodiff();
         Ok(Self { arguments, config, folders, device, ranks, begun })
     }
 

@@ -286,7 +286,7 @@ fn contradictions_are_refused() {
         Stage1::new(folder.clone(), TRAIN, config).map(drop).expect_err("refused").to_string()
     };
     assert!(message(neighbours.clone()).contains("two that are 72° apart"));
-    let placed = SampleConfig { placed_share: 0.3, ..neighbours };
+    let placed = SampleConfig { placed_share: 0.3, upright: true, ..neighbours };
     assert!(message(placed).contains("`placed_share`: must be 0 unless `network.pair_degrees` is 180"));
     assert!(refusal(Layout::Authors, true).contains("no masks at twice the side"));
 }
