@@ -19,11 +19,11 @@ use snapsnap_base::config::Schema;
 use snapsnap_data::dataset::{Folder, Split};
 use snapsnap_data::prepare::{DataConfig, Subject};
 use snapsnap_data::sample::{Augment, SampleConfig, Stage1, Stage1Batcher, Stage1Item};
-use snapsnap_net::Prediction;
 use snapsnap_net::config::Config;
 use snapsnap_net::network::View;
 use snapsnap_net::steps::Record;
 use snapsnap_net::weights::{random_predictor, save};
+use snapsnap_net::{Prediction, Window};
 use snapsnap_people::synth;
 use snapsnap_train::gradients;
 use snapsnap_train::networks::Networks;
@@ -79,7 +79,9 @@ fn compare(networks: &Networks, config: &Config, items: Vec<Stage1Item>, device:
     let predictor = networks.predictor.as_ref().expect("the predictor is trained");
     let batch = Stage1Batcher.batch(items, device);
     let mut record = Record::default();
-    let prediction = Prediction::new(predictor, config, batch.images, &batch.masks, None, &mut record);
+    let masks = batch.masks.to_data().to_vec::<f32>().expect("numbers");
+    let window = Window::of_predictor(config, Window::around_person(&masks, config.network.resolution));
+    let prediction = Prediction::new(predictor, config, batch.images, &batch.masks, window, &mut record);
     losses(&prediction, &batch.points, &batch.valid, false)
 }
 

@@ -206,10 +206,11 @@ pub fn side_images(photos: [&[f32]; 2], points: &[f32], valid: &[Vec<bool>]) -> 
         let at = 3 * (view * area + i);
         [points[at], points[at + 1], points[at + 2]]
     };
-    let cloud = Cloud::new((0..2).flat_map(|view| {
+    let seen = (0..2).flat_map(|view| {
         let (photo, mask) = (photos[view], &valid[view]);
         (0..area).filter(|&i| mask[i]).map(move |i| (point(view, i), pixel(photo, area, i)))
-    }));
+    });
+    let cloud = Cloud::new(seen);
     (2..valid.len()).map(|view| paint(cloud.as_ref(), |i| point(view, i), &valid[view])).collect()
 }
 

@@ -1,12 +1,13 @@
 //! Photographs on their canvases → predicted points on the canvas, for trainings and for the reconstruction.
 
-use burn::tensor::Tensor;
+use burn::tensor::{Device, Tensor, TensorData};
 use rayon::prelude::*;
-use snapsnap_ops::{has_kernels, host};
+use snapsnap_ops::has_kernels;
 
 use crate::config::{Config, NetworkConfig};
 use crate::crop::Window;
 use crate::network::{Input, PointMap, PointPredictor, View};
+use crate::photograph::Photograph;
 use crate::steps::{Record, Step};
 
 /// Point maps of all views on the predictor's window of the canvas.
@@ -19,20 +20,36 @@ pub struct Prediction {
 }
 
 impl Prediction {
-    /// Predicted point maps of front and back `[B,2,3,S,S]` in [−1, 1], with the masks `[B,2,S,S]`, in a window of the canvas: without
-    /// one, in the window around these people.
+    /// Predicted point maps of one front and back, in the window around the person.
+    ///
+    /// # Panics
+    /// If a photograph's arrays do not have the canvas size.
+    pub fn of_pair(
+        predictor: &PointPredictor,
+        config: &Config,
+        photographs: [&Photograph; 2],
+        device: &Device,
+        record: &mut Record,
+    ) -> Self {
+        let side = config.network.resolution;
+        let masks = photographs.map(|photo| &*photo.mask).concat();
+        let window = Window::of_predictor(config, Window::around_person(&masks, side));
+        let images = photographs.map(|photo| &*photo.rgb).concat();
+        let images = Tensor::from_data(TensorData::new(images, [1, 2, 3, side, side]), device);
+        let masks = Tensor::from_data(TensorData::new(masks, [1, 2, side, side]), device);
+        Self::new(predictor, config, images, &masks, window, record)
+    }
+
+    /// Predicted point maps of front and back `[B,2,3,S,S]` in [−1, 1], with the masks `[B,2,S,S]`, in a window of the canvas.
     pub fn new(
         predictor: &PointPredictor,
         config: &Config,
         images: Tensor<5>,
         masks: &Tensor<4>,
-        window: Option<Window>,
+        window: Window,
         record: &mut Record,
     ) -> Self {
         let [b, _, colors, side, _] = images.dims();
-        let window = window.unwrap_or_else(|| {
-            Window::of_predictor(config, Window::around_person(&host(masks.clone()), side))
-        });
         let input = record.timed("input", |_| {
             // All fronts, then all backs.
             let photographs = images.swap_dims(0, 1).reshape([2 * b, colors, side, side]);

@@ -2,11 +2,10 @@
 
 use std::time::Duration;
 
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::Device;
 use snapsnap_splat::{Camera, Gaussians, RigidTransform};
 
 use crate::config::{Config, RotationFrame, WorldFrame};
-use crate::crop::Window;
 use crate::gaussians::{Origin, Painted, Painter};
 use crate::network::{PointPredictor, View};
 use crate::photograph::Photograph;
@@ -124,13 +123,8 @@ impl Reconstructor {
             assert_eq!(sizes, expected, "{name} photograph on a canvas of {side}²");
         }
         let mut record = Record::new(&self.device, stage);
-        let masks = photographs.map(|photo| photo.mask.as_slice()).concat();
-        let window = Window::of_predictor(&self.config, Window::around_person(&masks, side));
-        let images = photographs.map(|photo| photo.rgb.as_slice()).concat();
-        let images = Tensor::from_data(TensorData::new(images, [1, 2, 3, side, side]), &self.device);
-        let masks = Tensor::from_data(TensorData::new(masks, [1, 2, side, side]), &self.device);
         let prediction =
-            Prediction::new(&self.predictor, &self.config, images, &masks, Some(window), &mut record);
+            Prediction::of_pair(&self.predictor, &self.config, photographs, &self.device, &mut record);
         let mut points = record.timed("canvas", |_| Points::new(prediction.pasted(network)));
         let painter = Painter {
             config: &self.config,

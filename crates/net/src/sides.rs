@@ -1,24 +1,25 @@
 //! Colours of the unseen sides: every side point takes the colour of the nearest front or back point
 //! (docs/method.md, "Side colours").
 
-use std::collections::{BTreeMap, BTreeSet};
 use std::num::NonZeroUsize;
 
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 
 /// Value of a side pixel without a point, or far from every photographed one.
 pub const EMPTY: f32 = -1.0;
-/// Distance in metres beyond which a point takes no colour: it is no part of the photographed person.
-pub const FARTHEST: f32 = 0.5;
-/// Distance in metres up to which the neighbour is the nearest of all. Farther from all points, a k-d tree visits most of them, and the
-/// points of a cube of [`CUBE`] metres share the neighbour of its middle.
+/// Distance in metres up to which the neighbour is the nearest of all. A k-d tree visits most of its points for a point
+/// that is far from all of them. Such points have their neighbours in a thinned cloud.
 const NEAR: f32 = 0.05;
-const CUBE: f32 = 0.005;
+/// Least number of points in a thinned cloud.
+const THINNED: usize = 20_000;
 
 /// Coloured points among which the nearest of each side point is found.
 pub struct Cloud {
     tree: ImmutableKdTree<f32, 3>,
     colors: Vec<[f32; 3]>,
+    /// Every `step`-th point, for points farther than [`NEAR`].
+    thinned: ImmutableKdTree<f32, 3>,
+    step: usize,
 }
 
 impl Cloud {
@@ -30,8 +31,12 @@ impl Cloud {
         if points.is_empty() {
             return None;
         }
-        let tree = ImmutableKdTree::new_from_slice(&points).expect("fewer points than u32 can number");
-        Some(Self { tree, colors })
+        let step = (points.len() / THINNED).max(1);
+        let some = points.iter().copied().step_by(step).collect::<Vec<_>>();
+        let [tree, thinned] = [points, some].map(|points| {
+            ImmutableKdTree::new_from_slice(&points).expect("fewer points than u32 can number")
+        });
+        Some(Self { tree, colors, thinned, step })
     }
 
     /// Number of points.
@@ -44,28 +49,24 @@ impl Cloud {
         self.colors.is_empty()
     }
 
-    /// Colour of the nearest neighbour of each point (metres), on all cores; [`EMPTY`] for points that are not finite or farther than
-    /// [`FARTHEST`] from all.
+    /// Colour of the nearest neighbour of each point (metres), on all cores; [`EMPTY`] for points that are not finite.
     pub fn nearest_colors(&self, points: &[[f32; 3]]) -> Vec<[f32; 3]> {
-        // What is not finite is far from everything.
-        let safe = points.iter().map(|p| if is_finite(p) { *p } else { [f32::MAX; 3] }).collect::<Vec<_>>();
-        let mut found = self.within(&safe, NEAR);
-        let cube = |p: &[f32; 3]| p.map(|v| (v / CUBE).floor() as i32);
-        let far = || (0..safe.len()).filter(|i| found[*i].is_none());
-        let cubes: BTreeSet<[i32; 3]> = far().map(|i| cube(&safe[i])).collect();
-        let middles = cubes.iter().map(|cube| cube.map(|v| CUBE * (v as f32 + 0.5))).collect::<Vec<_>>();
-        let of_cubes: BTreeMap<_, _> = cubes.iter().zip(self.within(&middles, FARTHEST)).collect();
-        for i in far().collect::<Vec<_>>() {
-            found[i] = of_cubes[&cube(&safe[i])];
+        let mut colors = vec![[EMPTY; 3]; points.len()];
+        let mut left: Vec<usize> = (0..points.len()).filter(|i| is_finite(&points[*i])).collect();
+        for (tree, distance, step) in [(&self.tree, NEAR, 1), (&self.thinned, f32::INFINITY, self.step)] {
+            let queries: Vec<[f32; 3]> = left.iter().map(|i| points[*i]).collect();
+            let found = tree.query_batch(&queries).nearest_n::<SquaredEuclidean<f32>>(NonZeroUsize::MIN);
+            let found = found.within(distance * distance).execute();
+            let mut nearest = found.iter().map(|found| found.first());
+            left.retain(|i| match nearest.next().flatten() {
+                Some(found) => {
+                    colors[*i] = self.colors[step * found.item as usize];
+                    false
+                }
+                None => true,
+            });
         }
-        found.into_iter().map(|row| row.map_or([EMPTY; 3], |row| self.colors[row as usize])).collect()
-    }
-
-    /// The rows of the nearest neighbours of points that have one within a distance in metres.
-    fn within(&self, points: &[[f32; 3]], distance: f32) -> Vec<Option<u32>> {
-        let found = self.tree.query_batch(points).nearest_n::<SquaredEuclidean<f32>>(NonZeroUsize::MIN);
-        let found = found.within(distance * distance).execute();
-        found.iter().map(|found| found.first().map(|found| found.item)).collect()
+        colors
     }
 }
 
@@ -79,12 +80,20 @@ mod tests {
     use super::*;
 
     #[test]
-    fn colours_come_from_the_nearest_point_within_half_a_metre() {
+    fn colours_come_from_the_nearest_point() {
         let points = [[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 3.0, 0.0]];
         let cloud = Cloud::new(points.into_iter().zip([[0.1; 3], [0.2; 3], [0.3; 3]])).expect("points");
-        let queries =
-            [[0.0, 2.9, 0.0], [0.0, 0.0, 5.0], [-0.6, 0.2, 0.0], [1.49, 0.0, 0.0], [1.51, 0.0, 0.0]];
-        assert_eq!(cloud.nearest_colors(&queries), [[0.3; 3], [EMPTY; 3], [0.2; 3], [0.1; 3], [EMPTY; 3]]);
+        let queries = [[0.0, 2.99, 0.0], [0.0, 9.0, 0.0], [-0.6, 0.2, 0.0], [7.0, 0.0, 0.0]];
+        assert_eq!(cloud.nearest_colors(&queries), [[0.3; 3], [0.3; 3], [0.2; 3], [0.1; 3]]);
+    }
+
+    /// The points of a line, each with its place as its colour.
+    #[test]
+    fn far_points_have_a_neighbour_near_the_nearest() {
+        let line = (0..100_000).map(|i| i as f32 * 1e-5);
+        let cloud = Cloud::new(line.map(|x| ([x, 0.0, 0.0], [x; 3]))).expect("points");
+        let found = cloud.nearest_colors(&[[0.30001, 0.04, 0.0], [0.30001, 0.2, 0.0]]);
+        assert!((found[0][0] - 0.30001).abs() < 1e-6 && (found[1][0] - 0.30001).abs() <= 5e-5, "{found:?}");
     }
 
     #[test]
@@ -93,8 +102,8 @@ mod tests {
         let bad = [([f32::NAN, 0.0, 0.0], [0.0; 3]), ([f32::INFINITY; 3], [0.0; 3])];
         let cloud = Cloud::new(bad.into_iter().chain(same)).expect("points");
         assert_eq!(cloud.len(), 5000);
-        let queries = [[1.0, 2.0, 3.1], [1e30; 3], [f32::NAN; 3], [f32::NEG_INFINITY; 3]];
-        assert_eq!(cloud.nearest_colors(&queries), [[0.5; 3], [EMPTY; 3], [EMPTY; 3], [EMPTY; 3]]);
+        let queries = [[1.0, 2.0, 3.1], [1e15; 3], [f32::NAN; 3], [f32::NEG_INFINITY; 3]];
+        assert_eq!(cloud.nearest_colors(&queries), [[0.5; 3], [0.5; 3], [EMPTY; 3], [EMPTY; 3]]);
         assert!(Cloud::new(bad.into_iter()).is_none());
     }
 }

@@ -67,7 +67,7 @@ impl PointTask {
         let predictor = networks.predictor.as_ref().expect("stage 1 trains the predictor");
         let window = Window::of_predictor(&self.networks, extent);
         let images = batch.images.clone();
-        Prediction::new(predictor, &self.networks, images, &batch.masks, Some(window), &mut Record::default())
+        Prediction::new(predictor, &self.networks, images, &batch.masks, window, &mut Record::default())
     }
 
     /// Predicted maps of a sample on the whole canvas.

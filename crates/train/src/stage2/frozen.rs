@@ -1,11 +1,6 @@
 //! A frozen point predictor.
 
-use burn::tensor::{Device, Tensor, TensorData};
-use snapsnap_data::sample::Stage2Item;
-use snapsnap_net::Prediction;
-use snapsnap_net::config::Config;
 use snapsnap_net::network::PointPredictor;
-use snapsnap_net::steps::Record;
 
 use crate::config::TrainConfig;
 use crate::networks::Networks;
@@ -30,19 +25,4 @@ impl Frozen {
     pub fn predictor(&self, is_step: bool) -> &PointPredictor {
         if is_step { &self.lowered } else { self.networks.predictor.as_ref().expect("set in `new`") }
     }
-}
-
-/// A predictor's point maps of one sample.
-pub(super) fn of_sample(
-    predictor: &PointPredictor,
-    config: &Config,
-    item: &Stage2Item,
-    device: &Device,
-) -> Prediction {
-    let side = item.side;
-    let images = item.photographs.each_ref().map(|photo| &*photo.rgb).concat();
-    let images = Tensor::from_data(TensorData::new(images, [1, 2, 3, side, side]), device);
-    let masks = item.photographs.each_ref().map(|photo| &*photo.mask).concat();
-    let masks = Tensor::from_data(TensorData::new(masks, [1, 2, side, side]), device);
-    Prediction::new(predictor, config, images, &masks, None, &mut Record::default())
 }

@@ -17,6 +17,7 @@ use snapsnap_data::sample::{SampleConfig, Stage2, Stage2Item};
 use snapsnap_eval::lpips::Lpips;
 use snapsnap_net::config::{Config, RegressorStart};
 use snapsnap_net::network::{PointMap, PointPredictor, View, anchors};
+use snapsnap_net::steps::Record;
 use snapsnap_net::weights::random_regressors;
 use snapsnap_net::{Prediction, Window};
 use snapsnap_ops::{host, mean};
@@ -32,7 +33,7 @@ use crate::ranks::Ranks;
 use crate::task::{Moment, Part, Task, Validation};
 use snapsnap_eval::preview::{grid, heat, picture};
 
-use frozen::{Frozen, of_sample};
+use frozen::Frozen;
 pub use scene::anisotropy_penalty;
 use scene::{Phase, gaussians, targets};
 use scores::Scores;
@@ -102,16 +103,20 @@ impl GaussianTask {
     /// Predicts the points of a sample's photographs with the trained or the frozen predictor, in a step or in a validation.
     fn predict(&self, networks: &Networks, item: &Stage2Item, is_step: bool) -> Prediction {
         let inner = self.device.clone().inner();
-        match (&networks.predictor, &self.frozen) {
-            (Some(predictor), _) => {
-                let device = if is_step { &self.device } else { &inner };
-                of_sample(predictor, &self.config, item, device)
-            }
+        let (predictor, device) = match (&networks.predictor, &self.frozen) {
+            (Some(predictor), _) => (predictor, if is_step { &self.device } else { &inner }),
             (None, frozen) => {
                 let frozen = frozen.as_ref().expect("a predictor that is not trained is frozen");
-                of_sample(frozen.predictor(is_step), &self.config, item, &inner)
+                (frozen.predictor(is_step), &inner)
             }
-        }
+        };
+        Prediction::of_pair(
+            predictor,
+            &self.config,
+            item.photographs.each_ref(),
+            device,
+            &mut Record::default(),
+        )
     }
 
     /// Gaussians of all views, for validations.
