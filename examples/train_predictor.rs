@@ -79,7 +79,7 @@ fn compare(networks: &Networks, config: &Config, items: Vec<Stage1Item>, device:
     let predictor = networks.predictor.as_ref().expect("the predictor is trained");
     let batch = Stage1Batcher.batch(items, device);
     let mut record = Record::default();
-    let masks = batch.masks.to_data().to_vec::<f32>().expect("numbers");
+    let masks = batch.masks.to_data().try_to_vec::<f32>().expect("numbers");
     let window = Window::of_predictor(config, Window::around_person(&masks, config.network.resolution));
     let prediction = Prediction::new(predictor, config, batch.images, &batch.masks, window, &mut record);
     losses(&prediction, &batch.points, &batch.valid, false)

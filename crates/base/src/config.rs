@@ -228,9 +228,7 @@ pub fn is_gone<T: Schema>(key: &str, value: &str) -> bool {
     // 4 is 4.0.
     let number = |text: &str| text.parse::<f64>().ok();
     let is_same = |now: &&str| *now == value || number(now).is_some_and(|now| number(value) == Some(now));
-    T::REMOVED
-        .iter()
-        .any(|(gone, values)| *gone == key && (values.is_empty() || values.iter().any(|now| is_same(now))))
+    T::REMOVED.iter().any(|(gone, values)| *gone == key && (values.is_empty() || values.iter().any(is_same)))
 }
 
 /// Puts `above` over `below`, section by section and key by key.

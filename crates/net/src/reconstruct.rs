@@ -99,7 +99,7 @@ impl Reconstructor {
         self
     }
 
-    /// Leaves the colours of the unseen sides out: the regressor gets [`EMPTY`] instead.
+    /// Leaves the colours of the unseen sides out: the regressor gets −1 instead.
     pub fn without_side_colors(mut self) -> Self {
         self.side_colors = false;
         self

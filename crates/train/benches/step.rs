@@ -117,7 +117,7 @@ fn run(seconds: f64, side: usize, batch: usize) {
         let time = measure(seconds, || {
             let start = Instant::now();
             let predictor = precision.lower(masters.clone());
-            let input = Input { images: images.clone(), grid: grid.clone() };
+            let input = Input { images: images.clone(), grid };
             let raw = predictor.raw(&predictor.decode(predictor.encode(input)));
             let loss = Tensor::cat(raw.into_iter().map(|raw| raw.square().mean()).collect(), 0).sum();
             let forward = start.elapsed();

@@ -321,11 +321,11 @@ fn one(arguments: &Arguments, paths: [&PathBuf; 2]) -> Result<(), Failure> {
         report["times"] = times.collect();
         report["mesh"] = json!(surface);
         // A pipe or a device may be stdout.
-        return if file::is_special(output) {
-            Ok(say::err(&report.to_string()))
-        } else {
-            say::json(&report.to_string())
-        };
+        if file::is_special(output) {
+            say::err(&report.to_string());
+            return Ok(());
+        }
+        return say::json(&report.to_string());
     }
     if arguments.verbose {
         print("steps");
