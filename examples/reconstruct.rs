@@ -33,8 +33,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let placement = told.placement(config);
     let photographs = read(&sources, Cutting::Given, config.network.resolution, placement, told.focal)?;
 
-    let person = person(&photographs, &networks, &told, &|module| println!("{module}"));
-    let person = person.map_err(|steps| format!("no Gaussian came out: {steps:?}"))?;
+    let person = person(&photographs, &networks, &told, &|module| println!("{module}"))?;
     for (module, time) in &person.made.times {
         println!("{module:<26} {:>8.1} ms", 1e3 * time.as_secs_f64());
     }

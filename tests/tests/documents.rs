@@ -1,5 +1,5 @@
-//! Every command that README and docs show, but for the notes, in the order in which they show it, on less work: two people, a few steps, small
-//! pictures. A shell reads the pages' blocks, so that its variables and loops count; the programs it would start are recorded
+//! Every command that README and docs show, but for the notes, in the order in which they show it, on less work: two people,
+//! a few steps, small pictures. A shell reads the pages' blocks, so that its variables and loops count; the programs it would start are recorded
 //! and then run here. Commands within the text are looked at: programs, benches, tests and options must be there.
 #![cfg(unix)]
 

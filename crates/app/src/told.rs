@@ -2,7 +2,7 @@
 
 use clap::Args;
 use snapsnap_net::config::Config;
-use snapsnap_photo::{DISTANCES, ELEVATIONS, FOCALS, Told, Unplaced, unplaced};
+use snapsnap_photo::{DISTANCES, ELEVATIONS, FOCALS, Told, Unplaced};
 
 use crate::failure::{Failure, bail};
 
@@ -26,16 +26,18 @@ pub struct CameraArguments {
 impl CameraArguments {
     /// What the user says. Refuses impossible values, and all if the networks of a config do not see photographs as a user's.
     pub fn told(&self, config: &Config, as_is: bool) -> Result<Told, Failure> {
-        let why = unplaced(config, as_is).map(|why| match why {
+        let Self { height, focal, distance, elevation } = *self;
+        let told = Told { as_is, height, focal, distance, elevation };
+        let why = told.unplaced(config).map(|why| match why {
             Unplaced::AsIs => "with --as-is the cameras are the nominal ones",
             Unplaced::Compat => "weights in `mode.compat` have the published demo's cameras",
             Unplaced::Mirrored => "`mode.world_frame` is mirrored",
         });
         let options = [
-            ("--height", self.height, 0.1..=10.0),
-            ("--focal", self.focal, FOCALS),
-            ("--distance", self.distance, DISTANCES),
-            ("--elevation", self.elevation, ELEVATIONS),
+            ("--height", height, 0.1..=10.0),
+            ("--focal", focal, FOCALS),
+            ("--distance", distance, DISTANCES),
+            ("--elevation", elevation, ELEVATIONS),
         ];
         for (name, value, range) in options {
             let Some(value) = value else { continue };
@@ -46,7 +48,6 @@ impl CameraArguments {
                 bail!("{name}: {why}");
             }
         }
-        let Self { height, focal, distance, elevation } = *self;
-        Ok(Told { as_is, height, focal, distance, elevation })
+        Ok(told)
     }
 }

@@ -44,14 +44,17 @@ pub enum ConfigError {
     },
 }
 
+/// Keys that are gone, dotted, each with the values (as TOML) that mean what the program does now; without values, all do.
+pub type Removed = &'static [(&'static str, &'static [&'static str])];
+
 /// The type of a config. Every key has a default, so that a file may hold any part of it.
 pub trait Schema: DeserializeOwned + Serialize {
     /// Former names of keys with the present ones, dotted. A former name is refused with the present one in the message.
     const RENAMED: &'static [(&'static str, &'static str)] = &[];
 
-    /// Keys that are gone, dotted, each with the values (as TOML) that mean what the program does now. With them a key is ignored, so
-    /// that older files open; other values are refused.
-    const REMOVED: &'static [(&'static str, &'static [&'static str])] = &[];
+    /// Keys that are gone, section after section. With a value that means what the program does now, a key is ignored, so that older
+    /// files open; other values are refused.
+    const REMOVED: &'static [Removed] = &[];
 
     /// The dotted key of the first refused value, and the reason.
     fn refusal(&self) -> Option<(String, String)>;
@@ -205,7 +208,7 @@ fn check_names<T: Schema>(table: &mut Table, origin: &str) -> Result<bool, Confi
         }
     }
     let mut is_older = false;
-    for (gone, values) in T::REMOVED {
+    for (gone, values) in T::REMOVED.iter().copied().flatten() {
         let (section, key) = gone.rsplit_once('.').expect("a dotted key");
         let mut at = Some(&mut *table);
         for name in section.split('.') {
@@ -228,7 +231,8 @@ pub fn is_gone<T: Schema>(key: &str, value: &str) -> bool {
     // 4 is 4.0.
     let number = |text: &str| text.parse::<f64>().ok();
     let is_same = |now: &&str| *now == value || number(now).is_some_and(|now| number(value) == Some(now));
-    T::REMOVED.iter().any(|(gone, values)| *gone == key && (values.is_empty() || values.iter().any(is_same)))
+    let mut all = T::REMOVED.iter().copied().flatten();
+    all.any(|(gone, values)| *gone == key && (values.is_empty() || values.iter().any(is_same)))
 }
 
 /// Puts `above` over `below`, section by section and key by key.
@@ -310,8 +314,7 @@ mod tests {
 
     impl Schema for Config {
         const RENAMED: &'static [(&'static str, &'static str)] = &[("network.width", "network.dim")];
-        const REMOVED: &'static [(&'static str, &'static [&'static str])] =
-            &[("network.slope", &["4.0"]), ("network.cache", &[])];
+        const REMOVED: &'static [Removed] = &[&[("network.slope", &["4.0"])], &[("network.cache", &[])]];
 
         fn refusal(&self) -> Option<(String, String)> {
             (self.network.dim > 9).then(|| ("network.dim".into(), "must be at most 9".into()))

@@ -4,7 +4,7 @@
 use rayon::prelude::*;
 
 use crate::buffers::{give_words, take_words};
-use crate::half::{self, Left, PANEL, SLACK, Source};
+use crate::half::{self, PANEL, SLACK, Source};
 
 /// A matrix in f32: values, and their (column, row) strides in elements.
 pub type Matrix<'a> = (&'a [f32], [usize; 2]);
@@ -86,12 +86,7 @@ impl Multiply<'_> {
             let mut words = take_words((blocks * packed + SLACK) * half::PAIRS);
             let (rows, _) = words.as_chunks_mut();
             source.pack_left(&mut rows[..blocks * packed]);
-            let starts: Vec<_> = (0..blocks).map(|block| block * packed).collect();
-            let left = Left { values: rows, starts: &starts, rows: source.count };
-            let firsts: Vec<_> = (0..blocks).map(|block| block * half::PAIRS * PANEL).collect();
-            let panel = blocks * half::PAIRS * PANEL;
-            let right = half::Right { values: rhs, starts: &firsts, pair: PANEL, panel };
-            half::product(left, right, columns, |row, column, sums| {
+            half::product(&source, rows, rhs.as_chunks::<PANEL>().0, columns, |row, column, sums| {
                 let out = &mut out[(first + row) * stride + column..][..sums.len()];
                 match add {
                     true => out.iter_mut().zip(sums).for_each(|(out, sum)| *out += sum),

@@ -19,17 +19,11 @@ impl Rope {
     ///
     /// The angles are computed in f64: token positions reach the hundreds on large canvases.
     pub fn new(rows: usize, columns: usize, head_dim: usize, base: f64, device: &Device) -> Self {
-        let positions: Vec<_> = (0..rows * columns).map(|token| [token / columns, token % columns]).collect();
-        Self::at(&positions, head_dim, base, device)
-    }
-
-    /// As [`Rope::new`], for tokens at these positions (row, column).
-    pub fn at(positions: &[[usize; 2]], head_dim: usize, base: f64, device: &Device) -> Self {
         assert_eq!(head_dim % 4, 0, "head_dim {head_dim} must be a multiple of 4");
         let pairs = head_dim / 4;
         let (mut cos, mut sin) = (Vec::new(), Vec::new());
-        for token in positions {
-            for position in *token {
+        for token in 0..rows * columns {
+            for position in [token / columns, token % columns] {
                 let angles = (0..pairs).map(|k| position as f64 * base.powf(-(k as f64) / pairs as f64));
                 let (s, c): (Vec<f32>, Vec<f32>) =
                     angles.map(f64::sin_cos).map(|(s, c)| (s as f32, c as f32)).unzip();
@@ -38,7 +32,7 @@ impl Rope {
                 sin.extend(s);
             }
         }
-        let tensor = |values| Tensor::from_data(TensorData::new(values, [positions.len(), head_dim]), device);
+        let tensor = |values| Tensor::from_data(TensorData::new(values, [rows * columns, head_dim]), device);
         Self { cos: tensor(cos), sin: tensor(sin) }
     }
 

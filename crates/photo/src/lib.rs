@@ -31,7 +31,7 @@ use snapsnap_net::Photograph;
 use cutout::Cutout;
 pub use doubts::{Doubt, Sign};
 use exposure::match_back;
-pub use person::{DISTANCES, DistanceBy, ElevationBy, Person, Seat, Told, Unplaced, person, unplaced};
+pub use person::{DISTANCES, DistanceBy, ElevationBy, NoGaussian, Person, Seat, Told, Unplaced, person};
 use placing::together;
 pub use placing::{Mapping, on_canvas};
 pub use planes::PlaneMap;

@@ -47,6 +47,17 @@ impl Told {
             _ => Placement::Training { height },
         }
     }
+
+    /// Why cameras and heights have no effect with the networks of a config, if so.
+    pub fn unplaced(&self, config: &Config) -> Option<Unplaced> {
+        match self.placement(config) {
+            Placement::AsIs => Some(Unplaced::AsIs),
+            Placement::Demo { .. } => Some(Unplaced::Compat),
+            Placement::Training { .. } => {
+                (config.world_frame() == WorldFrame::Mirrored).then_some(Unplaced::Mirrored)
+            }
+        }
+    }
 }
 
 /// Why cameras and heights have no effect.
@@ -58,15 +69,6 @@ pub enum Unplaced {
     Compat,
     /// The world is mirrored.
     Mirrored,
-}
-
-/// Why cameras and heights have no effect with these networks, if so.
-pub fn unplaced(config: &Config, as_is: bool) -> Option<Unplaced> {
-    match (as_is, config.mode.compat) {
-        (true, _) => Some(Unplaced::AsIs),
-        (_, true) => Some(Unplaced::Compat),
-        _ => (config.world_frame() == WorldFrame::Mirrored).then_some(Unplaced::Mirrored),
-    }
 }
 
 /// Where a camera stood, and how that is known.
@@ -197,11 +199,26 @@ pub struct Person {
     pub made: Reconstruction,
 }
 
+/// No Gaussian came out of photographs.
+#[derive(Debug)]
+pub struct NoGaussian {
+    /// What the networks did.
+    pub steps: Vec<Step>,
+}
+
+impl fmt::Display for NoGaussian {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "no Gaussian came out of these photographs")
+    }
+}
+
+impl std::error::Error for NoGaussian {}
+
 /// The person in the photographs of front and back, as their cameras saw it, at its height. `stage` is called with the name of each module
 /// before it runs.
 ///
 /// # Errors
-/// The steps, if no Gaussian came out of them.
+/// [`NoGaussian`].
 ///
 /// # Panics
 /// If there are not two photographs on canvases of the networks' size.
@@ -210,16 +227,16 @@ pub fn person(
     networks: &Reconstructor,
     told: &Told,
     stage: &dyn Fn(&'static str),
-) -> Result<Person, Vec<Step>> {
+) -> Result<Person, NoGaussian> {
     let [front, back] = &*photographs.canvases else { panic!("a person needs two photographs") };
     let config = networks.config();
     let made = networks.reconstruct([front, back], stage);
     if made.gaussians.is_empty() {
-        return Err(made.steps);
+        return Err(NoGaussian { steps: made.steps });
     }
     let mut gaussians = made.in_world(config);
     let mut seats = None;
-    if unplaced(config, told.as_is).is_none() {
+    if told.unplaced(config).is_none() {
         let side = config.network.resolution;
         let [floor, top] = range(&host(gaussians.means.clone()));
         let here = [0, 1].map(|i| told.seat(&photographs.frames[i], side, top - floor));

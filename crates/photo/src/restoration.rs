@@ -64,8 +64,7 @@ impl Restoration {
         Self { maps: [0, 1].map(map), scale: 1.0, front: nominal(0, SIDE) }
     }
 
-    /// The person where the cameras saw it. Means are in metres in the nominal front camera's frame, before and after. Times
-    /// [`Self::scale`] they are in the frame of [`Self::front`]. Gaussians of photographed pixels belong to their photograph, the others
+    /// The person where the cameras saw it, from the nominal front camera's frame to the frame of [`Self::front`], metres. Gaussians of photographed pixels belong to their photograph, the others
     /// to the photograph that shows their half of the body. Gaussians that a camera does not see stay.
     pub fn person(&self, gaussians: Gaussians, origins: &[Origin]) -> Gaussians {
         let to_camera = nominal(0, self.front.width).world_to_camera;
@@ -83,7 +82,7 @@ impl Restoration {
         let [front, back] = self.maps.map(|map| map.apply_all(&world));
         let restored = front.mask_where(is_back, back) / self.scale;
         let means = affine(restored, &to_camera.rotation, to_camera.translation);
-        Gaussians { means, ..gaussians }
+        Gaussians { means, ..gaussians }.scaled(self.scale)
     }
 }
 

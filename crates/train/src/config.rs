@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
-use snapsnap_base::config::outside;
+use snapsnap_base::config::{Removed, outside};
 use snapsnap_data::dataset::Split;
 use snapsnap_data::sample::SampleConfig;
 use snapsnap_eval::lpips::MIN_SIDE;
@@ -218,21 +218,17 @@ impl Schema for TrainConfig {
         ("stage2.points", "stage2.points_weight"),
     ];
 
-    const REMOVED: &'static [(&'static str, &'static [&'static str])] = &{
-        let [a, b, c, d] = Config::GONE;
-        [
-            a,
-            b,
-            c,
-            d,
+    const REMOVED: &'static [Removed] = &[
+        Config::GONE,
+        &[
             ("samples.augment.blur", &["0.0"]),
             ("samples.augment.noise", &["0.0"]),
             ("training.gradient_checkpointing", &["false"]),
             ("stage1.normals_weight", &["0.05", "0.0"]),
             ("stage2.point_noise", &["0.0"]),
             ("stage2.point_map_cache", &[]),
-        ]
-    };
+        ],
+    ];
 
     fn refusal(&self) -> Option<(String, String)> {
         self.networks().refusal().or_else(|| self.problem())

@@ -1,6 +1,6 @@
 //! Properties of the networks that hold for any weights.
 
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::{Device, Int, Tensor, TensorData};
 use snapsnap_base::config::Schema;
 use snapsnap_net::config::{Config, Downsample, NetworkConfig, Upsample};
 use snapsnap_net::network::{Grid, Input, PointMap, View, activate};
@@ -79,10 +79,14 @@ fn rope_depends_on_relative_positions_only() {
         TensorData::new(noise(rows * columns * d, 2), [1, 1, rows * columns, d]),
         &device,
     );
+    // A part of a larger grid.
+    let [height, width] = [8, 15];
+    let Rope { cos, sin } = Rope::new(height, width, d, 100.0, &device);
     let scores = |origin: [usize; 2]| {
-        let positions: Vec<_> =
-            (0..rows * columns).map(|i| [origin[0] + i / columns, origin[1] + i % columns]).collect();
-        let rope = Rope::at(&positions, d, 100.0, &device);
+        let token = |i: usize| ((origin[0] + i / columns) * width + origin[1] + i % columns) as i64;
+        let tokens = (0..rows * columns).map(token).collect::<Vec<_>>();
+        let tokens = Tensor::<1, Int>::from_data(TensorData::new(tokens, [rows * columns]), &device);
+        let rope = Rope { cos: cos.clone().select(0, tokens.clone()), sin: sin.clone().select(0, tokens) };
         values(rope.apply(q.clone()).matmul(rope.apply(k.clone()).swap_dims(2, 3)))
     };
     let error = relative_error(&scores([5, 11]), &scores([0, 0]));

@@ -118,9 +118,10 @@ fn checkpoints_reach_the_disk_in_their_order() {
         let folder = to.parent().expect("lies in a folder").canonicalize().expect("a folder");
         let from = folder.join(from.file_name().expect("a name"));
         assert!(synced(&calls[..i], &from), "{call}: before its data");
-        let next = calls[i + 1..].iter().position(|call| call.contains("rename"));
-        let before_next = &calls[i + 1..next.map_or(calls.len(), |next| i + 1 + next)];
-        assert!(synced(before_next, &folder), "{call}: the folder is not synced");
+        // Of this thread.
+        let of_thread = |other: &&&str| other.split(' ').next() == call.split(' ').next();
+        let after = calls[i + 1..].iter().filter(of_thread).take_while(|call| !call.contains("rename"));
+        assert!(synced(&after.copied().collect::<Vec<_>>(), &folder), "{call}: the folder is not synced");
         renamed.push(to.file_name().expect("a name").to_string_lossy().into_owned());
     }
     // The first state is written before the first step.

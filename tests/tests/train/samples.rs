@@ -38,7 +38,7 @@ fn samples_without_a_person_are_skipped_and_named() {
         let nobody = image::RgbaImage::new(64, 64);
         nobody.save(copy.join(format!("train/img/0001/{view}.png"))).expect("writes");
     }
-    let set = ["--set=training.steps=9", "--set=training.batch=1", "--set=network.conf_threshold=0.999"];
+    let set = ["--set=training.steps=9", "--set=training.batch=1"];
     succeed(train(1, &config, &one).args(set));
     let run = temporary.path().join("run");
     let mut command = train_on(&copy, 2, &config, &run);

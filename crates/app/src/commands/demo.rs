@@ -83,7 +83,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let precision = PrecisionChoice::Auto.of_weights(&config, &device);
     let networks = Reconstructor::load(&weights, &device)?.in_precision(precision);
     let made = snapsnap_photo::person(&read, &networks, &told, &|name| progress.stage(name));
-    let world = made.unwrap_or_else(|steps| panic!("the sample pair shows a person: {steps:?}")).gaussians;
+    let world = made.map_err(|none| Failure::Input(none.to_string()))?.gaussians;
     let seconds = since.elapsed().as_secs_f64();
     progress.stage("writing");
     scene::write(&world, &folder.file("human.ply"))?;

@@ -157,10 +157,8 @@ fn read_all(
 
 /// The person of two photographs.
 fn make(photographs: &Photographs, networks: &Reconstructor, told: &Told) -> Result<Stored, Failure> {
-    match snapsnap_photo::person(photographs, networks, told, &|_| ()) {
-        Ok(person) => Ok(Stored::of(&person.gaussians)?),
-        Err(_) => bail!("no Gaussian came out of these photographs"),
-    }
+    let person = snapsnap_photo::person(photographs, networks, told, &|_| ());
+    Ok(Stored::of(&person.map_err(|none| Failure::Input(none.to_string()))?.gaussians)?)
 }
 
 /// Writes all people.

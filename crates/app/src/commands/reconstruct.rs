@@ -15,7 +15,7 @@ use snapsnap_net::config::{Config, OPPOSITE};
 use snapsnap_net::precision::{Precision, PrecisionChoice, cpu_has_bf16};
 use snapsnap_net::weights::WeightFile;
 use snapsnap_net::weights::schema::Part;
-use snapsnap_photo::{Cutting, Photographs, Source, Told};
+use snapsnap_photo::{Cutting, Person, Photographs, Source, Told};
 use snapsnap_splat::scene::Stored;
 
 use super::convert::AxesArguments;
@@ -272,33 +272,35 @@ fn one(arguments: &Arguments, paths: [&PathBuf; 2]) -> Result<(), Failure> {
     let (networks, precision) = arguments.model.load(&weights, &device)?;
     timed("loading weights", since);
     let person = snapsnap_photo::person(&photographs, &networks, &told, &|name| progress.stage(name));
-    let mut person = person.map_err(|steps| {
-        let steps: String = steps.iter().map(|step| format!("\n  {step}")).collect();
-        let why = format!("no Gaussian came out, so nothing was written; the steps:{steps}");
-        Failure::file(weights.path(), why)
+    let Person { gaussians, seats, mut made } = person.map_err(|none| {
+        let steps: String = none.steps.iter().map(|step| format!("\n  {step}")).collect();
+        Failure::file(weights.path(), format!("{none}, so nothing was written; the steps:{steps}"))
     })?;
-    times.append(&mut person.made.times);
+    times.append(&mut made.times);
 
     progress.stage("writing");
     let since = Instant::now();
-    arguments.axes.write(&Stored::of(&person.gaussians)?, output)?;
+    arguments.axes.write(&Stored::of(&gaussians)?, output)?;
     if let Some(path) = &config_path {
         output::write(path, config.resolved().to_toml().as_bytes())?;
     }
     if let Some(path) = &arguments.dump {
-        dump::write(&person.made, path)?;
+        dump::write(&made, path)?;
     }
+    // The maps need memory that turntable and mesh use.
+    let steps = std::mem::take(&mut made.steps);
+    drop(made);
     times.push(("writing", since.elapsed()));
     drop(progress);
     if let Some(turntable) = &turntable {
         let since = Instant::now();
-        turntable.write(&person.gaussians)?;
+        turntable.write(&gaussians)?;
         times.push(("turntable", since.elapsed()));
     }
     let mut surface = None;
     if let Some(target) = &target {
         let since = Instant::now();
-        surface = Some(mesh::describe(&target.write(&person.gaussians.clone().into(), output)?));
+        surface = Some(mesh::describe(&target.write(&gaussians.clone().into(), output)?));
         times.push(("mesh", since.elapsed()));
     }
     times.push(("total", start.elapsed()));
@@ -313,11 +315,11 @@ fn one(arguments: &Arguments, paths: [&PathBuf; 2]) -> Result<(), Failure> {
         let times = times.iter().map(|(name, time)| json!({ "module": name, "seconds": time.as_secs_f64() }));
         let mut report = Value::Object(settings.into_iter().collect());
         report["output"] = json!(output.display().to_string());
-        report["gaussians"] = json!(person.gaussians.len());
+        report["gaussians"] = json!(gaussians.len());
         report["photographs"] = json!(photographs.reports);
         report["doubts"] = json!(photographs.doubts);
-        report["cameras"] = json!(person.seats);
-        report["steps"] = json!(person.made.steps);
+        report["cameras"] = json!(seats);
+        report["steps"] = json!(steps);
         report["times"] = times.collect();
         report["mesh"] = json!(surface);
         // A pipe or a device may be stdout.
@@ -333,8 +335,8 @@ fn one(arguments: &Arguments, paths: [&PathBuf; 2]) -> Result<(), Failure> {
         let of_both = |what: &dyn Display, i: usize| line(&format!("{}: {what}", ["front", "back"][i]));
         settings.iter().for_each(|(name, value)| line(&format!("{name}: {value}")));
         photographs.reports.iter().enumerate().for_each(|(i, report)| of_both(report, i));
-        person.made.steps.iter().for_each(|step| line(step));
-        person.seats.iter().flatten().enumerate().for_each(|(i, seat)| of_both(seat, i));
+        steps.iter().for_each(|step| line(step));
+        seats.iter().flatten().enumerate().for_each(|(i, seat)| of_both(seat, i));
         surface.iter().for_each(|surface| line(surface));
         print("time, device synchronised");
         for (name, time) in times {
@@ -342,7 +344,7 @@ fn one(arguments: &Arguments, paths: [&PathBuf; 2]) -> Result<(), Failure> {
         }
     }
     if !say::is_quiet() {
-        print(&format!("{}: {} Gaussians", output.display(), person.gaussians.len()));
+        print(&format!("{}: {} Gaussians", output.display(), gaussians.len()));
     }
     Ok(())
 }

@@ -148,9 +148,8 @@ impl Studio {
         let mut read =
             snapsnap_photo::read(&[source(0), source(1)], Cutting::Missing, side, placement, told.focal)?;
         read.cutouts = Vec::new();
-        let Ok(person) = person(&read, &networks, told, &|step| job.step(step)) else {
-            return Err(text(StatusCode::UNPROCESSABLE_ENTITY, "no Gaussian came out of these photographs"));
-        };
+        let person = person(&read, &networks, told, &|step| job.step(step))
+            .map_err(|none| text(StatusCode::UNPROCESSABLE_ENTITY, &none.to_string()))?;
         let doubts: Vec<String> = read.doubts.iter().map(ToString::to_string).collect();
         let stored = Stored::of(&person.gaussians).map_err(Failure::from)?;
         // The next person may come in an hour.

@@ -11,7 +11,6 @@ mod test_set;
 #[cfg(test)]
 mod tests;
 
-use std::path::Path;
 use std::sync::Arc;
 
 use burn::data::dataset::{Dataset, DatasetError};
@@ -303,13 +302,15 @@ impl Source {
     /// Photographs of front and back as the networks' input: placed on their canvases like a user's, or used unchanged.
     fn photographs(
         &self,
-        paths: [&Path; 2],
-        views: [(&RgbImage, &GrayImage); 2],
+        subject: &str,
+        views: [usize; 2],
+        pictures: [(&RgbImage, &GrayImage); 2],
         is_placed: bool,
         random: &mut impl Rng,
     ) -> Result<Photographs, FileError> {
-        let changed = views.map(|(color, mask)| self.config.augment.apply(color, mask, random));
-        let source = |i: usize| Picture::pixels(paths[i], &changed[i].0, Some(&changed[i].1));
+        let paths = views.map(|view| self.folder.picture_path(self.split, subject, view));
+        let changed = pictures.map(|(color, mask)| self.config.augment.apply(color, mask, random));
+        let source = |i: usize| Picture::pixels(&paths[i], &changed[i].0, Some(&changed[i].1));
         let sources = [source(0), source(1)];
         let height = self.config.person_height;
         let placement = if is_placed { Placement::Training { height } } else { Placement::AsIs };

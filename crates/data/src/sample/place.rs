@@ -2,14 +2,11 @@
 //! (docs/method.md, "Photographs placed as a user's"). A person then always has the same height and place.
 //! Size and distance, which no picture shows, are no part of the task.
 
-use std::path::PathBuf;
-
 use glam::{DVec2, DVec3};
 use rand::Rng;
 use snapsnap_base::FileError;
 use snapsnap_net::Photograph;
 use snapsnap_photo::Restoration;
-use snapsnap_splat::Camera;
 
 use super::rectified::Rectification;
 use super::{INSIDE, Source, pair};
@@ -30,24 +27,8 @@ pub(super) struct Four {
     /// `[2,H,W,3]` and `[2,H,W]`: the same of the second surfaces of right and left. Empty without sides or without
     /// `samples.second_depth`.
     pub second: Points,
-    /// The front camera. The points times `scale` are in its frame: it moves with placed points.
-    pub front: Camera,
-    pub scale: f64,
     /// What moves upright points back to the photographed person.
     pub restoration: Option<Restoration>,
-}
-
-impl Four {
-    /// Photographs alone. `front` is the front photograph's camera.
-    pub(super) fn without_points(
-        photographs: [Photograph; 2],
-        front: Camera,
-        restoration: Option<Restoration>,
-    ) -> Self {
-        let (front, scale) = restoration.as_ref().map_or((front, 1.0), |back| (back.front, back.scale));
-        let (points, valid, second) = Default::default();
-        Self { photographs, points, valid, second, front, scale, restoration }
-    }
 }
 
 impl Source {
@@ -81,11 +62,9 @@ impl Source {
         };
         let seconds =
             if has_sides && self.config.second_depth { vec![second(2)?, second(3)?] } else { Vec::new() };
-        let paths = [0, 1].map(|i| self.folder.picture_path(self.split, subject, order[i]));
-        let paths = paths.each_ref().map(PathBuf::as_path);
-        let photographs =
-            self.photographs(paths, [0, 1].map(|i| (&views[i].color, &views[i].mask)), is_placed, random)?;
-        let (mut front, mut scale, mut restoration) = (views[0].camera, 1.0, None);
+        let pictures = [0, 1].map(|i| (&views[i].color, &views[i].mask));
+        let photographs = self.photographs(subject, [order[0], order[1]], pictures, is_placed, random)?;
+        let mut restoration = None;
         let [mut first, mut second] = <[Points; 2]>::default();
         let add_seen = |to: &mut Points, map: Seen| {
             for seen in map {
@@ -98,7 +77,7 @@ impl Source {
                 [0, 1].map(|i| &views[i].camera),
                 [0, 1].map(|i| &photographs.frames[i].mapping),
             );
-            (front, scale, restoration) = (back.front, back.scale, Some(back));
+            restoration = Some(back);
             (0..2).for_each(|i| add_seen(&mut first, rectification.photographed(&views[i], i)));
             for (to, sides) in [(&mut first, &views[2..]), (&mut second, &seconds)] {
                 let side = |(view, degrees)| rectification.of_side(view, degrees);
@@ -107,7 +86,7 @@ impl Source {
         } else {
             let far = if compat { COMPAT_FAR } else { 0.0 };
             let add = |to: &mut Points, view: &StoredView| {
-                to.0.extend(unproject(&view.depth, &view.camera, &front.world_to_camera, far));
+                to.0.extend(unproject(&view.depth, &view.camera, &views[0].camera.world_to_camera, far));
                 let there = |pixel: usize| match compat {
                     true => view.mask.as_raw()[pixel] >= INSIDE,
                     false => view.depth[pixel] > 0.0,
@@ -119,7 +98,7 @@ impl Source {
         }
         let (points, valid) = first;
         let photographs = pair(photographs.canvases);
-        Ok(Four { photographs, points, valid, second, front, scale, restoration })
+        Ok(Four { photographs, points, valid, second, restoration })
     }
 }
 

@@ -1,6 +1,5 @@
 //! Stage 2: front and back photographs, and target views of the rendered Gaussians.
 
-use std::path::PathBuf;
 use std::sync::Arc;
 
 use rand::Rng;
@@ -28,9 +27,7 @@ pub struct Stage2Item {
     pub photographs: [Photograph; 2],
     /// Cameras of front, back, right and left, side H. The front camera of an upright sample is moved with its points.
     pub cameras: [Camera; 4],
-    /// Scale of an upright sample: the person's size in metres over the size of the points.
-    pub scale: f64,
-    /// Moves upright people to where the photographs' cameras saw them, before they are scaled.
+    /// Moves upright people to where the photographs' cameras saw them.
     pub restoration: Option<Restoration>,
     /// `[4,H,W,3]` points of these views, in metres in the front camera's frame, `[2,H,W,3]` without sides; rectified if people are upright;
     /// empty without `points` of the config.
@@ -99,24 +96,23 @@ impl Stage2Item {
             let picture = |view: usize| folder.picture(*split, subject, view, false);
             let pictures = [picture(front)?, picture(back)?];
             let pictures = pictures.each_ref().map(|(color, mask)| (color, mask));
-            let paths = [front, back].map(|view| folder.picture_path(*split, subject, view));
-            let paths = paths.each_ref().map(PathBuf::as_path);
-            let photographs = source.photographs(paths, pictures, is_placed, &mut random)?;
+            let photographs = source.photographs(subject, [front, back], pictures, is_placed, &mut random)?;
             let mappings = [0, 1].map(|i| &photographs.frames[i].mapping);
             let restoration = config.upright.then(|| {
                 Restoration::to_cameras([&cameras[0], &cameras[1]], mappings, description.resolution)
             });
-            Four::without_points(pair(photographs.canvases), cameras[0], restoration)
+            let (points, valid, second) = Default::default();
+            Four { photographs: pair(photographs.canvases), points, valid, second, restoration }
         };
-        let Four { photographs, points, valid, front, scale, restoration, .. } = four;
-        cameras[0] = front;
-        let (points, valid) = if config.points { (points, valid) } else { Default::default() };
+        let Four { photographs, points, valid, restoration, .. } = four;
+        if let Some(restoration) = &restoration {
+            cameras[0] = restoration.front;
+        }
         Ok(Self {
             name: format!("{}: {subject}, view {first}", folder.root().display()),
             side: description.resolution as usize,
             photographs,
             cameras,
-            scale,
             restoration,
             points,
             valid,

@@ -138,12 +138,12 @@ impl Model {
         let photographs = self.canvases(item, Cutting::All)?;
         let start = Instant::now();
         let person = snapsnap_photo::person(&photographs, &self.reconstructor, &Told::default(), &|_| ());
-        let Person { gaussians, made, .. } = person.map_err(|_| no_gaussian())?;
+        let Person { gaussians, made, .. } = person.map_err(|none| EvalError::Empty(none.to_string()))?;
         let time = start.elapsed();
         let cameras = [&item.cameras[front], &item.cameras[back]];
         let mappings = [0, 1].map(|i| &photographs.frames[i].mapping);
         let restoration = Restoration::to_cameras(cameras, mappings, self.side() as u32);
-        let restored = restoration.person(made.gaussians.clone(), &made.origins).scaled(restoration.scale);
+        let restored = restoration.person(made.gaussians.clone(), &made.origins);
         let restored = restored.transformed(&restoration.front.world_to_camera.inverse());
         let [from, onto] = [&gaussians, &restored].map(|person| host(person.means.clone()));
         let motion = procrustes(from.as_chunks().0, onto.as_chunks().0, true);
@@ -193,7 +193,7 @@ impl Model {
                     [&frames[first].mapping, &frame.mapping],
                     side as u32,
                 );
-                gaussians = restoration.person(gaussians, &origins).scaled(restoration.scale);
+                gaussians = restoration.person(gaussians, &origins);
                 to_world = restoration.front.world_to_camera.inverse();
             }
             parts.push(placed(self.reconstructor.config(), gaussians, &to_world));

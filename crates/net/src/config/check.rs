@@ -1,6 +1,6 @@
 //! The refused values of a config, alone and beside each other.
 
-use snapsnap_base::config::outside;
+use snapsnap_base::config::{Removed, outside};
 
 use crate::weights::schema::{self, TensorSpec};
 
@@ -17,7 +17,7 @@ type Problem = (&'static str, String);
 
 impl Config {
     /// [`Schema::REMOVED`], also for configs that contain this one.
-    pub const GONE: [(&str, &[&str]); 4] = [
+    pub const GONE: Removed = &[
         ("network.drop_empty", &["false"]),
         ("network.normals", &["false"]),
         ("network.steepest", &["4.0"]),
@@ -27,7 +27,7 @@ impl Config {
 }
 
 impl Schema for Config {
-    const REMOVED: &'static [(&'static str, &'static [&'static str])] = &Self::GONE;
+    const REMOVED: &'static [Removed] = &[Self::GONE];
 
     fn refusal(&self) -> Option<(String, String)> {
         let problem = self.size_problem().or_else(|| self.problem()).or_else(|| self.contradiction());

@@ -12,7 +12,7 @@ use std::arch::x86_64::{
 use std::mem::transmute;
 use std::sync::OnceLock;
 
-use super::{BLOCK, Columns, Left, PAIRS, PANEL, Right, Row, Source, Sums};
+use super::{BLOCK, Columns, PAIRS, PANEL, Row, Source, Sums};
 
 /// Whether this processor has the instructions of all functions here.
 #[inline]
@@ -31,18 +31,18 @@ fn check() {
     assert!(is_there(), "this processor computes in bf16");
 }
 
-/// Sums of `rows` (4, 8 or 12) rows from `row` on.
-pub fn block(left: &Left, row: usize, rows: usize, columns: usize, panel: &Right, sums: &mut Sums) {
+/// Sums of the first `rows` (4, 8 or 12) rows. The blocks of the left factor lie `packed` rows apart.
+pub fn block(left: &[Row], packed: usize, rows: usize, columns: usize, panel: &[Columns], sums: &mut Sums) {
     check();
     // SAFETY: the processor has the instructions.
     unsafe {
         match (rows, columns > PAIRS) {
-            (12, true) => kernel::<12, 2>(left, row, panel, sums),
-            (12, false) => kernel::<12, 1>(left, row, panel, sums),
-            (8, true) => kernel::<8, 2>(left, row, panel, sums),
-            (8, false) => kernel::<8, 1>(left, row, panel, sums),
-            (_, true) => kernel::<4, 2>(left, row, panel, sums),
-            (_, false) => kernel::<4, 1>(left, row, panel, sums),
+            (12, true) => kernel::<12, 2>(left, packed, panel, sums),
+            (12, false) => kernel::<12, 1>(left, packed, panel, sums),
+            (8, true) => kernel::<8, 2>(left, packed, panel, sums),
+            (8, false) => kernel::<8, 1>(left, packed, panel, sums),
+            (_, true) => kernel::<4, 2>(left, packed, panel, sums),
+            (_, false) => kernel::<4, 1>(left, packed, panel, sums),
         }
     }
 }
@@ -62,13 +62,16 @@ pub fn pack_right(source: &Source, out: &mut [Columns]) {
 }
 
 #[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
-fn kernel<const ROWS: usize, const VECTORS: usize>(left: &Left, row: usize, panel: &Right, out: &mut Sums) {
+fn kernel<const ROWS: usize, const VECTORS: usize>(
+    left: &[Row],
+    packed: usize,
+    panel: &[Columns],
+    out: &mut Sums,
+) {
     let mut sums = [[_mm512_setzero_ps(); VECTORS]; ROWS];
-    for (start, first) in left.starts.iter().zip(panel.starts) {
-        let rows: &[Row; ROWS] = left.values[start + row..].first_chunk().expect("the block lies inside");
-        for pair in 0..PAIRS {
-            let columns: &Columns =
-                panel.values[first + pair * panel.pair..].first_chunk().expect("the panel lies inside");
+    for (block, panel) in panel.as_chunks::<PAIRS>().0.iter().enumerate() {
+        let rows: &[Row; ROWS] = left[block * packed..].first_chunk().expect("the block lies inside");
+        for (pair, columns) in panel.iter().enumerate() {
             let mut right = [as_halves(_mm512_setzero_si512()); VECTORS];
             for (v, right) in right.iter_mut().enumerate() {
                 *right = as_halves(words(&columns.as_chunks().0[v]));

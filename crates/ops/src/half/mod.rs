@@ -51,30 +51,6 @@ pub fn is_there() -> bool {
     false
 }
 
-/// The left factor of a product.
-#[derive(Clone, Copy)]
-pub struct Left<'a> {
-    /// Rows of all blocks, and [`SLACK`] more.
-    pub values: &'a [Row],
-    /// The first row of each block.
-    pub starts: &'a [usize],
-    /// How many rows.
-    pub rows: usize,
-}
-
-/// The right factor of a product, in panels of 32 columns.
-#[derive(Clone, Copy)]
-pub struct Right<'a> {
-    /// Pairs of k.
-    pub values: &'a [u32],
-    /// Where each block of k begins, in the first panel.
-    pub starts: &'a [usize],
-    /// From one pair to the next.
-    pub pair: usize,
-    /// From one panel to the next.
-    pub panel: usize,
-}
-
 /// Values in f32 that become a factor: rows of the left one, or columns of the right one.
 #[derive(Clone, Copy)]
 pub struct Source<'a> {
@@ -128,31 +104,34 @@ impl Source<'_> {
     }
 }
 
-/// Calls `each` with row, column and the sums from there on, up to 32 of a row, of `left` · `right`.
+/// Calls `each` with row, column and the sums from there on, up to 32 of a row, of `left` · `right`. `left` are the packed rows of
+/// `source` and [`SLACK`] more, `right` the packed columns.
 ///
 /// # Panics
 /// If a factor is smaller than the sizes say, or if the processor lacks the instructions.
-pub fn product(left: Left, right: Right, columns: usize, mut each: impl FnMut(usize, usize, &[f32])) {
-    let panels = columns.div_ceil(PANEL);
-    assert!(left.rows > 0 && panels > 0 && left.starts.len() == right.starts.len());
-    let reach = left.starts.iter().max().map_or(0, |start| start + left.rows + SLACK);
-    assert!(reach <= left.values.len(), "blocks lie inside, with slack");
-    let reach = (panels - 1) * right.panel + (PAIRS - 1) * right.pair + PANEL;
-    assert!(right.starts.iter().all(|start| start + reach <= right.values.len()), "panels lie inside");
+pub fn product(
+    source: &Source,
+    left: &[Row],
+    right: &[Columns],
+    columns: usize,
+    mut each: impl FnMut(usize, usize, &[f32]),
+) {
+    let (rows, packed, depth) = (source.count, source.packed_rows(), source.blocks() * PAIRS);
+    assert!(left.len() >= source.blocks() * packed + SLACK, "blocks lie inside, with slack");
+    assert!(right.len() >= columns.div_ceil(PANEL) * depth, "panels lie inside");
     #[cfg(target_arch = "x86_64")]
     {
         let mut sums: Sums = [[0.0; PANEL]; SLACK];
-        for p in 0..panels {
-            let count = (columns - p * PANEL).min(PANEL);
-            let panel = Right { values: &right.values[p * right.panel..], ..right };
+        for (column, panel) in (0..columns).step_by(PANEL).zip(right.chunks_exact(depth)) {
+            let count = (columns - column).min(PANEL);
             let mut row = 0;
-            while row < left.rows {
-                let rows = block_rows(left.rows - row);
-                avx512::block(&left, row, rows, count, &panel, &mut sums);
-                for (i, sums) in sums[..rows.min(left.rows - row)].iter().enumerate() {
-                    each(row + i, p * PANEL, &sums[..count]);
+            while row < rows {
+                let height = block_rows(rows - row);
+                avx512::block(&left[row..], packed, height, count, panel, &mut sums);
+                for (i, sums) in sums[..height.min(rows - row)].iter().enumerate() {
+                    each(row + i, column, &sums[..count]);
                 }
-                row += rows;
+                row += height;
             }
         }
     }

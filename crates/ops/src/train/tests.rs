@@ -196,9 +196,9 @@ fn rotary_attention_equals_burns() {
     for [batch, queries, keys, heads, head_dim] in [[1, 1, 1, 1, 4], [2, 5, 5, 3, 8], [1, 70, 66, 2, 4]] {
         let c = heads * head_dim;
         let zeros = || Param::from_tensor(Tensor::zeros([batch, keys, c], &device));
-        let ropes = [queries, keys].map(|n| {
-            let positions: Vec<_> = (0..n).map(|token| [token / 4, token % 4]).collect();
-            Rope::at(&positions, head_dim, 100.0, &device)
+        let ropes = [queries, keys].map(|n: usize| {
+            let Rope { cos, sin } = Rope::new(n.div_ceil(4), 4, head_dim, 100.0, &device);
+            Rope { cos: cos.narrow(0, 0, n), sin: sin.narrow(0, 0, n) }
         });
         let run = |pairs: &Pairs, q: Tensor<3>| {
             let (k, v) = (pairs.keys.val(), pairs.values.val());

@@ -71,7 +71,7 @@ pub(super) fn gaussians(
         Some(restoration) => restoration.person(gaussians, &origins),
         None => gaussians,
     };
-    Some(placed(config, person.scaled(item.scale), &to_world))
+    Some(placed(config, person, &to_world))
 }
 
 /// Target pictures `[V,3,h,w]` and masks `[V,h,w]` of the views with these indices.
