@@ -1,4 +1,4 @@
-//! Chromium without a window, asked through its DevTools protocol (messages of JSON that end with a zero byte, on two pipes).
+//! Headless Chromium, controlled by the DevTools protocol: JSON messages that end with a zero byte, over two pipes.
 
 use std::env;
 use std::fs::File;
@@ -13,26 +13,26 @@ use std::time::{Duration, Instant};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-/// Whatever takes longer has failed.
+/// Longest time of a command.
 const PATIENCE: Duration = Duration::from_secs(120);
 
-/// A page of a browser, ended with it.
+/// A page in a browser of its own, which is killed when this is dropped.
 pub struct Page {
     process: Child,
     to: File,
     from: Receiver<Value>,
     last: u64,
     session: Option<String>,
-    /// Addresses that the page asked for.
+    /// URLs that the page requested.
     pub requests: Vec<String>,
-    /// Errors on its console, and uncaught ones.
+    /// Errors on the page's console, and uncaught errors.
     pub errors: Vec<String>,
     _folder: TempDir,
 }
 
 impl Drop for Page {
     fn drop(&mut self) {
-        // Its helpers are in its group, and end with it where there is no `kill`.
+        // The browser's helpers are in its process group. Without the program `kill` they end with the browser.
         let group = format!("-{}", self.process.id());
         let _ = Command::new("kill").args(["-KILL", "--", &group]).status();
         let _ = self.process.kill();
@@ -52,8 +52,8 @@ fn program() -> Option<PathBuf> {
 }
 
 impl Page {
-    /// An empty page of so many pixels, drawn by a software GPU; `None`, said aloud, where there is no browser. That is an error
-    /// where `SNAPSNAP_REQUIRE_CHROMIUM` is set.
+    /// An empty page of `width` × `height` pixels, drawn by a software GPU. Without a browser: `None` and a printed
+    /// note, or a panic if `SNAPSNAP_REQUIRE_CHROMIUM` is set.
     pub fn new(width: u32, height: u32) -> Option<Self> {
         Self::with_options(
             width,
@@ -75,13 +75,13 @@ impl Page {
         let script = r#"to=$1 from=$2; shift 2; exec "$@" 3<"$to" 4>"$from""#;
         let mut command = Command::new("sh");
         command.args(["-c", script, "sh"]).args(&pipes).arg(program);
-        // Its own sandbox needs rights that containers do not give; the page is ours.
+        // Chromium's sandbox needs rights that containers do not have. All pages are our own.
         command.args(["--headless", "--no-sandbox", "--remote-debugging-pipe", "--no-first-run"]);
         command.args(options);
         command.arg(format!("--user-data-dir={}", folder.path().join("profile").display()));
         command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
         let process = command.process_group(0).spawn().expect("a shell");
-        // In the order in which the shell opens them: each waits for the other end.
+        // The shell opens the pipes in this order, too: opening one end waits for the other.
         let to = File::options().write(true).open(&pipes[0]).expect("a pipe");
         let mut reader = BufReader::new(File::open(&pipes[1]).expect("a pipe"));
         let (sender, from) = channel();
@@ -150,7 +150,7 @@ impl Page {
         }
     }
 
-    /// What an expression of JavaScript gives, awaited if it is a promise.
+    /// The value of a JavaScript expression. A promise is awaited.
     pub fn value(&mut self, expression: &str) -> Value {
         let wanted = json!({ "expression": expression, "awaitPromise": true, "returnByValue": true });
         let found = self.ask("Runtime.evaluate", wanted);
@@ -167,7 +167,7 @@ impl Page {
         }
     }
 
-    /// Chooses a file in the field that a selector names.
+    /// Chooses a file in the input field of a CSS selector.
     pub fn choose(&mut self, selector: &str, file: &Path) {
         let field = format!("document.querySelector({})", json!(selector));
         let found = self.ask("Runtime.evaluate", json!({ "expression": field }));
@@ -183,7 +183,7 @@ impl Page {
         }
     }
 
-    /// Presses the left button at one place of the page and lets it go at another, pixels.
+    /// Drags the left mouse button from one place of the page to another, in pixels.
     pub fn drag(&mut self, from: [f64; 2], to: [f64; 2]) {
         const STEPS: i32 = 5;
         let place =

@@ -29,7 +29,7 @@ const JOINTS: [(&str, Option<usize>, [f32; 3]); 20] = [
     ("mixamorig:RightFoot", Some(17), [-0.1, 0.08, 0.0]),
     ("mixamorig:LeftToeBase", Some(15), [0.1, 0.02, 0.15]),
 ];
-/// Ends of the bones: the row of the joint that moves it, and the place where it ends.
+/// Bones: the row of the joint that moves the bone, and the place where the bone ends.
 const BONES: [(usize, [f32; 3]); 16] = [
     (0, [0.0, 1.15, 0.0]),
     (1, [0.0, 1.5, 0.0]),
@@ -49,8 +49,8 @@ const BONES: [(usize, [f32; 3]); 16] = [
     (2, [0.0, 1.6, 0.0]),
 ];
 
-/// The character. Its mesh is stored `units` times as large as life, and the skin brings it back; `change` may change the
-/// description before it is written.
+/// The character. Its mesh is stored `units` times too large, and the inverse bind matrices of its skin scale it back.
+/// `change` edits the description before it is written.
 pub fn character(units: f32, change: impl FnOnce(&mut Value)) -> Vec<u8> {
     let (mut positions, mut joints, mut weights, mut rows) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     let mut texcoords = Vec::new();

@@ -126,7 +126,7 @@ pub fn snapsnap() -> Command {
             "--target-dir",
         ]);
         build.arg(target);
-        // Those of the tests' own build.
+        // The features of the tests' own build.
         if let Some(features) = std::env::var_os("SNAPSNAP_FEATURES") {
             build.arg("--features").arg(features);
         }
@@ -312,8 +312,8 @@ pub fn assert_close<const D: usize>(
     assert!(error <= bound, "{what}: relative error {error:.3e} > {bound:.0e}");
 }
 
-/// EXIF data of a telephone: a focal length in millimetres of 35 mm film, and Apple's maker note with an acceleration in thousandths of
-/// gravity.
+/// EXIF data of a phone: the focal length in mm on 35 mm film, and Apple's maker note with the acceleration in
+/// thousandths of gravity.
 pub fn exif(focal: u16, acceleration: [i32; 3]) -> Vec<u8> {
     let entry = |tag: u16, kind: u16, count: u32, value: [u8; 4]| {
         [&tag.to_be_bytes()[..], &kind.to_be_bytes(), &count.to_be_bytes(), &value].concat()

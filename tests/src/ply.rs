@@ -5,7 +5,7 @@ use crate::scenes::Random;
 /// A Gaussian's numbers by property name, as text.
 pub type Row = Vec<(String, f64)>;
 
-/// A person-sized cloud in the files' own terms (logits, logarithms, SH coefficients).
+/// A cloud of the size of a person, with values as files store them (logits, logarithms, SH coefficients).
 pub fn cloud(n: usize, degree: usize) -> Vec<Row> {
     let mut random = Random(4);
     let mut between = |low: f32, high: f32| f64::from(random.between(low, high));
@@ -38,7 +38,7 @@ pub fn cloud(n: usize, degree: usize) -> Vec<Row> {
         .collect()
 }
 
-/// How the numbers are written.
+/// Encoding of the numbers.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Format {
     /// As text.

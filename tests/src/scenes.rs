@@ -30,7 +30,7 @@ impl Random {
 pub struct HostScene {
     /// One Gaussian after another.
     pub gaussians: Vec<[f32; 14]>,
-    /// Colour behind them.
+    /// Colour of the background.
     pub background: [f32; 3],
 }
 
@@ -46,7 +46,7 @@ pub fn forward_camera(width: u32, height: u32) -> Camera {
     }
 }
 
-/// Seen by [`forward_camera`]: all around the image and beyond its border, 1 to 4 m away, some opaque, some faint.
+/// Random Gaussians for [`forward_camera`]: in the image and beyond its border, 1 to 4 m away, opaque to faint.
 pub fn random_scene(n: usize, seed: u64) -> HostScene {
     let mut r = Random(seed);
     let gaussian = |_| {
@@ -61,7 +61,7 @@ pub fn random_scene(n: usize, seed: u64) -> HostScene {
     HostScene { gaussians: (0..n).map(gaussian).collect(), background: [0.2, 0.5, 0.9] }
 }
 
-/// What came out of one pass forward and backward.
+/// Result of a forward and a backward pass.
 #[derive(Clone, Debug)]
 pub struct Pass {
     /// `[V,H,W,5]`: red, green, blue, alpha, depth.
@@ -70,7 +70,7 @@ pub struct Pass {
     pub gradient: Vec<[f32; 14]>,
     /// ∂L/∂background.
     pub background: [f32; 3],
-    /// What was seen and what was left out.
+    /// Numbers of visible and of culled Gaussians.
     pub counts: Counts,
 }
 
@@ -85,7 +85,7 @@ pub struct Tracked {
 }
 
 impl Tracked {
-    /// The set that [`render`] takes.
+    /// The tracked tensors as Gaussians.
     pub fn gaussians(&self) -> Gaussians {
         let [means, rotations, scales, colors] = self.rows.clone();
         Gaussians::new(means, rotations, scales, self.opacities.clone(), colors).expect("shapes")
@@ -93,7 +93,7 @@ impl Tracked {
 }
 
 impl HostScene {
-    /// For the oracle.
+    /// The scene in f64, for the oracle.
     pub fn in_f64(&self) -> Scene<f64> {
         Scene {
             gaussians: self.gaussians.iter().map(|g| g.map(f64::from)).collect(),
@@ -106,7 +106,7 @@ impl HostScene {
         TensorData::new(values, [self.gaussians.len(), count])
     }
 
-    /// On `device`, tracked where the device is an autodiff one.
+    /// The scene's tensors on `device`, tracked if it is an autodiff device.
     pub fn on(&self, device: &Device) -> Tracked {
         let rows = |first, count| {
             let tensor = Tensor::<2>::from_data(self.columns(first, count), device);

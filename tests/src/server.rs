@@ -7,10 +7,10 @@ use std::process::{Child, Command, Stdio};
 
 use crate::snapsnap;
 
-/// A server, ended with the test.
+/// A server process, which is killed when this is dropped.
 pub struct Server {
     process: Child,
-    /// On 127.0.0.1.
+    /// Port on 127.0.0.1.
     pub port: u16,
 }
 
@@ -29,7 +29,7 @@ impl Server {
         Self::started(command)
     }
 
-    /// A studio on a free port, whose canvases have so many pixels.
+    /// A studio on a free port, with canvases of `resolution`² pixels.
     pub fn studio(resolution: u32) -> Self {
         let mut command = snapsnap();
         command.args(["studio", "--device", "cpu", "--set", &format!("network.resolution={resolution}")]);
@@ -81,7 +81,7 @@ impl Server {
 
     fn answer(&self, request: &[u8]) -> (u16, String, Vec<u8>) {
         let mut stream = TcpStream::connect(("127.0.0.1", self.port)).expect("connected");
-        // A server that refuses a body need not read it.
+        // The server may close the connection before it has read a refused body.
         let _ = stream.write_all(request);
         let mut answer = Vec::new();
         stream.read_to_end(&mut answer).expect("answered");

@@ -14,7 +14,7 @@ use snapsnap_tests::{refused, shared, snapsnap, succeed};
 /// Settings of small and few views.
 const SMALL: [&str; 4] = ["--set", "views.count=4", "--set", "views.resolution=64"];
 
-/// A folder of as many people, each in one file.
+/// A folder of characters, one file each.
 fn folder(people: usize) -> tempfile::TempDir {
     let folder = tempfile::tempdir().expect("temporary folder");
     for person in 0..people {
@@ -48,7 +48,7 @@ fn skinned_meshes_stand_where_their_joints_put_them() {
     assert!((high.y - (1.45 + 0.7 + 0.04)).abs() < 1e-4, "{high}");
 }
 
-/// Whether the mesh is closed to a person: upright, on the floor, of a person's height.
+/// Asserts that the mesh is valid, stands on the floor and has a person's height.
 fn assert_stands(mesh: &Mesh, name: &str) {
     assert_eq!(mesh.check(), Ok(()), "{name}");
     let (low, high) = mesh.bounds();

@@ -1,4 +1,4 @@
-//! Many people in one command: tables and folders of pairs, folders of Gaussians; what is there is left out, and what fails is listed.
+//! Many people in one command: tables and folders of pairs, folders of Gaussians; reruns and failures.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -22,7 +22,7 @@ fn reconstruct(pairs: &Path, output: &Path) -> Command {
     command
 }
 
-/// A command that makes some and fails for others: exit code 1, and the rows of the list of failures.
+/// Runs a command that fails for some people (exit code 1). Returns the rows of the list of failures.
 fn failed(command: &mut Command, list: &Path) -> Vec<[String; 2]> {
     let output = command.output().expect("starts");
     let said = String::from_utf8_lossy(&output.stderr).into_owned();
@@ -70,7 +70,7 @@ fn a_table_of_pairs_becomes_the_people_of_single_calls() {
         [single, out.join("anna.ply"), out.join("other.ply"), out.join("turned.ply")]
             .map(|path| fs::read(path).expect("reads"));
     assert!(expected == anna && anna == other && anna != turned);
-    // The next run makes what failed, and only that.
+    // The next run makes only the failed people.
     pair(&photographs, "broken.png", "missing.png");
     fs::write(out.join("anna.ply"), b"kept").expect("written");
     let said = succeed(&mut reconstruct(&table, &out));
@@ -80,12 +80,12 @@ fn a_table_of_pairs_becomes_the_people_of_single_calls() {
         names(&out),
         ["anna.ply", "bad.ply", "lost.ply", "other.ply", "pairs.config.toml", "turned.ply"]
     );
-    // Others than before.
+    // Other settings than before.
     for options in [["--set", "regressor.margin=24"], ["--height", "1.8"]] {
         let said = refused(reconstruct(&table, &out).args(options));
         assert!(said.contains("pairs.config.toml") && said.contains("other settings"), "{options:?}: {said}");
     }
-    // The same weights in another place are the same, and others in the same place are others.
+    // Weights are compared by their content, not by their path.
     let weights = temporary.path().join("weights.safetensors");
     let mut bytes = fs::read(root().join("assets/weights/default.safetensors")).expect("reads");
     fs::write(&weights, &bytes).expect("written");
@@ -201,7 +201,7 @@ fn wrong_batches_are_refused() {
     assert!(refused(&mut reconstruct(&table, &out)).contains("pairs.csv"));
     assert!(refused(&mut reconstruct(Path::new("/dev/zero"), &out)).contains("/dev/zero"));
     assert!(!out.exists(), "nothing was made");
-    // A table is where the list of failures would be.
+    // The table has the path of the list of failures.
     fs::create_dir(&out).expect("made");
     let list = out.join("errors.csv");
     fs::write(&list, "front,back\nx_front.png,x_back.png\n").expect("written");
@@ -222,7 +222,7 @@ fn wrong_batches_are_refused() {
     assert!(said.contains("folder of the inputs"), "{said}");
 }
 
-/// A full disk ends the command, since the next people could not be written either. An interrupted one goes on where it was.
+/// A full disk ends the command, since the next people could not be written either. An interrupted command continues.
 #[cfg(unix)]
 #[test]
 fn batches_end_on_a_full_disk_and_go_on_after_a_kill() {

@@ -1,4 +1,4 @@
-//! The page of `snapsnap view` in a browser: what it shows is what `snapsnap render` shows.
+//! The page of `snapsnap view` in a browser: its pictures agree with `snapsnap render`.
 #![cfg(target_os = "linux")]
 
 use std::fs;
@@ -12,12 +12,12 @@ use snapsnap_tests::server::Server;
 use snapsnap_tests::{data, root, snapsnap, succeed};
 
 const SIDE: u32 = 768;
-/// Whatever takes longer has failed.
+/// Longest time until a state of the page.
 const PATIENCE: Duration = Duration::from_secs(120);
-/// Fewer dB between the page and our own render are two pictures.
+/// Least PSNR between the page and our own render, dB.
 const ALIKE: f64 = 25.0;
 
-/// A screenshot as the page's button saves it, once the Gaussians are sorted for this camera: nothing changes any more.
+/// Saves a screenshot as the page's button does, once it no longer changes: the Gaussians are sorted for this camera.
 fn screenshot(page: &mut Page, path: &Path) {
     let bytes = |page: &mut Page| {
         let found = page.value(
@@ -39,8 +39,8 @@ fn screenshot(page: &mut Page, path: &Path) {
     }
 }
 
-/// Waits until nothing is drawn any more, and looks whether the middle of what is on the screen, which no button covers, is what a
-/// screenshot would be.
+/// Waits until the page stops drawing. Then the middle of the screen, which no button covers, must show what a
+/// screenshot shows.
 fn check_rest(page: &mut Page, folder: &Path) {
     let end = Instant::now() + PATIENCE;
     let drawn = |page: &mut Page| page.value("snapsnap.renderer.info.render.frame");
@@ -98,7 +98,7 @@ fn agreement(page: &mut Page, file: &Path, folder: &Path) -> f64 {
     found["psnr"].as_f64().unwrap_or(f64::INFINITY)
 }
 
-/// Where the camera is: degrees around the person and above the horizon, and metres from what it turns around.
+/// The camera's degrees around the person and above the horizon, and its distance from the orbit's centre in metres.
 fn place(page: &mut Page) -> [f64; 3] {
     let camera = page.value("snapsnap.camera()");
     let entry =
@@ -144,7 +144,7 @@ fn a_browser_shows_the_person_and_turns_it() {
     };
     page.value(&choose("#000000"));
 
-    // From the front, and turned by a drag, once it has come to rest.
+    // From the front, and after a drag, once the camera is at rest.
     let front = agreement(&mut page, &file, folder);
     check_rest(&mut page, folder);
     let [yaw, pitch, away] = place(&mut page);
@@ -156,9 +156,9 @@ fn a_browser_shows_the_person_and_turns_it() {
     let turned = agreement(&mut page, &file, folder);
     check_rest(&mut page, folder);
     let [yaw, pitch, _] = place(&mut page);
-    // 150 of 768 pixels are 70°, and it runs on a little.
+    // 150 of 768 pixels are 70°, and the camera coasts a little.
     assert!((60.0..150.0).contains(&yaw) && (pitch - 8.0).abs() < 0.1, "{yaw} {pitch}");
-    // A wheel brings it nearer, a button to the person's back.
+    // The wheel moves the camera nearer, a button moves it behind the person.
     let wheel = json!({ "type": "mouseWheel", "x": 384, "y": 384, "deltaX": 0, "deltaY": -240 });
     page.ask("Input.dispatchMouseEvent", wheel);
     let end = Instant::now() + PATIENCE;
@@ -177,7 +177,7 @@ fn a_browser_shows_the_person_and_turns_it() {
     );
     assert!(front.min(turned).min(back) >= ALIKE, "{front} {turned} {back}");
 
-    // Arrows turn, with Shift they shift. Digits are sides. A double click moves the centre of turning to the body's surface.
+    // Arrows rotate, and pan with Shift. Digits choose a side. A double click sets the orbit's centre.
     let close = |a: f64, b: f64| (a - b).abs() < 0.1;
     page.press("1", false);
     page.press("ArrowRight", false);
@@ -212,7 +212,7 @@ fn a_browser_shows_the_person_and_turns_it() {
     assert_eq!(page.value("getComputedStyle(document.getElementById('keys')).display"), "block");
     page.press("?", false);
 
-    // A mesh says what is being done.
+    // The mesh's download shows its progress.
     page.value(
         "{ window.said = new Set(); window.saved = []; const message = document.getElementById('message'); \
          new MutationObserver(() => window.said.add(message.textContent)).observe(message, { childList: true }); \
@@ -229,7 +229,7 @@ fn a_browser_shows_the_person_and_turns_it() {
         "{said}"
     );
 
-    // The background is the colour that was chosen.
+    // The background has the chosen colour.
     page.value(&choose("chosen"));
     page.value(
         "{ const chosen = document.getElementById('background'); chosen.value = '#806040'; \
@@ -241,7 +241,7 @@ fn a_browser_shows_the_person_and_turns_it() {
     let corner = image::open(&shot).expect("a picture").into_rgb8().get_pixel(1, 1).0;
     assert!(corner.iter().zip([128, 96, 64]).all(|(c, chosen)| c.abs_diff(chosen) <= 1), "{corner:?}");
 
-    // Another file, dropped on it; what is no such file is told, and the page goes on.
+    // A dropped file is shown. An unreadable one gets a message, and the page continues.
     let drop = |name: &str, bytes: &[u8]| {
         format!(
             "{{ const transfer = new DataTransfer();\

@@ -1,4 +1,4 @@
-//! Cameras of a user's photographs: what files and options say, and the person's height.
+//! Cameras of a user's photographs: EXIF data, options, and the person's height.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -41,7 +41,7 @@ fn a_person_has_the_given_height() {
         top - floor
     });
     assert!((1.09..1.12).contains(&low), "{low}");
-    // All lengths alike.
+    // All lengths have the same factor.
     assert!(usual.len() == child.len() && usual.len() > 1000);
     for (a, b) in usual.iter().zip(&child) {
         assert!((0..3).all(|c| (a[c] * low / high - b[c]).abs() < 2e-3), "{a:?} {b:?}");
@@ -59,7 +59,7 @@ fn a_restored_person_stands_on_the_floor() {
     assert!(nominal.iter().zip(&level).any(|(a, b)| (a[1] - b[1]).abs() > 0.01));
 }
 
-/// A telephone's file has its lens and its tilt. The same as options give the same person.
+/// A phone's file has its focal length and its tilt. The same values as options give the same person.
 #[test]
 fn a_telephone_tells_its_lens_and_its_tilt() {
     let temporary = tempfile::tempdir().expect("temporary folder");
@@ -77,7 +77,7 @@ fn a_telephone_tells_its_lens_and_its_tilt() {
         let path = folder.join(side).with_extension("jpg");
         over.save(&path).expect("written");
         let bytes = fs::read(&path).expect("read");
-        // Behind the start of the image: a segment APP1. The telephone looks up by 10 degrees.
+        // Behind the start of the image: a segment APP1. The phone looks up by 10 degrees.
         let tiff = snapsnap_tests::exif(26, [0, -985, 174]);
         let length = (tiff.len() + 8) as u16;
         let segment = [b"\xff\xe1", &length.to_be_bytes()[..], b"Exif\0\0", &tiff].concat();
@@ -102,7 +102,7 @@ fn a_telephone_tells_its_lens_and_its_tilt() {
     assert!(own.iter().zip(&unknown).all(|(a, b)| (a[2] - b[2]).abs() < 1e-5));
 }
 
-/// A person far beside the middle of a wide-angle picture is the one of a picture that was taken straight ahead, if the lens is known.
+/// A known lens corrects a person far from the middle of a wide-angle picture.
 #[test]
 fn a_known_lens_turns_pictures_towards_the_person() {
     const FOCAL: f64 = 0.8 * 1024.0;

@@ -1,4 +1,4 @@
-//! What the program says of itself and of the machine.
+//! `doctor`, help, manual pages, completions, and messages about weights and drivers.
 
 use std::fs;
 
@@ -93,7 +93,7 @@ fn weights_of_another_size_are_refused_in_a_few_lines() {
         "{said}"
     );
     assert!(said.lines().count() < 4, "{said}");
-    // Weights of an import have no config to compare.
+    // An import has no stored config to compare.
     let said = refused(
         snapsnap()
             .args(["import-weights", "-o", "x.safetensors"])
@@ -174,7 +174,7 @@ fn without_arguments_a_newcomer_reads_the_first_steps() {
     assert!(!message.contains('\u{1b}'));
 }
 
-/// On a terminal that `script` pretends to be.
+/// The program `script` imitates a terminal.
 #[test]
 #[cfg(target_os = "linux")]
 fn colours_are_for_terminals_that_want_them() {

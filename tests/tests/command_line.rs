@@ -37,14 +37,14 @@ impl Workplace {
         command
     }
 
-    /// The same without a device.
+    /// As [`Self::reconstruct`], without `--device`.
     fn reconstruct_anywhere(&self, front: &str, back: &str) -> Command {
         let mut command = snapsnap();
         command.current_dir(self.0.path()).args(["reconstruct", front, back, "--weights", "w"]);
         command
     }
 
-    /// The message with which `reconstruct` refuses; nothing may have been written.
+    /// The message of a refused command, which may write nothing.
     fn refusal(&self, command: &mut Command) -> String {
         let before = self.files();
         let message = refused(command);

@@ -1,4 +1,4 @@
-//! Photographs with a background: the network that removes it, the edges and colours that it leaves, and the options.
+//! Photographs with a background: the matting network, the edges and colours of cut-outs, and the options.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;

@@ -1,4 +1,4 @@
-//! What works without any training or download: the demo, and reconstructions with the default weights.
+//! The demo, and reconstructions with the default weights, without any training or download.
 
 use std::fs;
 
@@ -9,8 +9,8 @@ use snapsnap_net::weights::{Source, WeightFile, save};
 use snapsnap_splat::scene;
 use snapsnap_tests::{refused, root, snapsnap, succeed};
 
-/// Worse than this on the person, seen from elsewhere, is no reconstruction: the photographs as flat cut-outs give 15 dB and
-/// less (docs/notes/evaluation.md).
+/// Least PSNR on the person in unseen views. The photographs as flat cut-outs have at most 15 dB
+/// (docs/notes/evaluation.md).
 const LEAST_DB: f64 = 16.0;
 
 #[test]
@@ -49,7 +49,7 @@ fn a_demo_is_made_of_the_sample_pair_and_looks_like_the_person() {
     assert_eq!(sheet.dimensions(), (1792, 512));
     let gif = fs::read(folder.join("turntable.gif")).expect("an animation");
     assert_eq!(image::guess_format(&gif).expect("a picture"), ImageFormat::Gif);
-    // A second one replaces the first, and what an interrupted one would leave.
+    // A second demo replaces the first one, even an incomplete one.
     fs::write(folder.join("human.ply"), "cut").expect("written");
     fs::write(folder.join("report.json"), r#"{"command":"snapsnap demo","commit":"0"}"#).expect("written");
     succeed(&mut command);
@@ -62,7 +62,7 @@ fn a_demo_is_made_of_the_sample_pair_and_looks_like_the_person() {
     assert_eq!(fs::read_to_string(other.join("human.ply")).expect("read"), "mine");
 }
 
-/// As a newcomer does it: the two pictures and nothing else.
+/// Two pictures, without weights, config and masks.
 #[test]
 fn two_pictures_become_a_person_with_the_default_weights() {
     let temporary = tempfile::tempdir().expect("temporary folder");
@@ -94,7 +94,7 @@ fn the_default_weights_are_whole_small_and_of_a_config_that_is_kept() {
     }
 }
 
-/// A trained point predictor gets the regressor of another file, with the config in which that was trained.
+/// A trained point predictor gets the regressor of another file together with that regressor's config.
 #[test]
 fn a_filled_regressor_keeps_its_config() {
     let temporary = tempfile::tempdir().expect("temporary folder");
@@ -151,7 +151,7 @@ fn weights_in_16_bits_are_the_nearest_ones_and_what_is_beyond_is_refused() {
     succeed(
         command(&["init-weights", "--config", tiny, "--seed", "1", "-o", "whole.safetensors"]).args(body),
     );
-    // The config comes along, changed where that is asked for.
+    // The stored config is kept, but for the keys of `--set`.
     let half = ["import-weights", "whole.safetensors", "--half", "--set", "network.resolution=256", "-o"];
     succeed(command(&half).arg("half.safetensors"));
     let [whole, half_path] =
@@ -161,7 +161,7 @@ fn weights_in_16_bits_are_the_nearest_ones_and_what_is_beyond_is_refused() {
     for name in whole.tensors().keys() {
         let (exact, near) = (whole.read_f32(name).expect("f32"), half_source.read_f32(name).expect("f16"));
         for (exact, near) in exact.iter().zip(near) {
-            // Eleven bits, or the smallest step there is.
+            // Eleven bits, or the smallest step of f16.
             assert!(
                 (exact - near).abs() <= (exact.abs() * 2.0_f32.powi(-11)).max(3e-8),
                 "{name}: {exact} {near}"

@@ -1,6 +1,6 @@
-//! Every command that README and docs show, but for the notes, in the order in which they show it, on less work: two people,
-//! a few steps, small pictures. A shell reads the pages' blocks, so that its variables and loops count; the programs it would start are recorded
-//! and then run here. Commands within the text are looked at: programs, benches, tests and options must be there.
+//! Runs every command of README and docs, except docs/notes, in the order of the pages, with less work: two people, a
+//! few steps, small pictures. A shell evaluates the pages' blocks and records the programs that it would start. The
+//! test then runs them. Commands within the text are checked only: programs, benches, tests and options must exist.
 #![cfg(unix)]
 
 use std::collections::BTreeSet;
@@ -11,7 +11,7 @@ use std::time::Instant;
 
 use snapsnap_tests::{data, root, shared, snapsnap, succeed, toml_config};
 
-/// In the order in which a reader meets them: each page's commands find what earlier ones made.
+/// In reading order: a page's commands use the outputs of earlier pages.
 const PAGES: [&str; 14] = [
     "README.md",
     "CONTRIBUTING.md",
@@ -28,9 +28,9 @@ const PAGES: [&str; 14] = [
     "docs/fuzz.md",
     "datasets/README.md",
 ];
-/// Tasks of `cargo xtask` that are no commands of the program; the suite itself and its neighbours.
+/// Tasks of `cargo xtask` that are no commands of the program.
 const TASKS: [&str; 6] = ["test", "lint", "dist", "fuzz", "bundle", "help"];
-/// Writes the command line that a shell would start: arguments end with one sign, commands with another.
+/// Records the commands that the shell would start. Byte 0x1F ends an argument, 0x1E a command.
 const RECORDER: &str = r#"set -eu
 record() { { printf '%s\037' "$@"; printf '\036'; } >> "$COMMANDS"; }
 for program in cargo snapsnap python bash; do eval "$program() { record $program \"\$@\"; }"; done
@@ -38,7 +38,7 @@ for program in cargo snapsnap python bash; do eval "$program() { record $program
 
 type Words = Vec<String>;
 
-/// What a page shows to be typed into a shell.
+/// The shell blocks of a page.
 fn blocks(page: &str) -> Vec<String> {
     let text = fs::read_to_string(root().join(page)).unwrap_or_else(|e| panic!("{page}: {e}"));
     let mut found = Vec::new();
@@ -50,14 +50,14 @@ fn blocks(page: &str) -> Vec<String> {
     found
 }
 
-/// The commands of a script with these arguments, its variables and loops followed.
+/// The commands of a script with these arguments, after the shell's expansion of variables and loops.
 fn recorded(page: &str, script: &str, arguments: &[String]) -> Vec<Words> {
     let temporary = tempfile::tempdir().expect("temporary folder");
     let commands = temporary.path().join("commands");
     fs::write(&commands, "").expect("written");
     let mut shell = Command::new("/bin/bash");
     shell.args(["-c", &format!("{RECORDER}{script}"), page]).args(arguments).env("COMMANDS", &commands);
-    // Of the rows of sweeps, which are all alike.
+    // Only some rows of the sweeps, since all rows are alike.
     shell.env("ROWS", "base transformer regressor free-start all");
     // Nothing but what is recorded may be started.
     let output = shell.env("PATH", "/nowhere").current_dir(temporary.path()).output().expect("bash starts");
@@ -93,7 +93,7 @@ fn of_program(words: &[String]) -> Option<&[String]> {
     }
 }
 
-/// What else is run must be there.
+/// Asserts that another program's command names existing files and tasks.
 fn look(words: &[String]) {
     let words: Vec<&str> = words.iter().map(String::as_str).collect();
     let is_there = match words[..] {
@@ -123,7 +123,7 @@ fn look(words: &[String]) {
     assert!(is_there, "nobody knows how to try `{}`", words.join(" "));
 }
 
-/// The same on less work.
+/// The same command with less work.
 fn less(words: &[String]) -> Words {
     let mut words = words.to_vec();
     for word in &mut words {
@@ -179,7 +179,7 @@ fn less(words: &[String]) -> Words {
                 more.extend(["--set", key]);
             }
         }
-        // They would serve for ever; tests/tests/view.rs and studio.rs ask them.
+        // Servers do not end; tests/tests/view.rs and studio.rs test them.
         "view" | "studio" => more.push("--help"),
         "bench" => {
             more.push("--quick");
@@ -194,7 +194,7 @@ fn less(words: &[String]) -> Words {
                 more.extend(["--set", "settings.wgpu.device=\"cpu\""]);
             }
         }
-        // Canvases of the published size are drawn by tests/tests/demo.rs.
+        // tests/tests/demo.rs tests the full resolution.
         "reconstruct" if !words.iter().any(|word| word == "--weights") => {
             more.extend(["--set", "network.resolution=256"]);
         }
@@ -218,7 +218,7 @@ fn less(words: &[String]) -> Words {
     words
 }
 
-/// A folder as the pages take for granted: the repository's files, two photographs, checkpoints, scans, MakeHuman's data.
+/// A folder with the files that the pages expect: photographs, checkpoints, scans, MakeHuman's data.
 fn place() -> tempfile::TempDir {
     use std::os::unix::fs::symlink;
     let temporary = tempfile::tempdir().expect("temporary folder");
@@ -299,7 +299,7 @@ fn every_command_of_readme_and_docs_works() {
     assert!(count > 20, "the pages' blocks were not found");
 }
 
-/// Options of the program's commands within the text are those of its help; what else is named is there.
+/// Options of commands within the text are in the program's help; other programs and files exist.
 #[test]
 fn commands_within_the_text_are_there() {
     let mut checked = 0;

@@ -1,4 +1,4 @@
-//! Photographs that are not those of the front and the back of one person who stands upright.
+//! Doubts about photographs that do not show the front and the back of one upright person.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -100,7 +100,7 @@ fn silhouettes_that_do_not_fit_are_noticed() {
     assert!(said.contains("silhouettes"), "{said}");
 }
 
-/// An arm that is nearer to the camera in one photograph is wider there: the boxes of this person are 677 and 563 of 1024 pixels wide.
+/// A nearer arm is wider: this person's boxes in front and back are 677 and 563 of 1024 pixels wide.
 #[test]
 fn an_outstretched_arm_raises_no_doubt() {
     let temporary = tempfile::tempdir().expect("temporary folder");

@@ -1,4 +1,4 @@
-//! `snapsnap fetch-weights` against servers that do what servers do.
+//! `snapsnap fetch-weights` with servers that break off, ignore ranges or send wrong content.
 
 use std::fs;
 use std::io::{BufRead, BufReader, Write};
@@ -15,8 +15,8 @@ fn published() -> Vec<u8> {
     fs::read(data("lpips").join(FILE)).expect("the learned layers")
 }
 
-/// A server on 127.0.0.1 that answers each request with what `answer` makes of its number and the first byte asked for; the
-/// first bytes asked for are noted.
+/// A server on 127.0.0.1. `answer` gets a request's number and the first byte of its range. Returns the server's
+/// address and the first bytes of all requests.
 fn server(
     answer: impl Fn(usize, Option<usize>) -> Vec<u8> + Send + 'static,
 ) -> (String, Arc<Mutex<Vec<Option<usize>>>>) {
@@ -48,7 +48,7 @@ fn whole(status: &str, body: &[u8]) -> Vec<u8> {
     [head.as_bytes(), body].concat()
 }
 
-/// What a server that knows ranges says, cut after so many bytes of the body.
+/// The answer of a server that supports ranges, after `cut` bytes of the body broken off.
 fn ranged(body: &[u8], first: Option<usize>, cut: usize) -> Vec<u8> {
     let from = first.unwrap_or(0);
     let rest = &body[from..];
@@ -92,7 +92,7 @@ fn what_is_fetched_is_shown_before_and_checked_after() {
     }
     assert_eq!(fs::read(folder.join(FILE)).expect("fetched"), published());
     assert_eq!(fs::read_dir(&folder).expect("a folder").count(), 1, "nothing else is left");
-    // What is there and sound is not fetched again; what is there and is not, is not replaced.
+    // A sound file is not fetched again, and a wrong file is not replaced.
     assert!(succeed(&mut fetch(&address, &folder)).contains("is there, and sound"));
     fs::write(folder.join(FILE), b"mine").expect("writes");
     assert!(refused(&mut fetch(&address, &folder)).contains("move it away"));
@@ -158,19 +158,19 @@ fn a_server_that_refuses_or_stays_short_is_told() {
     assert!(code == Some(1) && said.contains("404"), "{code:?}: {said}");
     assert_eq!(asked.lock().expect("unharmed").len(), 1, "what is refused is not asked for again");
     assert_eq!(fs::read_dir(temporary.path()).expect("lists").count(), 0, "nothing is left");
-    // Never more than half: what came is kept for the next time.
+    // A server that stops at half: the first bytes are kept for the next run.
     let body = published();
     let (address, _) = server(move |number, first| ranged(&body, first, if number == 0 { 3000 } else { 0 }));
     let (code, said) = run(&mut fetch(&address, temporary.path()));
     assert!(code == Some(1) && said.contains("3000 of 6009 bytes are kept"), "{code:?}: {said}");
     let part = fs::read(temporary.path().join(format!("{FILE}.part"))).expect("kept");
     assert_eq!(part, published()[..3000]);
-    // Nobody there.
+    // No server.
     let (code, said) = run(&mut fetch("http://127.0.0.1:9", tempfile::tempdir().expect("a folder").path()));
     assert!(code == Some(1) && said.contains("127.0.0.1"), "{code:?}: {said}");
 }
 
-/// What a server says to a range must be that range; one that never does is left, whatever it sends.
+/// A server that never sends the requested range is given up.
 #[test]
 fn a_server_that_goes_round_in_circles_is_left() {
     let temporary = tempfile::tempdir().expect("a folder");
@@ -199,7 +199,7 @@ fn what_has_the_name_of_an_unfinished_download_and_is_none_stays() {
         assert_eq!(fs::read_to_string(&victim).expect("kept"), "mine");
         fs::remove_file(&part).expect("removes");
     }
-    // A folder that has not got the file takes nothing of a download.
+    // A mirror without the file leaves an unfinished download alone.
     fs::write(&part, "a beginning").expect("writes");
     let empty = tempfile::tempdir().expect("a folder");
     refused(&mut fetch(&empty.path().display().to_string(), temporary.path()));

@@ -1,5 +1,5 @@
-//! Damaged files of every format that the program reads: a short run of fixed cases in the suite, or whatever
-//! `cargo xtask fuzz` asks for.
+//! Damaged files of every format that the program reads: a short run of fixed cases in the suite, or the run of
+//! `cargo xtask fuzz`.
 #![cfg(target_os = "linux")]
 
 use std::env;
@@ -39,7 +39,7 @@ fn repeat(name: &str) {
     let case = campaign.case(name);
     let target = Path::new(env!("CARGO_TARGET_TMPDIR")).join("fuzz");
     let place = target.join(name.replace(':', "-"));
-    // Of a run before.
+    // Left by an earlier run.
     let _ = fs::remove_dir_all(&place);
     fs::create_dir_all(&place).expect("a folder");
     let outcome = campaign.keep(case, &place);

@@ -1,4 +1,4 @@
-//! Files of Gaussians: what is read from them, and from one kind into another.
+//! Files of Gaussians: reading, writing and conversion.
 
 use std::fs;
 use std::path::Path;
@@ -71,7 +71,7 @@ fn every_layout_of_one_cloud_is_the_same_cloud() {
         let lines = b"3 7 8 9\n1 5\n";
         assert!(read("lines.ply", &ply_bytes(&rows, Format::Ascii, faces, lines)) == expected);
 
-        // And the numbers are what they should be.
+        // The numbers of one Gaussian.
         let row = |name: &str| rows[7].iter().find(|(n, _)| n == name).expect(name).1 as f32;
         assert_eq!(expected[0][21..24], ["x", "y", "z"].map(row));
         assert_eq!(expected[1][28..32], ["rot_0", "rot_1", "rot_2", "rot_3"].map(row));
@@ -104,7 +104,6 @@ fn what_is_written_is_read_again() {
     assert!(close(values(first.colors), values(second.colors)));
 }
 
-/// A colour that is no number is not black.
 /// A turned file looks as before from a turned camera, spherical harmonics included, and reads as before.
 #[test]
 fn a_ply_with_y_down_is_turned_and_turned_back() {
@@ -141,6 +140,7 @@ fn a_ply_with_y_down_is_turned_and_turned_back() {
     assert!(refused(&mut convert("up.ply", "down.spz", &["--y-down"])).contains("y up by definition"));
 }
 
+/// A colour that is no number is not black.
 #[test]
 fn colours_that_are_not_finite_are_kept() {
     let temporary = tempfile::tempdir().expect("temporary folder");
@@ -169,7 +169,7 @@ fn gaussians_go_into_an_spz_and_back_within_its_steps() {
     let apart =
         |a: Vec<f32>, b: Vec<f32>| a.iter().zip(b).fold(0.0_f32, |most, (a, b)| most.max((a - b).abs()));
     let (a, b) = (before.gaussians, after.gaussians);
-    // Half a step of each attribute: 1/4096 m, 1/255, 1/16 in the logarithm, C₀/0.15/255 of a colour, 16/128 of a coefficient.
+    // Half a step: 1/4096 m, 1/255, 1/16 in the logarithm, C₀/0.15/255 of a colour, 16/128 of a coefficient.
     assert!(apart(values(a.means), values(b.means)) <= 0.5001 / 4096.0);
     assert!(apart(values(a.opacities), values(b.opacities)) <= 0.501 / 255.0);
     assert!(apart(values(a.scales.log()), values(b.scales.log())) <= 0.501 / 16.0);
@@ -177,7 +177,7 @@ fn gaussians_go_into_an_spz_and_back_within_its_steps() {
     check_rotations(values(a.rotations), values(b.rotations));
     let bands = |loaded: Option<_>| values::<3>(loaded.expect("degree 1"));
     assert!(apart(bands(before.harmonics)[3..].to_vec(), bands(after.harmonics)[3..].to_vec()) < 0.07);
-    // What has gone through the steps once stays where it is.
+    // A second quantisation changes nothing.
     let again = temporary.path().join("again.spz");
     succeed(snapsnap().arg("convert").args([&back, &again]));
     let [once, twice] = [&small, &again].map(|path| scene::read(path, &device).expect("read").gaussians);

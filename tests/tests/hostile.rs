@@ -1,5 +1,5 @@
-//! What must not happen whatever a user gives: inputs and outputs destroyed, waiting for ever, memory without measure,
-//! leftovers of runs that were ended.
+//! Hostile input and interrupted runs: no file is destroyed, nothing waits for ever, memory is bounded, and no
+//! temporary files are left.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -62,7 +62,7 @@ impl Workplace {
         files
     }
 
-    /// The message with which a command refuses; nothing may have changed.
+    /// The message of a refused command, which may change no file.
     fn refusal(&self, mut command: Command) -> String {
         let before = self.files();
         let message = refused(&mut command);
@@ -98,13 +98,13 @@ fn a_folder_of_views_never_replaces_inputs_or_other_outputs() {
             assert!(message.contains("is given for two outputs") || !existing, "{name}: {message}");
         }
     }
-    // Others may lie there.
+    // Other outputs may be in the folder.
     succeed(&mut place.reconstruct(["i.png"; 2], ["-o", "d/040.ply", "--turntable", "d"]));
     assert!(fs::read(place.path("d/040.ply")).expect("the PLY").starts_with(b"ply"));
     assert!(place.path("d/039.png").exists() && place.path("d/cameras.json").exists());
 }
 
-/// One file under two spellings, links that lead to it, and what lies beside a scan.
+/// One file under two spellings, links to it, and files beside a scan.
 #[test]
 fn outputs_are_told_apart_by_where_they_are() {
     let place = Workplace::new();
@@ -178,7 +178,7 @@ fn an_interrupted_render_leaves_no_cameras_of_an_older_one() {
     second.kill().expect("kills");
     second.wait().expect("ends");
     assert!(!place.path("views/cameras.json").exists());
-    // A later one clears away what was being written.
+    // A later render removes the temporary files of the killed one.
     for (path, _) in place.files() {
         let yesterday = std::time::SystemTime::now() - Duration::from_secs(86_400);
         let file = fs::File::options().append(true).open(path).expect("opens");
@@ -239,7 +239,7 @@ fn what_lies_behind_the_gaussians_is_not_read() {
 #[cfg(target_os = "linux")]
 fn a_reconstruction_that_memory_cannot_hold_is_refused_with_both_figures() {
     let place = Workplace::new();
-    // A limit of the process counts where it is lower than what the machine has.
+    // The process's memory limit counts if it is below the machine's memory.
     let program = snapsnap().get_program().to_owned();
     let limited = Command::new("sh")
         .current_dir(place.0.path())
@@ -274,7 +274,7 @@ fn outputs_keep_their_permissions() {
     assert!(message.contains("locked.ply: cannot write: is write-protected"), "{message}");
 }
 
-/// What files hold and what they are called reaches the terminal as text.
+/// Contents and names of files are printed without control characters.
 #[test]
 fn escapes_in_files_and_names_stay_text() {
     let place = Workplace::new();

@@ -1,5 +1,5 @@
-//! The metrics against scikit-image, the `lpips` package, scipy and trimesh (docs/metrics_reference.py), and what must hold of
-//! any of them.
+//! The metrics against scikit-image, the `lpips` package, scipy and trimesh (docs/metrics_reference.py), and properties
+//! of every metric.
 
 use std::path::{Path, PathBuf};
 
@@ -16,7 +16,7 @@ use snapsnap_eval::similarity::{psnr, ssim, ssim_gaussian, ssim_of_loss};
 use snapsnap_splat::Camera;
 use snapsnap_tests::data;
 
-/// Numbers in [0, 1) that any language makes alike.
+/// Pseudo-random numbers in [0, 1), the same in every language.
 fn number(stream: u32, place: usize) -> f64 {
     let mixed = (place as u32).wrapping_mul(2_654_435_761).wrapping_add(stream.wrapping_mul(40_503_121));
     let mixed = (mixed ^ (mixed >> 15)).wrapping_mul(2_246_822_519);
@@ -82,7 +82,7 @@ fn disc(width: usize, height: usize) -> Vec<f32> {
     (0..width * height).map(|i| f32::from(u8::from(inside(i)))).collect()
 }
 
-/// f64 against f64 of the same 8-bit values: what is left is the order of sums and f32's rounding of v / 255.
+/// Limit for f64 against f64 of the same 8-bit values: the order of sums and f32's rounding of v / 255 differ.
 const EXACT: f64 = 2e-6;
 
 #[test]
@@ -118,7 +118,7 @@ fn random_lpips(device: &Device) -> Lpips {
     Lpips::load(&[random_weights(folder.path())], device).expect("loads")
 }
 
-/// A file of weights that follow from a formula, as in the reference.
+/// A file of weights from a formula, as in the reference.
 fn random_weights(folder: &Path) -> PathBuf {
     const LAYERS: [(usize, [usize; 3]); 5] =
         [(0, [64, 3, 11]), (3, [192, 64, 5]), (6, [384, 192, 3]), (8, [256, 384, 3]), (10, [256, 256, 3])];
@@ -168,7 +168,7 @@ fn lpips_is_the_packages_with_the_same_weights() {
 fn weights_that_are_not_the_published_ones_are_no_lpips() {
     let folder = tempfile::tempdir().expect("a folder");
     assert_eq!(Lpips::missing(folder.path()), lpips::PUBLISHED.map(|name| folder.path().join(name)));
-    // Files of those names that hold something else.
+    // Files with the published names and other contents.
     let [network, learned] = lpips::PUBLISHED.map(|name| folder.path().join(name));
     std::fs::rename(random_weights(folder.path()), network).expect("renames");
     std::fs::write(&learned, []).expect("writes");
@@ -190,7 +190,7 @@ fn a_picture_is_infinitely_like_itself_and_never_more_than_1() {
     }
 }
 
-/// In f64 here, in f32 and with gradients there.
+/// The metric computes in f64, the loss in f32 and with gradients.
 #[test]
 fn the_losss_similarity_is_the_one_that_training_uses() {
     let device = Device::flex();
@@ -234,7 +234,7 @@ fn distances_of_points_are_those_of_scipy_and_trimesh() {
     let torus = snapsnap_mesh::import::read(&data("metrics/torus.obj")).expect("the torus");
     let distance = point_to_surface(&a, &torus).expect("a surface");
     close("point to surface", distance, &expected["point_to_surface"], 1e-6);
-    // Points of the surface lie on it, evenly: their mean is its centre.
+    // Sampled points lie on the surface, evenly: their mean is the surface's centre.
     let drawn = geometry::sampled(&torus, 20_000, 3).expect("an area");
     assert!(point_to_surface(&drawn, &torus).expect("a surface") < 1e-6);
     let mean = |c: usize| drawn.iter().map(|p| f64::from(p[c])).sum::<f64>() / 20_000.0;
@@ -269,7 +269,7 @@ fn icp_finds_the_motion_that_trimesh_finds() {
         );
     }
     assert!(found.cost < 1e-10 && found.scale == 1.0, "{found:?}");
-    // With a scale, and what already lies right stays.
+    // With a scale. Points that are aligned already stay.
     let larger: Vec<[f32; 3]> = points.iter().map(|p| p.map(|v| 1.1 * v)).collect();
     let found = icp(&points, &larger, true).expect("points");
     assert!((found.scale - 1.1).abs() < 1e-5 && found.cost < 1e-10, "{found:?}");

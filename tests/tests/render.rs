@@ -119,7 +119,7 @@ fn an_orbit_gives_pictures_cameras_and_raw_tensors() {
         "small",
     ]));
     assert_eq!(picture(&place.path("small/000.png")).dimensions(), (40, 32));
-    // Without --raw's name for a folder, nothing but the raw file.
+    // With --raw and without -o, only the raw file is written.
     succeed(&mut place.render(&["in.ply", "--orbit", "1", "--size", "8x8", "--raw", "only"]));
     assert!(!place.files().contains(&"renders".to_owned()));
     succeed(&mut place.render(&["in.ply", "--orbit", "1", "--size", "8x8"]));
@@ -191,7 +191,7 @@ fn unsuitable_files_and_arguments_are_refused_by_name() {
     case(&header("comment test", &"\u{1b}[31mx".repeat(900)), &["not understood", "\\u{1b}[31mx"]);
     case(&header("comment test", "nonsense"), &["header line 3", "not understood"]);
     case(&header("comment test", "property float x"), &["no element before it"]);
-    // Far more than the file has, in an element that is skipped.
+    // A skipped element that claims far more rows than the file has.
     let skipped = "element vertex 20";
     let lists = "element face 4000000000\nproperty list uchar int i\nelement vertex 20";
     case(&header(skipped, lists), &["element `face`"]);
@@ -273,7 +273,7 @@ fn no_input_and_no_other_output_is_overwritten() {
     let cameras = fs::read(place.path("d/cameras.json")).expect("cameras");
     succeed(&mut place.render(&["a.ply", "--cameras", "d/cameras.json", "-o", "d"]));
     assert!(fs::read(place.path("d/cameras.json")).expect("cameras") == cameras);
-    // They would not describe pictures of another size.
+    // The existing cameras.json would not describe pictures of another size.
     let mut command = place.render(&["a.ply", "--cameras", "d/cameras.json", "-o", "d"]);
     let picture = fs::read(place.path("d/000.png")).expect("a picture");
     let message = refused(command.args(["--size", "32x32"]));
@@ -281,7 +281,7 @@ fn no_input_and_no_other_output_is_overwritten() {
     assert!(fs::read(place.path("d/000.png")).expect("a picture") == picture);
 }
 
-/// What goes into a pipe is the tensors and nothing else.
+/// A pipe gets the tensors and nothing else.
 #[cfg(target_os = "linux")]
 #[test]
 fn raw_tensors_go_into_a_pipe() {
@@ -308,7 +308,7 @@ fn poisoned_files_still_render() {
     place.file("in.ply", &ply_bytes(&rows, Format::Little, "", b""));
     let printed =
         succeed(&mut place.render(&["in.ply", "--orbit", "1", "--size", "64x64", "--raw", "raw", "-v"]));
-    // Opacity ±∞ is 1 and 0, scale −∞ is 0: those are no poison.
+    // Opacity ±∞ is 1 and 0, scale −∞ is 0: these values are valid.
     assert!(
         printed.lines().any(|l| l.contains("not finite or huge") && l.trim_end().ends_with(" 6.0")),
         "{printed}"
@@ -346,7 +346,7 @@ fn views_that_show_nothing_are_said_aloud() {
     assert!(picture(&place.path("empty/000.png")).pixels().all(|p| p.0 == [255, 0, 0]));
 }
 
-/// The renders of Gaussians written to a PLY and read again are those of the Gaussians.
+/// A written `cameras.json` has the documented keys.
 #[test]
 fn cameras_files_are_the_fixtures_format() {
     let place = Place::new();
@@ -357,7 +357,7 @@ fn cameras_files_are_the_fixtures_format() {
     }
 }
 
-/// Nobody looks into the head of a person made of the sample pair.
+/// The head of the sample person is closed.
 #[test]
 fn a_head_is_closed_from_above() {
     let place = Place::new();

@@ -1,4 +1,4 @@
-//! `snapsnap studio`, as its page and as somebody else would ask it, and its page in a browser.
+//! `snapsnap studio`: requests of its page and of other clients, and the page in a browser.
 
 use std::fs;
 use std::io::{Cursor, Read, Write};
@@ -28,7 +28,7 @@ fn parts(of: &[&[u8]]) -> (String, Vec<u8>) {
     (format!("X-Parts: {}\r\n", lengths.join(",")), of.concat())
 }
 
-/// The name of a person made of these photographs and strokes.
+/// Makes a person of front, back, and the strokes on each. Returns the person's name.
 fn made(server: &Server, of: [&[u8]; 4]) -> String {
     let (header, body) = parts(&of);
     let (status, _, answer) = server.post("/reconstruct", &header, &body);
@@ -101,7 +101,7 @@ fn people_of_the_studio_are_those_of_reconstruct() {
     let [whole, without] = [&name, &headless].map(|name| width(name));
     assert!(without > 1.1 * whole, "{whole} {without}");
 
-    // The last four are kept.
+    // The server keeps the last four people.
     for _ in 0..3 {
         made(&server, [&front, &back, &[], &[]]);
     }
@@ -157,7 +157,7 @@ fn unsuitable_requests_are_refused_and_others_served() {
     let (status, message) = refused("/reconstruct", &one, &wrong);
     assert!(status == 422 && message.contains("back photograph"), "{message}");
 
-    // A cut upload, and clients that promise much and send little.
+    // A cut upload, and clients that announce a long body and send one byte.
     let mut cut = TcpStream::connect(("127.0.0.1", server.port)).expect("connected");
     let head = format!("POST /cutout HTTP/1.1\r\nHost: 127.0.0.1:{}\r\n", server.port);
     write!(cut, "{head}Content-Length: {}\r\n\r\n", front.len()).expect("asked");
@@ -175,7 +175,7 @@ fn unsuitable_requests_are_refused_and_others_served() {
             stream
         })
         .collect();
-    // The server has read all promises once it refuses a last one. Memory that was promised would be in its address space.
+    // The server has read all headers once it refuses a last request. Allocated bodies would be in its address space.
     assert_eq!(refused("/cutout", "", b"no picture").0, 422);
     thread::sleep(Duration::from_millis(500));
     #[cfg(target_os = "linux")]
@@ -241,7 +241,7 @@ mod browser {
         found.as_array().expect("a colour").iter().map(|value| value.as_u64().expect("a byte")).collect()
     }
 
-    /// Photographs with a background are chosen, cut out, corrected by the brush, and become a person that turns and is downloaded.
+    /// Photographs are chosen, cut out, corrected by the brush, and become a person that is downloaded.
     #[test]
     fn a_person_is_made_in_the_browser() {
         let Some(mut page) = Page::new(1000, 900) else { return };
@@ -253,7 +253,7 @@ mod browser {
         assert_eq!(page.value(shown), true);
         assert_eq!(page.value("document.getElementById('make').disabled"), true);
 
-        // What is no picture is told, and the place stays free.
+        // A file that is no picture gets a message.
         let text = temporary.path().join("text.png");
         fs::write(&text, "nothing").expect("written");
         page.choose(&field("front"), &text);
@@ -289,7 +289,7 @@ mod browser {
         assert!(kept[1] > behind[1] + 50, "{behind:?} {kept:?}");
         page.value("document.querySelector('[data-side=front] .undo').click()");
 
-        // Progress is told, and the person is shown.
+        // The page shows the progress, then the person.
         page.value(
             "{ window.said = new Set(); const work = document.getElementById('work'); \
              new MutationObserver(() => window.said.add(work.textContent)).observe(work, { childList: true }); \

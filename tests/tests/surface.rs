@@ -12,7 +12,7 @@ use snapsnap_splat::{Gaussians, scene};
 use snapsnap_tests::ply::balls;
 use snapsnap_tests::{refused, root, snapsnap, succeed};
 
-/// A shell of round Gaussians: an upright ellipsoid of half axes `half` around `centre`, green above its middle and red below.
+/// An ellipsoid shell of round Gaussians with the half axes `half`, green above its middle and red below.
 fn shell(n: usize, half: Vec3, centre: Vec3) -> (Vec<f32>, Vec<f32>) {
     let golden = std::f32::consts::PI * (3.0 - 5.0_f32.sqrt());
     let place = |i: usize| {
@@ -59,7 +59,7 @@ fn written_around(path: &Path, centre: Vec3, height: f32) {
     scene::write(&gaussians.expect("shapes"), path).expect("written");
 }
 
-/// Every edge has two faces that run along it in opposite directions, all faces hang together, and nothing is not finite.
+/// Asserts that the mesh is one closed, consistently oriented, finite surface.
 fn check_closed(mesh: &Mesh) {
     mesh.check().expect("drawable");
     let mut edges = HashMap::new();
@@ -101,7 +101,7 @@ fn a_shell_becomes_one_closed_surface_of_its_size_and_colours_in_every_kind_of_f
         written_around(&path("human.ply"), centre, 1.0);
         let mut command = snapsnap();
         command.arg("mesh").arg(path("human.ply")).arg("-o").arg(path(name));
-        // Twelve thousand triangles of a GLB have a texture otherwise, and an OBJ of colours needs no material beside it.
+        // By default a GLB of 12,000 triangles has a texture. An OBJ with vertex colours needs no material file.
         let options = ["--faces", "12000", "-v", "--device", "cpu", "--texture", "0"];
         let said = succeed(command.args(&options[..if name == "mesh.ply" { 5 } else { 7 }]));
         assert!(!path("a.mtl").exists());
@@ -244,7 +244,7 @@ fn a_glb_has_a_texture_and_an_obj_has_normals_and_no_material_over_its_colours()
     assert_eq!(corner.split("//").collect::<Vec<_>>(), [corner.split('/').next().expect("a row"); 2]);
 }
 
-/// Far from the origin f32 has steps of a millimetre. A micrometre is small for a body, ten thousand kilometres large.
+/// Far from the origin, where f32 has steps of a millimetre, and from a micrometre to 10,000 km.
 #[test]
 fn bodies_of_every_size_and_place_keep_their_shape() {
     let temporary = tempfile::tempdir().expect("temporary folder");
@@ -259,7 +259,7 @@ fn bodies_of_every_size_and_place_keep_their_shape() {
         );
         assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
     }
-    // As numbers of the file, not of f32.
+    // The file's numbers, before any rounding to f32.
     let text = fs::read_to_string(path("far.obj")).expect("text");
     let rows: Vec<&str> = text.lines().filter(|line| line.starts_with("v ")).collect();
     let place = |line: &str| line.split(' ').skip(1).take(3).map(str::to_owned).collect::<Vec<_>>();
@@ -306,7 +306,7 @@ fn scenes_that_are_no_single_body_are_named() {
         "{said}"
     );
 
-    // One place has no surface, and neither have Gaussians that are far larger than what they form.
+    // Gaussians in one place have no surface, and neither have Gaussians far larger than the body.
     let random = (0..1000_u32).map(|i| [0, 1, 2].map(|c| ((i * 7 + c * 331) % 997) as f32 / 997.0));
     let scenes = [balls((0..5000).map(|_| [0.0; 3]), 0.1_f32.ln()), balls(random, 70.0)];
     for scene in scenes {

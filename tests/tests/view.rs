@@ -1,4 +1,4 @@
-//! `snapsnap view`, as a browser and as somebody else would ask it.
+//! `snapsnap view`: requests of its own page, of other sites and of misbehaving clients.
 
 use std::fs;
 use std::io::{Read, Write};
@@ -30,7 +30,7 @@ fn the_page_and_its_file_are_served_to_this_machine_alone() {
         let (status, headers, content) = server.ask(&format!("GET {path}"), None);
         assert!(status == 200 && headers.contains(kind) && !content.is_empty(), "{path}: {headers}");
     }
-    // Whatever kind the file is, the page gets a PLY; the download has its name.
+    // The page gets a PLY for any kind of file. The download has the file's name.
     let (status, headers, content) = server.ask("GET /scene.ply", None);
     assert!(status == 200 && headers.contains("die%20pr%c3%bcfung.ply"), "{headers}");
     let ply = temporary.path().join("got.ply");
@@ -62,7 +62,7 @@ fn the_page_and_its_file_are_served_to_this_machine_alone() {
     assert_eq!(server.ask(&format!("GET /{}", "x".repeat(20_000)), None).0, 431);
     assert_eq!(server.ask("nonsense\r\n", None).0, 400);
 
-    // Whatever clients promise, withhold or leave unread, others are served.
+    // Clients that send wrong lengths, nothing, or do not read do not block others.
     let connect = || TcpStream::connect(("127.0.0.1", server.port)).expect("connected");
     let idle: Vec<TcpStream> = (0..20).map(|_| connect()).collect();
     let unread: Vec<TcpStream> = (0..8).map(|_| connect()).collect();
@@ -75,7 +75,7 @@ fn the_page_and_its_file_are_served_to_this_machine_alone() {
     }
     drop((idle, unread));
 
-    // What is replaced is shown on reload, and what is broken says so.
+    // A reload shows a replaced file and names a broken one.
     fs::copy(data("spz/v3_degree3.spz"), &file).expect("copied");
     let (_, _, content) = server.ask("GET /scene.ply", None);
     fs::write(&ply, content).expect("written");
@@ -108,7 +108,7 @@ fn pages_of_other_sites_start_no_work() {
     for header in [own.as_str(), "Sec-Fetch-Site: same-origin", "Sec-Fetch-Site: none"] {
         assert_eq!(ask("/scene.ply", header), 200, "{header}");
     }
-    // A link on another page leads here.
+    // A link on another site may open the page.
     assert_eq!(ask("/", "Sec-Fetch-Site: cross-site"), 200);
 }
 

@@ -286,7 +286,7 @@ fn every_tensor_with_a_value_that_is_not_finite_is_named() {
     assert!(problems[0].contains(QKV) && problems[1].contains("gs_conv.bias"), "{problems:?}");
 }
 
-/// What an import refuses does not leave by an export either.
+/// An export refuses values that an import refuses.
 #[test]
 fn exports_refuse_values_that_are_not_finite() {
     let folder = tempfile::tempdir().expect("temporary folder");

@@ -1,4 +1,4 @@
-//! The operators of a training step one by one. `docs/operators_pytorch.py` runs this program and times PyTorch's.
+//! Times the operators of a training step one by one. `docs/operators_pytorch.py` compares with PyTorch's operators.
 //!
 //! Each line of input is a command. `time SECONDS NAME SIZES…` prints the times of the fastest forward and backward run
 //! in ms. `check FOLDER NAME SIZES…` reads `FOLDER/in0 …`, writes `FOLDER/out0 …` (result, then gradients), and prints
@@ -16,7 +16,7 @@ use snapsnap_ops::train::{
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
-/// A pass that returns everything it computed.
+/// A forward or backward pass, which returns everything it computed.
 type Run<'a> = Box<dyn Fn() -> Vec<Vec<f32>> + 'a>;
 
 /// Uniform in ±1.
@@ -52,7 +52,7 @@ fn lengths(name: &str, s: &[usize]) -> Vec<usize> {
 /// Forward and backward pass.
 fn build<'a>(name: &str, half: bool, s: &[usize], x: &'a [Vec<f32>]) -> [Run<'a>; 2] {
     let dy = &x[x.len() - 1];
-    // All inputs but the first two and the last one.
+    // The third input, unless it is the last one.
     let bias = x.get(2..x.len() - 1).and_then(|rest| Some(&rest.first()?[..]));
     let wanted = Wanted { bias: bias.is_some(), ..Wanted::ALL };
     macro_rules! passes {
@@ -150,8 +150,8 @@ fn read(path: &str, len: usize) -> Vec<f32> {
 }
 
 fn main() {
-    // On a thread of the pool: a caller from outside waits for the pool at every operator, which takes longer than the
-    // small operators do.
+    // On a thread of the pool: a caller from outside would wait for the pool at every operator, which takes longer than
+    // the small operators.
     rayon::scope(|_| serve());
 }
 

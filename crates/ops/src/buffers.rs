@@ -1,37 +1,37 @@
-//! Memory that operators use again. The system clears every fresh page, which for planes of this size takes about as
-//! long as their arithmetic.
+//! A pool of memory blocks for the operators. The system clears every fresh page. For images of this size that takes
+//! about as long as the operators' arithmetic.
 
 use std::sync::{Mutex, PoisonError};
 
 /// Largest number of unused values: 2 GiB of each type.
 const MOST: usize = 1 << 29;
 
-/// The unused memory of all operators.
+/// Unused blocks of floats.
 static FLOATS: Pool<f32> = Pool { free: Mutex::new(Vec::new()) };
-/// That of the factors of products in bf16, whose pairs are words.
+/// Unused blocks of words. A word is a pair of bf16 values.
 static WORDS: Pool<u32> = Pool { free: Mutex::new(Vec::new()) };
 
-/// `len` floats of any value.
+/// `len` floats with arbitrary values.
 pub fn take(len: usize) -> Vec<f32> {
     FLOATS.take(len)
 }
 
-/// Memory for later calls of [`take`].
+/// Returns memory to the pool, for later calls of [`take`].
 pub fn give(buffer: Vec<f32>) {
     FLOATS.give(buffer);
 }
 
-/// `len` words of any value.
+/// `len` words with arbitrary values.
 pub fn take_words(len: usize) -> Vec<u32> {
     WORDS.take(len)
 }
 
-/// Memory for later calls of [`take_words`].
+/// Returns memory to the pool, for later calls of [`take_words`].
 pub fn give_words(buffer: Vec<u32>) {
     WORDS.give(buffer);
 }
 
-/// Returns all unused memory to the allocator.
+/// Returns the pool's memory to the allocator.
 pub fn release() {
     FLOATS.release();
     WORDS.release();
@@ -46,7 +46,7 @@ struct Pool<T> {
 impl<T: Bits> Pool<T> {
     fn take(&self, len: usize) -> Vec<T> {
         let mut free = self.free.lock().unwrap_or_else(PoisonError::into_inner);
-        // Much larger blocks stay for larger requests.
+        // Blocks of more than twice the size are left for larger requests.
         let fitting = (0..free.len()).filter(|&i| (len..=2 * len).contains(&free[i].capacity()));
         let best = fitting.min_by_key(|&i| free[i].capacity()).map(|i| free.swap_remove(i));
         drop(free);
@@ -59,7 +59,7 @@ impl<T: Bits> Pool<T> {
         self.free.lock().unwrap_or_else(PoisonError::into_inner).clear();
     }
 
-    /// Beyond [`MOST`], the oldest blocks are freed.
+    /// Frees the oldest blocks if the pool exceeds [`MOST`] values.
     fn give(&self, buffer: Vec<T>) {
         let mut free = self.free.lock().unwrap_or_else(PoisonError::into_inner);
         free.push(buffer);
@@ -70,13 +70,13 @@ impl<T: Bits> Pool<T> {
     }
 }
 
-/// `len` values of any bits, as they come from the allocator: zeros would take as long as some operators do.
+/// `len` values that are not initialised: filling them with zeros would take as long as some operators do.
 #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 #[allow(unsafe_code, reason = "memory that is not filled")]
 fn arbitrary<T: Bits>(len: usize) -> Vec<T> {
     let mut buffer = Vec::<T>::with_capacity(len);
-    // SAFETY: the assembly may write all of the memory, for all that the compiler knows, so it has values; and `Bits` says
-    // that all of them are valid.
+    // SAFETY: the compiler must assume that the assembly writes all of the memory, so the memory has values. By `Bits`,
+    // every pattern of bits is valid.
     unsafe {
         std::arch::asm!("/* {0} */", in(reg) buffer.as_mut_ptr(), options(nostack, preserves_flags));
         buffer.set_len(len);
@@ -84,13 +84,13 @@ fn arbitrary<T: Bits>(len: usize) -> Vec<T> {
     buffer
 }
 
-/// The same for other processors, filled.
+/// `len` zeros, on processors without the assembly.
 #[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
 fn arbitrary<T: Bits>(len: usize) -> Vec<T> {
     vec![T::default(); len]
 }
 
-/// Types whose values are all patterns of bits.
+/// Types for which every pattern of bits is valid.
 trait Bits: Copy + Default {}
 impl Bits for f32 {}
 impl Bits for u32 {}

@@ -1,8 +1,8 @@
 #![allow(deprecated, reason = "NdArray is the CPU test backend")]
 
-//! Burn's convolution with another gradient of the weight, for GPUs. Burn's own, where kernels are not selected by trial, is
-//! a convolution with a kernel of the image's size: one thread per weight, and in it a loop over all pixels of all images.
-//! Here it is a product of matrices, `[D, pixels]` times `[pixels, taps · C]`.
+//! Burn's convolution with a faster gradient of the weight, for GPUs. Without autotuning, Burn computes this gradient
+//! as a convolution whose kernel is the whole image: one thread per weight, with a loop over all pixels of all images.
+//! Here it is im2col and a matrix product: `[D, pixels]` times `[pixels, taps · C]`.
 
 use burn::backend::autodiff::Autodiff;
 use burn::backend::autodiff::NodeId;
@@ -15,9 +15,9 @@ use burn::tensor::ops::ConvOptions;
 use burn::tensor::{DType, FloatDType, Shape, Slice, Tensor};
 use burn_cubecl::CubeBackend;
 
-/// Most pixels that one product of a weight's gradient adds up. Several products run at once, and their results are added.
+/// Most pixels that one matrix product sums over. Several products run at once, and their results are added.
 const PIXELS: usize = 512;
-/// Most values that are unfolded at once: 128 MB, the least that a WebGPU binding holds.
+/// Most values in one im2col matrix: 128 MB, the size that every WebGPU binding can hold.
 const VALUES: usize = 1 << 25;
 
 /// An image `[B, C, H, W]` and a weight `[D, C, K, K]`.
@@ -36,7 +36,7 @@ pub struct Image<B: Backend> {
 /// Backends with the operation.
 #[backend_extension(Cube, Flex, NdArray, Autodiff)]
 pub trait ConvolutionBackend: Backend {
-    /// A convolution with a margin of half a kernel of zeros.
+    /// A convolution with zero padding of half a kernel.
     fn convolve(#[extension_type] operands: Operands<Self>, stride: usize) -> Image<Self>;
 }
 
@@ -99,7 +99,7 @@ pub fn is_tracked_on_gpu<const D: usize>(x: &Tensor<D>) -> bool {
     device.is_autodiff() && device.inner().identity().is_some()
 }
 
-/// The convolution of an image `[B, C, H, W]` with a weight `[D, C, K, K]`, K odd, and a margin of K / 2 zeros.
+/// The convolution of an image `[B, C, H, W]` with a weight `[D, C, K, K]`, K odd, and zero padding of K / 2.
 pub fn convolve(x: Tensor<4>, weight: Tensor<4>, stride: usize) -> Tensor<4> {
     let operands = Operands { x: x.into_dispatch(), weight: weight.into_dispatch() };
     Tensor::from_dispatch(<Dispatch as ConvolutionBackend>::convolve(operands, stride).image)
@@ -114,7 +114,7 @@ fn options(side: usize, stride: usize) -> ConvOptions<2> {
     ConvOptions::new([stride; 2], [side / 2; 2], [1, 1], 1)
 }
 
-/// ∂L/∂ weight, of shape `[D, C, K, K]`, with at most about `values` values in memory at once beside image and gradient.
+/// The gradient of the weight `[D, C, K, K]`. The im2col matrices hold about `values` values at once, at most.
 fn weight_gradient<B: Backend>(
     x: FloatTensor<B>,
     upstream: FloatTensor<B>,
@@ -127,14 +127,14 @@ fn weight_gradient<B: Backend>(
     let (device, dtype) = (upstream.device(), upstream.dtype());
     let (image, upstream) = (with_margin::<B>(x, side / 2), B::float_permute(upstream, &[0, 2, 3, 1]));
     let taps = side * side * inputs;
-    // `unit` is the number of lines in one product. A band is a multiple of it, or less.
+    // `unit` lines make one product. A band of lines is a multiple of `unit`, or shorter than `unit`.
     let unit = (PIXELS / width).clamp(1, height);
     let band = (values / (batch * width * taps)).clamp(1, height);
     let band = if band > unit { band - band % unit } else { band };
-    // Taps of the pixels of one image, or its products.
+    // Values per image: the im2col matrix of a band or its products, whichever is larger.
     let of_image = (band * width * taps).max(band.div_ceil(unit) * outputs * taps);
     let images = (values / of_image).clamp(1, batch);
-    // A sum of many values in 16 bits would lose digits.
+    // Sums of many values need more than 16 bits.
     let wide = if matches!(dtype, DType::F16 | DType::BF16) { FloatDType::F32 } else { dtype.into() };
     let mut sum = B::float_zeros(Shape::new([1, outputs, taps]), &device, wide);
     for (start, first) in (0..batch)
@@ -158,7 +158,7 @@ fn weight_gradient<B: Backend>(
     B::float_permute(sum, &[0, 3, 1, 2])
 }
 
-/// An image `[B, C, H, W]` as `[B, H, W, C]` in a margin of zeros.
+/// An image `[B, C, H, W]` as `[B, H, W, C]` with zero padding.
 fn with_margin<B: Backend>(x: FloatTensor<B>, margin: usize) -> FloatTensor<B> {
     let [batch, channels, height, width] = x.shape().dims();
     let image = B::float_permute(x, &[0, 2, 3, 1]);
@@ -171,7 +171,7 @@ fn with_margin<B: Backend>(x: FloatTensor<B>, margin: usize) -> FloatTensor<B> {
     B::float_slice_assign(B::float_zeros(shape, &device, dtype), &inner, image)
 }
 
-/// The pixels under the taps of a kernel, `[B, lines, columns, taps · C]`, of an image with a margin.
+/// The im2col matrix `[B, lines, columns, taps · C]` of a padded image, for `lines` output lines from `first` on.
 fn taps_of<B: Backend>(
     image: &FloatTensor<B>,
     side: usize,
@@ -189,7 +189,7 @@ fn full() -> Slice {
     Slice::from(..)
 }
 
-/// `count` indices from `start` on.
+/// `count` indices from `start` on, `step` apart.
 fn part(start: usize, count: usize, step: usize) -> Slice {
     Slice::new(start as isize, Some((start + (count - 1) * step + 1) as isize), step as isize)
 }
@@ -217,7 +217,7 @@ mod tests {
             ([2, 5, 3, 8, 6], 3, 2),
             ([1, 2, 4, 7, 5], 3, 2),
             ([3, 4, 2, 5, 6], 1, 1),
-            ([1, 3, 2, 53, 61], 3, 1), // more lines than a product joins
+            ([1, 3, 2, 53, 61], 3, 1), // more lines than one product covers
             ([2, 2, 2, 48, 90], 3, 1),
         ];
         for (seed, ([batch, inputs, outputs, height, width], side, stride)) in (1..).step_by(3).zip(cases) {
@@ -241,7 +241,7 @@ mod tests {
         }
     }
 
-    /// Bands of lines and parts of a batch, of which the last are smaller.
+    /// Bands of lines and parts of a batch, the last ones smaller, give the gradient of a single product.
     #[test]
     fn parts_add_up() {
         let shape = Shape::new([3, 2, 3, 3]);

@@ -1,8 +1,8 @@
-//! Layers of the networks as functions of Burn's modules: kernels with gradients of their own on `flex`, Burn's operators
-//! everywhere else.
+//! Layers of the networks as functions of Burn's modules: kernels with their own gradients on `flex`, Burn's operators
+//! on all other devices.
 //!
-//! Parameters are expanded before they meet larger tensors, if gradients are computed on a GPU. The gradient of `expand` is a
-//! sum over one dimension after the other. That of Burn's operators is one sum over all of them, with one thread per
+//! Where gradients are computed on a GPU, parameters are expanded before they are added or multiplied. The gradient of
+//! `expand` sums one dimension after the other. Burn's broadcasting sums all dimensions at once, with one thread per
 //! parameter.
 
 use burn::module::Param;
@@ -16,7 +16,7 @@ use crate::op::{self, Kept, Kernel};
 use crate::train::{Conv1x1, Conv3x3, Gradients, LayerNorm, Linear, Statistics, Unfolded, Wanted};
 use crate::{gpu, has_kernels, in_f32, is_bf16, is_trained_fast};
 
-/// `[B, N, inputs]` → `[B, N, outputs]`.
+/// A linear layer: `[B, N, inputs]` → `[B, N, outputs]`.
 pub fn linear(layer: &nn::Linear, x: Tensor<3>) -> Tensor<3> {
     if gpu::is_tracked_on_gpu(&x) {
         let y = burn::tensor::module::linear(x, layer.weight.val(), None);
@@ -32,7 +32,7 @@ pub fn linear(layer: &nn::Linear, x: Tensor<3>) -> Tensor<3> {
     run(sizes, shape, x, layer.weight.val(), bias(&layer.bias))
 }
 
-/// GELU (erf form) of a linear layer, on `flex`.
+/// A linear layer followed by GELU (erf form), on `flex`.
 pub(crate) fn linear_gelu(layer: &nn::Linear, x: Tensor<3>) -> Tensor<3> {
     let (sizes, shape) = linear_sizes(layer, &x);
     run(Gelu(sizes), shape, x, layer.weight.val(), bias(&layer.bias))
@@ -43,7 +43,7 @@ fn linear_sizes(layer: &nn::Linear, x: &Tensor<3>) -> (Linear, [usize; 3]) {
     (Linear { rows: b * n, inputs, outputs, transposed: false, half }, [b, n, outputs])
 }
 
-/// Layer normalisation of tokens `[B, N, C]`. `epsilon` is that of the layer, whose field is private.
+/// Layer normalisation of tokens `[B, N, C]`. `epsilon` must be the layer's own value, which Burn keeps private.
 pub fn layer_norm(layer: &nn::LayerNorm, epsilon: f64, x: Tensor<3>) -> Tensor<3> {
     let (weight, shape) = (layer.gamma.val(), x.dims());
     if let Some(bias) = layer.beta.as_ref().filter(|_| gpu::is_tracked_on_gpu(&x)) {
@@ -63,8 +63,8 @@ fn normalised(x: Tensor<3>, epsilon: f64, [weight, bias]: [Tensor<3>; 2]) -> Ten
     centred / (variance + epsilon).sqrt() * weight + bias
 }
 
-/// A convolution of images `[B, C, H, W]`, or, where `rectified`, of max(x, 0). Layers without dilation and groups must have a padding of half
-/// a kernel.
+/// A convolution of images `[B, C, H, W]`; with `rectified`, a convolution of max(x, 0). A layer without dilation and
+/// groups must have a padding of half a kernel.
 pub fn conv2d(layer: &Conv2d, x: Tensor<4>, rectified: bool) -> Tensor<4> {
     let ([batch, inputs, height, width], [outputs, _, rows, columns]) = (x.dims(), layer.weight.dims());
     let (weight, bias) = (layer.weight.val(), bias(&layer.bias));
@@ -102,9 +102,9 @@ pub fn conv2d(layer: &Conv2d, x: Tensor<4>, rectified: bool) -> Tensor<4> {
     }
 }
 
-/// A transposed convolution whose kernel is as large as its stride: `[B, C, H, W]` → `[B, D, stride·H, stride·W]`. Every
-/// pixel becomes a square of its own, so that it is a 1×1 convolution to `[B, D · stride · stride, H, W]` and a
-/// rearrangement.
+/// A transposed convolution whose kernel is as large as its stride: `[B, C, H, W]` → `[B, D, stride·H, stride·W]`. The
+/// squares of two pixels do not overlap, so a 1×1 convolution to `[B, D · stride · stride, H, W]` and a rearrangement
+/// of its result are equivalent.
 pub fn enlarge(layer: &ConvTranspose2d, x: Tensor<4>) -> Tensor<4> {
     if !has_kernels(&x) {
         return layer.forward(x);
@@ -125,8 +125,8 @@ pub fn enlarge(layer: &ConvTranspose2d, x: Tensor<4>) -> Tensor<4> {
     ])
 }
 
-/// A convolution whose kernel is as large as its stride, from images `[B, C, H, W]` to tokens
-/// `[B, H/side · W/side, D]`, row-major.
+/// A convolution whose kernel is as large as its stride: images `[B, C, H, W]` → tokens `[B, H/side · W/side, D]`,
+/// row-major.
 pub fn patches(layer: &Conv2d, x: Tensor<4>) -> Tensor<3> {
     if !has_kernels(&x) {
         return layer.forward(x).flatten::<3>(2, 3).swap_dims(1, 2);
@@ -145,12 +145,12 @@ fn bias(bias: &Option<Param<Tensor<1>>>) -> Option<Tensor<1>> {
     bias.as_ref().map(Param::val)
 }
 
-/// A function of an input, a weight and perhaps a bias, with its gradients.
+/// A function of an input, a weight and an optional bias, with its gradients.
 trait Layer: std::fmt::Debug + Send + Sync + 'static {
     /// Values that the backward pass needs beside the input and the weight.
     type Kept: Send + 'static;
 
-    /// `keep`: for a backward pass.
+    /// `keep`: a backward pass will follow.
     fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>, keep: bool) -> (Vec<f32>, Self::Kept);
 
     fn backward(&self, x: &[f32], weight: &[f32], kept: Self::Kept, dy: &[f32], wanted: Wanted) -> Gradients;
@@ -186,7 +186,7 @@ impl Layer for Linear {
     }
 }
 
-/// A linear layer with GELU behind it.
+/// A linear layer followed by GELU.
 #[derive(Debug)]
 struct Gelu(Linear);
 
@@ -284,7 +284,7 @@ fn run<const A: usize, const W: usize, const D: usize>(
     weight: Tensor<W>,
     bias: Option<Tensor<1>>,
 ) -> Tensor<D> {
-    // Kernels read f32 and round it themselves.
+    // Kernels read f32 and round the factors themselves.
     let (weight, bias) = (weight.cast(FloatDType::F32), bias.map(|bias| bias.cast(FloatDType::F32)));
     let operator = Operator { layer, shape: shape.to_vec(), has_bias: bias.is_some() };
     op::run(operator, x, Some(weight), bias)

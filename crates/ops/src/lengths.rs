@@ -1,5 +1,5 @@
-//! Mean lengths of an image's vectors and of their differences between pixels, in one operator. Composed of Burn's
-//! operators, each of them would keep a dozen images for its gradient.
+//! Mean lengths of an image's vectors, and of differences between the vectors of two pixels, in one operator. Burn's
+//! operators would keep a dozen images for the gradient of each mean.
 
 use burn::tensor::Tensor;
 use rayon::prelude::*;
@@ -7,13 +7,13 @@ use rayon::prelude::*;
 use crate::has_kernels;
 use crate::op::{self, Kept, Kernel};
 
-/// Least square of a length with a gradient. The direction of a shorter vector is noise.
+/// Vectors whose squared length is smaller have no gradient: their direction is noise.
 const MIN_SQUARE: f64 = 1e-24;
 
-/// For every offset (rows, columns) the mean length of the differences between vectors `[B,H,W,3]` of two pixels that are so far apart. Offset
-/// (0, 0) stands for the vectors themselves. Only pairs whose pixels both have the `weight` `[B,H,W]` 1 count. The weight of all other pixels
-/// must be 0, and their vectors may be anything, also NaN. The result is `[B, offsets]`, 0 where no pair counts. Every offset must be smaller than
-/// the image.
+/// For every offset (rows, columns), the mean length of the difference between the vectors `[B,H,W,3]` of two pixels
+/// at this offset → `[B, offsets]`. Offset (0, 0) gives the mean length of the vectors themselves. `weight` `[B,H,W]`
+/// is 1 or 0. Only pairs of two pixels with weight 1 count; without a pair the mean is 0. Vectors of weight 0 may be
+/// NaN. Every offset must be smaller than the image.
 pub fn mean_lengths(vectors: Tensor<4>, weight: Tensor<3>, offsets: &[[usize; 2]]) -> Tensor<2> {
     let [batch, height, width, channels] = vectors.dims();
     assert!(channels == 3 && weight.dims() == [batch, height, width], "one weight per vector of three");
@@ -28,7 +28,7 @@ pub fn mean_lengths(vectors: Tensor<4>, weight: Tensor<3>, offsets: &[[usize; 2]
     op::run(kernel, vectors, Some(weight), None::<Tensor<1>>)
 }
 
-/// The same in Burn's operators.
+/// [`mean_lengths`] in Burn's operators.
 fn plain(vectors: Tensor<4>, weight: &Tensor<3>, offsets: &[[usize; 2]]) -> Tensor<2> {
     let [_, height, width, _] = vectors.dims();
     let nowhere = weight.clone().lower_equal_elem(0.0).unsqueeze_dim::<4>(3).expand(vectors.dims());
@@ -42,7 +42,7 @@ fn plain(vectors: Tensor<4>, weight: &Tensor<3>, offsets: &[[usize; 2]]) -> Tens
             offset => (vector(offset) - vector([0, 0]), weight(offset) * weight([0, 0])),
         };
         let length = vectors.square().sum_dim(3).clamp_min(MIN_SQUARE).sqrt().squeeze_dim::<3>(3);
-        // Not all at once: on GPUs one thread adds up what a step joins.
+        // One dimension after the other: a GPU uses one thread per sum of a step.
         let sum = |values: Tensor<3>| values.sum_dim(2).sum_dim(1).squeeze_dim::<2>(2);
         sum(length * weight.clone()) / sum(weight).clamp_min(1.0)
     };
@@ -58,8 +58,8 @@ struct MeanLengths {
 }
 
 impl MeanLengths {
-    /// Calls `each` for every pair of an offset in one row of a sample, with the index of its first pixel in the sample, that of its second
-    /// pixel, and the difference. Vectors themselves have equal indices.
+    /// Calls `each` for every pair at an offset whose first pixel is in row `row` of a sample, with the indices of the
+    /// two pixels in the sample and the difference. For offset (0, 0) it gets equal indices and the vector itself.
     #[inline(always)]
     fn pairs(
         &self,
@@ -104,7 +104,7 @@ impl Kernel for MeanLengths {
             for (offset, sum) in self.offsets.iter().zip(sums) {
                 self.pairs(vectors, weight, *offset, row, |_, _, vector| {
                     let square = square(vector);
-                    // NaN stays, unlike in `f64::max`.
+                    // `f64::max` would drop NaN.
                     let square = if square < MIN_SQUARE { MIN_SQUARE } else { square };
                     sum[0] += square.sqrt();
                     sum[1] += 1.0;
@@ -172,7 +172,7 @@ mod tests {
     use super::*;
     use crate::tests::{assert_equal, random, uniform};
 
-    /// Values and gradients, with NaN where the weight is 0 and a vector of length 0.
+    /// With a vector of length 0, and NaN where the weight is 0.
     #[test]
     fn mean_lengths_and_their_gradients_equal_their_composition_in_f64() {
         let shape @ [batch, height, width, _] = [3, 7, 11, 3];
@@ -210,7 +210,7 @@ mod tests {
         assert_equal("gradients", ours.1, in_f64.1);
     }
 
-    /// A prediction that is not a number makes a loss that is none, so that the step is skipped.
+    /// A prediction of NaN makes the loss NaN, so that the step is skipped.
     #[test]
     fn nan_that_counts_stays() {
         let vectors = Tensor::<4>::full([1, 2, 2, 3], f32::NAN, &Device::flex());

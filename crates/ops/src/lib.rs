@@ -1,6 +1,6 @@
-//! Operators that are slow on Burn's backends. Each is one function with two implementations: kernels with their own
-//! gradients on Burn's `flex` device, and plain tensor code on every other device and in 16 bits. Tests compare the two.
-//! [`gpu`] and [`rows`] have gradients for GPUs.
+//! Operators that are slow on Burn's backends. Each operator is one function with two implementations: kernels with
+//! their own gradients on Burn's `flex` device, and plain tensor code on every other device and in 16 bits. Tests
+//! compare the two. [`gpu`] and [`rows`] have gradients for GPUs.
 
 pub mod buffers;
 pub mod conv;
@@ -37,42 +37,42 @@ pub use rope::Rope;
 use snapsnap_base::bilinear::{Tap, taps};
 use train::{Attention, Tokens};
 
-/// Whether this crate's kernels apply to `x`: in f32 on `flex`, without autodiff.
+/// Whether `x` runs on this crate's kernels without gradients: f32 on `flex`, without autodiff.
 pub fn is_fast<const D: usize>(x: &Tensor<D>) -> bool {
     let device = x.device();
     x.dtype() == DType::F32 && !device.is_autodiff() && device == Device::flex()
 }
 
-/// Whether this crate's kernels with gradients apply to `x`: in f32 on `flex`, with autodiff.
+/// Whether `x` runs on this crate's kernels with gradients: f32 on `flex`, with autodiff.
 pub fn is_trained_fast<const D: usize>(x: &Tensor<D>) -> bool {
     let device = x.device();
     x.dtype() == DType::F32 && device.is_autodiff() && device.inner() == Device::flex()
 }
 
-/// Whether this crate's kernels apply to `x`, with gradients or without.
+/// Whether `x` runs on this crate's kernels, with gradients or without.
 pub fn has_kernels<const D: usize>(x: &Tensor<D>) -> bool {
     is_fast(x) || is_trained_fast(x)
 }
 
-/// `x` in the float type of a layer's weight. On `flex` all tensors between layers are f32: kernels round what they multiply.
+/// `x` in the float type of a layer's weight; on `flex` `x` itself, because kernels round their factors themselves.
 pub fn as_weight<const D: usize, const W: usize>(x: Tensor<D>, weight: &Param<Tensor<W>>) -> Tensor<D> {
     if has_kernels(&x) { x } else { x.cast(weight.val().dtype()) }
 }
 
-/// Whether a layer's weight is bf16: its products are, too.
+/// Whether a layer's weight is bf16; then the layer's products are in bf16, too.
 pub fn is_bf16<const D: usize>(weight: &Param<Tensor<D>>) -> bool {
     weight.val().dtype() == DType::BF16
 }
 
-/// Runs `compute` in f32 for tensors of 16 bits: norms, rotations.
+/// Runs `compute` in f32 and casts the result back, if `x` has 16 bits. For norms and rotations.
 pub fn in_f32<const D: usize>(x: Tensor<D>, compute: impl FnOnce(Tensor<D>) -> Tensor<D>) -> Tensor<D> {
     let dtype = x.dtype();
     let is_narrow = matches!(dtype, DType::F16 | DType::BF16);
     if is_narrow { compute(x.cast(FloatDType::F32)).cast(dtype) } else { compute(x) }
 }
 
-/// softmax(rope(q) · rope(k)ᵀ / √head_dim) · v, heads side by side in the channels: `q` `[B, N, C]`, `k` and `v`
-/// `[B, M, C]` → `[B, N, C]`; both sides share one grid, hence one table. With `half`, products are in bf16 on CPUs with instructions for it.
+/// softmax(rope(q) · rope(k)ᵀ / √head_dim) · v: `q` `[B, N, C]`, `k` and `v` `[B, M, C]` → `[B, N, C]`, with the heads
+/// side by side in the channels. Queries and keys lie on the same grid. `half`: products in bf16, if the CPU has them.
 pub fn rotary_attention(
     q: Tensor<3>,
     k: Tensor<3>,
@@ -95,7 +95,7 @@ pub fn rotary_attention(
     Tensor::from_data(TensorData::new(out, [b, n, c]), &device)
 }
 
-/// The same for queries, keys and values side by side in one tensor: `[B, N, 3·C]` → `[B, N, C]`.
+/// [`rotary_attention`] with queries, keys and values side by side in one tensor: `[B, N, 3·C]` → `[B, N, C]`.
 pub fn rotary_self_attention(qkv: Tensor<3>, rope: &Rope, heads: usize, half: bool) -> Tensor<3> {
     if is_trained_fast(&qkv) {
         return tracked::together(qkv, rope, heads, half);
@@ -116,7 +116,7 @@ fn plain_attention(q: Tensor<3>, k: Tensor<3>, v: Tensor<3>, ropes: [&Rope; 2], 
     out.swap_dims(1, 2).reshape([b, n, c])
 }
 
-/// GELU (erf form) of a linear layer: `[B, N, C]` → `[B, N, D]`.
+/// A linear layer followed by GELU (erf form): `[B, N, C]` → `[B, N, D]`.
 pub fn linear_gelu(layer: &Linear, x: Tensor<3>) -> Tensor<3> {
     if has_kernels(&x) {
         return layers::linear_gelu(layer, x);
@@ -124,7 +124,7 @@ pub fn linear_gelu(layer: &Linear, x: Tensor<3>) -> Tensor<3> {
     let has_gradient = x.device().is_autodiff();
     let x = layer.forward(x);
     if has_gradient {
-        // The gradient of Burn's own operator is that of the approximation by tanh on all backends but flex: 4e-4 off.
+        // On all backends but flex, Burn's GELU has the gradient of the approximation by tanh, which is 4e-4 off.
         return x.clone() * ((x * FRAC_1_SQRT_2).erf() + 1.0) * 0.5;
     }
     gelu(x)
@@ -132,8 +132,8 @@ pub fn linear_gelu(layer: &Linear, x: Tensor<3>) -> Tensor<3> {
 
 /// Bilinear resize of `[B, C, H, W]` to `size` (rows, columns).
 ///
-/// `align_corners`: the outermost samples coincide (inside the DPT head); otherwise pixel areas do (everything else).
-/// Check values: [0, 1] → [0, ⅓, ⅔, 1] and [0, ¼, ¾, 1] (docs/method.md, "Check values").
+/// `align_corners`: the outermost samples coincide (inside the DPT head). Otherwise the outer edges of the pixels
+/// coincide (everywhere else). [0, 1] becomes [0, ⅓, ⅔, 1] or [0, ¼, ¾, 1] (docs/method.md, "Check values").
 pub fn bilinear(x: Tensor<4>, size: [usize; 2], align_corners: bool) -> Tensor<4> {
     let ([b, c, h, w], device) = (x.dims(), x.device());
     let [down, across] = [(h, size[0]), (w, size[1])].map(|(from, to)| taps(from, to, align_corners));
@@ -141,7 +141,7 @@ pub fn bilinear(x: Tensor<4>, size: [usize; 2], align_corners: bool) -> Tensor<4
         return tracked::resized(x, down, across);
     }
     if device.is_autodiff() {
-        // Burn's own operator has no backward pass on GPUs; products with constant matrices have.
+        // Burn's own operator has no backward pass on GPUs. Products with constant matrices have one.
         let matrix = |taps: &[Tap], from: usize| {
             let data = TensorData::new(resize::matrix(taps, from), [taps.len(), from]);
             Tensor::<2>::from_data(data, &device).cast(x.dtype())
@@ -157,32 +157,32 @@ pub fn bilinear(x: Tensor<4>, size: [usize; 2], align_corners: bool) -> Tensor<4
     interpolate(x, options.with_output_size(size))
 }
 
-/// Sums over the last dimension: `[A, B, N]` → `[A, B, 1]`, in two steps. On GPUs one thread adds up what a step joins.
+/// Sums over the last dimension in two steps: `[A, B, N]` → `[A, B, 1]`. A GPU uses one thread per sum of a step.
 pub fn sum_last(x: Tensor<3>) -> Tensor<3> {
     let [a, b, n] = x.dims();
     let inner = near_root(n);
     x.reshape([a, b, inner, n / inner]).sum_dim(3).reshape([a, b, inner]).sum_dim(2)
 }
 
-/// The reverse of [`sum_last`]: `[A, B, 1]` → `[A, B, N]`. Its gradient is computed in two steps.
+/// Repeats the last dimension: `[A, B, 1]` → `[A, B, N]`. Its gradient is summed in two steps, as in [`sum_last`].
 pub fn spread_last(x: Tensor<3>, n: usize) -> Tensor<3> {
     let [a, b, _] = x.dims();
     let inner = near_root(n);
     x.reshape([a, b, 1, 1]).expand([a, b, inner, n / inner]).reshape([a, b, n])
 }
 
-/// The largest divisor of `n` that is not larger than its root.
+/// The largest divisor of `n` up to √n.
 fn near_root(n: usize) -> usize {
     (1..=n.isqrt()).rev().find(|inner| n.is_multiple_of(*inner)).unwrap_or(1)
 }
 
-/// The mean of all values `[1]`, as [`sum_last`] adds them up.
+/// The mean of all values `[1]`, summed by [`sum_last`].
 pub fn mean<const D: usize>(x: Tensor<D>) -> Tensor<1> {
     let count = x.dims().iter().product();
     sum_last(x.reshape([1, 1, count])).reshape([1]) / count as f64
 }
 
-/// Values on the host, without a copy if the tensor is contiguous and has no other owner.
+/// The values on the host. There is no copy if the tensor is contiguous and has no other owner.
 ///
 /// # Panics
 /// If the values are not f32.

@@ -1,11 +1,11 @@
-//! Elementary functions whose plain Rust the compiler turns into vector instructions.
+//! Elementary functions in plain Rust that the compiler turns into vector instructions.
 
-/// eˣ with a relative error below 3e-7, for |x| ≤ 87; beyond, the value at the border.
+/// eˣ with a relative error below 3e-7. x is clamped to ±87.
 #[inline(always)]
 pub fn exp(x: f32) -> f32 {
-    // Added and subtracted, 1.5·2²³ rounds to an integer, which then sits in the low bits.
+    // Adding and subtracting 1.5·2²³ rounds to an integer, which is in the low bits of the sum.
     const ROUND: f32 = 12_582_912.0;
-    // ln 2 in two parts, the first with few enough bits that n times it is exact (Cody and Waite).
+    // ln 2 in two parts. The first part has so few bits that its product with n is exact (Cody and Waite).
     const LN2_HIGH: f32 = 0.693_359_4;
     const LN2_LOW: f32 = -2.121_944_4e-4;
     let x = x.clamp(-87.0, 87.0);
@@ -32,14 +32,14 @@ pub fn silu_and_slope(x: f32) -> [f32; 2] {
     [value, sigmoid + value * (1.0 - sigmoid)]
 }
 
-/// x·Φ(x) with Φ from the error function's rational approximation 7.1.26 of Abramowitz and Stegun (absolute error
-/// below 1.5e-7).
+/// GELU: x·Φ(x), with Φ from approximation 7.1.26 of the error function by Abramowitz and Stegun (absolute error below
+/// 1.5e-7).
 #[inline(always)]
 pub fn gelu(x: f32) -> f32 {
     x * normal(x)[0]
 }
 
-/// Φ(x) + x·φ(x).
+/// The derivative of GELU: Φ(x) + x·φ(x).
 #[inline(always)]
 pub fn gelu_derivative(x: f32) -> f32 {
     // 1/√(2π).
@@ -48,7 +48,7 @@ pub fn gelu_derivative(x: f32) -> f32 {
     below + x * PEAK * bell
 }
 
-/// Φ(x), and e^(−x²/2), which it needs on the way.
+/// Φ(x) and e^(−x²/2).
 #[inline(always)]
 fn normal(x: f32) -> [f32; 2] {
     let z = x.abs() * std::f32::consts::FRAC_1_SQRT_2;
@@ -78,7 +78,7 @@ mod tests {
         assert!(worst < 3e-7, "{worst:e}");
     }
 
-    /// Φ from 20,000 steps of Simpson's rule over the normal density.
+    /// The reference Φ is 20,000 steps of Simpson's rule over the normal density.
     #[test]
     fn gelu_is_accurate_to_its_bound() {
         let phi = |x: f64| {
@@ -92,7 +92,7 @@ mod tests {
             let x = i as f32 * 0.1;
             let expected = f64::from(x) * phi(f64::from(x));
             let error = (f64::from(gelu(x)) - expected).abs();
-            // 1.5e-7 times |x|/√2·…, at most |x|, plus f32 rounding of the result.
+            // 1.5e-7 times at most |x|, plus f32 rounding of the result.
             assert!(error <= 3e-7 * f64::from(x.abs()).max(0.1), "gelu({x}): {error:e}");
         }
     }
@@ -104,14 +104,14 @@ mod tests {
             let expected = [f64::from(x) * sigmoid, sigmoid * (1.0 + f64::from(x) * (1.0 - sigmoid))];
             let got = silu_and_slope(x);
             for (got, expected) in got.into_iter().zip(expected) {
-                // exp's 3e-7 and three roundings, of terms that do not exceed max(1, |x|).
+                // The 3e-7 of `exp` and three roundings of terms up to max(1, |x|).
                 let error = (f64::from(got) - expected).abs();
                 assert!(error <= 1e-6 * f64::from(x.abs()).max(1.0), "x = {x}: {error:e}");
             }
         }
     }
 
-    /// Central differences of the same GELU in f64 steps wide enough for its rounding.
+    /// Against central differences of `gelu`, whose step is wide enough for its rounding.
     #[test]
     fn gelu_derivative_is_the_slope() {
         for i in -80..=80 {

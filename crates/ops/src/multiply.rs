@@ -1,5 +1,5 @@
-//! Matrix products on one thread, in f32 by the gemm crate or in bf16 by [`crate::half`]; what is shared out among threads
-//! is decided by its callers, by sizes alone, so that every element is one sum in one order.
+//! Matrix products on one thread, in f32 by the gemm crate or in bf16 by [`crate::half`]. Callers divide the work among
+//! threads by sizes alone, so that every element is one sum in one order.
 
 use rayon::prelude::*;
 
@@ -9,16 +9,16 @@ use crate::half::{self, PANEL, SLACK, Source};
 /// A matrix in f32: values, and their (column, row) strides in elements.
 pub type Matrix<'a> = (&'a [f32], [usize; 2]);
 
-/// Right factor of products `[k, n]`.
+/// Right factor `[k, n]` of products.
 pub enum Right<'a> {
-    /// As it is.
+    /// In f32, not packed.
     Plain(Matrix<'a>),
-    /// In bf16.
+    /// In bf16, packed by [`Source::pack_right`].
     Packed(Vec<u32>),
 }
 
 impl<'a> Right<'a> {
-    /// The factor for products in f32, or, if `half` and the processor can, in bf16.
+    /// The factor in bf16 if `half` is set and the processor has the instructions, else in f32.
     pub fn new(half: bool, [k, n]: [usize; 2], matrix: Matrix<'a>) -> Self {
         if half && half::is_there() { Self::packed([k, n], matrix) } else { Self::Plain(matrix) }
     }
@@ -52,7 +52,7 @@ impl Drop for Right<'_> {
     }
 }
 
-/// lhs `[m, k]` · rhs `[k, n]`.
+/// The product lhs `[m, k]` · rhs `[k, n]`.
 pub struct Multiply<'a> {
     /// m, n, k.
     pub size: [usize; 3],
@@ -60,12 +60,12 @@ pub struct Multiply<'a> {
     pub lhs: Matrix<'a>,
     /// Right factor.
     pub rhs: &'a Right<'a>,
-    /// Adds to the present values.
+    /// Adds the product to the values that are there.
     pub add: bool,
 }
 
 impl Multiply<'_> {
-    /// Writes the product's rows, which begin `stride` floats after one another.
+    /// Writes the product to `out`, whose rows begin `stride` floats apart.
     pub fn write(self, out: &mut [f32], stride: usize) {
         match self.rhs {
             Right::Plain(rhs) => self.in_f32(*rhs, out, stride),
@@ -74,7 +74,7 @@ impl Multiply<'_> {
     }
 
     fn in_bf16(&self, rhs: &[u32], out: &mut [f32], stride: usize) {
-        /// Words of the left factor at once: 128 KiB, which leaves a core's second-level cache room for a panel.
+        /// Words of the left factor that are packed at once: 128 KiB, which leaves second-level cache for a panel.
         const WORDS: usize = 32 * 1024;
         let Self { size: [m, columns, depth], lhs: (values, [inner, row]), add, .. } = *self;
         let blocks = depth.div_ceil(half::BLOCK);

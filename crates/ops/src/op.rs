@@ -1,5 +1,5 @@
-//! Operators of our own with gradients of their own, as one Burn backend extension. Code for Burn's backend
-//! interfaces is in this file, in `gpu` and in `rows`, since they change with every minor version of Burn.
+//! Operators with their own gradients, as one Burn backend extension. Only this file, `gpu` and `rows` use Burn's
+//! backend interfaces, which change with every minor version of Burn.
 
 use std::any::Any;
 use std::fmt::Debug;
@@ -16,15 +16,15 @@ use burn::backend::{
 };
 use burn::tensor::{Tensor, TensorData};
 
-/// An operator on contiguous f32 values: up to three tensors in, one out.
+/// An operator on contiguous f32 values: up to three input tensors, one result.
 pub trait Kernel: Debug + Send + Sync + 'static {
     /// Shape of the result.
     fn shape(&self) -> Vec<usize>;
 
-    /// The result, and, with `keep`, values for the backward pass beside the inputs. An absent input is one zero.
+    /// The result, and with `keep` the values that the backward pass needs beside inputs. An absent input is one zero.
     fn forward(&self, inputs: [&[f32]; 3], keep: bool) -> (Vec<f32>, Kept);
 
-    /// ∂L/∂ of the inputs that are wanted, each of the size of its input, from ∂L/∂result.
+    /// The gradients of the wanted inputs, each as long as its input, from the gradient of the result.
     fn backward(
         &self,
         inputs: [&[f32]; 3],
@@ -37,7 +37,7 @@ pub trait Kernel: Debug + Send + Sync + 'static {
 /// Values that an operator keeps for its backward pass.
 pub type Kept = Option<Box<dyn Any + Send>>;
 
-/// The tensors of a call.
+/// The input tensors of a call.
 #[derive(ExtensionType, Clone, Debug)]
 pub struct Inputs<B: Backend> {
     x: FloatTensor<B>,
@@ -82,7 +82,7 @@ fn slice(tensor: &FlexTensor) -> &[f32] {
 #[derive(Debug)]
 struct KernelBackward;
 
-/// A call, for the backward pass.
+/// What the backward pass needs of a call.
 #[derive(Debug, Clone)]
 struct Call {
     inputs: Inputs<Flex>,

@@ -1,26 +1,26 @@
-//! An approximation of the nearest matrix with orthonormal rows, as Muon uses it for directions (Jordan et al., "Muon").
+//! Newton-Schulz orthogonalisation of matrices for the optimiser Muon (Jordan et al., "Muon").
 
 use crate::multiply::{Multiply, Right};
 
-/// Coefficients of a step, of x, x³ and x⁵: those of Muon's authors, which bring singular values to between 0.7 and 1.2.
+/// Coefficients of x, x³ and x⁵ in a step, by Muon's authors. They bring singular values to between 0.7 and 1.2.
 const COEFFICIENTS: [f32; 3] = [3.4445, -4.775, 2.0315];
-/// How many steps there are.
+/// Number of steps.
 const STEPS: usize = 5;
-/// Smaller norms are taken for this.
+/// Norms below this value are replaced by it.
 const MIN_NORM: f32 = 1e-7;
-/// Smaller values are taken for 0. Beside a norm of 1 they are below f32's rounding. Products of a few of them would be subnormal numbers,
-/// with which processors multiply several times slower. Gradients of few directions are full of them.
+/// Smaller values become 0. Beside a norm of 1 they are below f32's rounding. Products of a few of these values are
+/// subnormal numbers, which processors multiply several times slower. Gradients of low rank have many of them.
 const NEGLIGIBLE: f32 = 1e-10;
 
-/// A matrix `[rows, columns]` with its singular values brought close to 1 by Newton-Schulz steps. On one thread: matrices
-/// are many, and small.
+/// Brings the singular values of a matrix `[rows, columns]` close to 1 by Newton-Schulz steps. Runs on one thread:
+/// matrices are many and small.
 ///
-/// A step multiplies X by Q = a + b·G + c·G², with G = X·Xᵀ. All Q are polynomials of the first G, so they commute, and the next G is
-/// Q·Q·G. Hence only the first and the last product have X's longer side. That saves more than half of the work for a side nine times the
-/// other, and costs a third more for equal sides.
+/// A step multiplies X by Q = a + b·G + c·G², with G = X·Xᵀ. All Q are polynomials of the first G. So they commute,
+/// and the next G is Q·Q·G. Only the first and the last product then have X's longer side. That saves more than half of
+/// the work if one side is nine times the other. For equal sides it costs a third more.
 pub fn orthogonalised(matrix: Vec<f32>, [rows, columns]: [usize; 2]) -> Vec<f32> {
     assert_eq!(matrix.len(), rows * columns);
-    // A tall matrix is read as its transpose, whose G is smaller.
+    // For a tall matrix X is the transpose, because its G is smaller.
     let is_tall = rows > columns;
     let (m, n) = if is_tall { (columns, rows) } else { (rows, columns) };
     // (column, row) strides of the m×n matrix as it is stored.
@@ -37,7 +37,7 @@ pub fn orthogonalised(matrix: Vec<f32>, [rows, columns]: [usize; 2]) -> Vec<f32>
     let transposed = Right::Plain((&x, [strides[1], strides[0]]));
     Multiply { size: [m, m, n], lhs: (&x, strides), rhs: &transposed, add: false }.write(&mut gram, m);
     gram.iter_mut().for_each(|value| *value = flushed(*value));
-    // The product of all Q begins with 1.
+    // `all` is the product of all Q. It begins as the identity.
     all.iter_mut().step_by(m + 1).for_each(|diagonal| *diagonal = 1.0);
     for step in 1..=STEPS {
         product(&gram, &gram, &mut correction);
@@ -61,7 +61,7 @@ pub fn orthogonalised(matrix: Vec<f32>, [rows, columns]: [usize; 2]) -> Vec<f32>
     out
 }
 
-/// 0 for a [`NEGLIGIBLE`] value.
+/// 0 if the value is below [`NEGLIGIBLE`], else the value.
 fn flushed(value: f32) -> f32 {
     if value.abs() < NEGLIGIBLE { 0.0 } else { value }
 }
@@ -70,7 +70,7 @@ fn flushed(value: f32) -> f32 {
 mod tests {
     use super::*;
 
-    /// A diagonal matrix stays diagonal, and the polynomial maps each of its values.
+    /// A diagonal matrix stays diagonal, and each of its values is mapped by the polynomial.
     #[test]
     fn singular_values_go_the_polynomials_way() {
         let values = [3.0_f32, 1.0, 0.25];
@@ -95,7 +95,7 @@ mod tests {
         assert_eq!(orthogonalised(vec![0.0; 6], [2, 3]), [0.0; 6]);
     }
 
-    /// Rows from 1 to 1e-7 or 1e-12, as in gradients of few directions: against the same steps in f64.
+    /// Rows whose sizes fall from 1 to 1e-7 or 1e-12, as in gradients of low rank, against the same steps in f64.
     #[test]
     fn matrices_of_few_directions_go_the_same_way() {
         for [rows, columns] in [[24, 60], [60, 24], [40, 40]] {

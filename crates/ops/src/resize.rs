@@ -1,5 +1,5 @@
-//! Bilinear resize of planes: every input row is stretched once, every output row blends two stretched ones. Its
-//! gradient goes the same way back.
+//! Bilinear resize of planes and its gradient. Every input row is resized to the output's width once, and every output
+//! row is a mean of two resized rows.
 
 use crate::buffers::take;
 use pulp::Arch;
@@ -22,7 +22,7 @@ pub fn resize(planes: &[f32], [rows, columns]: [usize; 2], down: &[Tap], across:
     let mut out = vec![0.0_f32; count * down.len() * across.len()];
     out.par_chunks_mut(down.len() * across.len()).zip(planes.par_chunks(rows * columns)).for_each(
         |(out, plane)| {
-            // The two stretched rows in use, and which they are.
+            // The two resized rows in use, and their row numbers.
             let mut held = [usize::MAX; 2];
             let mut stretched = [vec![0.0; across.len()], vec![0.0; across.len()]];
             for (out, &(low, high, weight)) in out.chunks_exact_mut(across.len()).zip(down) {
@@ -49,7 +49,7 @@ fn stretch(row: &[f32], across: &[Tap], out: &mut [f32]) {
     }
 }
 
-/// Gradient of the planes `[count, rows, columns]` of a [`resize`] from that of its result,
+/// Gradient of the planes `[count, rows, columns]` of [`resize`], from the gradient of its result
 /// `[count, down.len(), across.len()]`.
 pub fn resize_gradient(
     gradient: &[f32],
@@ -64,7 +64,7 @@ pub fn resize_gradient(
     tasks.for_each_init(
         || vec![0.0; size / down.targets],
         |sum, (out, gradient)| {
-            // Rows first: whole rows are vectors.
+            // Rows are summed first, because whole rows are vectors.
             for (row, out) in out.chunks_exact_mut(columns).enumerate() {
                 sum.fill(0.0);
                 for &(from, weight) in down.of(row) {
@@ -83,11 +83,11 @@ pub fn resize_gradient(
     out
 }
 
-/// Taps by the position that they read.
+/// The transpose of taps: for every position that is read, the positions that are written from it.
 struct Back {
-    /// How many positions they write.
+    /// Number of written positions.
     targets: usize,
-    /// Where the uses of every position begin, and where the last one's end.
+    /// Index of the first use of every position, then the number of all uses.
     starts: Vec<usize>,
     /// Written positions with their weights, which are not 0.
     uses: Vec<(usize, f32)>,
@@ -100,14 +100,14 @@ impl Back {
         };
         let mut all: Vec<_> = taps.iter().enumerate().collect::<Vec<_>>().iter().flat_map(parts).collect();
         all.retain(|&(.., weight)| weight != 0.0);
-        // Stable, so that uses stay in the order of their targets.
+        // The sort is stable, so that uses stay in the order of the written positions.
         all.sort_by_key(|&(position, ..)| position);
         let starts = (0..=from).map(|position| all.partition_point(|use_| use_.0 < position)).collect();
         let uses = all.into_iter().map(|(_, target, weight)| (target, weight)).collect();
         Self { targets: taps.len(), starts, uses }
     }
 
-    /// Uses of a position.
+    /// Uses of a position that is read.
     fn of(&self, position: usize) -> &[(usize, f32)] {
         &self.uses[self.starts[position]..self.starts[position + 1]]
     }

@@ -40,7 +40,7 @@ impl Rope {
     pub fn apply(&self, x: Tensor<4>) -> Tensor<4> {
         let [b, h, n, d] = x.dims();
         in_f32(x, |x| {
-            // Each half (row, column) holds pairs k and k + d/4; swapping the members gives the sine's factor.
+            // In each half (row, column), channels k and k + d/4 are a pair. The sine multiplies the other member.
             let swapped = x.clone().reshape([b * h * n, 2, 2, d / 4]).flip([2]).reshape([b, h, n, d]);
             x * self.cos.clone().unsqueeze() + swapped * self.sin.clone().unsqueeze()
         })

@@ -1,7 +1,7 @@
 #![allow(deprecated, reason = "NdArray is the CPU test backend")]
 
-//! Rows of a table with another gradient, for GPUs. Burn's own adds up the rows' gradients in one thread per column. Here
-//! each row is taken once at most, so that its gradient is a copy.
+//! A gather of a table's rows with a faster gradient, for GPUs. Burn scatters the rows' gradients with one thread per
+//! column. Here each row is taken once at most, so the gradient is a gather, too.
 
 use std::sync::Arc;
 
@@ -16,7 +16,7 @@ use burn_cubecl::CubeBackend;
 
 use crate::gpu::is_tracked_on_gpu;
 
-/// A table `[N, C]`, or rows of it.
+/// A table `[N, C]`, or rows of a table.
 #[derive(ExtensionType, Clone, Debug)]
 pub struct Table<B: Backend> {
     values: FloatTensor<B>,
@@ -51,14 +51,14 @@ fn select<B: Backend>(table: FloatTensor<B>, rows: &[i32]) -> FloatTensor<B> {
 struct RowsBackward;
 
 impl<B: Backend> Backward<B, 1> for RowsBackward {
-    /// The rows, and the table's shape.
+    /// The taken rows, and the table's shape.
     type State = (Arc<[i32]>, Shape);
 
     fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
         let upstream = grads.consume::<B>(&ops.node);
         let ([Some(parent)], (rows, shape)) = (ops.parents, ops.state) else { return };
         let [count, columns] = shape.dims();
-        // Rows that are not taken get a row of zeros behind the others.
+        // Rows that are not taken get the last row, which is 0.
         let mut places = vec![rows.len() as i32; count];
         for (place, row) in rows.iter().enumerate() {
             places[*row as usize] = place as i32;
@@ -83,13 +83,13 @@ impl<B: RowsBackend, C: CheckpointStrategy> RowsBackend for Autodiff<B, C> {
     }
 }
 
-/// No row of a table: [`taken`] returns zeros.
+/// Stands for no row: [`taken`] returns zeros.
 pub const NONE: i32 = -1;
 
-/// The `rows` `[M, C]` of a table `[N, C]`, zeros for [`NONE`].
+/// The `rows` `[M, C]` of a table `[N, C]`; zeros for [`NONE`].
 ///
 /// # Panics
-/// If a row is taken twice: on GPUs its gradient would be that of the last one alone.
+/// If a row is taken twice: on GPUs only the last one would have a gradient.
 pub fn taken(table: Tensor<2>, rows: &[i32]) -> Tensor<2> {
     let [n, columns] = table.dims();
     let mut is_taken = vec![false; n];
@@ -100,7 +100,7 @@ pub fn taken(table: Tensor<2>, rows: &[i32]) -> Tensor<2> {
     if !rows.contains(&NONE) {
         return selected(table, rows);
     }
-    // A last row without a gradient.
+    // The zeros are a last row without a gradient.
     let zeros = Tensor::zeros([1, columns], &table.device());
     let rows: Vec<i32> = rows.iter().map(|row| if *row == NONE { n as i32 } else { *row }).collect();
     selected(Tensor::cat(vec![table, zeros], 0), &rows)
@@ -127,7 +127,7 @@ mod tests {
     use crate::host;
     use crate::tests::uniform;
 
-    /// Rows 1 and 4 are not taken.
+    /// With rows that are not taken: 1 and 4.
     #[test]
     fn gradients_of_rows_equal_burns() {
         let rows = [3, NONE, 0, NONE, 2, NONE];

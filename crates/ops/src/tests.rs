@@ -1,4 +1,4 @@
-//! The kernels against the plain tensor code, at sizes that reach their corners.
+//! The kernels against the plain tensor code, at sizes that are no multiple of a block.
 
 use burn::module::Param;
 use burn::nn::LinearConfig;
@@ -8,7 +8,7 @@ use rand::{RngCore, SeedableRng};
 
 use super::Rope;
 
-/// Uniform in ±1; the same numbers on every run.
+/// Uniform in ±1 from a fixed seed.
 pub(crate) fn uniform(len: usize, seed: u64) -> Vec<f32> {
     let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
     (0..len).map(|_| random.next_u32() as f32 / u32::MAX as f32 * 2.0 - 1.0).collect()
@@ -18,7 +18,7 @@ pub(crate) fn random<const D: usize>(shape: [usize; D], seed: u64) -> Tensor<D> 
     Tensor::from_data(TensorData::new(uniform(shape.iter().product(), seed), shape), &Device::flex())
 }
 
-/// Relative L2 error. Both are f32, whose rounding over some hundred terms stays below a few 1e-6.
+/// Bounds the relative L2 error. f32 rounding over some hundred terms stays below a few 1e-6.
 pub(crate) fn assert_equal<const D: usize>(what: &str, got: Tensor<D>, expected: Tensor<D>) {
     assert_eq!(got.dims(), expected.dims(), "{what}");
     let norm = |x: Tensor<D>| x.square().sum().sqrt().into_scalar::<f32>();
@@ -47,7 +47,7 @@ fn linear_gelu_equals_its_composition() {
     assert_equal("gelu", super::linear_gelu(&layer, x.clone()), gelu(layer.forward(x)));
 }
 
-/// Also of a prime number of values, which has no two steps.
+/// Also for a prime number of values, which are summed in one step.
 #[test]
 fn sums_in_two_steps_and_their_gradients_equal_burns() {
     let device = Device::flex().autodiff();

@@ -1,4 +1,4 @@
-//! Rotary attention and bilinear resizing as operators with gradients, on `flex` in training.
+//! Rotary attention and bilinear resizing as [`Kernel`]s with gradients, for training on `flex`.
 
 use burn::tensor::Tensor;
 
@@ -9,11 +9,11 @@ use crate::resize::{resize, resize_gradient};
 use crate::train::{Attention, Tokens};
 use crate::{Rope, host};
 
-/// Attention whose queries, keys and values are tensors of their own, or parts of one.
+/// Rotary attention. Queries, keys and values are three tensors (`apart`) or side by side in one tensor.
 #[derive(Debug)]
 struct Attend {
     sizes: Attention,
-    /// cos and ±sin.
+    /// Tables of cos and ±sin, as in [`Rope`].
     tables: [Vec<f32>; 2],
     apart: bool,
 }
@@ -57,14 +57,14 @@ impl Kernel for Attend {
     }
 }
 
-/// As [`crate::rotary_attention`].
+/// [`crate::rotary_attention`] with gradients.
 pub fn apart([q, k, v]: [Tensor<3>; 3], rope: &Rope, heads: usize, half: bool) -> Tensor<3> {
     let ([batch, queries, c], keys) = (q.dims(), k.dims()[1]);
     let sizes = Attention { batch, queries, keys, heads, head_dim: c / heads, half };
     op::run(Attend { sizes, tables: tables(rope), apart: true }, q, Some(k), Some(v))
 }
 
-/// As [`crate::rotary_self_attention`].
+/// [`crate::rotary_self_attention`] with gradients.
 pub fn together(qkv: Tensor<3>, rope: &Rope, heads: usize, half: bool) -> Tensor<3> {
     let [batch, tokens, c] = qkv.dims();
     let sizes = Attention { batch, queries: tokens, keys: tokens, heads, head_dim: c / 3 / heads, half };
@@ -106,7 +106,7 @@ impl Kernel for Resize {
     }
 }
 
-/// As [`crate::bilinear`].
+/// [`crate::bilinear`] with gradients.
 pub fn resized(x: Tensor<4>, down: Vec<Tap>, across: Vec<Tap>) -> Tensor<4> {
     let none: Option<Tensor<1>> = None;
     op::run(Resize { from: x.dims(), down, across }, x, none.clone(), none)

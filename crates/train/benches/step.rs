@@ -1,9 +1,9 @@
 //! A training step, forward and backward, of the small predictor (`configs/small`, 256², batch 2) and of the regressor
 //! (two views of 256²): `cargo bench --workspace --bench step`. `docs/step_pytorch.py` measures PyTorch.
 //!
-//! Arguments: seconds per measurement (20), side (256), batch (2); `tiny`, `default` or `full` for that folder of `configs`;
-//! `wide` for twice the default's widths; `bf16`; `whole` for no partly frozen networks; `predictor` or `regressor` for
-//! one network alone, so that the printed memory is its own.
+//! Arguments: seconds per measurement (20), side (256), batch (2); `tiny`, `default` or `full` for that folder of
+//! `configs`; `wide` for twice the default's widths; `bf16`; `whole` for no partly frozen networks; `predictor` or
+//! `regressor` for one network alone, so that the printed memory is its own.
 
 use std::hint::black_box;
 use std::time::{Duration, Instant};
@@ -43,7 +43,7 @@ fn measure(seconds: f64, mut step: impl FnMut() -> (Duration, Duration)) -> Stri
 }
 
 fn main() {
-    // Free pages are kept, as the program keeps them.
+    // mimalloc keeps free pages, as in the program.
     #[allow(unsafe_code, reason = "a function of C")]
     unsafe {
         libmimalloc_sys::mi_option_set(15, 10_000);
@@ -51,7 +51,7 @@ fn main() {
     let arguments: Vec<f64> = std::env::args().filter_map(|argument| argument.parse().ok()).collect();
     let argument = |i: usize, default: f64| arguments.get(i).copied().unwrap_or(default);
     let (seconds, side, batch) = (argument(0, 20.0), argument(1, 256.0) as usize, argument(2, 2.0) as usize);
-    // Other threads than rayon's would hand every operator over and wait.
+    // A thread outside of rayon's pool would pass every operator to the pool and wait.
     rayon::scope(|_| run(seconds, side, batch));
 }
 

@@ -45,7 +45,7 @@ pub(crate) fn save<T: Task>(
     let text = serde_json::to_string(&record).expect("plain numbers and text");
     let metadata = HashMap::from([(RECORD_KEY.to_owned(), text)]);
     let names = rows.iter().map(|(name, row)| (name.clone(), row.dims().to_vec())).collect();
-    // One copy on the host at a time.
+    // Only one row at a time is copied to the host.
     let rows: Vec<_> = rows.into_values().collect();
     let values = |i: usize| Ok(host(rows[i].clone()));
     write_tensors(path, "the state of the training", metadata, names, values, &|_, _| ())

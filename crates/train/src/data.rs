@@ -68,8 +68,8 @@ impl<I: Clone + Send + Sync + 'static> Data<I> {
         ComposedDataset::new(self.training.iter().map(|set| set.with_epoch(pass)).collect())
     }
 
-    /// Sums over all samples of the validation, of which each rank adds its share: one sum per rank, on all ranks. If a sample of
-    /// any rank fails, all ranks get its error.
+    /// Calls `add` for this rank's share of the validation's samples. Returns the sums of all ranks, on all ranks. If a
+    /// sample of any rank fails, all ranks get an error.
     pub(crate) fn validated<S: Clone + Default + Serialize + DeserializeOwned>(
         &self,
         ranks: &Ranks,

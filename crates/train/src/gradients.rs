@@ -28,7 +28,7 @@ pub fn collect(networks: &Networks, gradients: &mut Gradients) -> Rows {
     collect.rows
 }
 
-/// Adds the gradients of one batch to those of the others.
+/// Adds the gradients of a batch to the sum of the earlier batches.
 pub fn add(sum: &mut Rows, gradients: Rows) {
     for (name, gradient) in gradients {
         let total = match sum.remove(&name) {
@@ -39,8 +39,8 @@ pub fn add(sum: &mut Rows, gradients: Rows) {
     }
 }
 
-/// Sums of all ranks' gradients on a device, where a rank may lack some. The ranks have the same networks, with parameters of
-/// these lengths.
+/// Sums of all ranks' gradients, on a device. A rank may lack some gradients. `lengths` are the numbers of values of
+/// all parameters, which are the same on all ranks.
 pub fn reduce(
     ranks: &Ranks,
     mut gradients: Rows,

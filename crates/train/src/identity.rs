@@ -12,8 +12,8 @@ use crate::TrainError;
 use crate::config::TrainConfig;
 use crate::task::Task;
 
-/// Keys that may change between the sessions of a run: its length, its reports, the speed of its loader, and paths. The files
-/// behind the paths have hashes of their own, or are no longer read.
+/// Keys that may change between the sessions of a run: its length, its reports, the speed of its loader, and paths. The
+/// files behind the paths have hashes of their own, or are no longer read.
 const FREE: [&str; 10] = [
     "data.folders",
     "stage2.lpips.files",
@@ -29,12 +29,12 @@ const FREE: [&str; 10] = [
 /// Sections of the networks. A state of other networks cannot be used.
 const NETWORKS: [&str; 3] = ["network.", "regressor.", "mode."];
 
-/// Beginnings of the keys that decide what a validation measures, besides the data.
+/// Prefixes of the keys that decide what a validation measures, besides the data.
 const VALIDATION: [&str; 3] = ["samples.", "training.validate_on", "training.validation_samples"];
-/// Beginnings of those among them that training samples alone have.
+/// Prefixes of the keys of [`VALIDATION`] that affect training samples alone.
 const TRAINING_ALONE: [&str; 3] = ["samples.augment.", "samples.repeat", "samples.seed"];
 
-/// What a run trains on what.
+/// Settings, data and frozen predictor of a run.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub(crate) struct Identity {
     /// The config's keys with their values, without the keys that may change.
@@ -74,19 +74,19 @@ impl Identity {
         Ok(Self { config: own, data, validated, predictor })
     }
 
-    /// The identity of a run of an earlier program, without the keys that are gone.
+    /// This identity without the keys that the config no longer has.
     pub fn current(mut self) -> Self {
         self.config.retain(|key, value| !is_gone::<TrainConfig>(key, value));
         self
     }
 
-    /// What differs in the identity `there`.
+    /// Differences from the identity `there`.
     pub fn differences(&self, there: &Self) -> Vec<String> {
         let [harmful, harmless] = self.sorted(there);
         harmful.into_iter().chain(harmless).collect()
     }
 
-    /// What differs in the identity `there`: the networks, and all else.
+    /// Differences from the identity `there`: of the networks, and of everything else.
     fn sorted(&self, there: &Self) -> [Vec<String>; 2] {
         let mut harmful = Vec::new();
         let mut harmless = Vec::new();

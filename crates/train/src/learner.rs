@@ -54,7 +54,7 @@ pub(crate) struct Learner<'a, T: Task> {
     pub ranks: &'a Ranks,
     /// With gradients.
     device: &'a Device,
-    /// Numbers of values of all parameters.
+    /// Number of values of each parameter.
     lengths: BTreeMap<String, usize>,
     samples: Samples<'a, T>,
 }
@@ -108,7 +108,7 @@ impl<'a, T: Task> Learner<'a, T> {
         for values in self.networks.checkpoint().values() {
             values.iter().for_each(|value| hash.update(value.to_le_bytes()));
         }
-        // Keys that a run may change, but not a rank.
+        // A run may change these keys between sessions, but all ranks need the same values.
         let t = &self.config.training;
         let times = [t.steps, t.validate_every, t.checkpoint_every, t.preview_every];
         let own = (identity.clone(), times, format!("{:x}", hash.finalize()), self.ranks.host().to_owned());
@@ -218,7 +218,7 @@ impl<'a, T: Task> Learner<'a, T> {
         Ok(Ok(values))
     }
 
-    /// A reason that concerns the samples of all ranks. `names` are those of this one.
+    /// A reason that concerns the samples of all ranks. `names` are this rank's samples.
     fn everywhere(&self, why: &str, names: Vec<String>) -> Skipped {
         of_samples(why, &self.ranks.gather(&names).concat())
     }
@@ -258,7 +258,7 @@ impl<'a, T: Task> Learner<'a, T> {
         Ok(Made { values, gradients: Some(rows) })
     }
 
-    /// This rank's part of a batch, by the batch's number since the beginning of the run; or the reason why a part of it cannot be loaded.
+    /// This rank's part of a batch of the run, or the reason why any rank cannot load its part.
     fn load(&mut self, number: u64) -> Result<Loaded<T::Item>, Skipped> {
         let loaded = self.samples.get(number, self.ranks);
         let reasons = self.ranks.gather(&loaded.as_ref().err().cloned());

@@ -84,8 +84,8 @@ impl Log {
         self.lines.last().map_or(0.0, |line| line.seconds)
     }
 
-    /// An SVG of the loss over the steps and, below it, of the figure by which validations choose the best weights. Empty without
-    /// values.
+    /// An SVG of the loss over the steps and, below it, of the score by which validations choose the best weights. It
+    /// is empty without values.
     pub fn curves(&self) -> String {
         let chart = |caption: &'static str, y: &'static str, name: &str, log_y: bool| {
             let values =

@@ -1,4 +1,4 @@
-//! The networks that are trained: the point predictor, the regressors, or both. Names are those of the checkpoints.
+//! The trained networks: the point predictor, the regressors, or both. Parameters have the names of checkpoints.
 
 use std::collections::BTreeMap;
 
@@ -94,8 +94,8 @@ impl Networks {
         self.parameters().into_iter().map(stored).collect()
     }
 
-    /// The same networks with the values in `rows`, which may be on another device. Other parameters keep their values, and
-    /// tracked ones stay tracked.
+    /// The same networks with the values in `rows`, which may be on another device. Parameters without a
+    /// row keep their values, and tracked parameters stay tracked.
     pub fn with_rows(self, rows: &Rows) -> Self {
         struct Replace<'a>(&'a Rows);
         impl NamedMapper for Replace<'_> {

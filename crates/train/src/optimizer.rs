@@ -22,9 +22,9 @@ pub struct OptimizerConfig {
     pub rate: f64,
     /// Decay of the gradients' mean.
     pub beta1: f64,
-    /// Decay of their squares' mean.
+    /// Decay of the mean of squared gradients.
     pub beta2: f64,
-    /// Added to the root of the squares' mean.
+    /// Added to the root of the mean of squared gradients.
     pub epsilon: f64,
     /// Share of a weight that a step at rate 1 would remove.
     pub weight_decay: f64,
@@ -42,7 +42,7 @@ pub struct MuonSettings {
     pub rate: f64,
     /// Share of the former velocity in the direction of a step.
     pub momentum: f64,
-    /// As in AdamW.
+    /// Share of a weight that a step at rate 1 would remove.
     pub weight_decay: f64,
 }
 
@@ -120,14 +120,14 @@ fn is_hidden(name: &str, rank: usize) -> bool {
 }
 
 impl Optimizer {
-    /// The device of a step for networks on `device`. With Muon it is the host: matrices are many and small, and each would be
-    /// dozens of kernels on a GPU.
+    /// The device of a step for networks on `device`. With Muon it is the host: matrices are many and small, and each
+    /// would be dozens of kernels on a GPU.
     pub(crate) fn device(&self, device: Device) -> Device {
         if self.config.muon.is_some() { Device::flex() } else { device }
     }
 
-    /// All values after one step of those that have a gradient, at `share` of the highest rates, on the device of a step.
-    /// Gradients are multiplied by `factor` first.
+    /// Makes one step of all parameters that have a gradient, at `share` of the highest rates, with gradients times
+    /// `factor`. Returns the values of all parameters, on the optimiser's device.
     pub fn step(&mut self, share: f64, networks: &Networks, gradients: Rows, factor: f64) -> Rows {
         let parameters = networks.parameters();
         let Some(device) = parameters.first().map(|first| self.device(first.values.device())) else {

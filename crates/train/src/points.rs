@@ -21,8 +21,8 @@ pub struct Losses {
     pub regression: Tensor<1>,
     /// Mean binary cross-entropy of the confidences per view, summed: `[1]`.
     pub confidence: Tensor<1>,
-    /// Mean error in metres of the differences between pixels that are 1, 2, 4 and 8 apart, per view, summed: `[1]`; if it
-    /// was asked for.
+    /// Mean error in metres of the differences between pixels that are 1, 2, 4 and 8 apart, per view, summed: `[1]`; if
+    /// it was asked for.
     pub relief: Option<Tensor<1>>,
 }
 
@@ -40,8 +40,8 @@ impl Losses {
 }
 
 /// The losses of predicted maps of the first V views. `points` `[B,V,S,S,3]` are the true points in metres in the front
-/// camera's frame, and `valid` `[B,V,S,S]`, 0 or 1, marks the pixels that have one. Confidences must be probabilities. The means are over
-/// the pixels of a sample, and then over the samples. `relief` asks for that loss.
+/// camera's frame, and `valid` `[B,V,S,S]`, 0 or 1, marks the pixels that have one. Confidences must be probabilities.
+/// The means are over the pixels of a sample, and then over the samples. `relief` asks for that loss.
 pub fn losses(prediction: &Prediction, points: &Tensor<5>, valid: &Tensor<4>, relief: bool) -> Losses {
     let Prediction { window, maps } = prediction;
     let ([b, ..], h, w) = (points.dims(), window.rows.len(), window.columns.len());
@@ -72,7 +72,7 @@ pub fn losses(prediction: &Prediction, points: &Tensor<5>, valid: &Tensor<4>, re
     Losses { regression: sum(regression), confidence: sum(confidence), relief: relief.then(|| sum(reliefs)) }
 }
 
-/// What the losses measure: the errors themselves, and their differences between two pixels that are [`SPACINGS`] apart in a row or a column.
+/// Pixel offsets: `0, 0` for the errors themselves, [`SPACINGS`] down and across for their differences.
 fn offsets(h: usize, w: usize) -> Vec<[usize; 2]> {
     let apart = SPACINGS.into_iter().flat_map(|spacing| [[spacing, 0], [0, spacing]]);
     [[0, 0]].into_iter().chain(apart.filter(|[down, across]| *down < h && *across < w)).collect()

@@ -1,5 +1,5 @@
-//! The processes of a training. With the feature `mpi`, under `mpirun` or `srun`, each is a rank of MPI. Otherwise there is one process.
-//! All ranks make the same calls in the same order.
+//! The processes of a training. With the feature `mpi`, under `mpirun` or `srun`, each is a rank of MPI. Otherwise
+//! there is one process. All ranks make the same calls in the same order.
 
 use std::ops::Range;
 
@@ -9,9 +9,9 @@ use snapsnap_data::sample::share;
 
 use crate::TrainError;
 
-/// Environment variables that launchers of MPI set: Open MPI's, PMIx', and those of MPICH and of Slurm's PMI-2.
+/// Environment variables that MPI launchers set: Open MPI, PMIx, and MPICH or Slurm's PMI-2.
 const LAUNCHERS: [&str; 3] = ["OMPI_COMM_WORLD_SIZE", "PMIX_RANK", "PMI_RANK"];
-/// Environment variables with the number of processes, the last one of `srun`.
+/// Environment variables with the number of processes. `srun` sets the last one.
 const SIZES: [&str; 3] = ["OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "SLURM_STEP_NUM_TASKS"];
 
 /// The place of this process among those of its training.
@@ -42,7 +42,7 @@ impl Default for Ranks {
 }
 
 impl Ranks {
-    /// Joins the ranks of a launcher, or stays alone without one. MPI ends when the result is dropped, which all ranks have to do.
+    /// Joins the ranks of a launcher, or stays alone without one. MPI ends when all ranks have dropped the result.
     ///
     /// # Errors
     /// A message if several processes were started, and this one cannot join the others.
@@ -98,7 +98,7 @@ impl Ranks {
         share([self.rank, self.size], count)
     }
 
-    /// Every rank's value, by rank.
+    /// The values of all ranks, in the order of the ranks.
     ///
     /// # Panics
     /// If a value does not have the same type on all ranks.
@@ -106,13 +106,13 @@ impl Ranks {
         if self.size == 1 {
             return vec![value.clone()];
         }
-        // Unlike JSON it has infinite numbers.
+        // MessagePack has infinite numbers and NaN, JSON does not.
         let bytes = rmp_serde::to_vec(value).expect("plain data");
         let read = |bytes: &Vec<u8>| rmp_serde::from_slice(bytes).expect("all ranks send the same type");
         self.exchange(&bytes).iter().map(read).collect()
     }
 
-    /// Ends all ranks' work if one of them failed: with its own error on that rank, and with a report of it on the others.
+    /// Returns an error on all ranks if any rank failed: its own error on a failed rank, a report of it on the others.
     ///
     /// # Errors
     /// [`TrainError`] if any rank failed.
@@ -203,7 +203,7 @@ mod over_mpi {
             starts.iter().zip(&counts).map(part).collect()
         }
 
-        /// Every rank adds up one part of the values, and sends the sum to all: each value travels twice, whatever the number of ranks.
+        /// Each rank sums one part of the values and sends the sum to all ranks. Each value is sent twice.
         pub(super) fn sum_all(&self, values: &mut [f32]) {
             let part = values.len().div_ceil(self.size);
             if part == 0 {

@@ -52,7 +52,7 @@ pub struct Options<'a> {
     pub limit: Option<Duration>,
     /// Flag that ends the session.
     pub stop: &'a AtomicBool,
-    /// Continue a run although other settings, data or predictors than its own are given.
+    /// Continue a run although its settings, data or predictor differ from the recorded ones.
     pub force: bool,
 }
 
@@ -170,7 +170,7 @@ struct Session<'a, T: Task> {
     options: &'a Options<'a>,
     watch: &'a mut dyn Watch,
     start: Instant,
-    /// The first rank's.
+    /// Only the first rank has one.
     log: Option<Log>,
     identity: Identity,
     /// Why the last skipped step was skipped.
@@ -192,7 +192,7 @@ impl<'a, T: Task> Session<'a, T> {
         let mut learner = Learner::new(task, config, networks, options.device, options.ranks);
         let state = options.folder.join(STATE);
         let identity = Identity::of(task, config)?;
-        // The first rank is about to write a state.
+        // The first rank decides, since it is about to write a state.
         let is_begun = options.ranks.gather(&state.exists())[0];
         let mut is_changed = false;
         if is_begun {
@@ -392,8 +392,8 @@ fn save_state<T: Task>(path: &Path, learner: &Learner<T>, identity: &Identity) -
     Ok(checkpoint::save(path, learner, identity)?)
 }
 
-/// Runs `work` on the best thread for its device. For the CPU it is one of rayon's threads, since other threads hand
-/// every operator over and wait. Other devices order work by the calling thread.
+/// Runs `work` on the best thread for its device. For the CPU it is a thread of rayon's pool, since any other thread
+/// passes every operator to the pool and waits. Other devices order their work by the calling thread.
 pub fn on_best_thread<R: Send>(device: &Device, work: impl FnOnce() -> R + Send) -> R {
     if device.clone().inner() == Device::flex() {
         let mut result = None;

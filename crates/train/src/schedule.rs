@@ -28,8 +28,8 @@ pub enum Schedule {
         /// The last rate divided by the highest.
         end: f64,
     },
-    /// A linear rise, the highest rate, and a linear fall ("warmup-stable-decay"). While the rate is constant, it does not depend on
-    /// the number of steps, so that a run's end can be set later.
+    /// A linear rise, the highest rate, and a linear fall ("warmup-stable-decay"). While the rate is constant, it does
+    /// not depend on the number of steps, so that a run's end can be set later.
     Trapezoid {
         /// Steps in which the rate rises.
         warm_up: usize,

@@ -68,8 +68,8 @@ pub trait Task: Sync {
         None
     }
 
-    /// Parts of the loss of a batch, or of one rank's share of it. The loss of a whole batch is the mean of its shares' losses, weighted
-    /// with their numbers of samples. Empty if no sample shows a person.
+    /// Parts of the loss of a batch, or of one rank's share of it. The loss of a whole batch is the mean of its shares'
+    /// losses, weighted with their numbers of samples. Empty if no sample shows a person.
     ///
     /// # Errors
     /// [`TrainError`] if the batch cannot be used.

@@ -20,7 +20,7 @@ fn json(command: &mut Command) -> Value {
     serde_json::from_str(&succeed(command.arg("--json"))).expect("JSON")
 }
 
-/// The pair of pictures of the reference that is cut out of the sheet of people.
+/// The reference's pair of pictures that are cut out of the sheet of people.
 #[test]
 fn figures_are_those_of_scikit_image_in_every_window() {
     let temporary = tempfile::tempdir().expect("a folder");

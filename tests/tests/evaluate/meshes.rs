@@ -11,7 +11,7 @@ fn a_mesh_is_as_far_from_the_truth_as_it_was_moved_until_it_is_aligned() {
     let temporary = tempfile::tempdir().expect("a folder");
     let (meshes, report) = (temporary.path().join("meshes"), temporary.path().join("report"));
     fs::create_dir(&meshes).expect("a folder");
-    // Only one of the two has a mesh, moved by 3 cm and turned by 4°. The other wears a skirt, which looks alike when turned.
+    // One of them has a mesh, moved by 3 cm and turned by 4°. The other wears a skirt, which looks alike when turned.
     let scan = fs::read_to_string(people().join("scans/test/0001/0001.obj")).expect("the saved scan");
     let (sin, cos) = 4.0_f64.to_radians().sin_cos();
     let lines =
@@ -44,7 +44,7 @@ fn a_mesh_is_as_far_from_the_truth_as_it_was_moved_until_it_is_aligned() {
     assert!(aligned[0].as_f64().is_some_and(|degrees| (degrees - 4.0).abs() < 1.5), "{aligned}");
     let text = fs::read_to_string(report.join("report.md")).expect("a report");
     assert!(text.contains("rigid, by iterated closest points"), "{text}");
-    // The name of before, with a value.
+    // The option's former name, with a value.
     let (_, _, scaled) = run(&["--icp", "similarity"]);
     assert!(scaled[2].as_f64().is_some_and(|scale| (scale - 1.0).abs() < 0.03 && scale != 1.0), "{scaled}");
 }
@@ -65,7 +65,7 @@ fn scans_are_the_truth_where_they_are_given() {
     for key in ["truth_to_surface", "surface_to_scan"] {
         assert!(figure(key) < 1e-4, "{key}: {found}");
     }
-    // Both have 50,000 different points on some three square metres.
+    // Both surfaces have 50,000 different points on some three square metres.
     assert!((0.3..0.5).contains(&figure("chamfer")), "{found}");
 }
 
@@ -80,7 +80,7 @@ fn meshes_of_two_data_sets_are_told_apart() {
     let scan = fs::read_to_string(people().join("scans/test/0001/0001.obj")).expect("the saved scan");
     let scan: String =
         scan.lines().filter(|line| !line.contains("mtl")).flat_map(|line| [line, "\n"]).collect();
-    // One that belongs to neither.
+    // A mesh that belongs to neither set.
     fs::write(meshes.join("0001.obj"), &scan).expect("writes");
     let run = || {
         let mut command = snapsnap();
@@ -100,7 +100,7 @@ fn meshes_of_two_data_sets_are_told_apart() {
     assert_eq!(found["subjects"].as_array().map(Vec::len), Some(1), "{found}");
     assert_eq!((&found["subjects"][0]["name"], found["people"].as_u64()), (&name.into(), Some(1)), "{found}");
     assert_eq!(found["left_out"].as_array().map(Vec::len), Some(3), "{found}");
-    // Sets of one name have that of the folder around them as well, however they were typed.
+    // Sets of the same name are told apart by their parent folder's name, also for relative paths.
     let around = temporary.path().join("around");
     fs::create_dir_all(meshes.join("around/people")).expect("a folder");
     fs::create_dir(&around).expect("a folder");

@@ -29,7 +29,7 @@ fn aligned_models_have_smaller_errors_and_the_report_says_how_they_moved() {
     assert!(moved_text.contains("## Alignment") && moved_text.contains("rigid and scale"), "{moved_text}");
     let apart = |report: &Value| report["geometry_cm"]["to_truth"]["mean"].as_f64().expect("a distance");
     assert!(apart(&moved) < apart(&plain), "{} → {}", apart(&plain), apart(&moved));
-    // Baselines stay.
+    // Baselines are not aligned.
     assert_eq!(moved["baselines"], plain["baselines"]);
 }
 
@@ -88,7 +88,7 @@ fn a_report_has_its_keys_and_follows_from_its_tables() {
     let mean = |contestant: &str, protocol: &str, figure: usize| {
         let people = ["0000", "0001"].map(|name| {
             let sum = sums[&[contestant, protocol, name]];
-            // Six views from two sides.
+            // Six views for each of two turns.
             assert_eq!(sum[0], 12.0);
             sum[figure] / sum[0]
         });
@@ -175,7 +175,7 @@ fn five_photographs_have_no_unseen_sides() {
     assert!(text.contains("| model | 2 | 6 |"), "{text}");
 }
 
-/// Their networks are for known cameras alone, at the angle of their training.
+/// Networks of neighbours need known cameras at the angle of their training.
 #[test]
 fn networks_of_neighbours_are_refused_for_other_photographs() {
     let temporary = tempfile::tempdir().expect("a folder");
@@ -212,7 +212,7 @@ fn networks_of_neighbours_are_refused_for_other_photographs() {
     assert!(!temporary.path().join("human.ply").exists());
 }
 
-/// Changed photographs change the figures of their ablation. Placed ones have no errors of points.
+/// Changed photographs change the figures of their ablation. Placed photographs have no errors of points.
 #[test]
 fn photographs_are_changed_by_ablations() {
     let temporary = tempfile::tempdir().expect("a folder");

@@ -17,7 +17,7 @@ const CONVOLUTION: [&str; 4] = [
     "network.ray_channels=true",
 ];
 
-/// The device, unless it is a software adapter: compiling kernels takes minutes there, and keys act alike on every device.
+/// The device, unless it is a software adapter, which compiles kernels for minutes.
 fn real_device() -> Option<Device> {
     let device = device()?;
     if is_software(&device) {
@@ -116,7 +116,7 @@ fn a_mirrored_back_is_the_back_of_a_mirrored_photograph() {
     }
 }
 
-/// With `network.both_ways` the prediction of mirrored photographs is the mirrored prediction, but for the order of sums.
+/// With `network.both_ways`, mirrored photographs give the mirrored prediction, but for rounding.
 #[test]
 fn predictions_of_both_ways_are_symmetric() {
     let Some(device) = real_device() else { return };
@@ -146,7 +146,7 @@ fn predictions_of_both_ways_are_symmetric() {
             let got = [values(map.points.clone()), values(map.conf.clone())].concat();
             let error = relative_error(&got, &mirrored(&flipped[other].1));
             assert!(error < 1e-6, "{view:?}: {error:e}");
-            // It is the mean of the two single predictions.
+            // The prediction is the mean of the two single predictions.
             let alone = &once[*view as usize].1;
             let alone = [values(alone.points.clone()), values(alone.conf.clone())].concat();
             let mean: Vec<f32> =
@@ -183,7 +183,7 @@ fn channels_hold_the_share_of_the_person_and_the_ray() {
     near(at(1, 5, 0, 7), down);
 }
 
-/// The maps of a result, its Gaussians and its plan agree on the points that moved.
+/// The maps, the Gaussians and the steps of a reconstruction agree on the points that moved.
 #[test]
 fn points_that_moved_into_the_silhouettes_are_those_of_maps_and_gaussians() {
     let Some(device) = device() else { return };
@@ -222,7 +222,7 @@ fn points_that_moved_into_the_silhouettes_are_those_of_maps_and_gaussians() {
         run.steps.iter().find_map(pixels)
     };
     assert_eq!([moved(&runs[0]), moved(&runs[1])], [None, Some(count)]);
-    // A Gaussian's centre is its pixel's point and the regressor's offset, 1.25 mm at most here. The points move by centimetres.
+    // A centre is its pixel's point and the regressor's offset, 1.25 mm at most. Points move by centimetres.
     for (run, points) in runs.iter().zip([before, after]) {
         let chosen = points.chunks_exact(3).zip(run.valid.iter().flatten());
         let points: Vec<f32> =
@@ -234,7 +234,7 @@ fn points_that_moved_into_the_silhouettes_are_those_of_maps_and_gaussians() {
     }
 }
 
-/// The steps tell channels and the window. Every valid pixel of a photograph becomes a Gaussian.
+/// The steps contain the channels and the window. Every valid pixel of a photograph becomes a Gaussian.
 #[test]
 fn the_steps_of_a_reconstruction_name_channels_and_window() {
     let Some(device) = device() else { return };

@@ -12,7 +12,7 @@ mod splat_oracle;
 mod steps;
 mod training;
 
-/// |`found` − `expected`|. A NaN is infinitely far away: `max` would pass over it.
+/// |`found` − `expected`|, ∞ for a NaN, which `f64::max` would ignore.
 fn distance(found: f64, expected: f64) -> f64 {
     let distance = (found - expected).abs();
     if distance.is_nan() { f64::INFINITY } else { distance }

@@ -41,7 +41,7 @@ fn predictor(folder: &Path, config: &Config, device: &Device) -> PointPredictor 
     WeightFile::open(file.path(), None).expect("our file").point_predictor(device).expect("weights")
 }
 
-/// Compares the network of the fixture `name`, which has numbers of so many `heads`.
+/// Compares the network of the fixture `name`, which has numbers of `heads` heads.
 fn network(name: &str, heads: usize) {
     let folder = fixture(name);
     let Some(device) = device() else { return };

@@ -12,7 +12,7 @@ const BOUND: f64 = 1e-4;
 /// A confidence this close to the threshold may fall on either side of it.
 const UNDECIDED: f32 = 1e-5;
 const THRESHOLD: f32 = 0.9;
-/// Most side pixels that take the colour of another, equally near neighbour. Random weights give a few such ties.
+/// Largest number of side pixels with the colour of another, equally near neighbour. Random weights give a few ties.
 const MOST_TIES: usize = 4;
 
 /// The fixture's pictures as files; returns the arguments that name them.
@@ -96,8 +96,8 @@ fn compare(got: &Numbers, expected: &Numbers) {
         assert!(a == b || (conf[i] - THRESHOLD).abs() < UNDECIDED, "valid: pixel {i}");
     }
     let ties = side_images(got, expected, &valid.1, &expected_valid.1);
-    // A tie with the other colour changes the regressor's input of that side, so that its Gaussians have no counterpart.
-    // `networks` compares the regressor on equal inputs.
+    // A tie with the other colour changes the regressor's input of that side, so that its Gaussians have no
+    // counterpart. `networks` compares the regressor on equal inputs.
     let area = valid.0[1..].iter().product::<usize>();
     let same_picture = |pixel: usize| pixel / area < 2 || ties[pixel / area - 2] == 0;
 
@@ -115,7 +115,7 @@ fn compare(got: &Numbers, expected: &Numbers) {
     }
 }
 
-/// Side images agree except where two neighbours are equally near. Returns the number of these ties per side.
+/// Side images agree except where two neighbours are equally near. Returns the number of ties per side.
 fn side_images(got: &Numbers, expected: &Numbers, valid: &[u8], expected_valid: &[u8]) -> [usize; 2] {
     let points = expected.f32("points").1;
     let (got, expected_images) = (got.f32("side_images"), expected.f32("side_images"));

@@ -111,7 +111,7 @@ fn random_gaussians_are_fitted_to_a_scene() {
         let worst = losses.iter().zip(&expected).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
         let relative = losses.iter().zip(&expected).map(|(a, b)| (a / b - 1.0).abs()).fold(0.0, f32::max);
         println!("against the CPU: loss within {worst:.1e}, relatively {relative:.1e}; {cpu:.2} dB there");
-        // Rounding grows along the way. Both descents agree to 1e-3 of the first loss.
+        // Rounding errors grow with the steps. Both descents agree to 1e-3 of the first loss.
         assert!(worst < 1e-3 * expected[0] && (after - cpu).abs() < 0.3);
     }
 }

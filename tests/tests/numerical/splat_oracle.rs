@@ -8,7 +8,7 @@ use snapsnap_tests::{Numbers, device, device_name, fixture, is_on_gpu, values};
 
 use crate::distance;
 
-/// Names of the 14 numbers of a Gaussian, and where each name's numbers lie.
+/// Inputs, and their columns among the 14 numbers of a Gaussian.
 const PARTS: [(&str, std::ops::Range<usize>); 5] =
     [("means", 0..3), ("rotations", 3..7), ("scales", 7..10), ("opacities", 10..11), ("colors", 11..14)];
 
@@ -72,7 +72,7 @@ fn load(name: &str) -> (Numbers, HostScene, Vec<Camera>, RenderOptions) {
     (numbers, scene, cameras, options)
 }
 
-/// Largest difference of `found` `[H·W]` from camera `camera` of the fixture, over the pixels that `banded` spares.
+/// Largest difference of `found` `[H·W]` from camera `camera` of the fixture, over the pixels that are not `banded`.
 fn worst<'a>(
     numbers: &Numbers,
     camera: usize,
@@ -378,8 +378,8 @@ fn finite_differences_of_the_operation() {
     }
 }
 
-/// Spherical harmonics are an ordinary tensor function: their gradients agree with finite differences, in the coefficients
-/// and, through the direction of view, in the means.
+/// Spherical harmonics are an ordinary tensor function: their gradients agree with finite differences, in the
+/// coefficients and, through the direction of view, in the means.
 #[test]
 fn harmonics_are_differentiable() {
     let Some(device) = device() else { return };

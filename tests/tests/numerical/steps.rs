@@ -46,7 +46,7 @@ fn people(root: &std::path::Path) -> Arc<Folder> {
     config.views.second_depth = true;
     let folder = Folder::create(&root.join("people"), config.description("test")).expect("makes");
     for index in 0..2 {
-        // With most people, elements of almost no gradient turn AdamW's first step around by their rounding alone.
+        // With most other people, rounding alone turns AdamW's first step around for elements of almost no gradient.
         let (name, person) = (format!("{index:04}"), synth::person(&format!("stride/{index}"), None));
         config.add(&folder, &Subject::plain(Split::Train, &name), &person).expect("adds");
     }
@@ -87,7 +87,7 @@ fn compare(stage: &str, on: impl Fn(&Device) -> (f64, Rows, Networks), device: &
     compare_weights(stage, &rows, &after, &expected_after);
 }
 
-/// Compares losses and gradients. Returns the gradients of `flex` and the networks after a step on `device` and on `flex`.
+/// Compares losses and gradients. Returns `flex`'s gradients, and the networks after a step on both devices.
 fn compare_gradients(
     stage: &str,
     on: impl Fn(&Device) -> (f64, Rows, Networks),
@@ -117,7 +117,7 @@ fn compare_weights(stage: &str, expected_rows: &Rows, after: &Networks, expected
     let total: f64 = gradients::norm(expected_rows);
     let (got, expected) = (after.checkpoint(), expected_after.checkpoint());
     for (name, expected) in expected {
-        // A first step of AdamW is as long for a gradient of rounding as for any other.
+        // AdamW's first step has the same length for a rounding error as for any other gradient.
         let Some(row) = expected_rows.get(&name) else {
             // The first unit of the coarsest fusion never runs.
             assert_eq!(got[&name], expected, "{stage}: {name} has no gradient");
@@ -205,7 +205,7 @@ fn a_step_of_stage_2_is_the_same_on_every_device() {
         if sides {
             compare(what, on, &device);
         } else {
-            // Without its step: AdamW's first one is as long for a gradient of rounding as for any other, and the regressor has some here.
+            // No comparison of weights: AdamW's first step is as long for rounding errors.
             compare_gradients(what, on, &device);
         }
     }
@@ -257,7 +257,7 @@ fn sixteen_bits_have_the_same_gradients_but_for_rounding() {
     }
 }
 
-/// Random values in f64, tracked.
+/// Random values in `range`, as many as a tensor of `shape` has.
 fn random(shape: &[usize], range: std::ops::Range<f64>, seed: u64) -> Vec<f64> {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     (0..shape.iter().product()).map(|_| random.random_range(range.clone())).collect()

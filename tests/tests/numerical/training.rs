@@ -1,4 +1,4 @@
-//! Training against the authors' code: losses, gradients and weights of its steps (f64 arithmetic, stored as f32 or f64).
+//! Losses, gradients and weights of training steps against the authors' code, which computed them in f64.
 
 use std::collections::BTreeMap;
 

@@ -53,7 +53,7 @@ fn perceptual_distance_is_part_of_the_last_steps() {
     assert!(said.contains("stage2.lpips"), "{said}");
 }
 
-/// A run keeps the precision in which it began, and weights tell it to `reconstruct`.
+/// A run keeps its precision, and `reconstruct` reads the precision from the weights.
 #[test]
 fn the_precision_of_a_run_is_that_of_its_weights() {
     let (temporary, config) = place();
@@ -157,8 +157,8 @@ fn validations_of_sixteen_bits_are_close_to_thirty_two() {
     }
     let state = fs::read(temporary.path().join("f16/state/state.safetensors")).expect("a state");
     assert!(String::from_utf8_lossy(&state[..20_000]).contains("\\\"loss_scale\\\":{"));
-    // The regressor as well, on a frozen predictor. Validations are in f32. At the config's own rate its score falls and
-    // rises by a dB every few steps in any precision, so that rounding decides where it stands. This rate is stable.
+    // The regressor on a frozen predictor. Validations are in f32. At the config's own rate the score changes by a dB
+    // every few steps in any precision, so that rounding decides. This rate is stable.
     let start = temporary.path().join("f32/best.safetensors");
     let scores = ["f32", "f16", "bf16"].map(|precision| {
         let run = temporary.path().join(format!("two-{precision}"));

@@ -1,5 +1,5 @@
-//! Trainings by several ranks of MPI: the losses of one process, equal bytes, and ends with one message. They need `mpirun`, and a
-//! program with the feature `mpi`.
+//! Trainings by several ranks of MPI: the losses of one process, equal bytes, and ends with one message. They need
+//! `mpirun`, and a program with the feature `mpi`.
 
 use std::fs;
 use std::path::Path;
@@ -30,7 +30,7 @@ fn is_there() -> bool {
     false
 }
 
-/// The command on so many ranks, each with one thread.
+/// The command on `ranks` ranks of one thread each.
 fn on_ranks(ranks: usize, command: &Command) -> Command {
     let mut all = Command::new("mpirun");
     all.args(["--allow-run-as-root", "--oversubscribe", "--bind-to", "none", "-n", &ranks.to_string()]);
@@ -61,8 +61,8 @@ fn ranks_have_the_losses_of_one_process_and_the_same_bytes_again() {
     }
     let (temporary, config) = place();
     let weights = temporary.path().join("start.safetensors");
-    // Batches of 4 of 3 people with 6 samples each: the last batch of a pass has 2, so that two of four ranks have none.
-    // With the rates of the other tests, rounding errors grow tenfold every two steps of stage 2.
+    // Batches of 4 of 3 people with 6 samples each: the last batch of a pass has 2, so that two of four ranks have
+    // none. With the rates of the other tests, rounding errors grow tenfold every two steps of stage 2.
     let rates = ["optimizer.rate=1e-3", "optimizer.muon.rate=1e-3"];
     let keys = [&["training.steps=20", "training.batch=4", "samples.repeat=6"][..], &rates].concat();
     for stage in [1, 2] {
@@ -104,7 +104,7 @@ fn ranks_have_the_losses_of_one_process_and_the_same_bytes_again() {
     }
 }
 
-/// Kills of a rank end all ranks, and leave a state with which the run ends with the same bytes. `SNAPSNAP_TEST_KILLS` is their number.
+/// A killed rank ends all, and the resumed run has the same bytes. `SNAPSNAP_TEST_KILLS`: number of kills.
 #[test]
 fn a_killed_rank_ends_all_and_the_run_goes_on() {
     if !is_there() {
@@ -132,7 +132,7 @@ fn a_killed_rank_ends_all_and_the_run_goes_on() {
         let ranks = String::from_utf8_lossy(&ranks.stdout).into_owned();
         let ranks: Vec<&str> = ranks.split_whitespace().collect();
         let Some(victim) = ranks.get(random.random_range(0..ranks.len().max(1))) else {
-            // They have not begun yet.
+            // The ranks have not started yet.
             child.kill().expect("kills");
             child.wait().expect("ends");
             continue;
@@ -204,7 +204,7 @@ fn failures_of_a_rank_end_all_with_one_message() {
     let (temporary, config) = place();
     let run = |name: &str| temporary.path().join(name);
     let start = Instant::now();
-    // Too many ranks, which all of them notice.
+    // More ranks than samples in a batch. All ranks notice it.
     let output = on_ranks(3, &train(1, &config, &run("many"))).output().expect("runs");
     let message = "`training.batch` is 2, must be at least 3, the number of ranks";
     assert_eq!(output.status.code(), Some(2), "{}", said(&output));

@@ -206,7 +206,7 @@ fn averages_begin_with_the_weights() {
     succeed(resumed().arg("--set=training.steps=5").args(without_effect));
 }
 
-/// Scores on easier people do not keep the weights of later ones from being the best.
+/// After a change of the validation's people, the best score of the earlier people no longer counts.
 #[test]
 fn the_best_validation_is_of_the_present_people() {
     let (temporary, config) = place();
@@ -224,7 +224,7 @@ fn the_best_validation_is_of_the_present_people() {
             .map(|line| line.split(',').next().map(str::to_owned))
     };
     let before = results(&run);
-    // Changes that no validation sees keep it.
+    // Changes that do not affect validations keep the best weights.
     let ruined = temporary.path().join("ruined");
     copy_folder(&run, &ruined);
     let ruinous =
@@ -293,7 +293,7 @@ fn stage_2_continues_with_its_own_predictor_only() {
     fs::copy(weights(0), run.join("last.safetensors")).expect("copies");
     let said = refused(train(2, &config, &run).args(["--resume", "--set=training.steps=7"]));
     assert!(said.contains("the frozen point predictor has other weights"), "{said}");
-    // Neither the weights that it began with nor the latest ones are needed.
+    // Neither the initial weights nor `last.safetensors` are needed.
     fs::remove_file(weights(0)).expect("removed");
     fs::remove_file(joint.join("last.safetensors")).expect("removed");
     succeed(&mut trained("--set=training.steps=4", &weights(1)));

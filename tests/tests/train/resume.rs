@@ -95,7 +95,7 @@ fn sessions_after_a_time_limit_or_an_interrupt_end_with_the_same_bytes() {
     assert!(results(&whole) == before);
 }
 
-/// A run goes on with its data set packed, as if nothing had happened.
+/// A packed data set gives the same bytes, also to a run that began with folders.
 #[test]
 fn packed_people_give_the_bytes_of_their_folders() {
     let (temporary, config) = place();

@@ -45,7 +45,7 @@ fn both_stages_learn_and_write_weights_for_reconstructions() {
     for part in [weights.display().to_string(), people().display().to_string()] {
         assert!(command.contains(&part), "{command}");
     }
-    // No config of stage 2 lies beside that of stage 1.
+    // There is no config of stage 2 beside the config of stage 1.
     assert!(command.contains("--config STAGE2.toml"), "{command}");
     let said = succeed(train(2, &config, &two).arg("--weights").arg(&weights));
     let command = next(&said);
@@ -57,7 +57,7 @@ fn both_stages_learn_and_write_weights_for_reconstructions() {
     assert!(temporary.path().join("turn.png").is_file());
     assert_eq!(logged(&two, "validation/psnr_masked").len(), 4);
 
-    // Stage 1 reads nothing of a regressor, whatever that was trained for. Stage 2 does.
+    // Stage 1 ignores the regressor of a weight file. Stage 2 checks the regressor's config.
     let other = [
         "--set=training.steps=1",
         "--set=schedule.warm_up=0",
@@ -87,7 +87,7 @@ fn a_rehearsal_writes_nothing_and_prints_the_time_of_the_run() {
     assert!(!run.exists());
 }
 
-/// Data reach the disk before their name does, the name before the next step, and weights before the state that continues with them.
+/// A file's data reach the disk before its rename, the rename before the next step, and weights before their state.
 #[test]
 #[cfg(target_os = "linux")]
 fn checkpoints_reach_the_disk_in_their_order() {
@@ -118,7 +118,7 @@ fn checkpoints_reach_the_disk_in_their_order() {
         let folder = to.parent().expect("lies in a folder").canonicalize().expect("a folder");
         let from = folder.join(from.file_name().expect("a name"));
         assert!(synced(&calls[..i], &from), "{call}: before its data");
-        // Of this thread.
+        // Calls of the same thread.
         let of_thread = |other: &&&str| other.split(' ').next() == call.split(' ').next();
         let after = calls[i + 1..].iter().filter(of_thread).take_while(|call| !call.contains("rename"));
         assert!(synced(&after.copied().collect::<Vec<_>>(), &folder), "{call}: the folder is not synced");

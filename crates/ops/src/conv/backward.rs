@@ -1,8 +1,8 @@
 //! The gradients of one convolution, band by band.
 //!
-//! A row of the input meets the three rows of the output's gradient that it reached, while all are in cache: with the
-//! transposed weights they give the gradient of the row, and with the row, activated anew, that of the weights. So
-//! nothing but the planes before normalisation has to be kept from the forward pass.
+//! An input row affects three rows of the output. The gradients of these three rows, with the transposed weights, give
+//! the gradient of the input row. Their products with the input row, which is activated again, give the gradient of the
+//! weights. So the forward pass keeps nothing but the planes before normalisation.
 
 use pulp::Arch;
 use rayon::prelude::*;
@@ -13,29 +13,29 @@ use super::weights::transpose;
 use super::{CHANNELS, Plane, Source};
 use crate::buffers::take;
 
-/// Columns that are worked on while they are in the first cache; a multiple of every kernel's block of pixels.
+/// Columns that are processed while they are in the first-level cache; a multiple of every kernel's block of pixels.
 const CHUNK: usize = 120;
-/// A rest below this is added to the last chunk.
+/// If fewer columns than this would remain, the last chunk takes them.
 const REST: usize = 12;
-/// Pixels whose products are summed in f32 before they join the f64 sums.
+/// Pixels whose products are summed in f32 before they are added to the f64 sums.
 const SINGLE: usize = 1024;
 
 /// Which gradients are needed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Wanted {
-    /// Those of the inputs.
+    /// Gradients of the inputs.
     pub input: bool,
-    /// Those of weights and biases.
+    /// Gradients of weights and biases.
     pub parameters: bool,
 }
 
-/// The backward pass of [`super::Conv`], shortcut aside.
+/// The backward pass of [`super::Conv`], without the shortcut.
 pub struct Backward<'a> {
     /// Inputs of the forward pass.
     pub sources: &'a [Source<'a>],
     /// Weights of the forward pass.
     pub weights: &'a [f32],
-    /// Of the result, before the shortcut was added.
+    /// Gradient of the result before the shortcut was added.
     pub upstream: Upstream<'a>,
     /// 1 or 2.
     pub stride: usize,
@@ -45,7 +45,7 @@ pub struct Backward<'a> {
     pub wanted: Wanted,
 }
 
-/// Sums per channel over the gradient g of a source, which its normalisation needs.
+/// Sums per channel over the gradient g of a source. The backward pass of its normalisation needs them.
 #[derive(Debug, Clone, Default)]
 pub struct Sums {
     /// Σ g.
@@ -66,31 +66,31 @@ impl Sums {
 /// Result of [`Backward::run`].
 #[derive(Debug, Clone, Default)]
 pub struct Gradients {
-    /// Per source `[height, width, 16]`: of the plane, or, if it is activated, of scale·x + shift.
+    /// Per source `[height, width, 16]`: gradient of the plane, or of scale·x + shift if the plane is normalised.
     pub inputs: Vec<Vec<f32>>,
-    /// Per source, over `inputs`, where it is activated.
+    /// Per source, sums over its gradient in `inputs`, if the plane is normalised.
     pub sums: Vec<Sums>,
-    /// `[source][row][column][channel in][16]`.
+    /// Gradient of the weights, `[source][row][column][channel in][16]`.
     pub weights: Vec<f64>,
-    /// Of every output channel.
+    /// Gradient of the bias.
     pub bias: [f64; CHANNELS],
 }
 
 impl Plane {
-    /// The mean that gradients' products are taken about: the exact one, rounded to f32.
+    /// The mean that [`Sums::product`] subtracts: the exact mean, rounded to f32.
     pub(super) fn centre(&self, channel: usize) -> f64 {
         f64::from(self.moments.mean[channel] as f32)
     }
 }
 
 impl Backward<'_> {
-    /// The gradients on all cores; the same bits for any number of them.
+    /// Computes the gradients on all cores, with the same bits for any number of cores.
     pub fn run(&self) -> Gradients {
         let plane = self.sources[0].plane;
         let line = plane.width * CHANNELS;
         let count = if self.wanted.input { self.sources.len() } else { 0 };
         let mut inputs: Vec<Vec<f32>> = (0..count).map(|_| take(plane.height * line)).collect();
-        // Enough bands for many cores, and few rows of gradients made twice.
+        // Enough bands for many cores, and few rows at the borders that two bands compute.
         let band = (plane.height / 16).clamp(4, 16);
         let mut outs: Vec<Vec<&mut [f32]>> =
             (0..plane.height.div_ceil(band)).map(|_| Vec::with_capacity(inputs.len())).collect();
@@ -105,7 +105,7 @@ impl Backward<'_> {
             Band::new(self, &transposed, outs).run(rows)
         };
         let parts: Vec<Gradients> = outs.into_par_iter().enumerate().map(run).collect();
-        // Joined in the order of the rows, for the same bits with any number of threads.
+        // Added in the order of the rows, for the same bits with any number of threads.
         let mut parts = parts.into_iter();
         let mut all = parts.next().unwrap_or_default();
         for part in parts {
@@ -117,20 +117,20 @@ impl Backward<'_> {
     }
 }
 
-/// A band's memory.
+/// The backward pass of a band of rows, with its buffers.
 struct Band<'a> {
     pass: &'a Backward<'a>,
     transposed: &'a [f32],
-    /// Rows of the inputs' gradients.
+    /// The band's rows of the inputs' gradients.
     outs: Vec<&'a mut [f32]>,
     /// Three rows of the output's gradient in turn, `[columns + 2, 16]`, zero at both ends.
     slots: [Vec<f32>; 3],
-    /// Which padded row each slot holds, and whether there is anything in it.
+    /// Which padded row each slot holds, and whether the output has this row.
     held: [(usize, bool); 3],
     values: Vec<f32>,
     slopes: Vec<f32>,
     doubled: Vec<f32>,
-    /// Weight gradients of the last pixels and their number.
+    /// Weight gradients of the last pixels in f32, and the number of these pixels.
     products: (Vec<f32>, usize),
     sums: Gradients,
 }
@@ -199,7 +199,7 @@ impl<'a> Band<'a> {
         *count = 0;
     }
 
-    /// Brings a row of the output's gradient into its slot; rows are counted from the padding above the image.
+    /// Brings a row of the output's gradient into its slot. Row 0 is the padding above the image.
     fn hold(&mut self, padded: usize) {
         let slot = padded % 3;
         if self.held[slot].0 == padded {
@@ -207,7 +207,7 @@ impl<'a> Band<'a> {
         }
         let plane = self.pass.sources[0].plane;
         let rows = plane.height * if self.pass.enlarge { 2 } else { 1 };
-        // Behind a stride of 2, every other row has no output.
+        // With a stride of 2, every other row has no output.
         let exists = (1..=rows).contains(&padded) && (padded - 1).is_multiple_of(self.pass.stride);
         self.held[slot] = (padded, exists);
         if exists {
@@ -217,8 +217,8 @@ impl<'a> Band<'a> {
         }
     }
 
-    /// One source's gradients over `pixels` columns from `start` on: row `row` of the image or its half `part`, row `line`
-    /// of the band.
+    /// One source's gradients over `pixels` columns from `start` on. `row` is the image's row, `part` (0 or 1) one of
+    /// its two copies if the input was doubled, and `line` the band's row.
     fn chunk(&mut self, source: usize, [row, part]: [usize; 2], line: usize, start: usize, pixels: usize) {
         let arch = Arch::new();
         let Source { plane, affine } = &self.pass.sources[source];
@@ -238,7 +238,7 @@ impl<'a> Band<'a> {
             None => input,
         };
         let y = row * factor + part;
-        // The rows of the output's gradient that this row reached, by the kernel's rows.
+        // The slots of the three output rows that this row affects, by the kernel's row.
         let reached = [0, 1, 2].map(|ky| (y + 2 - ky) % 3);
         let reached = || reached.into_iter().enumerate().filter(|(_, slot)| self.held[*slot].1);
         if self.pass.wanted.parameters {

@@ -1,4 +1,4 @@
-//! One convolution forward, band by band.
+//! The forward pass of one convolution, band by band.
 
 use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
@@ -11,19 +11,19 @@ use crate::math::silu;
 /// Output rows per task.
 const BAND: usize = 16;
 
-/// Second summand of the result, before scaling.
+/// What is added to the convolution before scaling.
 pub enum Shortcut<'a> {
     /// Nothing.
     None,
-    /// The plane itself.
+    /// A plane.
     Identity(&'a Plane),
-    /// 1×1 convolution of the planes, weights `[plane][channel in][16]`; its bias is part of the main bias.
+    /// A 1×1 convolution of planes with weights `[plane][channel in][16]`. Its bias is part of [`Conv::bias`].
     Project(&'a [&'a Plane], &'a [f32]),
 }
 
 /// A 3×3 convolution with padding 1.
 pub struct Conv<'a> {
-    /// Inputs, whose channels follow one another.
+    /// Inputs, stacked along the channels.
     pub sources: &'a [Source<'a>],
     /// `[source][row][column][channel in][16]`.
     pub weights: &'a [f32],
@@ -31,7 +31,7 @@ pub struct Conv<'a> {
     pub bias: [f32; CHANNELS],
     /// 1, or 2 to halve the size.
     pub stride: usize,
-    /// Doubles the input by repetition first.
+    /// Doubles the input's size by repetition before the convolution.
     pub enlarge: bool,
     /// Added to the result.
     pub shortcut: Shortcut<'a>,
@@ -40,7 +40,7 @@ pub struct Conv<'a> {
 }
 
 impl Conv<'_> {
-    /// The convolution on all cores; the same bits for any number of them.
+    /// Computes the convolution on all cores, with the same bits for any number of cores.
     pub fn run(&self) -> Plane {
         let factor = if self.enlarge { 2 } else { 1 };
         let input = self.sources[0].plane;
@@ -59,14 +59,14 @@ impl Conv<'_> {
     fn band(&self, first: usize, [rows, columns]: [usize; 2], width: usize, out: &mut [f32]) -> Moments {
         let arch = Arch::new();
         let line = (columns + 2) * CHANNELS;
-        // Three activated rows per source, in turn; `held` has the row of each slot.
+        // The last three activated rows of each source. `held` has the row number of each slot.
         let mut slots: Vec<[Vec<f32>; 3]> =
             self.sources.iter().map(|_| std::array::from_fn(|_| vec![0.0; line])).collect();
         let mut held = [usize::MAX; 3];
         let mut moments = Moments::default();
         for (i, out) in out.chunks_exact_mut(width * CHANNELS).enumerate() {
             let y = first + i;
-            // Padded row numbers, one more than the image's.
+            // Row numbers of the padded image, one more than in the image.
             let window = [0, 1, 2].map(|k| y * self.stride + k);
             for padded in window {
                 let slot = padded % 3;
@@ -109,7 +109,7 @@ impl Conv<'_> {
     }
 }
 
-/// Activates one row of a source into `out` `[columns + 2, 16]`, zero at both ends; a missing row is zero throughout.
+/// Writes one activated row of a source to `out` `[columns + 2, 16]`, with 0 at both ends. Without a row, all is 0.
 struct Fill<'a> {
     source: &'a Source<'a>,
     row: Option<usize>,

@@ -1,4 +1,4 @@
-//! Inner loops of both passes over rows of pixels, in vectors of the processor's own width.
+//! Inner loops of both passes over rows of pixels, in vectors as wide as the processor's.
 
 use pulp::{Simd, WithSimd};
 
@@ -19,7 +19,7 @@ pub struct Tap<'a> {
 
 /// One output row: (bias + Σ taps + identity) · scale.
 pub struct Row<'a> {
-    /// Their rows may be longer than the output.
+    /// Rows may be longer than the output.
     pub taps: &'a [Tap<'a>],
     /// Added to every pixel.
     pub bias: &'a [f32; CHANNELS],
@@ -31,7 +31,7 @@ pub struct Row<'a> {
     pub out: &'a mut [f32],
 }
 
-/// Every output pixel reads the input STRIDE pixels further on.
+/// A [`Row`] whose neighbouring output pixels read input pixels STRIDE apart.
 pub struct Strided<'a, const STRIDE: usize>(pub Row<'a>);
 
 impl<const STRIDE: usize> WithSimd for Strided<'_, STRIDE> {
@@ -39,7 +39,7 @@ impl<const STRIDE: usize> WithSimd for Strided<'_, STRIDE> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        // Vectors per pixel, and as many pixels at once as the registers hold accumulators for.
+        // Vectors per pixel, and pixels at once: as many as there are registers for their sums.
         match S::F32_LANES {
             16 => row::<S, 1, 12, STRIDE>(simd, self.0),
             8 => row::<S, 2, 5, STRIDE>(simd, self.0),
@@ -57,7 +57,7 @@ fn row<S: Simd, const VECTORS: usize, const PIXELS: usize, const STRIDE: usize>(
         pixels::<S, VECTORS, PIXELS, STRIDE>(simd, &mut row, x);
     }
     if whole < width && width > PIXELS {
-        // Some pixels twice, which is still faster than the rest one by one.
+        // Computes some pixels twice, which is still faster than the remaining pixels one by one.
         pixels::<S, VECTORS, PIXELS, STRIDE>(simd, &mut row, width - PIXELS);
     } else {
         for x in whole..width {
@@ -103,8 +103,8 @@ fn pixels<S: Simd, const VECTORS: usize, const PIXELS: usize, const STRIDE: usiz
     }
 }
 
-/// out`[tap][in][out]` += Σ over pixels x of input`[x][in]` · gradient`[x + TAPS − 1 − tap][out]`: the gradient of TAPS
-/// neighbouring matrices.
+/// The gradient of the matrices of TAPS neighbouring taps:
+/// out`[tap][in][out]` += Σ over pixels x of input`[x][in]` · gradient`[x + TAPS − 1 − tap][out]`.
 pub struct Products<'a, const TAPS: usize> {
     /// `[pixels, 16]`.
     pub input: &'a [f32],
@@ -119,7 +119,7 @@ impl<const TAPS: usize> WithSimd for Products<'_, TAPS> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        // As many input channels at once as the registers hold accumulators for.
+        // Vectors per pixel, and input channels at once: as many as there are registers for their sums.
         match S::F32_LANES {
             16 => products::<S, 1, 8, TAPS>(simd, self),
             8 => products::<S, 2, 4, TAPS>(simd, self),

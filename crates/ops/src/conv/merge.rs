@@ -1,4 +1,4 @@
-//! The gradient of a plane that several operators read: through a normalisation, through a shortcut, and as a skip.
+//! The gradient of a plane that several operators read: a normalisation, a shortcut, and a skip connection.
 
 use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
@@ -7,15 +7,15 @@ use super::CHANNELS;
 use super::kernels::{Products, Row, Strided, Tap};
 use super::norm::Linear;
 
-/// Pixels that are worked on while they are in the first cache; a multiple of every kernel's block of pixels.
+/// Pixels that are processed while they are in the first-level cache; a multiple of every kernel's block of pixels.
 const CHUNK: usize = 60;
 /// Pixels per task.
 const TASK: usize = 32 * CHUNK;
 
-/// The plane's way around a block.
+/// The shortcut around a residual block.
 #[derive(Debug, Clone, Copy)]
 pub struct Branch<'a> {
-    /// Gradient of the block's scaled sum.
+    /// Gradient of the block's result, a scaled sum.
     pub upstream: &'a [f32],
     /// Factor of that sum.
     pub scale: f32,
@@ -23,24 +23,24 @@ pub struct Branch<'a> {
     pub projection: Option<&'a [f32]>,
 }
 
-/// Joins the gradients of the plane `x` `[pixels, 16]`.
+/// Adds up the gradients of the plane x `[pixels, 16]`.
 pub struct Merge<'a> {
-    /// The plane.
+    /// The plane x.
     pub plane: &'a [f32],
-    /// Through its normalisation.
+    /// The gradient through the plane's normalisation, as a map.
     pub map: &'a Linear,
-    /// Through a shortcut.
+    /// The gradient through a shortcut.
     pub shortcut: Option<Branch<'a>>,
-    /// Of other readers.
+    /// The gradient of other readers.
     pub other: Option<&'a [f32]>,
     /// Whether a projection's weight gradient is needed.
     pub parameters: bool,
 }
 
 impl Merge<'_> {
-    /// Turns the gradient behind the normalisation into the gradient of the plane, on all cores, with the same bits for any
-    /// number of them. Returns the gradient `[16 in][16 out]` of a projection's weight; empty without a projection, or if it
-    /// is unwanted.
+    /// Turns the gradient of the normalisation's result into the gradient of the plane, on all cores, with the same
+    /// bits for any number of cores. Returns the gradient `[16 in][16 out]` of a projection's weight; empty without a
+    /// projection or without [`Self::parameters`].
     pub fn run(&self, gradient: &mut [f32]) -> Vec<f64> {
         let task = |(i, out): (usize, &mut [f32])| self.task(i * TASK * CHANNELS, out);
         let parts: Vec<Vec<f64>> = gradient.par_chunks_mut(TASK * CHANNELS).enumerate().map(task).collect();
@@ -88,7 +88,7 @@ impl Merge<'_> {
     }
 }
 
-/// out = slope·out + curve·x + shift + branch. A type and not a closure, which would not be compiled for wide vectors.
+/// out = slope·out + curve·x + shift + branch. A closure would not be compiled for wide vectors.
 struct Descend<'a> {
     map: &'a Linear,
     plane: &'a [f32],

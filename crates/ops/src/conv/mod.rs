@@ -1,9 +1,9 @@
-//! 3×3 convolutions of 16 channels, which memory traffic bounds: normalisation, SiLU, convolution, shortcut and the
-//! next normalisation's moments in one pass. A band of rows keeps its three activated input rows in cache.
+//! Fused 3×3 convolutions of 16 channels: normalisation, SiLU, convolution, shortcut and the moments for the next
+//! normalisation in one pass, because memory traffic limits the speed. A band keeps its three activated rows in cache.
 //!
-//! Pixels are stored with their channels together, so that one pixel is one vector of the widest kind.
-//! `forward` and `backward` are the two passes over bands. Both use `kernels` for a row. `norm` is the arithmetic of group
-//! normalisation between two passes. `merge` joins the gradients of a plane that several operators read.
+//! The 16 channels of a pixel are adjacent, so that one pixel is one vector of the widest kind.
+//! `forward` and `backward` are the two passes over bands. Both use `kernels` for a row. `norm` is the arithmetic of
+//! group normalisation between two passes. `merge` adds the gradients of a plane that several operators read.
 
 use pulp::{Simd, WithSimd};
 
@@ -34,14 +34,14 @@ pub struct Plane {
     pub width: usize,
     /// `[height, width, 16]`.
     pub data: Vec<f32>,
-    /// Of every channel.
+    /// The moments of every channel.
     pub moments: Moments,
 }
 
 /// Mean and sum of squared deviations per channel.
 #[derive(Debug, Clone, Default)]
 pub struct Moments {
-    /// How many pixels.
+    /// Number of pixels.
     pub count: f64,
     /// Mean.
     pub mean: [f64; CHANNELS],
@@ -62,7 +62,7 @@ impl WithSimd for RowMoments<'_> {
 }
 
 impl Moments {
-    /// Moments of a row of pixels. Two passes while the row is in cache: one-pass sums cancel when means are large.
+    /// Moments of a row of pixels in two passes. The sums of a single pass would cancel where means are large.
     #[inline(always)]
     fn of_row(row: &[f32]) -> Self {
         let (pixels, _) = row.as_chunks::<CHANNELS>();
@@ -87,7 +87,7 @@ impl Moments {
         Self { count: n, mean: std::array::from_fn(exact), squares: std::array::from_fn(around) }
     }
 
-    /// Joins the moments of two disjoint sets (Chan, Golub and LeVeque).
+    /// The moments of the union of two disjoint sets (Chan, Golub and LeVeque).
     fn join(mut self, other: &Self) -> Self {
         let total = self.count + other.count;
         if other.count > 0.0 {
@@ -101,14 +101,14 @@ impl Moments {
     }
 }
 
-/// Normalisation of one plane: silu(scale·x + shift) per channel.
+/// Scale and shift per channel of a normalised plane, which a convolution reads as silu(scale·x + shift).
 pub type Affine = [[f32; CHANNELS]; 2];
 
 /// One input of a convolution.
 #[derive(Debug, Clone, Copy)]
 pub struct Source<'a> {
-    /// 16 channels.
+    /// The image.
     pub plane: &'a Plane,
-    /// Applied before the convolution; without it the plane is taken as it is.
+    /// Applied before the convolution, with SiLU. `None`: the convolution reads the plane itself.
     pub affine: Option<Affine>,
 }

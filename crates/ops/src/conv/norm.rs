@@ -1,12 +1,12 @@
-//! Group normalisation between the passes: from moments to affine maps, and from sums over gradients back.
+//! Group normalisation between the passes: affine maps from moments, and gradients from sums over gradients.
 
 use super::{Affine, CHANNELS, Plane, Sums};
 
 /// Mean and reciprocal standard deviation of every group.
 pub type Layer = [Vec<f32>; 2];
 
-/// A map of a normalised plane's gradient: slope·g + curve·x + shift per channel, with the gradient g before SiLU (behind
-/// scale and shift) and the plane x.
+/// Slope, curve and shift per channel. slope·g + curve·x + shift is the gradient of the plane x, where g is the
+/// gradient of the normalised plane before SiLU.
 pub type Linear = [[f32; CHANNELS]; 3];
 
 /// Group normalisation of one or two stacked planes.
@@ -25,11 +25,11 @@ pub struct GroupNorm<'a> {
 /// Result of a normalisation's backward pass.
 #[derive(Debug, Clone)]
 pub struct NormGradients {
-    /// Of the factors.
+    /// Gradient of the factors.
     pub gamma: Vec<f64>,
-    /// Of the summands.
+    /// Gradient of the summands.
     pub beta: Vec<f64>,
-    /// From the gradient behind it to the gradient before it, plane by plane.
+    /// Per plane, the map from the gradient of the result to the gradient of the plane.
     pub maps: Vec<Linear>,
 }
 
@@ -38,7 +38,7 @@ impl GroupNorm<'_> {
         self.gamma.len() / self.groups
     }
 
-    /// Statistics of the stacked planes, from their moments.
+    /// Statistics of the stacked planes, from the planes' moments.
     pub fn measure(&self, planes: &[&Plane]) -> Layer {
         let per_group = self.per_group();
         let channel = |i: usize| {
@@ -70,8 +70,8 @@ impl GroupNorm<'_> {
         (0..self.gamma.len() / CHANNELS).map(affine).collect()
     }
 
-    /// The backward pass from the sums over each plane's gradient. Measured statistics depend on the planes themselves
-    /// and so add to their gradient; `frozen` ones do not.
+    /// The backward pass from the sums over each plane's gradient. Measured statistics depend on the planes and add to
+    /// the planes' gradient. `frozen` statistics are constants.
     pub fn backward(
         &self,
         [mean, rstd]: &Layer,
@@ -82,7 +82,7 @@ impl GroupNorm<'_> {
         let per_group = self.per_group();
         let channels = self.gamma.len();
         let beta: Vec<f64> = (0..channels).map(|i| sums[i / CHANNELS].gradient[i % CHANNELS]).collect();
-        // Σ g·x̂: the passes sum about the plane's own mean, which need not be the group's.
+        // Σ g·x̂. The sums are about the plane's own mean, which can differ from the group's mean.
         let gamma: Vec<f64> = (0..channels)
             .map(|i| {
                 let (plane, c, g) = (i / CHANNELS, i % CHANNELS, i / per_group);

@@ -1,4 +1,4 @@
-//! Steps of the backward pass on a row of pixels, before and after the products.
+//! Steps of the backward pass on a row of pixels, before and after the matrix products.
 
 use pulp::{Simd, WithSimd};
 
@@ -9,13 +9,13 @@ use crate::math::silu_and_slope;
 /// Gradient of a convolution's output.
 #[derive(Debug, Clone, Copy)]
 pub enum Upstream<'a> {
-    /// A plane's data and a factor.
+    /// The gradient's data and a factor.
     Scaled(&'a [f32], f32),
-    /// The output is normalised: gradient behind the normalisation, the output, and the map that joins them.
+    /// The next operator normalises the output: the gradient of the normalised values, the output, and the map.
     Normalised(&'a [f32], &'a [f32], &'a Linear),
 }
 
-/// Every pixel twice.
+/// Repeats every pixel.
 pub fn double(input: &[f32], out: &mut [f32]) {
     let pairs = out.as_chunks_mut::<CHANNELS>().0.chunks_exact_mut(2);
     for (pixel, pair) in input.as_chunks::<CHANNELS>().0.iter().zip(pairs) {
@@ -23,7 +23,7 @@ pub fn double(input: &[f32], out: &mut [f32]) {
     }
 }
 
-/// Sums of neighbouring pixels, added to those of the row above if there is one.
+/// Sums of two neighbouring pixels. `add`: added to the values of `out`, which are the sums of the row above.
 pub fn halve(doubled: &[f32], out: &mut [f32], add: bool) {
     let pairs = doubled.as_chunks::<CHANNELS>().0.chunks_exact(2);
     for (pixel, pair) in out.as_chunks_mut::<CHANNELS>().0.iter_mut().zip(pairs) {
@@ -33,7 +33,7 @@ pub fn halve(doubled: &[f32], out: &mut [f32], add: bool) {
     }
 }
 
-/// Σ over pixels. Four sums side by side, because an addition takes several cycles.
+/// Sum over pixels, as four sums side by side, because an addition takes several cycles.
 pub struct Sum<'a>(pub &'a [f32]);
 
 impl WithSimd for Sum<'_> {
@@ -52,7 +52,7 @@ impl WithSimd for Sum<'_> {
     }
 }
 
-/// One row of the output's gradient into `out` `[columns + 2, 16]`, every `stride`-th pixel; the others stay zero.
+/// Writes a row of the output's gradient to every `stride`-th pixel of `out` `[columns + 2, 16]`; all others stay 0.
 pub struct Fill<'a> {
     pub upstream: Upstream<'a>,
     pub row: usize,
@@ -96,7 +96,7 @@ impl WithSimd for Fill<'_> {
     }
 }
 
-/// silu(scale·x + shift) and its slope there.
+/// silu(scale·x + shift) and the slope of SiLU.
 pub struct Activate<'a> {
     pub input: &'a [f32],
     pub affine: &'a Affine,
@@ -121,7 +121,7 @@ impl WithSimd for Activate<'_> {
     }
 }
 
-/// Multiplies the gradient behind SiLU by its slope; gives Σ g and Σ g·(x − centre) of the result g.
+/// Multiplies the gradient of SiLU's result by the slope. Returns Σ g and Σ g·(x − centre) of the product g.
 pub struct Descend<'a> {
     pub input: &'a [f32],
     pub centre: [f32; CHANNELS],

@@ -1,4 +1,4 @@
-//! Convolution weights between PyTorch's order and the kernels'.
+//! Convolution weights in PyTorch's order and in the kernels' order.
 
 use super::CHANNELS;
 
@@ -7,7 +7,7 @@ fn position(o: usize, i: usize, tap: usize, taps: usize) -> usize {
     ((i / CHANNELS * taps + tap) * CHANNELS + i % CHANNELS) * CHANNELS + o
 }
 
-/// A PyTorch weight `[out, in, k, k]` of `taps` = k² as `[source][k][k][16 in][16 out]`, absent channels 0.
+/// A PyTorch weight `[out, in, k, k]`, `taps` = k², as `[source][k][k][16 in][16 out]`. Missing channels are 0.
 pub fn arrange(values: &[f32], [out, inputs, taps]: [usize; 3]) -> Vec<f32> {
     let mut arranged = vec![0.0; inputs.div_ceil(CHANNELS) * taps * CHANNELS * CHANNELS];
     for (from, value) in values[..out * inputs * taps].iter().enumerate() {
@@ -17,7 +17,7 @@ pub fn arrange(values: &[f32], [out, inputs, taps]: [usize; 3]) -> Vec<f32> {
     arranged
 }
 
-/// Adds the gradient of the arranged weight to the gradient of PyTorch's.
+/// Adds the gradient of an arranged weight to `values`, the gradient in PyTorch's order.
 pub fn rearrange(arranged: &[f64], [out, inputs, taps]: [usize; 3], values: &mut [f64]) {
     for (to, value) in values[..out * inputs * taps].iter_mut().enumerate() {
         let (o, i, tap) = (to / taps / inputs, to / taps % inputs, to % taps);
@@ -25,7 +25,7 @@ pub fn rearrange(arranged: &[f64], [out, inputs, taps]: [usize; 3], values: &mut
     }
 }
 
-/// Every 16×16 matrix transposed, as gradients go the other way.
+/// Transposes every 16×16 matrix, for the gradient of the input.
 pub fn transpose(arranged: &[f32]) -> Vec<f32> {
     let squares = arranged.chunks_exact(CHANNELS * CHANNELS);
     squares

@@ -1,4 +1,4 @@
-//! Packing and the kernel of AVX-512 with its instructions for bf16.
+//! Packing and the kernel for AVX-512 with instructions for bf16.
 
 #![allow(unsafe_code, reason = "functions for processors that have these instructions, and loads of vectors")]
 
@@ -14,7 +14,7 @@ use std::sync::OnceLock;
 
 use super::{BLOCK, Columns, PAIRS, PANEL, Row, Source, Sums};
 
-/// Whether this processor has the instructions of all functions here.
+/// Whether this processor has the instructions of all functions of this file.
 #[inline]
 pub fn is_there() -> bool {
     static THERE: OnceLock<bool> = OnceLock::new();
@@ -31,7 +31,7 @@ fn check() {
     assert!(is_there(), "this processor computes in bf16");
 }
 
-/// Sums of the first `rows` (4, 8 or 12) rows. The blocks of the left factor lie `packed` rows apart.
+/// Sums of the first `rows` (4, 8 or 12) rows. The blocks of the left factor begin `packed` rows apart.
 pub fn block(left: &[Row], packed: usize, rows: usize, columns: usize, panel: &[Columns], sums: &mut Sums) {
     check();
     // SAFETY: the processor has the instructions.
@@ -47,14 +47,14 @@ pub fn block(left: &[Row], packed: usize, rows: usize, columns: usize, panel: &[
     }
 }
 
-/// As [`Source::pack_left`].
+/// See [`Source::pack_left`].
 pub fn pack_left(source: &Source, out: &mut [Row]) {
     check();
     // SAFETY: the processor has the instructions.
     unsafe { left(source, out) }
 }
 
-/// As [`Source::pack_right`].
+/// See [`Source::pack_right`].
 pub fn pack_right(source: &Source, out: &mut [Columns]) {
     check();
     // SAFETY: the processor has the instructions.
@@ -115,15 +115,15 @@ fn right(source: &Source, out: &mut [Columns]) {
     }
 }
 
-/// 16 rows (or columns) from `first` on by 16 pairs of k from `k` on: `[row][pair]` or `[pair][row]`. Outside of the
-/// source, everything is 0.
+/// 16 rows (or columns) from `first` on by 16 pairs of k from `k` on: `[row][pair]` if `by_row`, else `[pair][row]`.
+/// Values outside of the source are 0.
 #[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
 fn square(source: &Source, first: usize, k: usize, by_row: bool) -> [__m512i; PAIRS] {
     let Source { stride, inner, count, depth, .. } = *source;
     let (count, depth) = (count.saturating_sub(first).min(PAIRS), depth - k);
     let values = &source.values[(first * stride + k * inner).min(source.values.len())..];
     let mut square = [_mm512_setzero_si512(); PAIRS];
-    // Whichever is contiguous is read in vectors.
+    // The contiguous dimension is read in vectors.
     let along_rows = inner != 1 && stride == 1;
     for (i, out) in square.iter_mut().enumerate() {
         if along_rows {
@@ -141,7 +141,7 @@ fn square(source: &Source, first: usize, k: usize, by_row: bool) -> [__m512i; PA
     square
 }
 
-/// The first `count` of 16 values `step` apart, then zeros.
+/// 16 floats: `count` values that lie `step` apart, then zeros.
 #[inline]
 #[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
 fn line(values: &[f32], start: usize, step: usize, count: usize) -> __m512 {
@@ -159,7 +159,7 @@ fn line(values: &[f32], start: usize, step: usize, count: usize) -> __m512 {
     unsafe { _mm512_loadu_ps(line.as_ptr()) }
 }
 
-/// Pairs (a₀, b₀), (a₁, b₁) …
+/// Words of the pairs (a₀, b₀), (a₁, b₁) …
 #[inline]
 #[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
 fn interleaved(a: __m512, b: __m512) -> __m512i {
@@ -169,7 +169,7 @@ fn interleaved(a: __m512, b: __m512) -> __m512i {
     _mm512_or_si512(a, _mm512_slli_epi32::<16>(b))
 }
 
-/// Pairs (a₀, a₁), … (b₀, b₁), …
+/// Words of the pairs (a₀, a₁), … (b₀, b₁), …
 #[inline]
 #[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
 fn consecutive(a: __m512, b: __m512) -> __m512i {
@@ -177,7 +177,7 @@ fn consecutive(a: __m512, b: __m512) -> __m512i {
     unsafe { transmute(_mm512_cvtne2ps_pbh(b, a)) }
 }
 
-/// Four rounds of shuffles: of words, of pairs of words, of quarters and of halves.
+/// Transposes in four rounds of shuffles: of words, of pairs of words, of quarters and of halves.
 #[inline]
 #[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
 fn transpose(rows: &mut [__m512i; PAIRS]) {

@@ -1,14 +1,14 @@
 //! Matrix products of factors in bf16 with sums in f32, on processors that have `vdpbf16ps` of AVX-512.
 //!
-//! Values are rounded to bf16 to the nearest, ties to even, and stored in pairs that
-//! follow one another in the inner dimension k, which is filled up with zeros to blocks of 32:
+//! Values are rounded to bf16 to the nearest, ties to even. A word holds two values that are adjacent in the inner
+//! dimension k, which is padded with zeros to blocks of 32:
 //!
 //! * the left factor as `[blocks][rows][16 pairs]`;
 //! * the right factor as panels of 32 columns, `[panels][blocks · 16 pairs][32]`.
 //!
 //! Every element is one sum in one order, for any number of threads. Subnormal numbers count as 0.
 //!
-//! `unsafe` is needed to call functions that use instructions which not every processor has, and to read and write vectors.
+//! `unsafe` is needed to call functions with instructions that not every processor has, and to read and write vectors.
 
 #![cfg_attr(not(target_arch = "x86_64"), allow(unused, reason = "there is no unit"))]
 
@@ -25,7 +25,7 @@ pub const PAIRS: usize = 16;
 pub const BLOCK: usize = 2 * PAIRS;
 /// Columns of a panel.
 pub const PANEL: usize = 32;
-/// Largest number of rows that a kernel reads beyond the last one of the left factor.
+/// Rows of padding behind the left factor, which a kernel may read.
 pub const SLACK: usize = 32;
 
 /// One row of the left factor in one block of k.
@@ -35,7 +35,7 @@ pub type Columns = [u32; PANEL];
 /// A block of sums. A kernel fills its first rows.
 type Sums = [[f32; PANEL]; SLACK];
 
-/// Rows of the kernel's block of sums, if `left` rows remain.
+/// Rows of the kernel's next block of sums, if `left` rows remain.
 fn block_rows(left: usize) -> usize {
     left.next_multiple_of(4).min(12)
 }
@@ -51,14 +51,14 @@ pub fn is_there() -> bool {
     false
 }
 
-/// Values in f32 that become a factor: rows of the left one, or columns of the right one.
+/// Values in f32 that become a factor: rows of the left factor, or columns of the right factor.
 #[derive(Clone, Copy)]
 pub struct Source<'a> {
     /// Values.
     pub values: &'a [f32],
-    /// From one row or column to the next, in values.
+    /// Distance of one row or column from the next, in values.
     pub stride: usize,
-    /// From one k to the next.
+    /// Distance of one k from the next, in values.
     pub inner: usize,
     /// Rows or columns.
     pub count: usize,
@@ -104,8 +104,8 @@ impl Source<'_> {
     }
 }
 
-/// Calls `each` with row, column and the sums from there on, up to 32 of a row, of `left` · `right`. `left` are the packed rows of
-/// `source` and [`SLACK`] more, `right` the packed columns.
+/// Computes `left` · `right`, and calls `each` with row, first column and up to 32 neighbouring sums. `left` are the
+/// packed rows of `source` and [`SLACK`] more rows, `right` the packed columns.
 ///
 /// # Panics
 /// If a factor is smaller than the sizes say, or if the processor lacks the instructions.

@@ -1,4 +1,4 @@
-//! Products against f64.
+//! Products of bf16 factors against f64.
 
 use super::*;
 use crate::tests::uniform;
@@ -9,7 +9,7 @@ fn nearest(x: f32) -> f32 {
     f32::from_bits((bits + 0x7fff + (bits >> 16 & 1)) & 0xffff_0000)
 }
 
-/// Whether the instructions can be tried here.
+/// Whether this processor has the instructions; prints a line if it has not.
 fn can_try() -> bool {
     if !is_there() {
         println!("skipped: this processor has no instructions for bf16 (AVX512-BF16)");
@@ -60,7 +60,7 @@ fn products_equal_those_of_rounded_factors() {
     }
 }
 
-/// Infinities stay, and what is no number stays so, whatever its bits.
+/// Infinities stay infinite, and every NaN stays NaN.
 #[test]
 fn rounding_keeps_what_is_not_finite() {
     let values = [

@@ -1,8 +1,7 @@
-//! Attention with rotary positions, one head of one sample after the other: rotate while packing, two matrix products per
-//! block of queries, the exponentials in between while the scores are in cache.
-//!
-//! The forward pass keeps nothing but the logarithm of every row's sum of exponentials. The backward pass computes the
-//! scores again, block of queries by block of queries (Dao, "FlashAttention-2"), so that they never leave the cache.
+//! Attention with rotary position embedding. Each head of each sample is one task: queries and keys are rotated and
+//! packed, then each block of queries takes two matrix products, with the softmax between them while the scores are in
+//! cache. The forward pass keeps nothing but the logarithm of every row's sum of exponentials. The backward pass
+//! computes the scores of each block of queries again (Dao, "FlashAttention-2"), so that scores never leave the cache.
 
 use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
@@ -14,7 +13,7 @@ use crate::multiply::{Matrix, Multiply, Right};
 /// Queries per block of the forward pass: 128 × 1024 scores of 4 bytes fit a second-level cache.
 const FORWARD_BLOCK: usize = 128;
 
-/// Queries per block of the backward pass: 64 × 1024 scores, and their gradients, take the same.
+/// Queries per block of the backward pass: 64 × 1024 scores and their gradients are of the same size.
 const BLOCK: usize = 64;
 
 /// Sizes of an attention; tokens hold `heads · head_dim` channels.
@@ -30,14 +29,14 @@ pub struct Attention {
     pub heads: usize,
     /// Channels of a head, a multiple of 4.
     pub head_dim: usize,
-    /// Products in bf16, if the processor has them.
+    /// Products in bf16, if the processor has the instructions.
     pub half: bool,
 }
 
 /// Rotation tables cos and ±sin, `[tokens, head_dim]` each, as [`crate::Rope`] holds them.
 pub type Tables<'a> = [&'a [f32]; 2];
 
-/// Queries, keys or values `[B, tokens, C]`, perhaps as some of the channels of wider tokens.
+/// Queries, keys or values `[B, tokens, C]`, which may be some of the channels of wider tokens.
 #[derive(Debug, Clone, Copy)]
 pub struct Tokens<'a> {
     values: &'a [f32],
@@ -51,7 +50,7 @@ impl<'a> Tokens<'a> {
         [0, 1, 2].map(|part| Self { values: &qkv[part * channels..], width: 3 * channels })
     }
 
-    /// Queries, keys and values that are tensors of their own.
+    /// Queries, keys and values from three tensors.
     pub fn apart(qkv: [&'a [f32]; 3], channels: usize) -> [Self; 3] {
         qkv.map(|values| Self { values, width: channels })
     }
@@ -59,7 +58,7 @@ impl<'a> Tokens<'a> {
 
 impl Attention {
     /// softmax(rotated q · rotated kᵀ / √head_dim) · v: queries `[B, queries, C]`, keys and values `[B, keys, C]` →
-    /// `[B, queries, C]`, and the logarithms of the rows' sums `[B, heads, queries]`.
+    /// `[B, queries, C]`, and the logarithms of the rows' sums of exponentials, `[B, heads, queries]`.
     pub fn forward(&self, [q, k, v]: [Tokens; 3], rope: Tables) -> (Vec<f32>, Vec<f32>) {
         let Self { queries, keys, head_dim: d, .. } = *self;
         let arch = Arch::new();
@@ -91,8 +90,8 @@ impl Attention {
         (out, logarithms)
     }
 
-    /// Gradients of queries, keys and values from that of the output, `dy` `[B, queries, C]`. They come together: each
-    /// needs nearly all of the others' work.
+    /// Gradients of queries, keys and values from the output's gradient `dy` `[B, queries, C]`. One function computes
+    /// all three, because they share nearly all of the work.
     pub fn backward(&self, qkv: [Tokens; 3], rope: Tables, logarithms: &[f32], dy: &[f32]) -> [Vec<f32>; 3] {
         let by_head = self.by_head(qkv, rope, logarithms, dy);
         let tokens = [self.queries, self.keys, self.keys];
@@ -101,7 +100,7 @@ impl Attention {
         out
     }
 
-    /// As [`Attention::backward`], in one tensor `[B, tokens, 3·C]`.
+    /// [`Attention::backward`] with the three gradients in one tensor `[B, tokens, 3·C]`.
     pub fn backward_parts(&self, qkv: [Tokens; 3], rope: Tables, logarithms: &[f32], dy: &[f32]) -> Vec<f32> {
         let by_head = self.by_head(qkv, rope, logarithms, dy);
         let out = self.by_token(by_head.each_ref().map(Vec::as_slice), self.queries);
@@ -154,12 +153,12 @@ impl Attention {
         1.0 / (self.head_dim as f32).sqrt()
     }
 
-    /// From the first token of the i-th head of all samples on.
+    /// The values from the first token of a head on; `i` counts the heads of all samples.
     fn head<'a>(&self, x: Tokens<'a>, tokens: usize, i: usize) -> &'a [f32] {
         &x.values[i / self.heads * tokens * x.width + i % self.heads * self.head_dim..]
     }
 
-    /// The i-th head's tokens `[tokens, head_dim]`, rotated and scaled.
+    /// The tokens `[tokens, head_dim]` of head `i`, rotated and multiplied by `factor`.
     fn pack(&self, x: Tokens, tokens: usize, i: usize, rope: Tables, factor: f32) -> Vec<f32> {
         let (d, width) = (self.head_dim, x.width);
         let mut out = take(tokens * d);
@@ -188,12 +187,12 @@ impl Attention {
     }
 }
 
-/// Into contiguous rows.
+/// A matrix product into contiguous rows.
 fn product(size: [usize; 3], lhs: Matrix, rhs: &Right, out: &mut [f32], add: bool) {
     Multiply { size, lhs, rhs, add }.write(out, size[1]);
 }
 
-/// One head's tokens, rotated, scaled and packed.
+/// Rotates, scales and packs one head's tokens.
 struct Rotate<'a> {
     x: &'a [f32],
     width: usize,
@@ -212,7 +211,7 @@ impl WithSimd for Rotate<'_> {
         for (token, out) in self.out.chunks_exact_mut(d).enumerate() {
             let x = &self.x[token * self.width..][..d];
             let (cos, sin) = (&self.rope[0][token * d..][..d], &self.rope[1][token * d..][..d]);
-            // Two halves (row, column), each of two quarters whose members pair up.
+            // Two halves (row, column). The two quarters of a half hold the members of its pairs.
             for half in [0, 2 * quarter] {
                 let [x, cos, sin] =
                     [x, cos, sin].map(|values| values[half..half + 2 * quarter].split_at(quarter));
@@ -226,7 +225,7 @@ impl WithSimd for Rotate<'_> {
     }
 }
 
-/// Turns gradients of rotated tokens back, in their place, and scales them.
+/// Rotates the gradients of rotated tokens back, in place, and scales them.
 struct Unrotate<'a> {
     x: &'a mut [f32],
     d: usize,
@@ -258,7 +257,7 @@ impl WithSimd for Unrotate<'_> {
 /// Independent accumulators of a reduction, as many as the widest vector has lanes.
 const LANES: usize = 16;
 
-/// Rows of scores → e^(score − row's maximum), and the logarithms of the sums of e^score; returns the rows' sums.
+/// Replaces scores by e^(score − row's maximum), and writes ln Σ e^score per row. Returns the sums of the new rows.
 struct Exponentials<'a> {
     scores: &'a mut [f32],
     keys: usize,
@@ -270,7 +269,7 @@ impl WithSimd for Exponentials<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, _simd: S) -> Vec<f32> {
-        // Loops, since closures do not inherit the target's features.
+        // Loops, because closures are not compiled for the target's features.
         let mut all = Vec::with_capacity(self.logarithms.len());
         for (row, logarithm) in self.scores.chunks_exact_mut(self.keys).zip(self.logarithms) {
             let mut most = [f32::NEG_INFINITY; LANES];
@@ -301,7 +300,7 @@ impl WithSimd for Exponentials<'_> {
     }
 }
 
-/// Rows of scores → their softmax p; rows of its gradient dp → that of the scores, p · (dp − Σ p·dp).
+/// Replaces scores by their softmax p, and the gradient dp by the gradient of the scores, p · (dp − Σ p·dp).
 struct Backward<'a> {
     scores: &'a mut [f32],
     gradients: &'a mut [f32],

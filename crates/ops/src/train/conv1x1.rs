@@ -1,5 +1,5 @@
-//! 1×1 convolutions for training: a matrix product per block of pixels, on images as Burn stores them. A block is small
-//! enough that its channels stay in the second-level cache between the products that read them.
+//! 1×1 convolutions: one matrix product per block of pixels, on images `[B, C, H, W]`. A block is so small that its
+//! channels stay in the second-level cache between the products that read them.
 
 use rayon::prelude::*;
 
@@ -11,7 +11,7 @@ use crate::wide::pieces;
 
 /// Floats of a block's inputs and outputs: 128 KiB.
 const BLOCK_FLOATS: usize = 32 * 1024;
-/// Parts that the weight's gradient is summed in at most, before they are joined in their order.
+/// Largest number of partial sums of the weight's gradient, which are then added in a fixed order.
 const PARTS: usize = 16;
 
 /// Sizes of a convolution, and whether it reads max(x, 0) instead of its input x.
@@ -27,11 +27,11 @@ pub struct Conv1x1 {
     pub pixels: usize,
     /// Reads max(x, 0).
     pub rectified: bool,
-    /// Products in bf16, if the processor has them.
+    /// Products in bf16, if the processor has the instructions.
     pub half: bool,
 }
 
-/// Some pixels of one image, and where their results belong, channel by channel.
+/// Some pixels of one image, and the slices for their results, channel by channel.
 struct Block<'a> {
     image: usize,
     first: usize,
@@ -61,7 +61,7 @@ impl Conv1x1 {
         out
     }
 
-    /// Gradients from that of the output, `dy` `[B, outputs, H, W]`.
+    /// Gradients from the output's gradient `dy` `[B, outputs, H, W]`.
     pub fn backward(&self, x: &[f32], weight: &[f32], dy: &[f32], wanted: Wanted) -> Gradients {
         let Self { inputs, outputs, .. } = *self;
         let mut dx = wanted.input.then(|| take(x.len()));
@@ -78,7 +78,7 @@ impl Conv1x1 {
         }
     }
 
-    /// One part's gradients. Those of weight and bias are returned, empty where not wanted.
+    /// The gradients of some blocks. Returns the weight's and the bias's gradients, empty if unwanted.
     fn part(
         &self,
         part: &mut [Block],
@@ -126,7 +126,7 @@ impl Conv1x1 {
         (weights, biases)
     }
 
-    /// The first `n` pixels of the input as it is read: values and their (column, row) strides.
+    /// The first `n` pixels of the (rectified) input: values and their (column, row) strides.
     fn read<'a>(&self, x: &'a [f32], n: usize, read: &'a mut [f32]) -> (&'a [f32], [usize; 2]) {
         if !self.rectified {
             return (x, [1, self.pixels]);
@@ -137,7 +137,7 @@ impl Conv1x1 {
         (read, [1, n])
     }
 
-    /// All blocks, with the slices of `out` `[B, channels, H, W]` that belong to them, if there is one.
+    /// All blocks, with their slices of `out` `[B, channels, H, W]`, if there is an output.
     fn blocks<'a>(&self, out: Option<(&'a mut [f32], usize)>) -> Vec<Block<'a>> {
         let Self { batch, pixels, .. } = *self;
         let piece = (BLOCK_FLOATS / (self.inputs + self.outputs)).next_multiple_of(64).min(pixels);

@@ -1,10 +1,9 @@
-//! 3×3 convolutions with stride 1 and padding 1 for training: Winograd's F(4×4, 3×3) as in `wide`, on images as Burn
-//! stores them.
+//! 3×3 convolutions with stride 1 and padding 1 by Winograd's F(4×4, 3×3) of `wide`, on images `[B, C, H, W]`.
 //!
-//! The gradient of the input is the same convolution with filters turned by 180° and the roles of inputs and outputs
-//! exchanged. The weight gradient is the transpose of the method: the products of transformed inputs and transformed
-//! output gradients are summed over all tiles before they are transformed back, 36 instead of 144 multiplications per
-//! sixteen pixels and pair of channels there, too.
+//! The gradient of the input is the same convolution with filters turned by 180°, and with inputs and outputs
+//! exchanged. The gradient of the weight is the transposed method: the products of transformed inputs and transformed
+//! output gradients are summed over all tiles, and the sum is transformed back. This takes 36 instead of 144
+//! multiplications per sixteen pixels and pair of channels, too.
 
 use rayon::prelude::*;
 
@@ -16,12 +15,11 @@ use crate::wide::convolution::{Bands, Weights};
 use crate::wide::transforms::{POINTS, TILE};
 use crate::wide::{GROUP, pieces};
 
-/// Floats that a block's transformed inputs and products take together: 1 MiB, of which a core's second-level cache
-/// holds most.
+/// Floats of a block's transformed inputs and products together: 1 MiB, most of which fits a second-level cache.
 const BLOCK_FLOATS: usize = 256 * 1024;
 
-/// Pixels of all images up to which the weight's gradient is summed tap by tap. If a channel is positive in a few pixels
-/// only, the gradients of some taps are 0. Winograd's method has rounding errors instead, which AdamW would scale up.
+/// Up to this number of pixels of all images, the weight's gradient is summed tap by tap. If a channel is positive in a
+/// few pixels only, the gradients of some taps are 0. Winograd's method would round, and AdamW scale up the rounding.
 const FEW_PIXELS: usize = 1024;
 
 /// Sizes of a convolution, and whether it reads max(x, 0) instead of its input x.
@@ -48,7 +46,7 @@ impl Conv3x3 {
         self.run(x, self.rectified, filters, bias, None)
     }
 
-    /// Gradients from that of the output, `dy` `[B, outputs, H, W]`.
+    /// Gradients from the output's gradient `dy` `[B, outputs, H, W]`.
     pub fn backward(&self, x: &[f32], weight: &[f32], dy: &[f32], wanted: Wanted) -> Gradients {
         let input = wanted.input.then(|| {
             let filters = Weights { values: weight, strides: [9, 9 * self.inputs], turned: true };
@@ -61,7 +59,7 @@ impl Conv3x3 {
             let gradients = direct.backward(x, weight, dy, Wanted { input: false, ..wanted });
             Gradients { input, ..gradients }
         } else if wanted.weight {
-            // The bias's gradient is a by-product.
+            // The gradient of the bias is a by-product.
             let [weight, bias] = self.weight_gradient(x, dy);
             Gradients { input, weight: Some(weight), bias: wanted.bias.then_some(bias) }
         } else {
@@ -70,7 +68,7 @@ impl Conv3x3 {
         }
     }
 
-    /// Winograd's method with any filters; where `mask` is given and not positive, the result is 0.
+    /// Winograd's method with any filters. The result is 0 where `mask` is not positive, if there is a mask.
     fn run(
         &self,
         x: &[f32],

@@ -1,5 +1,5 @@
-//! Element-wise operations, as loops of vector instructions. (Plain loops compile to branches here, which random
-//! signs make ten times as slow.)
+//! Element-wise operations in vector instructions. (Plain loops compile to branches here, which are ten times as slow
+//! for random signs.)
 
 use pulp::Arch;
 use rayon::prelude::*;
@@ -56,7 +56,7 @@ pub fn add_to_rows(row: &[f32], rows: &mut [f32]) {
     );
 }
 
-/// The sum, in sixteen interleaved parts.
+/// The sum of the values, as sixteen interleaved sums.
 pub fn total(values: &[f32]) -> f32 {
     Arch::new().dispatch(
         #[inline(always)]
@@ -71,7 +71,7 @@ pub fn total(values: &[f32]) -> f32 {
     )
 }
 
-/// Sums over the pixels of all images `[batch, channels, pixels]`: the gradient of a convolution's bias.
+/// Sums of every channel over the pixels of all images `[batch, channels, pixels]`: the gradient of a bias.
 pub fn channel_sums(images: &[f32], batch: usize, channels: usize) -> Vec<f32> {
     let pixels = images.len() / (batch * channels);
     let sum = |c: usize| {

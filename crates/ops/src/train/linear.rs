@@ -1,5 +1,5 @@
-//! Linear layers for training, alone or with GELU behind them: one matrix product per block of rows, with everything
-//! that is done element by element beside it while the block is in the cache.
+//! Linear layers, alone or followed by GELU: one matrix product per block of rows. Bias, GELU and their gradients are
+//! computed while the block is in the cache.
 
 use pulp::Arch;
 use rayon::prelude::*;
@@ -12,9 +12,9 @@ use crate::multiply::{Multiply, Right};
 
 /// Rows per task of the products over rows.
 const ROWS: usize = 128;
-/// Rows of the weight's gradient per task, at least and at most: a task reads all of one factor.
+/// Least and largest number of rows of the weight's gradient per task. Each task reads all of one factor.
 const WEIGHT_ROWS: [usize; 2] = [48, 256];
-/// Tasks that the weight's gradient is cut into between those limits.
+/// Number of tasks of the weight's gradient, within the limits of [`WEIGHT_ROWS`].
 const WEIGHT_TASKS: usize = 16;
 
 /// Sizes of a layer.
@@ -26,9 +26,9 @@ pub struct Linear {
     pub inputs: usize,
     /// Channels of the output.
     pub outputs: usize,
-    /// The weight is `[outputs, inputs]`, as a convolution's, instead of `[inputs, outputs]`.
+    /// The weight is `[outputs, inputs]`, as in a convolution, instead of `[inputs, outputs]`.
     pub transposed: bool,
-    /// Products in bf16, if the processor has them.
+    /// Products in bf16, if the processor has the instructions.
     pub half: bool,
 }
 
@@ -42,7 +42,7 @@ impl Linear {
         out
     }
 
-    /// gelu(z), and, with `keep`, z = x · weight + bias, which [`Linear::backward`] needs: `[rows, outputs]` each.
+    /// gelu(z) with z = x · weight + bias. With `keep` also z, for [`Linear::backward`]. Both are `[rows, outputs]`.
     pub fn forward_gelu(
         &self,
         x: &[f32],
@@ -74,8 +74,8 @@ impl Linear {
         (out, before)
     }
 
-    /// Gradients from that of the output, `dy` `[rows, outputs]`. `before` has the values before GELU from
-    /// [`Linear::forward_gelu`], if there was one.
+    /// Gradients from the output's gradient `dy` `[rows, outputs]`. `before` has the values before GELU of
+    /// [`Linear::forward_gelu`]; `None` if the layer has no GELU.
     pub fn backward(
         &self,
         x: &[f32],
@@ -120,7 +120,7 @@ impl Linear {
     }
 
     fn weight_gradient(&self, x: &[f32], dz: &[f32]) -> Vec<f32> {
-        // Rows and columns of the weight as it is stored.
+        // Rows and columns in the order in which the weight is stored.
         let (inputs, outputs) = ((x, self.inputs), (dz, self.outputs));
         let ((left, rows), (right, columns)) =
             if self.transposed { (outputs, inputs) } else { (inputs, outputs) };

@@ -1,9 +1,9 @@
-//! The operators of the networks for training: forward and backward passes as plain functions of f32 slices. (Burn's own
-//! backward pass of a convolution is a forward convolution whose kernel is the whole image, and that of attention is
-//! composed of small steps.)
+//! The operators of the networks: forward and backward passes as plain functions of f32 slices. (Burn computes the
+//! backward pass of a convolution as a convolution whose kernel is the whole image, and the backward pass of attention
+//! in many small steps.)
 //!
 //! Images are `[B, C, H, W]` and tokens `[B, N, C]`, contiguous, of any size. Every result has the same bits for any
-//! number of threads: work is cut by sizes alone, and sums of several tasks are joined in their order.
+//! number of threads: work is divided by sizes alone, and the sums of several tasks are added in a fixed order.
 
 mod attention;
 mod conv1x1;
@@ -31,7 +31,7 @@ pub use unfolded::Unfolded;
 pub use crate::resize::{resize, resize_gradient};
 pub use snapsnap_base::bilinear::{Tap, taps};
 
-/// The wanted gradients. Unwanted ones cost nothing.
+/// Which gradients are wanted. Unwanted gradients cost nothing.
 #[derive(Debug, Clone, Copy)]
 pub struct Wanted {
     /// Of the operator's input.
@@ -58,7 +58,7 @@ pub struct Gradients {
     pub bias: Option<Vec<f32>>,
 }
 
-/// Sums of parts of `len` values each, in their order.
+/// The sum of parts of `len` values each, in the order of the parts.
 fn join<'a>(parts: impl Iterator<Item = &'a [f32]>, len: usize) -> Vec<f32> {
     /// Values per task.
     const PIECE: usize = 1024;
@@ -74,7 +74,7 @@ fn join<'a>(parts: impl Iterator<Item = &'a [f32]>, len: usize) -> Vec<f32> {
     out
 }
 
-/// `count` pieces of the data, or `count` times nothing.
+/// The data in `count` pieces, or `count` times `None`.
 fn parts(data: Option<&mut [f32]>, piece: usize, count: usize) -> Vec<Option<&mut [f32]>> {
     match data {
         Some(data) => data.chunks_mut(piece).map(Some).collect(),

@@ -1,4 +1,4 @@
-//! Layer normalisation for training.
+//! Layer normalisation, forward and backward.
 
 use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
@@ -24,7 +24,7 @@ pub struct LayerNorm {
 pub type Statistics = [f32; 2];
 
 impl LayerNorm {
-    /// `x` `[rows, channels]`, `weight` and `bias` `[channels]` → `[rows, channels]` and the statistics for the backward pass.
+    /// `x` `[rows, channels]`, `weight` and `bias` `[channels]` → `[rows, channels]` and each row's statistics.
     pub fn forward(&self, x: &[f32], weight: &[f32], bias: &[f32]) -> (Vec<f32>, Vec<Statistics>) {
         let mut out = take(x.len());
         let mut statistics = vec![[0.0; 2]; x.len() / self.channels];
@@ -36,8 +36,8 @@ impl LayerNorm {
         (out, statistics)
     }
 
-    /// Gradients from that of the output, `dy` `[rows, channels]`. Weight and bias are summed together: both are found
-    /// if either is wanted.
+    /// Gradients from the output's gradient `dy` `[rows, channels]`. If the gradient of weight or bias is wanted, both
+    /// are computed.
     pub fn backward(
         &self,
         x: &[f32],
@@ -70,7 +70,7 @@ impl LayerNorm {
     }
 }
 
-/// Sum of f over positions, in sixteen interleaved parts.
+/// The sum of f over all positions of the slices, as sixteen interleaved sums.
 #[inline(always)]
 fn sum<const N: usize>(slices: [&[f32]; N], f: impl Fn([f32; N]) -> f32) -> f32 {
     let whole = slices[0].len() / LANES * LANES;
@@ -114,7 +114,7 @@ impl WithSimd for Forward<'_> {
     }
 }
 
-/// With h the normalised row and g = dy·weight: dx = scale · (g − mean(g) − h · mean(g·h)).
+/// dx = scale · (g − mean(g) − h · mean(g·h)), with the normalised row h and g = dy·weight.
 struct Backward<'a> {
     x: &'a [f32],
     dy: &'a [f32],
@@ -140,7 +140,7 @@ impl WithSimd for Backward<'_> {
     }
 }
 
-/// Column sums of dy·h and dy.
+/// Column sums of dy·h (`weight`) and dy (`bias`), with the normalised row h.
 struct Sums<'a> {
     x: &'a [f32],
     dy: &'a [f32],

@@ -1,15 +1,15 @@
-//! Between images as Burn stores them, plane after plane, and the groups of 16 channels that the wide kernels work on.
-//! Blocks of 16 × 16 values are transposed in registers on the way, so no image is stored a second time.
+//! Conversion between images `[C, H, W]` and the groups of 16 adjacent channels that `wide` reads. Blocks of 16 × 16
+//! values are transposed in registers, so no image is stored a second time.
 
 use pulp::Simd;
 
 use crate::wide::GROUP;
 use crate::wide::transforms::Lines;
 
-/// Values of 16 pixels in 16 channels.
+/// The values of 16 pixels in 16 channels.
 type Square = [[f32; GROUP]; GROUP];
 
-/// How this processor transposes squares.
+/// The way in which this processor transposes squares.
 #[derive(Debug, Clone, Copy)]
 pub struct Transposer {
     #[cfg(target_arch = "x86_64")]
@@ -24,7 +24,7 @@ impl Transposer {
         }
     }
 
-    /// One loop of vector instructions.
+    /// Runs `op`, compiled for the widest vectors of this processor.
     #[inline(always)]
     fn run(self, op: impl WithTranspose) {
         #[cfg(target_arch = "x86_64")]
@@ -43,7 +43,7 @@ trait WithTranspose {
     fn run(self, transpose: impl Transpose);
 }
 
-/// A way to transpose.
+/// A way to transpose squares.
 trait Transpose: Copy {
     fn square(self, square: Square) -> Square;
 }
@@ -63,9 +63,9 @@ struct Wide(pulp::x86::V4);
 
 #[cfg(target_arch = "x86_64")]
 impl Transpose for Wide {
-    /// Four rounds of shuffles of pairs: of values, of pairs of values, of quarters and of halves.
+    /// Four rounds of shuffles: of values, of pairs of values, of quarters and of halves.
     ///
-    /// Loops, because closures of `array::from_fn` do not inherit the target's features.
+    /// Loops, because closures of `array::from_fn` are not compiled for the target's features.
     #[inline(always)]
     fn square(self, square: Square) -> Square {
         use std::arch::x86_64::{__m512, __m512d};
@@ -104,7 +104,7 @@ fn rectify(square: &mut Square) {
     }
 }
 
-/// One image `[channels, height, width]`, read in groups.
+/// One image `[channels, height, width]`, read in groups of 16 channels.
 #[derive(Debug, Clone, Copy)]
 pub struct Planes<'a> {
     pub data: &'a [f32],
@@ -120,7 +120,7 @@ impl Planes<'_> {
         self.data.len() / (self.height * self.width)
     }
 
-    /// As [`Lines::line`].
+    /// See [`Lines::line`].
     pub fn read(&self, group: usize, row: Option<usize>, first: isize, out: &mut [f32]) {
         let Some(row) = row.filter(|row| *row < self.height) else {
             out.fill(0.0);
@@ -149,7 +149,7 @@ impl Lines for Planes<'_> {
     }
 }
 
-/// Pixels of up to 16 planes that are `plane` floats apart → pixels with their channels together.
+/// Makes the channels of each pixel adjacent, for up to 16 planes that begin `plane` floats apart.
 struct Gather<'a> {
     data: &'a [f32],
     plane: usize,
@@ -165,7 +165,7 @@ impl WithTranspose for Gather<'_> {
         let (squares, rest) = pixels.as_chunks_mut::<GROUP>();
         let mut done = 0;
         if channels == GROUP && !squares.is_empty() {
-            // Sixteen loads, each with an address of its own in the program, are sixteen streams to prefetch.
+            // Sixteen load instructions are sixteen streams that the processor prefetches.
             let mut planes = [data; GROUP];
             for (c, values) in planes.iter_mut().enumerate() {
                 *values = &data[c * plane..][..squares.len() * GROUP];
@@ -196,13 +196,13 @@ impl WithTranspose for Gather<'_> {
     }
 }
 
-/// Pixels with their channels together into up to 16 planes.
+/// Writes pixels with adjacent channels to up to 16 planes.
 pub struct Scatter<'a, 'b> {
     /// `[pixels][16]`.
     pub pixels: &'a [f32],
     /// The same pixels of every channel.
     pub planes: &'a mut [&'b mut [f32]],
-    /// Writes 0 where these planes (which begin `stride` floats after one another) are not positive.
+    /// Planes and the number of floats between them. Where they are not positive, 0 is written.
     pub mask: Option<(&'a [f32], usize)>,
 }
 
@@ -273,7 +273,7 @@ fn keep_positive(values: &mut [f32], x: &[f32]) {
 mod tests {
     use super::*;
 
-    /// 35 channels of 7 × 21 pixels there and back, with this processor's transposition and the plain one.
+    /// 35 channels of 7 × 21 pixels to groups and back, with this processor's transposition and the plain one.
     #[test]
     fn planes_become_groups_and_groups_become_planes() {
         let (channels, height, width) = (35, 7, 21);

@@ -1,5 +1,5 @@
-//! The operators against Burn's in f64, forward and backward, at sizes that reach the corners: channels that fill no
-//! group, tiles and blocks that overhang, single rows.
+//! The operators against Burn's in f64, forward and backward, with channels that fill no group, tiles and blocks that
+//! overhang, and single rows.
 
 use super::*;
 use crate::tests::uniform as random;
@@ -18,8 +18,8 @@ fn values<const D: usize>(x: Tensor<D>) -> Vec<f64> {
     x.into_data().convert::<f64>().try_into_vec().expect("f64")
 }
 
-/// Relative L2 error. Sums here have up to some thousand terms of 24 bits, and Winograd's points magnify their rounding:
-/// the worst of all is 2.5e-6, of a weight gradient.
+/// Bounds the relative L2 error. Sums have up to some thousand terms of 24 bits, and Winograd's points magnify their
+/// rounding. The largest error is 2.5e-6, of a weight gradient.
 fn assert_equal(what: &str, got: &[f64], expected: &[f64]) {
     assert_eq!(got.len(), expected.len(), "{what}");
     let norm = |values: &mut dyn Iterator<Item = f64>| values.map(|x| x * x).sum::<f64>().sqrt();
@@ -29,7 +29,7 @@ fn assert_equal(what: &str, got: &[f64], expected: &[f64]) {
     assert!(error < 5e-6, "{what}: {error:e}");
 }
 
-/// Random parameters in a float type.
+/// Replaces all parameters by random values of a float type.
 struct Filled {
     float: FloatDType,
     seed: u64,
@@ -44,7 +44,7 @@ impl ModuleMapper for Filled {
     }
 }
 
-/// The gradients of all parameters.
+/// Collects the gradients of all parameters.
 struct Collect<'a>(&'a Found, Vec<Vec<f64>>);
 
 impl ModuleVisitor for Collect<'_> {
@@ -53,8 +53,8 @@ impl ModuleVisitor for Collect<'_> {
     }
 }
 
-/// Compares the result of `run`, and its gradients by the input and by the module's parameters, in f32 and with
-/// parameters in bf16 with those in f64. Only an input in f32 reaches the operators of this crate.
+/// Compares `run` in f32, and in f32 with parameters in bf16, with `run` in f64: the result, and the gradients of the
+/// input and of the module's parameters. Only an input in f32 reaches the operators of this crate.
 fn check<M: Module, const A: usize, const D: usize>(
     what: &str,
     module: M,
@@ -78,7 +78,7 @@ fn check<M: Module, const A: usize, const D: usize>(
     }
 }
 
-/// Relative L2 error and cosine in bf16, whose rounding is 2⁻⁹ at most.
+/// Bounds the relative L2 error and the cosine in bf16, whose rounding is 2⁻⁹ at most.
 fn assert_close(what: &str, got: &[f64], expected: &[f64]) {
     assert_eq!(got.len(), expected.len(), "{what}");
     let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
@@ -183,7 +183,7 @@ fn layer_norm_equals_burns() {
     }
 }
 
-/// Keys and values.
+/// Keys and values as parameters, so that `check` compares their gradients.
 #[derive(Module, Debug)]
 struct Pairs {
     keys: Param<Tensor<3>>,
@@ -252,7 +252,7 @@ fn resizing_equals_burns() {
     }
 }
 
-/// Results and gradients of all operators, at sizes of several tasks.
+/// Results and gradients of all operators, at sizes that need several tasks.
 fn everything(half: bool) -> Vec<Vec<f32>> {
     let mut all = Vec::new();
     let keep = |all: &mut Vec<_>, g: Gradients| all.extend([g.input, g.weight, g.bias].into_iter().flatten());

@@ -6,7 +6,7 @@ use pulp::{Simd, WithSimd};
 use crate::wide::GROUP;
 use crate::wide::transforms::{Block, Lines, P, P2, POINTS, Q, Q2, SPAN, TILE};
 
-/// A of four values.
+/// A · d for four values d.
 #[inline(always)]
 fn gradient_points<S: Simd>(simd: S, d: [S::f32s; TILE]) -> [S::f32s; SPAN] {
     let times = |a: f32, b, c| simd.mul_add_e_f32s(simd.splat_f32s(a), b, c);
@@ -22,7 +22,7 @@ fn gradient_points<S: Simd>(simd: S, d: [S::f32s; TILE]) -> [S::f32s; SPAN] {
     ]
 }
 
-/// Gᵀ of six values.
+/// Gᵀ · s for six values s.
 #[inline(always)]
 fn taps<S: Simd>(simd: S, s: [S::f32s; SPAN]) -> [S::f32s; 3] {
     let times = |a: f32, b, c| simd.mul_add_e_f32s(simd.splat_f32s(a), b, c);
@@ -43,12 +43,12 @@ fn taps<S: Simd>(simd: S, s: [S::f32s; SPAN]) -> [S::f32s; 3] {
 pub struct OutputGradients<'a, L> {
     pub source: &'a L,
     pub block: Block,
-    /// Tiles from one group to the next, at least those of the block.
+    /// Tiles from one group to the next, at least as many as in the block.
     pub stride: usize,
     /// Room for six rows of the block's pixels in one group.
     pub lines: &'a mut [f32],
     pub out: &'a mut [f32],
-    /// One sum of dy per channel, in whole groups; the block's is added.
+    /// Sums of dy per channel, in whole groups, to which the block's sums are added.
     pub sums: &'a mut [f64],
 }
 
@@ -98,7 +98,7 @@ impl<L: Lines> WithSimd for OutputGradients<'_, L> {
     }
 }
 
-/// A of every column of four rows, in the place of six.
+/// A · d for every column of four rows, in place: the six rows of `lines` are the result.
 #[inline(always)]
 fn spread_rows<S: Simd>(simd: S, lines: &mut [f32]) {
     let (lines, _) = S::as_mut_simd_f32s(lines);
@@ -112,7 +112,7 @@ fn spread_rows<S: Simd>(simd: S, lines: &mut [f32]) {
     }
 }
 
-/// out `[16·left groups, 16·right groups]` = or += leftᵀ · right, summed over tiles.
+/// out `[16·left groups, 16·right groups]` = leftᵀ · right, summed over tiles.
 pub struct Accumulate<'a> {
     /// `[groups][stride][16]`.
     pub left: &'a [f32],
@@ -121,7 +121,7 @@ pub struct Accumulate<'a> {
     /// Tiles from one group to the next.
     pub stride: usize,
     pub tiles: usize,
-    /// Adds to the present values.
+    /// Adds the product to the values of `out`.
     pub add: bool,
     pub out: &'a mut [f32],
 }
@@ -131,7 +131,7 @@ impl WithSimd for Accumulate<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        // Vectors and rows of a block of the result: as many as there are registers for, less those of the factors.
+        // Vectors and rows of a block of the result: as many as there are registers beside those for the factors.
         match S::F32_LANES {
             16 => blocks::<S, 1, 2, 8>(simd, self),
             8 => blocks::<S, 2, 2, 4>(simd, self),
@@ -141,7 +141,7 @@ impl WithSimd for Accumulate<'_> {
     }
 }
 
-/// NARROW vectors are one group, WIDE ones one or two.
+/// NARROW vectors are one group. WIDE vectors are one or two groups.
 #[inline(always)]
 fn blocks<S: Simd, const NARROW: usize, const WIDE: usize, const ROWS: usize>(simd: S, mut sum: Accumulate) {
     let count = sum.right.len() / (sum.stride * GROUP);
@@ -160,7 +160,7 @@ fn blocks<S: Simd, const NARROW: usize, const WIDE: usize, const ROWS: usize>(si
     }
 }
 
-/// Rows from `row` on of the groups of columns from `column` on.
+/// ROWS rows from `row` on and VECTORS vectors of columns from group `column` on.
 #[inline(always)]
 fn block<S: Simd, const NARROW: usize, const VECTORS: usize, const ROWS: usize>(
     simd: S,
@@ -200,8 +200,8 @@ fn block<S: Simd, const NARROW: usize, const VECTORS: usize, const ROWS: usize>(
 
 /// Gᵀ·s·G of one output's sums, `[inputs, 3, 3]`.
 pub struct Taps<'a> {
-    /// Every part's sums of that output: from the first point's, `[inputs in whole groups]`, to the next point's
-    /// `stride` floats.
+    /// Every part's sums of this output, `[inputs in whole groups]` per point. The sums of two points begin `stride`
+    /// floats apart.
     pub parts: &'a [&'a [f32]],
     pub stride: usize,
     pub out: &'a mut [f32],

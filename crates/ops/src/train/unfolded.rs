@@ -1,6 +1,6 @@
-//! 3×3 convolutions with padding 1 for training as matrix products of the unfolded input, in which the nine taps of a
-//! channel follow one another. Winograd's method needs stride 1; this one takes any. The heads have one such layer, on
-//! their smallest image.
+//! 3×3 convolutions with padding 1 by im2col: matrix products with the unfolded input, in which the nine taps of a
+//! channel follow one another. Winograd's method needs stride 1; this method takes any stride. The DPT heads have one
+//! layer with stride 2; the convolutional body has one between every two levels.
 
 use rayon::prelude::*;
 
@@ -12,7 +12,7 @@ use crate::wide::pieces;
 
 /// Taps of a filter.
 const TAPS: usize = 9;
-/// Tasks per image in the forward pass, if each then has this many pixels.
+/// Most tasks per image in the forward pass, and fewest pixels per task.
 const BANDS: usize = 4;
 const PIXELS: usize = 64;
 /// Channels per task in the backward pass.
@@ -71,13 +71,13 @@ impl Unfolded {
         out
     }
 
-    /// Gradients from that of the output, `dy` `[B, outputs, ⌈H/stride⌉, ⌈W/stride⌉]`.
+    /// Gradients from the output's gradient `dy` `[B, outputs, ⌈H/stride⌉, ⌈W/stride⌉]`.
     pub fn backward(&self, x: &[f32], weight: &[f32], dy: &[f32], wanted: Wanted) -> Gradients {
         let Self { batch, inputs, outputs, .. } = *self;
         let [rows, columns] = self.size();
         let (plane, n) = (self.height * self.width, rows * columns);
         let mut dx = wanted.input.then(|| take(x.len()));
-        // Every task has its channels of all images.
+        // Every task computes some input channels of all images.
         let slices: Vec<Vec<&mut [f32]>> = match &mut dx {
             Some(dx) => pieces(dx, inputs * plane, CHANNELS * plane),
             None => (0..inputs.div_ceil(CHANNELS)).map(|_| Vec::new()).collect(),
@@ -130,8 +130,8 @@ impl Unfolded {
         [self.height.div_ceil(self.stride), self.width.div_ceil(self.stride)]
     }
 
-    /// Planes `x` → the inputs of the nine taps of every channel, `[channels, 9, rows, columns]`, for output rows from `row`
-    /// on.
+    /// Writes the inputs of the nine taps of every channel, `[channels, 9, rows, columns]`, for the output rows from
+    /// `row` on.
     fn unfold(&self, x: &[f32], row: usize, taps: &mut [f32]) {
         let (plane, [_, columns]) = (self.height * self.width, self.size());
         let mut positive = take(if self.rectified { x.len() } else { 0 });
@@ -146,7 +146,7 @@ impl Unfolded {
             let (x, tap) = (&x[i / TAPS * plane..][..plane], i % TAPS);
             let (first, last, from) = self.columns(tap);
             for (y, out) in out.chunks_exact_mut(columns).enumerate() {
-                // One more than the place in the image.
+                // One more than the image's row.
                 let line = self.stride * (row + y) + tap / 3;
                 if !(1..=self.height).contains(&line) {
                     out.fill(0.0);
@@ -162,7 +162,7 @@ impl Unfolded {
         give(positive);
     }
 
-    /// The transpose of `unfold`, for all rows and without max(x, 0).
+    /// The transpose of `unfold` (col2im), for all rows and without max(x, 0).
     fn fold(&self, taps: &[f32], x: &mut [f32]) {
         let [rows, columns] = self.size();
         x.fill(0.0);
@@ -180,8 +180,8 @@ impl Unfolded {
         }
     }
 
-    /// Output columns for which a tap lies inside the image (first, one after the last), and the input column that it
-    /// reads for the first of them.
+    /// The first and one after the last output column for which a tap lies inside the image, and the input column that
+    /// the tap reads for the first one.
     fn columns(&self, tap: usize) -> (usize, usize, usize) {
         let [_, columns] = self.size();
         let shift = tap % 3;

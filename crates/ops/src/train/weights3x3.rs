@@ -1,7 +1,7 @@
 //! The gradients of a 3×3 convolution's weights and biases.
 //!
-//! The images are cut into a fixed number of parts. Each sums the products of its own tiles, block after block, and the
-//! parts' sums are joined in their order: the same bits for any number of threads.
+//! The images are divided into a fixed number of parts. Each part sums the products of its tiles, block after block.
+//! The sums of the parts are added in a fixed order, for the same bits with any number of threads.
 
 use pulp::Arch;
 use rayon::prelude::*;
@@ -15,9 +15,9 @@ use crate::wide::transforms::{Block, Inputs, POINTS, TILE, lines};
 
 /// Largest number of parts: enough for the cores of a desktop computer.
 const PARTS: usize = 16;
-/// Tiles per part at least, so that the parts' sums are no more data than their transformed tiles.
+/// Fewest tiles per part, so that a part's sums are no more data than its transformed tiles.
 const PART_TILES: usize = 96;
-/// Points whose products are one task, where there are fewer parts than cores.
+/// Points per task, if there are fewer parts than cores.
 const TASK_POINTS: usize = 6;
 
 impl Conv3x3 {
@@ -44,8 +44,8 @@ impl Conv3x3 {
         [weight, bias]
     }
 
-    /// Sums `[36][outputs][inputs]`, channels in whole groups, of rows of tiles (image, first row, rows), and those of
-    /// the output's gradient.
+    /// The products' sums `[36][outputs][inputs]`, channels in whole groups, over rows of tiles (image, first row,
+    /// rows), and the sums of the output's gradient.
     fn part(&self, x: &[f32], dy: &[f32], blocks: &[(usize, usize, usize)]) -> (Vec<f32>, Vec<f64>) {
         let (arch, transposer) = (Arch::new(), Transposer::new());
         let (plane, columns) = (self.height * self.width, self.width.div_ceil(TILE));

@@ -1,4 +1,4 @@
-//! The gradient of the features → gradients of parameters and input, along the tape from its end.
+//! The backward pass: gradients of parameters and input from the gradient of the features.
 
 use rayon::prelude::*;
 
@@ -14,9 +14,9 @@ use crate::conv::{
 /// Result of [`Network::backward`]; unwanted gradients are empty.
 #[derive(Debug, Default)]
 pub struct Gradients {
-    /// `[B, H, W, 6]`.
+    /// Gradient of the input `[B, H, W, 6]`.
     pub input: Vec<f32>,
-    /// In the order of [`Network::tensors`].
+    /// Gradients of the parameters in the order of [`Network::tensors`].
     pub parameters: Vec<f32>,
 }
 
@@ -51,7 +51,7 @@ impl Network {
         let parts: Vec<_> = saved.samples.into_par_iter().enumerate().map(run).collect();
         let mut sums = vec![0.0; self.parameters()];
         let mut gradient = vec![0.0; if wanted.input { input.len() } else { 0 }];
-        // Joined in the order of the images, for the same bits with any number of threads.
+        // Added in the order of the images, for the same bits with any number of threads.
         for (i, (plane, part)) in parts.into_iter().enumerate() {
             sums.iter_mut().zip(part).for_each(|(sum, g)| *sum += g);
             if let Some(plane) = plane {
@@ -70,9 +70,9 @@ struct Pass<'a> {
     sample: Sample,
     frozen: bool,
     wanted: Wanted,
-    /// Of the planes of the tape, as far as their readers have been passed.
+    /// Gradients of the tape's planes, summed over the readers that are done.
     gradients: Vec<Option<Vec<f32>>>,
-    /// Of the parameters.
+    /// Gradients of the parameters.
     sums: Vec<f64>,
 }
 
@@ -105,7 +105,7 @@ impl Pass<'_> {
         self.sample.planes[0].take().into_iter().for_each(|plane| give(plane.data));
     }
 
-    /// Normalisation, SiLU and the two convolutions at the end.
+    /// The last normalisation, SiLU and the two convolutions after it.
     fn last(&mut self, upstream: Vec<f32>) {
         let network = self.network;
         let (weights, _) = compose(&network.conv_out, &network.gs_conv, self.parameters);
@@ -126,14 +126,14 @@ impl Pass<'_> {
         self.sample.planes[index] = Some(plane);
     }
 
-    /// Gradients of the composed convolution at the end → those of its two factors.
+    /// Gradients of the last two convolutions from the gradients of their composition.
     fn split(&mut self, gradients: &ConvGradients) {
         let (first, second) = (&self.network.conv_out, &self.network.gs_conv);
         let (first_weights, first_bias) = arranged(first, self.parameters);
         let (matrix, _) = arranged(second, self.parameters);
         let matrix = matrix.as_chunks::<CHANNELS>().0;
         let composed = gradients.weights.as_chunks::<CHANNELS>().0;
-        // Rows of the first factor: every tap's input channels, and its bias.
+        // Rows of the first convolution: the input channels of every tap, and the bias.
         let rows = first_weights.as_chunks::<CHANNELS>().0.iter().chain([&first_bias]);
         let mut of_first = Vec::with_capacity(gradients.weights.len() + CHANNELS);
         let mut of_second = vec![0.0; CHANNELS * CHANNELS];
@@ -216,7 +216,7 @@ impl Pass<'_> {
         }
     }
 
-    /// The convolution of normalised and activated planes.
+    /// The backward pass of a convolution of normalised and activated planes.
     fn normalised(
         &mut self,
         norm: &Norm,
@@ -231,7 +231,7 @@ impl Pass<'_> {
         Backward { sources: &sources, weights, upstream, stride: 1, enlarge: false, wanted }.run()
     }
 
-    /// A normalisation's own gradients; gives the maps through it.
+    /// Adds a normalisation's gradients to the sums. Returns the maps to the planes' gradients.
     fn norm(&mut self, norm: &Norm, planes: &[&Plane], sums: &[Sums]) -> Vec<Linear> {
         let group_norm = self.network.norm(norm, self.parameters);
         let gradients = group_norm.backward(&self.sample.layers[norm.index], planes, sums, self.frozen);
@@ -243,7 +243,7 @@ impl Pass<'_> {
         gradients.maps
     }
 
-    /// Adds a convolution's gradients in the kernels' order to the sums.
+    /// Adds a convolution's gradients, which are in the kernels' order, to the sums.
     fn conv(&mut self, place: &Place, weights: &[f64], bias: &[f64]) {
         if self.wanted.parameters {
             rearrange(weights, place.shape, &mut self.sums[place.weight.clone()]);

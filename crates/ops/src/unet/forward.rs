@@ -1,4 +1,4 @@
-//! Input → features, and the tape for the backward pass.
+//! The forward pass: features from the input, and the tape for the backward pass.
 
 use rayon::prelude::*;
 
@@ -17,11 +17,11 @@ pub struct Forward {
     pub features: Vec<f32>,
     /// Per normalisation: means and reciprocal standard deviations `[B, groups]`, measured or as given.
     pub statistics: Vec<Layer>,
-    /// For [`Network::backward`], if kept.
+    /// The tape for [`Network::backward`], if kept.
     pub saved: Option<Saved>,
 }
 
-/// The tape: 16 planes' worth of pixels per image at full size (64 bytes per pixel each), the input not among them.
+/// The tape without the input: as many values per image as 16 planes of full size, with 64 bytes per pixel each.
 #[derive(Debug, Clone)]
 pub struct Saved {
     pub(super) samples: Vec<Sample>,
@@ -31,11 +31,11 @@ pub struct Saved {
 /// One image's part of the tape.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Sample {
-    /// Outputs of the steps, one more than the step's number; the input's place stays empty.
+    /// Plane i + 1 is the output of step i. Plane 0, the input, stays empty.
     pub planes: Vec<Option<Plane>>,
-    /// Between the convolutions of every residual block, by the block's step.
+    /// The plane between the two convolutions of a residual block, by the block's step.
     pub hidden: Vec<Option<Plane>>,
-    /// Per normalisation.
+    /// Statistics per normalisation.
     pub layers: Vec<Layer>,
 }
 
@@ -46,9 +46,9 @@ impl Sample {
 }
 
 impl Network {
-    /// `input` `[B, H, W, 6]`, H and W multiples of 4 → features, with `parameters` in the order of
-    /// [`Network::tensors`]. `frozen` statistics replace measured ones. `keep`: for a backward pass; without it, planes are
-    /// released after their last reader, and images are computed one after another.
+    /// The features of `input` `[B, H, W, 6]`, H and W multiples of 4, with `parameters` in the order of
+    /// [`Network::tensors`]. `frozen` statistics replace measured ones. `keep`: a backward pass will follow. Without
+    /// `keep`, planes are released after their last reader, and images are computed one after another.
     ///
     /// # Panics
     /// If lengths and sizes do not fit.
@@ -95,7 +95,7 @@ impl Network {
     }
 }
 
-/// `[h, w, N]` → plane, the other channels 0.
+/// `[h, w, N]` → plane with 0 in the other channels.
 pub(super) fn pad<const N: usize>(values: &[f32], [height, width]: [usize; 2]) -> Plane {
     let mut data = take(height * width * CHANNELS);
     let pixels = data.as_chunks_mut::<CHANNELS>().0.par_iter_mut().zip(values.as_chunks::<N>().0);
@@ -105,7 +105,7 @@ pub(super) fn pad<const N: usize>(values: &[f32], [height, width]: [usize; 2]) -
     Plane { height, width, data, moments: Moments::default() }
 }
 
-/// Plane → `[h, w, N]`, the first channels.
+/// The first channels of a plane, `[h, w, N]`.
 pub(super) fn cut<const N: usize>(plane: &[f32], out: &mut [f32]) {
     let pixels = out.as_chunks_mut::<N>().0.par_iter_mut().zip(plane.as_chunks::<CHANNELS>().0);
     pixels.with_min_len(TASK).for_each(|(out, pixel)| out.copy_from_slice(&pixel[..N]));
@@ -118,7 +118,7 @@ pub(super) fn arranged(place: &Place, parameters: &[f32]) -> (Vec<f32>, [f32; CH
     (arrange(&parameters[place.weight.clone()], place.shape), bias)
 }
 
-/// A 3×3 convolution followed by a 1×1 convolution, as one: nothing lies between the two.
+/// A 3×3 convolution and the 1×1 convolution that follows it directly, as one convolution.
 pub(super) fn compose(first: &Place, second: &Place, parameters: &[f32]) -> (Vec<f32>, [f32; CHANNELS]) {
     let (first, first_bias) = arranged(first, parameters);
     let (second, second_bias) = arranged(second, parameters);
@@ -138,7 +138,7 @@ struct Pass<'a> {
     /// Statistics to use instead of measured ones.
     frozen: Option<Vec<Layer>>,
     sample: Sample,
-    /// Of each plane; empty if planes are kept.
+    /// The last step that reads each plane; empty if planes are kept.
     last_readers: &'a [usize],
 }
 
@@ -170,7 +170,7 @@ impl Pass<'_> {
                 hidden.into_iter().for_each(|plane| give(plane.data));
                 self.release(i);
             }
-            // The caller has the input.
+            // The caller has the input, so the tape does not keep it.
             let input = self.sample.planes[0].take();
             input.into_iter().for_each(|plane| give(plane.data));
         }
@@ -193,7 +193,7 @@ impl Pass<'_> {
         Conv { sources: &sources, weights: &weights, bias, stride, enlarge, shortcut, scale: 1.0 }.run()
     }
 
-    /// The first half of a residual block.
+    /// The first convolution of a residual block.
     fn first(&mut self, block: &Residual, inputs: &[usize]) -> Plane {
         let affines = self.normalise(&block.norm1, inputs, None);
         let source = |(&i, affine)| Source { plane: self.sample.plane(i), affine: Some(affine) };
@@ -203,7 +203,7 @@ impl Pass<'_> {
         Conv { sources: &sources, weights: &weights, bias, stride, enlarge, shortcut, scale: 1.0 }.run()
     }
 
-    /// The second half.
+    /// The second convolution of a residual block, and its shortcut.
     fn second(&mut self, block: &Residual, inputs: &[usize], hidden: &Plane) -> Plane {
         let affine = self.normalise(&block.norm2, &[], Some(hidden))[0];
         let (weights, mut bias) = arranged(&block.conv2, self.parameters);
@@ -221,7 +221,7 @@ impl Pass<'_> {
         Conv { sources: &sources, weights: &weights, bias, stride: 1, enlarge: false, shortcut, scale }.run()
     }
 
-    /// The group normalisation of planes on the tape and one that is not there yet, as affine maps.
+    /// Affine maps of the group normalisation of planes of the tape and of `hidden`, which is not on the tape yet.
     fn normalise(&mut self, norm: &Norm, inputs: &[usize], hidden: Option<&Plane>) -> Vec<Affine> {
         let planes: Vec<_> = inputs.iter().map(|&i| self.sample.plane(i)).chain(hidden).collect();
         let group_norm = self.network.norm(norm, self.parameters);

@@ -1,4 +1,4 @@
-//! The operators in order of execution, and where each one's parameters lie in one flat vector.
+//! The operators in order of execution, and where their parameters lie in one flat vector.
 
 use std::collections::HashMap;
 use std::ops::Range;
@@ -12,15 +12,15 @@ const LEVELS: usize = 3;
 /// A parameter: its name in a checkpoint, its shape there, and where its values lie.
 #[derive(Debug, Clone)]
 pub struct Tensor {
-    /// As the authors' state dict has it.
+    /// The name in the authors' state dict.
     pub name: String,
     /// `[out, in, k, k]` or `[n]`.
     pub shape: Vec<usize>,
-    /// Place in the flat vector.
+    /// The values' place in the flat vector.
     pub range: Range<usize>,
 }
 
-/// A convolution's places.
+/// Where the parameters of a convolution lie.
 #[derive(Debug, Clone)]
 pub(super) struct Conv {
     pub weight: Range<usize>,
@@ -29,7 +29,7 @@ pub(super) struct Conv {
     pub shape: [usize; 3],
 }
 
-/// A normalisation's places and its number.
+/// Where the parameters of a normalisation lie, and its number.
 #[derive(Debug, Clone)]
 pub(super) struct Norm {
     pub gamma: Range<usize>,
@@ -47,7 +47,7 @@ pub(super) struct Residual {
     pub shortcut: Option<Conv>,
 }
 
-/// Makes plane i + 1, if it is step i; plane 0 is the input.
+/// Step i computes plane i + 1. Plane 0 is the input.
 #[derive(Debug, Clone)]
 pub(super) enum Step {
     Convolve { conv: Conv, from: usize, stride: usize, enlarge: bool },
@@ -66,8 +66,8 @@ pub struct Network {
 }
 
 impl Network {
-    /// The network whose normalisations have `groups` groups and whose parameters have these `shapes`, by their names in a
-    /// checkpoint.
+    /// The network whose normalisations have `groups` groups and whose parameters have these `shapes`, by their names
+    /// in a checkpoint.
     ///
     /// # Panics
     /// If `groups` does not divide 16, or if a parameter is missing.
@@ -91,7 +91,7 @@ impl Network {
         self.gs_conv.bias.end
     }
 
-    /// The last step that reads each plane; the normalisation at the end counts as one more step.
+    /// The last step that reads each plane. The normalisation at the end counts as one more step.
     pub(super) fn last_readers(&self) -> Vec<usize> {
         let mut readers = vec![0; self.steps.len() + 1];
         for (i, step) in self.steps.iter().enumerate() {
@@ -115,7 +115,7 @@ impl Network {
     }
 }
 
-/// Assigns places in the flat vector, one after another.
+/// Assigns consecutive places in the flat vector.
 struct Places<'a> {
     shapes: &'a HashMap<String, Vec<usize>>,
     tensors: Vec<Tensor>,

@@ -1,7 +1,7 @@
 //! The regressor's network as one differentiable function over the fused convolutions.
 //!
 //! `layout` lists the operators and the places of their parameters; `forward` and `backward` run them.
-//! The tape between the two holds the planes that group normalisations or convolutions read, and nothing else.
+//! The tape between them holds only the planes that group normalisations or convolutions read.
 
 mod backward;
 mod forward;
@@ -11,11 +11,11 @@ pub use backward::Gradients;
 pub use forward::{Forward, Saved};
 pub use layout::{Network, Tensor};
 
-/// Channels in: red, green, blue, x, y, z.
+/// Channels of the input: red, green, blue, x, y, z.
 pub const INPUT_CHANNELS: usize = 6;
-/// Channels out.
+/// Channels of the features.
 pub const FEATURES: usize = 14;
-/// Every sum of two branches is scaled by this, so that its variance stays put.
+/// Factor of every sum of two branches, which keeps the variance.
 pub const BRANCH_SCALE: f64 = std::f64::consts::FRAC_1_SQRT_2;
 /// Added to every variance.
 pub const EPSILON: f64 = 1e-5;

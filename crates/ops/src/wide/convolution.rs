@@ -1,9 +1,9 @@
 //! 3×3 convolutions with stride 1 and padding 1 by Winograd's F(4×4, 3×3): 36 instead of 144 multiplications per
 //! sixteen outputs and pair of channels.
 //!
-//! Filters are transformed once. Then tasks take bands of rows: transform the inputs of a block of tiles, multiply by the
-//! filters of each of the 36 points, transform the products and write them where they belong. A block is large enough
-//! that reading all filters for it costs little, and small enough that intermediate results stay in the cache.
+//! Filters are transformed once. Each task computes a band of rows: it transforms the inputs of a block of tiles,
+//! multiplies by the filters of each of the 36 points, transforms the products and writes them. A block is so large
+//! that reading all filters for it costs little, and so small that intermediate results stay in the cache.
 
 use pulp::Arch;
 use rayon::prelude::*;
@@ -13,7 +13,7 @@ use super::product::{Left, PANEL, Product, Right};
 use super::transforms::{Block, Filters, Inputs, Lines, Outputs, POINTS, TILE, lines};
 use crate::buffers::{give, take};
 
-/// Filters, `strides` floats from one output to the next and from one input to the next, perhaps turned by 180°.
+/// Filters. `strides`: floats from one output to the next, and from one input to the next. `turned`: by 180°.
 #[derive(Debug, Clone, Copy)]
 pub struct Weights<'a> {
     pub values: &'a [f32],
@@ -22,7 +22,7 @@ pub struct Weights<'a> {
 }
 
 impl Weights<'_> {
-    /// `[panels][36][inputs in whole groups][32]`.
+    /// The transformed filters `[panels][36][inputs in whole groups][32]`.
     pub fn transform(self, [inputs, outputs]: [usize; 2]) -> Vec<f32> {
         let Self { values, strides, turned } = self;
         let panel = POINTS * inputs.next_multiple_of(GROUP) * PANEL;
@@ -41,9 +41,9 @@ impl Weights<'_> {
 #[derive(Debug, Clone, Copy)]
 pub struct Bands<'a> {
     pub inputs: usize,
-    /// Of [`Weights::transform`].
+    /// From [`Weights::transform`].
     pub filters: &'a [f32],
-    /// Of all outputs in whole groups.
+    /// One value per output, in whole groups.
     pub bias: &'a [f32],
     /// Pixels of a row.
     pub width: usize,
@@ -52,16 +52,16 @@ pub struct Bands<'a> {
 }
 
 impl Bands<'_> {
-    /// Output rows from tile row `row` on, as many as `out` `[rows][width][16]` holds per group.
+    /// Computes output rows from tile row `row` on. `out` has `[rows][width][16]` per group.
     pub fn run(&self, source: &impl Lines, row: usize, out: &mut [&mut [f32]]) {
         let Self { filters, bias, width, .. } = *self;
         let arch = Arch::new();
         let rows = (out[0].len() / (width * GROUP)).div_ceil(TILE);
         let columns = width.div_ceil(TILE);
-        // Parts of equal width if a row of tiles is more than a block.
+        // If a row of tiles is longer than a block, it is divided into parts of equal width.
         let part = columns.div_ceil(columns.div_ceil(self.tiles));
         let (inputs, outputs) = (self.inputs.next_multiple_of(GROUP), bias.len());
-        // An odd distance puts the 36 points of a tile into different sets of the cache.
+        // With an odd stride, the 36 points of a tile are in different sets of the cache.
         let stride = (rows * part) | 1;
         let mut read = take(lines(part));
         let mut points = take(POINTS * inputs * stride);

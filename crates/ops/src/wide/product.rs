@@ -1,4 +1,4 @@
-//! Matrix products whose factors are stored as the kernel reads them, so that nothing is packed for a product.
+//! Matrix products whose factors are stored in the order in which the kernel reads them, so that nothing is packed.
 //!
 //! The kernel keeps a block of the result in registers (12 rows of 32 columns with AVX-512), sums over the whole inner
 //! dimension and writes the block once. Every element is one sum in one order, for any number of threads.
@@ -7,10 +7,10 @@ use pulp::{Simd, WithSimd};
 
 use super::GROUP;
 
-/// Adjacent columns of the right factor.
+/// Columns of a panel of the right factor.
 pub const PANEL: usize = 2 * GROUP;
 
-/// Left factor `[rows, 16·groups]`: one `[rows][16]` per group, `stride` floats from one to the next.
+/// Left factor `[rows, 16·groups]`: `[rows][16]` per group, with `stride` floats from one group to the next.
 #[derive(Clone, Copy)]
 pub struct Left<'a> {
     pub values: &'a [f32],
@@ -19,7 +19,7 @@ pub struct Left<'a> {
     pub rows: usize,
 }
 
-/// Right factor `[16·groups, columns]`: one `[16·groups][32]` per panel, `stride` floats from one to the next.
+/// Right factor `[16·groups, columns]`: `[16·groups][32]` per panel, with `stride` floats from one panel to the next.
 #[derive(Clone, Copy)]
 pub struct Right<'a> {
     pub values: &'a [f32],
@@ -32,7 +32,7 @@ pub struct Product<'a, 'b> {
     pub right: Right<'a>,
     /// One value per column, in whole panels.
     pub bias: Option<&'a [f32]>,
-    /// One `[rows][16]` per group of columns.
+    /// `[rows][16]` per group of 16 columns.
     pub out: &'a mut [&'b mut [f32]],
 }
 
@@ -41,8 +41,8 @@ impl WithSimd for Product<'_, '_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        // Vectors per row of a block of 32 columns and of one of 16, and rows per block: as many as there are registers
-        // for, less those of the factors. Sixteen registers hold no block of 32 columns.
+        // Vectors per row of a block of 32 columns and of a block of 16 columns, and rows per block: as many as there
+        // are registers beside those for the factors. Sixteen registers are too few for a block of 32 columns.
         match S::F32_LANES {
             16 => panels::<S, 2, 1, 12>(simd, self),
             8 => panels::<S, 2, 2, 6>(simd, self),
@@ -62,14 +62,14 @@ fn panels<S: Simd, const WIDE: usize, const NARROW: usize, const ROWS: usize>(si
             rows::<S, WIDE, ROWS>(simd, left, panel, bias, out);
         } else {
             for (i, out) in out.chunks_mut(1).enumerate() {
-                // The panel's second half begins 16 floats later and ends as much earlier.
+                // The second half of the panel begins 16 floats later.
                 rows::<S, NARROW, ROWS>(simd, left, &panel[i * GROUP..], &bias[i * GROUP..], out);
             }
         }
     }
 }
 
-/// All rows of VECTORS vectors of columns.
+/// All rows of the result in VECTORS vectors of columns.
 #[inline(always)]
 fn rows<S: Simd, const VECTORS: usize, const ROWS: usize>(
     simd: S,
@@ -78,7 +78,7 @@ fn rows<S: Simd, const VECTORS: usize, const ROWS: usize>(
     bias: &[f32],
     out: &mut [&mut [f32]],
 ) {
-    /// Rows of the smaller block, for the rest of the rows.
+    /// Rows of the smaller block, for the remaining rows.
     const FEW: usize = 4;
     let mut row = 0;
     while row < left.rows {
@@ -98,7 +98,7 @@ fn rows<S: Simd, const VECTORS: usize, const ROWS: usize>(
     }
 }
 
-/// Rows from `row` on.
+/// ROWS rows from `row` on, in VECTORS vectors of columns.
 #[inline(always)]
 fn block<S: Simd, const VECTORS: usize, const ROWS: usize>(
     simd: S,

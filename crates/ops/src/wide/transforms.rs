@@ -1,18 +1,18 @@
 //! The three transforms of Winograd's F(4×4, 3×3) (Lavin and Gray, "Fast Algorithms for Convolutional Neural
 //! Networks"): filters, tiles of inputs and tiles of products.
 //!
-//! The points are 0, ±⅝, ±3⁄2 and ∞. With the usual 0, ±1, ±2, ∞ the transforms magnify rounding errors twice as much
-//! (compare Alam, Anderson, Barabasz and Gregg, "Winograd Convolution for Deep Neural Networks: Efficient Point
-//! Selection"), and these are as exact in binary.
+//! The points are 0, ±⅝, ±3⁄2 and ∞, which are exact in binary. With the usual points 0, ±1, ±2, ∞ the transforms
+//! magnify rounding errors twice as much (compare Alam, Anderson, Barabasz and Gregg, "Winograd Convolution for Deep
+//! Neural Networks: Efficient Point Selection").
 
 use pulp::{Simd, WithSimd};
 
 use super::GROUP;
 use super::product::PANEL;
 
-/// Rows and columns of outputs of a tile.
+/// Rows and columns of a tile's outputs.
 pub const TILE: usize = 4;
-/// Rows and columns of its inputs.
+/// Rows and columns of a tile's inputs.
 pub const SPAN: usize = 6;
 /// Products per tile and pair of channels.
 pub const POINTS: usize = SPAN * SPAN;
@@ -23,7 +23,7 @@ pub const Q: f32 = 1.5;
 pub const P2: f32 = P * P;
 pub const Q2: f32 = Q * Q;
 
-/// A rectangle of tiles.
+/// A rectangle of tiles, with its place and size in tiles.
 #[derive(Clone, Copy)]
 pub struct Block {
     pub row: usize,
@@ -38,7 +38,7 @@ impl Block {
     }
 }
 
-/// Bᵀ of six values.
+/// Bᵀ · d for six values d.
 #[inline(always)]
 fn input_points<S: Simd>(simd: S, d: [S::f32s; SPAN]) -> [S::f32s; SPAN] {
     let times = |a: f32, b, c| simd.mul_add_e_f32s(simd.splat_f32s(a), b, c);
@@ -55,7 +55,7 @@ fn input_points<S: Simd>(simd: S, d: [S::f32s; SPAN]) -> [S::f32s; SPAN] {
     ]
 }
 
-/// G of three values, for as many filters as a panel is wide.
+/// G · (a, b, c) for the 32 filters of a panel.
 #[inline(always)]
 fn filter_points(a: &[f32; PANEL], b: &[f32; PANEL], c: &[f32; PANEL]) -> [[f32; PANEL]; SPAN] {
     let (at_zero, at_p, at_q) = (1.0 / (P2 * Q2), 0.5 / (P2 * (P2 - Q2)), 0.5 / (Q2 * (Q2 - P2)));
@@ -73,7 +73,7 @@ fn filter_points(a: &[f32; PANEL], b: &[f32; PANEL], c: &[f32; PANEL]) -> [[f32;
     out
 }
 
-/// Aᵀ of six values.
+/// Aᵀ · m for six values m.
 #[inline(always)]
 fn outputs<S: Simd>(simd: S, m: [S::f32s; SPAN]) -> [S::f32s; TILE] {
     let times = |a: f32, b, c| simd.mul_add_e_f32s(simd.splat_f32s(a), b, c);
@@ -90,14 +90,14 @@ fn outputs<S: Simd>(simd: S, m: [S::f32s; SPAN]) -> [S::f32s; TILE] {
 
 /// G·g·Gᵀ of up to 32 filters: `[36][inputs in whole groups][32]`.
 pub struct Filters<'a> {
-    /// From the first filter's first tap on.
+    /// The values from the first filter's first tap on.
     pub weights: &'a [f32],
     /// At most 32.
     pub outputs: usize,
     pub inputs: usize,
     /// Floats from one filter to the next, and from one input to the next.
     pub strides: [usize; 2],
-    /// Turns the filters by 180°, as the gradient of a convolution's input needs them.
+    /// Turns the filters by 180°, for the gradient of a convolution's input.
     pub turned: bool,
     pub out: &'a mut [f32],
 }
@@ -136,13 +136,13 @@ impl WithSimd for Filters<'_> {
     }
 }
 
-/// Source of tiles.
+/// An image as a source of tiles.
 pub trait Lines: Sync {
     /// Groups of channels.
     fn groups(&self) -> usize;
 
-    /// Part of a row of one group into `out` `[columns][16]`: from column `first` on, where −1 is the border. Outside of
-    /// the image (a missing row is) everything is 0.
+    /// Writes a part of a row of one group to `out` `[columns][16]`, from column `first` on, where −1 is the border.
+    /// Pixels outside of the image are 0. `None` is a row outside of the image.
     fn line<S: Simd>(&self, simd: S, group: usize, row: Option<usize>, first: isize, out: &mut [f32]);
 }
 
@@ -150,14 +150,14 @@ pub trait Lines: Sync {
 pub struct Inputs<'a, L> {
     pub source: &'a L,
     pub block: Block,
-    /// Tiles from one group to the next, at least those of the block.
+    /// Tiles from one group to the next, at least as many as in the block.
     pub stride: usize,
     /// Room for [`lines`] floats.
     pub lines: &'a mut [f32],
     pub out: &'a mut [f32],
 }
 
-/// Floats of the rows that a row of `columns` tiles reads.
+/// Floats of the six input rows that a row of `columns` tiles reads.
 pub fn lines(columns: usize) -> usize {
     SPAN * (TILE * columns + SPAN - TILE) * GROUP
 }
@@ -170,7 +170,7 @@ impl<L: Lines> WithSimd for Inputs<'_, L> {
         let Self { source, block, stride, lines, out } = self;
         let (groups, vectors) = (source.groups(), GROUP / S::F32_LANES);
         let length = lines.len() / SPAN;
-        // Input rows and columns begin one before the first output.
+        // The input rows and columns of a tile begin one before its outputs.
         let first = (TILE * block.column) as isize - 1;
         for (group, tile_row) in (0..groups).flat_map(|group| (0..block.rows).map(move |row| (group, row))) {
             for (i, out) in lines.chunks_exact_mut(length).enumerate() {
@@ -204,7 +204,7 @@ impl<L: Lines> WithSimd for Inputs<'_, L> {
     }
 }
 
-/// Bᵀ of every column of six rows, in their place.
+/// Bᵀ · d for every column of six rows, in place.
 #[inline(always)]
 fn mix_rows<S: Simd>(simd: S, lines: &mut [f32]) {
     let (lines, _) = S::as_mut_simd_f32s(lines);
@@ -229,7 +229,7 @@ pub struct Outputs<'a, 'b> {
     pub bias: &'a [f32],
     /// Pixels per row of the image.
     pub width: usize,
-    /// Rows of the image from the block's first on, `[rows][width][16]` per group; tiles may overhang them.
+    /// Rows of the image from the block's first row on, `[rows][width][16]` per group. Tiles may overhang the rows.
     pub out: &'a mut [&'b mut [f32]],
 }
 

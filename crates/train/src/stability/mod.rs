@@ -43,7 +43,7 @@ anisotropy_limit = 1.5
 points_weight = 1.0
 "#
 );
-/// Settings that include interpolation, and sides of random weights, whose confidences are near ½.
+/// Interpolated maps, and sides in spite of the confidences of random weights, which are near ½.
 const SETTINGS: [&str; 2] = ["network.net_resolution=32", "network.conf_threshold=0.4"];
 
 /// All cases of losses, optimiser and training. `many_steps` is the number of steps of the longest case.
@@ -158,7 +158,7 @@ fn identical_pictures() -> Found {
         .must(similarity == Some(1.0), "SSIM is not 1")
 }
 
-/// Weights of a matrix, which Muon trains, and of a bias.
+/// 1000 steps without gradients, of a matrix, which Muon trains, and of biases.
 fn zero_gradients(device: &Device) -> Found {
     const STEPS: usize = 1000;
     let config = config(&[]);

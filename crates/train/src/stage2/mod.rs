@@ -64,8 +64,8 @@ pub struct GaussianTask {
 }
 
 impl GaussianTask {
-    /// A training on these data sets and a device with autodiff. `predictor` is the frozen predictor on the device without autodiff, or
-    /// `None` if it is trained as well.
+    /// A training on these data sets and a device with autodiff. `predictor` is the frozen predictor on the device
+    /// without autodiff, or `None` if it is trained as well.
     ///
     /// # Errors
     /// [`TrainError`] if a data set cannot be used with this config, or weights of LPIPS cannot be read.
@@ -100,7 +100,7 @@ impl GaussianTask {
         })
     }
 
-    /// Predicts the points of a sample's photographs with the trained or the frozen predictor, in a step or in a validation.
+    /// Points of a sample's photographs by the trained or the frozen predictor, in a step or a validation.
     fn predict(&self, networks: &Networks, item: &Stage2Item, is_step: bool) -> Prediction {
         let inner = self.device.clone().inner();
         let (predictor, device) = match (&networks.predictor, &self.frozen) {
@@ -142,8 +142,8 @@ impl GaussianTask {
     }
 
     /// Scores of the billboard baseline: both photographs as flat cut-outs in the plane through the person's axis. Its
-    /// points are the ray anchors, which lie on that plane. The last layer of a regressor with a geometric start is zero,
-    /// so that random weights leave each Gaussian in its pixel's colour. Confidences of 0 leave the sides out.
+    /// points are the ray anchors, which lie on that plane. The last layer of a regressor with a geometric start is
+    /// zero, so that random weights leave each Gaussian in its pixel's colour. Confidences of 0 leave the sides out.
     fn billboard(&self, ranks: &Ranks) -> Result<Scores, TrainError> {
         if let Some(scores) = self.billboard_scores.get() {
             return Ok(*scores);
