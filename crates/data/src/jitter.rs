@@ -20,7 +20,7 @@ pub struct JitterConfig {
     pub view: Jitter,
 }
 
-/// Ranges, each ±.
+/// Largest deviations to either side.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Jitter {
@@ -32,16 +32,16 @@ pub struct Jitter {
     pub roll: f64,
     /// Distance in metres.
     pub distance: f64,
-    /// Share of the focal length.
+    /// Focal length, as a share of itself.
     pub focal: f64,
     /// Position of the target point in metres, per axis.
     pub look_at: f64,
-    /// Place of the optical axis in the picture, as a share of its side, across and up: a picture that was cropped.
+    /// Principal point, as a share of the picture's side in x and in y, as if the picture was cropped.
     pub shift: f64,
 }
 
 impl JitterConfig {
-    /// The first key that makes no sense for cameras at `radius` metres, and why.
+    /// The first invalid key for cameras at `radius` metres, and why it is invalid.
     pub(crate) fn problem(&self, radius: f64) -> Option<(String, String)> {
         let Self { rig, view } = self;
         let sections = [("rig", rig), ("view", view), ("rig + jitter.view", &rig.plus(view))];
@@ -66,7 +66,7 @@ impl Jitter {
         ])
     }
 
-    /// Sum of both deviations of what has a limit. Yaw and roll have none, and are 0.
+    /// Sums the deviations whose sum is limited. Yaw and roll are not limited, and are 0 in the sum.
     pub(crate) fn plus(&self, other: &Self) -> Self {
         Self {
             yaw: 0.0,
@@ -79,16 +79,16 @@ impl Jitter {
         }
     }
 
-    /// Moves the optical axis of a camera at random in its picture.
+    /// Moves the principal point of a camera at random.
     pub(crate) fn shifted(&self, camera: Camera, random: &mut impl Rng) -> Camera {
         let mut stray = || self.shift * f64::from(camera.width) * random.random_range(-1.0..1.0);
         let principal_point = camera.principal_point + DVec2::new(stray(), stray());
         Camera { principal_point, ..camera }
     }
 
-    /// Moves a camera at random.
+    /// Moves the camera of an orbit at random, except for its principal point.
     pub(crate) fn apply(&self, orbit: &mut Orbit, random: &mut impl Rng) {
-        // A range of 0 draws a number as well, so that the other ranges' numbers do not depend on it.
+        // A range of 0 also draws a random number, so that the numbers of the other ranges do not change.
         let mut stray = |range: f64| range * random.random_range(-1.0..1.0);
         orbit.yaw_degrees += stray(self.yaw);
         orbit.pitch_degrees += stray(self.pitch);

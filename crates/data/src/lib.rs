@@ -1,4 +1,4 @@
-//! Photographs and training data: scans and generated people → rendered views → data sets → samples.
+//! Training data: scans and generated people are rendered, stored as data sets of views, and read as samples.
 
 pub mod dataset;
 mod jitter;

@@ -18,14 +18,14 @@ pub enum Kind {
     Random,
 }
 
-/// What the light moves with.
+/// The camera with which random light moves.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Follows {
-    /// The camera of each view, as if the person turned in front of it.
+    /// The camera of each view, as if the person turned in front of one camera.
     #[default]
     Camera,
-    /// The camera of the first view, as if the others moved around the person.
+    /// The camera of the first view, as if one camera moved around the person.
     First,
 }
 
@@ -35,12 +35,12 @@ pub enum Follows {
 pub struct LightConfig {
     /// Even or random.
     pub kind: Kind,
-    /// What random light moves with.
+    /// The camera with which random light moves.
     pub follows: Follows,
-    /// Largest number of lamps; each subject has one to so many.
+    /// Largest number of lamps. Each subject has at least one.
     pub lamps: usize,
-    /// Range of the luminance of the brightest over that of the darkest direction of a surface, before shadows. Shown
-    /// values differ less: by the 2.2nd root of it.
+    /// Range of the contrast: the luminance of a surface in its brightest direction over its luminance in the darkest
+    /// direction, before shadows. Pixel values differ less: by the 2.2nd root of the contrast.
     pub contrast: [f32; 2],
     /// Largest deviation of the channels of a lamp's colour, as a share.
     pub color: f32,
@@ -56,7 +56,7 @@ impl Default for LightConfig {
 }
 
 impl LightConfig {
-    /// The first key that makes no sense, and why.
+    /// The first invalid key, and why it is invalid.
     pub(crate) fn problem(&self) -> Option<(&'static str, String)> {
         let [low, high] = self.contrast.map(f64::from);
         outside([
@@ -87,13 +87,13 @@ impl LightConfig {
         let lamps = lamps.collect();
         let warm = between(-0.5, 0.5) * self.color;
         let ground = between(0.3, 1.0) * tint(-between(-0.5, 0.5) * self.color, -warm);
-        // As many low contrasts as high ones.
+        // Uniform in the logarithm of the contrast.
         let [low, high] = self.contrast;
         let contrast = low * libm::powf(high / low, between(0.0, 1.0));
         Light::Around(Surroundings::new(lamps, [tint(-warm, warm), ground], contrast))
     }
 
-    /// `light` in a view from `degrees` around the subject, of a subject whose first view is from `first` degrees.
+    /// The light of a view from `degrees` around the subject, whose first view is from `first` degrees.
     pub(crate) fn seen_from(&self, light: &Light, degrees: f64, first: f64) -> Light {
         let degrees = if self.follows == Follows::Camera { degrees } else { first };
         match light {

@@ -1,4 +1,4 @@
-//! From a mesh to a subject of a data set: cameras, names and shards.
+//! Renders meshes as subjects of a data set: config, cameras, and shards of the work.
 
 use std::path::Path;
 use std::str::FromStr;
@@ -41,9 +41,9 @@ pub struct ViewsConfig {
     pub arrangement: Arrangement,
     /// Groups: largest angle, in degrees, between a group's front and the subject's own front.
     pub front_within_degrees: f64,
-    /// Added to the published cameras' pitch, which is 8° downwards. In degrees.
+    /// Degrees that are added to the published cameras' pitch of 8° downwards.
     pub pitch: f64,
-    /// Factor of the published cameras' distance.
+    /// Factor on the distance of the published cameras.
     pub distance: f64,
     /// Whether the focal length grows with the distance, so that a person is as large in a picture from afar.
     pub framed: bool,
@@ -190,8 +190,8 @@ impl DataConfig {
     /// Renders a subject and adds it to the data set. `mesh` stands on the floor at the origin.
     ///
     /// # Errors
-    /// [`FileError`] for a mesh that cannot be rendered or is outside a view, with its origin, and for files that
-    /// cannot be written.
+    /// [`FileError`] if the mesh cannot be rendered or is outside a view (the error names the subject's origin), or if
+    /// a file cannot be written.
     pub fn add(&self, folder: &Folder, subject: &Subject, mesh: &Mesh) -> Result<Made, FileError> {
         let Subject { split, name, identity, yaw_degrees, origin } = *subject;
         let renderer = Renderer::new(mesh).map_err(|e| FileError::unsuitable(origin, e))?;
@@ -210,15 +210,15 @@ impl DataConfig {
 /// A subject that is added to a data set.
 #[derive(Debug, Clone, Copy)]
 pub struct Subject<'a> {
-    /// Its split.
+    /// The subject's split.
     pub split: Split,
-    /// Its name in the data set.
+    /// Name in the data set.
     pub name: &'a str,
-    /// Its name among all data sets, which seeds its light and the random deviations of its cameras.
+    /// Name that is unique among all data sets. It seeds the light and the random deviations of the cameras.
     pub identity: &'a str,
-    /// Direction in which it faces, around y.
+    /// Direction in which the subject faces: the angle around +y, from +z.
     pub yaw_degrees: f64,
-    /// Its source, for error messages.
+    /// Source of the mesh, for error messages.
     pub origin: &'a Path,
 }
 
@@ -243,7 +243,7 @@ impl Default for Shard {
 }
 
 impl Shard {
-    /// As in names of files: `0-of-4`.
+    /// The shard in file names, such as `0-of-4`.
     pub fn name(self) -> String {
         format!("{}-of-{}", self.index, self.count)
     }
@@ -350,7 +350,7 @@ mod tests {
         assert_eq!(config.refusal(), Some(("jitter.rig.focal".into(), "is 0.6, must be 0 to 0.5".into())));
     }
 
-    /// From 1.6 to 4 metres a person is about as large in all pictures, and somewhere near their middles.
+    /// From 1.6 to 4 metres, a person has about the same size in all pictures, and is near the middle.
     #[test]
     fn framed_cameras_see_persons_of_one_size_from_any_distance() {
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/data/phone.toml");

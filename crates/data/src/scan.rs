@@ -14,8 +14,8 @@ use snapsnap_base::FileError;
 use snapsnap_mesh::import;
 use snapsnap_mesh::mesh::{Mesh, MeshError};
 
-/// Height of a normalised subject in metres (docs/method.md, "Scans"). Real stature is lost on purpose: two photographs
-/// do not show it.
+/// Height of a normalised subject in metres (docs/method.md, "Scans"). The real height is dropped on purpose: two
+/// photographs do not show it.
 pub const HEIGHT: f32 = 1.8;
 /// Largest random change of a training subject's height, in metres.
 const HEIGHT_JITTER: f32 = 0.05;
@@ -44,8 +44,8 @@ pub enum Collection {
 }
 
 impl Collection {
-    /// The split of a subject, the `place`-th of its set. THuman follows the published lists. The first 100 of 2K2K and
-    /// all of 4D-Dress are for testing, the others for training (docs/method.md, "Scans").
+    /// The split of a subject, which is number `place` of its set, from 0. THuman follows the published lists. The
+    /// first 100 of 2K2K and all of 4D-Dress are for testing, the others for training (docs/method.md, "Scans").
     pub fn split(self, subject: &str, place: usize) -> Split {
         match (self.of(subject), subject.parse::<u32>()) {
             (Self::FourDDress, _) => Split::Test,
@@ -64,8 +64,8 @@ impl Collection {
         }
     }
 
-    /// Whether SMPL-X parameters contain the direction that its subjects face. Subjects of other collections face +z
-    /// (docs/method.md, "Cameras").
+    /// Whether the SMPL-X parameters of a subject contain the direction that it faces. Subjects of other collections
+    /// face +z (docs/method.md, "Cameras").
     pub fn has_orientation(self) -> bool {
         matches!(self, Self::Thuman20 | Self::Thuman21)
     }
@@ -150,7 +150,7 @@ pub fn find(root: &Path) -> Result<Vec<Source>, FileError> {
     Ok(sources)
 }
 
-/// A valid folder name on every system, and not a hidden one.
+/// Makes a folder name that is valid on every system and not hidden.
 fn subject_name(name: &str) -> String {
     let fine = |c: char| c.is_alphanumeric() || "-_. ".contains(c);
     let name: String = name.chars().take(60).map(|c| if fine(c) { c } else { '_' }).collect();

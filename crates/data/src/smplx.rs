@@ -1,7 +1,7 @@
 //! The direction that a scan faces, from its SMPL-X parameters: THuman's `smplx_param.pkl`, or JSON.
 //!
-//! A pickle is a program for a stack machine that may call any function. This machine calls none. It keeps calls as
-//! data, among which NumPy's arrays are recognised.
+//! A pickle is a program for a stack machine that may call any function. The machine of this file calls no function. It
+//! stores calls as data, and recognises the calls that make NumPy's arrays.
 
 use std::cell::RefCell;
 use std::path::Path;
@@ -21,10 +21,10 @@ const MAX_NODES: usize = 100;
 const ORIENTATION: &str = "global_orient";
 
 /// Angle in degrees, around +y, from +z to the direction that the body faces. As in the published code, `global_orient`
-/// is taken for a pure rotation around y, the angle of which is its second component (docs/method.md, "Cameras").
+/// is treated as a pure rotation around y by its second component (docs/method.md, "Cameras").
 ///
 /// # Errors
-/// [`FileError`] for files that are no such parameters.
+/// [`FileError`] for a file that cannot be read or has no orientation of three finite numbers.
 pub fn yaw_degrees(path: &Path) -> Result<f64, FileError> {
     let bytes = file::read(path, MAX_BYTES).map_err(FileError::read(path))?;
     let is_json = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("json"));
@@ -83,7 +83,7 @@ fn shared(values: Vec<Value>) -> Rc<RefCell<Vec<Value>>> {
 
 /// The numbers of a NumPy array or scalar, or of a list, in order.
 fn numbers(value: &Value, nodes: &mut usize) -> Option<Vec<f64>> {
-    // The number of values of lists inside one another may be exponential.
+    // Lists that share their elements may contain exponentially many values.
     *nodes = nodes.checked_sub(1)?;
     match value {
         Value::Number(number) => Some(vec![*number]),
@@ -121,7 +121,7 @@ fn numbers(value: &Value, nodes: &mut usize) -> Option<Vec<f64>> {
     }
 }
 
-/// Bytes. In protocol 2, Python 3 writes them as a call that encodes text as Latin-1.
+/// The bytes of a value. In protocol 2, Python 3 writes bytes as a call that encodes text as Latin-1.
 fn raw(value: &Value) -> Option<Rc<[u8]>> {
     match value {
         Value::Bytes(bytes) => Some(bytes.clone()),
@@ -197,7 +197,7 @@ impl<'a> Machine<'a> {
     fn add(&mut self, values: Vec<Value>) -> Result<(), String> {
         match self.stack.last() {
             Some(Value::List(items) | Value::Dict(items)) => items.borrow_mut().extend(values),
-            // State of a foreign object.
+            // Items of an object of another class are not needed.
             Some(Value::Object(_)) => {}
             _ => return Err("it adds to a value that is no container".into()),
         }

@@ -32,10 +32,10 @@ pub fn rectangle() -> (Mesh, Vec3) {
     (mesh, normal * (0.9 / normal.dot(centre)))
 }
 
-/// Centre and half size of [`block`]. No two of its views are equal.
+/// Centre and half size of [`block`]. All of its views differ.
 pub const BLOCK: (Vec3, Vec3) = (Vec3::new(0.06, 0.9, 0.03), Vec3::new(0.3, 0.8, 0.17));
 
-/// A block whose six sides face along the axes.
+/// An axis-aligned block.
 pub fn block() -> Mesh {
     let (middle, half) = BLOCK;
     let corner = |i: u32| Vec3::new((i & 1) as f32, (i >> 1 & 1) as f32, (i >> 2) as f32) * 2.0 - 1.0;
@@ -44,7 +44,7 @@ pub fn block() -> Mesh {
     mesh(positions, sides, Vec3::new(0.3, 0.6, 0.8))
 }
 
-/// A mesh of one colour with faces of four corners.
+/// A mesh of one colour, made of quadrilaterals.
 fn mesh<const N: usize>(positions: Vec<Vec3>, faces: [[u32; 4]; N], color: Vec3) -> Mesh {
     let faces = faces.into_iter().flat_map(|[a, b, c, d]| [[a, b, c], [a, c, d]]);
     Mesh {
@@ -62,7 +62,7 @@ pub fn off_block(p: Vec3) -> f32 {
     (out.max(Vec3::ZERO).length() + out.max_element().min(0.0)).abs()
 }
 
-/// As [`made`], with a config of these values.
+/// A data set like [`made`], with the default config and these values of `views`.
 pub fn data_set(
     mesh: &Mesh,
     layout: Layout,
@@ -79,7 +79,7 @@ pub fn data_set(
     made(&config, mesh, subjects)
 }
 
-/// A data set of this config with `subjects` copies of a mesh in train.
+/// A data set of this config, with `subjects` copies of `mesh` in the split train.
 pub fn made(config: &DataConfig, mesh: &Mesh, subjects: usize) -> (TempDir, Arc<Folder>) {
     let temporary = tempfile::tempdir().expect("temporary folder");
     let root = temporary.path().join(format!("people_{}_{}", config.views.resolution, config.views.count));

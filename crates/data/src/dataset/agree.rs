@@ -81,7 +81,7 @@ impl Seen {
     }
 }
 
-/// Messages for pairs of views, `step` places apart, that do not fit one another.
+/// Messages for pairs of views, `step` places apart, that contradict one another.
 pub fn disagreements(views: &[Option<Seen>], step: usize) -> impl Iterator<Item = String> {
     let count = views.len();
     let pairs = if count > 2 { count } else { count.saturating_sub(1) };

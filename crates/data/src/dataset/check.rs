@@ -64,7 +64,7 @@ pub fn check(root: &Path, mut progress: impl FnMut(usize, usize)) -> Result<Chec
         let mut reported = HashSet::new();
         checked.problems.extend(problems.into_iter().flatten().filter(|p| reported.insert(p.clone())));
         let at = folder.path(*split, "img", subject);
-        // A quarter turn; in groups, from a photograph to a side.
+        // Views a quarter turn apart are compared; in groups, a photograph with a side.
         let step = match folder.description().arrangement {
             Arrangement::Ring => (seen.len() / 4).max(1),
             Arrangement::Groups => 2,
@@ -91,7 +91,7 @@ fn orphans(folder: &Folder, split: Option<Split>, subjects: &[String]) -> Vec<St
     problems
 }
 
-/// Files of no view in the description.
+/// Files that belong to none of the views in the description.
 fn unexpected(folder: &Folder, split: Option<Split>, subject: &str) -> Vec<String> {
     let views = folder.description().views;
     let mut extra = BTreeSet::new();

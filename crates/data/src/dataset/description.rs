@@ -97,7 +97,7 @@ pub struct Description {
     pub layout: Layout,
     /// Views of each subject.
     pub views: usize,
-    /// Their arrangement around it.
+    /// Arrangement of the views around the subject.
     #[serde(default, skip_serializing_if = "Arrangement::is_ring")]
     pub arrangement: Arrangement,
     /// Side of a view in pixels.

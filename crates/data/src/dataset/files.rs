@@ -51,7 +51,7 @@ fn to_byte(value: f32) -> u8 {
     (value.clamp(0.0, 1.0) * 255.0).round() as u8
 }
 
-/// A pixel's straight colour. Colours of a view are multiplied by coverage.
+/// The straight colour of a pixel. The colours of a view are premultiplied by coverage.
 fn straight(view: &View, pixel: usize) -> [u8; 3] {
     let alpha = view.alpha[pixel];
     if alpha > 0.0 { view.color[pixel].map(|c| to_byte(c / alpha)) } else { [0; 3] }

@@ -1,4 +1,4 @@
-//! The fingerprint of a data set, by which a continued training notices other pictures.
+//! The fingerprint of a data set, by which a resumed training detects changed pictures.
 
 use std::fs::{self, File};
 use std::io::{self, Read, Seek, SeekFrom};
@@ -10,15 +10,15 @@ use snapsnap_base::{FileError, file};
 
 use super::{Folder, Split};
 
-/// Bytes that are read at the beginning and at the end of a file. A PNG and a compressed array end with checksums of their
-/// content.
+/// Bytes that are read at the beginning and at the end of a file. A PNG and a compressed array end with checksums of
+/// their content.
 const ENDS: u64 = 4096;
 /// Largest depth of files below a split: `img/S/v.png`.
 const MAX_DEPTH: usize = 3;
 
 impl Folder {
-    /// A hash of the description and of the people of `splits`: of the names, lengths, beginnings and ends of their files. A packed data
-    /// set has the same one as its folders.
+    /// A hash of the description and of the files of `splits`: their names, lengths, beginnings and ends. A packed data
+    /// set has the same hash as its folders.
     ///
     /// # Errors
     /// [`FileError::Read`] for a file or folder that cannot be read.
@@ -54,7 +54,7 @@ impl Folder {
     }
 }
 
-/// Adds the files below a folder. Hidden ones, which are unfinished, are left out.
+/// Adds the files below a folder. Hidden files are unfinished, and left out.
 fn list(folder: &Path, depth: usize, files: &mut Vec<PathBuf>) -> io::Result<()> {
     for entry in fs::read_dir(folder)? {
         let entry = entry?;

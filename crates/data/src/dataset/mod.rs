@@ -58,7 +58,7 @@ pub struct Folder {
 
 /// A file that was read.
 struct Stored {
-    /// Its path for messages.
+    /// Path for messages.
     path: PathBuf,
     bytes: Vec<u8>,
 }
@@ -200,7 +200,7 @@ impl Folder {
         fs::read_dir(folder)?.map(entry).collect()
     }
 
-    /// Reads the file of the data set that is at `path`, or that would be there without archives.
+    /// Reads a file of the data set. `path` is the file's path in a data set of folders, also if the set is packed.
     fn stored(&self, path: &Path) -> Result<Stored, FileError> {
         let (path, bytes) = match &self.shards {
             Some(shards) => shards.read(self.below(path))?,
@@ -209,7 +209,7 @@ impl Folder {
         Ok(Stored { path, bytes })
     }
 
-    /// Bytes that a file may have: more than the cameras of all views, or 16 for each pixel of a picture of twice the side.
+    /// Largest size of a file in bytes: enough for all cameras, and for 16 bytes per pixel at twice the side.
     fn largest(&self) -> u64 {
         let Description { resolution, views, .. } = self.description;
         let (pixels, views) = (u64::from(resolution).pow(2), views as u64);
@@ -221,7 +221,7 @@ impl Folder {
         path.strip_prefix(&self.root).unwrap_or(path)
     }
 
-    /// File name of a view's picture, mask or depth, by the name of its folder.
+    /// File name of a view's picture, mask or depth; `kind` is the name of the folder.
     fn file_name(&self, kind: &str, view: impl Display) -> String {
         let ending = match (kind, self.description.layout) {
             ("depth" | "depth2", Layout::Exact) => "npz",

@@ -12,11 +12,11 @@ use super::shards::{self, BLOCK, INDEX, Line};
 use super::write::remove_left;
 use super::{Folder, Split, Stored};
 
-/// The config of the preparation, which is kept.
+/// File name of the config of `prepare`, which is copied.
 const SETTINGS: &str = "prepare.config.toml";
-/// How the name of a folder in the making ends.
+/// Suffix of the name of an unfinished folder.
 const UNFINISHED: &str = ".unfinished";
-/// How the name of its lock goes on.
+/// Suffix of the lock's name, after [`UNFINISHED`].
 const LOCK: &str = ".lock";
 
 /// What was packed.
@@ -24,7 +24,7 @@ const LOCK: &str = ".lock";
 pub struct Packed {
     /// Subjects.
     pub subjects: usize,
-    /// Their files.
+    /// Files of the subjects.
     pub files: usize,
     /// Archives.
     pub archives: usize,
@@ -32,13 +32,13 @@ pub struct Packed {
     pub bytes: u64,
 }
 
-/// Packs a data set of folders into the new folder `output`: archives of about `size` bytes, each with whole subjects. The
-/// folder appears when all files are written. Calls `progress` with the number of packed subjects and of all subjects. The same
-/// data set gives the same bytes.
+/// Packs a data set of folders into the new folder `output`: archives of about `size` bytes, each with whole subjects.
+/// The folder appears when all files are written. Calls `progress` with the number of packed subjects and of all
+/// subjects. The same data set gives the same bytes.
 ///
 /// # Errors
-/// [`FileError`]: `output` exists and is not empty, the data set is packed already, a subject lacks a file or has a full stop
-/// in its name, or a file cannot be written.
+/// [`FileError`]: `output` exists and is not empty, the data set is packed already, a subject lacks a file or has a
+/// full stop in its name, or a file cannot be written.
 pub fn pack(
     folder: &Folder,
     output: &Path,
@@ -68,9 +68,9 @@ pub fn pack(
     fs::create_dir_all(parent).map_err(FileError::write(parent))?;
     let prefix = format!(".{}.", name.to_string_lossy());
     tidy(parent, &prefix);
-    // Several runs may pack into one folder at once: the first one to end is the one that counts.
+    // Several runs may pack into one folder at once: the first run that ends makes the folder.
     let temporary = parent.join(format!("{prefix}{}{UNFINISHED}", process::id()));
-    // The system releases the lock of a killed run. Some file systems have none.
+    // The system releases the lock of a killed run. Some file systems have no locks.
     let mark = parent.join(format!("{prefix}{}{UNFINISHED}{LOCK}", process::id()));
     let lock = File::create(&mark).map_err(FileError::write(&mark))?;
     let _ = lock.try_lock();
@@ -98,7 +98,7 @@ pub fn pack(
     packed
 }
 
-/// Removes the folders that killed runs have left in `parent`, by their locks. Those of runs in progress stay.
+/// Removes the folders of killed runs in `parent`, whose locks are free. Folders of runs in progress stay.
 fn tidy(parent: &Path, prefix: &str) {
     for mark in fs::read_dir(parent).into_iter().flatten().flatten().map(|entry| entry.path()) {
         let name = mark.file_name().unwrap_or_default().to_string_lossy().into_owned();
@@ -110,12 +110,12 @@ fn tidy(parent: &Path, prefix: &str) {
     }
 }
 
-/// An archive in the making.
+/// An archive that is being written.
 struct Open {
     split: Option<Split>,
     path: PathBuf,
     out: tar::Builder<BufWriter<File>>,
-    /// Bytes so far.
+    /// Bytes written so far.
     at: u64,
 }
 

@@ -1,4 +1,4 @@
-//! Packed data sets: tar archives in WebDataset's layout, and an index by which single files are read.
+//! Packed data sets: tar archives in WebDataset's layout, and an index for reading single files.
 //!
 //! ```text
 //! ROOT/dataset.toml             the description
@@ -6,8 +6,8 @@
 //!     /train-000000.tar, …      0000.img.0.png, 0000.depth.0.npz, …, 0000.cameras.json
 //! ```
 //!
-//! A file `train/img/0000/0.png` of a folder is the member `0000.img.0.png` of an archive of its split: the subject is the
-//! sample's key, and the rest its field. Archives of a set without splits begin with `all`.
+//! A file `train/img/0000/0.png` of a folder is the member `0000.img.0.png` of an archive of its split: the subject is
+//! the sample's key, and the rest its field. Archives of a set without splits begin with `all`.
 
 use std::collections::{BTreeMap, HashMap};
 use std::fs::{self, File};
@@ -26,9 +26,9 @@ pub const INDEX: &str = "archives.csv";
 const WHOLE: &str = "all";
 /// Largest index that is read, in bytes: four million files.
 const MAX_INDEX: u64 = 256 << 20;
-/// Archives that stay open once they were read. Systems limit the number of open files.
+/// Number of archives that stay open after the first read. Systems limit the number of open files.
 const KEPT_OPEN: usize = 256;
-/// Bytes of a tar header. Members begin at multiples of it.
+/// Bytes of a tar header. Members begin at multiples of this size.
 pub const BLOCK: u64 = 512;
 
 /// A line of the index.
@@ -39,9 +39,9 @@ pub struct Line {
     pub archive: String,
     /// Name of the member.
     pub file: String,
-    /// Position of its content in the archive, in bytes. The header lies before it.
+    /// Position of the member's content in the archive, in bytes. The header lies before the content.
     pub offset: u64,
-    /// Bytes of its content.
+    /// Bytes of the member's content.
     pub length: u64,
 }
 
@@ -116,10 +116,10 @@ pub struct Shards {
 }
 
 impl Shards {
-    /// Reads the index in `root`; `None` if there is none, and no archive.
+    /// Reads the index in `root`; `None` if there is neither an index nor an archive.
     ///
     /// # Errors
-    /// [`FileError`] for an index that is damaged or does not fit the archives, and for archives that are missing or cut.
+    /// [`FileError`] for an index that is damaged or does not fit the archives, and for missing or truncated archives.
     pub fn open(root: &Path) -> Result<Option<Self>, FileError> {
         let index = root.join(INDEX);
         let there = archives_in(root)?;
@@ -185,7 +185,7 @@ impl Shards {
         self.files.get(path).copied().ok_or_else(missing)
     }
 
-    /// The content of the file that folders would have at `path`, below the root, and a path for messages.
+    /// The content of the file that a data set of folders has at `path`, below its root, and a path for messages.
     ///
     /// # Errors
     /// [`FileError`] for a file that is not listed, and for one that is not where the index says.
@@ -211,7 +211,7 @@ impl Shards {
         Err(FileError::unsuitable(archive, message))
     }
 
-    /// Bytes of a member from `from` on, counted from its header.
+    /// Reads `count` bytes of a member, from byte `from` on, counted from the beginning of its header.
     fn part(&self, place: Place, from: u64, count: u64) -> Result<Vec<u8>, FileError> {
         let Archive { path, file: kept } = &self.archives[place.archive];
         let at = place.offset - BLOCK + from;

@@ -152,7 +152,7 @@ fn a_killed_run_leaves_no_half_subject() {
     assert!(check(root, |_, _| {}).expect("checks").problems.is_empty());
 }
 
-/// A fault does not hide another.
+/// One fault does not hide another.
 #[test]
 fn a_check_lists_everything_that_is_wrong() {
     let (_temporary, folder) = small(Layout::Exact);
@@ -239,7 +239,7 @@ fn depths_that_the_authors_layout_cannot_store_are_refused() {
     config.add(&folder, &Subject::plain(Split::Train, "0000"), &wall).expect("f32 stores them");
 }
 
-/// Each file of the authors' layout is checked, also after faults of the others.
+/// Each file of the authors' layout is checked, also if other files are faulty.
 #[test]
 fn a_check_looks_at_every_file_of_the_authors_layout() {
     let (_temporary, folder) = small(Layout::Authors);
@@ -263,7 +263,7 @@ fn a_check_looks_at_every_file_of_the_authors_layout() {
     assert_eq!(problems.len(), files.len(), "{problems:#?}");
 }
 
-/// Cameras that are valid, but not those of the renders.
+/// Cameras that are valid, but did not render the views.
 #[test]
 fn a_check_reports_cameras_that_do_not_fit_their_views() {
     type Change = fn(&mut Camera);

@@ -23,8 +23,8 @@ pub enum Made {
     Elsewhere,
 }
 
-/// Removes the folder of a killed run and its lock, which is called like the folder, with the extension `lock`. Those of a run in progress
-/// stay.
+/// Removes the folder of a killed run and the folder's lock `mark`, which has the folder's name and the extension
+/// `lock`. A folder of a run in progress stays.
 pub(super) fn remove_left(mark: &Path) {
     let Ok(lock) = fs::File::open(mark) else { return };
     // A run in progress holds its lock. This one is held until the folder is removed.
@@ -35,7 +35,7 @@ pub(super) fn remove_left(mark: &Path) {
 }
 
 impl Folder {
-    /// Whether the subject is complete: every kind of file, up to the last view.
+    /// Whether the subject is complete: the last view has a file of every kind.
     pub fn has(&self, split: Split, subject: &str) -> bool {
         let last = self.description.views - 1;
         self.kinds().iter().all(|kind| {
@@ -49,13 +49,13 @@ impl Folder {
         })
     }
 
-    /// Adds a subject from the source `origin`. `cameras` have the set's side and pixel centres. `draw` renders the view of each, with
-    /// pixel centres at +½; with `high_resolution` also at twice the side. The subject appears when all files are written. Several runs may
-    /// write into one data set at once.
+    /// Adds a subject from the source `origin`. `cameras` have the data set's resolution and pixel centres. `draw`
+    /// renders a camera's view with pixel centres at +½; for `high_resolution` it is called again at twice the side.
+    /// The subject appears when all files are written. Several runs may write into one data set at once.
     ///
     /// # Errors
-    /// [`FileError::Write`]; [`FileError::Unsuitable`] for a name that is no file name, an empty view, or, in the authors' layout, a depth
-    /// of half a metre or less.
+    /// [`FileError::Write`]; [`FileError::Unsuitable`] for a name that is no file name, an empty view, or, in the
+    /// authors' layout, a depth of half a metre or less.
     ///
     /// # Panics
     /// If the number or the size of the cameras differs from the set's views.
@@ -71,7 +71,7 @@ impl Folder {
         assert_eq!(cameras.len(), description.views, "cameras");
         let side = description.resolution;
         assert!(cameras.iter().all(|c| (c.width, c.height) == (side, side)), "a camera of another size");
-        // Other folders than the subject's own, and hidden names.
+        // Refuses names that lead to another folder, and hidden names.
         if subject.is_empty() || subject.starts_with('.') || subject.contains(['/', '\\']) {
             let message = format!("`{}` is no name of a subject", quoted(subject));
             return Err(FileError::unsuitable(origin, message));
@@ -100,7 +100,7 @@ impl Folder {
         let guard = file::unfinished_folder(&temporary).map_err(FileError::write(&temporary))?;
         let made = self.write_into(&temporary, subject, origin, cameras, &draw);
         let made = made.and_then(|()| self.reveal(&temporary, split, subject));
-        // The folder around it stays, since other runs may use it.
+        // The folder `.unfinished` stays, since other runs may use it.
         let _ = fs::remove_dir_all(&temporary);
         drop(guard);
         mark.remove();
@@ -184,7 +184,7 @@ impl Folder {
             let (from, to) = (temporary.join(kind), self.path(Some(split), kind, subject));
             let parent = to.parent().unwrap_or(&self.root);
             fs::create_dir_all(parent).map_err(FileError::write(parent))?;
-            // A part of a subject that is not complete.
+            // A folder of an incomplete subject.
             if to.is_dir() {
                 fs::remove_dir_all(&to).map_err(FileError::write(&to))?;
             }

@@ -1,4 +1,4 @@
-//! Augmentation: changes to rendered photographs that imitate cameras and masks.
+//! Augmentation: changes to rendered photographs that imitate real cameras and inexact masks.
 
 use std::io::Cursor;
 
@@ -14,9 +14,9 @@ use snapsnap_base::config::outside;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Augment {
-    /// Brighter or darker by up to this share.
+    /// Largest change of brightness, as a share.
     pub exposure: f32,
-    /// Red and blue against green, up to this share.
+    /// Largest change of red and blue against green, as a share.
     pub white_balance: f32,
     /// Largest error of masks that are too small, in pixels.
     pub mask_erosion: f32,
@@ -28,12 +28,12 @@ pub struct Augment {
     pub background: bool,
     /// Stage 2: whether targets have a random colour instead of black as their background.
     pub background_color: bool,
-    /// Stage 1: half of the samples are mirrored, which makes two people of each.
+    /// Stage 1: whether half of the samples are mirrored.
     pub flip: bool,
 }
 
 impl Default for Augment {
-    /// Augmentation of this program's trainings.
+    /// Augmentation of this program's own trainings.
     fn default() -> Self {
         Self {
             exposure: 0.15,
@@ -136,7 +136,7 @@ fn compressed(picture: RgbImage, quality: u8) -> RgbImage {
     let decoded = image::ImageReader::with_format(Cursor::new(&bytes), image::ImageFormat::Jpeg).decode();
     match (done, decoded) {
         (Ok(()), Ok(decoded)) => decoded.into_rgb8(),
-        // It fails only without memory. The picture then stays uncompressed.
+        // Compression fails only if memory runs out. The picture then stays uncompressed.
         _ => picture,
     }
 }
@@ -146,7 +146,7 @@ pub(super) fn moved(mask: &GrayImage, reach: f32) -> GrayImage {
     let radius = reach.abs();
     let (width, height) = (i64::from(mask.width()), i64::from(mask.height()));
     let whole = radius.ceil() as i64;
-    // Pixels of a disc, with the share of each that lies within the radius.
+    // Offsets of the pixels of a disc, and the share of each pixel within the radius.
     let disc: Vec<(i64, i64, f32)> = (-whole..=whole)
         .flat_map(|y| (-whole..=whole).map(move |x| (x, y)))
         .map(|(x, y)| (x, y, (radius + 1.0 - ((x * x + y * y) as f32).sqrt()).clamp(0.0, 1.0)))
@@ -158,7 +158,7 @@ pub(super) fn moved(mask: &GrayImage, reach: f32) -> GrayImage {
         let value = if inside { mask.as_raw()[(y * width + x) as usize] } else { 0 };
         if dilate { value } else { 255 - value }
     };
-    // Squares that are not empty. A disc reaches at most into the neighbours of its square.
+    // Squares of pixels with anything in them. A disc reaches at most into the squares beside its own.
     let square = whole.max(8);
     let squares = [width, height].map(|side| side.div_euclid(square) + 1);
     let mut filled = vec![false; (squares[0] * squares[1]) as usize];
@@ -171,7 +171,7 @@ pub(super) fn moved(mask: &GrayImage, reach: f32) -> GrayImage {
         let (x, y) = (x / square, y / square);
         (y - 1..=y + 1).any(|y| {
             (x - 1..=x + 1).any(|x| {
-                // A mask is empty outside the picture. Erosion grows this outside.
+                // A mask is empty outside the picture. Erosion makes the empty part grow.
                 let inside = (0..squares[0]).contains(&x) && (0..squares[1]).contains(&y);
                 if inside { filled[(y * squares[0] + x) as usize] } else { !dilate }
             })

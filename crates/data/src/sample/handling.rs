@@ -1,4 +1,4 @@
-//! Properties of a user's photographs that a data set's views do not have.
+//! Changes that give a data set's views the faults of a user's photographs.
 
 use image::{GrayImage, RgbImage};
 use serde::{Deserialize, Serialize};
@@ -17,10 +17,10 @@ pub enum Road {
     /// The photographs are the canvases already. Cameras and masks are the data set's.
     #[default]
     Canvas,
-    /// The photographs are placed on their canvases as a user's are. Cameras and masks are the data set's.
+    /// The photographs are placed on their canvases like a user's photographs. Cameras and masks are the data set's.
     Placed,
-    /// The photographs are a user's: neither cameras nor masks are known. The person is brought into the data set's world by the
-    /// similarity that moves its Gaussians nearest to where the true cameras see them.
+    /// The photographs are treated as a user's photographs: cameras and masks are unknown. The similarity that moves
+    /// the Gaussians nearest to where the true cameras see them brings the person into the data set's world.
     User,
 }
 
@@ -30,11 +30,11 @@ pub enum Road {
 pub struct Handling {
     /// How photographs become a person.
     pub road: Road,
-    /// Difference of exposure, in stops, between the first photograph and the others. Each is changed by half of it.
+    /// Difference of exposure, in stops, between the first photograph and the others; each photograph gets half of it.
     pub exposure: f32,
-    /// Exposure of the back, in stops beside the front's, which stays as it is.
+    /// Stops by which the exposure of the back changes. The front does not change.
     pub back_exposure: f32,
-    /// Colour of the background from 0 to 1; unset: the data set's. It shows through masks that are too large.
+    /// Colour of the background from 0 to 1; unset: the data set's. The background shows through too large masks.
     pub background: Option<[f32; 3]>,
     /// Error of the masks in pixels of 1024: above 0 they are too large, below 0 too small.
     pub mask: f32,
@@ -46,7 +46,7 @@ pub struct Handling {
 }
 
 impl Handling {
-    /// The first key that makes no sense, and why.
+    /// The first invalid key, and why it is invalid.
     pub fn problem(&self) -> Option<(&'static str, String)> {
         let background = self.background.unwrap_or_default().map(|value| ("background", value, 0.0..=1.0));
         outside([
@@ -97,7 +97,7 @@ impl Handling {
     }
 }
 
-/// Gives all pixels the mean colour of those in the mask.
+/// Gives all pixels the mean colour of the pixels in the mask.
 fn flatten(color: &mut RgbImage, mask: &GrayImage) {
     let (mut sum, mut weight) = ([0.0_f64; 3], 0.0);
     for (pixel, share) in color.pixels().zip(mask.pixels()) {

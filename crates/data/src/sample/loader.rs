@@ -24,7 +24,7 @@ pub struct Loader<I> {
     part: [usize; 2],
 }
 
-/// One of `parts` even shares of `count` things.
+/// The rows of part `part`, if `parts` parts share `count` rows evenly.
 pub fn share([part, parts]: [usize; 2], count: usize) -> Range<usize> {
     part * count / parts..(part + 1) * count / parts
 }
@@ -40,17 +40,17 @@ impl<I: 'static> Loader<I> {
         Self { dataset: Arc::new(dataset), batch, workers, prefetch, shuffle: None, part: [0, 1] }
     }
 
-    /// The loader of one part of every batch, among so many parts.
+    /// Loads only part number `part`, of `parts`, of every batch.
     ///
     /// # Panics
-    /// If there is no such part.
+    /// If `part` is not below `parts`.
     pub fn part(mut self, part: usize, parts: usize) -> Self {
         assert!(part < parts, "part {part} of {parts}");
         self.part = [part, parts];
         self
     }
 
-    /// The loader with a random order, a new one in every pass.
+    /// Loads items in a random order, which differs in every pass.
     pub fn shuffled(mut self, seed: u64) -> Self {
         self.shuffle = Some(seed);
         self
@@ -61,7 +61,7 @@ type Loaded<I> = Result<Vec<I>, DatasetError>;
 
 /// Batches of one pass, in their order.
 pub struct Batches<I> {
-    /// The workers' batches. Workers load batches in turn.
+    /// The channel of each worker. Workers load batches in turn.
     loaded: Vec<Receiver<Loaded<I>>>,
     workers: Vec<JoinHandle<()>>,
     count: usize,
@@ -117,10 +117,10 @@ impl<I> Iterator for Batches<I> {
 
 impl<I> Drop for Batches<I> {
     fn drop(&mut self) {
-        // Workers end when their batches have no receiver.
+        // A worker ends when its channel has no receiver.
         self.loaded.clear();
         for worker in self.workers.drain(..) {
-            // Panics of its items were caught.
+            // Panics while an item was loaded were caught.
             let _ = worker.join();
         }
     }

@@ -35,7 +35,7 @@ pub use test_set::{Test, TestItem};
 
 /// Degrees between front and back.
 const OPPOSITE: f64 = 180.0;
-/// Least coverage of a pixel of the person, in 8 bits.
+/// Least mask value, of 255, at which a pixel counts as the person.
 const INSIDE: u8 = 128;
 
 /// The section `[samples]` of a training config.
@@ -56,18 +56,18 @@ pub struct SampleConfig {
     /// Stage 2: whether samples contain the points of all views for stage 1's loss: `stage2.points_weight`.
     #[serde(skip)]
     pub points: bool,
-    /// Stage 1: whether samples with sides contain the second surface that faces each side camera, such as the flank behind an
-    /// arm. The data set must contain it: `views.second_depth`.
+    /// Stage 1: whether samples with sides contain the second surface that faces each side camera, such as the flank
+    /// behind an arm. The data set must contain it: `views.second_depth`.
     pub second_depth: bool,
-    /// Share of the samples whose photographs are placed on their canvas like a user's photographs. Their points are
-    /// scaled and moved into the nominal cameras' views. Above 0, all photographs of rigs whose distance or focal length varies
-    /// are placed.
+    /// Share of the samples whose photographs are placed on their canvas like a user's photographs. The points of these
+    /// samples are scaled and moved into the nominal cameras' views. If the distance or focal length of rigs varies,
+    /// any share above 0 places all photographs.
     pub placed_share: f32,
-    /// Whether people are upright whatever the elevation of their photographs' cameras, which no picture shows. Points are rectified:
-    /// those of nominal cameras that would see the same pixels of an upright person. In stage 2, people are restored before they
+    /// Whether points are rectified to the points of an upright person (docs/method.md, "Upright targets"): no
+    /// photograph shows its camera's elevation. In stage 2, people are restored to the photographs' cameras before they
     /// are rendered.
     pub upright: bool,
-    /// Whether samples contain the points of right and left. Networks without heads for the sides need none.
+    /// Whether samples contain the points of right and left. Only networks with side heads need these points.
     #[serde(skip)]
     pub sides: bool,
     /// Height of a placed person in pixels of a canvas of 1024: `mode.person_height`.
@@ -110,7 +110,7 @@ impl SampleConfig {
         Self { compat: true, high_resolution: true, augment: Augment::none(), ..Self::default() }
     }
 
-    /// The first key that makes no sense, and why.
+    /// The first invalid key, and why it is invalid.
     pub fn problem(&self) -> Option<(String, String)> {
         let ranges = [
             ("repeat", self.repeat as f32, 1.0..=1e6),
@@ -135,7 +135,7 @@ impl SampleConfig {
         if let Some((key, message, _)) = beside_compat.into_iter().find(|(.., wrong)| self.compat && *wrong) {
             return Some((key.into(), format!("{message} with `compat = true`")));
         }
-        // Samples of neighbours are those of known cameras.
+        // Photographs of neighbouring views keep their known cameras.
         let beside_neighbours = [
             ("placed_share", "must be 0", self.placed_share > 0.0),
             ("upright", "must be false", self.upright),
@@ -247,7 +247,7 @@ impl Source {
         (subject, random)
     }
 
-    /// A view for the front photograph, or the front of a random group.
+    /// Draws the view of the front photograph. In groups, it is the front of a random group.
     fn front(&self, random: &mut impl Rng) -> usize {
         let count = self.folder.description().views;
         if self.folder.description().arrangement == Arrangement::Groups {
@@ -261,7 +261,7 @@ impl Source {
         (count + random.random_range(0..=2 * reach) - reach) % count
     }
 
-    /// Front, back, and the sides at +90° and +270°. The back is a neighbour with other `pair_degrees`.
+    /// Views of front, back, and the sides at +90° and +270°. Unless `pair_degrees` is 180, the back is a neighbour.
     fn order(&self, front: usize) -> [usize; 4] {
         let Description { arrangement, views, .. } = *self.folder.description();
         let mut order = arrangement.four(front, views);
@@ -276,7 +276,7 @@ impl Source {
         if self.config.compat { *stored } else { self.folder.exact_camera(stored) }
     }
 
-    /// A target view: `[3,h,w]` in [0, 1] over a colour, and the share of the person `[h,w]`.
+    /// A target view: `[3,h,w]` in [0, 1] over `background`, and the person's share of each pixel `[h,w]`.
     fn target(
         &self,
         subject: &str,
@@ -285,7 +285,7 @@ impl Source {
         background: [f32; 3],
     ) -> Result<(Vec<f32>, Vec<f32>), FileError> {
         let (color, mask) = self.folder.picture(self.split, subject, view, high_resolution)?;
-        // The authors' pictures are over black already. Their masks have half the side of the larger pictures.
+        // The authors' pictures already have a black background. Masks have half the side of their large pictures.
         let is_done = self.folder.description().layout == Layout::Authors && background == [0.0; 3];
         let value = |c: u8, a: u8, behind: f32| {
             let a = if is_done { 1.0 } else { f32::from(a) / 255.0 };
@@ -328,18 +328,18 @@ impl Source {
 
     /// Whether a sample's photographs are placed like a user's.
     fn is_placed(&self, random: &mut impl Rng) -> bool {
-        // A share of 0 draws no random number, so that it leaves the others as they are.
+        // A share of 0 draws no random number, so that the later random numbers do not change.
         let share = self.config.placed_share;
         if share == 0.0 {
             return false;
         }
-        // A photograph that is not placed must have the nominal distance and focal length, or its points cannot be predicted.
+        // A photograph that is not placed needs the nominal distance and focal length: else no network can predict it.
         let rig = self.folder.description().drawn.as_ref().map(|drawn| &drawn.jitter.rig);
         rig.is_some_and(|rig| rig.distance > 0.0 || rig.focal > 0.0) || random.random::<f32>() < share
     }
 }
 
-/// Steps of a ring of `views` that span `degrees`; a fraction if no view is there.
+/// Number of steps between the views of a ring that span `degrees`; fractional if no view is there.
 fn steps_of(degrees: f64, views: usize) -> f64 {
     degrees * views as f64 / 360.0
 }

@@ -1,6 +1,6 @@
-//! Training photographs placed on their canvas as a user's are, and the points that belong to them
-//! (docs/method.md, "Photographs placed as a user's"). A person then always has the same height and place.
-//! Size and distance, which no picture shows, are no part of the task.
+//! Photographs of a training sample, and their points. Photographs may be placed on their canvas like a user's
+//! photographs (docs/method.md, "Photographs placed as a user's"). The person then always has the same height and
+//! place: a network does not have to predict size and distance, which no picture shows.
 
 use glam::{DVec2, DVec3};
 use rand::Rng;
@@ -21,18 +21,18 @@ pub(super) const LOOKUPS: usize = 3;
 pub(super) struct Four {
     /// Front and back on canvases of H and W pixels; masks are 1 or 0 with `compat`.
     pub photographs: [Photograph; 2],
-    /// `[4,H,W,3]` in metres in the front's frame, and their validity `[4,H,W]`. Without sides there are two instead of four.
+    /// Points `[4,H,W,3]` in metres in the front camera's frame, and their validity `[4,H,W]`; 2 without sides.
     pub points: Vec<f32>,
     pub valid: Vec<f32>,
-    /// `[2,H,W,3]` and `[2,H,W]`: the same of the second surfaces of right and left. Empty without sides or without
-    /// `samples.second_depth`.
+    /// Points `[2,H,W,3]` and validity `[2,H,W]` of the second surfaces of right and left. Empty without sides or
+    /// without `samples.second_depth`.
     pub second: Points,
-    /// What moves upright points back to the photographed person.
+    /// Moves upright points back to the photographed person.
     pub restoration: Option<Restoration>,
 }
 
 impl Source {
-    /// Front, back, and, with sides, right and left of a subject.
+    /// Reads front, back, and, with sides, right and left of a subject; `order` has their views.
     pub(super) fn four(
         &self,
         subject: &str,
@@ -109,7 +109,7 @@ pub(super) type Points = (Vec<f32>, Vec<f32>);
 pub(super) type Seen = Vec<Option<DVec3>>;
 
 impl StoredView {
-    /// The point at a place of the view, from its pixel's depth, in the camera's frame.
+    /// The point at `place` (pixels), in metres in the camera's frame, with the depth of the pixel there.
     pub(super) fn point(&self, place: DVec2) -> Option<DVec3> {
         let side = self.camera.width as usize;
         let (column, row) = (place.x.floor(), place.y.floor());

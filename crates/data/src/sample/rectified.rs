@@ -1,7 +1,7 @@
-//! Rectified points: those of an upright person whom the nominal cameras would photograph alike (docs/method.md, "Upright targets"). A
-//! photograph does not show its camera's elevation and distance. A pixel, with knowledge about people, shows how far in front of the
-//! body's axis its surface lies. Each point therefore keeps its distance ahead of the axis, and moves to the nominal camera's ray of
-//! its pixel.
+//! Rectified points: the points of an upright person that the nominal cameras would see in the same pixels
+//! (docs/method.md, "Upright targets"). A photograph does not show its camera's elevation and distance. It does show,
+//! to a network that knows people, how far the surface lies in front of the body's axis. Each point therefore keeps its
+//! distance in front of the axis, and moves onto the nominal camera's ray through its pixel.
 
 use glam::{DVec2, DVec3};
 use snapsnap_photo::{AXIS, Mapping, PlaneMap, Restoration, nominal, turn_to_front, turned};
@@ -10,9 +10,9 @@ use snapsnap_splat::{Camera, RigidTransform};
 use super::place::{LOOKUPS, Seen, centres};
 use crate::dataset::StoredView;
 
-/// Moves points between the world and the nominal cameras'. Both have the origin of the subject, y up, and the front camera above +z.
+/// Moves points between the turned world and the nominal cameras' world. Both have the subject at the origin and y up.
 pub(super) struct Rectification {
-    /// Of front and back: from the photograph's pixels to the nominal camera's.
+    /// From the pixels of front and back to the pixels of their nominal cameras.
     mappings: [Mapping; 2],
     /// Both photographs' cameras in the turned world.
     cameras: [Camera; 2],
@@ -23,7 +23,7 @@ pub(super) struct Rectification {
 }
 
 impl Rectification {
-    /// Of the photographs of front and back, and the way back.
+    /// The rectification of the photographs of front and back, and the restoration that undoes it.
     pub(super) fn new(cameras: [&Camera; 2], mappings: [&Mapping; 2]) -> (Self, Restoration) {
         let restoration = Restoration::to_cameras(cameras, mappings, cameras[0].width);
         let turn = turn_to_front(cameras[0]);
@@ -56,8 +56,8 @@ impl Rectification {
         centres(self.cameras[photograph].width).map(seen).collect()
     }
 
-    /// Rectified points of the nominal camera that stands `degrees` around the body's axis from the front's, in the nominal front
-    /// camera's frame. `view` is the data set's view of that side.
+    /// Rectified points of a side, in the nominal front camera's frame. The side's nominal camera stands `degrees`
+    /// around the body's axis from the front camera; `view` is the data set's view of the side.
     pub(super) fn of_side(&self, view: &StoredView, degrees: f64) -> Seen {
         let nominal = Camera::orbit_at_yaw_degrees(degrees, view.camera.width);
         let (to_side, from_side) = (nominal.world_to_camera, nominal.world_to_camera.inverse());

@@ -24,9 +24,10 @@ pub struct Stage1Item {
     pub side: usize,
     /// `[2,3,H,W]` front and back in [−1, 1] times the mask.
     pub images: Vec<f32>,
-    /// `[2,H,W]` share of the person in the input masks; with `compat` 1 or 0.
+    /// `[2,H,W]` input masks: the person's share of each pixel; 1 or 0 with `compat`.
     pub masks: Vec<f32>,
-    /// `[4,H,W,3]` points of front, back, right and left, in metres in the front camera's frame; `[2,H,W,3]` without sides.
+    /// `[4,H,W,3]` points of front, back, right and left in the front camera's frame, metres; `[2,H,W,3]` without
+    /// sides.
     pub points: Vec<f32>,
     /// `[4,H,W]` or `[2,H,W]`: 1 for pixels that have a point, 0 for others.
     pub valid: Vec<f32>,
@@ -64,8 +65,8 @@ impl Stage1 {
 }
 
 impl Stage1Item {
-    /// True points `[H,W,3]` of a view and which pixels have one `[H,W]`. Views are in the order of the heads; 4 and 5 are the
-    /// second surfaces of right and left. `None` for views that the sample does not contain.
+    /// True points `[H,W,3]` of a view, and their validity `[H,W]`. Views 0 to 3 are front, back, right and left; 4 and
+    /// 5 are the second surfaces of right and left. `None` for a view that the sample does not contain.
     pub fn truth(&self, view: usize) -> Option<(&[f32], &[f32])> {
         let area = self.side * self.side;
         let (points, valid, row) = match view {
@@ -94,7 +95,7 @@ impl Stage1Item {
         Ok(item)
     }
 
-    /// Mirrors the sample: left becomes right, also for the sides.
+    /// Mirrors the sample in x, and swaps the two sides.
     fn flip(&mut self) {
         let (side, area) = (self.side, self.side * self.side);
         for image in [&mut self.images, &mut self.masks, &mut self.valid, &mut self.second_valid] {
@@ -106,7 +107,7 @@ impl Stage1Item {
             points.reverse();
             points.iter_mut().for_each(|point| point[0] = -point[0]);
         }
-        // Right and left are the third and the fourth.
+        // Views 2 and 3 are right and left.
         let maps = [&mut self.points[6 * area..], &mut self.valid[2 * area..]];
         for map in maps.into_iter().chain([&mut self.second_points[..], &mut self.second_valid[..]]) {
             let (right, left) = map.split_at_mut(map.len() / 2);
@@ -139,7 +140,7 @@ impl Batcher<Stage1Item, Stage1Batch> for Stage1Batcher {
     }
 }
 
-/// Two fields of all items as one tensor.
+/// A tensor with the two fields of each item, one after the other.
 fn stacked<const D: usize>(
     items: &[Stage1Item],
     of: impl Fn(&Stage1Item) -> [&[f32]; 2],

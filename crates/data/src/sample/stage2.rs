@@ -1,4 +1,4 @@
-//! Stage 2: front and back photographs, and target views of the rendered Gaussians.
+//! Stage 2: front and back photographs, and target views for the renders.
 
 use std::sync::Arc;
 
@@ -27,10 +27,10 @@ pub struct Stage2Item {
     pub photographs: [Photograph; 2],
     /// Cameras of front, back, right and left, side H. The front camera of an upright sample is moved with its points.
     pub cameras: [Camera; 4],
-    /// Moves upright people to where the photographs' cameras saw them.
+    /// Moves an upright person to where the photographs' cameras saw it.
     pub restoration: Option<Restoration>,
-    /// `[4,H,W,3]` points of these views, in metres in the front camera's frame, `[2,H,W,3]` without sides; rectified if people are upright;
-    /// empty without `points` of the config.
+    /// `[4,H,W,3]` points of the views of `cameras`, in metres in the front camera's frame; `[2,H,W,3]` without sides.
+    /// Rectified if people are upright; empty without `points` of the config.
     pub points: Vec<f32>,
     /// `[4,H,W]` or `[2,H,W]`: 1 for pixels that have a point, 0 for others; empty like `points`.
     pub valid: Vec<f32>,
@@ -38,7 +38,7 @@ pub struct Stage2Item {
     pub target_side: usize,
     /// `[V,3,h,w]` targets in [0, 1] over `background`: random views, then right and left.
     pub targets: Vec<f32>,
-    /// `[V,h,w]` share of the person in the targets' pixels.
+    /// `[V,h,w]` share of the person in each pixel of the targets.
     pub target_masks: Vec<f32>,
     /// Cameras of the targets.
     pub target_cameras: Vec<Camera>,

@@ -10,14 +10,14 @@ use crate::dataset::{Folder, Split, unproject};
 use snapsnap_base::FileError;
 
 /// Subjects of a test set. The caller chooses the input views. The published test takes the first and the opposite one,
-/// 0 and 15 of 30 (docs/method.md, "Samples"). Nothing about a subject is random.
+/// 0 and 15 of 30 (docs/method.md, "Samples"). No sample is random.
 #[derive(Debug, Clone)]
 pub struct Test(Source);
 
 /// One subject; H and W are the side of the data set's views.
 #[derive(Debug, Clone)]
 pub struct TestItem {
-    /// Its name.
+    /// Name of the subject.
     pub subject: String,
     /// H and W.
     pub side: usize,
@@ -75,8 +75,8 @@ impl Test {
         })
     }
 
-    /// Ground truth of a view: `[3,H,W]` in [0, 1] over `background`, and the share of the person `[H,W]`. Thirty views
-    /// of one subject would take 400 MB.
+    /// Ground truth of a view: `[3,H,W]` in [0, 1] over `background`, and the share of the person `[H,W]`. Views are
+    /// read one by one: thirty views of a subject would take 400 MB.
     ///
     /// # Errors
     /// As [`Self::sample`].

@@ -132,7 +132,7 @@ fn broken_archives_and_indices_are_refused_by_name() {
             refused()
         );
     }
-    // A cut index: at the end of an archive's lines, in the middle of them, of all of them; and none.
+    // An index that is cut after or within the lines of an archive, or after the heading; and no index.
     let count = |name: &str| lines.lines().filter(|line| line.starts_with(name)).count();
     let all = lines.lines().count();
     for kept in [all - count("val"), all - 1, 1] {
@@ -142,7 +142,7 @@ fn broken_archives_and_indices_are_refused_by_name() {
     }
     fs::remove_file(&index).expect("removes");
     assert!(refused().contains("archives.csv: cannot read"), "{}", refused());
-    // A file that the index has not.
+    // A file that the index does not list.
     let without: Vec<&str> = lines.lines().filter(|line| !line.contains("0001.depth.3.npz")).collect();
     fs::write(&index, without.join("\n")).expect("writes");
     let missing = check(root, |_, _| {}).expect("checks").problems;
@@ -176,7 +176,7 @@ fn a_subject_without_a_file_or_with_a_full_stop_is_not_packed() {
     assert_eq!(left, [folder.root()], "nothing is left of it");
 }
 
-/// What a killed run has left is removed, and what another run still writes is not.
+/// Files of a killed run are removed. Files of a run in progress stay.
 #[test]
 fn what_killed_runs_have_left_is_removed() {
     let (temporary, folder) = small(Layout::Exact);

@@ -68,8 +68,8 @@ fn side_cameras_of_groups_follow_from_the_front_camera() {
     assert!(Stage1::new(folder, TRAIN, SampleConfig::compat()).is_err());
 }
 
-/// Photographs of placed samples have the place and size of a user's. The front's points project to their pixels, the
-/// sides' points to their pixels in the nominal cameras.
+/// People in placed samples have the place and size of people in a user's photographs. The front's points project to
+/// their pixels, the sides' points to their pixels in the nominal cameras.
 #[test]
 fn placed_samples_fit_the_nominal_cameras() {
     let mut config = DataConfig::default();
@@ -99,7 +99,7 @@ fn placed_samples_fit_the_nominal_cameras() {
     assert!((&always.points, &always.images) == (&placed.points, &placed.images));
     assert!(first(SampleConfig { placed_share: 0.0, ..samples }).images != placed.images);
     let side = 128;
-    // Both photographs together have the height of a user's.
+    // Over both photographs, the person is `person_height` high.
     let masks = item.photographs.each_ref().map(|photo| &*photo.mask).concat();
     let seen: Vec<usize> = (0..2 * side * side).filter(|i| masks[*i] > 0.5).collect();
     let rows = || seen.iter().map(|i| i / side % side);
@@ -183,8 +183,8 @@ fn restored_points_lie_on_the_photographed_person() {
     }
 }
 
-/// Rectified points lie on the nominal cameras' rays of their pixels. Those of the photographs are as far ahead of the body's axis as the
-/// stored surface, and nominal cameras' points are left as they are.
+/// Rectified points lie on the nominal cameras' rays through their pixels. Points of the photographs keep their
+/// distance in front of the body's axis. Points that nominal cameras see do not move.
 #[test]
 fn rectified_points_keep_their_distance_from_the_axis() {
     for (is_nominal, placed_share) in [(true, 0.0), (false, 0.0), (false, 1.0)] {

@@ -88,7 +88,7 @@ fn stage_one_points_lie_on_the_subject_in_the_front_cameras_frame() {
                     points.zip(valid).filter(|(_, v)| **v > 0.0).map(|(p, _)| p).collect()
                 })
                 .collect();
-            // Which view is the front: the one out of whose frame its points land on the block.
+            // The front is the view whose camera transforms the points of the first map onto the block.
             let off = |yaw: f64, points: &[Vec3]| {
                 let world = Camera::orbit_at_yaw_degrees(yaw, 128).world_to_camera.inverse();
                 let world = points.iter().map(|p| world.apply(p.as_dvec3()).as_vec3());
@@ -129,7 +129,7 @@ fn our_samples_follow_their_seed_and_are_augmented() {
     let plain = stage1(&folder, SampleConfig { augment: Augment::none(), ..SampleConfig::default() });
     assert_ne!(images(&stage, 4), images(&plain, 4));
     assert_eq!(stage.sample(4).expect("reads").points, plain.sample(4).expect("reads").points);
-    // Every view is a front.
+    // Every view is the front of some sample.
     let firsts: std::collections::HashSet<Vec<u32>> =
         (0..90).map(|i| images(&plain, i)[..3 * 64 * 64].iter().map(|v| v.to_bits()).collect()).collect();
     assert_eq!(firsts.len(), 8);
@@ -231,8 +231,8 @@ fn stage_one_is_loaded_in_batches() {
     assert_eq!(shapes, [[4, 4, 64, 64, 3], [2, 4, 64, 64, 3]]);
 }
 
-/// The second photograph is the neighbour's, and its points are that view's, in the frame of the first.
-/// Faces that a camera sees from the side have larger errors.
+/// The second photograph and its points come from the neighbouring view. Its points are in the frame of the first view.
+/// Faces that a camera sees at a small angle have larger errors.
 #[test]
 fn samples_of_neighbours_have_the_photograph_around_the_person() {
     let (_temporary, folder) = data_set(&block(), Layout::Exact, 64, 20, false, 1);

@@ -9,8 +9,7 @@ use snapsnap_mesh::mesh::{Face, Mesh};
 use std::sync::Arc;
 use tempfile::TempDir;
 
-/// A block with a slab beside its right side, as an arm hangs beside a flank: the slab's half size is a part of the
-/// block's.
+/// A block with a slab beside its right side, as an arm hangs beside a flank. The slab is smaller than the block.
 fn armed() -> Mesh {
     let (mut mesh, arm) = (block(), block());
     let first = mesh.positions.len() as u32;
@@ -29,7 +28,7 @@ fn data_of_armed(resolution: u32) -> (TempDir, Arc<Folder>) {
     made(&config, &armed(), 1)
 }
 
-/// The points of a map that has one.
+/// The valid points of the map number `map`.
 fn there(points: &[f32], valid: &[f32], map: usize, side: usize) -> Vec<Vec3> {
     let (points, valid) = (&points[3 * map * side * side..], &valid[map * side * side..][..side * side]);
     points_of(points).zip(valid).filter(|(_, valid)| **valid > 0.5).map(|(point, _)| point).collect()
@@ -78,7 +77,7 @@ fn samples_carry_the_flank_behind_an_arm() {
         }
     }
 
-    // Placed samples have them on the rays of the nominal cameras.
+    // The second surfaces of placed samples lie on the rays of the nominal cameras.
     let placed =
         sample(SampleConfig { placed_share: 1.0, upright: true, person_height: 700, ..samples.clone() }, 0);
     assert_ne!(placed.second_points, plain.second_points);
@@ -91,7 +90,7 @@ fn samples_carry_the_flank_behind_an_arm() {
     }
 }
 
-/// Networks without heads for the sides get the same photographs and the same points of them, and nothing else is read.
+/// Samples without sides have the same photographs and the same points of front and back as samples with sides.
 #[test]
 fn samples_without_sides_are_those_with_sides_without_them() {
     let side = 64;
