@@ -1,4 +1,4 @@
-//! Many inputs of one command: what is there already is skipped, what fails is listed in a file, and the rest goes on.
+//! Commands with many inputs: existing outputs are skipped, failures are listed in a file, and other inputs go on.
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
@@ -26,7 +26,7 @@ const KINDS: [(&str, &str, Kind); 4] = [
     ("sog", "PlayCanvas", Kind::Sog),
 ];
 
-/// Why options of a folder are refused for a file.
+/// Message for options of folders in a command for one file.
 pub const ONE: &str = "is for a folder of many files";
 
 /// The share of many inputs that one process makes.
@@ -68,20 +68,20 @@ impl KindArgument {
 pub struct Batch {
     folder: PathBuf,
     shard: Option<Shard>,
-    /// The list of what failed, from the first failure on.
+    /// The list of failures, from the first failure on.
     list: Option<csv::Writer<File>>,
     failed: usize,
-    /// Failures of the program in a row.
+    /// Number of consecutive internal errors.
     bugs: usize,
 }
 
 /// First line of a list of failures.
 const HEADER: &str = "name,error";
-/// Number of failures in a row, such as those of a lost card, after which a command ends.
+/// Number of consecutive internal errors, for example of a lost GPU, after which a command ends.
 const MOST_BUGS: usize = 5;
 
 impl Batch {
-    /// Makes the folder, and removes the list of an earlier run of the same part. Refuses to remove another file.
+    /// Makes the folder, and removes the list of an earlier run of the same shard. Refuses to remove another file.
     pub fn new(folder: &Path, shard: &ShardArgument) -> Result<Self, Failure> {
         make_folder(folder)?;
         let batch = Self { folder: folder.to_owned(), shard: shard.shard, list: None, failed: 0, bugs: 0 };
@@ -100,13 +100,13 @@ impl Batch {
         Ok(batch)
     }
 
-    /// The list of what failed.
+    /// Path of the list of failures.
     fn path(&self) -> PathBuf {
         let name = self.shard.map_or("errors.csv".into(), |shard| format!("errors-{}.csv", shard.name()));
         self.folder.join(name)
     }
 
-    /// The jobs of this part whose file `output` is not there yet.
+    /// The jobs of this shard whose file `output` does not exist yet.
     pub fn missing<T>(&self, jobs: Vec<T>, output: impl Fn(&T) -> PathBuf) -> Vec<T> {
         let all = jobs.into_iter().enumerate();
         let mine = all.filter(|(place, _)| self.shard.is_none_or(|shard| shard.has(*place)));
@@ -122,7 +122,7 @@ impl Batch {
         missing
     }
 
-    /// Lists a failure. An output that cannot be written ends the command, since the next ones could not be written either.
+    /// Lists a failure. An output that cannot be written ends the command, since later outputs would fail as well.
     pub fn failed(&mut self, name: &str, failure: Failure) -> Result<(), Failure> {
         // The program is ending, which causes errors.
         if file::is_ending() {
@@ -172,8 +172,8 @@ pub fn unpanicked<T>(work: impl FnOnce() -> Result<T, Failure>) -> Result<T, Fai
     catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(bug)
 }
 
-/// Runs `work` on every file of Gaussians in a folder, with its name without extension. Its result is `output(name)`, whose existence shows
-/// that it is done.
+/// Runs `work` on every file of Gaussians in a folder, with the file's name without extension. Files whose
+/// `output(name)` exists are skipped.
 pub fn each(
     folder: &Path,
     target: &Path,

@@ -8,13 +8,13 @@ use image::{GrayImage, ImageFormat, Rgb, RgbImage, Rgba, RgbaImage};
 use crate::failure::Failure;
 use crate::output::{check_folder, make_folder, write};
 
-/// Paths of front and back in the folder. Refuses one that is no folder and cannot become one.
+/// Paths of front and back in the folder. Refuses a path that is no folder and cannot become one.
 pub fn paths(folder: &Path) -> Result<[PathBuf; 2], Failure> {
     check_folder(folder)?;
     Ok(["front.png", "back.png"].map(|name| folder.join(name)))
 }
 
-/// Writes a photograph with its mask as the alpha channel, in a folder that is made if it is missing. Colours without coverage are black.
+/// Writes a photograph with its mask as alpha channel, and makes the folder. Colours without coverage are black.
 pub fn save(path: &Path, rgb: &RgbImage, mask: &GrayImage) -> Result<(), Failure> {
     make_folder(path.parent().expect("a name in the folder"))?;
     let pixels = RgbaImage::from_fn(rgb.width(), rgb.height(), |x, y| {

@@ -48,8 +48,8 @@ pub fn choose(name: &str) -> Result<Device, Failure> {
     }
 }
 
-/// The device called `name` for one person and small networks: `auto` is the CPU. Each process compiles the kernels of a card
-/// anew, which takes longer than the CPU's whole work (docs/inference.md).
+/// The device called `name` for one person and small networks: `auto` is the CPU. Each process compiles the kernels of
+/// a card anew, which takes longer than the CPU's whole work (docs/inference.md).
 ///
 /// # Errors
 /// As [`choose`].
@@ -57,7 +57,7 @@ pub fn choose_for_one(name: &str) -> Result<Device, Failure> {
     choose(if name == "auto" { "cpu" } else { name })
 }
 
-/// The device called `name` for the process number `turn` of several on this machine: without an index, they take the cards in turn.
+/// The device called `name` for process `turn` of several on this machine. Without an index they take the GPUs in turn.
 ///
 /// # Errors
 /// As [`choose`].
@@ -134,7 +134,7 @@ struct Adapter {
     /// Its place among the adapters of the kind.
     index: usize,
     name: String,
-    /// Whether it is no software.
+    /// Whether it is hardware.
     is_card: bool,
 }
 
@@ -145,7 +145,7 @@ impl Adapter {
     }
 }
 
-/// What graphics drivers answer.
+/// The answers of the graphics drivers.
 #[derive(Debug, Default, Serialize, Deserialize)]
 struct Drivers {
     /// All adapters of the compiled kinds.

@@ -32,7 +32,7 @@ macro_rules! bail {
 pub(crate) use bail;
 
 impl Failure {
-    /// An error of the user's that concerns this file or folder.
+    /// A user's error about this file or folder.
     pub fn file(path: &Path, message: impl fmt::Display) -> Self {
         Self::Input(format!("{}: {message}", path.display()))
     }

@@ -1,4 +1,4 @@
-//! Ctrl-C and termination signals. Most commands remove their temporary files and end. A training saves its state first.
+//! Ctrl-C and termination signals. Most commands remove their temporary files and end. Training saves its state first.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, LazyLock};
@@ -13,7 +13,7 @@ static PATIENT: AtomicBool = AtomicBool::new(false);
 static SIGNALLED: AtomicBool = AtomicBool::new(false);
 /// Whether the command must end itself.
 static STOP: LazyLock<Arc<AtomicBool>> = LazyLock::new(Arc::default);
-/// Whether that is because of SIGTERM or SIGUSR1.
+/// Whether the signal was SIGTERM or SIGUSR1.
 static TERMINATED: LazyLock<Arc<AtomicBool>> = LazyLock::new(Arc::default);
 /// Whether Ctrl-C is the normal end of the command.
 static WELL: AtomicBool = AtomicBool::new(false);
@@ -35,8 +35,8 @@ pub fn listen() {
     }
 }
 
-/// From now on the first signal sets the returned flag instead of ending the program. SIGUSR1 is such a signal as well: batch systems
-/// can send it before a job's time is over.
+/// From now on the first signal sets the returned flag instead of ending the program. SIGUSR1 counts as a signal:
+/// batch systems can send it before a job's time is over.
 pub fn patiently() -> &'static AtomicBool {
     PATIENT.store(true, Ordering::Relaxed);
     #[cfg(unix)]

@@ -1,8 +1,8 @@
 //! snapsnap turns two photographs of a person into 3D Gaussians. This crate is its command line.
 //!
-//! The other crates are libraries. [`snapsnap_net::Reconstructor`] turns photographs into Gaussians. [`snapsnap_splat::render`]
-//! is the differentiable renderer. [`snapsnap_train::points`] has the losses of stage 1. The folder `examples` of the
-//! repository has a program for each: `cargo run --release --example reconstruct`, `fit_gaussians` or `train_predictor`.
+//! The other crates are libraries: [`snapsnap_net::Reconstructor`] turns photographs into Gaussians,
+//! [`snapsnap_splat::render`] is the differentiable renderer, and [`snapsnap_train::points`] has the losses of stage
+//! 1. Examples of each: `cargo run --release --example reconstruct`, `fit_gaussians` or `train_predictor`.
 // The page is part of the documentation only. A change of it does not rebuild the program.
 #![cfg_attr(doc, doc = "\n", doc = include_str!("../../../docs/architecture.md"))]
 
@@ -33,8 +33,8 @@ use std::process::ExitCode;
 use clap::{CommandFactory, Parser, Subcommand};
 use failure::bail;
 
-/// Every operation allocates and frees large tensors. mimalloc keeps their pages, while the system allocator returns them to the
-/// kernel and causes page faults.
+/// Every operation allocates and frees large tensors. mimalloc keeps their pages, while the system allocator returns
+/// them to the kernel and causes page faults.
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
@@ -43,15 +43,15 @@ static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 fn keep_pages() {
     /// `mi_option_purge_delay` of mimalloc 2 and 3.
     const PURGE_DELAY: libmimalloc_sys::mi_option_t = 15;
-    // SAFETY: it changes a number.
+    // SAFETY: the function only sets a number.
     #[allow(unsafe_code, reason = "a function of C")]
     unsafe {
         libmimalloc_sys::mi_option_set(PURGE_DELAY, 10_000);
     }
 }
 
-/// Keeps compiled kernels of Vulkan in the user's cache, from one process to the next. Each version has its own: CubeCL
-/// knows kernels by name.
+/// Keeps compiled kernels of Vulkan in the user's cache, from one process to the next. Each version of the program has
+/// its own cache, since CubeCL identifies kernels by name.
 #[cfg(feature = "vulkan")]
 fn keep_kernels() {
     use cubecl::config::{CubeClRuntimeConfig, RuntimeConfig};

@@ -21,7 +21,7 @@ pub fn remove(path: &Path) -> Result<(), Failure> {
     }
 }
 
-/// Refuses a path that is no folder, or none that can be made.
+/// Refuses a path that is no folder and cannot become one, or in which no file can be written.
 pub fn check_folder(path: &Path) -> Result<(), Failure> {
     if path.exists() && !path.is_dir() {
         return Err(Failure::file(path, "exists and is no folder"));

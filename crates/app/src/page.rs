@@ -50,7 +50,7 @@ pub enum Kind {
     Studio,
 }
 
-/// Serves the page until the program ends. `shows` is its content in words; `rest` answers what is no file of the page.
+/// Serves the page until the program ends. `shows` is its content in words; `rest` answers requests for other paths.
 pub fn show(
     kind: Kind,
     arguments: &PageArguments,
@@ -124,7 +124,7 @@ pub fn text(status: StatusCode, message: &str) -> Answer {
     Answer { status, ..answer("text/plain; charset=utf-8", content) }
 }
 
-/// The answer to a page that asks again later.
+/// The answer that asks the page to try again later.
 pub fn busy() -> Answer {
     text(StatusCode::SERVICE_UNAVAILABLE, "the server is busy with earlier requests; try again in a minute")
 }

@@ -13,14 +13,14 @@ pub const FOLDER: &str = "weights";
 
 #[derive(Args)]
 pub struct Arguments {
-    /// Folder with the published weights of AlexNet and LPIPS (`snapsnap fetch-weights alexnet lpips`), or your own weight files
-    /// [default: weights].
+    /// Folder with the published weights of AlexNet and LPIPS (`snapsnap fetch-weights alexnet lpips`), or your own
+    /// weight files [default: weights].
     #[arg(long = "lpips", value_name = "DIR|FILE", num_args = 1..)]
     pub files: Vec<PathBuf>,
 }
 
 impl Arguments {
-    /// The network on the device of this name, or the reason for its absence. The device is chosen only if weights exist.
+    /// The network, or the reason for its absence. The device called `device` is chosen only if weights exist.
     ///
     /// # Errors
     /// If weights of the command line are missing, or weights are damaged.
@@ -47,7 +47,7 @@ pub fn describe(lpips: &Result<Lpips, String>) -> String {
     }
 }
 
-/// Remark behind a distance with other weights.
+/// Remark after a distance that other weights than the published ones gave.
 pub fn mark(lpips: &Result<Lpips, String>) -> &'static str {
     match lpips {
         Ok(network) if !network.is_published() => " (not with the published weights)",

@@ -30,7 +30,7 @@ const FILES: &[&str] = &[
 ];
 /// The file that marks a folder as a report. It is written last.
 pub const REPORT: &str = "report.json";
-/// Largest size of such a file in bytes.
+/// Largest size of [`REPORT`] in bytes.
 const MOST: u64 = 256 << 20;
 
 /// Files of one report.
@@ -43,8 +43,8 @@ pub struct ReportFolder {
 }
 
 impl ReportFolder {
-    /// Makes the folder. Refuses folders in which the report's files cannot be written, or would replace one of the `inputs` or a
-    /// file that is not part of an older report.
+    /// Makes the folder. Refuses folders in which the report's files cannot be written, or would replace one of the
+    /// `inputs` or a file that is not part of an older report.
     pub fn new(path: &Path, inputs: &[&Path]) -> Result<Self, Failure> {
         Self::of(path, FILES, inputs)
     }

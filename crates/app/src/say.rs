@@ -1,5 +1,5 @@
-//! Messages on stdout and stderr. Control characters in names and contents of files are escaped, since a terminal would interpret
-//! them. Only [`lines`], [`json`] and [`result`] can fail.
+//! Messages on stdout and stderr. Control characters in names and contents of files are escaped, since a terminal
+//! would interpret them. Only [`lines`], [`json`] and [`result`] can fail.
 
 use std::io::{ErrorKind, Write};
 use std::path::Path;
@@ -35,7 +35,7 @@ pub fn note(line: &str) {
     }
 }
 
-/// [`out`], or [`err`] if the output file is a pipe or a device, whose data messages must not enter.
+/// [`out`], or [`err`] if the output file is a pipe or a device, so that messages do not mix with its data.
 pub fn beside(output: &Path) -> fn(&str) {
     if file::is_special(output) { err } else { out }
 }

@@ -1,5 +1,5 @@
-//! A small web server for local clients, with one request per connection. The time of a connection and the memory of all uploads are
-//! bounded. All connections share one copy of a file.
+//! A small web server for local clients, with one request per connection. The time of a connection and the memory of
+//! all uploads are bounded. All connections share one copy of a file.
 
 use std::io::{self, Read, Write};
 use std::net::{Shutdown, TcpListener, TcpStream};
@@ -21,8 +21,8 @@ const HEADERS: usize = 64;
 const PATIENCE: Duration = Duration::from_secs(10);
 /// Time limit of an answer or an upload.
 const LONGEST_ANSWER: Duration = Duration::from_secs(600);
-/// Time that every answer and upload may take, and bytes per second that it must reach beyond that time. A client behind an SSH tunnel
-/// is faster.
+/// Time that every answer and upload may take, and bytes per second that are required beyond this time. A client
+/// behind an SSH tunnel is faster.
 const ALLOWANCE: Duration = Duration::from_secs(10);
 const SLOWEST: u64 = 512 << 10;
 /// Bytes of one write or read.
@@ -77,8 +77,8 @@ pub struct Body<'a> {
 const SLOW: Refusal = (StatusCode::REQUEST_TIMEOUT, "the upload is too slow");
 
 impl Body<'_> {
-    /// Reads the body. Refuses one of more than `most` bytes, a slow client, and a body beyond [`MOST_HELD`]. Memory grows with the bytes
-    /// that arrive, whatever their number is said to be.
+    /// Reads the body. Refuses a body of more than `most` bytes or beyond [`MOST_HELD`], and a slow client. Memory
+    /// grows with the bytes that arrive, not with the announced length.
     pub fn read(&mut self, most: u64) -> Result<Upload, Refusal> {
         let length = self.length.ok_or((StatusCode::LENGTH_REQUIRED, "the request has no Content-Length"))?;
         if length > most {
@@ -194,7 +194,7 @@ fn converse(mut stream: TcpStream, answer: &dyn Fn(&Request, &mut Body) -> Answe
     Ok(())
 }
 
-/// Sends a part of an answer that began at `start`, after `sent` other bytes. A client that reads too slowly is left.
+/// Sends a part of an answer that began at `start`, after `sent` other bytes. Slow clients are dropped.
 fn send(stream: &mut TcpStream, mut part: &[u8], start: Instant, mut sent: u64) -> io::Result<()> {
     while !part.is_empty() {
         stream.set_write_timeout(Some(time_left(start, sent)?))?;
@@ -211,14 +211,14 @@ fn send(stream: &mut TcpStream, mut part: &[u8], start: Instant, mut sent: u64) 
     Ok(())
 }
 
-/// The time that is left to a client who began at `start` and has read or written so many bytes.
+/// The time that is left to a client who began at `start` and has read or written `bytes` bytes.
 fn time_left(start: Instant, bytes: u64) -> io::Result<Duration> {
     let end = (ALLOWANCE + Duration::from_secs(bytes / SLOWEST)).min(LONGEST_ANSWER);
     let left = end.saturating_sub(start.elapsed());
     if left.is_zero() { Err(io::ErrorKind::TimedOut.into()) } else { Ok(left) }
 }
 
-/// Reads a request line and its headers, and what arrives of the body with them.
+/// Reads a request line and its headers, and the part of the body that arrives with them.
 fn request(stream: &mut TcpStream) -> io::Result<Result<(Request, Vec<u8>), Refusal>> {
     let end = Instant::now() + PATIENCE;
     let mut bytes = Vec::new();

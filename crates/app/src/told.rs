@@ -24,7 +24,7 @@ pub struct CameraArguments {
 }
 
 impl CameraArguments {
-    /// What the user says. Refuses impossible values, and all if the networks of a config do not see photographs as a user's.
+    /// Refuses impossible values, and all values if the config's networks do not place photographs as a user's.
     pub fn told(&self, config: &Config, as_is: bool) -> Result<Told, Failure> {
         let Self { height, focal, distance, elevation } = *self;
         let told = Told { as_is, height, focal, distance, elevation };

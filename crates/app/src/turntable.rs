@@ -50,7 +50,7 @@ impl Turntable {
         }
     }
 
-    /// Output files, without those that a folder does not contain yet.
+    /// Output files; of a folder only the existing ones.
     pub fn outputs(&self) -> Vec<PathBuf> {
         match self {
             Self::Gif(path) | Self::Sheet(path) => vec![path.clone()],
@@ -87,8 +87,8 @@ impl Turntable {
     }
 }
 
-/// The pictures of an animation of a file's Gaussians. `done` is called with the numbers of finished and of all pictures. Refuses
-/// scenes that would take far longer than a person's.
+/// The pictures of an animation of a file's Gaussians. `done` is called with the numbers of finished and of all
+/// pictures. Refuses scenes that would take far longer than a person's.
 pub fn all_around(scene: &Loaded, done: &dyn Fn(usize, usize)) -> Result<Vec<RgbImage>, Failure> {
     let options = RenderOptions { max_intersections: MAX_INTERSECTIONS, ..RenderOptions::inria() };
     let view =

@@ -30,7 +30,7 @@ impl ViewFolder {
         Ok(Self { path: path.to_owned(), views, keeps_cameras })
     }
 
-    /// Whether the folder's cameras are those that the command was given.
+    /// Whether the folder's cameras are an input of the command.
     pub fn keeps_cameras(&self) -> bool {
         self.keeps_cameras
     }

@@ -30,15 +30,15 @@ pub fn sum_of(weights: &WeightFile) -> Result<String, Failure> {
     Ok(sum.map_err(FileError::read(path))?)
 }
 
-/// SHA-256 of what is left to read, in hexadecimal digits.
+/// SHA-256 of the remaining bytes, in hexadecimal digits.
 pub fn sha256(from: &mut impl Read) -> io::Result<String> {
     let mut hasher = Sha256::new();
     io::copy(from, &mut hasher)?;
     Ok(hasher.finalize().iter().map(|byte| format!("{byte:02x}")).collect())
 }
 
-/// Opens a weight file, or `weights.safetensors` in a folder, or without a path the default weights. --config and --set override the
-/// stored config.
+/// Opens a weight file, or `weights.safetensors` in a folder, or without a path the default weights. --config and
+/// --set override the stored config.
 pub fn open(path: Option<&Path>, arguments: &ConfigArguments) -> Result<WeightFile, Failure> {
     let path = path.map(|path| if path.is_dir() { path.join(IN_FOLDER) } else { path.to_owned() });
     let opened = |config: Option<Config>| match &path {

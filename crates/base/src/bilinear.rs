@@ -1,11 +1,11 @@
 //! Weights of a bilinear resize along one axis.
 
-/// The samples of one target position: lower index, upper index, weight of the upper.
+/// One target position: lower source index, upper source index, weight of the upper sample.
 pub type Tap = (usize, usize, f32);
 
 /// Samples and weights of every target position when `from` samples become `to`.
 ///
-/// `align_corners`: the outermost samples coincide; otherwise the outer edges of the pixels do. Edges are repeated.
+/// With `align_corners`, the centres of the outermost pixels coincide; without, their outer edges do.
 pub fn taps(from: usize, to: usize, align_corners: bool) -> Vec<Tap> {
     let position = |i: usize| match align_corners {
         true if to > 1 => i as f64 * (from - 1) as f64 / (to - 1) as f64,

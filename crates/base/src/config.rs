@@ -32,7 +32,7 @@ pub enum ConfigError {
         /// The parser's message, with line and key.
         message: String,
     },
-    /// A value that is refused, alone or beside another.
+    /// A value that is not allowed, by itself or together with the value of another key.
     #[error("{origin}: `{key}`: {message}")]
     Value {
         /// File or other origin of the text.
@@ -44,22 +44,22 @@ pub enum ConfigError {
     },
 }
 
-/// Keys that are gone, dotted, each with the values (as TOML) that mean what the program does now; without values, all do.
+/// Removed keys, dotted, each with the values (TOML) that are still accepted. An empty list accepts every value.
 pub type Removed = &'static [(&'static str, &'static [&'static str])];
 
 /// The type of a config. Every key has a default, so that a file may hold any part of it.
 pub trait Schema: DeserializeOwned + Serialize {
-    /// Former names of keys with the present ones, dotted. A former name is refused with the present one in the message.
+    /// Renamed keys, dotted: (former name, present name). A former name is refused; the error has the new name.
     const RENAMED: &'static [(&'static str, &'static str)] = &[];
 
-    /// Keys that are gone, section after section. With a value that means what the program does now, a key is ignored, so that older
-    /// files open; other values are refused.
+    /// Lists of removed keys. A removed key with an accepted value is ignored, so that older files still load; other
+    /// values are refused.
     const REMOVED: &'static [Removed] = &[];
 
     /// The dotted key of the first refused value, and the reason.
     fn refusal(&self) -> Option<(String, String)>;
 
-    /// Reads and checks a file and those that it extends; `overrides` are `a.b=c` assignments on top.
+    /// Reads and checks a file and the files that it extends; `overrides` are `a.b=c` assignments on top.
     ///
     /// # Errors
     /// [`ConfigError`], naming file, key and allowed values.
@@ -68,8 +68,8 @@ pub trait Schema: DeserializeOwned + Serialize {
         build(table, origin, overrides)
     }
 
-    /// Parses and checks TOML text that extends no file; `origin` names it in errors, `overrides` are `a.b=c` assignments on
-    /// top.
+    /// Parses and checks TOML text that extends no file; `origin` names it in errors, `overrides` are `a.b=c`
+    /// assignments on top.
     ///
     /// # Errors
     /// [`ConfigError`], naming origin, key and allowed values.
@@ -92,7 +92,7 @@ pub trait Schema: DeserializeOwned + Serialize {
         }
     }
 
-    /// The config as TOML, every set key written out.
+    /// The config as TOML, with every key that has a value.
     ///
     /// # Panics
     /// For a type that TOML cannot represent.
@@ -144,7 +144,7 @@ fn syntax(origin: &str, message: String) -> ConfigError {
     ConfigError::Syntax { origin: origin.to_owned(), message }
 }
 
-/// The keys of a file over those of the files that it extends, and the name of them all for errors.
+/// The merged keys of a file and of the files that it extends, and the names of all these files for errors.
 fn layers<T: Schema>(path: &Path) -> Result<(Table, String), ConfigError> {
     let mut chain: Vec<PathBuf> = Vec::new();
     let mut merged = Table::new();
@@ -165,7 +165,7 @@ fn layers<T: Schema>(path: &Path) -> Result<(Table, String), ConfigError> {
     Ok((merged, names.join(" extending ")))
 }
 
-/// One text's keys, each of them of the right type, and the name of the file that it extends.
+/// The keys of one TOML text, whose names and types are checked, and the name of the file that the text extends.
 fn layer<T: Schema>(text: &str, origin: &str) -> Result<(Table, Option<String>), ConfigError> {
     let mut table: Table = toml::from_str(text).map_err(|e| syntax(origin, e.to_string()))?;
     let extended = match table.remove(EXTENDS) {
@@ -176,7 +176,7 @@ fn layer<T: Schema>(text: &str, origin: &str) -> Result<(Table, Option<String>),
         }
     };
     let is_older = check_names::<T>(&mut table, origin)?;
-    // A list of values would pass for a section.
+    // serde would accept an array in place of a section.
     if let Some((key, value)) = table.iter().find(|(_, value)| !value.is_table()) {
         return Err(syntax(origin, format!("`{key}` is a {}, must be a section [{key}]", value.type_str())));
     }
@@ -184,7 +184,7 @@ fn layer<T: Schema>(text: &str, origin: &str) -> Result<(Table, Option<String>),
         Value::Table(table.clone()).try_into::<T>().map_err(|e| syntax(origin, e.to_string()))?;
         return Ok((table, extended));
     }
-    // From the text, since only then do messages carry line numbers. Keys of the whole file come before its sections.
+    // Parsed from the text, so that messages have line numbers. `extends` is blanked out; it precedes all sections.
     let is_extends = |line: &str| line.trim_start().starts_with(EXTENDS);
     let mut in_section = false;
     let own: Vec<&str> = text
@@ -198,7 +198,7 @@ fn layer<T: Schema>(text: &str, origin: &str) -> Result<(Table, Option<String>),
     Ok((table, extended))
 }
 
-/// Refuses former names of keys, and takes out keys that are gone; returns whether there was one.
+/// Refuses renamed keys and takes out removed keys; returns whether a removed key was there.
 fn check_names<T: Schema>(table: &mut Table, origin: &str) -> Result<bool, ConfigError> {
     for (old, new) in T::RENAMED {
         let (section, key) = old.rsplit_once('.').expect("a dotted key");
@@ -226,16 +226,16 @@ fn check_names<T: Schema>(table: &mut Table, origin: &str) -> Result<bool, Confi
     Ok(is_older)
 }
 
-/// Whether `key` is one of [`Schema::REMOVED`], and `value`, as TOML, means what the program does now.
+/// Whether `key` is in [`Schema::REMOVED`] and accepts `value` (TOML).
 pub fn is_gone<T: Schema>(key: &str, value: &str) -> bool {
-    // 4 is 4.0.
+    // 4 and 4.0 are the same value.
     let number = |text: &str| text.parse::<f64>().ok();
     let is_same = |now: &&str| *now == value || number(now).is_some_and(|now| number(value) == Some(now));
     let mut all = T::REMOVED.iter().copied().flatten();
     all.any(|(gone, values)| *gone == key && (values.is_empty() || values.iter().any(is_same)))
 }
 
-/// Puts `above` over `below`, section by section and key by key.
+/// Merges `above` into `below`, section by section and key by key; `above` wins.
 fn merge(below: &mut Table, above: Table) {
     for (key, value) in above {
         match (below.get_mut(&key), value) {
@@ -281,10 +281,10 @@ fn assign(table: &mut Table, assignment: &str) -> Result<(), String> {
     Ok(())
 }
 
-/// For `deserialize_with`: exactly four numbers. An array type alone would drop a fifth without a word.
+/// For `deserialize_with`: exactly four numbers. With an array type alone, a fifth number is dropped silently.
 ///
 /// # Errors
-/// The deserialiser's, for another count.
+/// The deserialiser's error, if there are not four numbers.
 pub fn four<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<[usize; 4], D::Error> {
     let values: Vec<usize> = serde::Deserialize::deserialize(deserializer)?;
     let count = values.len();

@@ -13,7 +13,7 @@ pub fn is_guarded() -> bool {
     GUARDED.get()
 }
 
-/// Reads a file with libraries that may panic on damaged ones, and turns a panic into an error.
+/// Runs `read`, whose libraries may panic on damaged files, and turns a panic into an error.
 ///
 /// # Errors
 /// The error of `read`, or [`FileError::Unsuitable`] with the panic's message.

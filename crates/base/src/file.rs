@@ -1,4 +1,4 @@
-//! Files that appear whole or not at all, and files that are read to an end.
+//! Atomic writing of files, and reading of regular files up to a limit.
 
 use std::collections::HashSet;
 use std::fs::{self, File};
@@ -8,18 +8,18 @@ use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
 use std::thread;
 use std::time::Duration;
 
-/// How the names of temporary files begin.
+/// Prefix of the names of temporary files.
 const PREFIX: &str = ".snapsnap-";
-/// Age of temporary files after which they count as left by a killed run.
+/// Age after which a temporary file counts as left by a killed run.
 const LEFT: Duration = Duration::from_secs(600);
-/// How often the removal of a folder is tried.
+/// Attempts to remove a folder.
 const FOLDER_TRIES: usize = 100;
 
 /// Temporary files that are being written.
 #[derive(Default)]
 struct Unfinished {
     paths: Vec<PathBuf>,
-    /// The program is about to end: no new ones.
+    /// Whether the program is about to end and new temporary files are refused.
     ending: bool,
 }
 
@@ -29,13 +29,13 @@ fn unfinished() -> MutexGuard<'static, Unfinished> {
     UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Removes the temporary files of writes in progress and lets no new ones begin: for a program that is about to be ended
+/// Removes the temporary files of writes in progress and refuses new writes: for a program that is about to be ended
 /// from outside.
 pub fn remove_unfinished() {
     let mut unfinished = unfinished();
     unfinished.ending = true;
     for path in unfinished.paths.drain(..) {
-        // It may be renamed or removed already. Other threads may still be writing into a folder.
+        // The path may be renamed or removed already. Other threads may still write into a folder, hence the attempts.
         for _ in 0..FOLDER_TRIES {
             let removed = if path.is_dir() { fs::remove_dir_all(&path) } else { fs::remove_file(&path) };
             if removed.is_ok() || !path.is_dir() {
@@ -51,11 +51,11 @@ pub fn is_ending() -> bool {
     unfinished().ending
 }
 
-/// Makes the folder `path`, and those around it, for files that are to be moved elsewhere once all of them are written.
-/// [`remove_unfinished`] removes it with all that is in it, until the guard is dropped.
+/// Makes the folder `path` and its parents, for files that are moved elsewhere once all of them are written. Until the
+/// guard is dropped, [`remove_unfinished`] removes the folder with its content.
 ///
 /// # Errors
-/// The operating system's refusal, or that the program is being ended.
+/// The operating system's refusal, or [`io::ErrorKind::Interrupted`] after [`remove_unfinished`].
 pub fn unfinished_folder(path: &Path) -> io::Result<Watch> {
     let mut unfinished = unfinished();
     if unfinished.ending {
@@ -66,12 +66,12 @@ pub fn unfinished_folder(path: &Path) -> io::Result<Watch> {
     Ok(Watch(path.to_owned()))
 }
 
-/// Ends the watch over a folder or file of [`unfinished_folder`] or [`unfinished_file`]; they themselves stay.
+/// Guard of an unfinished folder or file. When the guard is dropped, [`remove_unfinished`] no longer removes the path.
 #[derive(Debug)]
 pub struct Watch(PathBuf);
 
 impl Watch {
-    /// Removes the file and ends the watch.
+    /// Removes the file and drops the guard.
     pub fn remove(self) {
         let _ = fs::remove_file(&self.0);
     }
@@ -83,14 +83,14 @@ impl Drop for Watch {
     }
 }
 
-/// Notes a file that the run removes when it ends, as [`remove_unfinished`] does with those that it is writing.
+/// Registers a file, which [`remove_unfinished`] removes until the guard is dropped.
 #[must_use = "the file is forgotten when the guard is dropped"]
 pub fn unfinished_file(path: &Path) -> Watch {
     unfinished().paths.push(path.to_owned());
     Watch(path.to_owned())
 }
 
-/// Creates a temporary file and notes it, in one step as seen from [`remove_unfinished`].
+/// Creates a temporary file and registers it for [`remove_unfinished`], under one lock.
 fn create(path: &Path) -> io::Result<File> {
     let mut unfinished = unfinished();
     if unfinished.ending {
@@ -99,10 +99,10 @@ fn create(path: &Path) -> io::Result<File> {
     let mut options = File::options();
     options.read(true).write(true).create_new(true);
     let file = options.open(path)?;
-    // Distinguishes an unfinished file of a running process from one that a killed run has left. Some file systems have no
-    // locks.
+    // The lock distinguishes the file of a running process from a file that a killed run has left. Some file systems
+    // have no locks.
     let _ = file.lock();
-    // Another run may have taken it for left in between.
+    // Before it was locked, another run may have removed the file as a leftover.
     if !path.exists() {
         return Err(io::ErrorKind::AlreadyExists.into());
     }
@@ -116,7 +116,7 @@ fn tidied() -> &'static Mutex<HashSet<PathBuf>> {
     TIDIED.get_or_init(Mutex::default)
 }
 
-/// Removes the temporary files that killed runs have left in `folder`; once for each folder of a run.
+/// Removes the temporary files that killed runs have left in `folder`. Each process does this once per folder.
 fn tidy(folder: &Path) {
     if !tidied().lock().unwrap_or_else(PoisonError::into_inner).insert(folder.to_owned()) {
         return;
@@ -130,18 +130,18 @@ fn tidy(folder: &Path) {
         let is_ours = name.strip_prefix(PREFIX).is_some_and(|rest| rest.len() == 6);
         let is_old = |file: &File| {
             let age = file.metadata().and_then(|metadata| metadata.modified()).map(|time| time.elapsed());
-            // Locks do not reach other machines on every file system.
+            // Not every file system shares locks between machines, hence the age.
             age.is_ok_and(|age| age.is_ok_and(|age| age > LEFT))
         };
         let Ok(file) = File::open(entry.path()) else { continue };
-        // The lock is held until the file is removed, so that a process that has just made it waits.
+        // The lock is held until the file is removed, so that a process that has just created the file waits.
         if is_ours && is_old(&file) && file.try_lock().is_ok() {
             let _ = fs::remove_file(entry.path());
         }
     }
 }
 
-/// Fills `buffer` from `offset` on, in bytes. Threads may read one file at once.
+/// Fills `buffer` from byte `offset` on. Several threads may read one file at the same time.
 ///
 /// # Errors
 /// The operating system's refusal, or the end of the file before the buffer is full.
@@ -150,7 +150,7 @@ pub fn read_exact_at(file: &File, buffer: &mut [u8], offset: u64) -> io::Result<
     std::os::unix::fs::FileExt::read_exact_at(file, buffer, offset)
 }
 
-/// Fills `buffer` from `offset` on, in bytes. Threads may read one file at once.
+/// Fills `buffer` from byte `offset` on. Several threads may read one file at the same time.
 ///
 /// # Errors
 /// The operating system's refusal, or the end of the file before the buffer is full.
@@ -168,10 +168,10 @@ pub fn read_exact_at(file: &File, mut buffer: &mut [u8], mut offset: u64) -> io:
     Ok(())
 }
 
-/// Writes `path` through `fill` into a temporary file beside it, which is renamed after success. A failure leaves the former
-/// file. The new file keeps the permissions of the former one; a write-protected file is refused. A symbolic link stays and
-/// its target is replaced. A pipe or a device is written in place, since renaming would replace it. After a power failure there is the
-/// former file or the whole new one.
+/// Writes `path`: `fill` writes a temporary file beside it, which is renamed after success. A failure leaves the
+/// former file. The new file keeps the permissions of the former one; a write-protected file is refused. A symbolic
+/// link stays and its target is replaced. A pipe or a device is written in place, since renaming would replace it.
+/// After a power failure there is the former file or the whole new one.
 ///
 /// # Errors
 /// The error of `fill`, or the operating system's refusal to create, write or rename the file.
@@ -211,14 +211,14 @@ pub fn write_whole<E: From<io::Error>>(
     Ok(())
 }
 
-/// Renames a file, or a folder of files, so that the new name and the data are there after a power failure.
+/// Renames a file or a folder of files. Afterwards the new name and the data survive a power failure.
 ///
 /// # Errors
 /// The operating system's refusal.
 pub fn rename(from: &Path, to: &Path) -> io::Result<()> {
     let files = fs::read_dir(from).into_iter().flatten().flatten().map(|entry| entry.path());
     for path in files.chain([from.to_owned()]) {
-        // Not all systems bring a file to the disk that is open for reading.
+        // Not all systems can sync a file that is only open for reading.
         let _ = File::open(path).and_then(|file| file.sync_all());
     }
     fs::rename(from, to)?;
@@ -226,7 +226,7 @@ pub fn rename(from: &Path, to: &Path) -> io::Result<()> {
     Ok(())
 }
 
-/// Brings the names in a folder to the disk. Not all systems and folders can be opened for that; the names then follow later.
+/// Syncs the names in a folder to the disk. Where a folder cannot be opened, the system writes the names later.
 fn sync_folder(folder: &Path) {
     let _ = File::open(folder).and_then(|folder| folder.sync_all());
 }
@@ -244,14 +244,14 @@ fn permissions_of(path: &Path) -> io::Result<Option<fs::Permissions>> {
         }
         Ok(there) => Ok(Some(there.permissions())),
         Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(None),
-        // A name that is too long, or a circle of links.
+        // A name that is too long, or a cycle of links.
         Err(e) => Err(e),
     }
 }
 
-/// The file behind symbolic links, which need not be there.
+/// Follows symbolic links. The target need not exist.
 pub fn target_of(path: &Path) -> PathBuf {
-    /// Links may lead round in circles.
+    /// Most links that are followed, since links may form a cycle.
     const LINKS: usize = 40;
     let mut path = path.to_owned();
     for _ in 0..LINKS {
@@ -261,8 +261,8 @@ pub fn target_of(path: &Path) -> PathBuf {
     path
 }
 
-/// Checks, before any work, that `path` can be written: a file can be created in its folder, and an existing file is not
-/// write-protected. A pipe or a device is not opened, since its reader would notice.
+/// Checks, before any work, that `path` can be written: a file can be created in its folder, and an existing file is
+/// not write-protected. A pipe or a device is not opened, since its reader would notice.
 ///
 /// # Errors
 /// The operating system's reason.
@@ -278,10 +278,10 @@ pub fn check_writable(path: &Path) -> io::Result<()> {
     tempfile::tempfile_in(folder_of(path)).map(drop)
 }
 
-/// Opens a regular file for reading: a pipe or a device might never answer, or never end.
+/// Opens a regular file for reading. Pipes and devices are refused: reading them may block or never end.
 ///
 /// # Errors
-/// The operating system's refusal, or that it is no regular file.
+/// The operating system's refusal, or that `path` is no regular file.
 pub fn open(path: &Path) -> io::Result<File> {
     let metadata = fs::metadata(path)?;
     if metadata.is_dir() {
@@ -293,10 +293,10 @@ pub fn open(path: &Path) -> io::Result<File> {
     File::open(path)
 }
 
-/// The whole of a regular file of at most `limit` bytes.
+/// The content of a regular file of at most `limit` bytes.
 ///
 /// # Errors
-/// As [`open`], or that it is longer.
+/// As [`open`], or that the file is longer.
 pub fn read(path: &Path, limit: u64) -> io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
     open(path)?.take(limit.saturating_add(1)).read_to_end(&mut bytes)?;
@@ -306,10 +306,10 @@ pub fn read(path: &Path, limit: u64) -> io::Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// The whole of a regular text file of at most `limit` bytes.
+/// The text of a regular file of at most `limit` bytes.
 ///
 /// # Errors
-/// As [`read`], or that it is not UTF-8.
+/// As [`read`], or that the file is not UTF-8.
 pub fn read_text(path: &Path, limit: u64) -> io::Result<String> {
     let text = String::from_utf8(read(path, limit)?);
     text.map_err(|_| io::Error::new(io::ErrorKind::InvalidData, "is no text (UTF-8)"))
@@ -371,11 +371,11 @@ mod tests {
         }
         write_whole::<io::Error>(&path, |out| {
             assert!(!left.exists() && other.exists());
-            // However long it takes.
+            // A file that is being written stays, however old it is.
             for entry in fs::read_dir(folder.path()).expect("lists") {
                 old(&entry.expect("entry").path());
             }
-            // Another run that begins now is independent of this one.
+            // As if another run began now.
             tidied().lock().unwrap_or_else(PoisonError::into_inner).clear();
             tidy(folder.path());
             out.write_all(b"whole")

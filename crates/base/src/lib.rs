@@ -1,5 +1,5 @@
-//! The lowest floor of snapsnap: files that are written whole or not at all, the errors that name them, configs, random
-//! streams, bilinear weights and plots. Every other crate may use it.
+//! Atomic writing of files, errors that name files, configs, random streams, bilinear weights and plots. Every other
+//! crate may use this one.
 
 pub mod bilinear;
 pub mod config;

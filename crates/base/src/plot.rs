@@ -7,18 +7,18 @@ use plotters::prelude::*;
 
 /// Width and height of a chart in pixels.
 const SIZE: (u32, u32) = (1000, 460);
-/// Columns of the names of the series.
+/// Width of the legend in pixels.
 const NAMES: u32 = 220;
-/// Rows of a name.
+/// Height of a line of the legend in pixels.
 const ROW: i32 = 18;
-/// Largest number of points of a line that are marked. More marks would hide the line.
+/// Lines with at most this many points get a mark at each point. More marks would hide the line.
 const MARKS: usize = 100;
 
 /// A named line, or points that are not joined.
 pub struct Series {
-    /// In the legend.
+    /// Text in the legend.
     pub name: String,
-    /// x and y.
+    /// x and y of each point.
     pub points: Vec<(f64, f64)>,
     /// Whether the points are joined.
     pub line: bool,
@@ -27,11 +27,11 @@ pub struct Series {
 /// Axes of a chart.
 #[derive(Default)]
 pub struct Axes<'a> {
-    /// Above it.
+    /// Text above the chart.
     pub caption: &'a str,
-    /// Below it.
+    /// Label of the x axis.
     pub x: &'a str,
-    /// Beside it.
+    /// Label of the y axis.
     pub y: &'a str,
     /// Whether x is logarithmic.
     pub log_x: bool,
@@ -39,7 +39,7 @@ pub struct Axes<'a> {
     pub log_y: bool,
 }
 
-/// An SVG of some charts below one another. Values that cannot be drawn are left out; the text is empty if none is left.
+/// An SVG of charts below one another. Points that cannot be drawn are left out; without any point the text is empty.
 pub fn svg(charts: &[(Axes, Vec<Series>)]) -> String {
     let mut text = String::new();
     if charts.iter().all(|(axes, series)| drawable(axes, series).next().is_none()) {
@@ -59,7 +59,7 @@ pub fn svg(charts: &[(Axes, Vec<Series>)]) -> String {
 }
 
 fn is_drawable(axes: &Axes, (x, y): (f64, f64)) -> bool {
-    // Beyond that, ranges have no differences and axes no ticks.
+    // Beyond 1e15, differences within a range vanish and axes have no ticks.
     let is_bounded = |v: f64, log: bool| v.abs() < 1e15 && (!log || v > 0.0);
     is_bounded(x, axes.log_x) && is_bounded(y, axes.log_y)
 }
@@ -85,7 +85,7 @@ fn draw(area: &Area, axes: &Axes, series: &[Series]) -> Drawn {
     let (plot, names) = area.split_horizontally(SIZE.0 - NAMES);
     let mut builder = ChartBuilder::on(&plot);
     builder.caption(axes.caption, ("sans-serif", 16)).margin(10).x_label_area_size(36).y_label_area_size(60);
-    // One call for each kind of axis, whose types differ.
+    // A macro, since linear and logarithmic axes have different types.
     macro_rules! chart {
         ($x:expr, $y:expr) => {{
             let mut chart = builder.build_cartesian_2d($x, $y)?;
@@ -124,7 +124,7 @@ fn draw(area: &Area, axes: &Axes, series: &[Series]) -> Drawn {
     Ok(())
 }
 
-/// Ticks of a logarithmic axis: powers of ten, with their multiples where the range contains few of them.
+/// Ticks of a logarithmic axis: powers of ten, and their multiples where the range contains few powers of ten.
 fn ticks(range: &Range<f64>) -> Vec<f64> {
     let decades = (range.end / range.start).log10();
     let steps: &[f64] = match decades {
@@ -138,7 +138,7 @@ fn ticks(range: &Range<f64>) -> Vec<f64> {
     all.filter(|tick| range.contains(tick)).collect()
 }
 
-/// A number with at most four digits, or all those of an integer.
+/// A number with four significant digits at most; an integer keeps all of its digits.
 fn number(value: f64) -> String {
     if value == 0.0 {
         return "0".into();
@@ -163,7 +163,7 @@ mod tests {
             axes(),
             series(vec![(0.0, 1.0), (1.0, -1e308), (2.0, 1e308), (3.0, f64::NAN), (4.0, 2.0)]),
         )]);
-        // The mark beside the name is one more.
+        // Two points, and the mark in the legend.
         assert_eq!(drawn.matches("<circle").count(), 3, "{drawn}");
         assert!(drawn.contains("a &lt; b"));
         assert_eq!(svg(&[(axes(), series(vec![(f64::INFINITY, 1.0)]))]), "");

@@ -1,9 +1,9 @@
-//! Randomness that is the same on every machine: each purpose has a stream of its own, named by words.
+//! Random streams that are the same on every machine. Each purpose has its own stream, identified by a name.
 
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-/// The stream called so. Different names give unrelated streams.
+/// The stream called `name`. Different names give unrelated streams.
 pub fn stream(name: &str) -> ChaCha8Rng {
     // FNV-1a over four lanes fills ChaCha's key of 256 bits.
     let mut key = [0; 32];
@@ -25,7 +25,7 @@ mod tests {
     #[test]
     fn streams_are_fixed_by_their_names() {
         let first = |name: &str| stream(name).random::<u64>();
-        // On every machine.
+        // The same number on every machine.
         assert_eq!(first("train/1/0"), 6_893_838_934_489_721_906);
         let names = (0..1000).map(|i| format!("train/1/{i}"));
         let values: std::collections::HashSet<u64> = names.map(|name| first(&name)).collect();

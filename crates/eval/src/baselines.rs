@@ -1,4 +1,4 @@
-//! Baselines of an evaluation (docs/method.md, "Evaluation").
+//! Baselines of an evaluation: flat cut-outs, ground-truth points, mean pictures (docs/method.md, "Evaluation").
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -19,11 +19,11 @@ use crate::evaluate::model::joined;
 use crate::evaluate::person::{People, part_of, planes, smaller, test_of};
 use crate::pictures::Picture;
 
-/// Largest side of mean pictures, which are smooth.
+/// Largest side of mean pictures in pixels. Mean pictures are smooth.
 const MEAN_SIDE: usize = 256;
 
-/// Photographs `[3,S,S]` in [−1, 1] as flat cut-outs, each in the upright plane through the body's axis that faces its
-/// camera; world frame. `valid` `[S,S]` are the person's masks.
+/// Gaussians (world frame) of photographs `[3,S,S]` in [−1, 1] as flat cut-outs. Each cut-out stands in the upright
+/// plane through the body's axis that faces its camera. `valid` `[S,S]` are the person's masks.
 pub fn billboard(
     photographs: &[Vec<f32>],
     valid: &[Vec<bool>],
@@ -38,7 +38,7 @@ pub fn billboard(
     joined(photographs.iter().zip(valid).zip(cameras).map(part).collect())
 }
 
-/// Intersections of the rays of a camera's pixels with the upright plane through the world's y axis that faces it:
+/// Points at which the pixel rays of a camera meet the upright plane through the world's y axis that faces the camera:
 /// `[S,S,3]` metres in the camera's frame.
 fn upright(camera: &Camera, side: usize) -> Vec<f32> {
     let camera = camera.resized(side as u32, side as u32);
@@ -68,7 +68,7 @@ pub fn true_points(
         ([front, back], 4) => side_images([front, back], points, valid),
         _ => Vec::new(),
     };
-    // The first camera sees all of them.
+    // The points of all views are in the first camera's frame.
     let seen = |((image, valid), points)| CanvasView { view: View::Front, image, points, valid };
     let images = photographs.iter().chain(&sides).map(Vec::as_slice);
     let with_masks = images.zip(valid.iter().map(Vec::as_slice));
@@ -80,7 +80,7 @@ fn in_world(gaussians: Gaussians, camera: &Camera) -> Gaussians {
     placed(&Config::default(), gaussians, &camera.world_to_camera.inverse())
 }
 
-/// The mean picture of training people for each view.
+/// For each view, the mean picture of training people.
 pub struct MeanPictures {
     side: usize,
     /// `[3,S,S]` of each view.
@@ -88,10 +88,10 @@ pub struct MeanPictures {
 }
 
 impl MeanPictures {
-    /// Mean pictures of the training people in data sets with the views of the people to evaluate.
+    /// Mean pictures of the training people of data sets that have the same views as the people to evaluate.
     ///
     /// # Errors
-    /// [`EvalError`] for sets with different views or sizes, or a picture that cannot be read.
+    /// [`EvalError`] if the data sets differ in views or sizes, or if a picture cannot be read.
     pub fn new(folders: &[PathBuf], evaluated: &[People]) -> Result<Self, EvalError> {
         let views = evaluated.first().map_or(0, People::views);
         if let Some(set) = evaluated.iter().find(|set| set.views() != views) {
@@ -141,7 +141,7 @@ impl MeanPictures {
     /// The mean picture of a view at a size.
     ///
     /// # Errors
-    /// Those of [`Picture::new`]. Means of pictures have none.
+    /// Errors of [`Picture::new`]. Means of pictures cause none.
     pub fn picture(&self, view: usize, side: usize) -> Result<Picture, EvalError> {
         let planes = planes(self.views[view].clone(), 3, self.side);
         let planes = if side == self.side { planes } else { bilinear(planes, [side, side], false) };

@@ -8,15 +8,15 @@ use snapsnap_splat::SplatError;
 /// A comparison that cannot be made.
 #[derive(Debug, thiserror::Error)]
 pub enum EvalError {
-    /// Different sizes.
+    /// Two pictures or sets have different sizes.
     #[error("the sizes differ: {} and {}", size(found), size(expected))]
     Sizes {
-        /// Extents, the last two of which are height and width.
+        /// The extents found; the last two are height and width.
         found: Vec<usize>,
-        /// Those of the other picture.
+        /// The expected extents.
         expected: Vec<usize>,
     },
-    /// A value of a picture that is not finite or outside [0, 1], such as one of 0 to 255.
+    /// A value of a picture is not finite or not in [0, 1], for example because values are 0 to 255.
     #[error("value {value} at channel {channel}, row {row}, column {column} of the {what}: must be 0 to 1")]
     Value {
         /// The picture.
@@ -25,24 +25,24 @@ pub enum EvalError {
         value: f32,
         /// 0 to 2: red, green, blue.
         channel: usize,
-        /// From the top.
+        /// Row from the top.
         row: usize,
-        /// From the left.
+        /// Column from the left.
         column: usize,
     },
-    /// Nothing to compare.
+    /// There is nothing to compare, for the reason of the message.
     #[error("{0}")]
     Empty(String),
-    /// A file.
+    /// Error of a file.
     #[error(transparent)]
     File(#[from] FileError),
-    /// Weights.
+    /// Error of weights.
     #[error(transparent)]
     Weights(#[from] WeightsError),
-    /// A config.
+    /// Error of a config.
     #[error(transparent)]
     Config(#[from] ConfigError),
-    /// A render.
+    /// Error of a render.
     #[error(transparent)]
     Splat(#[from] SplatError),
 }

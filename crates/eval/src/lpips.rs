@@ -9,12 +9,12 @@ use burn::tensor::ops::{ConvOptions, MaxPoolOptions};
 use burn::tensor::{Device, Tensor, TensorData};
 use snapsnap_net::weights::{Source, WeightsError, not_finite};
 
-/// Least side of a picture. Smaller ones leave no pixel for the third layer.
+/// Least side of a picture in pixels. Of a smaller picture, no pixel is left for the third layer.
 pub const MIN_SIDE: usize = 31;
 
 /// File names of the published weights: torchvision's AlexNet and the authors' learned layers.
 pub const PUBLISHED: [&str; 2] = ["alexnet-owt-7be5be79.pth", "lpips-alex-v0.1.pth"];
-/// Distance of the two pictures of [`Lpips::check`] with the authors' package (docs/lpips_reference.py).
+/// Distance between the pictures of [`Lpips::check`], from the authors' package (docs/lpips_reference.py).
 const KNOWN: f64 = 0.093_218_468;
 
 /// Shift and divisor of red, green and blue in [−1, 1].
@@ -55,7 +55,7 @@ impl Layer {
     }
 }
 
-/// The network and its learned layers, not tracked.
+/// The network and its learned layers, without gradients of their weights.
 #[derive(Debug, Clone)]
 pub struct Lpips {
     layers: Vec<Parameters>,
@@ -122,7 +122,7 @@ impl Lpips {
         Ok(Self { layers: layers.into() })
     }
 
-    /// Published files that are not in a folder.
+    /// The published files that are missing in a folder.
     pub fn missing(folder: &Path) -> Vec<PathBuf> {
         PUBLISHED.map(|name| folder.join(name)).into_iter().filter(|file| !file.exists()).collect()
     }
@@ -130,7 +130,7 @@ impl Lpips {
     /// The published weights in a folder, checked with a known distance.
     ///
     /// # Errors
-    /// [`WeightsError`] for files that cannot be read, or that are not the published ones.
+    /// [`WeightsError`] for files that cannot be read or are not the published files.
     pub fn published(folder: &Path, device: &Device) -> Result<Self, WeightsError> {
         let files = PUBLISHED.map(|name| folder.join(name));
         let network = Self::load(&files, device)?;
@@ -144,13 +144,13 @@ impl Lpips {
         Ok(network)
     }
 
-    /// Whether the distance of the check pictures is that of the published weights. Differences between devices are far
-    /// smaller than those between weights.
+    /// Whether the check pictures have the distance that the published weights give. Devices change the distance far
+    /// less than other weights do.
     pub fn is_published(&self) -> bool {
         (self.check() - KNOWN).abs() <= 1e-4 * KNOWN
     }
 
-    /// Distance of two pictures of 64 × 64 pixels: noise from a formula, and its mean with other noise.
+    /// Distance between two pictures of 64 × 64 pixels: noise from a formula, and the mean of this and other noise.
     pub fn check(&self) -> f64 {
         const SIDE: usize = 64;
         let device = self.device();
@@ -163,12 +163,12 @@ impl Lpips {
         f64::from(self.distance(a, half).into_scalar::<f32>())
     }
 
-    /// Device of its weights.
+    /// Device of the weights.
     pub fn device(&self) -> Device {
         self.layers[0].weight.device()
     }
 
-    /// The same on another device.
+    /// The network on another device.
     pub fn to_device(&self, device: &Device) -> Self {
         let moved = |layer: &Parameters| Parameters {
             weight: layer.weight.clone().to_device(device),
@@ -206,7 +206,7 @@ impl Parameters {
     }
 }
 
-/// Values in [0, 1] with the network's normalisation.
+/// Pictures with values in [0, 1], normalised for the network.
 fn normalised(x: Tensor<4>) -> Tensor<4> {
     let of_channel = |values: [f32; 3]| {
         Tensor::<1>::from_floats(values, &x.device()).reshape([1, 3, 1, 1]).cast(x.dtype())
@@ -214,7 +214,7 @@ fn normalised(x: Tensor<4>) -> Tensor<4> {
     (x.clone() * 2.0 - 1.0 - of_channel(SHIFT)) / of_channel(SCALE)
 }
 
-/// Features of length 1 per pixel.
+/// Features `[B,C,H,W]`, scaled to length 1 at every pixel.
 fn unit(x: Tensor<4>) -> Tensor<4> {
     /// Least square, since the square root has no gradient at 0.
     const MIN_SQUARE: f64 = 1e-30;
@@ -222,7 +222,7 @@ fn unit(x: Tensor<4>) -> Tensor<4> {
     x / (length + EPSILON)
 }
 
-/// Numbers in [0, 1), equal in every language.
+/// Pseudo-random numbers in [0, 1) that the reference in Python computes alike.
 fn number(stream: u32, place: usize) -> f64 {
     let mixed = (place as u32).wrapping_mul(2_654_435_761).wrapping_add(stream.wrapping_mul(40_503_121));
     let mixed = (mixed ^ (mixed >> 15)).wrapping_mul(2_246_822_519);
@@ -275,7 +275,7 @@ mod tests {
         Tensor::from_data(TensorData::new(values(stream, 3 * h * w, |u| u), [1, 3, h, w]), device)
     }
 
-    /// Distance, and norm and sum of its gradient, of the authors' package (docs/lpips_reference.py).
+    /// `EXPECTED`: distance, norm and sum of its gradient, from the authors' package (docs/lpips_reference.py).
     #[test]
     fn distances_and_gradients_are_the_authors() {
         const EXPECTED: [([usize; 2], [f64; 3]); 3] = [

@@ -36,7 +36,7 @@ impl Picture {
         Ok(Self { width, height, values })
     }
 
-    /// A render `[H, W, 3]`, clamped to [0, 1] and shrunk to means of `times`² pixels.
+    /// A render `[H, W, 3]`, clamped to [0, 1] and shrunk by `times`: each pixel is the mean of `times`² pixels.
     ///
     /// # Errors
     /// [`EvalError::Value`] for a value that is not finite.
@@ -63,7 +63,7 @@ impl Picture {
         Self::new(planes, size, "render")
     }
 
-    /// A picture of any file. Pictures with alpha are laid over black, the background of the protocols.
+    /// The picture of a decoded file. Alpha is blended over black, the background of the protocols.
     ///
     /// # Errors
     /// [`EvalError::Value`] for files of floating-point numbers with other values.
@@ -90,10 +90,10 @@ impl Picture {
         &self.values[channel * self.height * self.width..][..self.height * self.width]
     }
 
-    /// The part `[x, y, width, height]`.
+    /// The crop `[x, y, width, height]`.
     ///
     /// # Panics
-    /// If it is not inside the picture.
+    /// If the crop is not inside the picture.
     pub fn cropped(&self, [x, y, width, height]: [usize; 4]) -> Self {
         assert!(x + width <= self.width && y + height <= self.height, "{width}×{height} at {x}, {y}");
         let line = |c: usize, row: usize| &self.plane(c)[row * self.width + x..][..width];

@@ -4,10 +4,10 @@ use glam::DVec3;
 
 use crate::geometry::double;
 
-/// Names of the views in reports, in their order.
+/// Names of the views in reports, in the order of their indices.
 pub const VIEWS: [&str; 4] = ["front", "back", "right", "left"];
 
-/// A view's predicted and ground-truth points.
+/// Predicted and ground-truth points of a view.
 #[derive(Debug, Clone, Copy)]
 pub struct Pair<'a> {
     /// Its index in [`VIEWS`].
@@ -27,10 +27,10 @@ pub struct PointError {
     pub view: usize,
     /// Mean distance.
     pub mean: f64,
-    /// The same after the common mean shift of the photographed views is removed.
+    /// Mean distance after the common mean shift of the photographed views is removed.
     pub centred: f64,
-    /// Share of the ground-truth points without a finite prediction inside of the predictor's window. The means do not
-    /// include them.
+    /// Share of the ground-truth points for which there is no finite prediction, for example outside the predictor's
+    /// window. The means do not include these points.
     pub missed: f64,
 }
 
@@ -56,15 +56,15 @@ pub fn point_errors(pairs: &[Pair]) -> Vec<PointError> {
     pairs.iter().filter_map(error).collect()
 }
 
-/// Longest side in metres of a triangle of neighbouring pixels on one surface, on a canvas whose rows have `side` pixels: six pixel widths.
-/// Longer sides are steps from one surface to another. The nominal cameras' focal length is 0.8 of the canvas, and the person is two
-/// metres away.
+/// Largest side in metres of a triangle of neighbouring pixels on one surface: six pixel widths, on a canvas whose
+/// rows have `side` pixels. Longer sides are depth steps. The nominal cameras' focal length is 0.8 of the canvas, and
+/// the person is two metres away.
 pub fn longest_side(side: usize) -> f64 {
     6.0 * 2.0 / (0.8 * side as f64)
 }
 
-/// Mean angle in degrees between the normals of predicted and true points, on a canvas whose rows have `side` pixels. A normal is that
-/// of the triangle of a pixel and its neighbours on the right and below. `None` without a triangle of one true surface.
+/// Mean angle in degrees between normals of predicted and true points, on a canvas whose rows have `side` pixels. Each
+/// normal is of the triangle of a pixel, its right and its lower neighbour. `None` without a triangle on one surface.
 pub fn normal_error(pair: &Pair, side: usize) -> Option<f64> {
     let longest = longest_side(side);
     let (points, truth) = (pair.points.as_chunks().0, pair.truth.as_chunks().0);
@@ -80,7 +80,7 @@ pub fn normal_error(pair: &Pair, side: usize) -> Option<f64> {
         let ([a, b], [c, d]) = (sides(points), sides(truth));
         let (predicted, true_normal) = (a.cross(b), c.cross(d));
         if c.length().max(d.length()) <= longest && true_normal.length() > 0.0 {
-            // The angle of vectors of any length, 90° for a length of 0.
+            // The angle between vectors of any length; 90° if the predicted normal has length 0.
             let (across, along) = (predicted.cross(true_normal).length(), predicted.dot(true_normal));
             sum += if predicted.length() > 0.0 { across.atan2(along).to_degrees() } else { 90.0 };
             count += 1;
@@ -89,7 +89,7 @@ pub fn normal_error(pair: &Pair, side: usize) -> Option<f64> {
     (count > 0).then(|| sum / f64::from(count))
 }
 
-/// Whether a pixel has a prediction. Pixels outside of the predictor's window have the point 0, the position of the first camera.
+/// Whether a pixel has a prediction. Pixels outside the predictor's window have the point 0, where the camera stands.
 fn is_predicted(point: &[f32; 3]) -> bool {
     point.iter().all(|v| v.is_finite()) && point.iter().any(|v| *v != 0.0)
 }
@@ -127,7 +127,7 @@ mod tests {
         valid[5] = 0.0;
         assert!(is_30(error(&wrong, &flat, &valid)));
         assert_eq!(error(&turned, &flat, &[0.0; 12]), None);
-        // A pixel of a canvas of four is 62 cm wide; steps of more than six are no surface.
+        // With four pixels a row, a pixel is 62 cm wide. Sides of more than six pixels are depth steps.
         assert_eq!(error(&flat, &wall(4.0), &[1.0; 12]), None);
     }
 

@@ -1,4 +1,4 @@
-//! Sheets of pictures.
+//! Sheets of pictures with captions, colours of errors, PNG files.
 
 use std::io::{Cursor, Write};
 use std::path::Path;
@@ -10,11 +10,11 @@ use snapsnap_base::{FileError, file};
 /// Largest side of one picture of a grid in pixels.
 const MOST: u32 = 256;
 
-/// Width and height of a letter in pixels, and of the strip of captions.
+/// Width and height of a letter, and height of the strip of captions, in pixels.
 const LETTER: u32 = 8;
 const STRIP: u32 = 14;
 
-/// Pictures of one size in rows. Each column has one of the captions above it, which are repeated; `note` stands below.
+/// A sheet of equally large pictures in rows. The captions stand above the columns and repeat; `note` stands below.
 pub fn grid(rows: &[Vec<RgbImage>], captions: &[&str], note: &str) -> Option<RgbImage> {
     let first = rows.first()?.first()?;
     let scale = first.width().max(first.height()).div_ceil(MOST).max(1);
@@ -24,7 +24,7 @@ pub fn grid(rows: &[Vec<RgbImage>], captions: &[&str], note: &str) -> Option<Rgb
     let size = [columns * width, rows.len() as u32 * height + strips * STRIP];
     let mut sheet = RgbImage::from_pixel(size[0], size[1], Rgb([255; 3]));
     for (column, caption) in (0..columns).zip(captions.iter().cycle()) {
-        // A caption ends where its column does.
+        // A caption is cut off at the end of its column.
         write(&mut sheet, caption, [column * width, 0], (column + 1) * width);
     }
     if !note.is_empty() {

@@ -10,15 +10,15 @@ use crate::pictures::Picture;
 const PAPER: [usize; 2] = [1000, 500];
 /// Margin of the protocol `masked` around the person's mask, at 1024 pixels.
 const MARGIN: usize = 8;
-/// The picture height of both.
+/// The picture height to which [`PAPER`] and [`MARGIN`] refer.
 const AT: usize = 1024;
 
-/// Pixels of a picture.
+/// The compared pixels of a picture.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Region {
     /// Left, top, width, height.
     pub window: [usize; 4],
-    /// Mask `[height, width]` of the pixels of the window that count; `None`: all.
+    /// Mask `[height, width]` of the compared pixels of the window; `None`: all.
     pub inside: Option<Vec<bool>>,
 }
 
@@ -28,8 +28,8 @@ impl Region {
         Self { window: [0, 0, picture.width, picture.height], inside: None }
     }
 
-    /// The paper's window of 1000 × 500 of 1024 pixels, scaled to the picture's height. Its centre is that of the box
-    /// of all pixels of the ground truth that are not black; it is moved into the picture. Wider people are cut off.
+    /// The paper's window of 1000 × 500 of 1024 pixels, scaled to the picture's height. It is centred on the box of
+    /// all ground-truth pixels that are not black, then moved into the picture. Wider people are cut off.
     ///
     /// # Errors
     /// [`EvalError::Empty`] for a black picture.
@@ -63,14 +63,14 @@ impl Region {
         Ok(Self { window, inside: Some(inside) })
     }
 
-    /// Whether a pixel of the picture counts.
+    /// Whether a pixel of the picture is compared.
     pub fn counts(&self, column: usize, row: usize) -> bool {
         let [x, y, width, height] = self.window;
         let in_window = (x..x + width).contains(&column) && (y..y + height).contains(&row);
         in_window && self.inside.as_ref().is_none_or(|inside| inside[(row - y) * width + column - x])
     }
 
-    /// Number of pixels.
+    /// Number of compared pixels.
     pub fn pixels(&self) -> usize {
         match &self.inside {
             Some(inside) => inside.iter().filter(|set| **set).count(),
@@ -84,7 +84,7 @@ pub fn margin(height: usize) -> usize {
     (MARGIN * height).div_ceil(AT)
 }
 
-/// Left, top, right and bottom of the pixels that are set.
+/// Left, top, right and bottom of the bounding box of the set pixels, inclusive; `None` if no pixel is set.
 fn bounds(width: usize, height: usize, is_set: impl Fn(usize) -> bool) -> Option<[usize; 4]> {
     let mut found: Option<[usize; 4]> = None;
     for i in (0..width * height).filter(|i| is_set(*i)) {

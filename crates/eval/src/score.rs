@@ -24,8 +24,8 @@ pub struct Score {
 }
 
 impl Score {
-    /// Compares an image with the ground truth in a region. LPIPS gets the region's box, with black pixels outside of a
-    /// mask. Boxes of masks are enlarged with black to the network's least size.
+    /// Compares an image with the ground truth in a region. LPIPS compares the region's box, with black pixels outside
+    /// a mask. The box of a mask that is smaller than [`MIN_SIDE`] is padded with black.
     ///
     /// # Errors
     /// [`EvalError::Sizes`].

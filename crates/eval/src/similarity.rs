@@ -13,7 +13,7 @@ use crate::region::Region;
 const UNIFORM: usize = 7;
 /// Side of the loss's Gaussian window.
 const GAUSSIAN: usize = 11;
-/// Its standard deviation in pixels.
+/// Standard deviation of the Gaussian window in pixels.
 const SIGMA: f64 = 1.5;
 /// Constants of Wang et al. 2004 for values in [0, 1]: (0.01)² and (0.03)².
 const C1: f64 = 1e-4;
@@ -72,10 +72,10 @@ pub fn check_sizes(image: &Picture, target: &Picture) -> Result<(), EvalError> {
     Err(EvalError::Sizes { found: size(image), expected: size(target) })
 }
 
-/// Structural similarity as scikit-image's `structural_similarity` computes it by default for values in [0, 1]: uniform
-/// window of 7 × 7 pixels, sample covariances (N − 1), mean over pixels and channels. Without a mask, the region is
-/// cropped first, and pixels whose window leaves it are left out. With a mask, windows of its pixels may leave it.
-/// `None` if no pixel is left.
+/// Structural similarity as scikit-image's `structural_similarity` computes it by default for values in [0, 1]:
+/// uniform window of 7 × 7 pixels, sample covariances (N − 1), mean over pixels and channels. Without a mask, the
+/// region is cropped first, and pixels whose window extends beyond the crop are left out. With a mask, windows may
+/// extend beyond the mask. `None` if no pixel is left.
 ///
 /// # Errors
 /// [`EvalError::Sizes`].
@@ -106,8 +106,8 @@ pub fn ssim_of_loss(image: &Picture, target: &Picture, region: &Region) -> Resul
     Ok(mean_in_region(image, target, [0, 0], region, &window).unwrap_or(f64::NAN))
 }
 
-/// Mean similarity over the channels and over the pixels of a region, for two parts of pictures from column `left` and
-/// row `top` on. `None` if the parts have no pixel of the region.
+/// Mean similarity over the channels and over the pixels of a region, for crops of two pictures that begin at column
+/// `left` and row `top`. `None` if the crops contain no pixel of the region.
 fn mean_in_region(
     image: &Picture,
     target: &Picture,
@@ -134,11 +134,11 @@ fn mean_in_region(
 
 /// A window around a pixel.
 struct Window {
-    /// Along rows and along columns; their sum is 1.
+    /// Weights along rows and along columns, with a sum of 1.
     weights: Vec<f64>,
-    /// Factor of variances.
+    /// Factor of variances and covariances.
     correction: f64,
-    /// Whether the picture is padded with zeros. Otherwise pixels whose window leaves it are left out.
+    /// Whether the picture is padded with zeros. Otherwise pixels whose window extends beyond it are left out.
     padded: bool,
 }
 
@@ -170,7 +170,7 @@ fn line_of(a: &[f32], b: &[f32], [height, width]: [usize; 2], y: usize, window: 
         let vab = correction * (mab - ma * mb).clamp(-most, most);
         let similarity =
             ((2.0 * ma * mb + C1) * (2.0 * vab + C2)) / ((ma * ma + mb * mb + C1) * (va + vb + C2));
-        // Rounding can exceed the similarity of equal pictures.
+        // By rounding, the similarity of equal pictures can exceed 1.
         similarity.min(1.0)
     };
     columns.windows(weights.len()).map(similarity).collect()
@@ -190,7 +190,7 @@ pub fn ssim_gaussian(x: Tensor<4>, y: Tensor<4>) -> Tensor<4> {
     numerator / ((mxx + myy + C1) * (vx + vy + C2))
 }
 
-/// Gaussian means over the window, rows and columns one after the other.
+/// Separable Gaussian blur: down the columns, then along the rows.
 fn blur(x: Tensor<4>) -> Tensor<4> {
     let [b, c, h, w] = x.dims();
     let kernel: Vec<f32> = gaussian().into_iter().map(|weight| weight as f32).collect();
@@ -204,7 +204,7 @@ fn blur(x: Tensor<4>) -> Tensor<4> {
     conv2d(rows, across, None, ConvOptions::new([1, 1], [0, half], [1, 1], 1)).reshape([b, c, h, w])
 }
 
-/// Weights of the loss's window.
+/// Weights of the Gaussian window, with a sum of 1.
 fn gaussian() -> Vec<f64> {
     let weight = |i: usize| {
         let d = i as f64 - (GAUSSIAN / 2) as f64;

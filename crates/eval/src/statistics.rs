@@ -32,8 +32,8 @@ pub fn mean(figures: &[f64]) -> Option<f64> {
     (!figures.is_empty()).then(|| figures.iter().sum::<f64>() / figures.len() as f64)
 }
 
-/// Mean of one figure per person, with the percentile bootstrap over people; `None` without people. For paired
-/// differences it is the paired interval. An infinite figure (the PSNR of equal pictures) makes the mean infinite.
+/// Mean of one figure per person, with the percentile bootstrap interval over people; `None` without people. Of paired
+/// differences, it is the paired interval. An infinite figure (the PSNR of equal pictures) makes the mean infinite.
 pub fn interval(figures: &[f64]) -> Option<Interval> {
     let (n, mean) = (figures.len(), mean(figures)?);
     let mut random = ChaCha8Rng::seed_from_u64(SEED);
@@ -49,20 +49,20 @@ pub fn difference(a: f64, b: f64) -> f64 {
     if a == b { 0.0 } else { a - b }
 }
 
-/// A quantile of sorted values, linear between them.
+/// A quantile of sorted values, with linear interpolation.
 ///
 /// # Panics
-/// Without values.
+/// If there is no value.
 pub fn quantile(sorted: &[f64], share: f64) -> f64 {
     let at = share * (sorted.len() - 1) as f64;
     let (below, above) = (sorted[at.floor() as usize], sorted[at.ceil() as usize]);
     if below == above { below } else { below + (above - below) * at.fract() }
 }
 
-/// A quantile of times in seconds, linear between them.
+/// A quantile of times in seconds, with linear interpolation.
 ///
 /// # Panics
-/// Without times.
+/// If there is no time.
 pub fn quantile_of_times(times: &[Duration], share: f64) -> f64 {
     let mut seconds: Vec<f64> = times.iter().map(Duration::as_secs_f64).collect();
     seconds.sort_by(f64::total_cmp);
@@ -77,7 +77,7 @@ pub mod number {
     /// Writes a number, or text if it is not finite.
     ///
     /// # Errors
-    /// Those of the serializer.
+    /// Errors of the serializer.
     pub fn serialize<S: Serializer>(value: &f64, serializer: S) -> Result<S::Ok, S::Error> {
         if value.is_finite() { value.serialize(serializer) } else { value.to_string().serialize(serializer) }
     }
@@ -85,7 +85,7 @@ pub mod number {
     /// Reads a number or its text.
     ///
     /// # Errors
-    /// Those of the deserializer, and for text that is no number.
+    /// Errors of the deserializer, and text that is no number.
     pub fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
         #[derive(Deserialize)]
         #[serde(untagged)]

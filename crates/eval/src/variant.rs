@@ -10,8 +10,8 @@ use snapsnap_data::sample::Handling;
 use snapsnap_net::config::PrecisionChoice;
 use snapsnap_splat::Preset;
 
-/// A section `[ablations.NAME]` of an evaluation, and `[model]` or `[settings.NAME]` of a benchmark. Unset keys are
-/// those of the model under test.
+/// A section `[ablations.NAME]` of an evaluation, or `[model]` or `[settings.NAME]` of a benchmark. Unset keys have
+/// the values of the model under test.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Variant {
@@ -39,7 +39,7 @@ pub struct Variant {
     pub preset: Option<Preset>,
     /// Benchmarks: whether splats smaller than a pixel keep their weight.
     pub antialiased: Option<bool>,
-    /// Benchmarks: the scene. Settings of a scene are compared with its one setting that omits nothing.
+    /// Benchmarks: the scene. Settings of a scene are compared with the scene's one setting that omits nothing.
     pub scene: Option<String>,
     /// Benchmarks: the omitted work, for the report. Unset: none.
     pub omits: Option<String>,
@@ -78,7 +78,7 @@ impl Variant {
         }
     }
 
-    /// The set keys with their values, without `weights`, which JSON cannot express if it is not UTF-8.
+    /// The set keys with their values, except `weights`: JSON cannot express a path that is not UTF-8.
     fn keys(&self) -> Map<String, Value> {
         let variant = json!(Self { weights: None, ..self.clone() });
         let Value::Object(mut keys) = variant else { unreachable!("a variant has keys") };
@@ -86,7 +86,7 @@ impl Variant {
         keys
     }
 
-    /// The first key whose value makes no sense, and why.
+    /// The first key with an invalid value, and the reason.
     pub(crate) fn refusal(&self) -> Option<(&'static str, String)> {
         let photographs = self.photographs.as_ref().and_then(Handling::problem);
         let must = |is_wrong: bool, range: &str| is_wrong.then(|| format!("must be {range}"));
@@ -119,7 +119,7 @@ impl Variant {
     }
 }
 
-/// Why a list of input views makes no sense.
+/// The reason why a list of input views is invalid; `None` for a valid list.
 pub(crate) fn views_problem(inputs: &[usize]) -> Option<String> {
     if inputs.len() == 1 || inputs.len() > 64 {
         return Some("must be empty, or 2 to 64 views".into());

@@ -20,7 +20,7 @@ use crate::{Content, Cutting, Frame, MIN_SIDE, Placement, Rect, Source, rim, spe
 /// A photograph without its background.
 pub(super) struct Cutout<'a> {
     pub path: &'a Path,
-    /// File of the mask.
+    /// File of the mask; without one, of the photograph.
     mask_path: &'a Path,
     pub rgb: RgbImage,
     pub mask: GrayImage,
@@ -77,14 +77,14 @@ impl<'a> Cutout<'a> {
         };
         // The demo includes every pixel that is not 0. Lossy masks have many such pixels outside the person.
         let least = if matches!(placement, Placement::Demo { .. }) { 1 } else { u8::MAX.div_ceil(2) };
-        // The demo has no such steps, and a network's mask needs none.
+        // The demo removes neither specks nor rims, and a network's mask has none.
         let (specks, rim) = match placement {
             Placement::Training { .. } if is_given => {
                 (specks::remove(&mut mask, least), rim::clean(&mut rgb, &mut mask))
             }
             _ => (0, 0),
         };
-        // A network's mask has them already.
+        // [`matte`] has applied the strokes to a network's mask already.
         if let Some(strokes) = strokes.filter(|_| is_given) {
             strokes::paint(strokes, &mut mask, |_, _| {});
         }
@@ -108,8 +108,8 @@ impl<'a> Cutout<'a> {
         Ok(Self { path, mask_path, rgb, mask, frame, report })
     }
 
-    /// Turns the photograph towards the middle of the person's box, or of the common box of both photographs. Returns colours and mask
-    /// before the turn.
+    /// Turns the photograph towards the middle of the person's box, or of the common box of both photographs. Returns
+    /// colours and mask before the turn.
     pub fn turn(&mut self, common: Option<Standing>) -> Option<(RgbImage, GrayImage)> {
         let person = common.map_or(self.report.person, |standing| standing.person);
         let turn = Turn::towards(person, self.frame.size, self.frame.shot)?;
@@ -164,7 +164,7 @@ fn alpha(picture: &DynamicImage) -> Result<GrayImage, &'static str> {
             "has no alpha channel: cut the person out, give masks with --masks FRONT_MASK BACK_MASK, or let --cutout auto do it",
         );
     }
-    // The usual case needs no copy.
+    // RGBA, the usual case, needs no copy.
     let rgba = picture.as_rgba8().map_or_else(|| Cow::Owned(picture.to_rgba8()), Cow::Borrowed);
     let mask = GrayImage::from_fn(rgba.width(), rgba.height(), |x, y| image::Luma([rgba.get_pixel(x, y)[3]]));
     if mask.pixels().all(|p| p[0] == u8::MAX) {

@@ -1,4 +1,4 @@
-//! Signs that two photographs are not those of the front and the back of one person who stands upright.
+//! Signs that two photographs do not show the front and the back of one person who stands upright.
 
 use std::fmt;
 
@@ -10,14 +10,14 @@ use super::cutout::Cutout;
 
 /// Mask value from which a pixel belongs to the person.
 const PERSON: u8 = 128;
-/// Share of a border from which the mask touches it.
+/// Share of a border from which the mask counts as touching the border.
 const TOUCHED: f32 = 0.05;
-/// Number of borders that no person touches.
+/// Number of touched borders from which a mask is doubtful.
 const BORDERS: usize = 3;
 /// Largest width of a person as a share of the height. Outstretched arms reach about 1.
 const WIDEST: f32 = 1.2;
-/// Least overlap (intersection over union) of the front's silhouette and the mirrored back's, scaled to one height. Right pairs have 0.63 and
-/// more (docs/notes/photographs.md).
+/// Least overlap (intersection over union) of the front's silhouette and the mirrored back's, scaled to one height.
+/// Right pairs have 0.63 and more (docs/notes/photographs.md).
 const OVERLAP: f32 = 0.6;
 /// Rows of the face below the top of the person's box, as shares of the height.
 const FACE: [f32; 2] = [0.03, 0.11];
@@ -32,10 +32,10 @@ const COLUMNS: i64 = 2 * GRID as i64;
 /// Largest mean difference of colours, of 255, between two files of one picture.
 const EQUAL: f32 = 2.0;
 
-/// A sign that photographs are not those of the front and the back of one person who stands upright.
+/// A sign that photographs are unsuitable, and the photographs that it concerns.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Doubt {
-    /// The photographs that it is about: their files, or other names.
+    /// Files or other names of the photographs.
     pub photographs: Vec<String>,
     /// What is wrong.
     #[serde(flatten)]
@@ -46,9 +46,9 @@ pub struct Doubt {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 #[serde(tag = "sign", rename_all = "kebab-case")]
 pub enum Sign {
-    /// The mask touches so many borders of the picture as no person does.
+    /// The mask touches more borders of the picture than a person does.
     TouchesBorders {
-        /// Their number.
+        /// Number of touched borders.
         borders: usize,
     },
     /// The person is wider than high.
@@ -157,14 +157,14 @@ fn grid() -> impl Iterator<Item = (u32, u32)> {
     (0..GRID).flat_map(|y| (0..GRID).map(move |x| (x, y)))
 }
 
-/// Intersection over union of the front's silhouette and the mirrored back's, scaled to one height and shifted to where they overlap most.
-/// Their widths may differ: an arm looks longer in the photograph in which it is nearer to the camera.
+/// Intersection over union of the front's and the mirrored back's silhouette, at one height and where they overlap
+/// most. Widths may differ: an arm looks longer in the photograph in which it is nearer to the camera.
 fn overlap(front: &Cutout, back: &Cutout) -> f32 {
     let (front, back) = (silhouette(front, false), silhouette(back, true));
     let common = |shift: usize| {
         let count = |a: &[bool], b: &[bool]| a.iter().skip(shift).zip(b).filter(|(a, b)| **a && **b).count();
         let rows = || front.iter().zip(&back);
-        // To either side.
+        // Shifted to either side.
         let counts = [rows().map(|(a, b)| count(a, b)).sum(), rows().map(|(a, b)| count(b, a)).sum()];
         counts.into_iter().fold(0, usize::max)
     };
@@ -173,7 +173,7 @@ fn overlap(front: &Cutout, back: &Cutout) -> f32 {
     most as f32 / (front + back - most).max(1) as f32
 }
 
-/// Rows of a silhouette, mirrored or not, in cells of 1/64 of the person's height, around the middle of the person's box.
+/// Rows of a silhouette, mirrored or not, in cells of 1/64 of the person's height, around the middle of its box.
 fn silhouette(one: &Cutout, mirrored: bool) -> Vec<Vec<bool>> {
     let Rect { x, y, width, height } = one.report.person;
     let (height, grid) = (i64::from(height), i64::from(GRID));
@@ -204,8 +204,8 @@ fn are_equal(front: &Cutout, back: &Cutout, mirrored: bool) -> bool {
     count > 0 && sum / count as f32 <= EQUAL
 }
 
-/// Share of the pixels at the place of the face that have the colour of skin. Its hue hardly depends on its brightness (Chai and Ngan, "Face
-/// segmentation using skin-color map in videophone applications", 1999). Brown hair has it as well.
+/// Share of the face's pixels that have the hue of skin, which hardly depends on brightness (Chai and Ngan, "Face
+/// segmentation using skin-color map in videophone applications", 1999). Brown hair has this hue as well.
 fn skin(one: &Cutout) -> f32 {
     let Rect { x, y, width, height } = one.report.person;
     let at = |share: f32| (share * height as f32) as u32;

@@ -1,4 +1,4 @@
-//! Photographs that differ in exposure or white balance: the back's colours are matched to the front's (docs/method.md, "Exposure").
+//! Matches the back's colours to the front's if exposure or white balance differ (docs/method.md, "Exposure").
 
 use glam::Vec3;
 use image::{GrayImage, RgbImage};
@@ -9,25 +9,25 @@ use super::Rect;
 const ROWS: u32 = 200;
 /// Distance of the compared pixels from the silhouette, as shares of the person's height.
 const BAND: (f32, f32) = (0.012, 0.04);
-/// Largest difference of the widths of a row in front and back, as a share of the larger one. Then the edges show the same surface.
+/// Rows whose widths in front and back differ by more than this share of the larger width show different surfaces.
 const WIDER: f32 = 0.2;
-/// Fewest rows with colours, on either edge.
+/// Fewest rows with colours on either edge.
 const FEWEST: usize = 20;
 /// Channels below this value count as this value: their ratio would be noise.
 const DARK: f32 = 0.02;
 /// Brightest channel of colours that are compared: darker ones are noise, brighter ones clipped.
 const USABLE: (f32, f32) = (0.06, 0.97);
-/// Least differences of the brightness and of a channel beside it that are corrected, and the largest corrections, as logarithms of
-/// ratios. The former lie above the differences of people who were photographed alike: light that stays with the camera, or a room that is
-/// brighter in front of them, makes front and back differ as well.
+/// Smallest difference that is corrected, and largest correction, of the brightness and of a channel relative to it,
+/// as logarithms of ratios. People photographed alike differ by less than the smallest: light that stays with the
+/// camera, or a room that is brighter in front of them, makes front and back differ as well.
 const BRIGHTNESS: (f32, f32) = (0.28, 0.8);
 const BALANCE: (f32, f32) = (0.08, 0.3);
 /// Mask value of pixels that show the person alone.
 const WHOLE: u8 = 250;
 const INSIDE: u8 = 128;
 
-/// Multiplies the back's colours so that surfaces which both photographs see have one colour. Returns the factors, unless the photographs
-/// hardly differ, or too few surfaces can be compared.
+/// Multiplies the back's colours so that surfaces in both photographs have equal colours. Returns the factors; `None`
+/// if the photographs hardly differ or too few rows can be compared.
 pub(super) fn match_back(
     front: (&RgbImage, &GrayImage),
     back: (&mut RgbImage, &GrayImage),
@@ -70,7 +70,7 @@ pub(super) fn match_back(
     Some(gain)
 }
 
-/// A row of the person: its width as a share of the person's height, and the mean colours beside its left and right ends, if they are known.
+/// A row of the person: its width as a share of the person's height, and the mean colours at its left and right ends.
 struct Row {
     width: f32,
     colors: [Option<Vec3>; 2],
@@ -117,7 +117,7 @@ mod tests {
 
     use super::*;
 
-    /// A person of 100 × 300 pixels. `left` and `right` are the brightnesses of the halves; the middle differs in front and back.
+    /// A person of 100 × 300 pixels. `left` and `right` are the brightnesses of its halves, `middle` is a colour.
     fn person(middle: [u8; 3], [left, right]: [f32; 2], gain: [f32; 3]) -> (RgbImage, GrayImage) {
         let inside = |x: u32, y: u32| (50..150).contains(&x) && (20..320).contains(&y);
         let rgb = RgbImage::from_fn(200, 340, |x, y| {

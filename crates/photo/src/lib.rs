@@ -1,5 +1,4 @@
-//! Photographs of a person → canvases and cameras → Gaussians: the one road from pictures to a person (docs/architecture.md, "The
-//! road").
+//! Photographs of a person are placed on canvases and become Gaussians (docs/architecture.md, "The road").
 
 mod cutout;
 mod doubts;
@@ -41,7 +40,7 @@ pub use shot::{ELEVATIONS, FOCALS, Shot, Viewpoint};
 
 /// Least side of a photograph in pixels.
 const MIN_SIDE: u32 = 64;
-/// Canvas side to which heights and rows refer.
+/// Side of the canvas to which constant heights and rows refer, in pixels.
 const REFERENCE_SIDE: f32 = 1024.0;
 
 /// Placement of a photograph on its canvas.
@@ -61,48 +60,48 @@ pub enum Placement {
     },
 }
 
-/// Who tells a photograph's person from the background.
+/// What separates the person from the background.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Cutting {
     /// Masks and alpha channels alone.
     Given,
-    /// A network, for photographs without either.
+    /// A network, for photographs with neither a mask nor an alpha channel.
     Missing,
-    /// A network, for all photographs without a mask's file.
+    /// A network, for all photographs without a mask file. Alpha channels are ignored.
     All,
 }
 
-/// What is known of a picture.
+/// Where the pixels of a photograph come from.
 #[derive(Clone, Copy)]
 pub enum Content<'a> {
     /// The file at the source's path.
     File,
     /// The content of a file.
     Bytes(&'a [u8]),
-    /// Its pixels, and the person's share of each, if that is known.
+    /// The pixels, and a mask (the person's share of each pixel) if there is one.
     Pixels(&'a RgbImage, Option<&'a GrayImage>),
 }
 
 /// A photograph and what is known about it.
 #[derive(Clone, Copy)]
 pub struct Source<'a> {
-    /// Its file, or a name for messages.
+    /// Path of the file, or a name for messages.
     pub path: &'a Path,
-    /// Where its pixels are.
+    /// Where the pixels come from.
     pub content: Content<'a>,
     /// File of the mask (white: person).
     pub mask: Option<&'a Path>,
-    /// Corrections of the mask, of any size: white keeps, black removes, 128 changes nothing.
+    /// A picture of any size that corrects the mask: white keeps, black removes, 128 changes nothing.
     pub strokes: Option<&'a GrayImage>,
 }
 
 impl<'a> Source<'a> {
-    /// A file alone.
+    /// A photograph in a file, without mask file and strokes.
     pub fn file(path: &'a Path) -> Self {
         Self { path, content: Content::File, mask: None, strokes: None }
     }
 
-    /// Pixels alone, and the person's share of each, if that is known.
+    /// A photograph in memory, with its mask if there is one.
     pub fn pixels(name: &'a Path, rgb: &'a RgbImage, mask: Option<&'a GrayImage>) -> Self {
         Self { content: Content::Pixels(rgb, mask), ..Self::file(name) }
     }
@@ -116,10 +115,10 @@ impl<'a> Source<'a> {
     }
 }
 
-/// What is known of a photograph's camera, after a turn.
+/// What is known about the camera of a photograph, after the photograph was turned.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Frame {
-    /// What the file or the user says.
+    /// Focal length and pitch, from the file or the user.
     pub shot: Shot,
     /// Width and height of the photograph in pixels.
     pub size: [u32; 2],
@@ -127,29 +126,29 @@ pub struct Frame {
     pub mapping: Mapping,
 }
 
-/// Photographs of one person on their canvases: of the front and, as far as there are more, of the back and of other sides.
+/// Photographs of one person on their canvases: the front, then the back and other sides if there are more.
 #[derive(Debug, Clone)]
 pub struct Photographs {
-    /// On canvases of one size.
+    /// The photographs, on canvases of one size.
     pub canvases: Vec<Photograph>,
-    /// Their cameras, as far as they are known.
+    /// The camera of each photograph, as far as it is known.
     pub frames: Vec<Frame>,
-    /// Colours and masks before they are turned and placed.
+    /// Colours and mask of each photograph before it is turned and placed.
     pub cutouts: Vec<(RgbImage, GrayImage)>,
-    /// What was done to each.
+    /// What was done to each photograph.
     pub reports: Vec<PhotoReport>,
-    /// Signs that the first two are not photographs as the networks need them.
+    /// Signs that the first two photographs are unsuitable for the networks.
     pub doubts: Vec<Doubt>,
 }
 
-/// Reads photographs and places each on a canvas of `side` pixels. The mask of the person is the source's, or without one what `cutting`
-/// says. With [`Placement::Training`], two photographs whose sizes and boxes agree are taken for photographs from one place. They get the
-/// same scale and offset. If a focal length is known, from the files or as `focal` in millimetres of 35 mm film, people beside the middle
-/// are turned into it.
+/// Reads photographs and places each on a canvas of `side` pixels. `cutting` says where the mask of a source without
+/// one comes from. With [`Placement::Training`], two photographs whose sizes and boxes agree count as taken from one
+/// place and get the same scale and offset. If a focal length is known, from the files or as `focal` (millimetres of
+/// 35 mm film), a photograph whose person is beside the middle is turned towards the person.
 ///
 /// # Errors
-/// [`FileError`]: unreadable files, a mask of another size, an empty or missing mask, a photograph in which the network finds nobody, a
-/// file of less than 64 pixels or of a single colour, or, with [`Placement::AsIs`], a picture of another size than the canvas.
+/// [`FileError`]: unreadable files, a mask of another size, an empty or missing mask, nobody found by the network, a
+/// file below 64 pixels or of a single colour, or, with [`Placement::AsIs`], a picture of another size.
 pub fn read(
     sources: &[Source],
     cutting: Cutting,
@@ -161,7 +160,7 @@ pub fn read(
     for source in sources {
         cutouts.push(Cutout::read(*source, cutting, side, placement)?);
     }
-    // Photographs of one person are taken with one camera.
+    // One camera took all photographs: a value that one file lacks is taken from another file.
     let (mut pitch, mut lens) = (None, focal);
     for cutout in &cutouts {
         (pitch, lens) = (pitch.or(cutout.frame.shot.pitch), lens.or(cutout.frame.shot.focal));
@@ -207,7 +206,7 @@ pub fn read(
     Ok(made)
 }
 
-/// Colours and mask of one photograph, as [`read`] takes them for [`Placement::Training`].
+/// Colours and mask of one photograph, as [`read`] computes them for [`Placement::Training`].
 ///
 /// # Errors
 /// As [`read`].

@@ -1,6 +1,6 @@
-//! Cuts a person out of a photograph (docs/method.md, "Background removal"): a network finds the pixels, a guided filter lays their edges
-//! onto those of the photograph (He et al., "Guided Image Filtering", 2013; He and Sun, "Fast Guided Filter", 2015), and the background's
-//! share is taken out of mixed colours (Forte, "Approximate Fast Foreground Colour Estimation", 2021).
+//! Removes backgrounds (docs/method.md, "Background removal"): a network finds the person, a guided filter aligns
+//! edges with the photograph's (He et al., "Guided Image Filtering", 2013; He and Sun, "Fast Guided Filter", 2015),
+//! and mixed colours lose the background's share (Forte, "Approximate Fast Foreground Colour Estimation", 2021).
 
 use glam::{Mat3, Vec3};
 use image::imageops::{self, FilterType};
@@ -15,11 +15,11 @@ use crate::resize::bilinear;
 
 /// Margin of the network's second look around the person's box, as a share of the box's longer side.
 const MARGIN: f32 = 0.1;
-/// Probability of a pixel of the person.
+/// Probability above which a pixel counts as the person's.
 const LIKELY: f32 = 0.5;
-/// Distance from the person's largest piece, in pixels of [`SIDE`], beyond which nothing belongs to it.
+/// Distance from the person's largest piece, in pixels of [`SIDE`], beyond which no pixel belongs to the person.
 const NEAR: usize = 6;
-/// Longest side of a cut-out. Pictures of more pixels are reduced first, two of one size alike. Canvases have 1024 rows.
+/// Longest side of a cut-out. Larger pictures are reduced first, two of one size alike. Canvases have 1024 rows.
 const LONGEST: u32 = 4096;
 /// Longer side of the pictures on which filters are computed.
 const FILTERED: u32 = 640;
@@ -27,21 +27,21 @@ const FILTERED: u32 = 640;
 const RADIUS: usize = 4;
 /// Variance below which the photograph has no edges.
 const EPSILON: f32 = 1e-4;
-/// A gap in the person is filled if no probability in it is lower: it is a shadow, such as that below the chin. Between an arm and the
-/// body it is far lower.
+/// A gap in the person is filled if no probability in the gap is lower: the gap is a shadow, for example below the
+/// chin. Between an arm and the body probabilities are far lower.
 const NO_GAP: f32 = 0.2;
 /// Least coverage of a pixel that is no part of a gap.
 const WHOLE: f32 = 0.95;
-/// The filter leaves edges soft. In the mask, a pixel shows the background up to the first value, and the person from the second on.
+/// Up to the first coverage, a mask's pixel is background, from the second on, person: filtered edges are soft.
 const SOFT: (f32, f32) = (0.3, 0.7);
-/// The same for colours: a mixed one does more harm than a corrected one.
+/// These limits for colours: a mixed colour does more harm than a corrected one.
 const MIXED: (f32, f32) = (0.1, 0.8);
 
-/// As [`super::segmenter::segment`].
+/// The signature of [`super::segmenter::segment`].
 type Segment<'a> = dyn Fn(&[f32]) -> Vec<f32> + 'a;
 
-/// Cuts the person out of a picture: its coverage, and the colours without the background's share. The picture is reduced first if it
-/// is longer than [`LONGEST`]. `strokes` correct the coverage. `None` if the network finds nobody.
+/// Colours without the background's share, and coverage, of the person in a picture. A picture longer than [`LONGEST`]
+/// is reduced first. `strokes` correct the coverage. `None` if the network finds nobody.
 pub fn matte(
     mut picture: RgbImage,
     segment: &Segment,
@@ -56,7 +56,7 @@ pub fn matte(
     let whole = Rect { x: 0, y: 0, width: picture.width(), height: picture.height() };
     let (_, person) = largest(&found(&picture, whole, segment))?;
     let part = around(person, whole);
-    // The person fills the second picture.
+    // In the second look the person fills the picture.
     let mut probability = found(&picture, part, segment);
     let (is_near, _) = largest(&probability)?;
     probability.iter_mut().zip(&is_near).filter(|(_, near)| !**near).for_each(|(p, _)| *p = 0.0);
@@ -71,7 +71,7 @@ pub fn matte(
     Some((picture, mask))
 }
 
-/// The network's answer for a part of a picture.
+/// The network's probabilities for a part of a picture.
 fn found(picture: &RgbImage, part: Rect, segment: &Segment) -> Vec<f32> {
     let part = imageops::crop_imm(picture, part.x, part.y, part.width, part.height);
     let small = imageops::resize(&*part, SIDE as u32, SIDE as u32, FilterType::Lanczos3);
@@ -81,7 +81,7 @@ fn found(picture: &RgbImage, part: Rect, segment: &Segment) -> Vec<f32> {
     segment(&(0..3).flat_map(plane).collect::<Vec<f32>>())
 }
 
-/// Pixels within [`NEAR`] of the largest piece of likely ones, and that piece's box.
+/// Whether each pixel lies within [`NEAR`] of the largest piece of likely pixels, and the box of this piece.
 fn largest(probability: &[f32]) -> Option<(Vec<bool>, Rect)> {
     let likely: Vec<bool> = probability.iter().map(|p| *p > LIKELY).collect();
     let Pieces { of, pieces } = pieces(&likely, SIDE as u32);
@@ -91,7 +91,7 @@ fn largest(probability: &[f32]) -> Option<(Vec<bool>, Rect)> {
     Some((near.iter().map(|share| *share > 1e-6).collect(), *person))
 }
 
-/// A box in pixels of [`SIDE`] with its margin, in pixels of the picture.
+/// Adds the margin to a box in pixels of [`SIDE`]. Returns the box in pixels of the picture.
 fn around(person: Rect, whole: Rect) -> Rect {
     let (sx, sy) = (whole.width as f32 / SIDE as f32, whole.height as f32 / SIDE as f32);
     let margin = MARGIN * (person.width as f32 * sx).max(person.height as f32 * sy);
@@ -105,7 +105,7 @@ fn around(person: Rect, whole: Rect) -> Rect {
     Rect { x: x0, y: y0, width: x1 - x0, height: y1 - y0 }
 }
 
-/// What the full resolution needs of the filters: planes of a small picture.
+/// The filters of a small picture, which are interpolated at full resolution.
 struct Filter {
     size: [usize; 2],
     /// Coverage = `slope` · colour + `offset`.
@@ -155,7 +155,7 @@ impl Filter {
             (slope[i], offset[i], alpha[i]) = (Vec3::ZERO, 1.0, 1.0);
         }
 
-        // Both means are taken over the pixels that surely show one of the two, and reach as far as the filter's edges.
+        // Means over pixels that surely show the person or the background, within the filter's radius.
         let of = |share: &dyn Fn(f32) -> f32| {
             let weights: Vec<f32> = alpha.iter().map(|a| share(*a)).collect();
             let weighted: Vec<Vec3> = color.iter().zip(&weights).map(|(c, w)| *c * *w).collect();
@@ -167,7 +167,7 @@ impl Filter {
         Self { size, slope, offset, person, background }
     }
 
-    /// Writes the coverage and the person's colours in the part of a picture that the filter is of.
+    /// Writes the coverage and the person's colours into the part of the picture for which the filter was made.
     fn cut_out(&self, picture: &mut RgbImage, mask: &mut GrayImage, part: Rect) {
         let across = taps(self.size[1], part.width as usize, false);
         let down = taps(self.size[0], part.height as usize, false);
@@ -180,7 +180,7 @@ impl Filter {
                 let alpha = between(share, MIXED);
                 if alpha > 0.0 && alpha < 1.0 {
                     let (person, background) = (self.at(&self.person, at), self.at(&self.background, at));
-                    // What is left over belongs to the person by its share.
+                    // The person gets its share of the residual.
                     let left = color - alpha * person - (1.0 - alpha) * background;
                     let own = (person + alpha * left).clamp(Vec3::ZERO, Vec3::ONE);
                     *pixel = Rgb(own.to_array().map(|c| (255.0 * c).round() as u8));
@@ -189,7 +189,7 @@ impl Filter {
         }
     }
 
-    /// A plane between the pixels of the small picture.
+    /// Interpolates a plane of the small picture.
     fn at<T>(&self, plane: &[T], [(y0, y1, fy), (x0, x1, fx)]: [Tap; 2]) -> T
     where
         T: Copy + std::ops::Mul<f32, Output = T> + std::ops::Add<Output = T>,
@@ -203,7 +203,7 @@ fn unit(pixel: &Rgb<u8>) -> Vec3 {
     Vec3::from_array(pixel.0.map(f32::from)) / 255.0
 }
 
-/// Pixels of gaps that belong to the person.
+/// Pixels of gaps that are filled ([`NO_GAP`]).
 fn no_gaps(alpha: &[f32], p: &[f32], width: usize) -> Vec<usize> {
     let is_open: Vec<bool> = alpha.iter().map(|a| *a < WHOLE).collect();
     let Pieces { of, pieces } = pieces(&is_open, width as u32);
@@ -261,8 +261,8 @@ mod tests {
     const PERSON: [u8; 3] = [200, 60, 40];
     const WALL: [u8; 3] = [60, 120, 160];
 
-    /// A photograph of a person of 100 × 300 units in a picture of 300 × 400, `scale` pixels to a unit, with a dark spot on the chest. The
-    /// pixels along the left edge are half wall.
+    /// A person of 100 × 300 units in a picture of 300 × 400, with a dark spot on the chest. A unit is `scale` pixels.
+    /// The pixels along the left edge are half wall.
     fn photograph(scale: u32) -> RgbImage {
         RgbImage::from_fn(300 * scale, 400 * scale, |x, y| {
             let is_tall = (50 * scale..350 * scale).contains(&y);
@@ -276,7 +276,7 @@ mod tests {
         })
     }
 
-    /// A network that finds what is redder than the wall, blurred, and is unsure about the spot.
+    /// A network that finds reddish pixels, blurred, and is unsure about the grey spot.
     fn network(rgb: &[f32]) -> Vec<f32> {
         let (red, blue) = (&rgb[..SIDE * SIDE], &rgb[2 * SIDE * SIDE..]);
         let of = |(red, blue): (&f32, &f32)| {

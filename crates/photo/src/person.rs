@@ -1,4 +1,4 @@
-//! Photographs on their canvases → the person, at its height and where the photographs' cameras saw it.
+//! Makes a person of photographs on their canvases, and restores it to its height and to the real cameras.
 
 use std::fmt;
 use std::ops::RangeInclusive;
@@ -15,11 +15,11 @@ use crate::restoration::Restoration;
 use crate::shot::{ELEVATIONS, Viewpoint};
 use crate::{Frame, Photographs, Placement};
 
-/// Distances in metres beyond which a camera photographs nobody who stands upright.
+/// Plausible distances of a camera from a standing person, in metres.
 pub const DISTANCES: RangeInclusive<f64> = 1.0..=30.0;
-/// Height of a person whose height is not given, in metres.
+/// Assumed height of a person whose height is not given, in metres.
 const USUAL: f64 = 1.72;
-/// Share of the Gaussians above and below a person's height, which may be outliers.
+/// Share of the Gaussians at either end of the heights that may be outliers.
 const OUTSIDE: f64 = 0.0002;
 
 /// What a user says of the photographs.
@@ -48,7 +48,7 @@ impl Told {
         }
     }
 
-    /// Why cameras and heights have no effect with the networks of a config, if so.
+    /// The reason why cameras and heights have no effect with the networks of a config, if there is one.
     pub fn unplaced(&self, config: &Config) -> Option<Unplaced> {
         match self.placement(config) {
             Placement::AsIs => Some(Unplaced::AsIs),
@@ -74,10 +74,10 @@ pub enum Unplaced {
 /// Where a camera stood, and how that is known.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Seat {
-    /// Its place relative to the networks' person.
+    /// Elevation and distance relative to the person of the networks.
     #[serde(skip)]
     pub viewpoint: Viewpoint,
-    /// Distance in metres from a person of this height.
+    /// Distance in metres from a person of `height`.
     pub distance: f64,
     /// How the distance is known.
     pub distance_by: DistanceBy,
@@ -85,7 +85,7 @@ pub struct Seat {
     pub height: f64,
     /// Whether the height was not told.
     pub height_assumed: bool,
-    /// How far it looks down at the person's middle, in degrees.
+    /// How far the camera looks down at the person's middle, in degrees.
     pub elevation: f64,
     /// How the elevation is known.
     pub elevation_by: ElevationBy,
@@ -95,23 +95,23 @@ pub struct Seat {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 #[serde(tag = "by", rename_all = "kebab-case")]
 pub enum DistanceBy {
-    /// It was told.
+    /// The user told it.
     Told,
-    /// It follows from the lens.
+    /// It follows from the focal length.
     Lens {
         /// Millimetres of 35 mm film.
         focal: f64,
-        /// Whether a user told it; otherwise the file.
+        /// Whether the user told the focal length; otherwise it is the file's.
         told: bool,
     },
-    /// The nominal one: the lens does not fit a person of this size.
+    /// The nominal distance: the focal length does not fit a person of this size.
     Misfit {
         /// Millimetres of 35 mm film.
         focal: f64,
-        /// Whether a user told it; otherwise the file.
+        /// Whether the user told the focal length; otherwise it is the file's.
         told: bool,
     },
-    /// The nominal one: nothing is known.
+    /// The nominal distance: the focal length is unknown.
     Unknown,
 }
 
@@ -119,11 +119,11 @@ pub enum DistanceBy {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum ElevationBy {
-    /// It was told.
+    /// The user told it.
     Told,
     /// The file says it.
     File,
-    /// The nominal one: nothing is known.
+    /// The nominal elevation: nothing is known.
     Unknown,
 }
 
@@ -155,13 +155,13 @@ impl fmt::Display for Seat {
 }
 
 impl Told {
-    /// Where the camera of a photograph stood. `height` is that of the networks' person in metres, on a canvas of `side` pixels.
+    /// Where the camera of a photograph stood. The networks' person is `height` metres high, the canvas `side` pixels.
     fn seat(&self, frame: &Frame, side: usize, height: f64) -> Seat {
         let nominal = Viewpoint::default();
         let tall = self.height.unwrap_or(USUAL);
         let focal = frame.shot.focal;
         let seen = focal.map(|focal| Viewpoint::distance(focal, frame, side));
-        // The lens of a turned picture is a little shorter where the person would not fit into it.
+        // Turning may shorten the focal length so that the person fits. A told focal length is reported unchanged.
         let (lens, told) = (self.focal.or(focal).unwrap_or_default(), self.focal.is_some());
         let (distance, distance_by) = match (self.distance, seen) {
             (Some(distance), _) => (distance * height / tall, DistanceBy::Told),
@@ -189,20 +189,20 @@ impl Told {
     }
 }
 
-/// A person of photographs.
+/// A person made of photographs.
 pub struct Person {
     /// In the world of the config: y up, metres.
     pub gaussians: Gaussians,
-    /// Where the cameras of front and back stood, unless they are the canvases'.
+    /// Where the cameras of front and back stood; `None` if cameras have no effect ([`Told::unplaced`]).
     pub seats: Option<[Seat; 2]>,
-    /// What the networks made, in the front camera's frame. `origins` are those of [`Self::gaussians`] as well.
+    /// The networks' result, in the front camera's frame. Its `origins` hold for [`Self::gaussians`] as well.
     pub made: Reconstruction,
 }
 
 /// No Gaussian came out of photographs.
 #[derive(Debug)]
 pub struct NoGaussian {
-    /// What the networks did.
+    /// The steps of the networks.
     pub steps: Vec<Step>,
 }
 
@@ -214,8 +214,8 @@ impl fmt::Display for NoGaussian {
 
 impl std::error::Error for NoGaussian {}
 
-/// The person in the photographs of front and back, as their cameras saw it, at its height. `stage` is called with the name of each module
-/// before it runs.
+/// Makes the person in a front and a back photograph, restored to the real cameras and to its height. `stage` is
+/// called with the name of each module before it runs.
 ///
 /// # Errors
 /// [`NoGaussian`].
@@ -246,7 +246,7 @@ pub fn person(
             gaussians = placed(config, person, &restoration.front.world_to_camera.inverse());
             let mut means = host(gaussians.means.clone());
             let [low, top] = range(&means);
-            // The person stands where it stood.
+            // The lowest point returns to its old height.
             means.iter_mut().skip(1).step_by(3).for_each(|y| *y += (floor - low) as f32);
             let scale = told.height.map_or(1.0, |wanted| wanted / (top - low));
             let means =

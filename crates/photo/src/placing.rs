@@ -1,4 +1,4 @@
-//! Photographs on their canvases: as they are, as the demo places them, or at the training subjects' place and size, separately or together.
+//! Places photographs on canvases: unchanged, as the published demo does, or at the training subjects' size and place.
 
 use glam::DVec2;
 use image::{GenericImageView, GrayImage, RgbImage, imageops};

@@ -1,4 +1,4 @@
-//! Moves points from the rays of one camera to those of another, at the same distance in front of the body's axis.
+//! Moves points from the rays of one camera to the rays of another, at the same distance in front of the body's axis.
 
 use burn::tensor::Tensor;
 use glam::{DMat3, DVec3};
@@ -6,11 +6,11 @@ use snapsnap_splat::{Camera, RigidTransform, affine};
 
 use crate::placing::Mapping;
 
-/// Least distance in metres in front of the first camera and, along z, from the second one. Points nearer than that do not move.
+/// Least distance in metres in front of the first camera and, along z, from the second. Nearer points do not move.
 const NEAREST: f64 = 1e-3;
 
-/// A map of points: a pixel of one camera is a pixel of another, and the point moves from the first one's ray to the second one's. Its z
-/// is multiplied by `scale`. Both cameras are on the same side of the plane z = 0 and look towards it.
+/// Moves a point from its ray of one camera to the ray of the corresponding pixel of another camera, and multiplies
+/// its z by `scale`. Both cameras are on the same side of the plane z = 0 and look towards it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PlaneMap {
     /// The second camera's ray of a point p is `matrix`·p + `offset`, as long as p is far from the first camera.

@@ -35,7 +35,7 @@ pub enum Canvas {
     AsIs,
     /// The person's box was scaled to a place of the canvas.
     Scaled {
-        /// Whether the box of both photographs was placed.
+        /// Whether the common box of both photographs was placed.
         together: bool,
         /// Canvas pixels per pixel.
         scale: f32,

@@ -4,8 +4,8 @@ use image::imageops::{self, FilterType};
 use image::{ImageBuffer, Luma};
 use snapsnap_base::bilinear::taps;
 
-/// Resizes `values` of `from` (rows, columns) to `to` with the image crate's Lanczos filter, antialiased when shrinking.
-/// Values are in [0, 1].
+/// Resizes `values` in [0, 1] of size `from` (rows, columns) to `to` with the image crate's Lanczos filter,
+/// antialiased when shrinking.
 pub fn lanczos3(values: Vec<f32>, from: [usize; 2], to: [usize; 2]) -> Vec<f32> {
     let plane = ImageBuffer::<Luma<f32>, _>::from_raw(from[1] as u32, from[0] as u32, values)
         .expect("as many values as pixels");

@@ -1,7 +1,6 @@
-//! The person where the photographs' own cameras saw it (docs/method.md, "Upright targets" and "Cameras of a user"). The networks see an
-//! upright person in the nominal cameras' canvases. A pixel, with what is known about people, shows how far in front of the body's axis
-//! its surface lies. Each point therefore keeps its distance ahead of the axis, and moves from the ray of its canvas's camera to the ray
-//! of the real camera.
+//! Restores a person to the real cameras (docs/method.md, "Upright targets" and "Cameras of a user"). The networks see
+//! an upright person in the nominal cameras, and estimate from a pixel how far in front of the body's axis its surface
+//! lies. Each point keeps this distance and moves from the ray of the nominal camera to the ray of the real camera.
 
 use burn::tensor::{Tensor, TensorData};
 use glam::{DMat3, DVec3};
@@ -16,27 +15,27 @@ use crate::shot::Viewpoint;
 /// z of the body's axis, in metres.
 pub const AXIS: f64 = 0.0;
 
-/// The nominal camera of the front (0) or the back (1) on a canvas of `side` pixels. World: y up, the front camera above +z.
+/// The nominal camera of the front (0) or back (1) on a canvas of `side` pixels. World: y up, front camera above +z.
 pub fn nominal(photograph: usize, side: u32) -> Camera {
     Camera::orbit_at_yaw_degrees([0.0, 180.0][photograph], side)
 }
 
-/// Scale of a camera's points relative to a nominal camera's, if `mapping` maps its photograph to the canvas of `side` pixels. It is the
-/// ratio of the distances from the body's axis times the ratio of the pixel sizes.
+/// Scale of the points of `camera` over the points of a nominal camera: the ratio of the distances from the body's
+/// axis times the ratio of the pixel sizes. `mapping` maps the photograph to a canvas of `side` pixels.
 fn scale_of(mapping: &Mapping, camera: &Camera, side: u32) -> f64 {
     let nominal = Orbit::default();
     let distance = camera.world_to_camera.apply(nominal.centre).z / nominal.radius;
     distance * nominal.focal * f64::from(side) / camera.focal.y / mapping.scale.y
 }
 
-/// Moves people from the rays of their canvases' cameras to those of the cameras that photographed them.
+/// Moves people from the rays of the nominal cameras to the rays of the real cameras.
 #[derive(Debug, Clone)]
 pub struct Restoration {
-    /// Of front and back, in the turned world.
+    /// The maps of front and back, in the turned world ([`turn_to_front`]).
     pub maps: [PlaneMap; 2],
     /// The photographed person's size over the size of the points.
     pub scale: f64,
-    /// The camera in whose frame the restored person is, in the cameras' world. It has the nominal elevation.
+    /// The camera in whose frame the restored person is, in the real cameras' world. It has the nominal elevation.
     pub front: Camera,
 }
 
@@ -55,7 +54,7 @@ impl Restoration {
 
     /// For cameras that stand at these viewpoints, with a lens that shows the person at the same size.
     pub fn to_viewpoints(viewpoints: [Viewpoint; 2]) -> Self {
-        // Its number does not matter.
+        // Every side gives the same maps.
         const SIDE: u32 = 1024;
         let map = |i: usize| {
             let real = viewpoints[i].camera([0.0, 180.0][i], SIDE);
@@ -64,13 +63,13 @@ impl Restoration {
         Self { maps: [0, 1].map(map), scale: 1.0, front: nominal(0, SIDE) }
     }
 
-    /// The person where the cameras saw it, from the nominal front camera's frame to the frame of [`Self::front`], metres. Gaussians of photographed pixels belong to their photograph, the others
-    /// to the photograph that shows their half of the body. Gaussians that a camera does not see stay.
+    /// Restores a person, from the nominal front camera's frame to the frame of [`Self::front`]. Photographed Gaussians
+    /// belong to their photograph, others to the photograph of their half of the body. Unseen Gaussians stay.
     pub fn person(&self, gaussians: Gaussians, origins: &[Origin]) -> Gaussians {
         let to_camera = nominal(0, self.front.width).world_to_camera;
         let to_world = to_camera.inverse();
         let world = affine(gaussians.means, &to_world.rotation, to_world.translation);
-        // Farther from the axis than any point, so that a point's own z decides for the others alone.
+        // Photographed pixels get a number beyond every z, so that the point's own z decides for other pixels alone.
         let sign = |origin: &Origin| match origin.view {
             Some(View::Front) => f32::MAX,
             Some(View::Back) => f32::MIN,
@@ -86,7 +85,7 @@ impl Restoration {
     }
 }
 
-/// From a world to one whose front camera is above +z.
+/// The turn about y that brings the front camera above +z.
 pub fn turn_to_front(front: &Camera) -> RigidTransform {
     let backward = -front.world_to_camera.rotation.row(2);
     let rotation = DMat3::from_rotation_y(-backward.x.atan2(backward.z));
@@ -104,7 +103,7 @@ mod tests {
 
     use super::*;
 
-    /// Means of people whose cameras stand at `viewpoints`, world. `origins` are those of the points.
+    /// World points of pixels of `view`, restored to cameras that both stand at `viewpoint`.
     fn restored(viewpoint: Viewpoint, points: &[DVec3], view: Option<View>) -> Vec<DVec3> {
         let device = Device::flex();
         let to_front = nominal(0, 1024).world_to_camera;
@@ -126,7 +125,7 @@ mod tests {
         let opposite = DVec3::new(-point.x, point.y, -point.z);
         let same = restored(Viewpoint::default(), &[point, opposite], None);
         assert!(same[0].abs_diff_eq(point, 1e-6) && same[1].abs_diff_eq(opposite, 1e-6), "{same:?}");
-        // A level camera far away sees heights as they are: the nominal one's picture of a point is a lower one there.
+        // A level camera far away sees heights as they are. The nominal camera's picture of a point is lower there.
         let level = Viewpoint { elevation: 0.0, distance: 1e3 };
         let (place, _) = nominal(0, 1024).project(point).expect("in front");
         let expected = (537.0 - place.y) * 2.0 / (0.8 * 1024.0) + 0.85;
@@ -139,7 +138,7 @@ mod tests {
         assert!(moved[1].abs_diff_eq(turned, ROUNDING), "{moved:?}");
     }
 
-    /// A pixel of the back belongs to the back's camera, also in front of the axis, where a pixel of a side belongs to the front's.
+    /// A back pixel belongs to the back's camera, even in front of the axis; a side pixel there to the front's camera.
     #[test]
     fn pixels_belong_to_the_cameras_that_saw_them() {
         let low = Viewpoint { elevation: -5.0, distance: 2.0 };

@@ -1,12 +1,12 @@
-//! The rim of a mask that is too large: pixels of the background's colour leave the mask, and pixels that mix person and background
-//! receive the person's colour (docs/method.md, "Rims").
+//! Corrects the rim of a mask that is too large: pixels of the background's colour leave the mask, and pixels that mix
+//! person and background receive the person's colour (docs/method.md, "Rims").
 
 use glam::Vec3;
 use image::{GrayImage, Rgb, RgbImage};
 
 use super::Rect;
 
-/// Width of the rim in pixels for a person of [`HEIGHT`] pixels. Masks that are too large by two thirds of it are corrected.
+/// Width of the rim in pixels for a person of [`HEIGHT`] pixels. Masks too large by two thirds of it are corrected.
 const REACH: u32 = 6;
 /// Height of the person that [`REACH`] refers to, in pixels.
 const HEIGHT: u32 = 739;
@@ -16,30 +16,30 @@ const MAX_REACH: u32 = 64;
 const DISTINCT: f32 = 0.12;
 /// Least share of the outline with distinct colours.
 const LEAST_DISTINCT: f32 = 0.25;
-/// Share of the distinct outline that has more of the background than of the person if a mask is too large.
+/// A mask is too large if this share of the distinct outline shows more of the background than of the person.
 const SHOWN: f32 = 0.4;
-/// Largest distance of a mixed colour from the line between both, as a share of its length, and in addition to it.
+/// Largest distance of a mixed colour from the line between both colours: a share of its length, plus a constant.
 const OFF_LINE: (f32, f32) = (0.35, 0.03);
-/// Up to this share of the background, a pixel is the person's; from the second on, it is the background's.
+/// Shares of the background up to which a pixel is the person's, and from which it is the background's.
 const MIXED: (f32, f32) = (0.1, 0.9);
-/// Distance of colours that count as one.
+/// Distance below which two colours count as equal.
 const ALIKE: f32 = 0.08;
-/// Least share of the outline that has its median colour, if it has but one.
+/// Least share of the outline with the median colour, if the outline counts as uniform.
 const UNIFORM: f32 = 0.6;
-/// Largest share of the person behind the outline that may have that colour as well.
+/// Largest share of the person behind the outline that may have this colour as well.
 const WORN: f32 = 0.3;
 /// Mask value from which a pixel is the person's.
 const INSIDE: u8 = 128;
-/// An outline longer than both the first, in pixels, and the box's area divided by the second is no person's.
+/// Longest outline of a person: the larger of the first number, in pixels, and the box's area over the second number.
 const LONGEST: (usize, usize) = (50_000, 20);
 
-/// Takes the background out of the rim of `mask` and of the colours there. Returns the number of pixels that left the mask.
+/// Removes the background from the rim of `mask` and from the colours there. Returns how many pixels left the mask.
 pub(super) fn clean(rgb: &mut RgbImage, mask: &mut GrayImage) -> usize {
     let Some(person) = Rect::around(mask, INSIDE) else { return 0 };
     let reach = (REACH * person.height).div_ceil(HEIGHT).clamp(1, MAX_REACH);
     let Some(rim) = Rim::new(mask, person, reach as i8) else { return 0 };
     let colors = Colors::new(&rim, rgb);
-    // A background of exactly one colour may be no background, as in a cut-out. Then the colour of the outline is tried.
+    // A background of exactly one colour may be none, as in a cut-out. Then the colour of the outline is tried.
     let shown = if colors.is_flat { None } else { colors.shares(&rim, &colors.outside) };
     let shares = shown.or_else(|| {
         let uniform = vec![colors.uniform(&rim)?; colors.own.len()];
@@ -57,7 +57,7 @@ pub(super) fn clean(rgb: &mut RgbImage, mask: &mut GrayImage) -> usize {
         lost += usize::from(*value < INSIDE);
         rgb.put_pixel(x, y, Rgb((255.0 * colors.inside[i]).to_array().map(|c| c.round() as u8)));
     }
-    // Soft pixels beyond those that left are the background's as well.
+    // Soft pixels outside of pixels that left are background as well.
     for &pixel in &rim.beyond {
         let level = rim.levels[pixel];
         let inner = if level == -1 { 1 } else { level + 1 };
@@ -74,8 +74,8 @@ pub(super) fn clean(rgb: &mut RgbImage, mask: &mut GrayImage) -> usize {
 /// Pixels near the outline of a mask, in a part of the picture.
 struct Rim {
     part: Rect,
-    /// For each pixel of the part: 1 and more inside, counted from the outline, [`DEEP`] behind the rim; −1 and less outside, 0
-    /// farther away.
+    /// Level of each pixel of the part. Inside: 1, 2, … from the outline, [`DEEP`] behind the rim. Outside: −1, −2, …,
+    /// and 0 farther away.
     levels: Vec<i8>,
     /// Pixels inside, level by level.
     pixels: Vec<usize>,
@@ -135,13 +135,13 @@ impl Rim {
         Some(rim)
     }
 
-    /// The place in the picture.
+    /// Column and row of a pixel of the part in the picture.
     fn place(&self, at: usize) -> (u32, u32) {
         let at = at as u32;
         (self.part.x + at % self.part.width, self.part.y + at / self.part.width)
     }
 
-    /// The neighbours inside of the part.
+    /// The neighbours of a pixel in the part, up to eight.
     fn neighbours(&self, at: usize) -> impl Iterator<Item = usize> + use<> {
         let (width, height) = (self.part.width as usize, self.part.height as usize);
         let (x, y) = (at % width, at / width);
@@ -152,7 +152,7 @@ impl Rim {
         .filter(move |to| *to != at)
     }
 
-    /// Those of them that share a side.
+    /// The neighbours that share a side, up to four.
     fn direct(&self, at: usize) -> impl Iterator<Item = usize> + use<> {
         let width = self.part.width as usize;
         self.neighbours(at).filter(move |to| to.abs_diff(at) == width || to.abs_diff(at) == 1)
@@ -161,12 +161,12 @@ impl Rim {
 
 /// Colours at the pixels of a rim, channels 0 to 1.
 struct Colors {
-    /// For each pixel of the part, its index among the rim's; `u32::MAX` for others.
+    /// For each pixel of the part, its index among the rim's pixels or the pixels beyond; `u32::MAX` for others.
     index: Vec<u32>,
     own: Vec<Vec3>,
-    /// Of the person behind the rim.
+    /// Colours of the person behind the rim.
     inside: Vec<Vec3>,
-    /// Of the picture outside of the mask.
+    /// Colours of the picture outside of the mask.
     outside: Vec<Vec3>,
     /// Whether the picture near the mask has exactly one colour.
     is_flat: bool,
@@ -214,7 +214,7 @@ impl Colors {
         Self { index, own, inside, outside, is_flat }
     }
 
-    /// The outline's colour, if it has but one and the person behind it has others.
+    /// The outline's colour, if it is uniform and the person behind it has other colours.
     fn uniform(&self, rim: &Rim) -> Option<Vec3> {
         let outline = rim.pixels.iter().take_while(|at| rim.levels[**at] == 1).count();
         let median = |channel: usize| {
@@ -229,8 +229,8 @@ impl Colors {
         (share(&self.own) >= UNIFORM && share(&self.inside) <= WORN).then_some(color)
     }
 
-    /// The share of the `background` in each pixel of the rim; 0 where nothing but person lies between it and the outline.
-    /// `None` if the mask is not too large.
+    /// The share of `background` in each pixel of the rim; 0 where only the person lies between the pixel and the
+    /// outline. `None` if the mask is not too large.
     fn shares(&self, rim: &Rim, background: &[Vec3]) -> Option<Vec<f32>> {
         // Share, and whether colours are distinct.
         let share = |i: usize| {
@@ -391,8 +391,8 @@ mod tests {
         assert_eq!(clean(&mut rgb, &mut grown), 0);
     }
 
-    /// The right half of the mask is too large, the left is good and has a soft fringe. People who are small, or whose feet are beyond
-    /// the frame, are corrected as well.
+    /// The right half of the mask is too large, the left is good and has a soft fringe. People who are small, or whose
+    /// feet are beyond the frame, are corrected as well.
     #[test]
     fn only_what_shows_the_background_leaves() {
         let (mut rgb, good) = (picture(BACKGROUNDS[3].1), mask(0.0));

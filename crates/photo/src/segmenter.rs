@@ -11,8 +11,8 @@ pub const SIDE: usize = NETWORK_SIDE;
 
 const WEIGHTS: &[u8] = include_bytes!("../../../assets/weights/u2netp.safetensors");
 
-/// Colours from 0 to 1, `[3, SIDE, SIDE]` → probability of each pixel to belong to the person, `[SIDE, SIDE]`. It runs on the CPU: it is
-/// small, and a GPU's kernels would take longer to compile.
+/// The probability of each pixel to belong to the person, `[SIDE, SIDE]`, from colours in [0, 1], `[3, SIDE, SIDE]`.
+/// It is computed on the CPU: the network is small, and a GPU's kernels would take longer to compile.
 pub fn segment(rgb: &[f32]) -> Vec<f32> {
     static NETWORK: OnceLock<Mutex<U2Net>> = OnceLock::new();
     let device = Device::flex();

@@ -1,4 +1,4 @@
-//! Where a photograph's camera stood, from the file or a user, and what follows for the person (docs/method.md, "Cameras of a user").
+//! What a file tells about its camera, and the camera's distance and elevation (docs/method.md, "Cameras of a user").
 
 use std::io::{BufReader, Cursor};
 
@@ -11,7 +11,7 @@ use super::{Content, Frame, Source};
 
 /// Focal lengths of lenses, in millimetres of 35 mm film.
 pub const FOCALS: std::ops::RangeInclusive<f64> = 8.0..=1200.0;
-/// Elevations in degrees beyond which a camera photographs nobody who stands upright.
+/// Plausible elevations of a camera that photographs a standing person, in degrees.
 pub const ELEVATIONS: std::ops::RangeInclusive<f64> = -45.0..=60.0;
 /// Diagonal of a frame of 35 mm film, in millimetres.
 const FILM: f64 = 43.267;
@@ -29,7 +29,7 @@ pub struct Shot {
 }
 
 impl Shot {
-    /// What the file's EXIF data say; nothing if there are none or they are damaged.
+    /// Reads the file's EXIF data. Missing or damaged data give nothing.
     pub fn of(source: &Source) -> Self {
         let reader = exif::Reader::new();
         let read = || match source.content {
@@ -46,14 +46,14 @@ impl Shot {
     fn in_exif(exif: &exif::Exif) -> Self {
         let field = |tag| exif.get_field(tag, In::PRIMARY).map(|field| &field.value);
         let focal = field(Tag::FocalLengthIn35mmFilm).and_then(|value| value.get_uint(0));
-        // The camera beside the screen looks the other way.
+        // The camera beside the screen looks the other way, so the pitch would be wrong.
         let is_selfie = field(Tag::LensModel).is_some_and(|lens| matches!(lens, Value::Ascii(texts) if texts.iter().any(|text| text.windows(5).any(|part| part == b"front"))));
         let note = match field(Tag::MakerNote) {
             Some(Value::Undefined(bytes, _)) if !is_selfie => acceleration(bytes),
             _ => None,
         };
-        // Seen from the front, x points left, y down and z into the telephone, as the camera at its back looks. The acceleration is
-        // opposite to gravity.
+        // Axes of a telephone seen from its front: x left, y down, z into it, which is the direction of the camera at
+        // its back. The acceleration is opposite to gravity.
         let pitch = note
             .filter(|up| (0.8..1.2).contains(&up.length()))
             .map(|up| (-up.z / up.length()).asin().to_degrees());
@@ -61,7 +61,7 @@ impl Shot {
     }
 }
 
-/// The acceleration vector in Apple's maker note, in units of gravity: a TIFF directory whose offsets count from the note's start.
+/// The acceleration in units of gravity from Apple's maker note, a TIFF directory with offsets from the note's start.
 fn acceleration(note: &[u8]) -> Option<DVec3> {
     let bytes = |at: usize, length: usize| note.get(at..at.checked_add(length)?);
     let short = |at| bytes(at, 2).map(|b| u16::from_be_bytes([b[0], b[1]]));
@@ -83,12 +83,12 @@ fn acceleration(note: &[u8]) -> Option<DVec3> {
     Some(DVec3::new(fraction(0)?, fraction(1)?, fraction(2)?))
 }
 
-/// The camera of a placed photograph, relative to the body's axis, in metres of the networks' person.
+/// Place of a camera relative to the body's middle, in metres of the networks' person.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Viewpoint {
-    /// How far it looks down at the body's middle, in degrees.
+    /// How far the camera looks down at the body's middle, in degrees.
     pub elevation: f64,
-    /// Distance from the body's middle.
+    /// Distance of the camera from the body's middle.
     pub distance: f64,
 }
 
@@ -101,23 +101,23 @@ impl Default for Viewpoint {
 }
 
 impl Viewpoint {
-    /// The distance in metres from which a lens of `focal` millimetres of 35 mm film sees a person of this size on a canvas of `side`
-    /// pixels.
+    /// The distance in metres from which a lens of `focal` millimetres of 35 mm film sees a person of this size on a
+    /// canvas of `side` pixels.
     pub fn distance(focal: f64, frame: &Frame, side: usize) -> f64 {
         let Orbit { focal: nominal, radius, .. } = Orbit::default();
         radius * pixels(focal, frame.size) * frame.mapping.scale.y / (nominal * side as f64)
     }
 
-    /// How far, in degrees, a camera whose optical axis looks down by `pitch` degrees looks down at the body's middle. The other arguments
-    /// are those of [`Self::distance`].
+    /// The angle in degrees by which a camera looks down at the body's middle if its optical axis looks down by
+    /// `pitch` degrees. The other arguments are as in [`Self::distance`].
     pub fn elevation(pitch: f64, focal: f64, frame: &Frame, side: usize) -> f64 {
         let principal = Orbit::default().camera(side as u32).principal_point;
         let below = frame.mapping.source(principal).y - f64::from(frame.size[1]) / 2.0;
         pitch + (below / pixels(focal, frame.size)).atan().to_degrees()
     }
 
-    /// The camera of a canvas of `side` pixels that stands here, `yaw_degrees` around the person from the front's. World: y up, the front
-    /// camera above +z.
+    /// The camera of this viewpoint on a canvas of `side` pixels, `yaw_degrees` around the person from the front.
+    /// World: y up, the front camera above +z.
     pub fn camera(&self, yaw_degrees: f64, side: u32) -> Camera {
         let nominal = Orbit::default();
         // The person has the same size on the canvas.
@@ -127,7 +127,7 @@ impl Viewpoint {
     }
 }
 
-/// A focal length of 35 mm film in pixels of a picture.
+/// Converts a focal length of 35 mm film into pixels of a picture.
 pub(super) fn pixels(focal: f64, picture: [u32; 2]) -> f64 {
     focal / FILM * f64::from(picture[0]).hypot(f64::from(picture[1]))
 }

@@ -1,5 +1,5 @@
-//! Specks of a mask far from the person. Left in, a few pixels in a corner would make the person's box larger and the person
-//! smaller.
+//! Removes specks of a mask far from the person. A few pixels in a corner would make the person's box larger and the
+//! person smaller.
 
 use image::GrayImage;
 
@@ -20,7 +20,7 @@ pub(super) struct Pieces {
     pub pieces: Vec<(usize, Rect)>,
 }
 
-/// Sets the mask to 0 at specks: small pieces far from the largest piece of the pixels that reach `least`. Returns their number.
+/// Clears small pieces far from the largest piece of the pixels that reach `least`. Returns the number of pieces.
 pub(super) fn remove(mask: &mut GrayImage, least: u8) -> usize {
     let (width, height) = mask.dimensions();
     let cell = width.max(height).div_ceil(CELLS).max(1);

@@ -5,11 +5,11 @@ use image::{GrayImage, Luma};
 
 /// Value of a pixel without a stroke.
 const UNTOUCHED: u8 = 128;
-/// How far browsers that add noise to pictures may be from it.
+/// Largest distance from [`UNTOUCHED`] without a stroke: some browsers add noise to pictures.
 const NOISE: u8 = 8;
 
-/// Lays strokes of any size over a mask: white keeps, black removes, [`UNTOUCHED`] changes nothing, and values between are soft edges.
-/// `keep` is called with each pixel that strokes keep.
+/// Lays strokes of any size over a mask: white keeps, black removes, [`UNTOUCHED`] changes nothing, and values between
+/// are soft edges. `keep` is called with each pixel that strokes keep.
 pub fn paint(strokes: &GrayImage, mask: &mut GrayImage, mut keep: impl FnMut(u32, u32)) {
     let strokes = imageops::resize(strokes, mask.width(), mask.height(), FilterType::Triangle);
     for ((x, y, Luma([share])), Luma([stroke])) in mask.enumerate_pixels_mut().zip(strokes.pixels()) {

@@ -1,4 +1,4 @@
-//! Placement of the person, soft edges and extreme sizes.
+//! Tests of placement, soft edges and extreme sizes.
 
 use super::*;
 use image::{Rgba, RgbaImage};
@@ -27,7 +27,7 @@ fn quarters() -> tempfile::NamedTempFile {
     saved(&picture)
 }
 
-/// The canvas of a photograph that is front and back, and what was done to it.
+/// Canvas and report of a photograph that is both front and back.
 fn one(path: &Path, placement: Placement) -> Result<(Photograph, PhotoReport), FileError> {
     let mut read = read(&[Source::file(path); 2], Cutting::Given, SIDE, placement, None)?;
     Ok((read.canvases.remove(0), read.reports.remove(0)))
@@ -162,7 +162,7 @@ fn photographs_from_one_place_are_placed_together() {
     }
 }
 
-/// A mask that is too large by a pixel, over a lawn: a user's photograph is corrected, and one that is the canvas already is not.
+/// A mask that is a pixel too large, over a lawn. A user's photograph is corrected, a ready canvas is not.
 #[test]
 fn rims_of_the_background_are_left_out_of_a_users_photographs() {
     let side = SIDE as u32;
@@ -186,7 +186,7 @@ fn rims_of_the_background_are_left_out_of_a_users_photographs() {
         let (canvas, report) = one(file.path(), placement).expect("a person");
         assert!(greenish(&canvas) > 300 && report.rim == 0, "{placement:?}: {}", greenish(&canvas));
     }
-    // Photographs of a training go the same way.
+    // Photographs in memory, as in training, are corrected as well.
     let rgb = DynamicImage::from(picture.clone()).into_rgb8();
     let mask = GrayImage::from_fn(side, side, |x, y| image::Luma([picture.get_pixel(x, y).0[3]]));
     let source = Source::pixels(Path::new("x"), &rgb, Some(&mask));

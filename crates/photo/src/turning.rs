@@ -1,4 +1,4 @@
-//! A photograph turned towards its person: what the camera would have seen if it had looked at the person's middle
+//! Turns a photograph towards its person: the view of a camera in the same place that looks at the person's middle
 //! (docs/method.md, "Cameras of a user").
 
 use glam::{DMat3, DVec2, DVec3};
@@ -10,7 +10,7 @@ use super::shot::{ELEVATIONS, Shot, pixels};
 
 /// Angle in degrees between the optical axis and the person's middle up to which a photograph stays as it is.
 const LEAST: f64 = 2.0;
-/// Angle in degrees beyond which a focal length and a place contradict each other.
+/// Angle in degrees beyond which focal length and place of the person contradict each other.
 const MOST: f64 = 45.0;
 
 /// A turn of a camera about its centre. Both pictures have the same size, and their optical axes in their middles.
@@ -27,8 +27,8 @@ pub(super) struct Turn {
 }
 
 impl Turn {
-    /// The turn towards the middle of the box `person` in a photograph of this width and height. The turned camera has no roll, if the
-    /// photograph has none. `None` for an unknown focal length, and for a person in the middle or too far from it.
+    /// The turn towards the middle of the box `person` in a photograph of size `picture`. A camera without roll has
+    /// none after the turn. `None` for an unknown focal length, and for a person in the middle or too far from it.
     pub fn towards(person: Rect, picture: [u32; 2], shot: Shot) -> Option<Self> {
         let focal = pixels(shot.focal?, picture);
         let size = DVec2::from(picture.map(f64::from));
@@ -39,7 +39,7 @@ impl Turn {
         if !(LEAST..=MOST).contains(&forward.z.acos().to_degrees()) {
             return None;
         }
-        // No photograph of a standing person has another pitch.
+        // Other pitches are implausible for a standing person.
         let pitch = shot.pitch.filter(|pitch| ELEVATIONS.contains(pitch)).unwrap_or(0.0).to_radians();
         let up = DVec3::new(0.0, -pitch.cos(), -pitch.sin());
         let right = forward.cross(up).normalize();
@@ -109,7 +109,7 @@ fn sample(rgb: &RgbImage, mask: &GrayImage, place: DVec2) -> Option<(Rgb<u8>, Lu
 mod tests {
     use super::*;
 
-    /// A white disc of 40 pixels on black, in the direction (x, y, 1) of a camera of 26 mm, as its angular size demands.
+    /// A white ball on black in the direction `towards` of a camera of 26 mm, of 40 pixels in the middle.
     fn ball(picture: [u32; 2], towards: DVec3) -> (RgbImage, GrayImage) {
         let focal = pixels(26.0, picture);
         let is_inside = |x: u32, y: u32| {

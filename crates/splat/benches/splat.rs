@@ -57,7 +57,7 @@ fn cameras(count: usize, size: u32) -> Vec<Camera> {
     (0..count).map(|i| Camera::orbit_at_yaw_degrees(i as f64 * 360.0 / count as f64, size)).collect()
 }
 
-/// Median time, and peak of additional host memory from before the preparation on.
+/// Median time, and peak of host memory beyond the memory before the preparation.
 #[derive(Clone, Copy)]
 struct Figure {
     time: Duration,

@@ -4,7 +4,7 @@ use glam::{DMat3, DVec2, DVec3};
 
 use crate::op::MAX_SIDE;
 
-/// `x ↦ rotation · x + translation`; `rotation` is orthonormal but may be a reflection (the published demo's is).
+/// `x ↦ rotation · x + translation`; `rotation` is orthonormal but may be a reflection, as in the published demo.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RigidTransform {
     /// Orthonormal 3×3 matrix.
@@ -49,7 +49,7 @@ pub struct Camera {
     pub world_to_camera: RigidTransform,
 }
 
-/// A camera that looks at a subject from around it.
+/// A camera on an orbit around a subject, which it looks at.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Orbit {
     /// Point that the camera looks at, world metres.
@@ -113,8 +113,8 @@ impl Camera {
         Orbit { yaw_degrees, ..Orbit::default() }.camera(size)
     }
 
-    /// `count` cameras evenly around the training orbit, the first in front. A subject is as high in an image of any
-    /// width as in a square one.
+    /// `count` cameras evenly around the training orbit, the first in front. The height of a subject in the image
+    /// does not depend on `width`.
     pub fn orbit(count: usize, width: u32, height: u32) -> Vec<Self> {
         let camera = |index| {
             let square = Self::orbit_at_yaw_degrees(360.0 * index as f64 / count as f64, height);
@@ -132,15 +132,15 @@ impl Camera {
         Self { width, height, focal, principal_point, ..*self }
     }
 
-    /// The same camera after a walk of so many degrees around the world's y axis, as [`Orbit::yaw_degrees`] counts them.
+    /// The same camera, moved by `degrees` around the world's y axis in the direction of [`Orbit::yaw_degrees`].
     pub fn turned(&self, degrees: f64) -> Self {
         let RigidTransform { rotation, translation } = self.world_to_camera;
         let rotation = rotation * DMat3::from_rotation_y(-degrees.to_radians());
         Self { world_to_camera: RigidTransform { rotation, translation }, ..*self }
     }
 
-    /// Centre of the camera in the world, metres. By the true inverse: a matrix from a file may be orthonormal to a few
-    /// digits only.
+    /// Centre of the camera in the world, metres. Computed with the inverse, not the transpose: a matrix from a file
+    /// may be orthonormal to a few digits only.
     pub fn centre(&self) -> DVec3 {
         -(self.world_to_camera.rotation.inverse() * self.world_to_camera.translation)
     }

@@ -69,8 +69,8 @@ impl Entry {
 /// Reads the cameras of `path`.
 ///
 /// # Errors
-/// [`FileError`] if the file cannot be read or is no such list, or if nothing can be rendered into one of its cameras. It
-/// names the entry and the field.
+/// [`FileError`] if the file cannot be read, is no list of cameras, or has a camera that cannot be rendered into. The
+/// error names the entry and the field.
 pub fn read(path: &Path) -> Result<Vec<Camera>, FileError> {
     parse(path, &file::read_text(path, MAX_BYTES).map_err(FileError::read(path))?)
 }
@@ -162,7 +162,7 @@ mod tests {
         assert_eq!(read.len(), cameras.len());
         for (got, expected) in read.iter().zip(&cameras) {
             assert_eq!((got.width, got.height, got.focal), (expected.width, expected.height, expected.focal));
-            // The last digit of a number may change on its way through text.
+            // The last digit of a number may change in the text.
             let point = DVec3::new(0.3, 1.1, -0.2);
             let ((a, depth), (b, expected)) =
                 got.project(point).zip(expected.project(point)).expect("in front");

@@ -5,7 +5,7 @@ use snapsnap_base::FileError;
 /// Errors of cameras, Gaussians and their files.
 #[derive(Debug, thiserror::Error)]
 pub enum SplatError {
-    /// The tensors of one set of Gaussians disagree.
+    /// A tensor of the wrong shape.
     #[error("Gaussians: `{field}` has shape {found:?}, expected {expected:?}")]
     Shape {
         /// Name of the tensor.
@@ -26,7 +26,7 @@ pub enum SplatError {
         /// Its fault.
         problem: String,
     },
-    /// A constant of the rasteriser that makes no sense.
+    /// A render option outside its allowed range.
     #[error("render option `{field}` must be {allowed}")]
     Option {
         /// Name of the option.
@@ -34,7 +34,7 @@ pub enum SplatError {
         /// The allowed values.
         allowed: &'static str,
     },
-    /// An array that memory does not hold, or that the device does not allow in one piece.
+    /// An array that does not fit into memory, or that is larger than the device's largest buffer.
     #[error(
         "{what} needs {bytes} bytes, more than this device holds in one piece: render fewer views at once, or a smaller image"
     )]
@@ -44,7 +44,7 @@ pub enum SplatError {
         /// Its size.
         bytes: u64,
     },
-    /// More pairs of splats and tiles than memory on the device can hold.
+    /// More pairs of a splat and a tile than the device's memory or [`RenderOptions`](crate::RenderOptions) allow.
     #[error(
         "{found} pairs of a splat and a 16×16 tile, at most {limit} fit: render fewer views at once, or a smaller image"
     )]
@@ -54,7 +54,7 @@ pub enum SplatError {
         /// Pairs that fit.
         limit: u64,
     },
-    /// A value that may not be written: a NaN or an infinity in a PLY blinds most viewers.
+    /// A value that is not written: most viewers fail at a NaN or an infinity in a PLY.
     #[error("Gaussian {index}: `{field}` is not finite")]
     NotFinite {
         /// Name of the tensor.

@@ -16,15 +16,15 @@ pub struct Gaussians {
     pub scales: Tensor<2>,
     /// Opacities `[N]` in [0, 1].
     pub opacities: Tensor<1>,
-    /// Colours `[N,3]` (red, green, blue), 0 black, 1 white; they may lie beyond.
+    /// Colours `[N,3]` (red, green, blue), 0 black, 1 white; values outside of [0, 1] are allowed.
     pub colors: Tensor<2>,
 }
 
 impl Gaussians {
-    /// Puts the tensors together.
+    /// A set of these tensors.
     ///
     /// # Errors
-    /// [`SplatError::Shape`] where a tensor's rows or columns do not fit.
+    /// [`SplatError::Shape`] if the number of rows or columns of a tensor is wrong.
     pub fn new(
         means: Tensor<2>,
         rotations: Tensor<2>,
@@ -71,7 +71,7 @@ impl Gaussians {
         self.means.device()
     }
 
-    /// Moves the centres by `transform`; leaves the quaternions alone.
+    /// Transforms the centres but not the quaternions.
     pub fn with_means_transformed(mut self, transform: &RigidTransform) -> Self {
         self.means = affine(self.means, &transform.rotation, transform.translation);
         self
@@ -109,8 +109,8 @@ pub fn affine(points: Tensor<2>, matrix: &DMat3, translation: DVec3) -> Tensor<2
     times(points, &rows) + translation
 }
 
-/// `x` `[N, K]` times a small constant matrix given by its K rows. As a sum of K scaled rows: a GPU would tune a matrix
-/// product for seconds, and not every backend multiplies matrices without rows.
+/// `x` `[N, K]` times a small constant matrix with K rows, as a sum of K scaled rows: a matrix product is autotuned for
+/// seconds on a GPU, and not every backend supports one with N = 0.
 fn times<const C: usize>(x: Tensor<2>, rows: &[[f32; C]]) -> Tensor<2> {
     let device = x.device();
     let term =

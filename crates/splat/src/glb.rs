@@ -1,8 +1,8 @@
-//! Gaussians in a binary glTF, as the extension `KHR_gaussian_splatting` stores them: points whose attributes are activated values and SH
-//! coefficients. Viewers without the extension draw the points in `COLOR_0`.
+//! Gaussians in a binary glTF, as the extension `KHR_gaussian_splatting` stores them: points whose attributes are
+//! activated values and SH coefficients. Viewers without the extension draw the points in `COLOR_0`.
 //!
-//! The axes are x right, y up, z back, as in the world frame; nothing is rotated. Layout: glTF 2.0, section 4.4 (GLB), and the
-//! extension's README (github.com/KhronosGroup/glTF, `extensions/2.0/Khronos/KHR_gaussian_splatting`).
+//! The axes are x right, y up, z back, as in the world frame; nothing is rotated. Layout: glTF 2.0, section 4.4
+//! (GLB), and the extension's README (github.com/KhronosGroup/glTF, `extensions/2.0/Khronos/KHR_gaussian_splatting`).
 
 use std::io::{self, Read, Write};
 
@@ -20,13 +20,13 @@ const BINARY: u32 = 0x004e_4942;
 /// Component types.
 const BYTE: u32 = 5121;
 const FLOAT: u32 = 5126;
-/// Largest file: lengths have 32 bits.
+/// Largest file in bytes: lengths have 32 bits.
 const MAX_LENGTH: u64 = u32::MAX as u64;
-/// Largest JSON chunk. Ours has four kilobytes.
+/// Largest JSON chunk that is read, in bytes. Written ones have four kilobytes.
 const MAX_JSON: u32 = 16 << 20;
-/// Coefficients of all SH degrees up to 0, 1, 2 and 3.
+/// Numbers of SH coefficients up to degree 0, 1, 2 and 3.
 const COEFFICIENTS: [usize; 4] = [1, 4, 9, 16];
-/// Largest distance of a node's matrix from the identity.
+/// Largest deviation of a node's transform from the identity, per number.
 const MOVED: f64 = 1e-9;
 
 /// Names of the attributes, their types, and the columns of [`Stored`] in their order.
@@ -47,7 +47,7 @@ fn attributes(stored: &Stored) -> Vec<(String, &'static str, Vec<&[f32]>)> {
     all
 }
 
-/// The name of an SH coefficient by its number.
+/// The name of SH coefficient number `band`.
 fn coefficient(band: usize) -> String {
     let degree = band.isqrt();
     format!("SH_DEGREE_{degree}_COEF_{}", band - degree * degree)
@@ -72,7 +72,7 @@ pub(crate) fn check(stored: &Stored) -> Result<(), String> {
     Ok(())
 }
 
-/// Writes a file. [`check`] has found nothing.
+/// Writes a GLB of Gaussians that [`check`] accepts.
 pub(crate) fn write(stored: &Stored, out: &mut impl Write) -> io::Result<()> {
     let n = stored.len();
     let attributes = attributes(stored);
@@ -136,7 +136,7 @@ pub(crate) fn write(stored: &Stored, out: &mut impl Write) -> io::Result<()> {
     Ok(())
 }
 
-/// A quaternion (x, y, z, w) of length 1. One of no length is no rotation, as for the rasteriser.
+/// A quaternion (x, y, z, w), normalised. A quaternion of length 0 becomes the identity.
 fn unit(values: impl Iterator<Item = f64>) -> [f32; 4] {
     let values: Vec<f64> = values.collect();
     let length = values.iter().map(|v| v * v).sum::<f64>().sqrt();
@@ -151,7 +151,7 @@ fn linear(value: f32) -> f32 {
     if value <= 0.04045 { value / 12.92 } else { ((value + 0.055) / 1.055).powf(2.4) }
 }
 
-/// Reads a file of `length` bytes: the Gaussians of its one primitive that has the extension, in floats and at a node that is not moved.
+/// Reads a file of `length` bytes: its only primitive with the extension, with float attributes and unmoved nodes.
 pub(crate) fn read(mut input: impl Read, length: u64) -> Result<Stored, Problem> {
     let mut word = || {
         let mut bytes = [0; 4];
@@ -249,7 +249,7 @@ impl File<'_> {
         Ok(Stored { coefficients, columns })
     }
 
-    /// The values of an attribute of `size` floats.
+    /// The values of an attribute with `size` floats per Gaussian.
     fn floats(&self, accessor: &Value, name: &str, size: usize) -> Result<Vec<f32>, String> {
         let bad = |what: &str| format!("its attribute {name} {what}");
         let entry = |list: &str, row: &Value| {
@@ -286,7 +286,7 @@ impl File<'_> {
     }
 }
 
-/// Whether a node's place is not that of its parent.
+/// Whether a node has a transform other than the identity.
 fn is_moved(node: &Value) -> bool {
     let differs = |name: &str, identity: &[f64]| match node[name].as_array() {
         None => !node[name].is_null(),

@@ -1,4 +1,4 @@
-//! Cameras, 3D Gaussians, their files and the differentiable rasteriser: the lowest floor of snapsnap.
+//! Cameras, 3D Gaussians, their files and the differentiable rasteriser.
 
 pub mod adapter;
 mod camera;

@@ -1,43 +1,33 @@
-//! Small vectors and matrices, compiled as plain Rust for the CPU and, through CubeCL's `#[cube]`, into the GPU kernels.
+//! Small vectors and matrices, compiled for the CPU and, through CubeCL's `#[cube]`, into the GPU kernels.
 
 use bytemuck::NoUninit;
 use cubecl::CubeTypeMut;
 use cubecl::prelude::*;
 
-/// Three numbers.
+/// A vector.
 #[derive(CubeType, CubeTypeMut, Clone, Copy, Debug, NoUninit)]
 #[repr(C)]
 pub struct Vec3 {
-    /// First.
     pub x: f32,
-    /// Second.
     pub y: f32,
-    /// Third.
     pub z: f32,
 }
 
 /// Quaternion in (w, x, y, z) order.
 #[derive(CubeType, Clone, Copy, Debug)]
 pub struct Quat {
-    /// Real part.
     pub w: f32,
-    /// i.
     pub x: f32,
-    /// j.
     pub y: f32,
-    /// k.
     pub z: f32,
 }
 
-/// Three rows of three.
+/// A 3×3 matrix, row by row.
 #[derive(CubeType, Clone, Copy, Debug, NoUninit)]
 #[repr(C)]
 pub struct Mat3 {
-    /// First row.
     pub r0: Vec3,
-    /// Second row.
     pub r1: Vec3,
-    /// Third row.
     pub r2: Vec3,
 }
 
@@ -112,13 +102,13 @@ pub fn rotation_matrix(q: &Quat) -> Mat3 {
     }
 }
 
-/// Three consecutive numbers.
+/// The three numbers from index `at` on.
 #[cube]
 pub fn load3(values: &[f32], at: usize) -> Vec3 {
     Vec3 { x: values[at], y: values[at + 1], z: values[at + 2] }
 }
 
-/// Writes three consecutive numbers.
+/// Writes three numbers from index `at` on.
 #[cube]
 pub fn store3(values: &mut [f32], at: usize, v: &Vec3) {
     values[at] = v.x;

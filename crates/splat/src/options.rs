@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 pub const TILE: usize = 16;
 /// A splat is skipped at a pixel where its α is below this.
 pub const MIN_ALPHA: f32 = 1.0 / 255.0;
-/// A pixel takes no further splat once that would bring its transmittance below this.
+/// A pixel is closed by the first splat that would bring its transmittance below this; the splat is not drawn.
 pub const MIN_TRANSMITTANCE: f32 = 1e-4;
 
 /// Options of a render. Start from a preset and change fields.
@@ -22,12 +22,12 @@ pub struct RenderOptions {
     pub near: f32,
     /// Multiply opacity by √(det Σ'_raw / det Σ'), which keeps the total weight of a splat that the blur enlarges.
     pub antialiased: bool,
-    /// Render the depth channel as well; without it, nothing is computed for it.
+    /// Render the depth channel as well; otherwise it costs nothing.
     pub depth: bool,
     /// Colour `[3]` behind the Gaussians; differentiable. `None` is black and costs nothing.
     pub background: Option<Tensor<1>>,
-    /// Largest number of pairs of a splat and a 16×16 tile, on which the time of a render depends: in each view on the CPU, in the mean
-    /// over the views on a GPU. More are refused before any of them is drawn.
+    /// Largest number of pairs of a splat and a 16×16 tile: per view on the CPU, per view on average on a GPU. The
+    /// time of a render depends on this number. A render with more pairs is refused before drawing.
     pub max_intersections: u64,
 }
 

@@ -1,5 +1,5 @@
-//! 3D Gaussian PLY files in the layout of the INRIA viewer. Binary little-endian files are written; all
-//! files of that layout are read.
+//! 3D Gaussian PLY files in the layout of the INRIA viewer. Binary little-endian files are written; ASCII and binary
+//! files are read.
 
 pub mod header;
 mod read;
@@ -10,24 +10,24 @@ use crate::stored::Stored;
 
 pub(crate) use read::read;
 
-/// Properties of one vertex of SH degree 0, in INRIA's order; those of higher degrees, `f_rest_*`, come behind `f_dc_2`. No
-/// zeros are written for them: every known viewer reads a missing band as zero, and 45 floats would triple the file.
+/// Properties of one vertex of SH degree 0, in INRIA's order; higher degrees add `f_rest_*` after `f_dc_2`. Missing
+/// degrees are not written: every known viewer reads them as zero, and 45 zeros would triple the file.
 pub const PROPERTIES: [&str; 17] = [
     "x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1",
     "scale_2", "rot_0", "rot_1", "rot_2", "rot_3",
 ];
-/// How many of them come before `f_rest_0`.
+/// Number of properties before `f_rest_0`.
 const BEFORE_REST: usize = 9;
 
-/// Comment of files whose world has y down, as the scenes of INRIA's datasets. Their readers turn them back.
+/// Comment of files whose world has y down, as in INRIA's datasets. The reader of this crate turns the Gaussians back.
 pub(crate) const Y_DOWN: &str = "axes: y down";
 
-/// Writes a binary PLY with this comment.
+/// Writes a binary PLY, with a comment if there is one.
 pub(crate) fn write(stored: &Stored, comment: Option<&str>, out: &mut impl Write) -> io::Result<()> {
     let rest = stored.columns.len() - Stored::COLUMNS.len();
     let of = |name: &&str| {
         let at = Stored::COLUMNS.iter().position(|column| column == name);
-        // Normals are not used.
+        // Normals have no column and are written as 0.
         ((*name).to_owned(), at.map(|at| stored.columns[at].as_slice()))
     };
     let mut properties: Vec<(String, Option<&[f32]>)> = PROPERTIES.iter().map(of).collect();

@@ -128,7 +128,7 @@ impl<const K: usize> Number for Dual<K> {
 pub struct Scene<T> {
     /// One Gaussian after another.
     pub gaussians: Vec<[T; 14]>,
-    /// Colour behind them.
+    /// Colour behind the Gaussians.
     pub background: [T; 3],
 }
 
@@ -174,7 +174,7 @@ pub enum Cutoff {
     Smooth,
 }
 
-/// A splat at its place.
+/// A projected Gaussian.
 struct Splat<T> {
     /// Row of the Gaussian.
     index: usize,
@@ -196,7 +196,7 @@ pub fn render<T: Number>(
     pixels(scene, camera, options, cutoff, 0..camera.width * camera.height)
 }
 
-/// The same for some pixels, numbered row by row.
+/// As [`render`], for the pixels `which` only, numbered row by row.
 pub fn pixels<T: Number>(
     scene: &Scene<T>,
     camera: &Camera,
@@ -224,7 +224,7 @@ fn centre(at: u32, camera: &Camera) -> [f64; 2] {
     [f64::from(at % camera.width) + 0.5, f64::from(at / camera.width) + 0.5]
 }
 
-/// Pixels so close to a cut-off (α = 1/255, T = 1e-4, α_max) that f32 may be on its other side.
+/// For each pixel, whether a cut-off (α = 1/255, T = 1e-4, α_max) is so close that f32 may decide differently.
 pub fn banded(scene: &Scene<f64>, camera: &Camera, options: &RenderOptions) -> Vec<bool> {
     let with = |scale: f64| {
         let mut scene = scene.clone();
@@ -236,7 +236,7 @@ pub fn banded(scene: &Scene<f64>, camera: &Camera, options: &RenderOptions) -> V
     less.into_iter().zip(more).map(|(a, b)| a != b).collect()
 }
 
-/// The splats that each pixel takes, and whether they are clamped.
+/// The splats that each pixel takes, and whether their α is clamped.
 fn contributors(scene: &Scene<f64>, camera: &Camera, options: &RenderOptions) -> Vec<Vec<(usize, bool)>> {
     let splats = splats(scene, camera, options);
     let pixel = |at: u32| {
@@ -315,7 +315,7 @@ fn splat<T: Number>(index: usize, g: &[T; 14], camera: &Camera, options: &Render
     })
 }
 
-/// Composites a pixel. `take` is called with the index of each splat that it takes and with whether α is clamped.
+/// Composites a pixel. `take` is called for each splat that the pixel takes: its index, and whether its α is clamped.
 fn composite<T: Number>(
     splats: &[Splat<T>],
     pixel: [f64; 2],

@@ -15,9 +15,9 @@ pub struct Rendered {
     pub color: Tensor<4>,
     /// `[V,H,W]`: 1 − T_final.
     pub alpha: Tensor<3>,
-    /// `[V,H,W]`, metres: Σ t_z·α·T, not divided by alpha. Only if asked for.
+    /// `[V,H,W]`, metres: Σ t_z·α·T, not divided by alpha. Only with [`RenderOptions::depth`].
     pub depth: Option<Tensor<3>>,
-    /// Counts of visible Gaussians and of those left out.
+    /// Counts of visible and of culled Gaussians.
     pub counts: Counts,
 }
 
@@ -25,8 +25,8 @@ pub struct Rendered {
 /// projections (EWA splatting; docs/method.md, "Splatting").
 ///
 /// Differentiable in means, rotations, scales, opacities, colours and background. Untracked inputs cost nothing in
-/// the backward pass. On the CPU and on the GPU, equal inputs give equal bits, forward and backward. A Gaussian whose
-/// parameters are not finite or leave f32's range when projected is left out, counted, and gets a zero gradient.
+/// the backward pass. On one device, equal inputs give equal bits on every run, forward and backward. A Gaussian whose
+/// parameters are not finite or leave f32's range when projected is culled, counted, and gets a zero gradient.
 ///
 /// ```
 /// use burn::tensor::{Device, Tensor};
@@ -87,7 +87,7 @@ pub fn render(
     })
 }
 
-/// The kernels compute in f32 for models of every precision.
+/// Casts to f32, in which the kernels compute for models of every precision.
 fn f32<const D: usize>(tensor: &Tensor<D>) -> Tensor<D> {
     if tensor.dtype() == DType::F32 { tensor.clone() } else { tensor.clone().cast(DType::F32) }
 }

@@ -1,5 +1,5 @@
-//! Files of Gaussians: PLY, SPZ, GLB, and SOG, which is only written. The first bytes of a file decide its kind when it is
-//! read; its name decides when it is written.
+//! Files of Gaussians: PLY, SPZ, GLB, and SOG, which is only written. The kind of a file follows from its first bytes
+//! when it is read, and from its extension when it is written.
 
 use std::io::{self, Read, Write};
 use std::path::Path;
@@ -28,7 +28,7 @@ pub enum Kind {
 }
 
 impl Kind {
-    /// The kind of `path`'s extension, if there is one.
+    /// The kind with `path`'s extension; `None` for any other extension.
     pub fn named(path: &Path) -> Option<Self> {
         let extension = path.extension()?.to_str()?.to_ascii_lowercase();
         match extension.as_str() {
@@ -40,7 +40,7 @@ impl Kind {
         }
     }
 
-    /// The kind of `path` by its extension; PLY if it has none of them.
+    /// The kind with `path`'s extension; PLY for any other extension.
     pub fn of(path: &Path) -> Self {
         Self::named(path).unwrap_or(Self::Ply)
     }
@@ -50,7 +50,7 @@ impl Stored {
     /// Reads a file of any kind but SOG.
     ///
     /// # Errors
-    /// [`SplatError::File`] if it cannot be read, is of none of these kinds, is truncated, or lacks a property.
+    /// [`SplatError::File`] if the file cannot be read, is of another kind, is truncated, or lacks a property.
     pub fn read(path: &Path) -> Result<Self, SplatError> {
         let cannot = FileError::read(path);
         let mut file = file::open(path).map_err(&cannot)?;
@@ -73,19 +73,19 @@ impl Stored {
         Ok(read?)
     }
 
-    /// Writes the kind of file of `path`'s extension, whole or not at all.
+    /// Writes a file of the kind of `path`'s extension, whole or not at all.
     ///
     /// # Errors
-    /// [`SplatError::NotFinite`]; [`SplatError::File`] for what an SPZ, GLB or SOG cannot hold, or if the file cannot be written.
-    /// `path` is then left as it was.
+    /// [`SplatError::NotFinite`]; [`SplatError::File`] for values that an SPZ, GLB or SOG cannot hold, or if the file
+    /// cannot be written. `path` is then left as it was.
     pub fn write(&self, path: &Path) -> Result<(), SplatError> {
         let kind = Kind::of(path);
         self.check(kind, path)?;
         Ok(file::write_whole(path, |out| self.encode(kind, out)).map_err(FileError::write(path))?)
     }
 
-    /// Writes a PLY whose world has y down, whole or not at all, for viewers that expect the axes of INRIA's scenes. Readers of this
-    /// crate turn it back, by a comment in the header.
+    /// Writes a PLY whose world has y down, whole or not at all, for viewers that expect the axes of INRIA's scenes.
+    /// By a comment in the header, [`Stored::read`] recognises the file and turns the Gaussians back.
     ///
     /// # Errors
     /// As [`Self::write`].
@@ -109,7 +109,7 @@ impl Stored {
         Ok(bytes)
     }
 
-    /// Losses beyond the usual steps of this kind of file, a sentence each.
+    /// Losses beyond the usual quantisation of this kind of file, one sentence each.
     pub fn losses(&self, kind: Kind) -> Vec<String> {
         match kind {
             Kind::Ply => Vec::new(),
@@ -145,18 +145,18 @@ impl Stored {
     }
 }
 
-/// Reads the Gaussians of a file onto `device`; as [`Stored::read`] and [`Stored::load`].
+/// Reads the Gaussians of a file onto `device`: [`Stored::read`], then [`Stored::load`].
 ///
 /// # Errors
-/// Those of [`Stored::read`].
+/// As [`Stored::read`].
 pub fn read(path: &Path, device: &Device) -> Result<Loaded, SplatError> {
     Ok(Stored::read(path)?.load(device))
 }
 
-/// Writes `gaussians` as [`Stored::of`] and [`Stored::write`] do.
+/// Writes `gaussians`: [`Stored::of`], then [`Stored::write`].
 ///
 /// # Errors
-/// Theirs; `path` is then left as it was.
+/// As [`Stored::of`] and [`Stored::write`]; `path` is then left as it was.
 pub fn write(gaussians: &Gaussians, path: &Path) -> Result<(), SplatError> {
     Stored::of(gaussians)?.write(path)
 }

@@ -1,6 +1,6 @@
 //! Colours that depend on the direction of view: real spherical harmonics of degree 0 to 3.
 //!
-//! A tensor function of its own, so that a scene without them never pays for them.
+//! A separate tensor function, so that a scene without spherical harmonics has no cost for them.
 
 use burn::tensor::Tensor;
 
@@ -100,7 +100,7 @@ mod tests {
         let means = Tensor::<2>::from_data(TensorData::new(flat, [n, 3]), &device);
         let mut rows = vec![[0.0; 16]; n];
         for k in 0..16 {
-            // ½ added to everything, and far more, so that nothing is clamped.
+            // A large constant coefficient, so that no colour is clamped at 0.
             let mut unit = vec![0.0_f32; n * 16 * 3];
             for i in 0..n {
                 unit[(i * 16 + k) * 3] = 1.0;

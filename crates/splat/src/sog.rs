@@ -1,7 +1,7 @@
 //! PlayCanvas' SOG: quantised Gaussians as lossless pictures in a ZIP. Version 2 is written, without SH above degree 0.
 //!
-//! Layout: developer.playcanvas.com, "The SOG Format". It says that y is up, but PlayCanvas' viewers turn a SOG by 180° about z, as they
-//! turn a PLY. The Gaussians are therefore stored turned, and appear upright and from the front.
+//! Layout: developer.playcanvas.com, "The SOG Format". There y is up, but PlayCanvas' viewers turn a SOG, like a
+//! PLY, by 180° about z. The Gaussians are therefore stored turned, and appear upright and from the front.
 
 use std::io::{self, Cursor, Write};
 
@@ -13,15 +13,15 @@ use zip::{CompressionMethod, DateTime, ZipWriter};
 
 use crate::stored::{Stored, opacity};
 
-/// Values of a codebook.
+/// Number of values in a codebook.
 const CODES: usize = 256;
 /// Rounds of the search for a codebook (Lloyd, "Least squares quantization in PCM", 1982).
 const ROUNDS: usize = 12;
-/// Alpha of a quaternion whose first component was left out.
+/// Alpha of the pixel of a quaternion whose first component is left out.
 const FIRST_LEFT_OUT: u8 = 252;
-/// Largest value of a Gaussian. Ranges beyond it have no size in f32.
+/// Largest absolute value of a Gaussian. The range of larger values may overflow f32.
 const LARGEST: f32 = 1e30;
-/// Largest side of a WebP picture.
+/// Largest side of a WebP picture in pixels.
 const MAX_SIDE: usize = 16_383;
 
 /// The reason why a SOG cannot contain the Gaussians, if there is one.
@@ -47,9 +47,9 @@ pub(crate) fn losses(stored: &Stored) -> Vec<String> {
         .collect()
 }
 
-/// Writes a file. [`check`] has found nothing.
+/// Writes a SOG of Gaussians that [`check`] accepts.
 pub(crate) fn write(stored: &Stored, out: &mut impl Write) -> io::Result<()> {
-    // Neighbours in space are neighbours in the pictures, which then have fewer bytes.
+    // Neighbours in space become neighbours in the pictures, which then compress better.
     let order = along_a_curve(stored);
     let width = (order.len() as f64).sqrt().ceil() as usize;
     let size = [width, order.len().div_ceil(width)];
@@ -105,7 +105,7 @@ pub(crate) fn write(stored: &Stored, out: &mut impl Write) -> io::Result<()> {
         ("sh0.webp", pixels(&color)?),
     ];
     let mut archive = ZipWriter::new(Cursor::new(Vec::new()));
-    // The same bytes on every run; pictures are compressed already.
+    // A fixed time gives the same bytes on every run; pictures are compressed already.
     let options = SimpleFileOptions::default()
         .compression_method(CompressionMethod::Stored)
         .last_modified_time(DateTime::default());
@@ -121,7 +121,7 @@ fn range(values: &[f32]) -> (f32, f32) {
     values.iter().fold((f32::INFINITY, f32::NEG_INFINITY), |(low, high), v| (low.min(*v), high.max(*v)))
 }
 
-/// A lossless picture. Pixels behind the last Gaussian repeat it.
+/// A lossless WebP picture. Pixels after the last Gaussian repeat its pixel.
 fn picture(order: &[u32], [width, height]: [usize; 2], of: &dyn Fn(usize) -> [u8; 4]) -> io::Result<Vec<u8>> {
     let last = *order.last().expect("one Gaussian at least");
     let rows = order.iter().copied().chain(std::iter::repeat(last)).take(width * height);
@@ -134,7 +134,7 @@ fn picture(order: &[u32], [width, height]: [usize; 2], of: &dyn Fn(usize) -> [u8
     Ok(bytes)
 }
 
-/// A quaternion (w, x, y, z) without its largest component, in the steps of bytes.
+/// A quaternion (w, x, y, z): three bytes without the largest component, whose index is in the fourth byte.
 fn pack_smallest_three(q: [f32; 4]) -> [u8; 4] {
     let q = q.map(f64::from);
     let length = q.iter().map(|v| v * v).sum::<f64>().sqrt();
@@ -148,7 +148,7 @@ fn pack_smallest_three(q: [f32; 4]) -> [u8; 4] {
     [next(), next(), next(), FIRST_LEFT_OUT + largest as u8]
 }
 
-/// The Gaussians along a curve through space (Morton, "A computer oriented geodetic data base", 1966).
+/// The Gaussians in the order of a Morton curve (Morton, "A computer oriented geodetic data base", 1966).
 fn along_a_curve(stored: &Stored) -> Vec<u32> {
     let axes = [0, 1, 2].map(|axis| {
         let values = &stored.columns[axis];
@@ -168,7 +168,7 @@ fn along_a_curve(stored: &Stored) -> Vec<u32> {
     order.into_iter().map(|(_, i)| i).collect()
 }
 
-/// Values in ascending order that stand for those of columns.
+/// A codebook: values in ascending order, to which the values of columns are rounded.
 struct Codebook(Vec<f32>);
 
 impl Codebook {
@@ -182,7 +182,7 @@ impl Codebook {
             }))
             .collect();
         let (low, high) = (values[0], values[values.len() - 1]);
-        // Half of the codes follow the values, half their range, so that rare values have one near them.
+        // Half of the codes are quantiles, half are even steps of the range, so that rare values have a code nearby.
         let mut codes: Vec<f32> = (0..CODES / 2)
             .flat_map(|i| {
                 let last = CODES / 2 - 1;

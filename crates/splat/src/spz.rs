@@ -16,24 +16,24 @@ use crate::stored::{Problem, Stored};
 
 /// First bytes of a gzip stream.
 pub(crate) const GZIP: [u8; 2] = [0x1f, 0x8b];
-/// First bytes of versions that are no gzip stream as a whole.
+/// First bytes of version 4 and later, which are not one gzip stream.
 pub(crate) const BARE: [u8; 2] = *b"NG";
 const MAGIC: u32 = 0x5053_474e;
 const VERSION: u32 = 3;
-/// Number of Gaussians of the largest file that Niantic's library reads. It limits the memory for a hostile file, whose
-/// content may be a thousand times its size.
+/// Number of Gaussians of the largest file that Niantic's library reads. It limits the memory for a hostile file,
+/// which may decompress to a thousand times its size.
 const MAX_POINTS: usize = 10_000_000;
-/// Content in bytes, and its ratio to the file, beyond which a file is refused: a few kilobytes of equal Gaussians keep a
-/// rasteriser busy for minutes. The content of real files is up to 5 times as large.
+/// A file is refused if its decompressed size exceeds both limits, in bytes and relative to the file: a few kilobytes
+/// of equal Gaussians keep a rasteriser busy for minutes. Real files decompress to up to 5 times their size.
 const MAX_CONTENT: u64 = 1 << 20;
 const MAX_RATIO: u64 = 100;
 /// Fractional bits of coordinates, if they fit: steps of a quarter of a millimetre up to 2 km.
 const FRACTIONAL_BITS: u8 = 12;
 /// Largest coordinate in 24 bits.
 const MAX_FIXED: f64 = 8_388_607.0;
-/// Coefficients of SH degree 0 to its byte.
+/// Factor from a coefficient of SH degree 0 to its byte.
 const COLOR_SCALE: f32 = 0.15;
-/// Steps of SH coefficients, of degree 1 and of higher ones, as in Niantic's library. Coarse steps compress well.
+/// Quantisation steps of SH coefficients of degree 1 and above 1, as in Niantic's library. Coarse steps compress well.
 const SH_STEPS: [i32; 2] = [8, 16];
 /// Values per channel of SH degrees 0 to 4.
 const COEFFICIENTS: [usize; 5] = [1, 4, 9, 16, 25];
@@ -85,7 +85,7 @@ pub(crate) fn read(input: impl Read, length: u64) -> Result<Stored, Problem> {
         let unit = f64::from(bits).exp2().recip();
         for axis in 0..3 {
             let value = |p: &[u8]| {
-                // Into the upper bytes and back, for the sign.
+                // A shift into the upper bytes and back extends the sign.
                 let [a, b, c] = [0, 1, 2].map(|i| p[3 * axis + i]);
                 (f64::from(i32::from_le_bytes([0, a, b, c]) >> 8) * unit) as f32
             };
@@ -139,8 +139,8 @@ pub(crate) fn check(stored: &Stored) -> Result<(), String> {
     Ok(())
 }
 
-/// Losses beyond the usual steps of an SPZ, a sentence each. Scales below e⁻¹⁰ m (45 µm) silently become that value, an
-/// invisible change.
+/// Losses beyond the usual quantisation of an SPZ, one sentence each. Scales below e⁻¹⁰ m (45 µm) become e⁻¹⁰ m,
+/// which is invisible and not listed.
 pub(crate) fn losses(stored: &Stored) -> Vec<String> {
     let mut losses = Vec::new();
     let bits = fractional_bits(stored);
@@ -156,7 +156,7 @@ pub(crate) fn losses(stored: &Stored) -> Vec<String> {
             losses.push(format!("{count} Gaussians have {text}, and are cut off there"));
         }
     };
-    // Half a step beyond the last one is still the last one.
+    // Values up to half a step beyond the range round to its last step.
     let beyond = |step: f64| !(0.0..=255.0).contains(&step.round());
     count(7..10, &|v| 16.0 * (v + 10.0) > 255.5, "scales beyond 379 m");
     count(11..14, &|v| beyond(255.0 * (v * f64::from(COLOR_SCALE) + 0.5)), "colours (f_dc) beyond ±3.33");
@@ -223,7 +223,7 @@ pub(crate) fn write(stored: &Stored, out: &mut impl Write) -> io::Result<()> {
     out.finish().map(drop)
 }
 
-/// Content of the stream. Memory grows with the data, not with the header's promises.
+/// The decompressed stream. Memory grows with the data, not with the header's promises.
 struct Bytes<R> {
     input: R,
 }
@@ -240,8 +240,8 @@ impl<R: Read> Bytes<R> {
         Ok(bytes)
     }
 
-    /// Reads to the end, so that the decoder compares its checksum. Extensions may follow the Gaussians; their first
-    /// megabytes are skipped, and of longer ones the rest is not read.
+    /// Reads to the end, so that the decoder verifies the checksum. Extensions after the Gaussians are skipped; if
+    /// they are longer than `EXTENSIONS` bytes, the rest is not read.
     fn finish(&mut self) -> Result<(), Problem> {
         const EXTENSIONS: u64 = 1 << 24;
         io::copy(&mut (&mut self.input).take(EXTENSIONS), &mut io::sink()).map_err(damaged)?;
@@ -249,7 +249,7 @@ impl<R: Read> Bytes<R> {
     }
 }
 
-/// The problem of a stream: one that ends early or has a wrong checksum is a damaged file, not a failing disk.
+/// The problem of a read error: a stream that is cut or has a wrong checksum is a damaged file, no failing disk.
 fn damaged(e: io::Error) -> Problem {
     match e.kind() {
         io::ErrorKind::UnexpectedEof => "the file ends too early: its gzip stream is cut".to_owned().into(),
@@ -265,29 +265,29 @@ fn byte(value: f32) -> u8 {
     value.round().clamp(0.0, 255.0) as u8
 }
 
-/// Logit of an opacity in 255 steps, finite at both ends: a quarter of a step away from them.
+/// Logit of an opacity in 255 steps. The first and the last step move inwards by a quarter step, to be finite.
 fn logit(alpha: u8) -> f32 {
     let opacity = f32::from(alpha).clamp(0.25, 254.75) / 255.0;
     (opacity / (1.0 - opacity)).ln()
 }
 
-/// The middle of a coefficient's step.
+/// The byte of a coefficient, rounded to a multiple of `step`.
 fn sh_byte(value: f32, step: i32) -> u8 {
     let q = (value * 128.0).round().clamp(-128.0, 127.0) as i32 + 128;
     (((q + step / 2) / step) * step).clamp(0, 255) as u8
 }
 
-/// A quaternion (w, x, y, z) of versions 1 and 2: x, y and z in a byte each, w ≥ 0 from them.
+/// A quaternion (w, x, y, z) of versions 1 and 2: a byte each for x, y and z, from which w ≥ 0 follows.
 fn first_three(packed: [u8; 3]) -> [f32; 4] {
     let [x, y, z] = packed.map(|v| f32::from(v) / 127.5 - 1.0);
     [(1.0 - x * x - y * y - z * z).max(0.0).sqrt(), x, y, z]
 }
 
-/// Bits of a component of version 3, beside its sign.
+/// Mask of the magnitude of a component in version 3.
 const COMPONENT: u32 = (1 << 9) - 1;
 
-/// A quaternion (w, x, y, z) of version 3: the index of the largest of (x, y, z, w), and signs and sizes of the others
-/// over √½.
+/// A quaternion (w, x, y, z) of version 3: the index of the largest of (x, y, z, w), then signs and magnitudes of the
+/// other components, divided by √½.
 fn unpack_smallest_three(mut packed: u32) -> [f32; 4] {
     let largest = (packed >> 30) as usize;
     let mut q = [0.0_f32; 4];
@@ -302,7 +302,7 @@ fn unpack_smallest_three(mut packed: u32) -> [f32; 4] {
     [q[3], q[0], q[1], q[2]]
 }
 
-/// The inverse of [`unpack_smallest_three`], of a quaternion of any length; one of length 0 is no rotation.
+/// The inverse of [`unpack_smallest_three`]. Quaternions may have any length; length 0 becomes the identity.
 fn pack_smallest_three(wxyz: [f32; 4]) -> u32 {
     let length = wxyz.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
     let [w, x, y, z] =

@@ -1,4 +1,4 @@
-//! Gaussians as files contain them, before activation, column by column.
+//! Gaussians as files store them: before activation, column by column.
 
 use std::io;
 
@@ -6,17 +6,17 @@ use burn::tensor::{Device, Tensor, TensorData};
 
 use crate::{Camera, Gaussians, SplatError, sh};
 
-/// Opacities are stored as logits; f32 saturates to ±∞ at 0 and 1, so they are kept this far away from both.
+/// Least distance of a stored opacity from 0 and from 1, whose logits are infinite.
 const OPACITY_MARGIN: f32 = 1e-6;
-/// Scales are stored as logarithms; a scale that underflowed to 0 is stored as this many metres.
+/// Least scale that is stored, metres: the logarithm of a scale that underflowed to 0 is infinite.
 pub(crate) const MIN_SCALE: f32 = 1e-10;
 
-/// A file's Gaussians.
+/// The Gaussians of a file on a device.
 #[derive(Debug, Clone)]
 pub struct Loaded {
-    /// After activation; colours are those of SH degree 0, max(0, ½ + C₀·f_dc).
+    /// After activation, with the colours of SH degree 0: max(0, ½ + C₀·f_dc).
     pub gaussians: Gaussians,
-    /// Coefficients `[N,K,3]` for [`sh::colors`], where the file has a degree above 0.
+    /// Coefficients `[N,K,3]` for [`sh::colors`], if the file has an SH degree above 0.
     pub harmonics: Option<Tensor<3>>,
 }
 
@@ -24,7 +24,7 @@ impl Loaded {
     /// The Gaussians with their colours for a camera.
     ///
     /// # Errors
-    /// [`SplatError::Shape`] for coefficients of no degree.
+    /// [`SplatError::Shape`] if the number of coefficients belongs to no SH degree.
     pub fn seen_by(&self, camera: &Camera) -> Result<Gaussians, SplatError> {
         let gaussians = self.gaussians.clone();
         match &self.harmonics {
@@ -42,24 +42,24 @@ impl From<Gaussians> for Loaded {
     }
 }
 
-/// Gaussians before activation, as in files, column by column: see [`Stored::COLUMNS`].
+/// Gaussians before activation, column by column: see [`Stored::COLUMNS`].
 #[derive(Debug, Clone)]
 pub struct Stored {
     /// SH coefficients per channel: 1, 4, 9 or 16.
     pub(crate) coefficients: usize,
-    /// [`Stored::COLUMNS`], then `f_rest_0` …: all of red's, green's, blue's. Equally long.
+    /// [`Stored::COLUMNS`], then `f_rest_0` …: red's coefficients, then green's, then blue's. All equally long.
     pub(crate) columns: Vec<Vec<f32>>,
 }
 
 impl Stored {
-    /// Columns that every file has: centres in metres, quaternions (w, x, y, z), logarithms of standard deviations in metres, logits
-    /// of opacities, and the coefficients of SH degree 0.
+    /// Columns that every file has: centres in metres, quaternions (w, x, y, z), logarithms of standard deviations in
+    /// metres, logits of opacities, and the coefficients of SH degree 0.
     pub const COLUMNS: [&str; 14] = [
         "x", "y", "z", "rot_0", "rot_1", "rot_2", "rot_3", "scale_0", "scale_1", "scale_2", "opacity",
         "f_dc_0", "f_dc_1", "f_dc_2",
     ];
 
-    /// As a file would have them: colours as `(rgb − ½) / `[`sh::C0`].
+    /// The values that a file of `gaussians` stores: colours as `(rgb − ½) / `[`sh::C0`].
     ///
     /// # Errors
     /// [`SplatError::NotFinite`] for a NaN or an infinity in the tensors.
@@ -88,7 +88,7 @@ impl Stored {
         self.coefficients.isqrt() - 1
     }
 
-    /// The coefficient that band `band` (0 to [`Self::coefficients`] − 1) has of a channel: a column.
+    /// The column of SH coefficient `band` (0 to [`Self::coefficients`] − 1) of a channel.
     pub(crate) fn band(&self, band: usize, channel: usize) -> &[f32] {
         match band {
             0 => &self.columns[11 + channel],
@@ -99,7 +99,7 @@ impl Stored {
     /// Turns the Gaussians by 180° about the x axis, from y up to y down, or `back` in the opposite sense. Nothing is
     /// rounded.
     pub(crate) fn turn(&mut self, back: bool) {
-        // Monomials of each SH basis function up to degree 3: whether its powers of y and z have an odd sum, which reverses it.
+        // For each SH basis function: whether its exponents of y and z have an odd sum. The turn negates it then.
         const REVERSED: [bool; 16] = [
             false, true, true, false, true, false, false, true, false, true, false, true, true, false, true,
             false,
@@ -118,7 +118,7 @@ impl Stored {
         }
     }
 
-    /// Drops every Gaussian that has a value that is not finite; returns how many there were.
+    /// Drops every Gaussian with a value that is not finite; returns the number of dropped Gaussians.
     pub fn drop_not_finite(&mut self) -> usize {
         let whole = |i: usize| self.columns.iter().all(|column| column[i].is_finite());
         let kept: Vec<bool> = (0..self.len()).map(whole).collect();
@@ -132,7 +132,7 @@ impl Stored {
         dropped
     }
 
-    /// Puts them onto `device`. Values that are not finite are kept, a render counts and leaves them out.
+    /// Activates the Gaussians and uploads them to `device`. Values that are not finite are kept; a render culls them.
     pub fn load(&self, device: &Device) -> Loaded {
         let (n, k) = (self.len(), self.coefficients);
         let rows = |count: usize, first: usize, f: fn(f32) -> f32| {
@@ -184,7 +184,7 @@ pub(crate) fn opacity(logit: f32) -> f32 {
     1.0 / (1.0 + (-logit).exp())
 }
 
-/// The logit of an opacity, kept away from infinity.
+/// The logit of an opacity, limited by [`OPACITY_MARGIN`].
 pub(crate) fn logit(opacity: f32) -> f32 {
     let opacity = opacity.clamp(OPACITY_MARGIN, 1.0 - OPACITY_MARGIN);
     (opacity / (1.0 - opacity)).ln()

@@ -55,21 +55,16 @@ pub struct View {
     pub centre: Vec3,
     /// … and the rounding error.
     pub centre_rest: Vec3,
-    /// Focal length, pixels.
+    /// Focal lengths, pixels.
     pub fx: f32,
-    /// Focal length, pixels.
     pub fy: f32,
     /// Principal point, pixels.
     pub cx: f32,
-    /// Principal point, pixels.
     pub cy: f32,
-    /// Least t_x/t_z that J is linearised at.
+    /// Limits of t_x/t_z and t_y/t_z at which J is linearised.
     pub x_min: f32,
-    /// Largest t_x/t_z that J is linearised at.
     pub x_max: f32,
-    /// Least t_y/t_z that J is linearised at.
     pub y_min: f32,
-    /// Largest t_y/t_z that J is linearised at.
     pub y_max: f32,
 }
 
@@ -107,13 +102,10 @@ pub struct Projection {
 pub struct Footprint {
     /// Centre, pixels.
     pub u: f32,
-    /// Centre, pixels.
     pub v: f32,
-    /// Factor of Σ'⁻¹, see the module.
+    /// Factors of Σ'⁻¹: l₀, k and l₁ in the module's documentation.
     pub l0: f32,
-    /// Factor of Σ'⁻¹, see the module.
     pub k: f32,
-    /// Factor of Σ'⁻¹, see the module.
     pub l1: f32,
     /// √a: standard deviation along image x, pixels.
     pub sigma_x: f32,
@@ -237,7 +229,7 @@ pub fn footprint(view: &View, p: &Projection) -> Footprint {
     }
 }
 
-/// Where an ellipse lies within a strip of the image.
+/// Range of x of an ellipse within a horizontal strip of the image.
 #[derive(CubeType, Clone, Copy, Debug)]
 pub struct Span {
     /// Least x, relative to the ellipse's centre, pixels.
@@ -246,11 +238,11 @@ pub struct Span {
     pub right: f32,
 }
 
-/// The x that the ellipse dᵀΛd ≤ `radius_squared` reaches within the strip `top` ≤ d_y ≤ `bottom`, which it meets.
+/// The range of x of the ellipse dᵀΛd ≤ `radius_squared` within the strip `top` ≤ d_y ≤ `bottom`, which it meets.
 ///
-/// Its rightmost point is (r/l₀, −k·r/l₀). Where the strip does not hold that point, the strip's part reaches furthest on
-/// the edge next to it: at d_y = e the boundary is A·x² + 2·l₁²k·e·x + l₁²e² − r² = 0 with A = l₀² + l₁²k², so
-/// x = (−l₁²k·e ± √(r²A − (l₀l₁e)²))/A; for e = −k·r/l₀ this is r/l₀ again. The left end alike.
+/// The ellipse's rightmost point is (r/l₀, −k·r/l₀). If it is outside of the strip, the rightmost point within the
+/// strip is on the nearer edge: at d_y = e the boundary is A·x² + 2·l₁²k·e·x + l₁²e² − r² = 0 with A = l₀² + l₁²k²,
+/// so x = (−l₁²k·e ± √(r²A − (l₀l₁e)²))/A; for e = −k·r/l₀ this is r/l₀ again. The left end is computed alike.
 #[cube]
 pub fn span(l0: f32, k: f32, l1: f32, radius_squared: f32, top: f32, bottom: f32) -> Span {
     let b = l1 * k;
@@ -335,7 +327,7 @@ pub fn project_vjp(
         y: v_m0.y * p.jx * h0.y + v_m1.y * p.jy * h1.y,
         z: v_m0.z * p.jx * h0.z + v_m1.z * p.jy * h1.z,
     };
-    // v_h/jx, before the factor that all of its uses share.
+    // v_h0/jx and v_h1/jy. The factors jx and jy are applied below.
     let w0 = Vec3 { x: v_m0.x * scale.x, y: v_m0.y * scale.y, z: v_m0.z * scale.z };
     let w1 = Vec3 { x: v_m1.x * scale.x, y: v_m1.y * scale.y, z: v_m1.z * scale.z };
     let v_jx = dot(&w0, &h0);

@@ -28,8 +28,8 @@ pub struct Arguments {
 /// Axes of an output file of Gaussians.
 #[derive(Args, Debug, Serialize)]
 pub struct AxesArguments {
-    /// Write a PLY with y down, as SuperSplat and other viewers of INRIA's scenes expect it. Every command of this program
-    /// recognises such a file.
+    /// Write a PLY with y down, as SuperSplat and other viewers of INRIA's scenes expect it. Every command of this
+    /// program recognises such a file.
     #[arg(long)]
     y_down: bool,
 }

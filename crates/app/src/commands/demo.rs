@@ -39,7 +39,7 @@ const PHOTOGRAPHS: [(&str, &[u8]); 2] = [
     ("front.png", include_bytes!("../../../../assets/sample/front.png")),
     ("back.png", include_bytes!("../../../../assets/sample/back.png")),
 ];
-/// Ground truth of other cameras: degrees around the person from the front, and a picture of [`TRUTH`]² pixels over black.
+/// Ground truth of other cameras: degrees around the person from the front, and a picture of [`TRUTH`]² over black.
 const TRUTHS: [(f64, &[u8]); 3] = [
     (45.0, include_bytes!("../../../../assets/sample/45.png")),
     (135.0, include_bytes!("../../../../assets/sample/135.png")),

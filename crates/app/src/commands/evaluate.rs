@@ -46,8 +46,8 @@ pub struct Arguments {
     /// Other weights, which are compared with the model person by person.
     #[arg(long, value_name = "FILE|DIR")]
     against: Option<PathBuf>,
-    /// Also evaluate the model on changed photographs. grey: every pixel of the person gets the person's mean colour, so that only
-    /// the outline is left.
+    /// Also evaluate the model on changed photographs. grey: every pixel of the person gets the person's mean colour,
+    /// so that only the outline is left.
     #[arg(long, value_parser = one_of(INPUTS), value_name = "KIND", conflicts_with = "mesh_dir")]
     inputs: Option<bool>,
     /// Evaluate the meshes NAME.obj, .ply or .glb in this folder instead of weights.
@@ -229,7 +229,7 @@ pub(super) fn opened(variant: &Variant) -> Result<(WeightFile, Device), Failure>
     Ok((weights, device))
 }
 
-/// The model, its variants and the baselines. Those that cannot be loaded are added to `missing`.
+/// The model, its variants and the baselines. Contestants that cannot be loaded are added to `missing`.
 fn contestants(
     config: &EvalConfig,
     sets: &[People],

@@ -19,7 +19,7 @@ use crate::weights::sha256;
 
 /// Attempts in a row without new bytes after which the download fails.
 const ATTEMPTS: u32 = 4;
-/// Time limits of the first attempt and of any attempt. The limit doubles after an attempt with new bytes, which are kept.
+/// Time limits of the first and of the longest attempt. The limit doubles after an attempt that brought new bytes.
 const ATTEMPT: [Duration; 2] = [Duration::from_secs(60), Duration::from_secs(20 * 60)];
 /// Time limit of the connection, and of the wait for a response.
 const SILENCE: Duration = Duration::from_secs(60);
@@ -63,8 +63,8 @@ struct Item {
     licence: &'static str,
 }
 
-/// Size and sum of the LPIPS file are those of the file in the `lpips` package on PyPI. Size and sum of the other two are those that
-/// several projects pin. AlexNet's name contains the first eight digits of its sum.
+/// Size and sum of the LPIPS file are from the `lpips` package on PyPI, the others from several projects that pin
+/// them. AlexNet's name contains the first eight digits of its sum.
 const ITEMS: [Item; 3] = [
     Item {
         name: Name::Dust3r,
@@ -222,7 +222,7 @@ enum Broken {
     Source(String),
     /// Every attempt will fail.
     Refused(String),
-    /// The disk.
+    /// The file cannot be written.
     Write(io::Error),
 }
 

@@ -18,7 +18,7 @@ use crate::{device, memory, say};
 /// Bytes of the views and the field, and of each Gaussian besides its harmonics, as measured.
 const FIELD: u64 = 700_000_000;
 const GAUSSIAN: u64 = 220;
-/// Seconds per Gaussian on two cores of an AMD EPYC, and seconds from which they are announced.
+/// Seconds per Gaussian on two cores of an AMD EPYC, and seconds from which the estimate is printed.
 const SECONDS: f64 = 1e-5;
 const LONG: f64 = 20.0;
 /// Bytes per texel: position, normal, colour, and sums over views.
@@ -59,13 +59,14 @@ pub struct SurfaceArguments {
     /// Approximate number of triangles of the mesh; 0 keeps all [default: 100000].
     #[arg(long, value_name = "N")]
     faces: Option<usize>,
-    /// Side in pixels of a texture, 64 to 16384, or 0 for colours of vertices. A .ply has no texture [default: 2048 for .glb, else 0].
+    /// Side in pixels of a texture, 64 to 16384, or 0 for colours of vertices. A .ply has no texture [default: 2048
+    /// for .glb, else 0].
     #[arg(long, value_name = "SIZE", value_parser = texture_side)]
     texture: Option<u32>,
 }
 
 impl SurfaceArguments {
-    /// `None`, unless an option is given that would have no effect.
+    /// Refuses options that would have no effect; otherwise `None`.
     pub fn must_be_unused<T>(&self, why: &str) -> Result<Option<T>, Failure> {
         let given = [("--faces", self.faces.is_some()), ("--texture", self.texture.is_some())];
         match given.iter().find(|(_, given)| *given) {
@@ -103,7 +104,6 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     })
 }
 
-/// Makes one mesh.
 fn one(arguments: &Arguments, device: &Device) -> Result<(), Failure> {
     let since = Instant::now();
     let mut target = Target::new(&arguments.output, &arguments.surface)?;
@@ -167,7 +167,6 @@ impl Target {
         Ok(Self { path: path.to_owned(), companions: export::companions(path, texture > 0), options })
     }
 
-    /// All output files.
     pub fn files(&self) -> Vec<&Path> {
         let companions = self.companions.iter().map(PathBuf::as_path);
         companions.chain([self.path.as_path()]).collect()
@@ -185,7 +184,7 @@ impl Target {
         Ok(fused)
     }
 
-    /// Says what a user may not expect.
+    /// Warns of dropped pieces and of more triangles than wanted.
     fn warn(&self, fused: &Fused, name: &Path) {
         let name = name.display();
         if fused.largest_dropped >= COMPARABLE {
@@ -203,7 +202,7 @@ impl Target {
     }
 }
 
-/// A length in millimetres, or in metres far from those.
+/// A length in millimetres, or in metres if it is very small or large.
 fn length(metres: f32) -> String {
     if (1e-4..1.0).contains(&metres) { format!("{:.1} mm", 1e3 * metres) } else { format!("{metres:.1e} m") }
 }

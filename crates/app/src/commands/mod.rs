@@ -42,7 +42,7 @@ pub struct ConfigArguments {
 }
 
 impl ConfigArguments {
-    /// The config of the file, or without one that of `fallback` (name and TOML text), with the overrides applied.
+    /// The config of the file, else of `fallback` (name and TOML text), with the overrides applied.
     pub fn resolve(&self, fallback: (&str, &str)) -> Result<Config, Failure> {
         Ok(match &self.config {
             Some(path) => Config::from_file(path, &self.set)?,
@@ -51,7 +51,7 @@ impl ConfigArguments {
     }
 }
 
-/// An argument with these values: name, help, value.
+/// A parser of an argument that takes one of these values: name, help, value.
 pub fn one_of<T: Copy + Send + Sync + 'static, const N: usize>(
     values: [(&'static str, &'static str, T); N],
 ) -> impl TypedValueParser<Value = T> {
@@ -87,7 +87,7 @@ pub fn check_kind(path: &Path) -> Result<(), Failure> {
     Err(Failure::file(path, "is no .ply, .spz, .glb or .sog; the extension says what to write"))
 }
 
-/// Refuses an output folder in a data set (one of `roots`). There it would be a subject without pictures.
+/// Refuses an output folder in a data set (one of `roots`): the data set would take it for a subject without pictures.
 pub fn outside_data<'a>(path: &Path, roots: impl IntoIterator<Item = &'a Path>) -> Result<(), Failure> {
     let whole = std::path::absolute(path).map_err(|e| Failure::cannot_write(path, &e))?;
     // Links of existing folders are followed. `..` after a missing folder is taken literally.

@@ -1,5 +1,5 @@
-//! `snapsnap reconstruct --pairs`: many people. Weights are loaded once, and while the networks process one person, the next one is read and the
-//! previous one is written.
+//! `snapsnap reconstruct --pairs`: many people. Weights are loaded once. While the networks process one person, the
+//! next one is read and the previous one is written.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -45,7 +45,7 @@ struct Job {
     masks: [Option<PathBuf>; 2],
 }
 
-/// What decides the people of a folder.
+/// All settings on which the people of a folder depend.
 #[derive(Serialize)]
 struct Settings<'a> {
     /// SHA-256 of the weights.
@@ -120,7 +120,7 @@ fn check_settings(path: &Path, settings: &Settings) -> Result<(), Failure> {
     }
     let text = file::read_text(path, LARGEST_CONFIG).map_err(FileError::read(path))?;
     let there: toml::Table = toml::from_str(&text).map_err(|e| Failure::file(path, e))?;
-    // As text, since a table of its own would have other digits.
+    // Parsed from text like the file's table: a table made directly would have other digits.
     let wanted: toml::Table =
         toml::from_str(&toml::to_string_pretty(settings).expect("TOML types")).expect("TOML");
     match differences(&keys(&there), &keys(&wanted)).first() {
@@ -132,7 +132,7 @@ fn check_settings(path: &Path, settings: &Settings) -> Result<(), Failure> {
     }
 }
 
-/// Reads all photographs, one person after another, until nobody wants the next one.
+/// Reads all photographs, one person after another, until the receiver is gone.
 fn read_all(
     arguments: &Arguments,
     jobs: &[Job],
@@ -171,15 +171,15 @@ fn write_all(
     for (name, person) in people {
         let written =
             person.and_then(|stored| unpanicked(|| arguments.axes.write(&stored, &of_person(&name))));
-        // The list has room for all, and ends early only after an output that could not be written.
+        // The channel has room for all results. It closes early only after an output that could not be written.
         if to_list.send((name, written)).is_err() {
             return;
         }
     }
 }
 
-/// The people of a table with the columns `front` and `back`, and perhaps `name`, `front_mask` and `back_mask`. Paths are relative to the
-/// table's folder.
+/// The people of a table with the columns `front` and `back`, and perhaps `name`, `front_mask` and `back_mask`. Paths
+/// are relative to the table's folder.
 fn in_list(path: &Path) -> Result<Vec<Job>, Failure> {
     let cannot = |e: csv::Error| Failure::file(path, e);
     let folder = path.parent().unwrap_or(Path::new(""));
@@ -242,8 +242,8 @@ fn named_by(front: &Path) -> Option<String> {
 /// Ends of the names of a person's pictures.
 const ENDS: [&str; 4] = ["_front", "_back", "_front_mask", "_back_mask"];
 
-/// The people of a folder with `NAME_front.jpg`, `NAME_back.jpg`, and perhaps `NAME_front_mask.png` and `NAME_back_mask.png`, of any kind of
-/// picture.
+/// The people of a folder with `NAME_front.jpg`, `NAME_back.jpg`, and perhaps `NAME_front_mask.png` and
+/// `NAME_back_mask.png`, of any kind of picture.
 fn in_folder(folder: &Path) -> Result<Vec<Job>, Failure> {
     let mut found = BTreeMap::new();
     let mut others = 0;
@@ -284,7 +284,7 @@ fn in_folder(folder: &Path) -> Result<Vec<Job>, Failure> {
     checked(folder, names.into_iter().map(job).collect())
 }
 
-/// Refuses no people, and two people of one name, also where files do not tell upper from lower case.
+/// Refuses an empty list, and two people whose names are equal or differ only in case.
 fn checked(path: &Path, jobs: Vec<Job>) -> Result<Vec<Job>, Failure> {
     if jobs.is_empty() {
         return Err(Failure::file(path, "has no pair of photographs"));

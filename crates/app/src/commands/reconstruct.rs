@@ -28,13 +28,13 @@ use crate::told::CameraArguments;
 use crate::turntable::Turntable;
 use crate::{cutouts, device, dump, memory, output, say, weights};
 
-/// Bytes per pixel of a photograph while it is placed on its canvas: 4 of the decoded picture, 3 + 1 of its colours and mask,
-/// 4 of a plane of f32, 3 + 1 of the other photograph's colours and mask, and 2 to spare.
+/// Bytes per pixel of a photograph while it is placed on its canvas: 4 of the decoded picture, 3 + 1 of its colours
+/// and mask, 4 of a plane of f32, 3 + 1 of the other photograph's colours and mask, and 2 to spare.
 const BYTES_PER_PIXEL: u64 = 18;
 
 /// The output of one person.
 const DEFAULT_OUTPUT: &str = "human.ply";
-/// Why options of many people are refused for one.
+/// Message for options of --pairs in a reconstruction of one person.
 const ONE: &str = "is for many people, with --pairs";
 
 #[derive(Args)]
@@ -45,9 +45,9 @@ pub struct Arguments {
     /// Photograph of the back.
     #[arg(required_unless_present = "pairs")]
     back: Option<PathBuf>,
-    /// Many people: a table with the columns front, back and perhaps name, front_mask and back_mask, or a folder of NAME_front.jpg and
-    /// NAME_back.jpg. Their files NAME.ply go to the folder -o. People who are there already are left out. Pairs that fail are listed in
-    /// errors.csv.
+    /// Many people: a table with the columns front, back and perhaps name, front_mask and back_mask, or a folder of
+    /// NAME_front.jpg and NAME_back.jpg. Their files NAME.ply go to the folder -o. People who are there already are
+    /// left out. Pairs that fail are listed in errors.csv.
     #[arg(long, value_name = "CSV|DIR", conflicts_with_all = ["front", "back", "masks", "save_cutouts", "turntable", "mesh", "dump", "verbose", "json"])]
     pairs: Option<PathBuf>,
     #[command(flatten)]
@@ -57,12 +57,13 @@ pub struct Arguments {
     /// Masks of the two photographs (white: person).
     #[arg(long, num_args = 2, value_names = ["FRONT_MASK", "BACK_MASK"])]
     masks: Option<Vec<PathBuf>>,
-    /// Background removal. auto: by the network, for photographs without an alpha channel and --masks; network: always by the network,
-    /// alpha channels are ignored; none: by alpha channels and --masks alone.
+    /// Background removal. auto: by the network, for photographs without an alpha channel and --masks; network: always
+    /// by the network, alpha channels are ignored; none: by alpha channels and --masks alone.
     #[arg(long, value_name = "auto|network|none", default_value = "auto", value_parser = ["auto", "network", "none"])]
     pub cutout: String,
-    /// Also write the photographs without background, before they are placed on the canvas, as front.png and back.png. The back's
-    /// colours are matched to the front's. They are at most 4096 pixels long if the network removed the background.
+    /// Also write the photographs without background, before they are placed on the canvas, as front.png and back.png.
+    /// The back's colours are matched to the front's. They are at most 4096 pixels long if the network removed the
+    /// background.
     #[arg(long, value_name = "DIR")]
     save_cutouts: Option<PathBuf>,
     /// Use the pictures as the canvas, without cropping, scaling and centring.
@@ -75,8 +76,8 @@ pub struct Arguments {
     pub camera: CameraArguments,
     #[command(flatten)]
     pub model: ModelArguments,
-    /// File of Gaussians to write: .ply, .spz, .glb or .sog [default: human.ply]. The resolved config is written beside it. With --pairs,
-    /// a folder.
+    /// File of Gaussians to write: .ply, .spz, .glb or .sog [default: human.ply]. The resolved config is written
+    /// beside it. With --pairs, a folder.
     #[arg(short, long)]
     pub output: Option<PathBuf>,
     #[command(flatten)]
@@ -101,7 +102,7 @@ pub struct Arguments {
 }
 
 impl Arguments {
-    /// What tells the person from the background.
+    /// What separates the person from the background.
     fn cutting(&self) -> Cutting {
         match &*self.cutout {
             "none" => Cutting::Given,
@@ -110,8 +111,8 @@ impl Arguments {
         }
     }
 
-    /// Reads the photographs of a person for the networks of a config. Prints doubts about them with `name` before each, or refuses them
-    /// with --strict.
+    /// Reads the photographs of a person for the networks of a config. Prints doubts about them with `name` before
+    /// each, or refuses them with --strict.
     pub fn read(
         &self,
         sources: &[Source],
@@ -141,8 +142,8 @@ pub struct ModelArguments {
     /// auto, cpu, ndarray, wgpu, vulkan, cuda or metal; wgpu:1 is the second adapter.
     #[arg(long, default_value = "auto")]
     device: String,
-    /// Numbers in the point predictor's matrix products: f32, bf16, or auto: bf16 if the weights were trained in bf16 and the CPU
-    /// has instructions for it, else f32.
+    /// Numbers in the point predictor's matrix products: f32, bf16, or auto: bf16 if the weights were trained in bf16
+    /// and the CPU has instructions for it, else f32.
     #[arg(long, value_name = "auto|f32|bf16", default_value = "auto", value_parser = precision)]
     precision: PrecisionChoice,
 }
@@ -207,7 +208,7 @@ fn precision(text: &str) -> Result<PrecisionChoice, &'static str> {
     }
 }
 
-/// The precision, and what computes it on the CPU.
+/// The name of the precision, and of the instructions that compute it on the CPU.
 fn in_words(precision: Precision, device: &Device) -> String {
     let name = precision.name();
     if precision != Precision::Bf16 || !memory::is_cpu(device) {
@@ -228,7 +229,6 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     }
 }
 
-/// Makes one person.
 fn one(arguments: &Arguments, paths: [&PathBuf; 2]) -> Result<(), Failure> {
     let start = Instant::now();
     arguments.kind.must_be_unused(ONE)?;
@@ -287,7 +287,7 @@ fn one(arguments: &Arguments, paths: [&PathBuf; 2]) -> Result<(), Failure> {
     if let Some(path) = &arguments.dump {
         dump::write(&made, path)?;
     }
-    // The maps need memory that turntable and mesh use.
+    // Frees the point maps before turntable and mesh need memory.
     let steps = std::mem::take(&mut made.steps);
     drop(made);
     times.push(("writing", since.elapsed()));
@@ -349,8 +349,8 @@ fn one(arguments: &Arguments, paths: [&PathBuf; 2]) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Refuses outputs that cannot be written or would destroy an input. Returns the path of the output config, which is not written
-/// beside a pipe or a device, or over the given config.
+/// Refuses outputs that cannot be written or would destroy an input. Returns the path of the output config, which is
+/// not written beside a pipe or a device, or over the given config.
 fn check_paths(
     arguments: &Arguments,
     [front, back]: [&PathBuf; 2],

@@ -27,8 +27,8 @@ use crate::{device, say};
 const DEFAULT_SIDE: u32 = 1024;
 /// Largest picture, in pixels.
 const MAX_PIXELS: u64 = 1 << 26;
-/// Largest number of pairs of a splat and a tile in a picture without --force: about two seconds on two cores. A scene of five
-/// million Gaussians has half as many.
+/// Largest number of pairs of a splat and a tile in a picture without --force: about two seconds on two cores. A scene
+/// of five million Gaussians has half as many.
 pub const MAX_INTERSECTIONS: u64 = 100_000_000;
 /// Default folder of the pictures.
 const DEFAULT_FOLDER: &str = "renders";
@@ -54,8 +54,8 @@ pub struct Arguments {
     /// Colour behind the Gaussians, each from 0 to 1.
     #[arg(long, value_name = "R,G,B", value_parser = color, default_value = "0,0,0")]
     background: [f32; 3],
-    /// Folder for 000.png, 001.png, … and cameras.json [default: renders, unless --raw is given]. Each of several files gets a folder in
-    /// it.
+    /// Folder for 000.png, 001.png, … and cameras.json [default: renders, unless --raw is given]. Each of several
+    /// files gets a folder in it.
     #[arg(short, long, value_name = "DIR")]
     output: Option<PathBuf>,
     /// Also write colour, alpha and depth as f32 tensors.
@@ -257,8 +257,8 @@ fn check_raw(views: &[Camera]) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Colour `[V,H,W,3]`, alpha and depth `[V,H,W]`. Each view is written to temporary files, since all views together may be
-/// larger than memory.
+/// Colour `[V,H,W,3]`, alpha and depth `[V,H,W]`. Each view is written to temporary files, since all views together
+/// may be larger than memory.
 struct Raw {
     path: PathBuf,
     parts: [BufWriter<File>; 3],

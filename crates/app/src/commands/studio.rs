@@ -1,4 +1,4 @@
-//! `snapsnap studio`: a page (crates/app/viewer) that makes people of photographs. All of it stays in this process's memory.
+//! `snapsnap studio`: a page (crates/app/viewer) that makes people of photographs, all in this process's memory.
 
 use std::collections::VecDeque;
 use std::io::Cursor;
@@ -54,7 +54,7 @@ struct Studio {
     people: Mutex<VecDeque<(String, Arc<Stored>)>>,
     /// Number of people so far.
     made: AtomicUsize,
-    /// The start of this server. A page of an earlier one finds none of its people here.
+    /// Start of this server, a part of names: a page of an earlier server finds none of its people here.
     start: u128,
     /// Locked while a mesh or an animation is made, which takes all cores.
     long: Mutex<()>,
@@ -152,7 +152,7 @@ impl Studio {
             .map_err(|none| text(StatusCode::UNPROCESSABLE_ENTITY, &none.to_string()))?;
         let doubts: Vec<String> = read.doubts.iter().map(ToString::to_string).collect();
         let stored = Stored::of(&person.gaussians).map_err(Failure::from)?;
-        // The next person may come in an hour.
+        // Frees buffers, since the next person may come in an hour.
         snapsnap_ops::buffers::release();
         drop(networks);
         let name = format!("{:x}-{}", self.start, self.made.fetch_add(1, Ordering::Relaxed));

@@ -82,7 +82,7 @@ fn respond(request: &Request, input: &Path) -> Answer {
     }
 }
 
-/// The content of this extension for the current file, made once. `None` while slow clients are still reading too many former ones.
+/// The current file's content of this kind, made once. `None` while clients still read too many former contents.
 fn shared(
     input: &Path,
     extension: &'static str,

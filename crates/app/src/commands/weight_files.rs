@@ -33,8 +33,8 @@ pub struct InitArguments {
 
 #[derive(Args)]
 pub struct ImportArguments {
-    /// Checkpoints: DUSt3R or CroCo (`.safetensors`, `.pth`), Snap-Snap stage 1 and stage 2 (`.pth`), or weight files of
-    /// this program.
+    /// Checkpoints: DUSt3R or CroCo (`.safetensors`, `.pth`), Snap-Snap stage 1 and stage 2 (`.pth`), or weight files
+    /// of this program.
     #[arg(required = true)]
     sources: Vec<PathBuf>,
     /// Checkpoint for the tensors that no other checkpoint contains.
@@ -101,8 +101,8 @@ pub fn import(arguments: &ImportArguments) -> Result<(), Failure> {
     Ok(())
 }
 
-/// The config of --config, or the one stored in the files, or the published size. The published weights of that size need
-/// `compat`.
+/// The config of --config, else the config stored in the files, else the published size with `compat`, which the
+/// published weights need.
 fn import_config(ImportArguments { sources, fill, config, .. }: &ImportArguments) -> Result<Config, Failure> {
     if config.config.is_none() {
         // A pickle contains no config.

@@ -31,13 +31,13 @@ pub struct BenchConfig {
 pub struct BenchSection {
     /// Number of timed reconstructions.
     pub runs: usize,
-    /// Number of reconstructions before these.
+    /// Number of reconstructions before the timed ones.
     pub warm_up: usize,
     /// Number of people whose pictures are compared.
     pub people: usize,
     /// Number of compared views of each person, at equal angles.
     pub views: usize,
-    /// Side of the compared pictures; 0: that of the data set.
+    /// Side of the compared pictures in pixels; 0: the data set's side.
     pub resolution: usize,
     /// Side of the patch of a picture that the f64 oracle renders.
     pub oracle: u32,
@@ -82,9 +82,9 @@ impl BenchConfig {
         settings
     }
 
-    /// The evaluation of a variant's pictures.
+    /// The config of the evaluation of a variant's pictures.
     pub(super) fn evaluation(&self, variant: &Variant) -> EvalConfig {
-        // The Gaussians of one person are fitted.
+        // Only one person's Gaussians are fitted.
         let subjects = if variant.tune.is_some() { 1 } else { self.bench.people };
         let only = variant.only.as_ref().unwrap_or(&self.data.only).clone();
         let (views, metrics) = (ViewsSection::default(), MetricsSection::default());

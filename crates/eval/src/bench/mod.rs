@@ -25,17 +25,17 @@ use crate::variant::Variant;
 
 use config::BenchConfig;
 
-/// Most readings and renders that are timed.
+/// Largest number of timed readings and of timed renders.
 const FEW: usize = 5;
 
 /// Costs and errors of a variant.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub struct Measured {
-    /// Its name.
+    /// Name of the variant.
     pub name: String,
     /// The varied property.
     pub knob: Option<String>,
-    /// Its scene, if it belongs to one.
+    /// The scene, if the variant belongs to one.
     pub scene: Option<String>,
     /// The omitted work.
     pub omits: Option<String>,
@@ -49,7 +49,7 @@ pub struct Measured {
     pub runs: usize,
     /// Seconds from the photographs on their canvas to the Gaussians, p50.
     pub p50: f64,
-    /// The same, p95.
+    /// Seconds from the photographs on their canvas to the Gaussians, p95.
     pub p95: f64,
     /// Seconds of each module, p50, and of the work before and after a reconstruction.
     pub modules: Vec<(String, f64)>,
@@ -63,7 +63,7 @@ pub struct Measured {
     /// dB, protocol `masked`, mean over people and views.
     #[serde(with = "crate::statistics::number")]
     pub psnr: f64,
-    /// The same for each person.
+    /// PSNR of each person.
     pub people: Vec<PersonScore>,
     /// Mean over people and views.
     pub ssim: Option<f64>,
@@ -73,7 +73,7 @@ pub struct Measured {
     pub lpips_weights: String,
     /// Mean distance of the predicted points of front and back from the ground truth, mm.
     pub points_mm: Option<f64>,
-    /// The same for the unseen sides.
+    /// Mean distance of the predicted points of the unseen sides from the ground truth, mm.
     pub sides_mm: Option<f64>,
     /// Largest difference of a colour from the f64 oracle with the same cut-offs.
     pub splat_error: f64,
@@ -99,7 +99,7 @@ impl Measured {
         self.p50 + self.render
     }
 
-    /// Whether it belongs to no scene and its Gaussians are not fitted.
+    /// Whether the variant belongs to no scene and its Gaussians are not fitted.
     fn is_plain(&self) -> bool {
         self.scene.is_none() && self.tuning.is_none()
     }
@@ -248,12 +248,12 @@ fn patch(shown: &Gaussians, camera: &Camera, side: u32) -> Camera {
     Camera { width: side, height: side, principal_point: camera.principal_point - corner, ..*camera }
 }
 
-/// Share of the time. Smaller differences are noise.
+/// Relative difference of times. Smaller differences are noise.
 const FASTER: f64 = 0.03;
 
 /// For each variant, the index of the best variant that dominates it: with better pictures (the paired interval over
-/// people is above 0) in at most 3 % more time, or with equally good ones in at least 3 % less. Time is that of a
-/// reconstruction and a view. Scenes, tuned Gaussians and different people are not compared.
+/// people is above 0) in at most 3 % more time, or with equally good pictures in at least 3 % less time. The time is
+/// the sum of a reconstruction and a view. Scenes, tuned Gaussians and different people are not compared.
 pub fn dominated(measured: &[Measured]) -> Vec<Option<usize>> {
     let names = |m: &Measured| m.people.iter().map(|person| person.name.clone()).collect::<Vec<_>>();
     let is_alike = |a: &Measured, b: &Measured| a.is_plain() && b.is_plain() && names(a) == names(b);
@@ -287,7 +287,7 @@ mod tests {
     fn slower_and_no_better_variants_are_dominated_by_the_best_better_one() {
         let all = [(10.0, 20.0), (20.0, 19.0), (5.0, 19.5), (30.0, 21.0), (10.2, 20.0)];
         let mut all = all.map(|(p50, psnr)| measured(p50, psnr));
-        // The difference to the time of the last one is noise.
+        // The difference from the last variant's time is noise.
         assert_eq!(dominated(&all), [None, Some(4), None, None, None]);
         // Better for one person and worse for the other: better in the mean, but not clearly.
         all[4].people[0].psnr -= 1.0;

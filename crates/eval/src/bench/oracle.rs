@@ -7,11 +7,11 @@ use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
 
 use crate::EvalError;
 
-/// Largest α of a splat without cut-offs.
+/// Largest α of a splat in the oracle without cut-offs.
 const WHOLE: f32 = 0.999_99;
 
-/// Largest differences of a colour in a view: of the renderer from the oracle with the same cut-offs, and of that
-/// oracle from one without cut-offs, whose pixels never close, and whose splats fade smoothly and may be opaque.
+/// Largest differences of a colour in a view: between renderer and oracle with the same cut-offs, and between oracles
+/// with and without cut-offs. Without cut-offs pixels never close, and splats fade smoothly and may be opaque.
 pub(super) fn errors(
     gaussians: &Gaussians,
     camera: &Camera,

@@ -89,7 +89,7 @@ impl Bench<'_> {
         self.measured.first().map_or("n/a", |m| &m.lpips_weights)
     }
 
-    /// All failures, those of the measured variants last.
+    /// All failures; failures inside measured variants come last.
     pub fn failures(&self) -> Vec<LeftOut> {
         let partly =
             self.measured.iter().flat_map(|m| m.left_out.iter().map(|why| LeftOut::new(&m.name, why)));
@@ -145,7 +145,7 @@ impl Bench<'_> {
         for scene in scenes {
             let of_scene = || self.measured.iter().filter(|m| m.scene.as_ref() == Some(scene));
             let Some(whole) = of_scene().find(|m| m.omits.is_none()) else { continue };
-            // The time of a fit is that of a step.
+            // The time of a fit is the time of one step.
             let time = |m: &Measured| 1e3 * m.tuning.unwrap_or(m.p50);
             let share = |now: f64, before: f64| format!("{:.0} %", 100.0 * (1.0 - now / before));
             let megabytes = |m: &Measured| m.memory.map(|bytes| bytes as f64 / 1e6);

@@ -1,4 +1,4 @@
-//! Fit of a person's Gaussians to the photographs: the cost of gradients of all parameters, and of colours alone.
+//! Fit of a person's Gaussians to the photographs: the cost of gradients of all parameters, or of colours alone.
 
 use std::time::{Duration, Instant};
 
@@ -22,7 +22,7 @@ struct Moments {
 }
 
 impl Moments {
-    /// The direction of a step, of size 1 or so.
+    /// The direction of a step, with components of about 1.
     fn direction(&mut self, gradient: Tensor<2>, step: usize) -> Tensor<2> {
         const BETAS: [f64; 2] = [0.9, 0.99];
         self.mean = self.mean.clone() * BETAS[0] + gradient.clone() * (1.0 - BETAS[0]);
@@ -71,7 +71,7 @@ pub(super) fn fit(
             let Some(gradient) = tracked[i].grad(&gradients) else { continue };
             let direction = moments.direction(gradient, step);
             let value = rows[i].clone().inner();
-            // Steps of scales are relative to them. Opacities and colours stay in [0, 1].
+            // Steps of scales are relative to the scales. Opacities and colours stay in [0, 1].
             let moved = match i {
                 2 => value.clone() - value * direction * RATES[i],
                 3 | 4 => (value - direction * RATES[i]).clamp(0.0, 1.0),

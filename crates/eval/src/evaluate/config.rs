@@ -30,7 +30,7 @@ pub struct EvalConfig {
     pub baselines: BaselineSection,
     /// Variants of the model by name. Each is compared with the model, person by person.
     pub ablations: BTreeMap<String, Variant>,
-    /// Groups of subjects with figures of their own, such as those in loose clothes.
+    /// Groups of subjects with figures of their own, such as people in loose clothes.
     pub groups: BTreeMap<String, Group>,
     /// Pictures of the report.
     pub report: ReportSection,
@@ -42,7 +42,7 @@ pub struct EvalConfig {
 pub struct DataSection {
     /// The data sets. `--data` replaces them.
     pub folders: Vec<PathBuf>,
-    /// Split of the people. Unset: they are in the folder itself, as in the authors' test sets.
+    /// Split of the people. Unset: the people are in the folder itself, as in the authors' test sets.
     #[serde(with = "split")]
     pub split: Option<Split>,
     /// Number of people of each data set, the first ones; 0: all.
@@ -85,12 +85,12 @@ impl Default for DataSection {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ViewsSection {
-    /// Input views; empty: the first and the opposite one. With more than two, each and the next around the circle are
-    /// a pair of photographs with known cameras and without unseen sides. The Gaussians of all pairs are joined.
+    /// Input views; empty: the first and the opposite view. Of more than two, each view and the next around the circle
+    /// are a pair of photographs with known cameras and no unseen sides. The Gaussians of all pairs are joined.
     pub inputs: Vec<usize>,
-    /// Offsets that are added to the input views, for other angles than the person's own front.
+    /// Offsets that are added to the input views, for angles other than the person's front.
     pub turns: Vec<usize>,
-    /// Side of the compared pictures in pixels; 0: that of the data set, of which it is a whole part.
+    /// Side of the compared pictures in pixels, a divisor of the data set's side; 0: the data set's side.
     pub resolution: usize,
     /// Pictures are rendered this many times as large on each side, 1 or 2, and shrunk.
     pub supersampling: usize,
@@ -131,8 +131,8 @@ pub struct ModelSection {
     pub weights: Option<PathBuf>,
     /// Overrides of the config that is stored with the weights, `section.key=value`.
     pub set: Vec<String>,
-    /// Devices, as in `--device`; empty: the best one. The model runs on the first. Each further one is compared with
-    /// it like an ablation.
+    /// Devices, as in `--device`; empty: the best device. The model runs on the first. Each further device is compared
+    /// with the first like an ablation.
     pub devices: Vec<String>,
 }
 
@@ -204,8 +204,8 @@ pub struct BaselineSection {
     pub billboard: bool,
     /// Ground-truth points in the photographs' colours: the best input of a regressor.
     pub true_points: bool,
-    /// Data sets of people to train on with the same views, of any size. The baseline is their mean picture of each
-    /// view. Empty: left out.
+    /// Data sets of training people with the same views, of any size. The baseline is the mean picture of each view.
+    /// Empty: left out.
     pub mean: Vec<PathBuf>,
 }
 
@@ -219,9 +219,9 @@ impl Default for BaselineSection {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ReportSection {
-    /// Number of people in the picture of each kind: best, middle and worst.
+    /// Number of people in the picture from each of the best, the middle and the worst.
     pub people: usize,
-    /// Views of each in degrees from the first input view.
+    /// Views of each person, in degrees from the first input view.
     pub degrees: Vec<f64>,
 }
 
@@ -272,7 +272,7 @@ impl Schema for EvalConfig {
 
 impl EvalConfig {
     fn problem(&self) -> Option<(&'static str, String)> {
-        /// Other names in reports.
+        /// Names that have another meaning in reports.
         const TAKEN: [&str; 5] = ["model", "against", "billboard", "true_points", "mean_picture"];
         let Self { views, metrics, report, ablations, model, .. } = self;
         let devices = model.devices.iter().map(|name| on_device(name));

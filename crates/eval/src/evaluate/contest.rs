@@ -38,7 +38,7 @@ pub enum Kind {
 
 /// A model or a baseline.
 pub struct Contestant {
-    /// Its name in reports.
+    /// The name in reports.
     pub name: String,
     means: Means,
 }
@@ -61,7 +61,7 @@ pub struct Shown {
     pub lost: usize,
     /// Time of the reconstruction.
     pub time: Option<Duration>,
-    /// Degrees, centimetres (of the middle) and factor of the alignment, if there was one.
+    /// Rotation in degrees, shift of the middle in cm and scale of the alignment, if there was one.
     pub aligned: Option<[f64; 3]>,
 }
 
@@ -71,17 +71,17 @@ impl Contestant {
         Self { name: name.into(), means: Means::Model(kind, Box::new(model)) }
     }
 
-    /// The photographs as cut-outs.
+    /// The baseline of photographs as flat cut-outs.
     pub fn billboard(device: &Device) -> Self {
         Self { name: "billboard".into(), means: Means::Billboard(device.clone()) }
     }
 
-    /// Ground-truth points in the photographs' colours.
+    /// The baseline of ground-truth points in the photographs' colours.
     pub fn true_points(device: &Device) -> Self {
         Self { name: "true_points".into(), means: Means::TruePoints(device.clone()) }
     }
 
-    /// The mean picture of people to train on.
+    /// The baseline of mean pictures of training people.
     pub fn mean(pictures: MeanPictures) -> Self {
         Self { name: "mean_picture".into(), means: Means::Mean(pictures) }
     }
@@ -91,7 +91,7 @@ impl Contestant {
         Self { name: name.into(), means: Means::Fixed(Box::new(gaussians)) }
     }
 
-    /// Its role in the report.
+    /// The role in the report.
     pub fn kind(&self) -> Kind {
         match &self.means {
             Means::Model(kind, _) => *kind,
@@ -99,8 +99,8 @@ impl Contestant {
         }
     }
 
-    /// Its result for a person's photographs. `canvas` is the side of the baselines' canvas in pixels. Models are aligned with
-    /// the truth first.
+    /// The result for a person's photographs. `canvas` is the side of the baselines' canvas in pixels. Models are
+    /// aligned with the truth as `metrics` says.
     ///
     /// # Errors
     /// [`EvalError`] if files cannot be read, no Gaussian came out, or there is no truth for an alignment.
@@ -165,7 +165,7 @@ impl Contestant {
         }
     }
 
-    /// Its picture of a view, `side`² pixels.
+    /// The contestant's picture of a view, `side`² pixels.
     ///
     /// # Errors
     /// [`EvalError`] for Gaussians that cannot be rendered.
@@ -185,8 +185,8 @@ impl Contestant {
     }
 }
 
-/// Aligns Gaussians (world frame) and point maps (frame of the `front` camera) with the truth, by the centres of opaque
-/// Gaussians. Returns the figures of the motion.
+/// Aligns Gaussians (world frame) and point maps (frame of the `front` camera) with the truth, by the centres of
+/// opaque Gaussians. Returns rotation in degrees, shift of the centres' mean in cm, and scale.
 fn aligned(
     made: &mut Made,
     metrics: &MetricsSection,
@@ -219,10 +219,10 @@ fn aligned(
     Ok(motion.figures(&centres))
 }
 
-/// The photographs `[3,S,S]` on a canvas, and the pixels that are at least half the person's. Those have the person's
-/// own colour.
+/// The photographs `[3,S,S]` on a canvas, and masks of the pixels that the person covers at least by half. These
+/// pixels have the person's own colour.
 fn on_canvas(item: &TestItem, count: usize, side: usize) -> (Vec<Vec<f32>>, Vec<Vec<bool>>) {
-    // Stored colours are multiplied with the mask. Networks may have learned to undo that, baselines cannot.
+    // Stored colours are multiplied by the mask. Networks may have learned to undo this, baselines cannot.
     let own = |photo: Photograph| {
         let Photograph { mut rgb, mask, valid } = photo;
         for plane in rgb.chunks_exact_mut(mask.len()) {
@@ -233,7 +233,7 @@ fn on_canvas(item: &TestItem, count: usize, side: usize) -> (Vec<Vec<f32>>, Vec<
     (0..count).map(|place| own(photograph(item, place, side))).unzip()
 }
 
-/// Errors of predicted maps, by their indices in [`crate::points::VIEWS`], at the pixels with ground truth.
+/// Errors of point maps at the pixels with ground truth. Each map has its view's index in [`crate::points::VIEWS`].
 fn errors(
     people: &People,
     row: usize,
@@ -269,7 +269,7 @@ mod tests {
 
     use super::*;
 
-    /// Gaussians and maps of a cloud, moved by a known similarity that is smaller than the distance of neighbours, come back.
+    /// Alignment undoes a known similarity that moved Gaussians and maps by less than the distance of neighbours.
     #[test]
     fn aligned_models_lie_on_the_truth() {
         let front = Camera::orbit_at_yaw_degrees(0.0, 64);

@@ -33,7 +33,7 @@ pub struct MeshFigures {
     pub to_truth: f64,
     /// From ground-truth points to the nearest point of the mesh.
     pub from_truth: f64,
-    /// Mean of both.
+    /// Mean of `to_truth` and `from_truth`.
     pub chamfer: f64,
     /// From ground-truth points to the mesh's triangles.
     pub truth_to_surface: f64,
@@ -41,12 +41,12 @@ pub struct MeshFigures {
     pub surface_to_scan: Option<f64>,
     /// Mean cosine of normals from the views nearest to 0, 90, 180 and 270°, at pixels with both normals.
     pub normal_consistency: Option<f64>,
-    /// Degrees, centimetres (of its middle) and factor of the alignment, if there was one.
+    /// Rotation in degrees, shift of the middle in cm and scale of the alignment, if there was one.
     pub aligned: Option<[f64; 3]>,
 }
 
-/// Compares the meshes NAME.obj, .ply or .glb in a folder with the ground truth, or, with several data sets, SET/NAME.… of each.
-/// `progress` is called with the number of finished people and their total.
+/// Compares the meshes NAME.obj, .ply or .glb of a folder with the ground truth. With several data sets, files are
+/// SET/NAME.…. `progress` is called with the number of finished people and their total.
 pub fn evaluate_meshes(
     config: &EvalConfig,
     sets: &[People],
@@ -59,7 +59,7 @@ pub fn evaluate_meshes(
     for (done, (people, row)) in people.enumerate() {
         let name = name_of(sets, people, row);
         let own = people.test().name(row);
-        // In files, people of one name are told apart by the names of their data sets.
+        // A file needs the data set's name only if several data sets have a person of this name.
         let is_in = |set: &&People| set.chosen().iter().any(|row| set.test().name(*row) == own);
         let is_alone = sets.iter().filter(is_in).count() == 1;
         let names: Vec<&str> = [&*name].into_iter().chain(is_alone.then_some(own)).collect();
@@ -119,7 +119,7 @@ fn one(
     })
 }
 
-/// The mesh of a person in a folder, under the first of the names that has one.
+/// The mesh of a person in a folder: the first file that exists under one of the names.
 fn find(folder: &Path, names: &[&str]) -> Result<PathBuf, EvalError> {
     let files = names.iter().flat_map(|name| {
         // Collections of scans have a folder for each scan.

@@ -35,7 +35,7 @@ pub use surface::{Surface, Truth, truth};
 /// Scores of one view of a person.
 #[derive(Debug, Clone)]
 pub struct Row {
-    /// Row of [`Outcome::people`].
+    /// Index in [`Outcome::people`].
     pub person: usize,
     /// Offset that was added to the input views.
     pub turn: usize,
@@ -50,27 +50,27 @@ pub struct Row {
 /// All measurements of a contestant.
 #[derive(Debug, Clone, Default)]
 pub struct Judged {
-    /// Its name.
+    /// The contestant's name.
     pub name: String,
-    /// Its role.
+    /// The contestant's role.
     pub kind: Kind,
-    /// Views.
+    /// Scores of the views.
     pub rows: Vec<Row>,
     /// Errors of the predicted points, per person and turn.
     pub points: Vec<(usize, Vec<PointError>)>,
     /// The Gaussians as a surface, per person and turn.
     pub surface: Vec<(usize, Surface)>,
-    /// The mesh made of them, likewise.
+    /// The mesh made of the Gaussians, per person and turn.
     pub mesh: Vec<(usize, Surface)>,
     /// From the photographs to the Gaussians, per person and turn.
     pub times: Vec<Duration>,
-    /// Number of Gaussians, likewise.
+    /// Number of Gaussians, per person and turn.
     pub gaussians: Vec<usize>,
-    /// Degrees, centimetres (of the middle) and factor of the alignments, likewise.
+    /// Rotation in degrees, shift of the middle in cm and scale of the alignment, per person and turn.
     pub aligned: Vec<[f64; 3]>,
 }
 
-/// Means of each person's views, by row of [`Outcome::people`].
+/// Mean score of each person's views, by index in [`Outcome::people`].
 pub(crate) fn by_person<'a>(
     rows: impl IntoIterator<Item = &'a Row>,
     protocol: usize,
@@ -102,7 +102,7 @@ impl LeftOut {
 pub struct Outcome {
     /// Names of the people.
     pub people: Vec<String>,
-    /// The model first, if it could be loaded.
+    /// The contestants; the model is the first if it could be loaded.
     pub judged: Vec<Judged>,
     /// Failed parts.
     pub left_out: Vec<LeftOut>,
@@ -157,7 +157,7 @@ pub fn evaluate(
     outcome
 }
 
-/// People of the config who are missing.
+/// The people whom the config names and no data set has.
 pub(crate) fn missing(config: &EvalConfig, sets: &[People]) -> Vec<LeftOut> {
     let is_missing = |name: &&String| {
         !sets.iter().any(|set| set.chosen().iter().any(|row| set.test().name(*row) == name.as_str()))
@@ -176,7 +176,7 @@ pub(crate) fn is_named(person: &str, name: &str) -> bool {
     person == name || person.rsplit('/').next() == Some(name)
 }
 
-/// A person's name, with the data set's where there are several.
+/// A person's name. With several data sets, the data set's name stands before it.
 fn name_of(sets: &[People], people: &People, row: usize) -> String {
     let name = people.test().name(row);
     if sets.len() < 2 {
@@ -188,7 +188,7 @@ fn name_of(sets: &[People], people: &People, row: usize) -> String {
         let parts = root.components().filter(|part| matches!(part, Component::Normal(_)));
         parts.map(|part| part.as_os_str().to_string_lossy().into_owned()).collect::<Vec<_>>()
     };
-    // As many of the folders around it as tell the set apart.
+    // The fewest last folders of the path that no other data set has.
     let (own, all) = (parts(people), sets.iter().map(parts).collect::<Vec<_>>());
     let called = |count: usize| &own[own.len() - count..];
     let is_own = |count: &usize| all.iter().filter(|other| other.ends_with(called(*count))).count() == 1;
@@ -202,9 +202,9 @@ struct Place<'a> {
     contestants: &'a [Contestant],
     lpips: Option<&'a Lpips>,
     people: &'a People,
-    /// Row of the data set.
+    /// The person's row in the data set.
     row: usize,
-    /// Row of the outcome's people.
+    /// The person's index in [`Outcome::people`].
     person: usize,
 }
 
@@ -218,7 +218,7 @@ impl Place<'_> {
         outcome.left_out.push(LeftOut::new(name, why));
     }
 
-    /// The result, or `None` and a record of the failure.
+    /// The value of a result. A failure is recorded and gives `None`.
     fn kept<T>(&self, outcome: &mut Outcome, what: &str, result: Result<T, impl ToString>) -> Option<T> {
         result.map_err(|e| self.left_out(outcome, what, e)).ok()
     }
@@ -268,7 +268,7 @@ impl Place<'_> {
         }
     }
 
-    /// Records all measurements of a contestant but those of pictures.
+    /// Records all measurements of a contestant except the scores of pictures.
     fn measure(&self, i: usize, made: &Shown, truth: Option<&Truth>, outcome: &mut Outcome) {
         let Self { config, person, .. } = *self;
         let name = format!(", {}", self.contestants[i].name);
@@ -320,7 +320,8 @@ impl Place<'_> {
     }
 }
 
-/// Number of pictures of this side that are processed at once. It bounds memory: 64 million pixels need some 3 GB.
+/// Number of pictures of `side`² pixels that are processed at once, to bound memory: 64 million pixels need about 3
+/// GB.
 pub(crate) fn at_once(side: usize) -> usize {
     const PIXELS: usize = 1 << 26;
     (PIXELS / (side * side).max(1)).clamp(1, rayon::current_num_threads())
@@ -342,11 +343,11 @@ pub fn rendered(
     Picture::rendered(&snapsnap_ops::host(color), [large, large], views.supersampling)
 }
 
-/// Mean absolute difference of channels that is white in the sheet.
+/// Mean absolute difference of the channels that the sheet shows as white.
 const WORST: f32 = 0.5;
 
-/// A sheet of some people (rows of the outcome's): both photographs and, for each view of the config, the model's
-/// picture, the ground truth and the error. Also the people whose pictures failed.
+/// A sheet of the people with these indices in [`Outcome::people`]: both photographs and, for each view of the config,
+/// the model's picture, the ground truth and the error. Also returns the people whose pictures failed.
 pub fn sheet(
     config: &EvalConfig,
     sets: &[People],

@@ -26,7 +26,7 @@ pub struct Model {
     reconstructor: Reconstructor,
     stride: usize,
     min_opacity: f32,
-    /// Changes to its photographs.
+    /// Changes to the photographs that the model gets.
     pub photographs: Handling,
 }
 
@@ -35,7 +35,7 @@ pub struct Made {
     /// In the data set's world.
     pub gaussians: Gaussians,
     /// Point maps `[S,S,3]` in the first photograph's frame, by the indices of their views in [`crate::points::VIEWS`].
-    /// Empty for more than two photographs, and for placed ones.
+    /// Empty for more than two photographs, and for placed photographs.
     pub maps: Vec<(usize, Vec<f32>)>,
     /// Number of pixels and Gaussians that were not finite and are left out.
     pub lost: usize,
@@ -48,7 +48,7 @@ pub struct Made {
 }
 
 impl Model {
-    /// Loads both networks of a variant, whose config is that of `weights`.
+    /// Loads both networks of a variant, with the config of `weights`.
     ///
     /// # Errors
     /// [`WeightsError`] if a part is absent or a value is not finite.
@@ -77,7 +77,7 @@ impl Model {
         self.reconstructor.config().network.resolution
     }
 
-    /// Refuses cameras `found` degrees apart for networks of neighbours.
+    /// Refuses cameras `found` degrees apart if the networks are for neighbours at another angle.
     fn check_pair(&self, found: f64) -> Result<(), EvalError> {
         /// Largest deviation of a known camera, degrees.
         const MOST: f64 = 0.5;
@@ -90,7 +90,7 @@ impl Model {
         Ok(())
     }
 
-    /// The photographs on their canvases, as the variant's road has it.
+    /// The photographs, placed on their canvases. [`Cutting::Given`] uses the data set's masks.
     fn canvases(&self, item: &TestItem, cutting: Cutting) -> Result<Photographs, EvalError> {
         let (config, name) = (self.reconstructor.config(), Path::new(&item.subject));
         let knows_masks = cutting == Cutting::Given;
@@ -102,11 +102,11 @@ impl Model {
         Ok(snapsnap_photo::read(&sources.collect::<Vec<_>>(), cutting, self.side(), placement, None)?)
     }
 
-    /// Gaussians of a person seen from the views `inputs`. With more than two photographs, each and the next around the
-    /// circle form a pair, of which the first one's Gaussians are kept, in the frame of its known camera.
+    /// Gaussians of a person seen from the views `inputs`. Of more than two photographs, each and the next around the
+    /// circle form a pair. Of a pair, the first photograph's Gaussians are kept, placed by its known camera.
     ///
     /// # Errors
-    /// [`EvalError`] for photographs without a person, if no Gaussian came out, and for more than two photographs of a user.
+    /// [`EvalError`] without a person or a Gaussian, and for more than two photographs on the road `user`.
     pub fn reconstruct(&self, item: &TestItem, inputs: &[usize]) -> Result<Made, EvalError> {
         match self.photographs.road {
             Road::Canvas => {
@@ -122,7 +122,7 @@ impl Model {
         }
     }
 
-    /// A user's person, in the data set's world.
+    /// The person of photographs with unknown masks and cameras, in the data set's world.
     fn of_user(&self, item: &TestItem, inputs: &[usize]) -> Result<Made, EvalError> {
         let &[front, back] = inputs else {
             let message = "`photographs.road = \"user\"` is for a front and a back: `views.inputs`";
@@ -159,7 +159,7 @@ impl Model {
         })
     }
 
-    /// A person from photographs on their canvases, whose cameras are known. `frames` are those of placed photographs.
+    /// A person from photographs on their canvases, with known cameras. Placed photographs have `frames`.
     fn of_known_cameras(
         &self,
         item: &TestItem,
@@ -178,10 +178,10 @@ impl Model {
             self.check_pair(degrees(&item.cameras[inputs[second]], camera))?;
             let made = self.reconstructor.reconstruct([&photographs[first], &photographs[second]], &|_| ());
             let mut to_world = camera.world_to_camera.inverse();
-            // The second of more than two photographs is the first one of the next pair.
+            // With several pairs, the second photograph is the first photograph of the next pair.
             let (mut gaussians, origins) = self.thinned(made.gaussians.clone(), &made.origins, count > 1);
             if let Some(frames) = frames {
-                // The second of more than two photographs is a neighbour, and shows no back.
+                // With several pairs, the second photograph shows a neighbouring view, not the back.
                 let opposite = camera.turned(180.0);
                 let (other, frame) = if count == 1 {
                     (&item.cameras[inputs[1]], &frames[1])
@@ -209,7 +209,7 @@ impl Model {
                 let of_view = made.points.host.chunks_exact(3 * side * side).map(<[f32]>::to_vec);
                 maps = made.views.iter().map(|view| *view as usize).zip(of_view).collect();
             }
-            // All pairs have one plan.
+            // All pairs run the same steps.
             if first == 0 {
                 steps = made.steps;
             }
@@ -226,7 +226,7 @@ impl Model {
         Ok(Made { gaussians, maps, lost, time, modules, steps })
     }
 
-    /// The Gaussians after the variant's stride and least opacity, only the first photograph's with `only_front`, and their pixels.
+    /// The Gaussians that stride, least opacity and `only_front` (the first photograph's) keep, and their origins.
     fn thinned(
         &self,
         gaussians: Gaussians,
@@ -262,7 +262,7 @@ pub(super) fn no_gaussian() -> EvalError {
     EvalError::Empty("no Gaussian came out".into())
 }
 
-/// All Gaussians of several sets.
+/// Concatenates several sets of Gaussians.
 pub fn joined(parts: Vec<Gaussians>) -> Gaussians {
     let rows = |of: fn(&Gaussians) -> &Tensor<2>| {
         Tensor::cat(parts.iter().map(|part| of(part).clone()).collect(), 0)

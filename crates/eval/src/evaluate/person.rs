@@ -32,7 +32,7 @@ impl People {
     /// Opens a data set.
     ///
     /// # Errors
-    /// [`EvalError`] if it is none, or does not have the views of the config.
+    /// [`EvalError`] if the folder is no data set, or does not have the views of the config.
     pub fn open(path: &Path, data: &DataSection, views: &ViewsSection) -> Result<Self, EvalError> {
         let folder = Arc::new(Folder::open(path)?);
         let test = test_of(&folder, data.split)?;
@@ -84,7 +84,7 @@ impl People {
         self.folder.description().views
     }
 
-    /// The input views plus `turn`.
+    /// The input views, each moved on by `turn` views.
     pub fn inputs(&self, views: &ViewsSection, turn: usize) -> Vec<usize> {
         let count = self.views();
         let first = if views.inputs.is_empty() { vec![0, count / 2] } else { views.inputs.clone() };
@@ -129,7 +129,7 @@ impl People {
 /// The test samples of a split, with unchanged photographs.
 ///
 /// # Errors
-/// [`EvalError::File`] without such a split.
+/// [`EvalError::File`] if the data set has no such split.
 pub fn test_of(folder: &Arc<Folder>, split: Option<Split>) -> Result<Test, EvalError> {
     if let Some(split) = split.filter(|split| !folder.splits().contains(&Some(*split))) {
         let message = format!("has no split `{split}`: change `data.split`");
@@ -138,17 +138,17 @@ pub fn test_of(folder: &Arc<Folder>, split: Option<Split>) -> Result<Test, EvalE
     Ok(Test::new(folder.clone(), split, SampleConfig::default())?)
 }
 
-/// The largest whole part of a side up to `most`.
+/// The largest divisor of a side up to `most`.
 pub fn part_of(side: usize, most: usize) -> usize {
     (1..=side).find(|f| side.is_multiple_of(*f) && side / f <= most).map_or(side, |factor| side / factor)
 }
 
-/// Planes `[C, S, S]` shrunk to a whole part of their side.
+/// Planes `[C, S, S]`, shrunk with area means from side `from` to its divisor `to`.
 pub fn smaller(values: Vec<f32>, channels: usize, from: usize, to: usize) -> Vec<f32> {
     if from == to {
         return values;
     }
-    // Rounding can move means of values in [0, 1] beyond it.
+    // By rounding, means of values in [0, 1] can exceed 1.
     host(shrink(planes(values, channels, from), from / to, Downsample::Area).clamp(0.0, 1.0))
 }
 
@@ -157,8 +157,8 @@ pub fn planes(values: Vec<f32>, channels: usize, side: usize) -> Tensor<4> {
     Tensor::from_data(TensorData::new(values, [1, channels, side, side]), &Device::flex())
 }
 
-/// One of the input photographs, which is a canvas already, on a canvas of `side` pixels: area means if that is a whole part of its own
-/// side, else interpolated.
+/// An input photograph, which is stored as a canvas, resized to a canvas of `side` pixels: with area means if `side`
+/// divides the stored side, else with bilinear interpolation.
 pub fn photograph(item: &TestItem, place: usize, side: usize) -> Photograph {
     let (from, (rgb, mask)) = (item.side, &item.photographs[place]);
     let photograph = on_canvas(rgb, mask);
@@ -179,8 +179,8 @@ pub fn photograph(item: &TestItem, place: usize, side: usize) -> Photograph {
 pub type Points = (Vec<f32>, Vec<f32>);
 
 /// Ground-truth points of some views on a canvas of `side` pixels: `[V,S,S,3]` metres in the first view's frame, and
-/// their mask `[V,S,S]`. A pixel of the canvas has the mean of its points, if at least half of it has points. `None` if
-/// `side` is no whole part of the stored side.
+/// their mask `[V,S,S]`. A pixel of the canvas has the mean of its stored points, if at least half of its area has
+/// points. `None` if `side` does not divide the stored side.
 ///
 /// # Errors
 /// [`EvalError`] for a file of a view that cannot be read.
@@ -204,7 +204,7 @@ pub fn points(
     Ok(Some((points.concat(), valid.concat())))
 }
 
-/// One view's points on `side`² pixels instead of `stored`²: the means of pixels of which at least half has points.
+/// One view's points and mask, shrunk from `stored`² to `side`² pixels as [`points`] does it.
 pub(super) fn means(points: &[f32], valid: &[f32], stored: usize, side: usize) -> Points {
     let factor = stored / side;
     let mean = |cell: usize| {

@@ -10,18 +10,18 @@ use crate::geometry::double;
 
 /// Number of views whose points are joined to a side.
 const SOURCES: usize = 4;
-/// Largest angle between a side and such a view in degrees. Views farther away show less of the side.
+/// Largest angle in degrees between a side and a view that is joined to it. Views farther away show less of the side.
 const FARTHEST: f64 = 30.0;
-/// Largest angle, in degrees, of a view that is the side itself.
+/// A view at most this many degrees from a side is the side itself.
 const SAME: f64 = 0.1;
-/// Points farther than this behind the nearest one of their pixel, metres, belong to another surface.
+/// Points more than this many metres behind the nearest point of their pixel belong to another surface.
 const LAYER: f64 = 0.02;
 /// Largest distance of a point from its pixel's centre in pixels.
 const REACH: f64 = 0.5;
 
-/// Points seen by a camera `azimuth` degrees around the world's y axis from that of view `first`, on a canvas of `side`
-/// pixels: points `[S,S,3]` (metres, the frame of view `first`) and their mask `[S,S]`. They are the points of the view
-/// at that angle, or else of the nearest views. The mask is empty if no view is near.
+/// Points seen by a camera that stands `azimuth` degrees around the world's y axis from view `first`, on a canvas of
+/// `side` pixels: points `[S,S,3]` (metres, the frame of view `first`) and their mask `[S,S]`. The points come from
+/// the view at this angle, or else from the nearest views. The mask is empty if no view is near.
 ///
 /// # Errors
 /// [`EvalError::File`].
@@ -53,7 +53,7 @@ pub fn side_points(
     Ok((nearest.into_iter().flat_map(|point| point.map_or([0.0; 3], in_front)).collect(), valid))
 }
 
-/// Index of the point (world frame) nearest to each pixel's centre `[H,W]`, among those on the front surface.
+/// For each pixel `[H,W]`, the index of the point (world frame) of the front surface nearest to the pixel's centre.
 fn visible(points: &[DVec3], camera: &Camera) -> Vec<Option<usize>> {
     let (width, height) = (f64::from(camera.width), f64::from(camera.height));
     // Pixel, depth, and distance from the pixel's centre.
@@ -83,7 +83,7 @@ fn visible(points: &[DVec3], camera: &Camera) -> Vec<Option<usize>> {
 mod tests {
     use super::*;
 
-    /// A ball of 30 cm with a small one in front, seen by cameras 12° to either side of the side's own.
+    /// A ball of 30 cm with a small ball in front, seen by cameras 12° to either side of the side's camera.
     #[test]
     fn points_of_neighbouring_views_are_those_of_the_side() {
         const BALLS: [(DVec3, f64); 2] =
@@ -113,8 +113,8 @@ mod tests {
         let found = visible(&seen, &canvas);
         let pairs = || found.iter().zip(&exact).map(|(i, exact)| (i.map(|i| seen[i]), *exact));
         let off: Vec<f64> = pairs().filter_map(|(i, exact)| Some((i? - exact?).length())).collect();
-        // Pixels are 2 cm wide at that distance, and have about eight points. Few are seen only by the side or only by
-        // its neighbours.
+        // Pixels are 2 cm wide at this distance, and have about eight points. Few pixels are seen only by the side or
+        // only by its neighbours.
         let mean = off.iter().sum::<f64>() / off.len() as f64;
         assert!(mean < 0.4 * 0.02, "{mean} m");
         let only_one = pairs().filter(|(i, exact)| i.is_some() != exact.is_some()).count();

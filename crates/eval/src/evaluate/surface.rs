@@ -18,7 +18,7 @@ use crate::geometry::{Chamfer, chamfer, consistency, double, normals, points, sa
 const PER_VIEW: usize = 4000;
 /// Largest number of compared Gaussians.
 const MOST: usize = 60_000;
-/// Largest side of maps of normals, at which a pixel is about a centimetre wide. Finer maps would measure roughness.
+/// Largest side of maps of normals in pixels. A pixel is then about a centimetre wide; finer maps measure roughness.
 const NORMALS: usize = 256;
 /// Seed of the points drawn from a mesh.
 const SEED: u64 = 1;
@@ -26,20 +26,20 @@ const SEED: u64 = 1;
 const DIRECTIONS: [f64; 8] = [0.0, 90.0, 180.0, 270.0, 45.0, 135.0, 225.0, 315.0];
 /// Least coverage of a pixel that is closed.
 const CLOSED: f32 = 0.9;
-/// Largest distance in metres of a closed pixel's surface behind the true one. The inner side of a person's back lies farther.
+/// Largest distance in metres of a closed pixel's surface behind the true one. The back's inner side lies farther off.
 const BEHIND: f32 = 0.06;
-/// Width, in pixels of a map of [`NORMALS`], of what does not count beside a person's outline and beside steps of the depth by
-/// [`BEHIND`]. A slightly wrong outline is no hole.
+/// Width, in pixels of a map of side [`NORMALS`], of the rim that does not count, beside outlines and beside depth
+/// steps of [`BEHIND`]. A slightly wrong outline is no hole.
 const RIM: usize = 3;
 
 /// Distances of a surface from the ground truth.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Surface {
-    /// Metres.
+    /// Distances in metres.
     pub chamfer: Chamfer,
     /// Mean cosine of normals from four sides, at pixels with both normals.
     pub normals: Option<f64>,
-    /// Share of the true surface's pixels, from eight sides, that are not covered or show what lies behind; `None` for meshes.
+    /// Share of the true surface's pixels, from eight sides, that are open ([`Truth::open`]); `None` for meshes.
     pub open: Option<f64>,
 }
 
@@ -64,7 +64,7 @@ pub struct Truth {
 /// Ground truth of a person from the depth maps.
 ///
 /// # Errors
-/// [`EvalError`] for files that cannot be read, or that have no point.
+/// [`EvalError`] for files that cannot be read, or if no view has a point.
 pub fn truth(people: &People, row: usize) -> Result<Truth, EvalError> {
     let cameras = people.test().sample(row, &[], &Handling::default())?.cameras;
     let directions = DIRECTIONS.map(|wanted| nearest_view(&cameras, 0, wanted));
@@ -101,7 +101,7 @@ pub fn truth(people: &People, row: usize) -> Result<Truth, EvalError> {
 }
 
 impl Truth {
-    /// Mean cosine between the normals of the ground truth and those of the depth maps that `depth` returns for the views.
+    /// Mean cosine between the true normals and the normals of the depth maps that `depth` returns for the views.
     pub fn agreement(&self, depth: impl Fn(usize) -> Vec<f32>) -> Option<f64> {
         let (mut sum, mut count) = (0.0, 0);
         for (i, view) in self.views.iter().enumerate() {
@@ -114,7 +114,7 @@ impl Truth {
         (count > 0).then(|| sum / count as f64)
     }
 
-    /// The same for a mesh (world frame, metres).
+    /// [`Self::agreement`] for the depth maps of a mesh (world frame, metres).
     ///
     /// # Errors
     /// [`EvalError::Empty`] for a mesh that cannot be drawn.
@@ -124,8 +124,8 @@ impl Truth {
         Ok(self.agreement(|i| renderer.draw(&self.views[i].camera, &options).depth))
     }
 
-    /// Share of the true surface's pixels that are open in the views' pictures of depth (metres, not divided by coverage) and
-    /// coverage. `None` without such a pixel.
+    /// Share of the true surface's pixels that are open: hardly covered, or showing a surface far behind. `drawn` has
+    /// each view's depth (metres times coverage) and coverage. `None` if no pixel counts.
     pub fn open(&self, drawn: &[[Vec<f32>; 2]]) -> Option<f64> {
         let (mut open, mut count) = (0_u64, 0_u64);
         for (TrueView { camera, depth: truth, .. }, [depth, alpha]) in self.views.iter().zip(drawn) {
@@ -146,15 +146,15 @@ impl Truth {
     }
 }
 
-/// At most `most` entries of a list, at equal distances.
+/// At most `most` entries of a list, at equal steps.
 pub(super) fn thinned<T: Copy>(all: &[T], most: usize) -> Vec<T> {
     let kept = all.len().min(most);
     (0..kept).map(|i| all[i * all.len() / kept]).collect()
 }
 
 impl Surface {
-    /// Distances of Gaussians (world frame): of the centres of those with an opacity of at least `opaque`, and of their
-    /// rendered depths.
+    /// Compares Gaussians (world frame) with the truth: the centres of Gaussians with an opacity of at least `opaque`,
+    /// and the rendered depths.
     ///
     /// # Errors
     /// [`EvalError`] if no Gaussian is so opaque.
@@ -170,7 +170,7 @@ impl Surface {
             Ok([rendered.depth.expect("an option"), rendered.alpha].map(snapsnap_ops::host))
         };
         let drawn: Vec<[Vec<f32>; 2]> = truth.views.iter().map(drawn).collect::<Result<_, EvalError>>()?;
-        // Depths are weighted by coverage. A surface has at least half.
+        // Depths are weighted by coverage. A pixel of a surface has a coverage above ½.
         let surface = |[depth, alpha]: &[Vec<f32>; 2]| {
             depth.iter().zip(alpha).map(|(z, a)| if *a > 0.5 { z / a } else { 0.0 }).collect()
         };
@@ -181,10 +181,10 @@ impl Surface {
         })
     }
 
-    /// Distances of the mesh of Gaussians (world frame): of points drawn from it, and of the depths of its triangles.
+    /// Compares the mesh of Gaussians (world frame) with the truth: points drawn from the mesh, and its depth maps.
     ///
     /// # Errors
-    /// [`EvalError`] if no mesh can be made of them.
+    /// [`EvalError`] if no mesh can be made of the Gaussians.
     pub fn of_mesh(gaussians: &Gaussians, truth: &Truth) -> Result<Self, EvalError> {
         let fused = fuse(&gaussians.clone().into(), Options::default(), &|_| {});
         let mesh = fused.map_err(|e| EvalError::Empty(e.to_string()))?.into_world();
@@ -201,8 +201,8 @@ impl Surface {
 mod tests {
     use super::*;
 
-    /// A wall of 32 × 80 pixels whose lower half stands back, drawn with a hole, with a part that shows a surface far behind, and with
-    /// one that is thin.
+    /// A wall of 32 × 80 pixels whose lower half stands back. It is drawn with a hole, with a part that shows a
+    /// surface far behind, and with a thin part.
     #[test]
     fn open_pixels_are_uncovered_or_show_what_lies_behind() {
         let side = 256;
@@ -217,14 +217,14 @@ mod tests {
             let (depth, alpha): (Vec<f32>, Vec<f32>) = (0..side * side).map(of).unzip();
             truth.open(&[[depth, alpha]]).expect("pixels")
         };
-        // Without three pixels inside of the outline; the last pixels before an edge count as the edge on the right and below.
+        // Without three pixels inside the outline. On the right and below, the edge includes the last pixel before it.
         let (columns, rows) = ((13..38), (15..48).chain(55..88));
         let (wide, high) = (columns.len() as f64, rows.clone().count() as f64);
         let share = |of: &dyn Fn(usize, usize) -> bool| {
             let open = rows.clone().flat_map(|row| columns.clone().map(move |column| (row, column)));
             open.filter(|(row, column)| of(*row, *column)).count() as f64 / (wide * high)
         };
-        // Depths are weighted by coverage; 5 cm too far is an error, no hole.
+        // Depths are weighted by coverage. A surface 5 cm too far is wrong, but no hole.
         assert_eq!(drawn(&|i| (0.95 * (depth[i] + 0.05), 0.95)), 0.0);
         let hole = drawn(&|i| if i % side == 20 { (0.0, 0.0) } else { (depth[i], 1.0) });
         assert_eq!(hole, share(&|_, column| column == 20));

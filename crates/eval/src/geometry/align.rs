@@ -16,7 +16,7 @@ const ENOUGH: f64 = 1e-6;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Align {
-    /// They are compared as they are.
+    /// No alignment.
     #[default]
     None,
     /// Rotation and translation.
@@ -26,7 +26,7 @@ pub enum Align {
 }
 
 impl Align {
-    /// What is done, for reports.
+    /// Name of the method in reports.
     pub fn description(self) -> &'static str {
         match self {
             Self::None => "none",
@@ -43,7 +43,7 @@ pub struct Alignment {
     pub scale: f64,
     /// A proper rotation.
     pub rotation: DQuat,
-    /// In the points' unit.
+    /// In the unit of the points.
     pub translation: DVec3,
     /// Mean squared distance to the nearest neighbour after the motion.
     pub cost: f64,
@@ -60,19 +60,19 @@ impl Alignment {
         RigidTransform { rotation: DMat3::from_quat(self.rotation), translation: self.translation }
     }
 
-    /// Degrees of the rotation, motion of the points' middle in hundredths of their unit, and scale.
+    /// Rotation in degrees, shift of the points' mean in hundredths of their unit, and scale.
     pub fn figures(&self, points: &[[f32; 3]]) -> [f64; 3] {
         let angle = 2.0 * self.rotation.w.abs().min(1.0).acos();
-        // The motion of the world's origin has no meaning, that of the middle has.
+        // `translation` depends on the world's origin, the shift of the mean does not.
         let middle = points.iter().map(|p| double(*p)).sum::<DVec3>() / points.len() as f64;
         let moved = self.scale * (self.rotation * middle) + self.translation - middle;
         [angle.to_degrees(), 1e2 * moved.length(), self.scale]
     }
 }
 
-/// Motion of points onto others. Each step pairs every point with its nearest neighbour and finds the best rigid motion
-/// of those pairs (with `scale`: the best similarity). The result is the nearest minimum, so the initial error must be
-/// below some 30° and a quarter of the size.
+/// Motion of `points` onto `onto`. Each step pairs every point with its nearest neighbour and finds the best rigid
+/// motion of the pairs (with `scale`: the best similarity). The result is the nearest minimum, so the initial error
+/// must be below some 30° and a quarter of the size.
 ///
 /// # Errors
 /// [`EvalError::Empty`] for a set without points or with one that is not finite.
@@ -104,8 +104,8 @@ pub fn icp(points: &[[f32; 3]], onto: &[[f32; 3]], scale: bool) -> Result<Alignm
     Ok(best)
 }
 
-/// The motion with the least squared distances of points from their partners (Horn 1987). Its rotation is the
-/// eigenvector of the largest eigenvalue of a symmetric matrix of their covariances.
+/// The motion of `points` with the least squared distances to `targets`, row by row (Horn 1987). The quaternion of its
+/// rotation is the eigenvector of the largest eigenvalue of a symmetric matrix of covariances.
 pub(crate) fn procrustes(points: &[[f32; 3]], targets: &[[f32; 3]], scale: bool) -> Alignment {
     let n = points.len() as f64;
     let centre = |of: &[[f32; 3]]| of.iter().map(|p| double(*p)).sum::<DVec3>() / n;
@@ -131,7 +131,7 @@ pub(crate) fn procrustes(points: &[[f32; 3]], targets: &[[f32; 3]], scale: bool)
     for (p, t) in points.iter().zip(targets) {
         rotated += (rotation * (double(*p) - from)).dot(double(*t) - to);
     }
-    // Equal points have no scale.
+    // If all points are equal, the scale is undefined.
     let scale = if scale && spread > 0.0 && rotated > 0.0 { rotated / spread } else { 1.0 };
     let translation = to - scale * (rotation * from);
     Alignment { scale, rotation, translation, cost: 0.0 }

@@ -20,15 +20,15 @@ pub(crate) use align::procrustes;
 pub use align::{Align, Alignment, icp};
 pub use normals::{consistency, normals};
 
-/// Largest coordinate of a point in metres. The squares of larger ones overflow f32.
+/// Largest coordinate of a point in metres. The squares of larger coordinates overflow f32.
 const FARTHEST: f32 = 1e15;
 
 /// Mean distances between two sets of points.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Chamfer {
-    /// From each point of the first to the nearest of the second.
+    /// From each point of the first set to the nearest point of the second set.
     pub forward: f64,
-    /// From each point of the second to the nearest of the first.
+    /// From each point of the second set to the nearest point of the first set.
     pub backward: f64,
 }
 
@@ -42,7 +42,7 @@ impl Chamfer {
 /// Rows of a tensor `[N, 3]`.
 ///
 /// # Errors
-/// [`EvalError::Sizes`] for another shape, [`EvalError::Empty`] if there is no row or one is not finite.
+/// [`EvalError::Sizes`] for another shape, [`EvalError::Empty`] if there is no row or a row is not finite.
 pub fn points(tensor: &Tensor<2>) -> Result<Vec<[f32; 3]>, EvalError> {
     let [n, columns] = tensor.dims();
     if columns != 3 {
@@ -78,7 +78,7 @@ pub fn chamfer(a: &[[f32; 3]], b: &[[f32; 3]]) -> Result<Chamfer, EvalError> {
     Ok(Chamfer { forward: one_way(a, b), backward: one_way(b, a) })
 }
 
-/// For each of the first points, the row of the nearest of the second and its distance.
+/// For each point of `from`, the row of the nearest point of `to` and its distance.
 fn nearest(from: &[[f32; 3]], to: &[[f32; 3]]) -> Vec<(usize, f64)> {
     let tree = ImmutableKdTree::<f32, 3>::new_from_slice(to).expect("fewer points than u32 can number");
     let found = tree.query_batch(from).nearest_one::<SquaredEuclidean<f32>>().execute();
@@ -98,7 +98,7 @@ pub(crate) fn distance(a: [f32; 3], b: [f32; 3]) -> f64 {
 /// Mean Euclidean distance from points to the triangles of a mesh.
 ///
 /// # Errors
-/// [`EvalError::Empty`] without points or with one that is not finite, or for a mesh that has no area.
+/// [`EvalError::Empty`] without points, if a point is not finite, or for a mesh without area.
 pub fn point_to_surface(points: &[[f32; 3]], mesh: &Mesh) -> Result<f64, EvalError> {
     check_points(points)?;
     check_points(&mesh.positions.iter().map(|p| p.to_array()).collect::<Vec<_>>())?;

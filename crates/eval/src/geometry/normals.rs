@@ -1,4 +1,4 @@
-//! Normals of depth maps, and the cosine between those of two maps.
+//! Normals of depth maps, and the mean cosine between the normals of two maps.
 
 use glam::DVec3;
 use snapsnap_splat::Camera;
@@ -8,8 +8,7 @@ use snapsnap_splat::Camera;
 const JUMP: f32 = 0.01;
 
 /// Unit normals `[H, W]` towards the camera, in the camera's axes, of a depth map `[H, W]` (metres along the optical
-/// axis, 0 for no depth). They are central differences of the points. `None` at the rims of surfaces and of the
-/// picture.
+/// axis, 0 for no depth), from central differences of the points. `None` at the rims of surfaces and of the picture.
 pub fn normals(depth: &[f32], camera: &Camera) -> Vec<Option<DVec3>> {
     let (width, height) = (camera.width as usize, camera.height as usize);
     let point = |x: usize, y: usize| {
@@ -37,8 +36,8 @@ pub fn normals(depth: &[f32], camera: &Camera) -> Vec<Option<DVec3>> {
     (0..width * height).map(|i| normal(i % width, i / width)).collect()
 }
 
-/// Mean cosine between the normals of two maps at pixels with both, and the number of those pixels; `None` without such
-/// pixels.
+/// Mean cosine between the normals of two maps and the number of compared pixels, which have a normal in both maps;
+/// `None` if there is no such pixel.
 pub fn consistency(a: &[Option<DVec3>], b: &[Option<DVec3>]) -> Option<(f64, usize)> {
     let (mut sum, mut count) = (0.0, 0_usize);
     for (a, b) in a.iter().zip(b).filter_map(|(a, b)| a.zip(*b)) {

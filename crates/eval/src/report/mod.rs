@@ -42,13 +42,13 @@ pub fn today() -> String {
     OffsetDateTime::now_utc().date().to_string()
 }
 
-/// A figure with its interval in a table of Markdown, multiplied by `times`.
+/// A cell of a Markdown table: a figure with its interval, multiplied by `times`.
 pub fn cell(interval: Option<Interval>, times: f64, digits: usize) -> String {
     match interval {
         None => "n/a".into(),
         Some(Interval { mean, .. }) if mean.is_nan() => "n/a".into(),
         Some(Interval { mean, .. }) if mean.is_infinite() => if mean > 0.0 { "∞" } else { "−∞" }.into(),
-        // One person.
+        // One person has no spread.
         Some(Interval { mean, low, high }) if low == high => format!("{:.digits$}", mean * times),
         Some(Interval { mean, low, high }) => {
             let [mean, low, high] = [mean, low, high].map(|v| format!("{:.digits$}", v * times));
@@ -69,7 +69,7 @@ pub fn table(header: &[&str], rows: impl Iterator<Item = Vec<String>>) -> String
     String::from_utf8(bytes).expect("made of text")
 }
 
-/// A figure in a table of CSV; an absent one is empty.
+/// A cell of a CSV table; an absent figure is empty.
 pub fn number(figure: Option<f64>) -> String {
     figure.map_or(String::new(), |v| v.to_string())
 }

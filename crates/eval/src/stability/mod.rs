@@ -13,7 +13,7 @@ use serde::Serialize;
 /// An input and its required result.
 #[derive(Serialize)]
 pub struct Case {
-    /// Splats, networks, losses, training.
+    /// The area of the table: splats, networks, losses or training.
     pub area: &'static str,
     /// The input.
     pub input: String,
@@ -23,7 +23,7 @@ pub struct Case {
     pub value_limit: f64,
     /// Largest allowed error of gradients.
     pub gradient_limit: f64,
-    /// Whether it runs on the first device alone, since its result does not depend on the device.
+    /// Whether the case runs on the first device alone, since its result does not depend on the device.
     #[serde(skip)]
     pub once: bool,
     /// The test.
@@ -51,7 +51,7 @@ impl Case {
 /// The result of a case.
 #[derive(Debug, Clone, Default)]
 pub struct Found {
-    /// Error of values against f64, as defined by the case; not finite for values that are not.
+    /// Error of values against f64, as defined by the case; not finite if a value is not finite.
     pub value: Option<f64>,
     /// Relative error of gradients against f64.
     pub gradient: Option<f64>,
@@ -59,7 +59,7 @@ pub struct Found {
     pub note: String,
     /// The first failed requirement.
     pub broken: Option<String>,
-    /// Why the case does not run here. That is no failure.
+    /// The reason why the case does not run here, which is no failure.
     pub skipped: Option<String>,
 }
 

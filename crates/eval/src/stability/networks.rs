@@ -19,7 +19,7 @@ use crate::statistics::quantile;
 
 const AREA: &str = "Networks";
 
-/// All cases of networks but those in 16 bits, which need trained weights.
+/// All cases of networks except the cases in 16 bits, which need trained weights.
 pub fn cases() -> Vec<Case> {
     let mut cases = Vec::new();
     for norm in [0.0_f32, 1e-12, 0.29, 0.31, 20.0, 88.0, 1e4] {
@@ -52,8 +52,8 @@ pub fn cases() -> Vec<Case> {
     cases
 }
 
-/// Points of a trained predictor in 16 bits against those in 32, with `photographs` on its canvas. The limit of nine
-/// tenths of the points is a tenth of the error of such networks (docs/notes/training.md: 30 mm).
+/// Cases that compare a trained predictor's points in 16 bits with its points in 32 bits, with `photographs` on its
+/// canvas. The limit for nine tenths of the points is a tenth of such networks' error (docs/notes/training.md: 30 mm).
 pub fn sixteen_bits(weights: WeightFile, photographs: [Photograph; 2]) -> Vec<Case> {
     let shared = Arc::new((weights, photographs));
     let case = |precision: Precision| {
@@ -95,7 +95,7 @@ fn in_precision(
         .must(apart.iter().all(|v| v.is_finite()), "a point is not finite")
 }
 
-/// The gradient at `x` of the sum of a tensor.
+/// The gradient of the sum of the tensor `of` with respect to `x`.
 fn gradient_of_sum<const D: usize, const E: usize>(of: &Tensor<D>, x: &Tensor<E>) -> Vec<f32> {
     host(x.grad(&of.clone().sum().backward()).expect("tracked"))
 }
@@ -124,7 +124,7 @@ fn exponential_depth(norm: f32, device: &Device) -> Found {
         for c in 0..3 {
             let expected = r[c] * f;
             if size < f64::from(f32::MAX) {
-                // At norm 0 the point is 0 itself.
+                // At norm 0 the point is 0, and the error is absolute.
                 let size = if size > 0.0 { size } else { 1.0 };
                 values.push(apart(got[3 * i + c], expected) / size);
             }
@@ -188,7 +188,7 @@ fn attributes(device: &Device) -> Found {
         .must(all_finite(&gradient), "a gradient is not finite")
 }
 
-/// Twelve equal tokens. The output is their value for any weights.
+/// Twelve equal tokens. For any attention weights, the output is the tokens' value.
 fn attention(size: f32, device: &Device) -> Found {
     let row: Vec<f32> = (0..CHANNELS).map(|c| size * (0.2 + 0.03 * c as f32)).collect();
     let all: Vec<f32> = (0..TOKENS).flat_map(|_| row.clone()).collect();

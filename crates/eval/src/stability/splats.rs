@@ -16,13 +16,13 @@ use crate::geometry::double;
 /// Mean, rotation (w first), scales, opacity, colour.
 type Row = [f32; 14];
 
-/// Limits for blended rounding of f32. Largest errors on flex, ndarray and lavapipe: 7.9e-7 and 4.2e-6.
+/// Limits of errors by rounding to f32. Largest errors on flex, ndarray and lavapipe: 7.9e-7 and 4.2e-6.
 const VALUES: f64 = 2e-6;
 const GRADIENTS: f64 = 1e-5;
 /// Smaller gradients count as 0.
 const SMALLEST: f64 = 1e-30;
 
-/// Norms of quaternions that are rotations.
+/// Norms of quaternions that count as rotations.
 const QUATERNIONS: RangeInclusive<f32> = 1e-6..=1e18;
 
 /// All cases of the rasteriser (docs/method.md, "Stability cases").
@@ -77,7 +77,7 @@ pub fn cases() -> Vec<Case> {
         add(name, "left out where the oracle leaves it out", rows, camera);
     }
     for distance in [1e-3_f32, 1.0, 1e3, 1e6] {
-        // Its size in the picture does not depend on the distance.
+        // The scales grow with the distance, so that the size in the picture is constant.
         let far = |row: &mut Row| {
             row[2] = distance;
             row[7..10].iter_mut().for_each(|s| *s *= distance / 2.0);
@@ -142,7 +142,7 @@ fn six() -> Vec<Row> {
     (0..6).map(|_| one()).collect()
 }
 
-/// The six Gaussians, some of which are changed.
+/// The six Gaussians, of which `change` changes the rows `which`.
 fn changed(which: Range<usize>, change: impl FnMut(&mut Row)) -> Vec<Row> {
     let mut rows = six();
     rows[which].iter_mut().for_each(change);
@@ -161,8 +161,8 @@ fn scene(rows: &[Row]) -> Scene<f64> {
     Scene { gaussians: rows.iter().map(|row| row.map(f64::from)).collect(), background: [0.0; 3] }
 }
 
-/// Compares a render and its gradients with the oracle. Gaussians without a direction, which would be 0/0, are left out
-/// of the oracle too.
+/// Compares a render and its gradients with the oracle. The oracle does not get Gaussians whose quaternion is no
+/// rotation, for which it would compute 0/0.
 fn against_oracle(rows: &[Row], camera: &Camera, device: &Device) -> Result<Found, SplatError> {
     let options = RenderOptions { depth: true, ..RenderOptions::inria() };
     let norm = |row: &Row| row[3..7].iter().map(|q| f64::from(*q).powi(2)).sum::<f64>().sqrt() as f32;
@@ -198,8 +198,8 @@ fn against_oracle(rows: &[Row], camera: &Camera, device: &Device) -> Result<Foun
     let Some(found) = tracked.grad(&gradients).map(host) else {
         return Ok(Found::broken("no gradient"));
     };
-    // Errors are relative for each Gaussian, since gradients of others may be far larger, and for all its parameters in
-    // their own units, since terms may cancel to rounding errors (the rotation of a ball).
+    // Errors are relative to the same Gaussian's gradient, since others may be far larger. All its parameters count
+    // together in their own units, since terms may cancel to rounding errors (the rotation of a ball).
     let of_row = |(row, found): (usize, &Row)| {
         let (expected, units) = match kept.iter().position(|k| *k == row) {
             Some(place) => (of_oracle[place], std::array::from_fn(|i| unit(&rows[row], i, camera))),
@@ -221,7 +221,7 @@ fn against_oracle(rows: &[Row], camera: &Camera, device: &Device) -> Result<Foun
         .must(share < banded.len(), "nothing could be compared"))
 }
 
-/// A parameter's unit: a footprint of at least half a pixel for the mean, its length for the rotation.
+/// The unit of a parameter: for means the largest scale, at least half a pixel; for rotations the largest component.
 fn unit(row: &Row, parameter: usize, camera: &Camera) -> f64 {
     let largest = |values: &[f32]| values.iter().fold(0.0_f64, |most, v| most.max(f64::from(v.abs())));
     match parameter {
@@ -262,7 +262,7 @@ fn many_on_one_pixel(device: &Device) -> Result<Found, SplatError> {
         compared.flat_map(|((found, expected), _)| [0, 1, 2].map(|c| apart(found[c], expected.color[c])));
     let value = worst(off);
     let gradient = host(tracked.grad(&gradients).expect("tracked"));
-    // Gaussians in the middle of a pixel close it at once, those at its rim after hundreds.
+    // The pixel in the middle of the Gaussians closes at once, pixels at their rim after hundreds of Gaussians.
     let behind = &gradient[gradient.len() / 10 * 9..];
     let most = worst(behind.iter().map(|v| f64::from(v.abs())));
     Ok(Found { value: Some(value), gradient: Some(most), ..Found::default() }

@@ -14,7 +14,7 @@ use super::cpu::{self, Scene, State};
 use super::job::{Job, Wanted};
 use super::{Forward, SplatBackend, SplatInputs, SplatKernels, SplatOutput, Upstream, splat_untracked};
 
-/// The operation on a backend, given how to read a tensor of it: as something that holds values, and those values.
+/// Implements the operation for a backend. `$read` makes an owner of a tensor's values, `$slice` borrows the values.
 macro_rules! on_the_cpu {
     ($backend:ty, $read:expr, $slice:expr) => {
         #[allow(deprecated, reason = "the CPU test backend")]

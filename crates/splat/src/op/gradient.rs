@@ -71,7 +71,7 @@ impl SplatGradient {
         }
     }
 
-    /// Adds the part of a pixel at `w` with g = `g`.
+    /// Adds a pixel to the sums r and S: `w` is its offset, `g` the gradient of its power (see [`crate::vjp`]).
     #[inline(always)]
     pub fn add_shape(&mut self, g: f32, w: &Offset) {
         let g_0 = g * w.w0;
@@ -83,7 +83,7 @@ impl SplatGradient {
         self.footprint.s11 += g_1 * w.w1;
     }
 
-    /// Adds the record that starts at `at`.
+    /// Adds the record that starts at index `at`.
     pub fn add(&mut self, records: &[f32], at: usize, #[comptime] record: Record) {
         if comptime!(record.colors) {
             add3(&mut self.color, &load3(records, at));
@@ -104,7 +104,7 @@ impl SplatGradient {
         }
     }
 
-    /// Writes a record: its first number at `at`, each other one `stride` further.
+    /// Writes a record from index `at` on, with `stride` from one number to the next.
     pub fn store(&self, out: &mut [f32], at: usize, #[comptime] stride: usize, #[comptime] record: Record) {
         if comptime!(record.colors) {
             out[at] = self.color.x;

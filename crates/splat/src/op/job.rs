@@ -1,4 +1,4 @@
-//! Input of one call of the operation, and its counts: plain host data.
+//! Input of one call of the operation, and its counts, as plain host data.
 
 use super::splat::{FATES, Uniforms};
 use crate::linear::{Mat3, Vec3};
@@ -20,7 +20,7 @@ pub struct Counts {
     pub outside: u64,
     /// Opacity (after antialiasing) below 1/255.
     pub transparent: u64,
-    /// A quaternion shorter than 1e-6, a projected position or covariance beyond ±1e18, or a covariance whose determinant is not positive.
+    /// A quaternion shorter than 1e-6, a projected quantity beyond ±1e18, or a determinant that is not positive.
     pub degenerate: u64,
     /// A parameter that is NaN, infinite, or beyond ±1e18.
     pub invalid: u64,
@@ -29,7 +29,7 @@ pub struct Counts {
 }
 
 impl Counts {
-    /// The number of Gaussians of each fate, as [`super::splat`] numbers them, and of intersections.
+    /// `fates` has the number of Gaussians of each fate, in the order of the constants in [`super::splat`].
     pub(super) fn new(fates: [u64; FATES], intersections: u64) -> Self {
         let [visible, near, outside, transparent, degenerate, invalid] = fates;
         Self { visible, near, outside, transparent, degenerate, invalid, intersections }
@@ -67,7 +67,7 @@ impl Job {
         let check = |field, holds: bool, allowed| {
             if holds { Ok(()) } else { Err(SplatError::Option { field, allowed }) }
         };
-        // With a larger α, a single clamped splat would close the pixel and not be drawn itself.
+        // With a larger limit, a single clamped splat would close the pixel without being drawn.
         let largest = 1.0 - MIN_TRANSMITTANCE;
         check("max_alpha", max_alpha > 0.0 && max_alpha < largest, "within (0, 0.9999)")?;
         check("blur", blur > 0.0 && blur <= 1e6, "positive and at most 1e6 square pixels")?;
@@ -141,7 +141,7 @@ fn view(camera: &Camera) -> View {
     let centre = camera.centre();
     let high = centre.as_vec3();
     let low = (centre - high.as_dvec3()).as_vec3();
-    // The image borders, as t/t_z, plus 15 % of the image on either side.
+    // The image borders, as t_x/t_z or t_y/t_z, plus 15 % of the image on either side.
     let limits = |side: u32, focal: f64, principal: f64| {
         let margin = 0.15 * f64::from(side);
         ((-(principal + margin) / focal) as f32, ((f64::from(side) - principal + margin) / focal) as f32)

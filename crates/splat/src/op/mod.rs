@@ -38,8 +38,8 @@ pub struct SplatInputs<B: Backend> {
     pub(crate) background: FloatTensor<B>,
 }
 
-/// Colours `[V,H,W,3]`, alphas `[V,H,W,1]` and depths `[V,H,W,1]`. Without depths, the alphas take their place. After an
-/// error the tensors are meaningless.
+/// Colours `[V,H,W,3]`, alphas `[V,H,W,1]` and depths `[V,H,W,1]`. Without the depth channel, `depth` has the alphas.
+/// After an error the tensors are meaningless.
 #[derive(ExtensionType)]
 pub struct SplatOutput<B: Backend> {
     pub(crate) color: FloatTensor<B>,
@@ -56,8 +56,8 @@ fn channels<B: Backend>(image: FloatTensor<B>, range: Range<usize>) -> FloatTens
     B::float_slice(image, &[full, full, full, Slice::from(range)])
 }
 
-/// ∂L/∂ of the outputs of a call; `None` for outputs without a gradient. They stay apart, since joining pictures costs
-/// several times their memory.
+/// ∂L/∂ of the outputs of a call; `None` for outputs without a gradient. The outputs stay separate, since joining
+/// images costs several times their memory.
 #[derive(Debug, Clone, Copy)]
 pub struct Upstream<T> {
     /// Colours `[V,H,W,3]`.
@@ -87,7 +87,7 @@ pub trait SplatBackend: Backend {
     fn splat(#[extension_type] inputs: SplatInputs<Self>, job: Arc<Job>) -> SplatOutput<Self>;
 }
 
-/// Image, state if kept, counts.
+/// Image `[V,H,W,C]`, state if kept, counts.
 pub type Forward<B> = Result<(FloatTensor<B>, Option<<B as SplatKernels>::State>, Counts), SplatError>;
 
 /// Operations of a backend without autodiff.
@@ -95,7 +95,7 @@ pub trait SplatKernels: Backend {
     /// Values that the backward pass needs beside the inputs.
     type State: Clone + Send + Debug + 'static;
 
-    /// Image, and the state where `keep`.
+    /// Renders; with `keep` returns the state for the backward pass as well.
     ///
     /// # Errors
     /// [`SplatError::TooManyIntersections`].
@@ -133,7 +133,7 @@ fn failed<B: Backend>(anything: FloatTensor<B>, error: SplatError) -> SplatOutpu
     SplatOutput { color, alpha, depth, counts: Err(error) }
 }
 
-/// Gradients of the outputs, until the backward pass reads them.
+/// Gradients of the outputs that have been computed, until [`SplatBackward`] reads them.
 type Arrived<B> = Arc<Mutex<[Option<FloatTensor<B>>; 3]>>;
 
 #[derive(Debug)]
@@ -152,7 +152,7 @@ impl<B: SplatKernels> Backward<B, 6> for SplatBackward {
     type State = Kept<B>;
 
     fn backward(self, ops: Ops<Self::State, 6>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
-        // A token: the gradients themselves are in `arrived`.
+        // The node's own gradient is a token: the gradients of the outputs are in `arrived`.
         drop(grads.consume::<B>(&ops.node));
         let Kept { inputs, job, state, arrived } = ops.state;
         let [color, alpha, depth] = std::mem::take(&mut *lock(&arrived));
@@ -169,7 +169,7 @@ impl<B: SplatKernels> Backward<B, 6> for SplatBackward {
     }
 }
 
-/// Passes the gradient of one output to the operation. Burn's own slice would first write it into an image of zeros.
+/// Passes the gradient of one output to the operation. Burn's own slice would first copy it into an image of zeros.
 #[derive(Debug)]
 struct ChannelsBackward;
 

@@ -24,13 +24,10 @@ const RADIUS_MARGIN: f32 = 1e-2;
 pub struct Splat {
     /// Centre, pixels.
     pub u: f32,
-    /// Centre, pixels.
     pub v: f32,
-    /// Factor of Σ'⁻¹ (see [`crate::vjp`]).
+    /// Factors of Σ'⁻¹ (see [`crate::vjp`]).
     pub l0: f32,
-    /// Factor of Σ'⁻¹.
     pub k: f32,
-    /// Factor of Σ'⁻¹.
     pub l1: f32,
     /// Opacity after antialiasing.
     pub opacity: f32,
@@ -106,11 +103,11 @@ pub struct Projected {
     pub fate: u32,
 }
 
-/// Reaches a pixel.
+/// The Gaussian reaches the centre of a pixel.
 pub const VISIBLE: u32 = 0;
-/// Its depth t_z is at most `near`.
+/// The depth t_z is at most `near`.
 pub const NEAR: u32 = 1;
-/// No pixel within reach.
+/// No centre of a pixel is within reach.
 pub const OUTSIDE: u32 = 2;
 /// Opacity below 1/255.
 pub const TRANSPARENT: u32 = 3;
@@ -118,10 +115,10 @@ pub const TRANSPARENT: u32 = 3;
 pub const DEGENERATE: u32 = 4;
 /// A parameter that is not finite, or beyond ±1e18.
 pub const INVALID: u32 = 5;
-/// Number of fates.
+/// Number of values of [`Projected::fate`].
 pub const FATES: usize = 6;
 
-/// Whether a number is finite and not huge. The test is on bits, since shader compilers may assume that there is no NaN.
+/// Whether a number is finite and not huge, by its bits: shader compilers may assume that there is no NaN.
 #[cube]
 fn in_range(value: f32) -> bool {
     value.to_bits() & 0x7FFF_FFFFu32 <= comptime!(MAX_MAGNITUDE.to_bits())
@@ -173,7 +170,7 @@ pub fn splat(
     uniforms: &Uniforms,
     #[comptime] antialiased: bool,
 ) -> Projected {
-    // Everything is computed before the tests: a culled Gaussian has numbers that nobody reads, NaN among them.
+    // Everything is computed before the tests: the numbers of a culled Gaussian may be NaN, and nothing reads them.
     let t = to_camera(view, &gaussian.mean);
     let p = project(view, &t, &gaussian.rotation, &gaussian.scale, uniforms.blur);
     let f = footprint(view, &p);
@@ -185,7 +182,7 @@ pub fn splat(
     let radius_squared = 2.0 * (opacity / comptime!(MIN_ALPHA)).ln() + comptime!(RADIUS_MARGIN);
     let splat = Splat { u: f.u, v: f.v, l0: f.l0, k: f.k, l1: f.l1, opacity, depth: t.z, radius_squared };
 
-    // The first test that fails is the reason that is counted.
+    // Only the first failing test is counted.
     let mut fate = comptime!(VISIBLE).runtime();
     if !is_valid(gaussian, color) {
         fate = comptime!(INVALID).runtime();
@@ -224,7 +221,7 @@ fn pixels_between(low: f32, high: f32, side: u32) -> Extent {
     Extent { first: select(any, to_u32(first), 0u32), end: select(any, to_u32(last) + 1u32, 0u32) }
 }
 
-/// The tiles of these pixels.
+/// The tiles that contain the pixels.
 #[cube]
 #[allow(clippy::manual_div_ceil, reason = "CubeCL has no `div_ceil`")]
 pub fn tiles_of(pixels: &Extent) -> Extent {
@@ -232,7 +229,7 @@ pub fn tiles_of(pixels: &Extent) -> Extent {
     Extent { first: pixels.first / tile, end: (pixels.end + tile - 1u32) / tile }
 }
 
-/// The tiles within reach in the row `y` of tiles: those of the pixels that the splat's ellipse covers within the row.
+/// The tiles within reach in tile row `y`: the tiles of the pixels that the splat's ellipse covers within the row.
 #[cube]
 pub fn tiles_in_row(splat: &Splat, y: u32, uniforms: &Uniforms) -> Extent {
     let tile = comptime!(TILE as u32);
@@ -270,7 +267,7 @@ pub const SPLAT: usize = 8;
 
 #[cube]
 impl Splat {
-    /// Number `index` of a buffer of splats.
+    /// Reads splat number `index` of a buffer.
     pub fn load(splats: &[f32], index: usize) -> Splat {
         let at = index * comptime!(SPLAT);
         Splat {
@@ -285,7 +282,7 @@ impl Splat {
         }
     }
 
-    /// Writes number `index` of a buffer of splats.
+    /// Writes splat number `index` of a buffer.
     pub fn store(&self, splats: &mut [f32], index: usize) {
         let at = index * comptime!(SPLAT);
         splats[at] = self.u;

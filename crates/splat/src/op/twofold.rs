@@ -1,13 +1,13 @@
 //! Functions that Rust and CubeCL spell differently: `f` runs on CPUs, and CubeCL calls `f::expand` where a `#[cube]`
 //! function that calls `f` is compiled for a GPU.
 
-/// exp(x) for x ≤ 0, within 2 units in the last place; below −87 it stays at exp(−87). GPUs use their own.
+/// exp(x) for x ≤ 0, within 2 units in the last place; exp(−87) for x below −87. GPUs use their own exp.
 ///
 /// x = n·ln 2 + r with |r| ≤ ½ ln 2; exp(r) by its Taylor polynomial, whose remainder r⁸/8! is below 6e-9; 2ⁿ by the
-/// exponent bits. Unlike the standard library's, a loop over it compiles to SIMD.
+/// exponent bits. A loop over this function compiles to SIMD, which it does not with the standard library's exp.
 #[inline(always)]
 pub fn exp(x: f32) -> f32 {
-    /// Adding it to a small float rounds that to an integer, which the low bits then hold.
+    /// Adding this constant rounds a small float to an integer, which is then in the low bits of the sum.
     const ROUND: f32 = 12_582_912.0;
     /// ln 2 in two parts: the first has few enough bits that n times it is exact.
     const LN_2_HIGH: f32 = 0.693_359_4;

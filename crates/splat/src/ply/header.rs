@@ -5,7 +5,7 @@ use snapsnap_base::quoted;
 /// Longest header that is read, in bytes.
 pub const MAX_HEADER: usize = 1 << 20;
 
-/// Most properties of an element; a Gaussian has at most 62.
+/// Most properties of an element, and most elements; a Gaussian has at most 62 properties.
 const MAX_PROPERTIES: usize = 1000;
 
 /// How the values of the body are written.
@@ -77,7 +77,7 @@ impl Scalar {
         }
     }
 
-    /// The length or the index at the start of `bytes`, which are little-endian. `None` for what is neither.
+    /// The length or the index at the start of little-endian `bytes`. `None` for floats and negative numbers.
     pub fn read_count(self, bytes: &[u8]) -> Option<usize> {
         match self {
             Self::F32 | Self::F64 => None,
@@ -92,18 +92,18 @@ impl Scalar {
 /// A property of an element.
 #[derive(Clone, Debug)]
 pub struct Property {
-    /// As in the file.
+    /// Name in the file.
     pub name: String,
     /// Type of the value, or of the list's values.
     pub kind: Scalar,
-    /// Type of the length, where the property is a list.
+    /// Type of the length, if the property is a list.
     pub list: Option<Scalar>,
 }
 
-/// An element: so many rows of these properties.
+/// An element: `count` rows of `properties`.
 #[derive(Clone, Debug)]
 pub struct Element {
-    /// As in the file.
+    /// Name in the file.
     pub name: String,
     /// Rows that the header promises.
     pub count: usize,
@@ -116,11 +116,11 @@ pub struct Element {
 pub struct Header {
     /// How the body is written.
     pub format: Format,
-    /// In the order of the body.
+    /// Elements in the order of the body.
     pub elements: Vec<Element>,
     /// Texts of the comments.
     pub comments: Vec<String>,
-    /// Where the body begins.
+    /// Length of the header in bytes; the body follows.
     pub len: usize,
 }
 

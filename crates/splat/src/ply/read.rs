@@ -11,7 +11,7 @@ use snapsnap_base::quoted;
 /// Longest line of a body in text.
 const MAX_LINE: u64 = 1 << 20;
 
-/// Reads a PLY's Gaussians. An input that never ends is read only as far as the header promises.
+/// Reads a PLY's Gaussians. The input is read as far as the header promises, not to its end.
 pub(crate) fn read(mut input: impl Read) -> Result<Stored, Problem> {
     let mut start = Vec::new();
     (&mut input).take(MAX_HEADER as u64 + 1).read_to_end(&mut start)?;

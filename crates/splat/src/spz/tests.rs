@@ -13,7 +13,7 @@ fn reference(name: &str) -> (Vec<u8>, Value) {
     (bytes, serde_json::from_str(&text).expect("JSON"))
 }
 
-/// Niantic's lists as columns of ours.
+/// Niantic's lists as a [`Stored`].
 fn stored(values: &Value, degree: u64) -> Stored {
     let list = |key: &str| -> Vec<f32> {
         values[key].as_array().expect("a list").iter().map(|v| v.as_f64().expect("a number") as f32).collect()
@@ -104,7 +104,7 @@ fn what_is_no_spz_or_a_damaged_one_is_refused() {
     let at = sum.len() - 6;
     sum[at] ^= 1;
     assert!(problem(&sum).contains("damaged"));
-    // Neither memory nor time goes to the promises of a header, or to Gaussians that are all alike.
+    // A hostile header costs neither memory nor time: a large count without data, and many equal Gaussians.
     let mut header = content(&good)[..16].to_vec();
     header[8..12].copy_from_slice(&10_000_000_u32.to_le_bytes());
     assert!(problem(&packed(&header)).contains("10000000 Gaussians in"));
@@ -146,10 +146,10 @@ fn what_lies_beyond_the_range_is_counted() {
     values.columns[7][0] = 6.0;
     values.columns[9][0] = 7.0;
     values.columns[8][3] = 6.0;
-    // Smaller than the smallest is not seen anyway.
+    // A scale below the range is no loss.
     values.columns[7][1] = -23.0;
     values.columns[11][2] = -4.0;
-    // The ends of the range are held.
+    // Values at the ends of the range are no loss.
     values.columns[12][0] = -0.5 / COLOR_SCALE;
     values.columns[12][1] = 0.5 / COLOR_SCALE;
     values.columns[9][4] = 255.0 / 16.0 - 10.0;
@@ -161,7 +161,7 @@ fn what_lies_beyond_the_range_is_counted() {
     for (told, expected) in told.iter().zip(expected) {
         assert!(told.starts_with(expected), "{told}");
     }
-    // And it is kept at the border.
+    // Values beyond the range are clamped.
     let mut bytes = Vec::new();
     write(&values, &mut bytes).expect("written");
     let Ok(found) = read(&bytes[..], bytes.len() as u64) else { panic!("was written just now") };

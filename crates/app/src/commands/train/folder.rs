@@ -44,17 +44,17 @@ pub fn config(arguments: &Arguments) -> Result<TrainConfig, Failure> {
 /// The locked folder of a run.
 pub struct RunFolder {
     pub path: PathBuf,
-    /// Folders that were made for it, the innermost first.
+    /// Folders that were made for the run, the innermost first.
     made: Vec<PathBuf>,
-    /// Whether the file of the lock was made for it.
+    /// Whether the lock's file was made for the run.
     has_new_lock: bool,
     /// Locked until it is dropped.
     _lock: File,
 }
 
 impl RunFolder {
-    /// Makes or opens the folder, and locks it. Refuses runs of other networks or of other processes, existing runs without
-    /// --resume, and folders in which the run would replace something.
+    /// Makes or opens the folder, and locks it. Refuses runs of other networks or of other processes, existing runs
+    /// without --resume, and folders in which the run would replace something.
     pub fn open(
         path: &Path,
         arguments: &Arguments,

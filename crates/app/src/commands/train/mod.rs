@@ -55,22 +55,23 @@ pub struct Arguments {
     /// Continue the run in this folder, or begin it.
     #[arg(long)]
     resume: bool,
-    /// With --resume: continue the run even if settings, data sets or the frozen predictor have changed since its last state.
+    /// With --resume: continue the run even if settings, data sets or the frozen predictor have changed since its last
+    /// state.
     #[arg(long, requires = "resume")]
     force: bool,
     /// Check config and data, make a few steps without writing anything, and print how long the run will take.
     #[arg(long)]
     dry_run: bool,
-    /// auto, cpu, ndarray, wgpu, vulkan, cuda or metal; wgpu:1 is the second adapter. Several ranks of MPI on one machine take
-    /// the adapters in turn.
+    /// auto, cpu, ndarray, wgpu, vulkan, cuda or metal; wgpu:1 is the second adapter. Several ranks of MPI on one
+    /// machine take the adapters in turn.
     #[arg(long, default_value = "auto")]
     device: String,
 }
 
-/// Exit code of a session that a signal ended before its run was finished: EX_TEMPFAIL of sysexits.h. --resume continues the run.
+/// Exit code of a session that a signal ended early: EX_TEMPFAIL of sysexits.h. --resume continues the run.
 const UNFINISHED: u8 = 75;
 
-/// How much later than the first rank another one reports a failure.
+/// Delay of another rank's failure after the first rank's.
 const LATER: Duration = Duration::from_secs(2);
 
 /// A training with its data and its device.
@@ -78,7 +79,7 @@ struct Plan<'a> {
     arguments: &'a Arguments,
     config: TrainConfig,
     folders: Vec<Arc<Folder>>,
-    /// With gradients.
+    /// The device with automatic differentiation.
     device: Device,
     ranks: &'a Ranks,
     /// The folder of the run that is continued, with its config.
@@ -93,7 +94,7 @@ pub fn stage2(arguments: &Arguments) -> Result<ExitCode, Failure> {
     among_ranks(|ranks| humans(arguments, ranks))
 }
 
-/// Runs `work` as one of the ranks of MPI, if a launcher started several. The failure of one ends all, with its message.
+/// Runs `work` as one of the ranks of MPI, if a launcher started several. The failure of one rank ends all ranks.
 fn among_ranks(work: impl FnOnce(&Ranks) -> Result<ExitCode, Failure>) -> Result<ExitCode, Failure> {
     let ranks = Ranks::join().map_err(Failure::Input)?;
     if ranks.size() == 1 {
@@ -109,7 +110,7 @@ fn among_ranks(work: impl FnOnce(&Ranks) -> Result<ExitCode, Failure>) -> Result
         Ok(Err(failure)) => failure,
         Err(_) => Failure::Internal("a bug in this program; its message is above".into()),
     };
-    // What fails on all ranks is said once.
+    // A failure of all ranks is printed once, since the first rank ends the others meanwhile.
     if !ranks.is_first() {
         thread::sleep(LATER);
     }
@@ -145,8 +146,8 @@ fn humans(arguments: &Arguments, ranks: &Ranks) -> Result<ExitCode, Failure> {
     if joint {
         plan.keep_start();
     }
-    // The latest weights of a continued run contain its frozen predictor. Before the first checkpoint there are none. A predictor of the
-    // command line is compared with that of the run's state.
+    // The latest weights of a continued run contain its frozen predictor; before the first checkpoint there are none.
+    // A predictor of the command line is compared with the predictor of the run's state.
     let begun = plan.begun.as_ref().filter(|_| arguments.weights.is_none());
     let latest = begun.map(|(run, _)| run.join(LAST)).filter(|latest| latest.exists());
     let weights = match latest.or_else(|| plan.config.training.weights.clone()) {
@@ -176,7 +177,7 @@ fn humans(arguments: &Arguments, ranks: &Ranks) -> Result<ExitCode, Failure> {
     })
 }
 
-/// Opens the weights to begin with. They must fit the config, and the parts that are used must have been trained for it.
+/// Opens the weights to begin with. They must fit the config, and the used parts must have been trained for it.
 fn open(path: &Path, config: &TrainConfig, used: &[Part]) -> Result<WeightFile, Failure> {
     let weights = WeightFile::open(path, Some(config.networks()))?;
     used.iter().try_for_each(|part| weights.require_meaning(*part))?;
@@ -227,8 +228,8 @@ impl<'a> Plan<'a> {
         Ok(Self { arguments, config, folders, device, ranks, begun })
     }
 
-    /// A continued run whose networks are all in its state does not read the weights of the command line. Its config keeps those
-    /// that it began with.
+    /// A continued run with all networks in its state does not read --weights. Its config keeps the weights of its
+    /// start.
     fn keep_start(&mut self) {
         let Some((_, there)) = &self.begun else { return };
         let own = &mut self.config.training.weights;
@@ -335,7 +336,6 @@ impl<'a> Plan<'a> {
     }
 }
 
-/// A run's name.
 fn name(folder: &Path) -> String {
     folder.file_name().unwrap_or_default().to_string_lossy().into_owned()
 }
@@ -376,8 +376,8 @@ fn example(folder: &Folder) -> Option<[PathBuf; 2]> {
     pictures.iter().all(|path| path.is_file()).then_some(pictures)
 }
 
-/// Lower bound of the memory in bytes of one of several ranks of a training: weights, gradients, two moments and averages, samples, and the last
-/// layers of the heads. --dry-run measures the actual memory.
+/// Lower bound of the memory in bytes of one of several ranks of a training: weights, gradients, two moments and
+/// averages, samples, and the last layers of the heads. --dry-run measures the actual memory.
 fn least_memory(config: &TrainConfig, ranks: usize) -> u64 {
     let (n, batch) = (&config.network, config.training.batch.div_ceil(ranks) as u64);
     let parameters = schema::parameters(&config.networks(), Part::PointPredictor) as u64;

@@ -14,7 +14,7 @@ use crate::statistics::Interval;
 const TITLES: [&str; 3] = ["PSNR, dB", "SSIM", "LPIPS"];
 
 impl Evaluation<'_> {
-    /// `report.md`; `pictures` are files beside it.
+    /// `report.md`; `pictures` are names of files in the same folder.
     pub fn markdown(&self, pictures: &[&str]) -> String {
         let mut text = self.header.markdown("Evaluation");
         let _ = writeln!(text, "* LPIPS: {}", self.lpips);

@@ -154,7 +154,7 @@ impl Evaluation<'_> {
         })
     }
 
-    /// Means of the views of each person of a group.
+    /// Mean score of each person of a group.
     fn of_group(&self, group: &Group, judged: &Judged, protocol: usize) -> BTreeMap<usize, Score> {
         let mut people = by_person(&judged.rows, protocol);
         people.retain(|person, _| {
@@ -214,8 +214,8 @@ impl Evaluation<'_> {
         svg(&[(axes, self.outcome.judged.iter().map(series).collect())])
     }
 
-    /// The best, middle and worst people by PSNR of the last protocol, `count` of each without repetition: rows of the
-    /// outcome's people.
+    /// The best, middle and worst people by PSNR of the last protocol, `count` of each, without repetition, as indices
+    /// in [`Outcome::people`].
     pub fn ranked(&self, count: usize) -> Vec<usize> {
         let Some((model, (protocol, _))) = self.model().zip(self.protocols().last()) else {
             return Vec::new();
@@ -256,7 +256,7 @@ fn points_json(judged: &Judged) -> Value {
     VIEWS.iter().enumerate().map(view).collect()
 }
 
-/// Means over people: centimetres to the truth, from the truth and both, cosines, and open shares.
+/// Means over people: distances in cm to the truth, from the truth and both; cosine of normals; open share.
 fn surface_intervals(surfaces: &[(usize, Surface)]) -> [Option<Interval>; 5] {
     let over = |of: fn(&Surface) -> Option<f64>| {
         let of_person = |turns: &[(usize, Surface)]| {
@@ -295,7 +295,7 @@ fn seconds_json(judged: &Judged) -> Value {
     json!(seconds(judged).map(|[p50, p95]| json!({ "p50": p50, "p95": p95 })))
 }
 
-/// The figures of a score in a table; absent ones are empty.
+/// The cells of a score in a CSV table; absent figures are empty.
 fn numbers(score: &Score) -> [String; 3] {
     FIGURES.map(|(_, of, ..)| number(of(score)))
 }

@@ -85,7 +85,7 @@ fn background(view: &ViewState, job: &Job, color: &[f32]) -> [f32; 3] {
     [0, 1, 2].map(|c| rows.iter().map(|sum| sum[c]).sum::<f64>() as f32)
 }
 
-/// One record of sums over pixels per entry of the tiles' lists, in the lists' order.
+/// One record of sums over pixels for each entry of the tiles' lists, in the order of the entries.
 fn pixels(scene: Scene, job: &Job, view: &ViewState, upstream: Upstream<&[f32]>, record: Record) -> Vec<f32> {
     let mut records = vec![0.0_f32; view.lists.len() * record.len()];
     let mut rest = records.as_mut_slice();
@@ -115,9 +115,9 @@ struct Band<'a> {
 
 /// A tile's pixels while splats are removed from them, back to front.
 struct Pixels {
-    /// Transmittance in front of the splat last visited.
+    /// Transmittance in front of the splat that was visited last.
     transmittance: [Lanes; TILE],
-    /// Σ α_j T_j e_j over the splats behind, plus the background's part.
+    /// Σ α_j T_j e_j over the splats behind, plus the background's part (see [`crate::vjp`]).
     behind: [Lanes; TILE],
     last: [[u32; TILE]; TILE],
     /// ∂L/∂(red, green, blue, alpha, depth).
@@ -231,7 +231,7 @@ impl Band<'_> {
     }
 }
 
-/// Adds row `y`'s part of the gradients of the splat, number `n` of the tile, to `sums`.
+/// Removes the splat, number `n` of the tile, from the pixels of row `y`, and adds the row's gradients to `sums`.
 #[inline(always)]
 #[allow(clippy::too_many_arguments, reason = "an inner loop, inlined into its only caller")]
 fn take_off<const SHAPE: bool, const DEPTH: bool>(
@@ -270,7 +270,7 @@ fn take_off<const SHAPE: bool, const DEPTH: bool>(
             }
             let v_alpha = t * e - behind[i] * inverse;
             behind[i] += weight * e;
-            // Where α is clamped it does not depend on the splat.
+            // A clamped α does not depend on the splat.
             let g = if row.alpha[i] < max_alpha { v_alpha * alpha } else { 0.0 };
             let (w_0, w_1) = (row.w[0][i], row.w[1][i]);
             let (g_0, g_1) = (g * w_0, g * w_1);
@@ -290,7 +290,7 @@ fn write(sums: &Sums, visible: &Visible, record: Record, out: &mut [f32]) {
         if !is_kept {
             return 0.0;
         }
-        // Halves upon halves: a fixed order that the compiler can turn into SIMD.
+        // The upper half is added to the lower half until one number is left: a fixed order that compiles to SIMD.
         let mut lanes = *lanes;
         let mut width = TILE / 2;
         while width > 0 {
@@ -312,7 +312,7 @@ fn write(sums: &Sums, visible: &Visible, record: Record, out: &mut [f32]) {
     gradient.store(out, 0, 1, record);
 }
 
-/// Adds up the records of each Gaussian and takes them through its projection.
+/// Adds up the records of each Gaussian and applies the VJP of its projection to the sums.
 fn gather(
     scene: Scene,
     job: &Job,

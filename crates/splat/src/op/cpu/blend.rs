@@ -8,8 +8,8 @@ use super::lanes::{BATCH, Lanes, fetch, row, rows};
 use super::{ViewState, splats::Visible, tiles::Lists};
 use crate::options::{MIN_ALPHA, MIN_TRANSMITTANCE, TILE};
 
-/// Composites `view` over `background` into `image` `[H,W,C]` and, where `view` has room for them, notes each pixel's
-/// final transmittance and last splat.
+/// Composites `view` over `background` into `image` `[H,W,C]`. If the buffers of `view` are not empty, stores each
+/// pixel's final transmittance and last splat in them.
 pub fn blend(view: &mut ViewState, background: [f32; 3], job: &Job, image: &mut [f32]) {
     let band = TILE * job.width;
     let keep = !view.last.is_empty();
@@ -86,7 +86,7 @@ impl Band<'_> {
         TILE.min(self.job.width - x * TILE)
     }
 
-    /// Background where no splat is near.
+    /// Writes the background into a tile without splats.
     #[inline(always)]
     fn write_empty(&mut self, x: usize) {
         let (columns, channels) = (self.columns(x), self.job.channels());
@@ -163,7 +163,7 @@ impl Band<'_> {
     }
 }
 
-/// Adds the splat, number `n` of the tile counted from 1, to row `y`. Whether a pixel was closed by it.
+/// Adds the splat, number `n` of the tile counted from 1, to row `y`. Returns whether it closed a pixel.
 #[inline(always)]
 fn add<const DEPTH: bool>(
     p: &mut Pixels,

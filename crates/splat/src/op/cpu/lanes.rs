@@ -27,7 +27,7 @@ pub struct Row {
     pub alpha: Lanes,
 }
 
-/// The splat over the row of pixels whose first column is `left` and whose centre is at `y`.
+/// The splat over a row of pixels: `left` is the row's left edge, `y` the height of its pixel centres.
 #[inline(always)]
 pub fn row(splat: &Splat, left: f32, y: f32) -> Row {
     let mut row = Row { w: [[0.0; TILE]; 2], alpha: [0.0; TILE] };
@@ -43,8 +43,8 @@ pub fn row(splat: &Splat, left: f32, y: f32) -> Row {
 /// Splats that [`fetch`] copies at once.
 pub const BATCH: usize = 64;
 
-/// Copies the splats of `entries` side by side. They are scattered over a large array; loads on which nothing depends
-/// overlap, so that the latency of memory counts once per batch.
+/// Copies the splats of `entries`, which are scattered over a large array, into `batch`. Independent loads overlap,
+/// so that the latency of memory counts once per batch.
 #[inline(always)]
 pub fn fetch(splats: &[Visible], entries: &[u32], batch: &mut [Visible; BATCH]) {
     for (slot, &entry) in batch.iter_mut().zip(entries) {
@@ -52,7 +52,7 @@ pub fn fetch(splats: &[Visible], entries: &[u32], batch: &mut [Visible; BATCH]) 
     }
 }
 
-/// The rows within the splat's reach of the tile that starts at image row `top`.
+/// The rows of a tile within the splat's reach, relative to the tile's first image row `top`.
 #[inline(always)]
 pub fn rows(visible: &Visible, top: usize) -> std::ops::Range<usize> {
     let first = (visible.rows.first as usize).max(top) - top;

@@ -2,9 +2,9 @@
 //!
 //! A view takes four steps: project every Gaussian ([`splats`]), sort the visible ones by depth, list for each 16×16
 //! tile the splats whose ellipse reaches one of its pixels ([`tiles`]), and blend tile by tile ([`blend`]). Empty tiles
-//! only cost the writing of their pixels. The backward pass visits the same lists from the back ([`mod@backward`]).
+//! only cost the writing of their pixels. The backward pass visits the same lists back to front ([`mod@backward`]).
 //!
-//! Results of threads are joined in a fixed order, so they do not depend on the number of threads.
+//! Results of tasks are joined in a fixed order, so the output does not depend on the number of threads.
 
 #![allow(
     clippy::needless_range_loop,
@@ -93,8 +93,8 @@ pub fn forward(scene: Scene, job: &Job, keep: bool) -> Result<(Vec<f32>, State, 
 
 /// `n` zeros, or an error if the system refuses the memory.
 fn zeros(what: &'static str, n: usize) -> Result<Vec<f32>, SplatError> {
-    // A trial allocation, since `vec!` ends the process if it gets no memory. Yet `vec!` is the way to get zeros from the
-    // system, page by page when they are first touched.
+    // A trial allocation, since `vec!` aborts the process if it gets no memory. `vec!` is still used for the result:
+    // its zeros come from the system, page by page when they are first touched.
     let mut probe = Vec::<f32>::new();
     let bytes = (n as u64).saturating_mul(4);
     probe.try_reserve_exact(n).map_err(|_| SplatError::Memory { what, bytes })?;
@@ -166,7 +166,7 @@ mod tests {
         }
     }
 
-    /// Unwanted gradients take no memory, and wanted ones do not depend on the others.
+    /// Unwanted gradients take no memory, and a wanted gradient does not depend on the other ones.
     #[test]
     fn only_what_is_wanted_is_made() {
         let full = pass(EVERYTHING).1;

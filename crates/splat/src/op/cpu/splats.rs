@@ -52,7 +52,7 @@ pub fn visible(scene: Scene, view: &View, job: &Job, fates: &mut [u64; FATES]) -
     for (_, part) in &chunks {
         fates.iter_mut().zip(part).for_each(|(sum, part)| *sum += part);
     }
-    // Positive floats order like their bits; the position in the low half keeps ties in input order.
+    // Positive floats sort like their bits; the position in the low half keeps ties in input order.
     let mut order: Vec<u64> = Vec::with_capacity(chunks.iter().map(|(splats, _)| splats.len()).sum());
     for (chunk, (splats, _)) in chunks.iter().enumerate() {
         let position = |i: usize| (chunk * CHUNK + i) as u64;

@@ -10,9 +10,9 @@ use crate::SplatError;
 /// Splats per task.
 const CHUNK: usize = 4096;
 
-/// Largest number of entries of all lists: 2 GiB, and as much again while they are made …
+/// Largest number of entries in all lists: 2 GiB, and 2 GiB more while the lists are built.
 const MAX_ENTRIES: u64 = 1 << 29;
-/// … and with gradients, whose records take 40 bytes per entry.
+/// Largest number of entries with gradients, whose records take 40 bytes per entry.
 const MAX_KEPT: u64 = 1 << 28;
 
 /// One list of splats per tile, one after the other in one array, tiles row by row.
@@ -20,11 +20,11 @@ const MAX_KEPT: u64 = 1 << 28;
 pub struct Lists {
     /// Splat of each entry.
     pub entries: Vec<u32>,
-    /// Start of each tile's list in `entries`, and the length of `entries`.
+    /// Start of each tile's list in `entries`, then the length of `entries`.
     pub starts: Vec<u32>,
-    /// Places of a splat's entries in `entries`, splat by splat. Empty without gradients.
+    /// Indices into `entries` of each splat's entries, splat by splat. Empty without gradients.
     pub places: Vec<u32>,
-    /// Start of each splat's places in `places`, and the length of `places`. Empty without gradients.
+    /// Start of each splat's part of `places`, then the length of `places`. Empty without gradients.
     pub first_place: Vec<u32>,
 }
 

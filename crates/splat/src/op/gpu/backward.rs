@@ -4,9 +4,9 @@
 //!
 //! An *intersection* is a pair of a splat and a tile that it reaches; its *slot* is its number, in the order in which
 //! `emit` writes them. An *entry* is a place in the depth-sorted lists of the tiles. A *record* has the sums of one
-//! intersection over the tile's pixels. [`pixels()`] proceeds in rounds of [`ROUND`] splats, the farthest first, in three
-//! steps: each unit computes the terms of its pixel for all splats of the round; [`SHARERS`] units per splat add up
-//! [`SHARE`] pixels each; one unit per number of a record adds up what they found.
+//! intersection over the tile's pixels. [`pixels()`] proceeds in rounds of [`ROUND`] splats, the farthest first, in
+//! three steps: each unit computes the terms of its pixel for all splats of the round; [`SHARERS`] units per splat
+//! add up [`SHARE`] pixels each; one unit per number of a record adds up these partial sums.
 
 use cubecl::CubeTypeMut;
 use cubecl::prelude::*;
@@ -45,7 +45,7 @@ struct BackToFront {
     sum: f32,
 }
 
-/// What one splat adds to its sums at one pixel.
+/// Terms of one splat at one pixel.
 #[derive(CubeType, CubeTypeMut, Clone, Copy)]
 struct PixelTerms {
     /// α·T.
@@ -56,7 +56,7 @@ struct PixelTerms {
 
 #[cube]
 impl BackToFront {
-    /// Visits the next splat towards the camera. `e` = colour·v_colour + depth·v_depth + v_alpha (e_j in [`crate::vjp`]).
+    /// Visits the next splat towards the camera. `e` is e_j in [`crate::vjp`].
     fn step_past(&mut self, unclamped_alpha: f32, e: f32, max_alpha: f32) -> PixelTerms {
         let alpha = unclamped_alpha.min(max_alpha);
         let inverse = 1.0 / (1.0 - alpha);
@@ -64,13 +64,13 @@ impl BackToFront {
         let blend_weight = alpha * self.transmittance;
         let v_alpha = self.transmittance * e - self.sum * inverse;
         self.sum += blend_weight * e;
-        // Where α is clamped it does not depend on the splat.
+        // A clamped α does not depend on the splat.
         PixelTerms { blend_weight, v_power: select(unclamped_alpha < max_alpha, v_alpha * alpha, 0.0f32) }
     }
 }
 
 /// Fills `records` `[intersections, record.len()]` from `upstream` `[V,H,W,C]`. `splats` `[V·N,8]`, `colors` `[N,3]`,
-/// `background` `[3]`; `slots` has the slot of each entry; `transmittance` `[V·H·W]` is that behind all splats;
+/// `background` `[3]`; `slots` has the slot of each entry; `transmittance` `[V·H·W]` is behind all splats;
 /// `list_ends` `[V·H·W]` is one more than the place, in the tile's list, of the last splat that a pixel blended.
 #[cube(launch)]
 #[allow(clippy::too_many_arguments, reason = "a kernel takes its buffers one by one")]
@@ -149,7 +149,7 @@ pub fn pixels(
         }
         sync_cube();
 
-        // Step 2: SHARERS units for each of the same splats, SHARE pixels for each unit.
+        // Step 2: SHARERS units for each splat of the round, SHARE pixels for each unit.
         let in_round = unit / comptime!(SHARERS);
         let mut gradient = SplatGradient::zero();
         if in_round < rest {
@@ -229,7 +229,7 @@ fn load_upstream(upstream: &[f32], pixel: &Pixel, #[comptime] has_depth: bool) -
     Upstream { color: load3(upstream, at), alpha: upstream[at + 3], depth }
 }
 
-/// The largest of the units' values, by a tree, so that all units end with the same number. All units have passed a
+/// The largest value of all units, by a tree reduction; every unit gets the same number. All units have passed a
 /// barrier afterwards.
 #[cube]
 fn largest(value: u32) -> u32 {
@@ -248,7 +248,7 @@ fn largest(value: u32) -> u32 {
     workgroup_uniform_load(&values[0])
 }
 
-/// Zeros for the entries from `first` to `end`, which no pixel blended.
+/// Zeroes the records of the entries from `first` to `end` − 1, which no pixel blended.
 #[cube]
 fn clear(records: &mut [f32], slots: &[u32], first: usize, end: usize, #[comptime] record: Record) {
     let len = comptime!(record.len());
@@ -261,8 +261,8 @@ fn clear(records: &mut [f32], slots: &[u32], first: usize, end: usize, #[comptim
     }
 }
 
-/// Adds up the records of each Gaussian over its tiles and views, and takes them through its projection. Buffers of
-/// unwanted gradients have one number, which stays as it is.
+/// Adds up the records of each Gaussian over its tiles and views, and applies the VJP of its projection. Buffers of
+/// unwanted gradients have one number, which is not written.
 #[cube(launch)]
 #[allow(clippy::too_many_arguments, reason = "a kernel takes its buffers one by one")]
 pub fn gather(
@@ -323,7 +323,7 @@ pub fn gather(
             v_opacity += v_opacity_here;
         }
     }
-    // Records may have opacities for the geometry's sake alone.
+    // A record may have the opacity only because the geometry's gradient needs it.
     if comptime!(wanted.colors) {
         store3(v_colors, 3 * g, &v_color);
     }
@@ -370,7 +370,7 @@ pub fn background_rows(
     store3(rows, 3 * row, &sum);
 }
 
-/// Sum over the rows.
+/// ∂L/∂background: the sum over the image rows.
 #[cube(launch)]
 pub fn background_sum(rows: &[f32], out: &mut [f32], count: usize) {
     if ABSOLUTE_POS < 3 {

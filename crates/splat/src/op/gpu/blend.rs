@@ -26,7 +26,6 @@ pub struct TileLists {
 pub struct Pixel {
     /// Centre, pixels.
     pub x: f32,
-    /// Centre, pixels.
     pub y: f32,
     /// Whether it lies in the image.
     pub inside: bool,
@@ -49,8 +48,8 @@ pub fn pixel_of_unit(unit: u32, uniforms: &Uniforms) -> Pixel {
     }
 }
 
-/// Image `[V,H,W,C]` and, where `keep`, each pixel's final transmittance and one more than the index of the last splat
-/// that it took in its tile's list (0 for none).
+/// Writes the image `[V,H,W,C]` and, with `keep`, each pixel's final transmittance and one more than the index, in its
+/// tile's list, of the last splat that the pixel took (0 for none).
 #[cube(launch)]
 #[allow(clippy::too_many_arguments, reason = "a kernel takes its buffers one by one")]
 pub fn blend(

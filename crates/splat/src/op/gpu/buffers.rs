@@ -30,7 +30,7 @@ impl Buffers {
         self.empty([n], DType::F32)
     }
 
-    /// Uninitialised, of any shape. Under test filled with garbage, so that nothing relies on zeroed memory.
+    /// An uninitialised tensor. Under test it is filled with garbage, so that nothing relies on zeroed memory.
     pub fn empty<const D: usize>(&self, shape: [usize; D], dtype: DType) -> CubeTensor {
         // A binding of no bytes is not allowed.
         let shape = if shape.contains(&0) { Shape::new([1]) } else { Shape::new(shape) };
@@ -55,7 +55,7 @@ impl Buffers {
         CubeTensor::new_contiguous(self.client.clone(), self.device.clone(), shape, handle, DType::F32)
     }
 
-    /// So many cubes, spread over axes where one axis does not reach. Kernels return where `CUBE_POS` is beyond.
+    /// At least `n` cubes, over two axes if one is too short. Kernels return where `CUBE_POS` is `n` or more.
     pub fn cubes(&self, n: usize) -> CubeCount {
         let most = self.client.properties().hardware.max_cube_count.0 as usize;
         let y = n.div_ceil(most).max(1);
@@ -104,7 +104,7 @@ fn fill(out: &mut [u32], n: usize, value: u32) {
 mod tests {
     use super::testing::{read, with_buffers};
 
-    /// More groups of 256 than one axis of a launch takes.
+    /// The buffer needs more cubes than one axis of a launch takes.
     #[test]
     fn long_buffers_are_filled_to_the_end() {
         with_buffers(|buffers| {

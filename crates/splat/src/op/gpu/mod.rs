@@ -6,8 +6,8 @@
 //!    tile's list is front to back.
 //! 4. Blend, one cube per tile.
 //!
-//! Backward: one record of sums per intersection, written by the cube of its tile; then each Gaussian adds up its own
-//! records, which lie side by side, and takes them through the projection.
+//! Backward: the cube of a tile writes one record of sums per intersection; then each Gaussian adds up its own records,
+//! which lie side by side, and applies the VJP of its projection.
 
 mod backward;
 mod blend;
@@ -66,7 +66,7 @@ pub struct State {
 struct Lists {
     /// Splat of each entry.
     entries: CubeTensor,
-    /// Number, in order of emission, of each entry's intersection.
+    /// Number of each entry's intersection, in the order in which `emit` writes the intersections.
     slots: CubeTensor,
     starts: CubeTensor,
     ends: CubeTensor,
@@ -167,7 +167,7 @@ impl SplatKernels for CubeBackend {
     }
 }
 
-/// ∂L/∂image `[V,H,W,C]`: the gradients of all outputs, 0 for outputs without one.
+/// ∂L/∂image `[V,H,W,C]`: the gradients of all outputs, 0 for outputs without a gradient.
 fn whole(upstream: Upstream<CubeTensor>, job: &Job, device: &Device<CubeBackend>) -> CubeTensor {
     let shape = Shape::new([job.views.len(), job.height, job.width, job.channels()]);
     let Upstream { color, alpha, depth } = upstream;
@@ -182,7 +182,7 @@ fn whole(upstream: Upstream<CubeTensor>, job: &Job, device: &Device<CubeBackend>
     into_contiguous(image)
 }
 
-/// A buffer for a gradient. Its shape may be empty, while the buffer has at least one number, as kernels require.
+/// A buffer for a gradient. The shape may be empty; the buffer has at least one number, as kernels require.
 fn gradient<const D: usize>(buffers: &Buffers, shape: [usize; D]) -> CubeTensor {
     let CubeTensor { client, device, handle, .. } = buffers.empty(shape, DType::F32);
     CubeTensor::new_contiguous(client, device, Shape::new(shape), handle, DType::F32)
@@ -243,7 +243,7 @@ fn lists(
     let all_tiles = tiles * job.views.len();
     let dim = CubeDim::new_1d(UNITS);
     let one_each = |n: usize| buffers.cubes(n.div_ceil(UNITS as usize));
-    // The largest array per intersection: its record of the backward pass, or a number.
+    // The largest array has one record of the backward pass, or one number, per intersection.
     let numbers = if keep { RECORD } else { 1 };
     let limit = (buffers.largest() / 4).min(u32::MAX.into()) / numbers;
 

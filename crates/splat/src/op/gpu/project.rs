@@ -68,7 +68,7 @@ pub struct Reach {
 
 #[cube]
 impl Reach {
-    /// Number `index` of a buffer.
+    /// Reads number `index` of a buffer.
     pub fn load(reach: &[u32], index: usize) -> Reach {
         let at = index * comptime!(REACH);
         let rows = Extent { first: reach[at], end: reach[at + 1] };
@@ -100,7 +100,7 @@ pub fn project_all(
     #[comptime] antialiased: bool,
 ) {
     let i = ABSOLUTE_POS;
-    // Units without a Gaussian have none of the fates.
+    // Units beyond the last Gaussian count for no fate.
     let mut fate = comptime!(FATES as u32).runtime();
     let mut tiles = 0u32;
     if i < uniforms.n * uniforms.views {
@@ -150,7 +150,7 @@ fn count(fate: u32, tiles: u32, statistics: &[Atomic<u32>]) {
     }
 }
 
-/// Tile counts in depth order: `sorted[i]` is that of `order[i]`.
+/// Tile counts in depth order: `sorted[i]` is the tile count of splat `order[i]`.
 #[cube(launch)]
 pub fn sort_counts(reach: &[u32], order: &[u32], sorted: &mut [u32], total: usize) {
     if ABSOLUTE_POS < total {
@@ -160,8 +160,8 @@ pub fn sort_counts(reach: &[u32], order: &[u32], sorted: &mut [u32], total: usiz
 
 /// One intersection per splat and tile, splats front to back: its tile (counted over all views) and its splat.
 ///
-/// A splat has as many places as [`project_all()`] counted. Should this kernel be compiled to round differently, it fills
-/// the remaining places with a tile that does not exist and leaves the places of other splats alone.
+/// A splat has as many places as [`project_all()`] counted. If the compiler makes this kernel round differently, the
+/// kernel fills the remaining places with a tile that does not exist and never writes the places of other splats.
 #[cube(launch)]
 #[allow(clippy::too_many_arguments, reason = "a kernel takes its buffers one by one")]
 pub fn emit(

@@ -7,7 +7,7 @@ use super::scan::exclusive_sum;
 use burn_cubecl::tensor::CubeTensor;
 
 const UNITS: usize = 256;
-/// Consecutive pairs of each unit; consecutive, because that keeps the order of equal keys.
+/// Pairs of each unit. The pairs are consecutive, which keeps the order of equal keys.
 const ITEMS: usize = 8;
 const BLOCK: usize = UNITS * ITEMS;
 const BITS: u32 = 4;
@@ -31,7 +31,7 @@ pub fn sort_pairs(
     let mut counting = values.is_none();
     let mut pairs = (keys.clone(), values.unwrap_or(keys));
     let mut shift = 0;
-    // At least one pass: it makes up the values.
+    // At least one pass, since the first pass makes the values 0, 1, 2 ….
     while shift == 0 || shift < bits {
         let counts = buffers.u32(DIGITS * blocks);
         let mask = (1 << (bits - shift).min(BITS)) - 1;

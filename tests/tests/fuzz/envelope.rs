@@ -1,0 +1,103 @@
+//! Formats that wrap others in lengths and checksums. Damage of their bytes is noticed at the wrapping, so the parts
+//! inside are damaged by themselves and wrapped again.
+
+use std::io::{Cursor, Read, Write};
+
+use flate2::Compression;
+use flate2::read::GzDecoder;
+use flate2::write::GzEncoder;
+use zip::write::SimpleFileOptions;
+use zip::{CompressionMethod, ZipArchive, ZipWriter};
+
+/// Name and content of each part.
+pub type Parts = Vec<(Vec<u8>, Vec<u8>)>;
+
+const PNG: &[u8] = b"\x89PNG\r\n\x1a\n";
+
+/// The parts of a sound file whose name ends in `ending`; `None` if the format wraps nothing.
+pub fn open(ending: &str, bytes: &[u8]) -> Option<Parts> {
+    let mut parts = Parts::new();
+    match ending {
+        "png" => {
+            let mut rest = bytes.strip_prefix(PNG)?;
+            while let Some((length, more)) = rest.split_first_chunk() {
+                let (chunk, more) = more.split_at_checked(4 + u32::from_be_bytes(*length) as usize)?;
+                parts.push((Vec::new(), chunk.to_vec()));
+                rest = more.get(4..)?;
+            }
+        }
+        "glb" => {
+            let mut rest = bytes.get(12..)?;
+            while let Some((length, more)) = rest.split_first_chunk() {
+                let (kind, more) = more.split_at_checked(4)?;
+                let (chunk, more) = more.split_at_checked(u32::from_le_bytes(*length) as usize)?;
+                parts.push((kind.to_vec(), chunk.to_vec()));
+                rest = more;
+            }
+        }
+        "spz" => {
+            let mut content = Vec::new();
+            GzDecoder::new(bytes).read_to_end(&mut content).ok()?;
+            parts.push((Vec::new(), content));
+        }
+        "safetensors" => {
+            let (length, rest) = bytes.split_first_chunk()?;
+            let (header, data) = rest.split_at_checked(u64::from_le_bytes(*length) as usize)?;
+            parts.extend([(Vec::new(), header.to_vec()), (Vec::new(), data.to_vec())]);
+        }
+        "npz" | "pth" => {
+            let mut archive = ZipArchive::new(Cursor::new(bytes)).ok()?;
+            for row in 0..archive.len() {
+                let mut entry = archive.by_index(row).ok()?;
+                let mut content = Vec::new();
+                entry.read_to_end(&mut content).ok()?;
+                parts.push((entry.name_raw().to_vec(), content));
+            }
+        }
+        _ => return None,
+    }
+    Some(parts)
+}
+
+/// The file again, with lengths and checksums that fit.
+pub fn close(ending: &str, parts: &Parts) -> Vec<u8> {
+    match ending {
+        "png" => parts.iter().fold(PNG.to_vec(), |mut bytes, (_, chunk)| {
+            bytes.extend((chunk.len().saturating_sub(4) as u32).to_be_bytes());
+            bytes.extend(chunk);
+            bytes.extend(crc32fast::hash(chunk).to_be_bytes());
+            bytes
+        }),
+        "glb" => {
+            let mut chunks = Vec::new();
+            for (kind, part) in parts {
+                let length = part.len().next_multiple_of(4);
+                chunks.extend((length as u32).to_le_bytes());
+                chunks.extend(kind);
+                chunks.extend(part);
+                let padding = if kind == b"JSON" { b' ' } else { 0 };
+                chunks.resize(chunks.len() + length - part.len(), padding);
+            }
+            let length = (12 + chunks.len() as u32).to_le_bytes();
+            [b"glTF", &2_u32.to_le_bytes()[..], &length, &chunks].concat()
+        }
+        "spz" => {
+            let mut encoder = GzEncoder::new(Vec::new(), Compression::fast());
+            encoder.write_all(&parts[0].1).and_then(|()| encoder.finish()).expect("memory")
+        }
+        "safetensors" => {
+            [&(parts[0].1.len() as u64).to_le_bytes()[..], &parts[0].1, &parts[1].1].concat()
+        }
+        _ => {
+            let method =
+                if ending == "pth" { CompressionMethod::Stored } else { CompressionMethod::Deflated };
+            let options = SimpleFileOptions::default().compression_method(method);
+            let mut archive = ZipWriter::new(Cursor::new(Vec::new()));
+            for (name, part) in parts {
+                archive.start_file(String::from_utf8_lossy(name), options).expect("a new entry");
+                archive.write_all(part).expect("written to memory");
+            }
+            archive.finish().expect("written to memory").into_inner()
+        }
+    }
+}
